@@ -1,0 +1,85 @@
+"""The one vocabulary: names, shapes and units of everything observed, commanded and recorded.
+
+The same keys name a quantity in the simulator, on the real arm, in an episode file and in a
+policy's input. SI units (metres, radians, newtons, seconds); quaternions are wxyz; the base frame
+is the robot's first link. Keys follow LeRobot's naming.
+"""
+
+from dataclasses import dataclass
+
+STATE = "observation.state"
+TCP_POSE = "observation.tcp_pose"
+WRENCH = "observation.wrench"
+FRONT = "observation.images.front"
+WRIST = "observation.images.wrist"
+TACTILE_LEFT = "observation.images.tactile_left"
+TACTILE_RIGHT = "observation.images.tactile_right"
+ACTION = "action"
+
+TACTILE = (TACTILE_LEFT, TACTILE_RIGHT)
+CAMERAS = (FRONT, WRIST)
+IMAGE_PREFIX = "observation.images."
+
+# What only a simulator knows.
+TRUTH_PAD_WRENCH = "truth.pad_wrench"
+TRUTH_CONTACT = "truth.contact"
+TRUTH_SLIP = "truth.slip"
+TRUTH_OBJECT_POSE = "truth.object_pose"
+TRUTH_PROGRESS = "truth.progress"
+TRUTH_SUCCESS = "truth.success"
+
+N_JOINTS = 7
+CONTROL_HZ = 20
+TACTILE_SHAPE = (240, 320, 3)
+CAMERA_SHAPE = (128, 128, 3)
+
+_JOINTS = tuple(f"joint_{i}" for i in range(1, N_JOINTS + 1))
+_POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+_WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One column of the vocabulary: numpy dtype name, shape of one sample, component names."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    names: tuple[str, ...]
+    meaning: str
+
+
+_IMAGE_NAMES = ("height", "width", "channels")
+
+FEATURES: dict[str, Feature] = {
+    STATE: Feature(
+        "float32",
+        (15,),
+        tuple(f"{j}.pos" for j in _JOINTS) + tuple(f"{j}.vel" for j in _JOINTS) + ("gripper.pos",),
+        "joint positions (rad), joint velocities (rad/s), gripper width (m)",
+    ),
+    TCP_POSE: Feature("float32", (7,), _POSE, "tool centre point in the base frame: m, wxyz"),
+    WRENCH: Feature(
+        "float32", (6,), _WRENCH, "external force (N) and torque (Nm) at the TCP, base frame"
+    ),
+    FRONT: Feature("uint8", CAMERA_SHAPE, _IMAGE_NAMES, "fixed camera facing the robot, RGB"),
+    WRIST: Feature("uint8", CAMERA_SHAPE, _IMAGE_NAMES, "camera on the hand, RGB"),
+    TACTILE_LEFT: Feature("uint8", TACTILE_SHAPE, _IMAGE_NAMES, "left fingertip sensor, RGB"),
+    TACTILE_RIGHT: Feature("uint8", TACTILE_SHAPE, _IMAGE_NAMES, "right fingertip sensor, RGB"),
+    ACTION: Feature(
+        "float32",
+        (8,),
+        tuple(f"{j}.delta" for j in _JOINTS) + ("gripper.target",),
+        "joint change for this control tick (rad), gripper width target (m)",
+    ),
+    TRUTH_PAD_WRENCH: Feature(
+        "float32",
+        (12,),
+        tuple(f"{side}.{n}" for side in ("left", "right") for n in _WRENCH),
+        "force (N) and torque (Nm) of the object on each pad, pad frame (z out of the gel)",
+    ),
+    TRUTH_CONTACT: Feature("bool", (2,), ("left", "right"), "pad touches something"),
+    TRUTH_SLIP: Feature("bool", (2,), ("left", "right"), "pad contact slides"),
+    TRUTH_OBJECT_POSE: Feature("float32", (7,), _POSE, "object in the base frame: m, wxyz"),
+    TRUTH_PROGRESS: Feature("float32", (1,), ("progress",), "task progress in [0, 1]"),
+    TRUTH_SUCCESS: Feature("bool", (1,), ("success",), "task done"),
+}

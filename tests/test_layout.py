@@ -1,0 +1,68 @@
+"""The repository's layout: every folder is linked, is no package by itself, imports leftwards."""
+
+import ast
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ORDER = [
+    "control",
+    "sim_envs",
+    "episodes",
+    "encoders",
+    "rewards",
+    "policies",
+    "benchmarks",
+    "launch",
+]
+FORBIDDEN = {"rewards": {"policies"}, "policies": {"rewards"}}
+
+
+def allowed(folder: str) -> set[str]:
+    return set(ORDER[: ORDER.index(folder) + 1]) - FORBIDDEN.get(folder, set())
+
+
+def imported_modules(path: Path) -> set[str]:
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+@pytest.mark.parametrize("folder", ORDER)
+def test_folder_is_linked_and_bare(folder: str) -> None:
+    link = ROOT / "src" / "touchgoal" / folder
+    assert link.is_symlink() and link.resolve() == ROOT / folder
+    assert not (ROOT / folder / "__init__.py").exists(), "would shadow python-control and ROS"
+
+
+@pytest.mark.parametrize("path", sorted(p for f in ORDER for p in (ROOT / f).rglob("*.py")), ids=str)
+def test_imports_point_left(path: Path) -> None:
+    folder = path.relative_to(ROOT).parts[0]
+    modules = imported_modules(path)
+    used = {name.split(".")[1] for name in modules if name.startswith("touchgoal.")}
+    assert used <= allowed(folder), f"{path.name} imports from {used - allowed(folder)}"
+    if folder == "control":
+        assert not any(name.split(".")[0] == "torch" for name in modules)
+
+
+def test_files_stay_small() -> None:
+    long = {
+        str(p.relative_to(ROOT)): n
+        for f in ORDER
+        for p in (ROOT / f).rglob("*.py")
+        if (n := len(p.read_text().splitlines())) > 400
+    }
+    assert not long
+
+
+def test_version_is_said_once() -> None:
+    from touchgoal import __version__
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["version"] == __version__
