@@ -1,0 +1,275 @@
+"""What every task shares: a Gymnasium environment around the simulated cell."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
+from touchgoal.control.kinematics import FR3_HOME, Fr3Kinematics, fingers_down
+from touchgoal.sim_envs.contact import ContactReader, PadContact
+from touchgoal.sim_envs.objects import Body
+from touchgoal.sim_envs.scene import GRIPPER_MAX_FORCE, SIDES, SceneConfig, build
+from touchgoal.sim_envs.tactile import TactileFrame, TactilePad
+from touchgoal.sim_envs.tactile_optics import sample_unit
+
+GRIPPER_MAX_WIDTH = 0.08  # m, Franka Hand
+GRIPPER_SPEED = 0.1  # m/s of width, Franka Hand's datasheet maximum
+MAX_JOINT_SPEED = np.array([2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26])  # rad/s, FR3
+_SETPOINT_PERIOD = 0.002  # s: set-points coarser than 2 ms shake the wrist (MuJoCo 4.0.0)
+
+Observation = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """Options every task has.
+
+    Attributes:
+        cameras: which of "front" and "wrist" are observed; fewer is faster.
+        camera_size: (rows, columns) of their images.
+        tactile: whether the two fingertip images are observed.
+        control_hz: control ticks per second.
+        max_seconds: after which an episode is truncated.
+        scene: robot, sensors, physics.
+    """
+
+    cameras: tuple[str, ...] = ("front", "wrist")
+    camera_size: tuple[int, int] = v.CAMERA_SHAPE[:2]
+    tactile: bool = True
+    control_hz: int = v.CONTROL_HZ
+    max_seconds: float = 8.0
+    scene: SceneConfig = SceneConfig()
+
+
+class FrankaTactileEnv(gym.Env[Observation, np.ndarray], ABC):
+    """An FR3 with two fingertip sensors at a table; a task adds objects, progress and success.
+
+    Observations are a flat dict with the keys of `control/vocabulary.py`; truth (`truth.*`) is in
+    `info`. The action is the joint change (rad) for this tick, added to the commanded joint
+    positions, and the gripper width target (m). The gripper closes at its own speed and then
+    holds with `grasp_force` N on each finger, as the Franka Hand's `grasp` does.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": v.CONTROL_HZ}  # noqa: RUF012
+
+    def __init__(self, config: EnvConfig, render_mode: str | None = None) -> None:
+        self.config, self.render_mode = config, render_mode
+        self.kinematics = Fr3Kinematics()
+        self.action_space = self._action_space()
+        self.observation_space = gym.spaces.Dict(
+            {key: _space(v.FEATURES[key], self._shape(key)) for key in self._observed()}
+        )
+        self.grasp_force = 15.0
+        self.bodies: list[Body] = []
+        self._renderer: mujoco.Renderer | None = None
+        self._person: mujoco.Renderer | None = None
+        self._pads: list[TactilePad] = []
+
+    # What a task defines.
+
+    @abstractmethod
+    def _sample(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
+        """Choose the episode: set `bodies` and `grasp_force`, UserError on a bad option."""
+
+    @abstractmethod
+    def _extend(self, spec: mujoco.MjSpec) -> None:
+        """Add the task's own parts to the scene."""
+
+    @abstractmethod
+    def _place(self, rng: np.random.Generator) -> None:
+        """Put the objects where the episode starts."""
+
+    @abstractmethod
+    def _judge(self) -> tuple[float, bool]:
+        """Progress in [0, 1] and success after a tick."""
+
+    # Gymnasium.
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode; the same seed and options give the same episode."""
+        super().reset(seed=seed)
+        rng = self.np_random
+        self._sample(rng, dict(options or {}))
+        self._compile(rng)
+        self._place(rng)
+        self.command = self.start_joints(rng)
+        self._opening = GRIPPER_MAX_WIDTH / 2
+        self.data.qpos[self._arm] = self.command
+        self.data.qpos[self._fingers] = self._opening
+        self._ticks = 0
+        self._advance(np.zeros(v.N_JOINTS), GRIPPER_MAX_WIDTH, seconds=0.3)  # objects settle
+        self._judge()
+        return self._observe(), self._info(0.0, False)
+
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One control tick; the reward is the tick's gain in progress."""
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (8,) or not np.isfinite(action).all():
+            raise ValueError(f"an action is 8 finite numbers, not {action}")
+        low, high = self.action_space.low, self.action_space.high
+        action = np.clip(action, low, high)
+        self._advance(action[:7], action[7], seconds=1 / self.config.control_hz)
+        self._ticks += 1
+        before = self._progress
+        progress, success = self._judge()
+        truncated = self._ticks >= self.config.max_seconds * self.config.control_hz
+        info = self._info(progress, success)
+        return self._observe(), progress - before, success, truncated, info
+
+    def render(self) -> UInt8[np.ndarray, "h w 3"]:
+        """A picture for people, from the side camera, 480 x 640."""
+        return self.picture("side", (480, 640))
+
+    def picture(self, camera: str, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+        """The scene now, from any of its cameras."""
+        if self._person is None or (self._person.height, self._person.width) != size:
+            if self._person is not None:
+                self._person.close()
+            self._person = mujoco.Renderer(self.model, *size)
+        self._person.update_scene(self.data, camera)
+        return self._person.render()
+
+    def close(self) -> None:
+        """Free the OpenGL contexts."""
+        for renderer in (self._renderer, self._person, *self._pads):
+            if renderer is not None:
+                renderer.close()
+        self._renderer, self._person, self._pads = None, None, []
+
+    # What experts and drivers use.
+
+    def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, "7"]:
+        """Joint positions with the open hand over the table, a little different each time."""
+        position = np.array([0.45, 0.0, 0.26]) + rng.uniform(-0.03, 0.03, 3)
+        return self.kinematics.reach(position, fingers_down(rng.uniform(-0.2, 0.2)), FR3_HOME)
+
+    def tactile_frames(self) -> list[TactileFrame]:
+        """The last reading of the left and right sensor, with depth and contact mask."""
+        return self._frames
+
+    def pad_contacts(self) -> tuple[PadContact, PadContact]:
+        """Exact wrench and slip of the left and right pad after the last tick."""
+        return self._contacts
+
+    # Insides.
+
+    def _compile(self, rng: np.random.Generator) -> None:
+        self.close()
+        spec = build(self.bodies, self.config.scene)
+        self._extend(spec)
+        self.model = model = spec.compile()
+        self.data = mujoco.MjData(model)
+        self._arm = [model.joint(f"fr3_joint{i}").qposadr[0] for i in range(1, 8)]
+        self._arm_dof = [model.joint(f"fr3_joint{i}").dofadr[0] for i in range(1, 8)]
+        self._fingers = [model.joint(f"finger_joint{i}").qposadr[0] for i in (1, 2)]
+        self._gripper = model.actuator("gripper").id
+        self._tcp = model.site("tcp").id
+        self._reader = ContactReader(model)
+        self._frames: list[TactileFrame] = []
+        sensor = self.config.scene.sensor
+        if self.config.tactile:
+            self._pads = [
+                TactilePad(model, side, sensor, sample_unit(sensor.image_shape, rng), self.bodies)
+                for side in SIDES
+            ]
+        if self.config.cameras:
+            self._renderer = mujoco.Renderer(model, *self.config.camera_size)
+
+    def _advance(self, delta: np.ndarray, width: float, seconds: float) -> None:
+        """Physics for one tick, with set-points interpolated."""
+        setpoints = round(seconds / _SETPOINT_PERIOD)
+        steps = round(_SETPOINT_PERIOD / self.model.opt.timestep)
+        start = self.command
+        limits = self.model.actuator_ctrlrange[:7]
+        self.command = np.clip(start + delta, limits[:, 0], limits[:, 1])
+        travel = GRIPPER_SPEED / 2 * _SETPOINT_PERIOD  # m of one finger in one set-point
+        self.model.actuator_forcerange[self._gripper, 0] = -2 * self.grasp_force
+        self.model.actuator_forcerange[self._gripper, 1] = GRIPPER_MAX_FORCE
+        for k in range(1, setpoints + 1):
+            self._opening += np.clip(width / 2 - self._opening, -travel, travel)
+            self.data.ctrl[:7] = start + (self.command - start) * (k / setpoints)
+            self.data.ctrl[self._gripper] = self._opening
+            mujoco.mj_step(self.model, self.data, nstep=steps)
+        mujoco.mj_forward(self.model, self.data)
+        self._contacts = self._reader.pads(self.data)
+
+    def _observe(self) -> Observation:
+        data = self.data
+        quat = np.zeros(4)
+        mujoco.mju_mat2Quat(quat, data.site_xmat[self._tcp])
+        width = data.qpos[self._fingers].sum()
+        values = {
+            v.STATE: np.concatenate([data.qpos[self._arm], data.qvel[self._arm_dof], [width]]),
+            v.TCP_POSE: np.concatenate([data.site_xpos[self._tcp], quat]),
+            v.WRENCH: self._reader.external_wrench(data),
+        }
+        observation = {key: value.astype(np.float32) for key, value in values.items()}
+        if self._renderer is not None:
+            for camera in self.config.cameras:
+                self._renderer.update_scene(data, camera)
+                observation[v.IMAGE_PREFIX + camera] = self._renderer.render()
+        if self._pads:
+            self._frames = [
+                pad.sense(data, contact, self.np_random)
+                for pad, contact in zip(self._pads, self._contacts, strict=True)
+            ]
+            for key, frame in zip(v.TACTILE, self._frames, strict=True):
+                observation[key] = frame.image
+        return observation
+
+    def _info(self, progress: float, success: bool) -> dict[str, Any]:
+        self._progress = progress
+        pads = self._contacts
+        wrench = np.concatenate([w for pad in pads for w in (pad.force, pad.torque)])
+        return {
+            v.TRUTH_PAD_WRENCH: wrench.astype(np.float32),
+            v.TRUTH_CONTACT: np.array([pad.touching for pad in pads]),
+            v.TRUTH_SLIP: np.array([pad.slip_speed > 1e-3 for pad in pads]),
+            v.TRUTH_OBJECT_POSE: self.object_pose().astype(np.float32),
+            v.TRUTH_PROGRESS: np.array([progress], np.float32),
+            v.TRUTH_SUCCESS: np.array([success]),
+        }
+
+    def object_pose(self, name: str = "object") -> Float[np.ndarray, "7"]:
+        """Pose of an object in the base frame: m, quaternion wxyz."""
+        return self.data.joint(name).qpos.copy()
+
+    def _observed(self) -> list[str]:
+        keys = [v.STATE, v.TCP_POSE, v.WRENCH]
+        known = {key.removeprefix(v.IMAGE_PREFIX) for key in v.CAMERAS}
+        for camera in self.config.cameras:
+            if camera not in known:
+                raise UserError(f"unknown camera {camera!r}; choose from: {', '.join(sorted(known))}")
+            keys.append(v.IMAGE_PREFIX + camera)
+        return keys + (list(v.TACTILE) if self.config.tactile else [])
+
+    def _shape(self, key: str) -> tuple[int, ...]:
+        if key in v.CAMERAS:
+            return (*self.config.camera_size, 3)
+        if key in v.TACTILE:
+            return (*self.config.scene.sensor.image_shape, 3)
+        return v.FEATURES[key].shape
+
+    def _action_space(self) -> gym.spaces.Box:
+        step = MAX_JOINT_SPEED / self.config.control_hz
+        return gym.spaces.Box(
+            np.append(-step, 0.0).astype(np.float32),
+            np.append(step, GRIPPER_MAX_WIDTH).astype(np.float32),
+            dtype=np.float32,
+        )
+
+
+def _space(feature: v.Feature, shape: tuple[int, ...]) -> gym.spaces.Box:
+    if feature.dtype == "uint8":
+        return gym.spaces.Box(0, 255, shape, np.uint8)
+    return gym.spaces.Box(-np.inf, np.inf, shape, np.float32)

@@ -1,0 +1,113 @@
+"""What the solver's contacts say about the fingertips: wrenches, slip, external force."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.sim_envs.scene import SIDES
+
+SLIP_SPEED = 1e-3  # m/s of sliding between pad and object that counts as slip
+
+
+@dataclass(frozen=True)
+class PadContact:
+    """One pad's contact.
+
+    Attributes:
+        force, torque: of the object on the pad, N and Nm, in the sensor frame about its origin;
+            a squeeze is a negative z force.
+        slip_speed: of the object over the pad, m/s, the fastest contact point.
+        geoms: ids of the geoms that touch the pad.
+    """
+
+    force: Float[np.ndarray, "3"]
+    torque: Float[np.ndarray, "3"]
+    slip_speed: float
+    geoms: frozenset[int]
+
+    @property
+    def touching(self) -> bool:
+        """Whether anything presses on the pad."""
+        return bool(self.geoms)
+
+    @property
+    def normal_force(self) -> float:
+        """N, positive when pressed."""
+        return max(0.0, -float(self.force[2]))
+
+
+class ContactReader:
+    """Reads a model's contacts; one pass over them a control tick."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._model = model
+        self._pads = {model.geom(f"{side}_pad").id: i for i, side in enumerate(SIDES)}
+        self._sensors = [model.site(f"{side}_sensor").id for side in SIDES]
+        self._tcp = model.site("tcp").id
+        base = model.body("base").id
+        rooted = model.body_rootid[model.geom_bodyid] == model.body_rootid[base]
+        self._is_robot = rooted & (model.geom_bodyid != 0)
+
+    def pads(self, data: mujoco.MjData) -> tuple[PadContact, PadContact]:
+        """The left and the right pad's contact."""
+        force, torque = np.zeros((2, 3)), np.zeros((2, 3))
+        slip, geoms = [0.0, 0.0], [set(), set()]
+        for i, contact in enumerate(data.contact):
+            for own, other, sign in ((0, 1, -1.0), (1, 0, 1.0)):
+                side = self._pads.get(int(contact.geom[own]))
+                if side is None or contact.efc_address < 0:
+                    continue
+                f, t = self._wrench(data, i, contact)
+                site = self._sensors[side]
+                R = data.site_xmat[site].reshape(3, 3)
+                arm = contact.pos - data.site_xpos[site]
+                force[side] += sign * R.T @ f
+                torque[side] += sign * R.T @ (np.cross(arm, f) + t)
+                slip[side] = max(slip[side], self._sliding_speed(data, contact))
+                geoms[side].add(int(contact.geom[other]))
+        left, right = (
+            PadContact(force[s], torque[s], slip[s], frozenset(geoms[s])) for s in range(2)
+        )
+        return left, right
+
+    def external_wrench(self, data: mujoco.MjData) -> Float[np.ndarray, "6"]:
+        """Force (N) and torque (Nm) of everything outside on the robot, at the TCP, base frame."""
+        total = np.zeros(6)
+        tcp = data.site_xpos[self._tcp]
+        for i, contact in enumerate(data.contact):
+            first, second = (bool(self._is_robot[g]) for g in contact.geom)
+            if first == second or contact.efc_address < 0:
+                continue
+            f, t = self._wrench(data, i, contact)
+            sign = 1.0 if second else -1.0
+            total[:3] += sign * f
+            total[3:] += sign * (np.cross(contact.pos - tcp, f) + t)
+        return total
+
+    def touches(self, data: mujoco.MjData, one: int, other: int) -> bool:
+        """Whether two geoms are in contact."""
+        return any({int(g) for g in c.geom} == {one, other} for c in data.contact)
+
+    def _wrench(
+        self, data: mujoco.MjData, index: int, contact: mujoco.MjContact
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """World-frame force and torque of a contact's first geom on its second."""
+        wrench = np.zeros(6)
+        mujoco.mj_contactForce(self._model, data, index, wrench)
+        frame = contact.frame.reshape(3, 3)
+        return frame.T @ wrench[:3], frame.T @ wrench[3:]
+
+    def _sliding_speed(self, data: mujoco.MjData, contact: mujoco.MjContact) -> float:
+        velocities = []
+        for geom in contact.geom:
+            twist = np.zeros(6)
+            body = self._model.geom_bodyid[geom]
+            mujoco.mj_objectVelocity(
+                self._model, data, mujoco.mjtObj.mjOBJ_BODY, body, twist, 0
+            )
+            velocities.append(twist[3:] + np.cross(twist[:3], contact.pos - data.xpos[body]))
+        relative = velocities[1] - velocities[0]
+        normal = contact.frame[:3]
+        return float(np.linalg.norm(relative - normal * (normal @ relative)))

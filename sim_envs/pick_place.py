@@ -1,0 +1,170 @@
+"""The task of the paper's robot experiment: pick an object up and place it at a goal.
+
+`gymnasium.make("touchgoal.sim_envs.pick_place:touchgoal/PickPlace-v0")` imports and makes it.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+
+from touchgoal.control.errors import UserError
+from touchgoal.sim_envs.base import EnvConfig, FrankaTactileEnv
+from touchgoal.sim_envs.objects import CATALOGUE, find, sample_body
+from touchgoal.sim_envs.scene import VISUAL_GROUP
+
+WORKSPACE = ((0.40, 0.60), (-0.20, 0.20))  # m, where objects start and goals lie, base frame
+_LIFTED = 0.03  # m above rest that counts as picked up
+_APART = 0.12  # m at least between objects, and between start and goal
+
+
+@dataclass(frozen=True)
+class PickPlaceConfig(EnvConfig):
+    """Options of the pick-and-place task; reset's `options` override the random draws.
+
+    Attributes:
+        objects: catalogue names to draw from; empty: all.
+        distractors: other objects on the table.
+        mass: range, kg.
+        grasp_force: range of the force of each finger, N.
+        tolerance: distance of the object's centre to the goal that counts as placed, m.
+        release: whether the object must also be let go. The paper's reward curves end in touch, so
+            by default an episode ends with the placed object still held.
+    """
+
+    objects: tuple[str, ...] = ()
+    distractors: int = 0
+    mass: tuple[float, float] = (0.02, 0.2)
+    grasp_force: tuple[float, float] = (5.0, 30.0)
+    tolerance: float = 0.02
+    release: bool = False
+
+
+class PickPlace(FrankaTactileEnv):
+    """Pick the object up and place it on the disc.
+
+    | reset option | meaning |
+    |---|---|
+    | `object` | catalogue name |
+    | `mass` | kg |
+    | `grasp_force` | N of each finger |
+
+    Success: the object, once lifted by 3 cm, lies at rest on the table within `tolerance` of the
+    goal for half a second, and is let go if `release` asks for it. Progress: reaching (to 0.25),
+    grasped (0.35), carrying (to 0.85), lowering (to 0.95), success (1).
+    """
+
+    config: PickPlaceConfig
+
+    def __init__(self, config: PickPlaceConfig | None = None, render_mode: str | None = None):
+        super().__init__(config or PickPlaceConfig(), render_mode)
+        self.kinds = [find(name) for name in self.config.objects] or list(CATALOGUE.values())
+
+    def _sample(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
+        config = self.config
+        unknown = options.keys() - {"object", "mass", "grasp_force"}
+        if unknown:
+            raise UserError(
+                f"unknown reset option {sorted(unknown)[0]!r}; there are: object, mass, grasp_force"
+            )
+        kind = self.kinds[rng.integers(len(self.kinds))]
+        if "object" in options:
+            kind = find(options["object"])
+        mass, force = rng.uniform(*config.mass), rng.uniform(*config.grasp_force)
+        self.grasp_force = float(options.get("grasp_force", force))
+        self.bodies = [sample_body(kind, rng, float(options.get("mass", mass)))]
+        others = [k for k in CATALOGUE.values() if k.name != kind.name]
+        for i in range(config.distractors):
+            other = others[rng.integers(len(others))]
+            self.bodies.append(
+                sample_body(other, rng, rng.uniform(*config.mass), f"distractor_{i + 1}")
+            )
+        self._positions = _spread(rng, len(self.bodies) + 1)
+        self.goal = self._positions[-1]
+
+    def _extend(self, spec: mujoco.MjSpec) -> None:
+        spec.worldbody.add_geom(
+            name="goal",
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+            size=[0.03, 0.0005, 0],
+            pos=[*self.goal, 0.0005],
+            rgba=[0.1, 0.55, 0.35, 1],
+            contype=0,
+            conaffinity=0,
+            group=VISUAL_GROUP,
+        )
+
+    def _place(self, rng: np.random.Generator) -> None:
+        for body, position in zip(self.bodies, self._positions, strict=False):
+            yaw = rng.uniform(-np.pi, np.pi)
+            joint = self.data.joint(body.name)
+            joint.qpos[:3] = *position, body.rest_height + 0.001
+            joint.qpos[3:] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
+        self._still_ticks = 0
+        self._lifted = False
+        self._rest_height: float | None = None
+
+    def _judge(self) -> tuple[float, bool]:
+        position = self.object_pose()[:3]
+        if self._rest_height is None:  # the first call, when the object has settled
+            self._rest_height = float(position[2])
+            self._start = position[:2].copy()
+            self._reach = max(self._tcp_distance(position), 1e-3)
+        height = float(position[2]) - self._rest_height
+        self._lifted |= height > _LIFTED
+        away = float(np.linalg.norm(position[:2] - self.goal))
+        held = all(pad.touching for pad in self.pad_contacts())
+        let_go = not any(pad.touching for pad in self.pad_contacts())
+        speed = float(np.abs(self.data.joint("object").qvel).max())
+        resting = self.object_on_table() and speed < 0.05
+        there = self._lifted and away < self.config.tolerance and resting
+        placed = there and (let_go or not self.config.release)
+        self._still_ticks = self._still_ticks + 1 if placed else 0
+        success = self._still_ticks >= self.config.control_hz // 2
+        return self._progress_at(position, height, away, held, there, success), success
+
+    def _progress_at(
+        self,
+        position: np.ndarray,
+        height: float,
+        away: float,
+        held: bool,
+        there: bool,
+        success: bool,
+    ) -> float:
+        if success:
+            return 1.0
+        if there:
+            return 0.95
+        if not held:
+            return 0.25 * float(np.clip(1 - self._tcp_distance(position) / self._reach, 0, 1))
+        travelled = 1 - away / float(np.linalg.norm(self._start - self.goal))
+        carried = 0.35 + 0.5 * float(np.clip(travelled, 0, 1))
+        if away < self.config.tolerance:
+            carried += 0.1 * float(np.clip(1 - height / 0.1, 0, 1))
+        return carried
+
+    def _tcp_distance(self, position: np.ndarray) -> float:
+        return float(np.linalg.norm(self.data.site("tcp").xpos - position))
+
+    def object_on_table(self, name: str = "object") -> bool:
+        """Whether the table carries the object."""
+        return self._reader.touches(
+            self.data, self.model.geom(name).id, self.model.geom("table").id
+        )
+
+
+def _spread(rng: np.random.Generator, n: int) -> list[np.ndarray]:
+    """Random positions in the workspace, m, at least `_APART` from each other."""
+    low, high = np.array(WORKSPACE).T
+    points: list[np.ndarray] = []
+    while len(points) < n:
+        point = rng.uniform(low, high)
+        if all(np.linalg.norm(point - other) > _APART for other in points):
+            points.append(point)
+    return points
+
+
+gym.register(id="touchgoal/PickPlace-v0", entry_point=PickPlace)

@@ -1,0 +1,6 @@
+"""Shared by all tests: one thread, no network, small episodes recorded once."""
+
+import os
+
+os.environ["OMP_NUM_THREADS"] = "1"
+os.environ["HF_HUB_OFFLINE"] = "1"

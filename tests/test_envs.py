@@ -1,0 +1,156 @@
+"""Contract of every environment, and the laws that grasping in the simulator must obey."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
+from touchgoal.sim_envs.experts import OUTCOMES, PickPlaceExpert
+from touchgoal.sim_envs.objects import CATALOGUE, SHAPES
+from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+
+ENVS = ["touchgoal.sim_envs.pick_place:touchgoal/PickPlace-v0"]
+BLIND = PickPlaceConfig(cameras=(), tactile=False)
+STILL = np.zeros(8)
+
+
+@pytest.fixture
+def blind():
+    env = PickPlace(BLIND)
+    yield env
+    env.close()
+
+
+def rollout(env, expert, ticks=160):
+    for _ in range(ticks):
+        observation, _, terminated, truncated, info = env.step(expert.act({}))
+        if terminated or truncated:
+            break
+    return observation, terminated, info
+
+
+def lift(env, **options):
+    """Grasp and lift, then hold still for a second."""
+    env.reset(seed=3, options=options)
+    expert = PickPlaceExpert(env)
+    for _ in range(66):
+        env.step(expert.act({}))
+    for _ in range(20):
+        env.step(STILL)
+
+
+@pytest.mark.parametrize("name", ENVS)
+def test_gymnasium_contract(name: str) -> None:
+    env = gym.make(name)
+    check_env(env.unwrapped, skip_render_check=True)
+    observation, info = env.reset(seed=0)
+    for key, value in observation.items():
+        assert value.shape == v.FEATURES[key].shape and value.dtype == v.FEATURES[key].dtype
+    truth = {key for key in v.FEATURES if key.startswith("truth.")}
+    assert truth == info.keys()
+    for key in truth:
+        assert info[key].shape == v.FEATURES[key].shape and info[key].dtype == v.FEATURES[key].dtype
+    env.close()
+
+
+@pytest.mark.parametrize("name", ENVS)
+def test_same_seed_same_episode(name: str) -> None:
+    runs = []
+    for seed in (5, 5, 6):
+        env = gym.make(name)
+        env.reset(seed=seed)
+        env.action_space.seed(0)
+        for _ in range(5):
+            observation, *_ = env.step(env.action_space.sample())
+        runs.append(observation)
+        env.close()
+    for key in runs[0]:
+        np.testing.assert_array_equal(runs[0][key], runs[1][key])
+    assert not np.array_equal(runs[0][v.TACTILE_LEFT], runs[2][v.TACTILE_LEFT])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_expert_places_every_shape(blind: PickPlace, shape: str) -> None:
+    name = next(k.name for k in CATALOGUE.values() if k.shape == shape)
+    blind.reset(seed=1, options={"object": name})
+    _, success, info = rollout(blind, PickPlaceExpert(blind))
+    assert success and info[v.TRUTH_PROGRESS] == 1
+    distance = np.linalg.norm(info[v.TRUTH_OBJECT_POSE][:2] - blind.goal)
+    assert distance < blind.config.tolerance and info[v.TRUTH_CONTACT].all()
+
+
+def test_expert_lets_go_when_asked() -> None:
+    env = PickPlace(PickPlaceConfig(cameras=(), tactile=False, release=True))
+    env.reset(seed=1)
+    _, success, info = rollout(env, PickPlaceExpert(env))
+    assert success and not info[v.TRUTH_CONTACT].any()
+
+
+@pytest.mark.parametrize("outcome", [o for o in OUTCOMES if o != "success"])
+def test_failures_to_order(outcome: str) -> None:
+    env = PickPlace(PickPlaceConfig(cameras=(), tactile=False, distractors=1))
+    env.reset(seed=2, options={"object": "glass_ball"})
+    expert = PickPlaceExpert(env, outcome)  # type: ignore[arg-type]
+    touched, lifted = [], []
+    for _ in range(160):
+        *_, success, truncated, info = env.step(expert.act({}))
+        touched.append(info[v.TRUTH_CONTACT].any())
+        lifted.append(env.object_pose()[2] > 0.08)
+        if success or truncated:
+            break
+    assert not success
+    assert any(touched) == (outcome in ("drop", "wrong_object")) or outcome == "freeze"
+    assert any(lifted) == (outcome == "drop") or outcome == "freeze"
+    if outcome == "drop":
+        assert not touched[-1]
+
+
+@pytest.mark.parametrize("name", ["glass_ball", "wooden_block", "pebble", "sausage"])
+@pytest.mark.parametrize("force", [5.0, 30.0])
+def test_grasp_force_weight_and_creep(blind: PickPlace, name: str, force: float) -> None:
+    lift(blind, object=name, grasp_force=force, mass=0.1)
+
+    def in_hand() -> np.ndarray:
+        tcp = blind.data.site("tcp")
+        return tcp.xmat.reshape(3, 3).T @ (blind.object_pose()[:3] - tcp.xpos)
+
+    before = in_hand()
+    for _ in range(20):
+        blind.step(STILL)
+    pads = blind.pad_contacts()
+    assert np.linalg.norm(in_hand() - before) < 0.02e-3  # m in one second
+    for pad in pads:
+        assert pad.normal_force == pytest.approx(force, rel=0.02)
+        assert pad.slip_speed < 1e-3
+    weight = sum(pad.force[0] for pad in pads)  # x points down the finger
+    assert weight == pytest.approx(0.1 * 9.81, rel=0.02)
+
+
+def test_weak_grasp_loses_a_heavy_object(blind: PickPlace) -> None:
+    """Coulomb: 0.2 kg at friction 0.6 needs 1.64 N on each side."""
+    lift(blind, object="glass_ball", grasp_force=1.5, mass=0.2)
+    lost = blind.object_pose()[2]
+    lift(blind, object="glass_ball", grasp_force=2.5, mass=0.2)
+    assert lost < 0.05 < blind.object_pose()[2]
+
+
+def test_external_wrench_is_the_weight(blind: PickPlace) -> None:
+    lift(blind, object="toy_brick", grasp_force=20.0, mass=0.15)
+    observation, *_ = blind.step(STILL)
+    np.testing.assert_allclose(observation[v.WRENCH][:3], [0, 0, -0.15 * 9.81], atol=0.03)
+
+
+def test_bad_requests_say_what_to_do(blind: PickPlace) -> None:
+    with pytest.raises(UserError, match="unknown object 'teapot'; choose from: glass_ball"):
+        blind.reset(options={"object": "teapot"})
+    with pytest.raises(UserError, match="unknown reset option 'colour'"):
+        blind.reset(options={"colour": "red"})
+    with pytest.raises(UserError, match="unknown camera"):
+        PickPlace(PickPlaceConfig(cameras=("top",)))
+    blind.reset(seed=0)
+    with pytest.raises(UserError, match="needs a second object"):
+        PickPlaceExpert(blind, "wrong_object")
+    with pytest.raises(ValueError, match="8 finite numbers"):
+        blind.step(np.full(8, np.nan))
