@@ -128,15 +128,9 @@ class FrankaTactileEnv(gym.Env[Observation, np.ndarray], ABC):
 
     def render(self) -> UInt8[np.ndarray, "h w 3"]:
         """A picture for people, from the side camera, 480 x 640."""
-        return self.picture("side", (480, 640))
-
-    def picture(self, camera: str, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
-        """The scene now, from any of its cameras."""
-        if self._person is None or (self._person.height, self._person.width) != size:
-            if self._person is not None:
-                self._person.close()
-            self._person = mujoco.Renderer(self.model, *size)
-        self._person.update_scene(self.data, camera)
+        if self._person is None:
+            self._person = mujoco.Renderer(self.model, 480, 640)
+        self._person.update_scene(self.data, "side")
         return self._person.render()
 
     def close(self) -> None:
@@ -147,6 +141,12 @@ class FrankaTactileEnv(gym.Env[Observation, np.ndarray], ABC):
         self._renderer, self._person, self._pads = None, None, []
 
     # What experts and drivers use.
+
+    def scene(self, config: SceneConfig) -> mujoco.MjSpec:
+        """The present episode's scene, built with these options."""
+        spec = build(self.bodies, config)
+        self._extend(spec)
+        return spec
 
     def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, "7"]:
         """Joint positions with the open hand over the table, a little different each time."""
@@ -165,9 +165,7 @@ class FrankaTactileEnv(gym.Env[Observation, np.ndarray], ABC):
 
     def _compile(self, rng: np.random.Generator) -> None:
         self.close()
-        spec = build(self.bodies, self.config.scene)
-        self._extend(spec)
-        self.model = model = spec.compile()
+        self.model = model = self.scene(self.config.scene).compile()
         self.data = mujoco.MjData(model)
         self._arm = [model.joint(f"fr3_joint{i}").qposadr[0] for i in range(1, 8)]
         self._arm_dof = [model.joint(f"fr3_joint{i}").dofadr[0] for i in range(1, 8)]

@@ -1,0 +1,151 @@
+"""From acting in an environment to episodes on disk, on all cores."""
+
+import multiprocessing
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from tqdm import tqdm
+
+from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
+from touchgoal.episodes.encoding import EncodedEpisode, encode
+from touchgoal.episodes.schema import Episode, MetaValue
+from touchgoal.episodes.store import EpisodeWriter
+from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
+from touchgoal.sim_envs.experts import Outcome, PickPlaceExpert
+from touchgoal.sim_envs.filming import Film
+from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+
+
+class Actor(Protocol):
+    """Anything that acts: an expert, a policy, a person."""
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """The action (8,) for the next tick."""
+        ...
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One episode to record: the same demonstration always gives the same episode."""
+
+    seed: int
+    outcome: Outcome = "success"
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+def run(
+    env: FrankaTactileEnv, actor: Actor, observation: Observation, info: dict[str, Any]
+) -> Iterator[dict[str, np.ndarray]]:
+    """Act until the episode ends; yields what was seen, done and true at each tick.
+
+    Args:
+        env: after its reset.
+        actor: chooses the actions.
+        observation, info: what the reset returned.
+    """
+    done = False
+    while not done:
+        action = np.asarray(actor.act(observation), np.float32)
+        yield {**observation, v.ACTION: action, **info}
+        observation, _, terminated, truncated, info = env.step(action)
+        done = terminated or truncated
+    still = np.append(np.zeros(v.N_JOINTS), action[-1]).astype(np.float32)
+    yield {**observation, v.ACTION: still, **info}
+
+
+def demonstrate(env: PickPlace, demonstration: Demonstration) -> Episode:
+    """Record the expert, succeeding or failing as the demonstration asks."""
+    observation, info = env.reset(seed=demonstration.seed, options=demonstration.options)
+    expert = PickPlaceExpert(env, demonstration.outcome)
+    return to_episode(env, list(run(env, expert, observation, info)), demonstration)
+
+
+def demonstrate_on_film(
+    env: PickPlace, demonstration: Demonstration
+) -> tuple[Episode, UInt8[np.ndarray, "n h w 3"]]:
+    """Record the expert and film it, tick by tick."""
+    observation, info = env.reset(seed=demonstration.seed, options=demonstration.options)
+    expert, film = PickPlaceExpert(env, demonstration.outcome), Film(env)
+    ticks = []
+    for tick in tqdm(run(env, expert, observation, info), desc="filming", unit="frame"):
+        ticks.append(tick)
+        film.shoot()
+    film.close()
+    return to_episode(env, ticks, demonstration), np.stack(film.frames)
+
+
+def to_episode(
+    env: PickPlace, ticks: list[dict[str, np.ndarray]], demonstration: Demonstration
+) -> Episode:
+    """The episode of the ticks that were run in an environment."""
+    body = env.bodies[0]
+    success = bool(ticks[-1][v.TRUTH_SUCCESS][0])
+    asked_to_fail = demonstration.outcome != "success"
+    name = body.kind.name.replace("_", " ")
+    return Episode(
+        frames={key: np.stack([tick[key] for tick in ticks]) for key in ticks[0]},
+        task=f"pick up the {name} and place it on the disc",
+        meta={
+            "object": body.kind.name,
+            "shape": body.kind.shape,
+            "descriptions": list(body.kind.descriptions),
+            "seed": demonstration.seed,
+            "outcome": demonstration.outcome if success or asked_to_fail else "failure",
+            "success": success,
+            "grasp_force": env.grasp_force,
+            "mass": body.mass,
+            "sensor": env.config.scene.sensor.name,
+        },
+    )
+
+
+def collect(
+    root: Path, config: PickPlaceConfig, demonstrations: Sequence[Demonstration], workers: int
+) -> list[dict[str, MetaValue]]:
+    """Append demonstrations to the episode set in `root`, in their order.
+
+    Workers simulate and encode; this process alone writes, so that an interruption loses at most
+    the episodes in progress.
+
+    Returns:
+        The `meta` of each episode, outcome and success included.
+    """
+    if not demonstrations:
+        raise UserError("nothing to collect: ask for at least one episode")
+    writer = EpisodeWriter(root, fps=config.control_hz)
+    metas = []
+    with one_core_workers(workers) as pool:
+        encoded = pool.map(_record, [config] * len(demonstrations), demonstrations)
+        for episode in tqdm(encoded, total=len(demonstrations), desc="record", unit="episode"):
+            writer.append(episode)
+            metas.append(episode.description.meta)
+    return metas
+
+
+def one_core_workers(workers: int) -> ProcessPoolExecutor:
+    """Workers that use one core each; spawned, because OpenGL contexts do not survive a fork."""
+    return ProcessPoolExecutor(
+        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_use_one_core
+    )
+
+
+def _use_one_core() -> None:
+    """Keep OpenCV and software OpenGL from starting threads on the other workers' cores."""
+    cv2.setNumThreads(1)
+    os.environ["LP_NUM_THREADS"] = "1"
+
+
+def _record(config: PickPlaceConfig, demonstration: Demonstration) -> EncodedEpisode:
+    env = PickPlace(config)
+    try:
+        return encode(demonstrate(env, demonstration), config.control_hz)
+    finally:
+        env.close()
