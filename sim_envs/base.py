@@ -14,6 +14,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.kinematics import FR3_HOME, Fr3Kinematics, fingers_down
 from touchgoal.sim_envs.contact import ContactReader, PadContact
 from touchgoal.sim_envs.objects import Body
+from touchgoal.sim_envs.rendering import open_renderer
 from touchgoal.sim_envs.scene import GRIPPER_MAX_FORCE, SIDES, SceneConfig, build
 from touchgoal.sim_envs.tactile import TactileFrame, TactilePad
 from touchgoal.sim_envs.tactile_optics import sample_unit
@@ -129,7 +130,7 @@ class FrankaTactileEnv(gym.Env[Observation, np.ndarray], ABC):
     def render(self) -> UInt8[np.ndarray, "h w 3"]:
         """A picture for people, from the side camera, 480 x 640."""
         if self._person is None:
-            self._person = mujoco.Renderer(self.model, 480, 640)
+            self._person = open_renderer(self.model, 480, 640)
         self._person.update_scene(self.data, "side")
         return self._person.render()
 
@@ -181,7 +182,7 @@ class FrankaTactileEnv(gym.Env[Observation, np.ndarray], ABC):
                 for side in SIDES
             ]
         if self.config.cameras:
-            self._renderer = mujoco.Renderer(model, *self.config.camera_size)
+            self._renderer = open_renderer(model, *self.config.camera_size)
 
     def _advance(self, delta: np.ndarray, width: float, seconds: float) -> None:
         """Physics for one tick, with set-points interpolated."""

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from touchgoal.sim_envs.base import FrankaTactileEnv
+from touchgoal.sim_envs.rendering import open_renderer
 
 Picture = UInt8[np.ndarray, "h w 3"]
 _HEIGHT = 480
@@ -25,7 +26,7 @@ class Film:
         spec = env.scene(replace(env.config.scene, meshes="full"))
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
-        self._renderer = mujoco.Renderer(self._model, _HEIGHT, _HEIGHT)
+        self._renderer = open_renderer(self._model, _HEIGHT, _HEIGHT)
         self.frames: list[Picture] = []
 
     def shoot(self) -> Picture:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float32, UInt8
 from touchgoal.control.sensors import SensorModel
 from touchgoal.sim_envs.contact import PadContact
 from touchgoal.sim_envs.objects import Body
+from touchgoal.sim_envs.rendering import open_renderer
 from touchgoal.sim_envs.scene import OBJECT_GROUP, PAD_CAMERA_DISTANCE
 from touchgoal.sim_envs.tactile_geometry import (
     BOX,
@@ -166,7 +167,7 @@ def _depth_renderer(model: mujoco.MjModel, grid: Grid) -> mujoco.Renderer:
     quality = model.vis.quality
     kept = quality.offsamples, quality.shadowsize
     quality.offsamples, quality.shadowsize = 0, 0  # multisampling would blend depths at edges
-    renderer = mujoco.Renderer(model, grid.rows, grid.columns)
+    renderer = open_renderer(model, grid.rows, grid.columns)
     quality.offsamples, quality.shadowsize = kept
     renderer.enable_depth_rendering()
     return renderer

@@ -1,0 +1,324 @@
+"""The tables under meta/ of a LeRobotDataset v3, and durable writing.
+
+What goes beyond LeRobot are columns of meta/episodes that it ignores: `touchgoal/NAME` for the
+episode's fact NAME (plain scalar or list of strings) and `videos/KEY/crc32` for the checksum of
+its video.
+"""
+
+import io
+import json
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from touchgoal.control.errors import UserError
+from touchgoal.episodes.encoding import Description, index_columns
+from touchgoal.episodes.statistics import Stats, array_statistics, merge
+
+VERSION = "v3.0"
+CHUNK = 1000
+META_PREFIX = "touchgoal/"
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+INFO = "meta/info.json"
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+TASKS = "meta/tasks.parquet"
+STATS = "meta/stats.json"
+REPAIR = "run touchgoal's repair (touchgoal.episodes.store.repair)"
+
+Row = dict[str, Any]
+
+
+def data_path(slot: int) -> str:
+    """Path in the set of the data file number `slot`; each holds one episode."""
+    return DATA_PATH.format(chunk_index=slot // CHUNK, file_index=slot % CHUNK)
+
+
+def video_path(key: str, slot: int) -> str:
+    """Path in the set of the video of camera `key` number `slot`."""
+    return VIDEO_PATH.format(video_key=key, chunk_index=slot // CHUNK, file_index=slot % CHUNK)
+
+
+def slot_of(row: Row) -> int:
+    """Number of an episode's files; repair leaves gaps, so it may exceed its position."""
+    return row["data/chunk_index"] * CHUNK + row["data/file_index"]
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Writes a file that is afterwards there in full, power cut or not, or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(path.name + ".tmp")
+    with unfinished.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(unfinished, path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    os.fsync(folder)
+    os.close(folder)
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """What meta/ says of a set of episodes.
+
+    Attributes:
+        fps: frames per second.
+        features: as in info.json.
+        tasks: all instructions; the position is the task_index.
+        stats: statistics over all frames by key.
+        episodes: the table meta/episodes, one row an episode; None before the first.
+    """
+
+    fps: int
+    features: dict[str, dict[str, Any]]
+    tasks: tuple[str, ...] = ()
+    stats: dict[str, Stats] | None = None
+    episodes: pa.Table | None = None
+
+    @property
+    def next_slot(self) -> int:
+        """Number of the files of the episode to come."""
+        return slot_of(last_row(self.episodes)) + 1 if self.episodes is not None else 0
+
+    def added(self, description: Description, slot: int) -> "Catalogue":
+        """This catalogue with one more episode, whose files have number `slot`.
+
+        Raises:
+            UserError: its frame rate, features or facts differ from the set's.
+        """
+        self._check_same(description)
+        tasks = tuple(dict.fromkeys((*self.tasks, description.task)))
+        stats = description.stats | {
+            key: array_statistics(column[:, None])
+            for key, column in self.indices(description).items()
+        }
+        row = self._row(description, slot, stats)
+        schema = _schema(row) if self.episodes is None else self.episodes.schema
+        if facts := _differing(row, schema):
+            raise UserError(
+                f"the episode's meta differs from the set's in {', '.join(facts)}: give every "
+                "episode of a set the same keys with the same types"
+            )
+        table = pa.Table.from_pylist([row], schema=schema)
+        if self.episodes is not None:
+            table = pa.concat_tables([self.episodes, table]).combine_chunks()
+        if self.stats is not None:
+            stats = {key: merge(self.stats[key], stats[key]) for key in stats}
+        return replace(self, tasks=tasks, stats=stats, episodes=table)
+
+    def indices(self, description: Description) -> dict[str, Any]:
+        """The index columns of an episode that would come next."""
+        before = last_row(self.episodes)
+        tasks = list(dict.fromkeys((*self.tasks, description.task)))
+        return index_columns(
+            description.length,
+            self.fps,
+            episode_index=before["episode_index"] + 1 if before else 0,
+            first_index=before["dataset_to_index"] if before else 0,
+            task_index=tasks.index(description.task),
+        )
+
+    def _check_same(self, description: Description) -> None:
+        if description.fps != self.fps:
+            raise UserError(
+                f"this set runs at {self.fps} frames per second, the episode at {description.fps}: "
+                "record it into another folder"
+            )
+        ours, theirs = self.features, description.features
+        differing = sorted(
+            key for key in {*ours, *theirs} if _plain(ours.get(key)) != _plain(theirs.get(key))
+        )
+        if differing:
+            raise UserError(
+                f"this set has other features than the episode ({', '.join(differing)} differ in "
+                "presence or shape): record it into another folder"
+            )
+
+    def _row(self, description: Description, slot: int, stats: dict[str, Stats]) -> Row:
+        before = last_row(self.episodes)
+        first = before["dataset_to_index"] if before else 0
+        place = {"chunk_index": slot // CHUNK, "file_index": slot % CHUNK}
+        row: Row = {
+            "episode_index": before["episode_index"] + 1 if before else 0,
+            "tasks": [description.task],
+            "length": description.length,
+            "dataset_from_index": first,
+            "dataset_to_index": first + description.length,
+            "meta/episodes/chunk_index": 0,
+            "meta/episodes/file_index": 0,
+        }
+        row |= {f"data/{name}": value for name, value in place.items()}
+        for key, crc32 in description.video_crc32.items():
+            times = {"from_timestamp": 0.0, "to_timestamp": description.length / self.fps}
+            values = {**place, **times, "crc32": crc32}
+            row |= {f"videos/{key}/{name}": value for name, value in values.items()}
+        row |= {META_PREFIX + name: value for name, value in description.meta.items()}
+        for key, values in stats.items():
+            row |= {f"stats/{key}/{name}": value for name, value in values.items()}
+        return row
+
+    def write(self, root: Path) -> None:
+        """Writes all of meta/, each file at once and info.json, which commits, last."""
+        write_file(root / EPISODES, _parquet(self.episodes))
+        write_file(root / STATS, _json(self.stats))
+        write_file(root / TASKS, _parquet(_tasks_table(self.tasks)))
+        write_file(root / INFO, _json(self._info()))
+
+    def _info(self) -> dict[str, Any]:
+        last = last_row(self.episodes)
+        videos = any(feature["dtype"] == "video" for feature in self.features.values())
+        return {
+            "codebase_version": VERSION,
+            "robot_type": None,
+            "fps": self.fps,
+            "features": self.features,
+            "total_episodes": last["episode_index"] + 1,
+            "total_frames": last["dataset_to_index"],
+            "total_tasks": len(self.tasks),
+            "chunks_size": CHUNK,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
+            "data_path": DATA_PATH,
+            "video_path": VIDEO_PATH if videos else None,
+            "splits": {"train": f"0:{last['episode_index'] + 1}"},
+        }
+
+    @classmethod
+    def load(cls, root: Path) -> "Catalogue":
+        """Reads all of meta/ of a set.
+
+        Raises:
+            UserError: no set, an unknown version, or a file that cannot be read.
+        """
+        info = load_info(root)
+        return cls(
+            fps=info["fps"],
+            features=info["features"],
+            tasks=tuple(load_table(root, TASKS)["task"].to_pylist()),
+            stats=load_json(root, STATS),
+            episodes=load_table(root, EPISODES),
+        )
+
+
+def load_info(root: Path) -> dict[str, Any]:
+    """Reads meta/info.json.
+
+    Raises:
+        UserError: no set, or one of another version.
+    """
+    if not (root / INFO).exists():
+        raise UserError(
+            f"{root} is not a set of episodes (it has no {INFO}): give the folder that a recording "
+            f"command wrote; if a first recording was interrupted there, {REPAIR}"
+        )
+    info = load_json(root, INFO)
+    check_version(root, info)
+    return info
+
+
+def check_version(root: Path, info: dict[str, Any]) -> None:
+    """Raises UserError if info.json says another version than `VERSION`."""
+    if (version := info.get("codebase_version")) != VERSION:
+        raise UserError(
+            f"{root} is of LeRobot version {version!r}, touchgoal reads {VERSION}: convert it with "
+            "lerobot"
+        )
+
+
+def load_json(root: Path, name: str) -> dict[str, Any]:
+    """Reads a JSON file of a set; UserError names it if it is missing or broken."""
+    try:
+        return json.loads((root / name).read_bytes())
+    except (OSError, ValueError) as error:
+        raise unreadable(root / name, error) from error
+
+
+def load_table(root: Path, name: str, leave_out: str | None = None) -> pa.Table:
+    """Reads a Parquet file of a set, without the columns that begin with `leave_out`.
+
+    Raises:
+        UserError: the file is missing or broken.
+    """
+    try:
+        with pq.ParquetFile(root / name) as file:
+            names = file.schema_arrow.names
+            kept = [n for n in names if leave_out is None or not n.startswith(leave_out)]
+            return file.read(kept).combine_chunks()
+    except (OSError, pa.ArrowException) as error:
+        raise unreadable(root / name, error) from error
+
+
+def unreadable(path: Path, error: Exception) -> UserError:
+    """The error, in one line, that a file of a set is missing or broken."""
+    if isinstance(error, FileNotFoundError):
+        return UserError(f"{path} is missing: {REPAIR}")
+    return UserError(f"{path} is corrupt ({str(error).splitlines()[0]}): {REPAIR}")
+
+
+def last_row(table: pa.Table | None) -> Row:
+    """The last row of meta/episodes without statistics, or {} of no table."""
+    if table is None:
+        return {}
+    names = [name for name in table.column_names if not name.startswith("stats/")]
+    return table.select(names).slice(table.num_rows - 1).to_pylist()[0]
+
+
+def _plain(feature: dict[str, Any] | None) -> Any:
+    return feature and (feature["dtype"], feature["shape"])
+
+
+def _differing(row: Row, schema: pa.Schema) -> list[str]:
+    """Facts that only one of the two has, or that have another type."""
+    ours = _schema(row)
+    names = {*ours.names, *schema.names}
+    same = {
+        n for n in {*ours.names} & {*schema.names} if ours.field(n).type == schema.field(n).type
+    }
+    return sorted(name.removeprefix(META_PREFIX) for name in names - same)
+
+
+def _schema(row: Row) -> pa.Schema:
+    return pa.schema([(name, _arrow_type(value)) for name, value in row.items()])
+
+
+def _arrow_type(value: Any) -> pa.DataType:
+    if isinstance(value, list):
+        return pa.list_(_arrow_type(value[0]) if value else pa.string())
+    types = {str: pa.string(), bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
+    return next(types[kind] for kind in types if isinstance(value, kind))
+
+
+def _tasks_table(tasks: tuple[str, ...]) -> pa.Table:
+    """LeRobot reads tasks with pandas and wants `task` as the index, which pandas finds here."""
+    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": list(tasks)})
+    column = {"metadata": None}
+    pandas = {
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": [
+            column
+            | {"name": "task_index", "field_name": "task_index"}
+            | {"pandas_type": "int64", "numpy_type": "int64"},
+            column
+            | {"name": "task", "field_name": "task"}
+            | {"pandas_type": "unicode", "numpy_type": "object"},
+        ],
+        "creator": {"library": "pyarrow", "version": pa.__version__},
+        "pandas_version": "2.0.0",
+    }
+    return table.replace_schema_metadata({b"pandas": json.dumps(pandas).encode()})
+
+
+def _parquet(table: pa.Table | None) -> bytes:
+    file = io.BytesIO()
+    pq.write_table(table, file, write_page_checksum=True)
+    return file.getvalue()
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(value, indent=1, allow_nan=False).encode()

@@ -1,0 +1,138 @@
+"""What an episode is: synchronised frames in the project's vocabulary, a task, facts about it."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.vocabulary import FEATURES, IMAGE_PREFIX
+
+MetaValue = str | int | float | bool | list[str]
+
+# Columns that LeRobot adds to every frame; each is a scalar column of feature shape [1].
+INDEX_DTYPES = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+
+
+def is_image(key: str) -> bool:
+    """Whether a key holds pictures, of a camera or of a fingertip sensor."""
+    return key.startswith(IMAGE_PREFIX)
+
+
+def is_camera(key: str) -> bool:
+    """Whether a key holds context pictures, stored as lossy video; touch is stored losslessly."""
+    return is_image(key) and "tactile" not in key
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One recorded attempt at a task.
+
+    Attributes:
+        frames: key of `FEATURES` -> array (T, *shape) in the key's dtype, rows in step at the
+            set's frame rate. Pictures are uint8 RGB (T, h, w, 3); h and w may differ from
+            `FEATURES` but not within a set of episodes.
+        task: the instruction, in words.
+        meta: facts about the whole episode, such as the object, the seed and the outcome. All
+            episodes of a set have the same keys with the same types.
+    """
+
+    frames: dict[str, np.ndarray]
+    task: str
+    meta: dict[str, MetaValue] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Number of frames, T."""
+        return next((len(values) for values in self.frames.values()), 0)
+
+    def check(self) -> None:
+        """Raises UserError, naming the key, if anything here could not be stored faithfully."""
+        if not self.task.strip():
+            raise UserError("an episode needs a task in words: its task is empty")
+        if len(self) == 0:
+            raise UserError("an episode needs at least one key and one frame: this one is empty")
+        for key, values in self.frames.items():
+            _check_key(key, values)
+            if len(values) != len(self):
+                first = next(iter(self.frames))
+                raise UserError(
+                    f"{key} has {len(values)} frames but {first} has {len(self)}: record every "
+                    "key at every tick"
+                )
+        for key, value in self.meta.items():
+            _check_meta(key, value)
+
+
+def _check_key(key: str, values: np.ndarray) -> None:
+    if key not in FEATURES:
+        raise UserError(f"{key!r} is no key of touchgoal; known keys: {', '.join(FEATURES)}")
+    feature = FEATURES[key]
+    if values.dtype != feature.dtype:
+        raise UserError(f"{key} has dtype {values.dtype}: convert it to {feature.dtype}")
+    if is_image(key):
+        _check_image_shape(key, values.shape)
+    elif values.shape[1:] != feature.shape:
+        raise UserError(f"{key} has shape {values.shape[1:]} a frame, not {feature.shape}")
+    elif not np.isfinite(values).all():
+        frame = int(np.argwhere(~np.isfinite(values))[0][0])
+        raise UserError(f"{key} is not finite at frame {frame}: leave out what was not measured")
+
+
+def _check_image_shape(key: str, shape: tuple[int, ...]) -> None:
+    if len(shape) != 4 or shape[3] != 3 or 0 in shape:
+        raise UserError(f"{key} has shape {shape}: pictures are (T, h, w, 3), RGB")
+    # H.264 with subsampled colour (yuv420p) shares one colour sample between 2 x 2 pixels.
+    if is_camera(key) and (shape[1] % 2 or shape[2] % 2):
+        raise UserError(f"{key} is {shape[1]} x {shape[2]}: a camera needs even height and width")
+
+
+def _check_meta(key: str, value: Any) -> None:
+    if isinstance(value, list):
+        sound = all(isinstance(item, str) for item in value)
+    else:
+        sound = isinstance(value, str | int | float | bool)
+    if not sound or not key:
+        raise UserError(
+            f"meta {key!r} is a {type(value).__name__}: use str, int, float, bool or a list of str"
+        )
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        raise UserError(f"meta {key!r} is {value}, which does not fit in 64 bits: use a str")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise UserError(f"meta {key!r} is {value}: leave out what is not known")
+
+
+def describe_features(episode: Episode, fps: int) -> dict[str, dict[str, Any]]:
+    """The `features` of LeRobot's meta/info.json for an episode, index columns included."""
+    described = {}
+    for key, feature in FEATURES.items():
+        if key not in episode.frames:
+            continue
+        shape = list(episode.frames[key].shape[1:])
+        described[key] = {"dtype": feature.dtype, "shape": shape, "names": list(feature.names)}
+        if is_camera(key):
+            described[key] |= {"dtype": "video", "info": _video_info(shape, fps)}
+        elif is_image(key):
+            described[key]["dtype"] = "image"
+    for key, dtype in INDEX_DTYPES.items():
+        described[key] = {"dtype": dtype, "shape": [1], "names": None}
+    return described
+
+
+def _video_info(shape: list[int], fps: int) -> dict[str, Any]:
+    return {
+        "video.height": shape[0],
+        "video.width": shape[1],
+        "video.codec": "h264",
+        "video.pix_fmt": "yuv420p",
+        "video.fps": fps,
+        "video.channels": 3,
+        "is_depth_map": False,
+        "has_audio": False,
+    }

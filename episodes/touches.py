@@ -1,0 +1,164 @@
+"""Touches: single tactile frames with the object they feel, cut from episodes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Int, UInt8
+from tqdm import tqdm
+
+from touchgoal.control.contact import detect_contact
+from touchgoal.control.errors import UserError
+from touchgoal.control.vocabulary import TACTILE, TRUTH_CONTACT, WRIST
+from touchgoal.episodes.store import EpisodeSet
+
+_BACKGROUND_FRAMES = 5
+_VIEW_LEAD = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Touches:
+    """n tactile frames of e episodes, with b backgrounds: one per episode and side.
+
+    Attributes:
+        frames: raw sensor RGB, one side each.
+        background: the same sensors untouched, per episode and side.
+        background_of: row of `background` that belongs to each frame.
+        view: the wrist camera's unoccluded picture of the object, one per episode.
+        view_of: row of `view` that belongs to each frame.
+        object: catalogue id of what each frame feels; "" for no contact.
+        descriptions: catalogue id -> sentences on how the object feels.
+        side: index into `vocabulary.TACTILE` of each frame: 0 left, 1 right.
+        episode_of: index in the set of each frame's episode.
+    """
+
+    frames: UInt8[np.ndarray, "n h w 3"]
+    background: UInt8[np.ndarray, "b h w 3"]
+    background_of: Int[np.ndarray, " n"]
+    view: UInt8[np.ndarray, "e H W 3"]
+    view_of: Int[np.ndarray, " n"]
+    object: tuple[str, ...]
+    descriptions: dict[str, list[str]]
+    side: Int[np.ndarray, " n"]
+    episode_of: Int[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        """Number of touches, n."""
+        return len(self.frames)
+
+
+def collect(
+    episodes: EpisodeSet,
+    contact_frames_per_episode: int,
+    idle_frames_per_episode: int,
+    seed: int,
+) -> Touches:
+    """Draws frames in contact, and idle ones, evenly from both fingertips of every episode.
+
+    Contact is the simulator's if the set has it, else `detect_contact`'s. The background is the
+    median of a side's first 5 frames. The view is the wrist picture 5 frames before the last one
+    without contact on either side (the first, if that is earlier or nothing is touched), when the
+    hand does not yet hide the object. An episode with fewer frames of a kind gives what it has.
+
+    Args:
+        episodes: a set whose meta has `object` and `descriptions`.
+        contact_frames_per_episode: frames in contact to draw, both sides together.
+        idle_frames_per_episode: frames without contact on their side to draw.
+        seed: of the draw; an episode's draw does not depend on the other episodes.
+
+    Raises:
+        UserError: the set lacks the pictures or the meta, or no episode touches anything.
+    """
+    sides = _check(episodes)
+    most = len(episodes) * (contact_frames_per_episode + idle_frames_per_episode)
+    frames = np.empty((most, *episodes.features[TACTILE[sides[0]]]["shape"]), np.uint8)
+    drawn, backgrounds, views, filled = [], [], [], 0
+    for i in tqdm(range(len(episodes)), desc="touches", unit="episode"):
+        background = [_background(episodes, i, side) for side in sides]
+        contact = _contact(episodes, i, sides, background)
+        rng = np.random.default_rng([seed, i])
+        picks = np.concatenate(
+            [
+                _draw(contact, contact_frames_per_episode, rng),
+                _draw(~contact, idle_frames_per_episode, rng),
+            ]
+        )
+        for column, side in enumerate(sides):
+            rows = np.flatnonzero(picks[:, 1] == column)
+            key = TACTILE[side]
+            frames[filled + rows] = episodes.read(i, [key], picks[rows, 0].tolist()).frames[key]
+        filled += len(picks)
+        felt = contact[picks[:, 0], picks[:, 1]]
+        drawn.append(np.column_stack([np.full(len(picks), i), picks[:, 1], felt]))
+        backgrounds += background
+        views.append(_view(episodes, i, contact))
+    episode_of, column, felt = np.concatenate(drawn).T
+    if not felt.any():
+        raise UserError(f"nothing is touched in {episodes.root}: give episodes with contact")
+    names = [str(episodes.meta(i)["object"]) for i in range(len(episodes))]
+    return Touches(
+        frames=frames[:filled],
+        background=np.stack(backgrounds),
+        background_of=episode_of * len(sides) + column,
+        view=np.stack(views),
+        view_of=episode_of,
+        object=tuple(names[i] if f else "" for i, f in zip(episode_of, felt, strict=True)),
+        descriptions=_descriptions(episodes),
+        side=np.asarray(sides)[column],
+        episode_of=episode_of,
+    )
+
+
+def _check(episodes: EpisodeSet) -> list[int]:
+    """Raises UserError for a set without touch or without names; returns the sides it has."""
+    sides = [side for side, key in enumerate(TACTILE) if key in episodes.features]
+    if not sides or WRIST not in episodes.features:
+        raise UserError(f"{episodes.root} has no touch or no wrist pictures: record {WRIST} too")
+    if missing := {"object", "descriptions"} - set(episodes.meta(0)):
+        raise UserError(f"{episodes.root} lacks meta {', '.join(sorted(missing))}: record them")
+    return sides
+
+
+def _background(episodes: EpisodeSet, i: int, side: int) -> UInt8[np.ndarray, "h w 3"]:
+    key = TACTILE[side]
+    first = range(min(_BACKGROUND_FRAMES, episodes.lengths[i]))
+    return np.median(episodes.read(i, [key], first).frames[key], axis=0).astype(np.uint8)
+
+
+def _contact(
+    episodes: EpisodeSet, i: int, sides: list[int], background: list[np.ndarray]
+) -> Bool[np.ndarray, "t s"]:
+    if TRUTH_CONTACT in episodes.features:
+        return episodes.read(i, [TRUTH_CONTACT]).frames[TRUTH_CONTACT][:, sides]
+    columns = []
+    for side, untouched in zip(sides, background, strict=True):
+        frames = episodes.read(i, [TACTILE[side]]).frames[TACTILE[side]]
+        columns.append(detect_contact(frames, untouched))
+    return np.stack(columns, axis=1)
+
+
+def _draw(
+    mask: Bool[np.ndarray, "t s"], count: int, rng: np.random.Generator
+) -> Int[np.ndarray, "k 2"]:
+    """At most `count` places (frame, column) where the mask is true, in order of time."""
+    places = np.argwhere(mask)
+    return places[np.sort(rng.permutation(len(places))[:count])]
+
+
+def _view(
+    episodes: EpisodeSet, i: int, contact: Bool[np.ndarray, "t s"]
+) -> UInt8[np.ndarray, "H W 3"]:
+    touched = np.flatnonzero(contact.any(axis=1))
+    frame = max(int(touched[0]) - 1 - _VIEW_LEAD, 0) if len(touched) else 0
+    return episodes.read(i, [WRIST], [frame]).frames[WRIST][0]
+
+
+def _descriptions(episodes: EpisodeSet) -> dict[str, list[str]]:
+    """All sentences said of each object, each once, in the order in which they appear."""
+    said: dict[str, dict[str, None]] = {}
+    for i in range(len(episodes)):
+        meta = episodes.meta(i)
+        sentences = meta["descriptions"]
+        if not isinstance(sentences, list):
+            raise UserError(f"{episodes.root}: meta descriptions must be a list of str")
+        said.setdefault(str(meta["object"]), {}).update(dict.fromkeys(sentences))
+    return {name: list(sentences) for name, sentences in said.items()}

@@ -1,0 +1,37 @@
+"""Print one table of measured figures and keep its numbers."""
+
+import platform
+from typing import Annotated, Any
+
+import tyro
+
+from touchgoal.benchmarks import env_speed, reward_quality
+from touchgoal.launch.run_folder import open_run, write_json
+
+Config = (
+    Annotated[env_speed.Config, tyro.conf.subcommand("env-speed")]
+    | Annotated[reward_quality.Config, tyro.conf.subcommand("reward-quality")]
+)
+
+
+def main(config: env_speed.Config | reward_quality.Config) -> None:
+    """Run the chosen benchmark."""
+    benchmark: Any = env_speed if isinstance(config, env_speed.Config) else reward_quality
+    name = benchmark.__name__.rsplit(".", 1)[-1].replace("_", "-")
+    out = open_run(config.out, f"benchmark-{name}", config)
+    result = benchmark.run(config)
+    print(result.pop("table"))
+    print(f"hardware: {hardware()}")
+    write_json(out / "metrics.json", {**result, "hardware": hardware()})
+    print(f"numbers: {out / 'metrics.json'}")
+
+
+def hardware() -> str:
+    """Processor of this machine."""
+    model = platform.processor() or platform.machine()
+    try:
+        with open("/proc/cpuinfo") as file:
+            names = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
+    except FileNotFoundError:
+        return model
+    return f"{len(names)} cores, {names[0]}" if names else model

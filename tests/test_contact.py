@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+
+from touchgoal.control.contact import contact_strength, detect_contact
+
+HEIGHT, WIDTH = 240, 320
+Y, X = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+GEL = np.stack([90 + 40 * X / WIDTH, 100 + 30 * Y / HEIGHT, 110 - 30 * X / WIDTH], axis=-1)
+
+
+def sensed(light: np.ndarray, bump: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Frames of the gel under drifting light, with a shading bump of the given heights."""
+    rng = np.random.default_rng(seed)
+    noise = rng.standard_normal((HEIGHT, WIDTH, 3), dtype=np.float32)
+    shape = np.exp(-((X - 200) ** 2 + (Y - 90) ** 2) / (2 * 7.5**2))[..., None]
+    frames = np.empty((len(light), HEIGHT, WIDTH, 3), np.uint8)
+    for i, (gain, height) in enumerate(zip(light, bump, strict=True)):
+        # shifting one field of noise by a random offset is much faster than drawing anew
+        shifted = np.roll(noise, rng.integers(0, (HEIGHT, WIDTH)), axis=(0, 1))
+        frames[i] = GEL * gain + height * shape * np.array([1, -0.5, 0.3]) + shifted + 0.5
+    return frames
+
+
+def background_of(frames: np.ndarray) -> np.ndarray:
+    return np.median(frames[:5], axis=0).astype(np.uint8)
+
+
+def test_drifting_light_is_no_contact() -> None:
+    n = 500
+    drift = 1 + 0.15 * np.sin(np.arange(n) / 80)
+    frames = sensed(drift, np.zeros(n))
+    assert np.abs(frames[125].mean() - frames[0].mean()) > 10, "the light must really drift"
+    assert not detect_contact(frames, background_of(frames)).any()
+
+
+def test_weak_shading_is_found_in_drifting_light() -> None:
+    height = np.zeros(60)
+    height[20:40] = 8
+    frames = sensed(1 + 0.002 * np.arange(60), height)
+    np.testing.assert_array_equal(detect_contact(frames, background_of(frames)), height > 0)
+
+
+def test_contact_ends_only_below_half_the_threshold() -> None:
+    height = np.array([0, 0, 0, 0, 0, 2.2, 8, 2.2, 2.2, 0, 2.2], float)
+    frames = sensed(np.ones(len(height)), height)
+    background = background_of(frames)
+    weak = contact_strength(frames, background)[[5, 7, 8, 10]]
+    assert (weak > 1).all() and (weak < 2).all()
+    expected = [False] * 6 + [True] * 3 + [False] * 2
+    assert detect_contact(frames, background).tolist() == expected
+
+
+@pytest.mark.parametrize("size", [(2, 3), (30, 41)])
+def test_any_picture_size(size: tuple[int, int]) -> None:
+    frames = np.full((2, *size, 3), 80, np.uint8)
+    assert not detect_contact(frames, frames[0]).any()

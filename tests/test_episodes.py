@@ -1,0 +1,379 @@
+import io
+import json
+import os
+import pickle
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
+from touchgoal.episodes import metadata, statistics
+from touchgoal.episodes.encoding import encode
+from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter, repair, validate
+
+FPS = 20
+PNG_START = b"\x89PNG"
+NUMERIC = (v.STATE, v.ACTION, v.TRUTH_CONTACT, v.TRUTH_PROGRESS, v.TRUTH_SUCCESS)
+
+
+def moving_blob(n: int, height: int, width: int, seed: int) -> np.ndarray:
+    y, x = np.mgrid[:height, :width]
+    centre = width * (0.2 + 0.6 * np.arange(n)[:, None, None] / n)
+    blob = np.exp(-((x - centre) ** 2 + (y - height / 2) ** 2) / (0.02 * width * height))
+    red, green, blue = np.random.default_rng(seed).uniform(20, 120, 3)
+    picture = np.stack([red + 100 * blob, green + 60 * blob, blue + 0 * blob], axis=-1)
+    return picture.astype(np.uint8)
+
+
+def make_episode(seed: int, n: int = 7) -> Episode:
+    rng = np.random.default_rng(seed)
+    touch = rng.integers(0, 256, (2, n, 24, 32, 3), dtype=np.uint8)
+    frames = {
+        v.STATE: rng.standard_normal((n, 15)).astype(np.float32),
+        v.WRIST: moving_blob(n, 32, 48, seed),
+        v.TACTILE_LEFT: touch[0],
+        v.TACTILE_RIGHT: touch[1],
+        v.ACTION: rng.standard_normal((n, 8)).astype(np.float32),
+        v.TRUTH_CONTACT: rng.random((n, 2)) < 0.5,
+        v.TRUTH_PROGRESS: np.linspace(0, 1, n, dtype=np.float32)[:, None],
+        v.TRUTH_SUCCESS: np.arange(n)[:, None] == n - 1,
+    }
+    meta = {"object": f"cube_{seed % 2}", "descriptions": ["hard", "smooth"][: seed % 3]}
+    return Episode(
+        frames, f"lift the {seed % 2}", {**meta, "seed": seed, "grasp_force": np.float64(2.5)}
+    )
+
+
+def record(root: Path, seeds: range, n: int = 7) -> None:
+    writer = EpisodeWriter(root, FPS)
+    for seed in seeds:
+        writer.append(make_episode(seed, n))
+
+
+def assert_holds(root: Path, seeds: list[int], n: int = 7) -> None:
+    episodes = EpisodeSet(root)
+    assert [episodes.meta(i)["seed"] for i in range(len(episodes))] == seeds
+    for i, seed in enumerate(seeds):
+        assert_same(episodes.read(i), make_episode(seed, n))
+
+
+def assert_same(read: Episode, original: Episode) -> None:
+    assert (read.task, read.meta) == (original.task, original.meta)
+    assert set(read.frames) == set(original.frames)
+    for key in (*NUMERIC, *v.TACTILE):
+        np.testing.assert_array_equal(read.frames[key], original.frames[key], err_msg=key)
+        assert read.frames[key].dtype == original.frames[key].dtype
+    assert psnr(read.frames[v.WRIST], original.frames[v.WRIST]) > 35
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return 10 * np.log10(255**2 / np.mean((a.astype(float) - b) ** 2))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("set") / "episodes"
+    record(root, range(3), n=70)
+    return root
+
+
+@pytest.fixture(scope="module")
+def recorded_small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("small") / "episodes"
+    record(root, range(3))
+    return root
+
+
+@pytest.fixture
+def small(recorded_small: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(recorded_small, tmp_path / "set")
+
+
+def test_round_trip(recorded: Path) -> None:
+    assert validate(recorded) == []
+    assert_holds(recorded, [0, 1, 2], n=70)
+
+
+def test_part_of_an_episode_is_that_part_of_the_whole(recorded: Path) -> None:
+    episodes, rng = EpisodeSet(recorded), np.random.default_rng(0)
+    whole = episodes.read(1)
+    for size in (0, 1, 2, 9, 70):
+        frames = rng.integers(0, 70, size)
+        keys = rng.permutation(list(episodes.features))[:5].tolist()
+        part = episodes.read(1, keys, frames.tolist())
+        assert list(part.frames) == keys
+        for key in keys:
+            np.testing.assert_array_equal(part.frames[key], whole.frames[key][frames])
+
+
+def test_only_what_is_asked_for_is_decoded(small: Path) -> None:
+    for path in (small / "videos").rglob("*.mp4"):
+        path.write_bytes(b"not a video")
+    data = small / metadata.data_path(0)
+    damage(data, data.read_bytes().index(PNG_START) + 100)
+    episode = EpisodeSet(small).read(0, [v.STATE])
+    np.testing.assert_array_equal(episode.frames[v.STATE], make_episode(0).frames[v.STATE])
+
+
+def test_files_are_what_lerobot_reads(recorded: Path) -> None:
+    info = json.loads((recorded / metadata.INFO).read_text())
+    assert info["codebase_version"] == "v3.0" and info["total_frames"] == 210
+    dtypes = {key: feature["dtype"] for key, feature in info["features"].items()}
+    assert (dtypes[v.WRIST], dtypes[v.TACTILE_LEFT]) == ("video", "image")
+    assert (dtypes[v.TRUTH_CONTACT], dtypes[v.STATE]) == ("bool", "float32")
+    pandas = pq.read_table(recorded / metadata.TASKS).schema.pandas_metadata
+    assert pandas["index_columns"] == ["task"]
+    rows = pq.read_table(recorded / metadata.EPISODES).to_pylist()
+    assert [row["dataset_from_index"] for row in rows] == [0, 70, 140]
+    assert rows[2][f"videos/{v.WRIST}/to_timestamp"] == 3.5
+    table = pq.read_table(recorded / metadata.data_path(2))
+    assert set(table.column_names) == {key for key, dtype in dtypes.items() if dtype != "video"}
+    assert table["index"].to_pylist() == list(range(140, 210))
+    assert table["task_index"].to_pylist() == [0] * 70
+    assert table["timestamp"].to_numpy() == pytest.approx(np.arange(70) / FPS, abs=1e-6)
+    assert isinstance(table[v.TRUTH_PROGRESS][0].as_py(), float), "shape (1,) is a scalar column"
+    png = table[v.TACTILE_LEFT].to_pylist()[3]["bytes"]
+    pixels = np.asarray(Image.open(io.BytesIO(png)))
+    np.testing.assert_array_equal(pixels, make_episode(2, 70).frames[v.TACTILE_LEFT][3])
+
+
+def test_statistics_of_the_set_are_of_all_frames(recorded: Path) -> None:
+    stats = json.loads((recorded / metadata.STATS).read_text())
+    episodes = [make_episode(seed, 70) for seed in range(3)]
+    for key, axes, scale in ((v.ACTION, 0, 1), (v.TACTILE_LEFT, (0, 1, 2), 255)):
+        values = np.concatenate([episode.frames[key] for episode in episodes]).astype(float) / scale
+        shape = (3, 1, 1) if scale == 255 else (8,)
+        assert stats[key]["count"] == [210]
+        for name in ("min", "max", "mean", "std"):
+            expected = getattr(values, name)(axis=axes).reshape(shape)
+            np.testing.assert_allclose(stats[key][name], expected, rtol=1e-9, atol=1e-12)
+        quantile = np.quantile(values, 0.9, axis=axes).reshape(shape)
+        np.testing.assert_allclose(stats[key]["q90"], quantile, atol=0.2)
+    assert stats["index"]["max"] == [209]
+
+
+def test_picture_statistics_equal_numpy() -> None:
+    images = moving_blob(5, 16, 24, 0)
+    stats = statistics.image_statistics(images)
+    scaled = images.reshape(-1, 3) / 255
+    for name, q in statistics.QUANTILES.items():
+        np.testing.assert_allclose(np.ravel(stats[name]), np.quantile(scaled, q, axis=0))
+    np.testing.assert_allclose(np.ravel(stats["std"]), scaled.std(axis=0), atol=1e-9)
+
+
+def test_encoded_in_a_worker_and_continued(small: Path) -> None:
+    encoded = pickle.loads(pickle.dumps(encode(make_episode(3), FPS)))
+    assert EpisodeWriter(small, FPS).append(encoded) == 3
+    assert EpisodeWriter(small, FPS).append(make_episode(4)) == 4
+    assert validate(small) == []
+    assert_holds(small, list(range(5)))
+
+
+def without(episode: Episode, key: str) -> Episode:
+    frames = {name: values for name, values in episode.frames.items() if name != key}
+    return Episode(frames, episode.task, episode.meta)
+
+
+def with_frames(key: str, values: np.ndarray) -> Episode:
+    episode = make_episode(9)
+    return Episode({**episode.frames, key: values}, episode.task, episode.meta)
+
+
+def with_meta(**meta: object) -> Episode:
+    episode = make_episode(9)
+    return Episode(episode.frames, episode.task, {**episode.meta, **meta})  # pyright: ignore
+
+
+UNFIT = {
+    "state differ": without(make_episode(9), v.STATE),
+    "wrist differ": with_frames(v.WRIST, np.zeros((7, 32, 64, 3), np.uint8)),
+    "even height": with_frames(v.WRIST, np.zeros((7, 32, 47, 3), np.uint8)),
+    "convert it to uint8": with_frames(v.WRIST, np.zeros((7, 32, 48, 3), np.float32)),
+    "no key of touchgoal": with_frames("observation.smell", np.zeros((7, 1), np.float32)),
+    "has 6 frames": with_frames(v.ACTION, np.zeros((6, 8), np.float32)),
+    "not finite at frame 2": with_frames(
+        v.ACTION, np.where(np.arange(7)[:, None] == 2, np.nan, np.zeros((7, 8))).astype(np.float32)
+    ),
+    "meta differs from the set's in light": with_meta(light=1.0),
+    "meta differs from the set's in seed": with_meta(seed="nine"),
+    "does not fit in 64 bits": with_meta(seed=2**64),
+    "task is empty": Episode(make_episode(9).frames, " ", make_episode(9).meta),
+}
+
+
+@pytest.mark.parametrize("reason", UNFIT)
+def test_an_unfit_episode_leaves_the_set_as_it_was(small: Path, reason: str) -> None:
+    writer = EpisodeWriter(small, FPS)
+    with pytest.raises(UserError, match=reason):
+        writer.append(UNFIT[reason])
+    assert validate(small) == []
+    assert writer.append(make_episode(3)) == 3
+
+
+def test_refusals_say_what_to_do(small: Path, tmp_path: Path) -> None:
+    episodes = EpisodeSet(small)
+    with pytest.raises(UserError, match="episodes 0 to 2, not 3"):
+        episodes.read(3)
+    with pytest.raises(UserError, match="frames 0 to 6, not -1"):
+        episodes.read(0, frames=[0, -1])
+    with pytest.raises(UserError, match="has no observation.images.front"):
+        episodes.read(0, [v.FRONT])
+    with pytest.raises(UserError, match="not a set of episodes"):
+        EpisodeSet(tmp_path)
+    with pytest.raises(UserError, match="20 frames per second, not 30"):
+        EpisodeWriter(small, fps=30)
+    info = json.loads((small / metadata.INFO).read_text())
+    (small / metadata.INFO).write_text(json.dumps({**info, "codebase_version": "v2.1"}))
+    for refuse in (EpisodeSet, EpisodeWriter, validate, repair):
+        with pytest.raises(UserError, match="version 'v2.1'"):
+            refuse(small)
+
+
+def test_repair_leaves_foreign_sets_alone(small: Path) -> None:
+    path = small / metadata.data_path(0)
+    pq.write_table(pq.read_table(path).replace_schema_metadata(None), path)
+    before = sorted(small.rglob("*"))
+    with pytest.raises(UserError, match="only its own"):
+        repair(small)
+    assert sorted(small.rglob("*")) == before
+
+
+def damage(path: Path, position: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[position] ^= 0xFF
+    path.write_bytes(data)
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+DAMAGE = {
+    "flipped byte in touch": (
+        metadata.data_path(1),
+        lambda path: damage(path, path.read_bytes().index(PNG_START) + 100),
+    ),
+    "half a data file": (metadata.data_path(1), cut),
+    "flipped byte in a video": (metadata.video_path(v.WRIST, 1), lambda path: damage(path, 400)),
+    "half a video": (metadata.video_path(v.WRIST, 1), cut),
+    "no data file": (metadata.data_path(1), Path.unlink),
+    "no video": (metadata.video_path(v.WRIST, 1), Path.unlink),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_a_damaged_episode_is_named_and_moved_aside(small: Path, case: str) -> None:
+    name, harm = DAMAGE[case]
+    harm(small / name)
+    with pytest.raises(UserError, match=name) as error:
+        EpisodeSet(small).read(1)
+    assert "\n" not in str(error.value) and "touchgoal's repair" in str(error.value)
+    assert any(name in problem for problem in validate(small))
+    assert repair(small)
+    assert validate(small) == []
+    assert_holds(small, [0, 2])
+    assert EpisodeWriter(small, FPS).append(make_episode(4)) == 2
+    assert_holds(small, [0, 2, 4])
+    assert validate(small) == [] and repair(small) == []
+
+
+@pytest.mark.parametrize("name", [metadata.INFO, metadata.EPISODES, metadata.TASKS, metadata.STATS])
+@pytest.mark.parametrize("harm", [cut, Path.unlink])
+def test_damaged_metadata_is_made_again(small: Path, name: str, harm) -> None:
+    before = {path: path.read_bytes() for path in (small / "meta").rglob("*") if path.is_file()}
+    harm(small / name)
+    assert any(name in problem for problem in validate(small))
+    assert repair(small)
+    assert validate(small) == []
+    assert {path: path.read_bytes() for path in before} == before
+
+
+class Killed(BaseException):
+    """Stands for the process ending here."""
+
+
+def test_killed_at_every_write(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ends an append at each of its writes, with the file half written and fully written."""
+    replace, steps = os.replace, 0
+    for step in range(100):
+        root = shutil.copytree(small, small.with_name(f"killed_{step}"))
+        writer, calls = EpisodeWriter(root, FPS), 0
+
+        def die(source: Path, target: Path, step: int = step) -> None:
+            nonlocal calls
+            if calls == step // 2:
+                if step % 2:
+                    cut(Path(source))
+                raise Killed
+            calls += 1
+            replace(source, target)
+
+        monkeypatch.setattr(os, "replace", die)
+        try:
+            writer.append(make_episode(3))
+            break
+        except Killed:
+            steps += 1
+        finally:
+            monkeypatch.setattr(os, "replace", replace)
+        assert_holds(root, [0, 1, 2])
+        with pytest.raises(UserError, match="interrupted.*repair"):
+            EpisodeWriter(root, FPS)
+        assert repair(root)
+        kept = len(EpisodeSet(root))
+        EpisodeWriter(root, FPS).append(make_episode(kept))
+        assert_holds(root, list(range(kept + 1)))
+        assert validate(root) == []
+    assert steps == 2 * 6, "a video, a data file and four files of metadata"
+
+
+def test_killed_in_the_first_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def die(source: Path, target: Path) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(os, "replace", die)
+        record(tmp_path, range(1))
+    with pytest.raises(UserError, match="interrupted"):
+        EpisodeSet(tmp_path)
+    assert "no whole episode" in repair(tmp_path)[-1]
+    record(tmp_path, range(2))
+    assert validate(tmp_path) == []
+
+
+RECORDER = """
+import runpy, sys
+from touchgoal.episodes.store import EpisodeWriter
+make_episode = runpy.run_path(sys.argv[1])["make_episode"]
+writer = EpisodeWriter(sys.argv[2])
+while True:
+    print(writer.append(make_episode(len(writer))), flush=True)
+"""
+
+
+def test_killed_recorder_loses_no_acknowledged_episode(tmp_path: Path) -> None:
+    rng, acknowledged = random.Random(0), -1
+    for _ in range(3):
+        command = [sys.executable, "-c", RECORDER, __file__, str(tmp_path)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as recorder:
+            assert recorder.stdout is not None
+            for _ in range(rng.randint(1, 5)):
+                acknowledged = int(recorder.stdout.readline())
+            time.sleep(rng.uniform(0, 0.05))
+            recorder.send_signal(signal.SIGKILL)
+            acknowledged = int((recorder.stdout.read().split() or [acknowledged])[-1])
+        repair(tmp_path)
+        assert validate(tmp_path) == []
+        assert len(EpisodeSet(tmp_path)) - 1 in (acknowledged, acknowledged + 1)
+    assert_holds(tmp_path, list(range(len(EpisodeSet(tmp_path)))))
