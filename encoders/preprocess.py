@@ -1,0 +1,82 @@
+"""Raw fingertip frames to network input: the same numbers in training, tests and deployment."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from touchgoal.control.errors import UserError
+
+_ASPECT_TOLERANCE = 0.02  # a GelSight Mini's own 3280 x 2464 differs from 4:3 by 0.2 %
+
+
+@dataclass(frozen=True)
+class TactilePreprocessor:
+    """Resizes, subtracts the untouched sensor and divides by a constant.
+
+    Any change of the numbers that come out needs a new version: encoders refuse to load under
+    another preprocessor than they were trained with.
+
+    Attributes:
+        sensor: `control.sensors.SensorModel.name`.
+        version: Counts changes.
+        size: Height and width of the output in pixels.
+        scale: Grey levels (of 255) that make 1.0; about the contrast of a firm contact.
+    """
+
+    sensor: str
+    version: int
+    size: tuple[int, int]
+    scale: float
+
+    @property
+    def id(self) -> str:
+        """Names sensor and version, e.g. "gelsight_mini/v1"."""
+        return f"{self.sensor}/v{self.version}"
+
+    def __call__(
+        self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
+    ) -> Float32[np.ndarray, "n 3 H W"]:
+        """Signed change against the untouched sensor; zero where nothing touches.
+
+        Pixels are averaged over the area they cover (interpolated if the frames are smaller than
+        the output), after the subtraction, so that rounding does not eat faint contacts.
+
+        Args:
+            frames: Raw RGB frames of one sensor.
+            background: The same sensor untouched.
+
+        Raises:
+            UserError: The pictures have another shape (aspect ratio) than the sensor's.
+        """
+        self._check(frames.shape[1:3])
+        h, w = self.size
+        out = np.empty((len(frames), 3, h, w), np.float32)
+        shrinks = frames.shape[1] >= h and frames.shape[2] >= w
+        interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        untouched = background.astype(np.float32)
+        for i, frame in enumerate(frames):
+            change = (frame - untouched) / np.float32(self.scale)
+            out[i] = cv2.resize(change, (w, h), interpolation=interpolation).transpose(2, 0, 1)
+        return out
+
+    def _check(self, shape: tuple[int, ...]) -> None:
+        aspect, expected = shape[1] / shape[0], self.size[1] / self.size[0]
+        if abs(aspect / expected - 1) > _ASPECT_TOLERANCE:
+            raise UserError(
+                f"a {self.sensor} frame is {expected:.2f} times as wide as high, these are "
+                f"{shape[1]}x{shape[0]}: crop them, or choose the right sensor"
+            )
+
+
+PREPROCESSORS: dict[str, TactilePreprocessor] = {
+    "gelsight_mini": TactilePreprocessor("gelsight_mini", version=1, size=(120, 160), scale=16.0),
+}
+
+
+def preprocessor_for(sensor: str) -> TactilePreprocessor:
+    """The preprocessor of a sensor; UserError for an unknown one."""
+    if sensor not in PREPROCESSORS:
+        raise UserError(f"unknown sensor '{sensor}': choose from {', '.join(PREPROCESSORS)}")
+    return PREPROCESSORS[sensor]

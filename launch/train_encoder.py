@@ -1,0 +1,80 @@
+"""Train a touch encoder on recorded episodes: align touch with frozen image and text towers."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tqdm import tqdm
+
+from touchgoal.control.errors import UserError
+from touchgoal.encoders.align import PRESETS, AlignConfig, align
+from touchgoal.encoders.towers import load_towers
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.episodes.touches import collect
+from touchgoal.launch.run_folder import open_run
+from touchgoal.rewards.embedding_distance import EpisodeEmbedder, fit_scale
+
+
+@dataclass(frozen=True)
+class Align:
+    """Options of train-encoder align."""
+
+    episodes: Path
+    """Set of episodes to learn from."""
+    validation: Path
+    """Set of other episodes, by which the best epoch is chosen."""
+    out: Path | None = None
+    """Folder of the run; the encoder goes to its `encoder/`."""
+    towers: str = "offline"
+    """Frozen image and text towers: offline, or a CLIP as Hugging Face id or local directory."""
+    contact_frames: int = 24
+    """Frames in contact taken from each episode."""
+    idle_frames: int = 8
+    """Frames without contact taken from each episode."""
+    scale_episodes: int = 40
+    """Successful training episodes that fix the scale of the costs (encoder/scale.json)."""
+    resume: bool = False
+    """Go on with an interrupted run in `out`."""
+    align: AlignConfig = PRESETS["default"]
+    """The training."""
+
+
+def _preset(name: str) -> Align:
+    return Align(episodes=tyro.MISSING, validation=tyro.MISSING, align=PRESETS[name])
+
+
+Config = (
+    Annotated[Align, tyro.conf.subcommand("align", default=_preset("default"))]
+    | Annotated[Align, tyro.conf.subcommand("align-paper", default=_preset("paper"))]
+)
+
+
+def main(config: Align) -> None:
+    """Cut touches from the episodes, train, fit the scale of the costs."""
+    if config.resume and config.out is None:
+        raise UserError("to resume a run, name its folder with --out")
+    episodes, validation = EpisodeSet(config.episodes), EpisodeSet(config.validation)
+    towers = load_towers(config.towers)
+    out = open_run(config.out, "train-encoder", config)
+    train, val = (
+        collect(s, config.contact_frames, config.idle_frames, config.align.seed)
+        for s in (episodes, validation)
+    )
+    print(f"{len(train)} touches of {len(train.descriptions)} objects; {len(val)} for validation")
+    recipe = {
+        "command": " ".join(["touchgoal", *sys.argv[1:]]),
+        "data": "simulated: touchgoal collect-demos",
+        "episodes": len(episodes),
+        "validation_episodes": len(validation),
+    }
+    encoder = align(train, val, towers, config.align, out, recipe, config.resume)
+    embedder = EpisodeEmbedder(towers, encoder)
+    chosen = [i for i in range(len(episodes)) if episodes.meta(i).get("success", True)]
+    embedded = [
+        embedder.embed_episode(episodes.read(i), episodes.fps, f"{episodes.root}#{i}")
+        for i in tqdm(chosen[: config.scale_episodes], desc="scale", unit="episode")
+    ]
+    fit_scale(embedded, ("image", "tactile", "text")).save(out / "encoder" / "scale.json")
+    print(f"encoder and scale: {out / 'encoder'}")

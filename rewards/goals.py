@@ -1,0 +1,204 @@
+"""Goals: what a trajectory should end near, and which modality each goal speaks for.
+
+A goal is written in one of five forms:
+
+    last                the last frame of the episode itself (MMWand, Figure 8)
+    frame:K             frame K of the episode itself, counted from 0
+    image:PATH          a picture
+    episode:ROOT#K      the last frame of episode K of the episode set in ROOT
+    text:SENTENCE       how the object feels, in words (MMWand, Figure 9)
+
+There are three modalities, each a distance of its own: "image" (camera against goal picture),
+"tactile" (touch against goal touch), "text" (touch against goal sentence). A frame or an episode
+speaks for image and tactile, a picture for image, a sentence for text. Several goals may be given:
+each modality takes the first goal that speaks for it, and a goal left without a modality is an
+error, so `last` and `text:a hard smooth ball` together give all curves of Figures 8 and 9. A
+sentence is a goal for touch alone: the camera sees the object from the first frame on, so the
+distance of the picture to how it feels says nothing about how far the task has come.
+
+The own last frame flatters: every episode, a failed one too, ends at distance 0 of it. To judge
+episodes, give the end of another, successful one.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, UnidentifiedImageError
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.vocabulary import TRUTH_CONTACT
+from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.rewards.metrics import START_FRAMES
+
+Modality = Literal["image", "tactile", "text"]
+MODALITIES: tuple[Modality, ...] = ("image", "tactile", "text")
+
+FORMS = "last, frame:K, image:PATH, episode:ROOT#K or text:SENTENCE"
+
+
+@dataclass(frozen=True)
+class LastFrame:
+    """The last frame of the measured episode itself."""
+
+    speaks_for: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
+
+    def __str__(self) -> str:
+        """The form a user writes."""
+        return "last"
+
+
+@dataclass(frozen=True)
+class FrameNumber:
+    """Frame `index` (from 0) of the measured episode itself."""
+
+    index: int
+    speaks_for: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
+
+    def __str__(self) -> str:
+        """The form a user writes."""
+        return f"frame:{self.index}"
+
+
+@dataclass(frozen=True)
+class PictureFile:
+    """A picture file of the goal, as the measured camera would see it."""
+
+    path: Path
+    speaks_for: ClassVar[tuple[Modality, ...]] = ("image",)
+
+    def __str__(self) -> str:
+        """The form a user writes."""
+        return f"image:{self.path}"
+
+    def read(self) -> UInt8[np.ndarray, "1 h w 3"]:
+        """The picture, RGB.
+
+        Raises:
+            UserError: there is no such file, or it is no picture.
+        """
+        try:
+            with Image.open(self.path) as picture:
+                return np.asarray(picture.convert("RGB"))[None]
+        except FileNotFoundError:
+            raise UserError(f"goal picture {self.path} does not exist") from None
+        except (UnidentifiedImageError, OSError):
+            raise UserError(f"goal picture {self.path} cannot be read as an image") from None
+
+
+@dataclass(frozen=True)
+class EpisodeEnd:
+    """The last frame of episode `index` of the episode set in `root`."""
+
+    root: Path
+    index: int
+    speaks_for: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
+
+    def __str__(self) -> str:
+        """The form a user writes."""
+        return f"episode:{self.root}#{self.index}"
+
+    def read(self, keys: Sequence[str]) -> Episode:
+        """The first frames (for the background of touch) and, last, the last frame.
+
+        Args:
+            keys: the keys to read; the simulator's contact truth comes along where it is recorded.
+
+        Raises:
+            UserError: no such set, episode or key.
+        """
+        episodes = EpisodeSet(self.root)
+        if self.index >= len(episodes):
+            raise UserError(
+                f"goal '{self}' does not exist: {self.root} has episodes 0 to {len(episodes) - 1}"
+            )
+        length = episodes.lengths[self.index]
+        truth = [TRUTH_CONTACT] if TRUTH_CONTACT in episodes.features else []
+        frames = [*range(min(START_FRAMES, length)), length - 1]
+        return episodes.read(self.index, [*keys, *truth], frames)
+
+
+@dataclass(frozen=True)
+class Sentence:
+    """How the object feels, in words. Sentence encoders hardly see a "not": say what is there."""
+
+    text: str
+    speaks_for: ClassVar[tuple[Modality, ...]] = ("text",)
+
+    def __str__(self) -> str:
+        """The form a user writes."""
+        return f"text:{self.text}"
+
+
+GoalSpec = LastFrame | FrameNumber | PictureFile | EpisodeEnd | Sentence
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What to be near, per modality; None where no goal speaks for a modality."""
+
+    image: LastFrame | FrameNumber | PictureFile | EpisodeEnd | None = None
+    tactile: LastFrame | FrameNumber | EpisodeEnd | None = None
+    text: Sentence | None = None
+
+    def as_dict(self) -> dict[str, str]:
+        """The goal of each modality that has one, in the form a user writes."""
+        specs = {name: getattr(self, name) for name in MODALITIES}
+        return {name: str(spec) for name, spec in specs.items() if spec is not None}
+
+
+def parse_goal(text: str) -> GoalSpec:
+    """Read one goal in one of the five forms of this module.
+
+    Raises:
+        UserError: any other text; the message lists the forms.
+    """
+    kind, _, value = text.strip().partition(":")
+    value = value.strip()
+    episode = re.fullmatch(r"(.+)#(\d+)", value)
+    if text.strip() == "last":
+        return LastFrame()
+    if kind == "frame" and re.fullmatch(r"\d+", value):
+        return FrameNumber(int(value))
+    if kind == "image" and value:
+        return PictureFile(Path(value))
+    if kind == "episode" and episode:
+        return EpisodeEnd(Path(episode[1]), int(episode[2]))
+    if kind == "text" and value:
+        return Sentence(value)
+    raise UserError(f"goal '{text}' is not understood; write {FORMS}")
+
+
+def choose_goal(specs: Sequence[GoalSpec], available: Sequence[Modality]) -> Goal:
+    """Give each available modality the first goal that speaks for it.
+
+    Args:
+        specs: goals in the order given.
+        available: modalities of the measured source; a plain video has "image" alone.
+
+    Raises:
+        UserError: no goal, or one that no modality takes.
+    """
+    if not specs:
+        raise UserError(f"no goal was given; write {FORMS}")
+    taken: dict[str, GoalSpec] = {}
+    for spec in specs:
+        wanted = [m for m in spec.speaks_for if m in available]
+        if not wanted:
+            raise UserError(
+                f"goal '{spec}' speaks for {' and '.join(spec.speaks_for)}, but this source has "
+                f"{' and '.join(available)} only; leave the goal out"
+            )
+        free = [m for m in wanted if m not in taken]
+        if not free:
+            raise UserError(
+                f"goal '{spec}' is never used: '{taken[wanted[0]]}' before it already speaks for "
+                f"{' and '.join(wanted)}; put it first or leave it out"
+            )
+        taken |= dict.fromkeys(free, spec)
+    return Goal(**taken)  # pyright: ignore[reportArgumentType]  speaks_for fixes the types

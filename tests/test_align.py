@@ -1,0 +1,310 @@
+"""Alignment training and its retrieval metrics, at toy size."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from touchgoal.control.errors import UserError
+from touchgoal.encoders import align as align_module
+from touchgoal.encoders import pretrained
+from touchgoal.encoders.align import PRESETS, AlignConfig, AlignedBatch, align, batch_losses
+from touchgoal.encoders.retrieval import mean_average_precision, top1
+from touchgoal.encoders.touch_data import Augmentation, TouchData, prepare
+from touchgoal.encoders.touch_encoder import TouchEncoder
+from touchgoal.episodes.touches import Touches
+
+DESCRIPTIONS = {
+    "ball": ["a hard round ball", "round and firm", "a smooth sphere"],
+    "brush": ["bristles", "many fine hairs", "a scratchy brush"],
+    "cloth": ["a soft woven cloth", "soft", "loose threads crossing"],
+}
+CONFIG = AlignConfig(vit="tiny", embedding_dim=16, epochs=3, batch_size=16, lr=3e-3)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+class FakeTowers:
+    """Pictures by their mean colour, sentences by their letters."""
+
+    name = "fake"
+
+    def __init__(self, pretrained_together: bool = False) -> None:
+        self.pretrained_together = pretrained_together
+        self.image_dim = 26 if pretrained_together else 3
+        self.text_dim = 26
+
+    def embed_images(self, images: np.ndarray) -> torch.Tensor:
+        colour = torch.tensor(images.mean((1, 2)), dtype=torch.float32) / 255 - 0.5
+        return F.pad(colour, (0, self.image_dim - 3))
+
+    def embed_texts(self, texts: list[str]) -> torch.Tensor:
+        letters = "abcdefghijklmnopqrstuvwxyz"
+        return torch.tensor([[float(t.count(letter)) for letter in letters] for t in texts])
+
+
+def make_touches(per_object: int, seed: int) -> Touches:
+    """One episode of each object; a third of the touches is idle; each object has its grating."""
+    rng = np.random.default_rng(seed)
+    names = list(DESCRIPTIONS)
+    frames, objects, episode = [], [], []
+    background = np.full((60, 80, 3), 100, np.uint8)
+    x = np.arange(80)
+    for e in range(len(names)):
+        for i in range(per_object):
+            frame = background + rng.normal(0, 1, (60, 80, 3))
+            if i % 3:
+                wave = 20 * np.sin(2 * np.pi * (x / (8, 20, 45)[e] + rng.uniform()))
+                frame[:, :, e] += wave
+            frames.append(frame.round().astype(np.uint8))
+            objects.append(names[e] if i % 3 else "")
+            episode.append(e)
+    colours = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200]])
+    view = np.broadcast_to(colours[:, None, None], (3, 16, 16, 3)).astype(np.uint8)
+    return Touches(
+        frames=np.stack(frames),
+        background=np.stack([background] * 3),
+        background_of=np.array(episode),
+        view=view,
+        view_of=np.array(episode),
+        object=tuple(objects),
+        descriptions=DESCRIPTIONS,
+        side=np.zeros(len(frames), int),
+        episode_of=np.array(episode),
+    )
+
+
+TRAIN, VAL = make_touches(12, 0), make_touches(6, 1)
+
+
+def weights(encoder: TouchEncoder) -> torch.Tensor:
+    return torch.cat([w.flatten() for w in encoder.state_dict().values()])
+
+
+def final_weights(out_dir: Path) -> torch.Tensor:
+    state = torch.load(out_dir / "checkpoint.pt", weights_only=True)["encoder"]
+    return torch.cat([w.flatten() for w in state.values()])
+
+
+# ---- data
+
+
+def test_prepared_data_pairs_touch_with_object_and_view() -> None:
+    data = prepare(TRAIN, FakeTowers(), "gelsight_mini", CONFIG.idle_texts)
+    assert data.names == ("", "ball", "brush", "cloth")
+    assert [data.names[i] for i in data.label] == list(TRAIN.object)
+    assert data.contact.tolist() == [name != "" for name in TRAIN.object]
+    assert data.touch.shape == (36, 3, 120, 160)
+    assert data.says.sum(1).tolist() == [len(CONFIG.idle_texts), 3, 3, 3]
+    rows = torch.arange(36)
+    drawn = [data.draw_sentences(rows, torch.Generator().manual_seed(seed)) for seed in (0, 0, 1)]
+    assert torch.equal(drawn[0], drawn[1]) and not torch.equal(drawn[0], drawn[2])
+    assert data.says[data.label, drawn[0]].all()
+
+
+def test_without_idle_texts_idle_touches_are_left_out() -> None:
+    data = prepare(TRAIN, FakeTowers(), "gelsight_mini", ())
+    assert data.names == ("ball", "brush", "cloth") and len(data) == 24 and data.contact.all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"descriptions": {"ball": ["round"]}}, "'brush' has no descriptions"),
+        ({"object": ("",) * 36}, "no touch is in contact"),
+    ],
+)
+def test_unfit_touches_are_refused(change: dict, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        prepare(replace(TRAIN, **change), FakeTowers(), "gelsight_mini", CONFIG.idle_texts)
+
+
+def test_augmentation() -> None:
+    touch = torch.randn(6, 3, 20, 30, generator=torch.Generator().manual_seed(0))
+
+    def changed(augmentation: Augmentation, seed: int = 1) -> torch.Tensor:
+        return augmentation(touch, torch.Generator().manual_seed(seed))
+
+    assert torch.equal(changed(Augmentation()), touch)
+    everything = PRESETS["default"].augmentation
+    assert torch.equal(changed(everything), changed(everything))
+    assert not torch.equal(changed(everything), changed(everything, seed=2))
+    shifted = changed(Augmentation(shift=4))
+    inside = touch[:, :, 4:-4, 4:-4]
+    for before, after in zip(inside, shifted, strict=True):
+        windows = after.unfold(1, 12, 1).unfold(2, 22, 1)
+        gaps = (windows - before[:, None, None]).abs().amax((0, 3, 4))
+        assert gaps.min() == 0, "the middle of the picture is not found anywhere"
+    gained = changed(Augmentation(gain=0.2)) / touch
+    torch.testing.assert_close(gained, gained[:, :, :1, :1].expand_as(gained))
+    assert 0.8 <= gained.min() < 0.95 and 1.05 < gained.max() <= 1.2
+
+
+# ---- losses
+
+
+def random_batch() -> AlignedBatch:
+    generator = torch.Generator().manual_seed(0)
+    touch, text, image = (
+        F.normalize(torch.randn(6, 8, generator=generator), dim=1) for _ in range(3)
+    )
+    label = torch.tensor([0, 0, 1, 1, 2, 3])
+    return AlignedBatch(touch.requires_grad_(), text, image, label != 0, label[:, None] == label)
+
+
+def test_idle_touches_learn_from_text_only() -> None:
+    batch = random_batch()
+    losses = batch_losses(batch, False, CONFIG)
+    (gradient,) = torch.autograd.grad(losses["loss_touch_image"], batch.touch, retain_graph=True)
+    assert (gradient[:2] == 0).all() and (gradient[2:] != 0).all()
+    (gradient,) = torch.autograd.grad(losses["loss_touch_text"], batch.touch)
+    assert (gradient != 0).all()
+
+
+def test_loss_is_the_weighted_sum() -> None:
+    config = replace(CONFIG, text_weight=0.5, image_text_weight=0.25)
+    three = batch_losses(random_batch(), False, config)
+    expected = (
+        0.5 * three["loss_touch_text"] + three["loss_touch_image"] + 0.25 * three["loss_image_text"]
+    )
+    torch.testing.assert_close(three["loss"], expected)
+    two = batch_losses(random_batch(), True, config)
+    assert set(two) == {"loss", "loss_touch_text", "loss_touch_image"}
+
+
+def test_paper_preset_is_equation_2() -> None:
+    batch = random_batch()
+    c = batch.contact
+    paper = batch_losses(batch, True, PRESETS["paper"])
+    image = (batch.touch[c] @ batch.image[c].T / 0.2).log_softmax(1).diagonal().mean()
+    text = (batch.touch @ batch.text.T / 0.2).log_softmax(1).diagonal().mean()
+    torch.testing.assert_close(paper["loss"], -image - text)
+
+
+# ---- training
+
+
+def test_one_batch_can_be_learned_by_heart(tmp_path: Path) -> None:
+    # 16 touches, 24 epochs of a single step each
+    touches = make_touches(5, 0)
+    config = replace(CONFIG, epochs=60, batch_size=64, augmentation=Augmentation(), token_share=1.0)
+    encoder = align(touches, touches, FakeTowers(), config, tmp_path)
+    history = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    best = max(m["touch_to_text_map"] + m["touch_to_image_map"] for m in history)
+    assert best > 1.98
+    assert history[-1]["touch_to_text_top1"] == history[-1]["touch_to_image_top1"] == 1
+    assert history[-1]["idle_accuracy"] == 1
+    for modality in ("text", "image"):
+        loss, floor = (history[-1][f"touch_to_{modality}_{k}"] for k in ("loss", "floor"))
+        assert floor - 1e-4 <= loss < floor + 0.1
+    text = encoder.embed_text_goal(["a hard round ball", "a soft woven cloth"], FakeTowers())
+    ball = encoder.embed_frames(touches.frames[1:2], touches.background[0])
+    assert (ball @ text[0]).item() > (ball @ text[1]).item() + 0.3
+
+
+def test_what_is_returned_is_what_is_saved(tmp_path: Path) -> None:
+    encoder = align(TRAIN, VAL, FakeTowers(), replace(CONFIG, epochs=1), tmp_path)
+    saved = pretrained.load(tmp_path / "encoder", sensor="gelsight_mini", towers="fake")
+    assert torch.equal(weights(saved), weights(encoder))
+    provenance = pretrained.read_provenance(tmp_path / "encoder")
+    assert provenance["align"]["seed"] == 0 and provenance["touches"]["train"] == 36
+    assert provenance["metrics"]["chance_top1"] == pytest.approx(1 / 3)
+
+
+def test_same_seed_same_weights(tmp_path: Path) -> None:
+    config = replace(CONFIG, epochs=1)
+    state = torch.random.get_rng_state()
+    finals = []
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        align(TRAIN, VAL, FakeTowers(), replace(config, seed=seed), tmp_path / name)
+        finals.append(final_weights(tmp_path / name))
+        torch.rand(1)  # what others draw in between must not matter
+    assert torch.equal(finals[0], finals[1]) and not torch.equal(finals[0], finals[2])
+    torch.random.set_rng_state(state)
+
+
+def test_killed_and_resumed_is_bit_identical(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "whole")
+    evaluate = align_module.evaluate
+    calls = iter([evaluate])
+
+    def killed_in_second_epoch(encoder: TouchEncoder, data: TouchData) -> dict[str, float]:
+        step = next(calls, None)
+        if step is None:
+            raise KeyboardInterrupt
+        return step(encoder, data)
+
+    monkeypatch.setattr(align_module, "evaluate", killed_in_second_epoch)
+    with pytest.raises(KeyboardInterrupt):
+        align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "parts")
+    monkeypatch.undo()
+    torch.set_num_threads(1)
+    align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "parts", resume=True)
+    assert torch.equal(final_weights(tmp_path / "parts"), final_weights(tmp_path / "whole"))
+    for name in ("metrics.jsonl", "encoder/encoder.safetensors", "encoder/encoder.json"):
+        assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_paper_preset_runs_with_towers_pretrained_together(tmp_path: Path) -> None:
+    paper = replace(PRESETS["paper"], vit="tiny", epochs=1, batch_size=8, device="cpu")
+    encoder = align(TRAIN, VAL, FakeTowers(pretrained_together=True), paper, tmp_path)
+    assert encoder.config.embedding_dim == 26 and encoder.image_head is None
+    (line,) = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    metrics = json.loads(line)
+    assert metrics["touch_to_image_loss"] >= metrics["touch_to_image_floor"] - 1e-4
+    assert "idle_accuracy" not in metrics
+
+
+def test_bad_directories_and_configs_are_refused(tmp_path: Path) -> None:
+    def start(config: AlignConfig = CONFIG, resume: bool = False) -> Callable[[], TouchEncoder]:
+        return lambda: align(TRAIN, VAL, FakeTowers(), config, tmp_path, resume)
+
+    for message, call in (
+        ("nothing to resume", start(resume=True)),
+        ("unknown sensor 'nose'", start(replace(CONFIG, sensor="nose"))),
+        ("at least 1 epoch", start(replace(CONFIG, epochs=0))),
+    ):
+        with pytest.raises(UserError, match=message):
+            call()
+    start(replace(CONFIG, epochs=1))()
+    with pytest.raises(UserError, match="holds a run already"):
+        start(replace(CONFIG, epochs=1))()
+    with pytest.raises(UserError, match="of another data set, encoder or config"):
+        start(replace(CONFIG, epochs=1, lr=1e-5), resume=True)()
+
+
+# ---- retrieval metrics
+
+
+def test_average_precision_by_hand() -> None:
+    similarity = np.array([[0.9, 0.8, 0.7, 0.6]])
+    relevant = np.array([[True, False, True, False]])
+    assert mean_average_precision(similarity, relevant) == pytest.approx((1 + 2 / 3) / 2)
+
+
+def test_ties_count_as_their_expectation() -> None:
+    rng = np.random.default_rng(0)
+    similarity = rng.integers(0, 3, (1, 12)).astype(float)
+    relevant = rng.random((1, 12)) < 0.4
+    jittered = similarity + 1e-6 * rng.random((20_000, 12))
+    simulated = mean_average_precision(jittered, relevant.repeat(20_000, 0))
+    assert mean_average_precision(similarity, relevant) == pytest.approx(simulated, abs=3e-3)
+
+
+def test_collapsed_encoder_scores_chance() -> None:
+    label = torch.arange(3).repeat_interleave(5)
+    assert top1(torch.ones(15, 3), label) == pytest.approx(1 / 3)
+    relevant = (label[:, None] == label).numpy()
+    rng = np.random.default_rng(0)
+    random = np.mean([mean_average_precision(rng.random((15, 15)), relevant) for _ in range(200)])
+    assert mean_average_precision(np.ones((15, 15)), relevant) == pytest.approx(random, abs=0.01)

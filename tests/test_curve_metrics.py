@@ -1,0 +1,194 @@
+"""Curve metrics against hand-computed values, brute-force definitions and the known traps."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from touchgoal.rewards.metrics import (
+    EPS_FLOOR,
+    CurveMetrics,
+    average_ranks,
+    find_peaks,
+    kendall_tau_b,
+    largest_rebound,
+    measure_curve,
+    noise,
+    pearson,
+    spearman,
+)
+
+# Small integers make ties and plateaus common; halves keep every sum exact.
+CURVES = st.lists(st.integers(-6, 6), min_size=3, max_size=24).map(
+    lambda values: np.array(values) / 2
+)
+NOISE = np.random.default_rng(0).normal(0, 0.01, 100)
+STEP = np.where(np.arange(100) < 50, 1.0, 0.0)
+
+
+def brute_kendall(x: np.ndarray, y: np.ndarray) -> float | None:
+    pairs = list(combinations(range(len(x)), 2))
+    agreement = sum(np.sign((x[j] - x[i]) * (y[j] - y[i])) for i, j in pairs)
+    apart_x = sum(x[j] != x[i] for i, j in pairs)
+    apart_y = sum(y[j] != y[i] for i, j in pairs)
+    return agreement / (apart_x * apart_y) ** 0.5 if apart_x and apart_y else None
+
+
+def brute_peaks(d: np.ndarray, eps: float) -> list[int]:
+    """Walk from every run of equal values outwards, by the definition."""
+    found = []
+    for first in range(1, len(d) - 1):
+        last = first
+        while last + 1 < len(d) and d[last + 1] == d[first]:
+            last += 1
+        if last == len(d) - 1 or not d[first - 1] < d[first] > d[last + 1]:
+            continue
+        bases = []
+        for step, edge in ((-1, first), (1, last)):
+            lowest, at = d[first], edge
+            while 0 <= at < len(d) and d[at] <= d[first]:
+                lowest, at = min(lowest, d[at]), at + step
+            bases.append(lowest)
+        if d[first] - max(bases) >= eps:
+            found.append((first + last) // 2)
+    return found
+
+
+def test_correlations_by_hand() -> None:
+    x, y = np.array([1.0, 2.0, 2.0, 3.0]), np.array([1.0, 3.0, 2.0, 4.0])
+    assert average_ranks(x).tolist() == [1.0, 2.5, 2.5, 4.0]
+    # Ranks centred: (-1.5, 0, 0, 1.5) and (-1.5, .5, -.5, 1.5): 4.5 / sqrt(4.5 * 5).
+    assert spearman(x, y) == pytest.approx(0.9**0.5)
+    # 5 concordant pairs, 1 tie in x of 6 pairs: 5 / sqrt(5 * 6).
+    assert kendall_tau_b(x, y) == pytest.approx(5 / 30**0.5)
+    # Deviations (-1, 0, 0, 1) and (-1.5, .5, -.5, 1.5): 3 / sqrt(2 * 5).
+    assert pearson(x, y) == pytest.approx(3 / 10**0.5)
+
+
+@given(CURVES)
+def test_kendall_is_its_definition(x: np.ndarray) -> None:
+    time = np.arange(len(x))
+    expected = brute_kendall(x, time)
+    assert kendall_tau_b(x, time) == (None if expected is None else pytest.approx(expected))
+    assert kendall_tau_b(x, np.round(x)) == pytest.approx(brute_kendall(x, np.round(x)))
+
+
+@given(CURVES)
+def test_order_survives_monotone_transforms_and_turns_with_time(d: np.ndarray) -> None:
+    assume(np.ptp(d) > 0)
+    bent, backwards = measure_curve(np.exp(d), None), measure_curve(d[::-1], None)
+    straight = measure_curve(d, None)
+    assert straight.spearman is not None and straight.kendall_tau_b is not None
+    assert bent.spearman == pytest.approx(straight.spearman)
+    assert bent.kendall_tau_b == pytest.approx(straight.kendall_tau_b)
+    assert backwards.spearman == pytest.approx(-straight.spearman)
+    assert backwards.kendall_tau_b == pytest.approx(-straight.kendall_tau_b)
+    assert backwards.pearson == pytest.approx(-(straight.pearson or 0.0))
+    assert backwards.peaks == straight.peaks
+
+
+@given(CURVES, st.sampled_from([0.25, 0.5, 1.0, 2.0]))
+def test_peaks_are_their_definition(d: np.ndarray, eps: float) -> None:
+    assert find_peaks(d, eps).tolist() == brute_peaks(d, eps)
+
+
+def test_peaks_by_hand() -> None:
+    #             0    1    2    3    4    5    6    7    8
+    d = np.array([5.0, 3.0, 4.0, 4.0, 4.0, 1.0, 2.0, 0.0, 9.0])
+    # The plateau at 2..4 is one peak of prominence 1 (base 3), that at 6 has base 1, prominence 1;
+    # the ends are none.
+    assert find_peaks(d, 1.0).tolist() == [3, 6]
+    assert find_peaks(d, 1.01).tolist() == []
+    assert find_peaks(np.array([0.0, 2.0, 2.0]), 0.5).tolist() == []
+
+
+@given(CURVES)
+def test_largest_rebound_is_its_definition(d: np.ndarray) -> None:
+    brute = max(d[j] - d[i] for i in range(len(d)) for j in range(i, len(d)))
+    assert largest_rebound(d) == brute
+
+
+@given(st.lists(st.floats(0.01, 1.0), min_size=10, max_size=60))
+def test_strictly_falling_curve_is_perfect(falls: list[float]) -> None:
+    m = measure_curve(-np.cumsum(falls), contact=None)
+    assert m.spearman == pytest.approx(1) and m.kendall_tau_b == pytest.approx(1)
+    assert (m.peaks, m.largest_rebound, m.rebound_mass, m.violation_rate) == (0, 0.0, 0.0, 0.0)
+    if m.t_drop_50 is not None:
+        assert m.t_drop_10 is not None and m.t_drop_25 is not None
+        assert m.t_drop_10 <= m.t_drop_25 <= m.t_drop_50
+
+
+def test_straight_line_by_hand() -> None:
+    m = measure_curve(np.linspace(1, 0, 101), contact=40)
+    # The median of 1, .99, .98, .97, .96 is .98; half of it is reached at 1 - t / 100 <= .49.
+    assert m.start == pytest.approx(0.98) and m.end == 0
+    assert (m.t_drop_10, m.t_drop_25, m.t_drop_50, m.contact_lag) == (12, 27, 51, 11)
+    assert m.area == pytest.approx(0.5) and m.pearson == pytest.approx(1)
+    assert m.variation_ratio == pytest.approx(1 / 0.98)
+    assert m.sigma == pytest.approx(0, abs=1e-12) and m.noise_frames == 40
+
+
+def test_noise_is_measured_before_contact_and_blind_to_a_slope() -> None:
+    rng = np.random.default_rng(1)
+    d = np.linspace(1, 0, 4000) + rng.normal(0, 0.01, 4000)
+    d[2000:] += rng.normal(0, 0.5, 2000)
+    sigma, frames = noise(d, contact=2000)
+    assert frames == 2000 and sigma == pytest.approx(0.01, rel=0.05)
+    assert noise(d, contact=3)[1] == 4000
+
+
+def test_flat_window_makes_no_peak_of_rounding() -> None:
+    d = STEP + 1e-6 * np.cos(np.arange(100))
+    d[:50] = 1
+    m = measure_curve(d, contact=50)
+    assert (m.sigma, m.eps, m.peaks, m.violation_rate) == (0, EPS_FLOOR, 0, 0)
+    assert m.kendall_tolerant == measure_curve(STEP, contact=50).kendall_tau_b
+
+
+def test_one_eps_for_several_curves() -> None:
+    bumps = np.linspace(1, 0, 100) + 0.1 * np.sin(np.arange(100))
+    assert measure_curve(bumps, None, eps=0.05).peaks > 10
+    assert measure_curve(bumps, None, eps=0.5).peaks == 0
+
+
+@pytest.mark.parametrize("wiggle", [0.0, 1e-7])
+def test_constant_curve_is_undefined_not_perfect(wiggle: float) -> None:
+    m = measure_curve(0.7 + wiggle * np.sin(np.arange(60)), contact=None)
+    undefined = (m.spearman, m.kendall_tau_b, m.kendall_tolerant, m.pearson)
+    assert undefined == (None, None, None, None)
+    assert (m.t_drop_10, m.t_drop_50, m.relative_rebound, m.variation_ratio) == (None,) * 4
+    assert m.flat_fraction == 1 and m.area == pytest.approx(0.7)
+
+
+def test_never_touching_shows_no_drop() -> None:
+    m = measure_curve(1 + NOISE, contact=None)
+    assert m.spearman is not None and abs(m.spearman) < 0.3
+    assert (m.t_drop_50, m.contact_lag) == (None, None)
+    assert m.end > 0.9 and m.area == pytest.approx(1, abs=0.01)
+
+
+def test_grasp_then_drop_is_far_from_a_grasp() -> None:
+    grasp = measure_curve(STEP + NOISE, contact=50)
+    lost = STEP.copy()
+    lost[70:] = 1
+    drop = measure_curve(lost + NOISE, contact=50)
+    assert grasp.spearman is not None and drop.spearman is not None
+    assert grasp.spearman > 0.7 > 0.4 > drop.spearman
+    assert grasp.t_drop_50 == 50 and drop.t_drop_50 is None
+    assert grasp.largest_rebound < 0.1 < 0.9 < drop.largest_rebound
+    assert grasp.end < 0.1 < 0.9 < drop.end
+
+
+def test_metrics_go_to_json_by_name() -> None:
+    d = measure_curve(STEP, contact=50).as_dict()
+    assert d["contact_lag"] == 0 and CurveMetrics(**d) == measure_curve(STEP, contact=50)
+
+
+@pytest.mark.parametrize(
+    ("d", "contact"), [([1.0], None), ([1.0, float("nan")], None), ([1.0, 0.0], 2)]
+)
+def test_what_is_no_curve_is_refused(d: list[float], contact: int | None) -> None:
+    with pytest.raises(ValueError, match=r"frame|finite"):
+        measure_curve(np.array(d), contact)

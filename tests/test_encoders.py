@@ -1,0 +1,321 @@
+"""Preprocessor, ViT, InfoNCE, touch encoder and its files."""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from safetensors.torch import load_file, save_file
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.sensors import GELSIGHT_MINI
+from touchgoal.encoders import pretrained
+from touchgoal.encoders.infonce import info_nce, loss_floor, symmetric_info_nce
+from touchgoal.encoders.preprocess import PREPROCESSORS
+from touchgoal.encoders.touch_encoder import TouchEncoder, TouchEncoderConfig
+from touchgoal.encoders.vit import PRESETS, ViT, ViTConfig, random_patches
+
+MINI = PREPROCESSORS["gelsight_mini"]
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+class FakeTowers:
+    name = "fake"
+    image_dim, text_dim, pretrained_together = 12, 8, False
+
+    def embed_images(self, images: np.ndarray) -> torch.Tensor:
+        return torch.tensor(images[:, :2, :2].reshape(len(images), 12).astype(np.float32))
+
+    def embed_texts(self, texts: list[str]) -> torch.Tensor:
+        return torch.stack([torch.arange(8.0) + len(text) ** 0.5 for text in texts])
+
+
+def make_encoder(pretrained_together: bool = False) -> TouchEncoder:
+    towers = FakeTowers()
+    if pretrained_together:
+        towers.pretrained_together, towers.text_dim = True, 12
+    config = TouchEncoderConfig.for_towers(PRESETS["tiny"], towers, "gelsight_mini", 16)
+    return TouchEncoder(config).eval()
+
+
+# ---- preprocessor
+
+
+def test_preprocessor_is_named_after_the_sensor() -> None:
+    assert set(PREPROCESSORS) == {GELSIGHT_MINI.name}
+    assert MINI.id == "gelsight_mini/v1"
+
+
+def test_untouched_is_zero_and_change_is_in_units_of_the_scale(rng: np.random.Generator) -> None:
+    background = rng.integers(50, 200, (240, 320, 3)).astype(np.uint8)
+    pressed = background.copy()
+    pressed[:120, :, 1] += 16
+    out = MINI(np.stack([background, pressed]), background)
+    assert out.shape == (2, 3, 120, 160)
+    np.testing.assert_array_equal(out[0], 0)
+    expected = np.zeros((3, 120, 160))
+    expected[1, :60] = 16 / MINI.scale
+    np.testing.assert_allclose(out[1], expected, atol=1e-6)
+
+
+def test_pixels_are_averaged_over_their_area(rng: np.random.Generator) -> None:
+    frame = rng.integers(0, 256, (1, 240, 320, 3)).astype(np.uint8)
+    out = MINI(frame, np.full((240, 320, 3), 100, np.uint8))
+    blocks = frame[0].reshape(120, 2, 160, 2, 3).mean((1, 3)).transpose(2, 0, 1)
+    np.testing.assert_allclose(out[0] * MINI.scale + 100, blocks, atol=1e-3)
+
+
+def test_another_shape_of_picture_is_refused() -> None:
+    upright = np.zeros((1, 320, 240, 3), np.uint8)
+    with pytest.raises(UserError, match="240x320"):
+        MINI(upright, upright[0])
+
+
+# ---- ViT
+
+
+def test_sizes_of_the_presets() -> None:
+    with torch.device("meta"):
+        millions = {
+            name: sum(p.numel() for p in ViT(config).parameters()) / 1e6
+            for name, config in PRESETS.items()
+        }
+    assert millions["small"] == pytest.approx(2.8, abs=0.1)
+    assert millions["huge"] == pytest.approx(631, abs=2)  # ViT-H/14 without head and positions
+
+
+@pytest.mark.parametrize("class_token", [False, True])
+def test_vit_takes_any_size(class_token: bool) -> None:
+    vit = ViT(replace(PRESETS["tiny"], class_token=class_token))
+    for h, w, patches in ((120, 160, 12), (80, 80, 4), (81, 119, 9)):
+        assert vit(torch.zeros(2, 3, h, w)).shape == (2, patches + class_token, 32)
+        assert vit.features(torch.zeros(2, 3, h, w)).shape == (2, 32)
+
+
+def test_kept_patches_are_all_that_is_seen() -> None:
+    vit = ViT(PRESETS["tiny"])
+    images = torch.randn(2, 3, 120, 160)
+    order = torch.stack([torch.randperm(12), torch.randperm(12)])
+    everything = vit(images).gather(1, order[:, :, None].expand(-1, -1, 32))
+    torch.testing.assert_close(vit(images, order), everything, atol=1e-5, rtol=1e-5)
+    keep = torch.tensor([[0, 5], [5, 3]])
+    changed = images.clone()
+    changed[:, :, 80:] = 9  # the last row of patches, 8 to 11
+    torch.testing.assert_close(vit(changed, keep), vit(images, keep))
+    changed[:, :, 40:80, 40:80] = 9  # patch 5
+    assert not torch.allclose(vit(changed, keep), vit(images, keep))
+
+
+def test_position_matters() -> None:
+    vit = ViT(PRESETS["tiny"])
+    images = torch.zeros(2, 3, 120, 160)
+    images[0, :, :40, :40] = images[1, :, :40, 40:80] = 1
+    first, second = vit.features(images)
+    assert not torch.allclose(first, second, atol=1e-4)
+
+
+def test_random_patches_are_distinct_and_seeded() -> None:
+    drawn = [
+        random_patches(PRESETS["tiny"], 50, 0.5, torch.Generator().manual_seed(1)) for _ in range(2)
+    ]
+    assert drawn[0].shape == (50, 6) and torch.equal(drawn[0], drawn[1])
+    assert all(len(set(row)) == 6 for row in drawn[0].tolist())
+    assert set(drawn[0].flatten().tolist()) == set(range(12))
+
+
+def test_impossible_width_is_refused() -> None:
+    with pytest.raises(UserError, match="divisible"):
+        ViTConfig(width=100, heads=3)
+
+
+# ---- InfoNCE
+
+
+def unit(n: int, d: int) -> torch.Tensor:
+    return F.normalize(torch.randn(n, d), dim=1)
+
+
+def test_info_nce_is_equation_1() -> None:
+    a, b = unit(5, 7), unit(5, 7)
+    expected = 0.0
+    for i in range(5):
+        scores = [math.exp(float(a[i] @ b[j]) / 0.2) for j in range(5)]
+        expected -= math.log(scores[i] / sum(scores)) / 5
+    assert info_nce(a, b, 0.2).item() == pytest.approx(expected, rel=1e-5)
+    back = info_nce(b, a, 0.2).item()
+    assert symmetric_info_nce(a, b, 0.2).item() == pytest.approx((expected + back) / 2, rel=1e-5)
+
+
+def test_multi_positive_is_the_mean_over_right_answers() -> None:
+    a, b = unit(4, 6), unit(4, 6)
+    eye = torch.eye(4, dtype=torch.bool)
+    torch.testing.assert_close(info_nce(a, b, 0.1, eye), info_nce(a, b, 0.1))
+    positives = eye.clone()
+    positives[0, 2] = True
+    log_p = (a @ b.T / 0.1).log_softmax(1)
+    rows = [(log_p[0, 0] + log_p[0, 2]) / 2, log_p[1, 1], log_p[2, 2], log_p[3, 3]]
+    torch.testing.assert_close(info_nce(a, b, 0.1, positives), -torch.stack(rows).mean())
+    both = (info_nce(a, b, 0.1, positives) + info_nce(b, a, 0.1, positives.T)) / 2
+    torch.testing.assert_close(symmetric_info_nce(a, b, 0.1, positives), both)
+
+
+@pytest.mark.parametrize("temperature", [0.2, 0.07])
+def test_floor_for_orthogonal_targets(temperature: float) -> None:
+    # by symmetry the best anchor is alpha e_i - beta sum_j e_j, whose margin is sqrt(n / (n - 1))
+    n = 16
+    margin = math.sqrt(n / (n - 1))
+    expected = math.log1p((n - 1) * math.exp(-margin / temperature))
+    assert loss_floor(torch.eye(n), temperature) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("grouped", [False, True])
+def test_floor_is_where_free_anchors_end(grouped: bool) -> None:
+    targets = F.normalize(unit(16, 12) + 0.3 * torch.ones(12), dim=1)
+    group = torch.arange(16) // 3
+    positives = group[:, None] == group if grouped else None
+    floor = loss_floor(targets, 0.2, positives)
+    anchors = targets.clone().requires_grad_()
+    optimiser = torch.optim.Adam([anchors], lr=0.03)
+    for _ in range(400):
+        optimiser.zero_grad()
+        loss = info_nce(F.normalize(anchors, dim=1), targets, 0.2, positives)
+        loss.backward()
+        optimiser.step()
+    assert floor - 1e-5 <= loss.item() < floor + 5e-3
+
+
+# ---- touch encoder
+
+
+def test_embeddings_are_unit_vectors_of_one_space(rng: np.random.Generator) -> None:
+    encoder, towers = make_encoder(), FakeTowers()
+    frames = rng.integers(0, 256, (70, 60, 80, 3)).astype(np.uint8)
+    touch = encoder.embed_frames(frames, frames[0])
+    assert touch.shape == (70, 16)
+    for rows in (
+        touch,
+        encoder.embed_text_goal(["soft", "a hard ball"], towers),
+        encoder.embed_image_goal(frames[:3], towers),
+    ):
+        np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1, rtol=1e-5)
+        assert rows.shape[1] == 16
+    one = encoder.embed_frames(frames[69:], frames[0])
+    np.testing.assert_allclose(one[0], touch[69], atol=1e-5)
+
+
+def test_towers_pretrained_together_keep_their_space() -> None:
+    encoder = make_encoder(pretrained_together=True)
+    embeddings = torch.randn(3, 12)
+    assert encoder.config.embedding_dim == 12
+    for project in (encoder.project_image, encoder.project_text):
+        torch.testing.assert_close(project(embeddings), F.normalize(embeddings, dim=1))
+    assert not any("image_head" in name or "text_head" in name for name in encoder.state_dict())
+
+
+def test_other_towers_are_refused() -> None:
+    other = FakeTowers()
+    other.name = "other"
+    with pytest.raises(UserError, match="trained with the towers fake, not other"):
+        make_encoder().embed_text_goal(["soft"], other)
+
+
+# ---- files
+
+
+def test_saved_encoder_is_the_same(tmp_path: Path) -> None:
+    encoder = make_encoder()
+    touch = torch.randn(8, 3, 120, 160)
+    pretrained.save(encoder, tmp_path / "full", {"seed": 3}, half=False)
+    full = pretrained.load(tmp_path / "full", sensor="gelsight_mini", towers="fake")
+    assert torch.equal(full.embed_touch(touch), encoder.embed_touch(touch))
+    assert full.config == encoder.config and not full.training
+    assert pretrained.read_provenance(tmp_path / "full") == {"seed": 3}
+
+    pretrained.save(encoder, tmp_path / "half", {})
+    half = pretrained.load(tmp_path / "half")
+    cosine = (half.embed_touch(touch) * encoder.embed_touch(touch)).sum(1)
+    assert (1 - cosine).max() < 1e-3
+    full_bytes, half_bytes = (
+        (tmp_path / name / "encoder.safetensors").stat().st_size for name in ("full", "half")
+    )
+    assert half_bytes < 0.6 * full_bytes
+
+
+def edit_json(directory: Path, change: Callable[[dict], object]) -> None:
+    path = directory / "encoder.json"
+    description = json.loads(path.read_text())
+    change(description)
+    path.write_text(json.dumps(description))
+
+
+def wrong_shape(directory: Path) -> None:
+    weights = load_file(directory / "encoder.safetensors")
+    weights["touch_head.weight"] = torch.zeros(16, 31)
+    save_file(weights, directory / "encoder.safetensors")
+
+
+def missing_tensor(directory: Path) -> None:
+    weights = load_file(directory / "encoder.safetensors")
+    del weights["text_head.weight"]
+    save_file(weights, directory / "encoder.safetensors")
+
+
+def cut_short(directory: Path) -> None:
+    path = directory / "encoder.safetensors"
+    path.write_bytes(path.read_bytes()[:1000])
+
+
+DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no json": (lambda d: (d / "encoder.json").unlink(), "no touch encoder.*train-encoder align"),
+    "no weights": (lambda d: (d / "encoder.safetensors").unlink(), "missing"),
+    "no json inside": (lambda d: (d / "encoder.json").write_text("{"), "damaged"),
+    "old preprocessor": (
+        lambda d: edit_json(d, lambda j: j["config"].update(preprocessor="gelsight_mini/v0")),
+        "gelsight_mini/v0, this is gelsight_mini/v1",
+    ),
+    "unknown sensor": (
+        lambda d: edit_json(d, lambda j: j["config"].update(sensor="nose")),
+        "unknown sensor 'nose'",
+    ),
+    "no such field": (
+        lambda d: edit_json(d, lambda j: j["config"].update(colour="red")),
+        "damaged.*colour",
+    ),
+    "future format": (lambda d: edit_json(d, lambda j: j.update(format=99)), "format 99"),
+    "wrong shape": (wrong_shape, r"touch_head.weight is \(16, 31\), not \(16, 32\)"),
+    "missing tensor": (missing_tensor, "text_head.weight is None"),
+    "cut short": (cut_short, "damaged"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_files_are_refused(tmp_path: Path, damage: str) -> None:
+    pretrained.save(make_encoder(), tmp_path, {})
+    spoil, message = DAMAGES[damage]
+    spoil(tmp_path)
+    with pytest.raises(UserError, match=message) as error:
+        pretrained.load(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_encoder_for_another_use_is_refused(tmp_path: Path) -> None:
+    pretrained.save(make_encoder(), tmp_path, {})
+    with pytest.raises(UserError, match="is for gelsight_mini, not digit"):
+        pretrained.load(tmp_path, sensor="digit")
+    with pytest.raises(UserError, match="with the towers fake, not offline"):
+        pretrained.load(tmp_path, towers="offline")

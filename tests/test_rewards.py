@@ -1,0 +1,389 @@
+"""Goals, embedding distances, the scale, curves and reports, on tiny encoders and drawn touches."""
+
+import csv
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
+from torch import Tensor
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.vocabulary import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT
+from touchgoal.encoders.touch_encoder import TouchEncoder, TouchEncoderConfig
+from touchgoal.encoders.vit import PRESETS
+from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.rewards.curves import Contact, Curves, Scale, first_contact, reward, with_fused
+from touchgoal.rewards.embedding_distance import (
+    EmbeddedEpisode,
+    EmbeddedGoal,
+    EpisodeEmbedder,
+    distances,
+    fit_scale,
+    measure,
+)
+from touchgoal.rewards.goals import (
+    EpisodeEnd,
+    FrameNumber,
+    LastFrame,
+    Modality,
+    PictureFile,
+    Sentence,
+    choose_goal,
+    parse_goal,
+)
+from touchgoal.rewards.report import write_report
+
+N, CONTACT = 40, 20
+ALL: tuple[Modality, ...] = ("image", "tactile", "text")
+
+# Embeddings are directions in the plane, so that a distance is 1 - cos of an angle: at the start
+# everything lies at 90 degrees, the goal picture at 0, a held apple at 30, its sentence at 60.
+
+
+def direction(degrees: Sequence[float] | Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
+    radians = np.radians(np.asarray(degrees))
+    return np.stack([np.cos(radians), np.sin(radians)], axis=-1).astype(np.float32)
+
+
+def embedded(name: str, touches: bool = True, jitter: float = 0.0) -> EmbeddedEpisode:
+    rng = np.random.default_rng(len(name))
+    held = np.arange(N) >= CONTACT if touches else np.zeros(N, bool)
+    felt = np.where(held, 30.0, 90.0) + jitter * rng.normal(size=(2, N))
+    return EmbeddedEpisode(
+        source=name,
+        fps=20.0,
+        contact=Contact(CONTACT if touches else None, "truth"),
+        space={"image": "a", "tactile": "b", "text": "b"},
+        image=direction(np.linspace(90, 0, N) + jitter * rng.normal(size=N)),
+        sides=(TACTILE_LEFT, TACTILE_RIGHT),
+        touch=direction(felt),
+        descriptions=direction([60.0]),
+        object="apple",
+        success=touches,
+    )
+
+
+def goal_of(episode: EmbeddedEpisode) -> EmbeddedGoal:
+    assert episode.touch is not None and episode.descriptions is not None
+    forms = {str(name): f"episode:{episode.source}#0" for name in ALL}
+    return EmbeddedGoal(forms, episode.image[-1], episode.touch[:, -1], episode.descriptions[0])
+
+
+class PaintTowers:
+    """Towers that see coarse colours and hear letters; no weights to load."""
+
+    image_dim = 48
+    text_dim = 8
+    pretrained_together = False
+
+    def __init__(self, name: str = "paint") -> None:
+        self.name = name
+
+    def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
+        n, h, w, _ = images.shape
+        coarse = images.reshape(n, 4, h // 4, 4, w // 4, 3).mean((2, 4)).reshape(n, -1)
+        return torch.from_numpy(coarse.astype(np.float32)) + 1
+
+    def embed_texts(self, texts: list[str]) -> Float[Tensor, "n d"]:
+        letters = [[text.count(c) + 0.5 for c in "aeioursl"] for text in texts]
+        return torch.tensor(letters)
+
+
+def recorded(n: int = 12, contact: int = 7, color: int = 200) -> Episode:
+    """A square that crosses the front picture; a bright blob on both gels from contact on."""
+    rng = np.random.default_rng(0)
+    front = np.full((n, 32, 32, 3), 60, np.uint8)
+    gel = rng.integers(90, 110, (240, 320, 3), dtype=np.uint8)
+    touch = np.repeat(gel[None], n, axis=0)
+    touch[contact:, 80:160, 100:200] = color
+    for t in range(n):
+        front[t, 12:20, 2 * t : 2 * t + 8] = (color, 30, 30)
+    touching = np.arange(n)[:, None] >= [contact, contact + 1]  # the left finger comes first
+    frames = {FRONT: front, TACTILE_LEFT: touch, TACTILE_RIGHT: touch[:, :, ::-1].copy()}
+    meta = {"object": "apple", "descriptions": ["hard and smooth", "round"], "success": True}
+    return Episode({**frames, TRUTH_CONTACT: touching}, "pick the apple", meta)
+
+
+@pytest.fixture(scope="module")
+def embedder() -> EpisodeEmbedder:
+    torch.manual_seed(0)
+    towers = PaintTowers()
+    config = TouchEncoderConfig.for_towers(PRESETS["tiny"], towers, "gelsight_mini", 16)
+    encoder = TouchEncoder(config)
+    return EpisodeEmbedder(towers, encoder)
+
+
+@pytest.mark.parametrize(
+    ("text", "goal"),
+    [
+        ("last", LastFrame()),
+        ("frame:0", FrameNumber(0)),
+        ("image:ends/cup.png", PictureFile(Path("ends/cup.png"))),
+        ("episode:data/a#b#12", EpisodeEnd(Path("data/a#b"), 12)),
+        ("text:hard, smooth: round", Sentence("hard, smooth: round")),
+    ],
+)
+def test_goal_is_read_and_written_back(text: str, goal: object) -> None:
+    assert parse_goal(text) == goal and str(goal) == text
+
+
+@pytest.mark.parametrize(
+    "text", ["", "lst", "frame:", "frame:-1", "frame:x", "image:", "episode:data", "text:  "]
+)
+def test_unknown_goal_lists_the_forms(text: str) -> None:
+    with pytest.raises(UserError, match="last, frame:K, image:PATH, episode:ROOT#K or text:SENT"):
+        parse_goal(text)
+
+
+def test_each_modality_takes_the_first_goal_that_speaks_for_it() -> None:
+    last, picture, words = LastFrame(), PictureFile(Path("a.png")), Sentence("soft")
+    chosen = choose_goal([picture, last, words], ALL)
+    assert (chosen.image, chosen.tactile, chosen.text) == (picture, last, words)
+    assert chosen.as_dict() == {"image": "image:a.png", "tactile": "last", "text": "text:soft"}
+    with pytest.raises(UserError, match="'image:a.png' is never used: 'last' before it"):
+        choose_goal([last, picture], ALL)
+    with pytest.raises(UserError, match="speaks for text, but this source has image only"):
+        choose_goal([last, words], ["image"])
+    with pytest.raises(UserError, match="no goal"):
+        choose_goal([], ALL)
+
+
+def test_distances_by_hand() -> None:
+    e = embedded("a")
+    raw = distances(e, goal_of(e))
+    assert raw["image"][[0, -1]] == pytest.approx([1, 0], abs=1e-6)
+    assert raw["tactile"][[0, -1]] == pytest.approx([1 - np.cos(np.pi / 3), 0], abs=1e-6)
+    assert raw["text"] == pytest.approx(np.full(N, 1 - np.cos(np.pi / 6)), abs=1e-6)
+    assert e.touch is not None
+    one_hand = replace(e, touch=np.stack([e.touch[0], np.repeat(direction([90]), N, axis=0)]))
+    mean = distances(one_hand, goal_of(e))["tactile"][-1]
+    assert mean == pytest.approx((1 - np.cos(np.pi / 3)) / 2, abs=1e-6)
+
+
+def test_scale_maps_the_usual_start_to_one_and_end_to_zero(tmp_path: Path) -> None:
+    training = [embedded("a" * (k + 1), jitter=1.0) for k in range(4)]
+    scale = fit_scale(training, ["image", "tactile"])
+    new = embedded("new episode", jitter=1.0)
+    curves = measure(new, goal_of(training[0]), replace_text(scale))
+    for name in ("image", "tactile", "image+tactile"):
+        assert curves.normalised[name][:3] == pytest.approx(np.ones(3), abs=0.1)
+        assert curves.normalised[name][-1] == pytest.approx(0, abs=0.1)
+    scale.save(tmp_path / "scale.json")
+    assert Scale.load(tmp_path / "scale.json") == scale
+    assert [p.name for p in tmp_path.iterdir()] == ["scale.json"]
+
+
+def replace_text(scale: Scale) -> Scale:
+    """The scale with an entry for text, which the drawn words cannot fit (their ends are alike)."""
+    return replace(
+        scale,
+        start=scale.start | {"text": 1.0},
+        goal=scale.goal | {"text": 0.0},
+        space=scale.space | {"text": "b"},
+    )
+
+
+def test_own_end_counts_as_one_goal_among_the_others() -> None:
+    """The five frames before the last lie at 8 8 4 2 2 and at 40 degrees, the goals at 0, 40."""
+    still = replace(embedded("a"), image=direction([90.0] * 34 + [8.0, 8.0, 4.0, 2.0, 2.0, 0.0]))
+    turned = replace(embedded("b"), image=direction([90.0] * 30 + [40.0] * 10))
+    scale = fit_scale([still, turned], ["image"])
+    ends = 1 - np.cos(np.radians([4, 36, 40, 0]))
+    assert scale.goal["image"] == pytest.approx(np.median(ends), abs=1e-6)
+    assert scale.start["image"] == pytest.approx((1 + 1 - np.cos(np.radians(50))) / 2, abs=1e-6)
+
+
+def test_touch_goals_are_ends_with_the_same_object() -> None:
+    apple = embedded("apple")
+    assert apple.touch is not None
+    pear = replace(apple, touch=-apple.touch, object="pear")
+    assert fit_scale([apple, pear], ["tactile"]).goal["tactile"] == pytest.approx(0, abs=1e-6)
+    with pytest.raises(UserError, match="nearer the goal in 50% of 4 pairs"):
+        fit_scale([apple, replace(pear, object="apple")], ["tactile"])
+
+
+def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
+    good = embedded("good")
+    lost = replace(good, touch=direction([[90.0] * 20 + [140.0] * 20] * 2))
+    held = replace(good, touch=direction([[90.0] * 20 + [60.0] * 20] * 2))
+    with pytest.raises(UserError, match="nearer the goal in 67% of 3 pairs"):
+        fit_scale([held, held, lost], ["text"])
+    misses = [embedded("a" * (k + 1), touches=False, jitter=1.0) for k in range(8)]
+    noise = [replace(miss, success=True) for miss in misses]
+    with pytest.raises(UserError, match="'text': the end is nearer the goal in 0%"):
+        fit_scale([good], ["text"])
+    with pytest.raises(UserError, match="'tactile'"):
+        fit_scale(noise, ["tactile"])
+    with pytest.raises(UserError, match="miss failed"):
+        fit_scale([good, embedded("miss", touches=False)], ["image"])
+    with pytest.raises(UserError, match="other encoders"):
+        fit_scale([good, replace(good, space={"image": "z"})], ["image"])
+    with pytest.raises(UserError, match="at least one"):
+        fit_scale([], ["image"])
+    scale = fit_scale([good], ["image"])
+    with pytest.raises(UserError, match="has no 'tactile'"):
+        measure(good, goal_of(good), scale)
+    with pytest.raises(UserError, match="was fitted for a, these curves come from z"):
+        scale.normalise({"image": np.ones(3)}, {"image": "z"})
+    (tmp_path / "broken.json").write_text("{")
+    with pytest.raises(UserError, match="is not a scale"):
+        Scale.load(tmp_path / "broken.json")
+    with pytest.raises(UserError, match="there is no scale"):
+        Scale.load(tmp_path / "none.json")
+
+
+def test_an_episode_that_never_touches_stays_away_from_the_goal() -> None:
+    """Its picture ends at the goal, its touch does not; its own last frame would hide that."""
+    training = [embedded("a" * (k + 1), jitter=1.0) for k in range(4)]
+    scale = replace_text(fit_scale(training, ["image", "tactile"]))
+    miss = embedded("never touches", touches=False, jitter=1.0)
+    other = measure(miss, goal_of(training[0]), scale).metrics()
+    assert other["image"].end < 0.1
+    assert other["tactile"].end > 0.9 and other["tactile"].t_drop_50 is None
+    assert other["image+tactile"].end > 0.4
+    assert measure(miss, goal_of(miss), scale).metrics()["image+tactile"].end < 0.1
+
+
+def test_a_modality_with_a_larger_range_does_not_win() -> None:
+    falling, flat = np.linspace(1, 0, 30), np.ones(30)
+    fused = with_fused({"image": falling, "text": flat})
+    assert list(fused) == ["image", "text", "image+text"]
+    assert fused["image+text"] == pytest.approx((falling + 1) / 2)
+    raw_ranges = Scale({"image": 0.3, "tactile": 1.9}, {"image": 0.2, "tactile": 0.1}, {}, {}, 1)
+    same = {"image": "a", "tactile": "b"}
+    raw = {"image": 0.2 + 0.1 * falling, "tactile": 0.1 + 1.8 * falling[::-1]}
+    both = with_fused(
+        replace(raw_ranges, space=same).normalise(raw, {"image": "a", "tactile": "b"})
+    )
+    assert both["image+tactile"] == pytest.approx(np.full(30, 0.5))
+
+
+def test_rewards() -> None:
+    d = np.array([1.0, 0.4, 0.6, 0.0])
+    assert reward(d, "state") == pytest.approx([-1.0, -0.4, -0.6, 0.0])
+    assert reward(d, "difference") == pytest.approx([0.0, 0.6, -0.2, 0.6])
+
+
+def test_contact_is_the_simulators_or_detected() -> None:
+    episode = recorded()
+    assert first_contact(episode) == Contact(7, "truth")
+    seen = {k: v for k, v in episode.frames.items() if k != TRUTH_CONTACT}
+    assert first_contact(replace(episode, frames=seen)) == Contact(7, "detected")
+    assert first_contact(replace(episode, frames={FRONT: seen[FRONT]})).known_from == "no touch"
+
+
+def test_episode_is_embedded_once_for_all_goals(embedder: EpisodeEmbedder) -> None:
+    e = embedder.embed_episode(recorded(), 20.0, "mine")
+    assert e.modalities == ALL and (e.object, e.success) == ("apple", True)
+    goal = choose_goal([LastFrame(), Sentence("hard and smooth")], e.modalities)
+    curves = measure(e, embedder.embed_goal(goal, e), None)
+    assert set(curves.raw) == set(ALL) and not curves.normalised
+    assert curves.raw["image"][-1] == pytest.approx(0, abs=1e-6)
+    assert np.ptp(curves.raw["tactile"][:7]) < 1e-6 < 1e-4 < curves.raw["tactile"][0]
+    assert curves.raw["tactile"][7:] == pytest.approx(np.zeros(5), abs=1e-6)
+    assert e.descriptions is not None and embedder.embed_goal(goal, e).text is not None
+    assert embedder.embed_goal(goal, e).text == pytest.approx(e.descriptions[0], abs=1e-6)
+
+    third = embedder.embed_goal(choose_goal([FrameNumber(3)], e.modalities), e)
+    assert distances(e, third)["image"].argmin() == 3
+    with pytest.raises(UserError, match="frames are 0 to 11"):
+        embedder.embed_goal(choose_goal([FrameNumber(12)], e.modalities), e)
+
+
+def test_goals_from_a_picture_and_from_another_episode(
+    embedder: EpisodeEmbedder, tmp_path: Path
+) -> None:
+    writer = EpisodeWriter(tmp_path / "set")
+    writer.append(recorded(color=160))
+    writer.append(recorded())
+    stored = EpisodeSet(tmp_path / "set").read(1)
+    other = embedder.embed_episode(stored, 20.0, "set#1")
+    mine = embedder.embed_episode(recorded(color=160), 20.0, "mine")
+    spec = parse_goal(f"episode:{tmp_path / 'set'}#1")
+    end = embedder.embed_goal(choose_goal([spec], ALL), mine)
+    assert other.touch is not None and end.touch is not None and end.image is not None
+    assert end.image == pytest.approx(other.image[-1], abs=1e-5)
+    assert end.touch == pytest.approx(other.touch[:, -1], abs=1e-5)
+    with pytest.raises(UserError, match="episodes 0 to 1"):
+        embedder.embed_goal(choose_goal([EpisodeEnd(tmp_path / "set", 2)], ALL), mine)
+
+    Image.fromarray(stored.frames[FRONT][-1]).save(tmp_path / "end.png")
+    picture = embedder.embed_goal(choose_goal([PictureFile(tmp_path / "end.png")], ALL), mine)
+    assert picture.touch is None and picture.image == pytest.approx(other.image[-1], abs=1e-5)
+    (tmp_path / "end.png").write_text("no picture")
+    with pytest.raises(UserError, match=r"end\.png cannot be read"):
+        PictureFile(tmp_path / "end.png").read()
+    with pytest.raises(UserError, match="does not exist"):
+        PictureFile(tmp_path / "none.png").read()
+
+
+def test_video_has_pictures_alone(embedder: EpisodeEmbedder) -> None:
+    frames = recorded().frames[FRONT]
+    episode = embedder.embed_episode(recorded(), 20.0, "mine")
+    for any_embedder in (embedder, EpisodeEmbedder(PaintTowers(), None)):
+        video = any_embedder.embed_video(frames, 30.0, "a.mp4")
+        goal = choose_goal([LastFrame()], video.modalities)
+        curves = measure(video, any_embedder.embed_goal(goal, video), None)
+        assert list(curves.values) == ["image"] and curves.contact.frame is None
+        of_episode = measure(episode, embedder.embed_goal(goal, episode), None)
+        assert curves.values["image"] == pytest.approx(of_episode.values["image"])
+        assert curves.values["image"][0] > 0.01
+
+
+def test_what_cannot_be_embedded_is_refused(embedder: EpisodeEmbedder) -> None:
+    encoder = TouchEncoder(
+        TouchEncoderConfig.for_towers(PRESETS["tiny"], PaintTowers("oil"), "gelsight_mini", 16)
+    )
+    with pytest.raises(UserError, match="trained with the towers oil, not paint"):
+        EpisodeEmbedder(PaintTowers(), encoder)
+    with pytest.raises(UserError, match="starts in contact"):
+        embedder.embed_episode(recorded(contact=2), 20.0, "mine")
+    touch_alone = {k: v for k, v in recorded().frames.items() if k != FRONT}
+    with pytest.raises(UserError, match="choose another camera"):
+        embedder.embed_episode(replace(recorded(), frames=touch_alone), 20.0, "mine")
+
+
+def test_report_holds_the_curves(tmp_path: Path) -> None:
+    fall = np.linspace(1, 0, 30)
+    raw = {"image": 0.3 * fall, "tactile": 0.5 * fall}
+    curves = Curves(
+        source="a $ path$ #3",
+        goal={"image": "last", "tactile": "last"},
+        fps=20.0,
+        contact=Contact(12, "truth"),
+        raw=raw,
+        normalised=with_fused({"image": fall, "tactile": fall**2}),
+    )
+    paths = write_report(curves, tmp_path / "out", "ep3", {"encoder": "tiny"})
+    with Image.open(paths["png"]) as picture:
+        assert picture.size == (1200, 700)
+    with paths["csv"].open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(r["time_s"]) for r in rows] == pytest.approx(np.arange(30) / 20)
+    fused = [float(r["image+tactile"]) for r in rows]
+    assert fused == pytest.approx((fall + fall**2) / 2, abs=1e-6)
+    assert [float(r["raw_image"]) for r in rows] == pytest.approx(raw["image"], abs=1e-6)
+    content = json.loads(paths["json"].read_text())
+    assert content["metrics"]["tactile"]["contact_lag"] == curves.metrics()["tactile"].contact_lag
+    assert content["provenance"] == {"encoder": "tiny"} and content["contact"]["frame"] == 12
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        "ep3.csv",
+        "ep3.json",
+        "ep3.png",
+    ]
+    first = paths["png"].read_bytes()
+    assert write_report(curves, tmp_path, "ep3", {})["png"].read_bytes() == first
+
+
+def test_reports_need_no_torch() -> None:
+    code = "import sys, touchgoal.rewards.report; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

