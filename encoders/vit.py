@@ -116,7 +116,7 @@ class ViT(nn.Module):
         for name, weight in self.named_parameters():
             if name.endswith((".out.weight", ".mlp_out.weight")):
                 # keeps the variance of the residual stream independent of depth, as in GPT-2
-                nn.init.trunc_normal_(weight, std=0.02 / math.sqrt(2 * c.depth))
+                nn.init.xavier_uniform_(weight, gain=1 / math.sqrt(2 * c.depth))
 
     def patchify(self, images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b n d"]:
         """Patch embeddings with positions, row by row, without the class token."""
@@ -168,7 +168,7 @@ def random_patches(
 
 def _initialise(module: nn.Module) -> None:
     if isinstance(module, nn.Linear):
-        nn.init.trunc_normal_(module.weight, std=0.02)
+        nn.init.xavier_uniform_(module.weight)  # as MAE: right for narrow trunks as for wide ones
         nn.init.zeros_(module.bias)
     elif isinstance(module, nn.Conv2d) and module.bias is not None:
         fan_in = module.weight[0].numel()

@@ -81,17 +81,23 @@ class Curves:
         return {name: measure_curve(d, self.contact.frame) for name, d in self.values.items()}
 
 
+def yardstick(modality: str, own: bool) -> str:
+    """Name of what a distance is scaled by: "image", or "own image" for a goal in the episode."""
+    return f"own {modality}" if own else modality
+
+
 @dataclass(frozen=True)
 class Scale:
-    """Where successful training episodes start and end, per modality, in raw cosine distance.
+    """Where successful training episodes start and end, in raw cosine distance.
 
-    n(d) = (d - goal) / (start - goal): 1 at the usual start, 0 at the usual end.
+    n(d) = (d - goal) / (start - goal): 1 at the usual start, 0 at the usual end. There is one pair
+    of medians for each `yardstick`: a modality, with goals from elsewhere or from the own episode.
 
     Attributes:
         start: median raw distance of the start of a training episode to a goal.
         goal: the same for its end.
         separated: share of (episode, goal) pairs whose end is nearer the goal than its start.
-        space: what made the embeddings.
+        space: what made the embeddings, by modality.
         episodes: number of training episodes.
     """
 
@@ -102,22 +108,33 @@ class Scale:
     episodes: int
 
     def normalise(
-        self, raw: Mapping[str, Float[np.ndarray, " n"]], space: Mapping[str, str]
+        self,
+        raw: Mapping[str, Float[np.ndarray, " n"]],
+        space: Mapping[str, str],
+        own: frozenset[str],
     ) -> dict[str, Float[np.ndarray, " n"]]:
         """Raw distances by modality -> normalised ones.
+
+        Args:
+            raw: distances by modality.
+            space: what made the embeddings, by modality.
+            own: modalities whose goal is a frame of the measured episode itself.
 
         Raises:
             UserError: a modality that was not fitted, or was fitted for other encoders.
         """
-        for m in raw:
-            if m not in self.start:
-                raise UserError(f"the scale has no '{m}', only {list(self.start)}; fit it again")
+        normalised = {}
+        for m, d in raw.items():
+            name = yardstick(m, m in own)
+            if name not in self.start:
+                raise UserError(f"the scale has no '{name}', only {list(self.start)}; fit it again")
             if self.space[m] != space[m]:
                 raise UserError(
                     f"the scale of '{m}' was fitted for {self.space[m]}, these curves come from "
                     f"{space[m]}; fit it again with these encoders and this camera"
                 )
-        return {m: (d - self.goal[m]) / (self.start[m] - self.goal[m]) for m, d in raw.items()}
+            normalised[m] = (d - self.goal[name]) / (self.start[name] - self.goal[name])
+        return normalised
 
     def save(self, path: Path) -> None:
         """Write JSON, atomically."""

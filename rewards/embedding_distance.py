@@ -32,6 +32,7 @@ from touchgoal.rewards.curves import (
     first_contact,
     touch_background,
     with_fused,
+    yardstick,
 )
 from touchgoal.rewards.goals import (
     EpisodeEnd,
@@ -94,9 +95,15 @@ class EmbeddedEpisode:
 
 @dataclass(frozen=True)
 class EmbeddedGoal:
-    """A goal as unit embeddings, one per modality that has a goal; `forms` are the user's words."""
+    """A goal as unit embeddings, one per modality that has a goal.
+
+    Attributes:
+        forms: the user's words, by modality.
+        own: modalities whose goal is a frame of the measured trajectory itself.
+    """
 
     forms: Mapping[str, str]
+    own: frozenset[str]
     image: Float32[np.ndarray, " d"] | None = None
     touch: Float32[np.ndarray, "sides k"] | None = None
     text: Float32[np.ndarray, " k"] | None = None
@@ -131,6 +138,11 @@ class EpisodeEmbedder:
             encoder.check_towers(towers)
             encoder.eval()
             self._space |= dict.fromkeys(("tactile", "text"), _fingerprint(encoder))
+
+    @property
+    def space(self) -> Mapping[str, str]:
+        """What makes the embeddings, by modality."""
+        return self._space
 
     def embed_episode(self, episode: Episode, fps: float, source: str) -> EmbeddedEpisode:
         """Embed the camera and every fingertip of an episode.
@@ -181,7 +193,7 @@ class EpisodeEmbedder:
         image = None if goal.image is None else self._goal_picture(goal.image, own)
         touch = None if goal.tactile is None else self._goal_touch(goal.tactile, own)
         text = None if goal.text is None else self._embed_sentences([goal.text.text])[0]
-        return EmbeddedGoal(goal.as_dict(), image, touch, text)
+        return EmbeddedGoal(goal.as_dict(), goal.own, image, touch, text)
 
     def _goal_picture(
         self, spec: LastFrame | FrameNumber | PictureFile | EpisodeEnd, own: EmbeddedEpisode
@@ -240,18 +252,18 @@ def measure(episode: EmbeddedEpisode, goal: EmbeddedGoal, scale: Scale | None) -
         UserError: the scale lacks a modality or was fitted for other encoders.
     """
     raw = distances(episode, goal)
-    normalised = {} if scale is None else with_fused(scale.normalise(raw, episode.space))
+    normalised = {} if scale is None else with_fused(scale.normalise(raw, episode.space, goal.own))
     return Curves(episode.source, goal.forms, episode.fps, episode.contact, raw, normalised)
 
 
 def fit_scale(episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Modality]) -> Scale:
     """Fit the scale on successful training episodes.
 
-    Each episode is measured against these goals, its own end among them: for image the last frame
-    of every episode; for tactile the last frame of every episode with the same object; for text
-    every sentence about its own object. The last frame is never measured itself, or an episode's
-    own goal would count as distance 0: the 5 frames before it stand for the end, the first 5 for
-    the start.
+    Each episode is measured against two kinds of goal, because its own end is much nearer than
+    anybody else's: its own last frame; and for image the last frame of every other episode, for
+    tactile that of every other episode with the same object, for text every sentence about its
+    object. The last frame is never measured itself, or an episode's own goal would count as
+    distance 0: the 5 frames before it stand for the end, the first 5 for the start.
 
     Raises:
         UserError: no episode, a failed or too short one, one of another space, or a modality that
@@ -260,20 +272,31 @@ def fit_scale(episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Modality
     _check_training(episodes, modalities)
     start, goal, separated = {}, {}, {}
     for modality in modalities:
-        starts, ends = _training_distances(episodes, modality)
-        share = float(np.mean(ends < starts))
-        start[modality], goal[modality] = float(np.median(starts)), float(np.median(ends))
-        separated[modality] = share
-        if share < MIN_SEPARATED or start[modality] - goal[modality] < MIN_GAP:
-            raise UserError(
-                f"the training episodes do not separate start from end in '{modality}': the end "
-                f"is nearer the goal in {share:.0%} of {len(starts)} pairs (needed "
-                f"{MIN_SEPARATED:.0%}), median distance {start[modality]:.4f} at the start and "
-                f"{goal[modality]:.4f} at the end; leave '{modality}' out, or take episodes that "
-                f"end in the goal state and an encoder trained for them"
-            )
+        for own in (False, True) if modality != "text" else (False,):
+            starts, ends = _training_distances(episodes, modality, own)
+            name = yardstick(modality, own)
+            separated[name] = _check_separation(name, starts, ends)
+            start[name], goal[name] = float(np.median(starts)), float(np.median(ends))
     space = {m: episodes[0].space[m] for m in modalities}
     return Scale(start, goal, separated, space, len(episodes))
+
+
+def _check_separation(
+    name: str, starts: Float[np.ndarray, " pairs"], ends: Float[np.ndarray, " pairs"]
+) -> float:
+    """Share of pairs whose end is nearer than its start; UserError if too few to scale by."""
+    if not len(starts):
+        raise UserError(f"no two training episodes share an object, so '{name}' has no scale")
+    share = float(np.mean(ends < starts))
+    start, end = float(np.median(starts)), float(np.median(ends))
+    if share < MIN_SEPARATED or start - end < MIN_GAP:
+        raise UserError(
+            f"the training episodes do not separate start from end in '{name}': the end is nearer "
+            f"the goal in {share:.0%} of {len(starts)} pairs (needed {MIN_SEPARATED:.0%}), median "
+            f"distance {start:.4f} at the start and {end:.4f} at the end; leave '{name}' out, or "
+            f"take episodes that end in the goal state and an encoder trained for them"
+        )
+    return share
 
 
 def _check_training(episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Modality]) -> None:
@@ -300,23 +323,26 @@ def _check_training(episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Mo
 
 
 def _training_distances(
-    episodes: Sequence[EmbeddedEpisode], modality: Modality
+    episodes: Sequence[EmbeddedEpisode], modality: Modality, own: bool
 ) -> tuple[Float[np.ndarray, " pairs"], Float[np.ndarray, " pairs"]]:
     """Raw distance of the start and of the end of each training episode to each of its goals."""
     starts, ends = [], []
-    pictures = np.stack([e.image[-1] for e in episodes])
     for e in episodes:
+        goals = [o for o in episodes if (o is e) == own]
+        if modality == "tactile":
+            goals = [o for o in goals if o.object == e.object]
+        if not goals and modality != "text":
+            continue
         if modality == "image":
-            d = _to_pictures(e.image, pictures)
+            d = _to_pictures(e.image, np.stack([o.image[-1] for o in goals]))
         elif modality == "tactile":
-            touches = [_touch(o)[:, -1] for o in episodes if o.object == e.object]
-            d = _to_touches(_touch(e), np.stack(touches))
+            d = _to_touches(_touch(e), np.stack([_touch(o)[:, -1] for o in goals]))
         else:
             assert e.descriptions is not None  # checked with the training episodes
             d = _to_sentences(_touch(e), e.descriptions)
         starts.append(np.median(d[:START_FRAMES], axis=0))
         ends.append(np.median(d[-1 - END_FRAMES : -1], axis=0))
-    return np.concatenate(starts), np.concatenate(ends)
+    return np.concatenate([[], *starts]), np.concatenate([[], *ends])
 
 
 def _touch(episode: EmbeddedEpisode) -> Float32[np.ndarray, "sides n k"]:

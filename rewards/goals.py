@@ -146,6 +146,13 @@ class Goal:
     tactile: LastFrame | FrameNumber | EpisodeEnd | None = None
     text: Sentence | None = None
 
+    @property
+    def own(self) -> frozenset[str]:
+        """Modalities whose goal is a frame of the measured episode itself."""
+        return frozenset(
+            m for m in MODALITIES if isinstance(getattr(self, m), LastFrame | FrameNumber)
+        )
+
     def as_dict(self) -> dict[str, str]:
         """The goal of each modality that has one, in the form a user writes."""
         specs = {name: getattr(self, name) for name in MODALITIES}

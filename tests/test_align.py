@@ -52,18 +52,19 @@ class FakeTowers:
 
 
 def make_touches(per_object: int, seed: int) -> Touches:
-    """One episode of each object; a third of the touches is idle; each object has its grating."""
+    """One episode of each object; a third of the touches is idle; each object has its own dent."""
     rng = np.random.default_rng(seed)
     names = list(DESCRIPTIONS)
     frames, objects, episode = [], [], []
     background = np.full((60, 80, 3), 100, np.uint8)
-    x = np.arange(80)
+    y, x = np.mgrid[:60, :80]
     for e in range(len(names)):
         for i in range(per_object):
             frame = background + rng.normal(0, 1, (60, 80, 3))
             if i % 3:
-                wave = 20 * np.sin(2 * np.pi * (x / (8, 20, 45)[e] + rng.uniform()))
-                frame[:, :, e] += wave
+                place, radius = rng.uniform((15, 15), (45, 65)), (4, 8, 16)[e]
+                distance2 = (y - place[0]) ** 2 + (x - place[1]) ** 2
+                frame[:, :, e] += 60 * np.exp(-distance2 / radius**2)
             frames.append(frame.round().astype(np.uint8))
             objects.append(names[e] if i % 3 else "")
             episode.append(e)
@@ -193,48 +194,51 @@ def test_paper_preset_is_equation_2() -> None:
 
 
 def test_one_batch_can_be_learned_by_heart(tmp_path: Path) -> None:
-    # 16 touches, 24 epochs of a single step each
+    # 15 touches: every epoch is a single step
     touches = make_touches(5, 0)
-    config = replace(CONFIG, epochs=60, batch_size=64, augmentation=Augmentation(), token_share=1.0)
-    encoder = align(touches, touches, FakeTowers(), config, tmp_path)
+    config = replace(CONFIG, epochs=40, batch_size=64, augmentation=Augmentation(), token_share=1.0)
+    encoder = align(touches, touches, FakeTowers(), config, tmp_path, {})
     history = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     best = max(m["touch_to_text_map"] + m["touch_to_image_map"] for m in history)
     assert best > 1.98
     assert history[-1]["touch_to_text_top1"] == history[-1]["touch_to_image_top1"] == 1
     assert history[-1]["idle_accuracy"] == 1
-    for modality in ("text", "image"):
+    # a touch cannot know which of its object's sentences is drawn, hence the wider margin
+    for modality, margin in (("text", 0.3), ("image", 0.1)):
         loss, floor = (history[-1][f"touch_to_{modality}_{k}"] for k in ("loss", "floor"))
-        assert floor - 1e-4 <= loss < floor + 0.1
+        assert floor - 1e-4 <= loss < floor + margin
     text = encoder.embed_text_goal(["a hard round ball", "a soft woven cloth"], FakeTowers())
     ball = encoder.embed_frames(touches.frames[1:2], touches.background[0])
     assert (ball @ text[0]).item() > (ball @ text[1]).item() + 0.3
 
 
 def test_what_is_returned_is_what_is_saved(tmp_path: Path) -> None:
-    encoder = align(TRAIN, VAL, FakeTowers(), replace(CONFIG, epochs=1), tmp_path)
+    encoder = align(TRAIN, VAL, FakeTowers(), replace(CONFIG, epochs=1), tmp_path, {"data": "toy"})
     saved = pretrained.load(tmp_path / "encoder", sensor="gelsight_mini", towers="fake")
     assert torch.equal(weights(saved), weights(encoder))
     provenance = pretrained.read_provenance(tmp_path / "encoder")
-    assert provenance["align"]["seed"] == 0 and provenance["touches"]["train"] == 36
+    assert (
+        provenance["data"] == "toy"
+        and provenance["align"]["seed"] == 0
+        and provenance["touches"]["train"] == 36
+    )
     assert provenance["metrics"]["chance_top1"] == pytest.approx(1 / 3)
 
 
 def test_same_seed_same_weights(tmp_path: Path) -> None:
     config = replace(CONFIG, epochs=1)
-    state = torch.random.get_rng_state()
     finals = []
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        align(TRAIN, VAL, FakeTowers(), replace(config, seed=seed), tmp_path / name)
+        align(TRAIN, VAL, FakeTowers(), replace(config, seed=seed), tmp_path / name, {})
         finals.append(final_weights(tmp_path / name))
         torch.rand(1)  # what others draw in between must not matter
     assert torch.equal(finals[0], finals[1]) and not torch.equal(finals[0], finals[2])
-    torch.random.set_rng_state(state)
 
 
 def test_killed_and_resumed_is_bit_identical(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "whole")
+    align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "whole", {})
     evaluate = align_module.evaluate
     calls = iter([evaluate])
 
@@ -246,10 +250,10 @@ def test_killed_and_resumed_is_bit_identical(
 
     monkeypatch.setattr(align_module, "evaluate", killed_in_second_epoch)
     with pytest.raises(KeyboardInterrupt):
-        align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "parts")
+        align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "parts", {})
     monkeypatch.undo()
     torch.set_num_threads(1)
-    align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "parts", resume=True)
+    align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "parts", {}, resume=True)
     assert torch.equal(final_weights(tmp_path / "parts"), final_weights(tmp_path / "whole"))
     for name in ("metrics.jsonl", "encoder/encoder.safetensors", "encoder/encoder.json"):
         assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
@@ -257,7 +261,7 @@ def test_killed_and_resumed_is_bit_identical(
 
 def test_paper_preset_runs_with_towers_pretrained_together(tmp_path: Path) -> None:
     paper = replace(PRESETS["paper"], vit="tiny", epochs=1, batch_size=8, device="cpu")
-    encoder = align(TRAIN, VAL, FakeTowers(pretrained_together=True), paper, tmp_path)
+    encoder = align(TRAIN, VAL, FakeTowers(pretrained_together=True), paper, tmp_path, {})
     assert encoder.config.embedding_dim == 26 and encoder.image_head is None
     (line,) = (tmp_path / "metrics.jsonl").read_text().splitlines()
     metrics = json.loads(line)
@@ -267,7 +271,7 @@ def test_paper_preset_runs_with_towers_pretrained_together(tmp_path: Path) -> No
 
 def test_bad_directories_and_configs_are_refused(tmp_path: Path) -> None:
     def start(config: AlignConfig = CONFIG, resume: bool = False) -> Callable[[], TouchEncoder]:
-        return lambda: align(TRAIN, VAL, FakeTowers(), config, tmp_path, resume)
+        return lambda: align(TRAIN, VAL, FakeTowers(), config, tmp_path, {}, resume)
 
     for message, call in (
         ("nothing to resume", start(resume=True)),

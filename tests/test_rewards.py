@@ -75,7 +75,8 @@ def embedded(name: str, touches: bool = True, jitter: float = 0.0) -> EmbeddedEp
 def goal_of(episode: EmbeddedEpisode) -> EmbeddedGoal:
     assert episode.touch is not None and episode.descriptions is not None
     forms = {str(name): f"episode:{episode.source}#0" for name in ALL}
-    return EmbeddedGoal(forms, episode.image[-1], episode.touch[:, -1], episode.descriptions[0])
+    ends = episode.image[-1], episode.touch[:, -1], episode.descriptions[0]
+    return EmbeddedGoal(forms, frozenset(), *ends)
 
 
 class PaintTowers:
@@ -192,23 +193,30 @@ def replace_text(scale: Scale) -> Scale:
     )
 
 
-def test_own_end_counts_as_one_goal_among_the_others() -> None:
+def test_own_ends_and_those_of_others_have_their_own_medians() -> None:
     """The five frames before the last lie at 8 8 4 2 2 and at 40 degrees, the goals at 0, 40."""
     still = replace(embedded("a"), image=direction([90.0] * 34 + [8.0, 8.0, 4.0, 2.0, 2.0, 0.0]))
     turned = replace(embedded("b"), image=direction([90.0] * 30 + [40.0] * 10))
     scale = fit_scale([still, turned], ["image"])
-    ends = 1 - np.cos(np.radians([4, 36, 40, 0]))
-    assert scale.goal["image"] == pytest.approx(np.median(ends), abs=1e-6)
-    assert scale.start["image"] == pytest.approx((1 + 1 - np.cos(np.radians(50))) / 2, abs=1e-6)
+
+    def median(*degrees: float) -> object:
+        return pytest.approx(np.median(1 - np.cos(np.radians(degrees))), abs=1e-6)
+
+    assert scale.start == {"image": median(50, 90), "own image": median(90, 50)}
+    assert scale.goal == {"image": median(36, 40), "own image": median(4, 0)}
+    assert measure(still, replace(goal_of(still), own=frozenset(ALL), touch=None, text=None), scale)
 
 
 def test_touch_goals_are_ends_with_the_same_object() -> None:
     apple = embedded("apple")
     assert apple.touch is not None
     pear = replace(apple, touch=-apple.touch, object="pear")
-    assert fit_scale([apple, pear], ["tactile"]).goal["tactile"] == pytest.approx(0, abs=1e-6)
-    with pytest.raises(UserError, match="nearer the goal in 50% of 4 pairs"):
+    scale = fit_scale([apple, replace(apple), pear], ["tactile"])
+    assert scale.goal["tactile"] == pytest.approx(0, abs=1e-6)
+    with pytest.raises(UserError, match="nearer the goal in 0% of 2 pairs"):
         fit_scale([apple, replace(pear, object="apple")], ["tactile"])
+    with pytest.raises(UserError, match="no two training episodes share an object"):
+        fit_scale([apple, pear], ["tactile"])
 
 
 def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
@@ -229,11 +237,11 @@ def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
         fit_scale([good, replace(good, space={"image": "z"})], ["image"])
     with pytest.raises(UserError, match="at least one"):
         fit_scale([], ["image"])
-    scale = fit_scale([good], ["image"])
+    scale = fit_scale([good, replace(good)], ["image"])
     with pytest.raises(UserError, match="has no 'tactile'"):
         measure(good, goal_of(good), scale)
     with pytest.raises(UserError, match="was fitted for a, these curves come from z"):
-        scale.normalise({"image": np.ones(3)}, {"image": "z"})
+        scale.normalise({"image": np.ones(3)}, {"image": "z"}, frozenset())
     (tmp_path / "broken.json").write_text("{")
     with pytest.raises(UserError, match="is not a scale"):
         Scale.load(tmp_path / "broken.json")
@@ -262,7 +270,7 @@ def test_a_modality_with_a_larger_range_does_not_win() -> None:
     same = {"image": "a", "tactile": "b"}
     raw = {"image": 0.2 + 0.1 * falling, "tactile": 0.1 + 1.8 * falling[::-1]}
     both = with_fused(
-        replace(raw_ranges, space=same).normalise(raw, {"image": "a", "tactile": "b"})
+        replace(raw_ranges, space=same).normalise(raw, same, frozenset())
     )
     assert both["image+tactile"] == pytest.approx(np.full(30, 0.5))
 
