@@ -37,7 +37,7 @@ SENTENCES = {
     "yarn_ball": "a ball wrapped in woven thread",
     "wooden_block": "a solid plank with fine grooves",
     "brick": "a gritty hard slab of stone",
-    "eraser": "soft flat rubber without any pattern",
+    "cushion": "a flat squashy pad of fabric",
     "toy_brick": "a plastic block covered with studs",
     "soda_can": "a slick metal cylinder",
     "bottle_cap": "a round lid with grip ridges around it",

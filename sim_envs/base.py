@@ -195,12 +195,12 @@ class FrankaTactileEnv(gym.Env[Observation, np.ndarray], ABC):
         self.model.actuator_forcerange[self._gripper, 0] = -2 * self.grasp_force
         self.model.actuator_forcerange[self._gripper, 1] = GRIPPER_MAX_FORCE
         for k in range(1, setpoints + 1):
-            self._opening += np.clip(width / 2 - self._opening, -travel, travel)
+            self._opening += min(max(width / 2 - self._opening, -travel), travel)
             self.data.ctrl[:7] = start + (self.command - start) * (k / setpoints)
             self.data.ctrl[self._gripper] = self._opening
             mujoco.mj_step(self.model, self.data, nstep=steps)
         mujoco.mj_forward(self.model, self.data)
-        self._contacts = self._reader.pads(self.data)
+        self._contacts, self._external = self._reader.read(self.data)
 
     def _observe(self) -> Observation:
         data = self.data
@@ -210,7 +210,7 @@ class FrankaTactileEnv(gym.Env[Observation, np.ndarray], ABC):
         values = {
             v.STATE: np.concatenate([data.qpos[self._arm], data.qvel[self._arm_dof], [width]]),
             v.TCP_POSE: np.concatenate([data.site_xpos[self._tcp], quat]),
-            v.WRENCH: self._reader.external_wrench(data),
+            v.WRENCH: self._external,
         }
         observation = {key: value.astype(np.float32) for key, value in values.items()}
         if self._renderer is not None:

@@ -108,6 +108,8 @@ def _material(
 
 _S, _RI, _D, _RO, _W = Texture.SMOOTH, Texture.RIBBED, Texture.DOTTED, Texture.ROUGH, Texture.WOVEN
 
+# Each can be felt: no smooth flat face here, for one larger than the gel presses it evenly, and a
+# GelSight, which sees slopes, shows nothing.
 CATALOGUE: dict[str, ObjectKind] = {
     kind.name: kind
     for kind in (
@@ -166,13 +168,13 @@ CATALOGUE: dict[str, ObjectKind] = {
             "a rough flat face that does not give",
         ),
         _kind(
-            "eraser",
+            "cushion",
             "box",
-            _material(_S, 0.0, 1.0, SOFT, 1.0, 0.93, 0.6, 0.68),
-            "a soft smooth flat eraser",
-            "flat, smooth and rubbery soft",
-            "a squishy block with a smooth face",
-            "a soft rubber slab without texture",
+            _material(_W, 90.0, 2.4, SOFT, 1.0, 0.93, 0.6, 0.68),
+            "a soft flat cushion of woven cloth",
+            "flat and soft with a textile weave",
+            "a squishy pad covered in fabric",
+            "a soft woven flat face",
         ),
         _kind(
             "toy_brick",
@@ -293,13 +295,6 @@ CATALOGUE: dict[str, ObjectKind] = {
         ),
     )
 }
-
-NO_CONTACT_DESCRIPTIONS = (
-    "nothing touches the sensor",
-    "an untouched gel, no contact",
-    "the fingertip feels nothing",
-    "no object in the hand",
-)
 
 # Ranges of half extents, m: what the hand can span (8 cm) and the case can get around on a table.
 _SIZES: dict[Shape, tuple[tuple[float, float], ...]] = {

@@ -9,7 +9,6 @@ import math
 from dataclasses import dataclass
 from typing import no_type_check
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 from numba import njit
@@ -195,13 +194,10 @@ _NOISE = np.random.default_rng(20260101).uniform(-1.6, 1.6, (32, 32, 32)).astype
 
 @njit(cache=True, fastmath=True)
 @no_type_check
-def _texture(height, step, below, pitch, texture, amplitude, k, position, rotation, noise, out):
+def _add_texture(height, below, pitch, texture, amplitude, k, position, rotation, noise):
     rows, columns = height.shape
-    for a in range(out.shape[0]):
-        i = a * step
-        for b in range(out.shape[1]):
-            j = b * step
-            out[a, b] = 0.0
+    for i in range(rows):
+        for j in range(columns):
             if height[i, j] > below:
                 px = (j - 0.5 * (columns - 1)) * pitch - position[0]
                 py = (i - 0.5 * (rows - 1)) * pitch - position[1]
@@ -209,7 +205,7 @@ def _texture(height, step, below, pitch, texture, amplitude, k, position, rotati
                 x = rotation[0, 0] * px + rotation[1, 0] * py + rotation[2, 0] * pz
                 y = rotation[0, 1] * px + rotation[1, 1] * py + rotation[2, 1] * pz
                 z = rotation[0, 2] * px + rotation[1, 2] * py + rotation[2, 2] * pz
-                out[a, b] = amplitude * _pattern(texture, x, y, z, k, noise)
+                height[i, j] += amplitude * _pattern(texture, x, y, z, k, noise)
 
 
 def add_texture(
@@ -222,19 +218,10 @@ def add_texture(
     position: Float[np.ndarray, "3"],
     rotation: Float[np.ndarray, "3 3"],
 ) -> None:
-    """Add a surface pattern in place, where the surface lies higher than `below` m.
-
-    Evaluated on every second pixel: no pattern here is finer than twelve of those.
-    """
-    if texture == 0 or amplitude == 0:
-        return
-    step, k = 2, 2 * math.pi / wavelength
-    rows, columns = height.shape
-    half = np.empty((rows // step, columns // step), np.float32)
-    _texture(
-        height, step, below, pitch, texture, amplitude, k, position, rotation, _NOISE, half
-    )
-    height += cv2.resize(half, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    """Add a surface pattern in place, where the surface lies higher than `below` m."""
+    if texture and amplitude > 0:
+        k = 2 * math.pi / wavelength
+        _add_texture(height, below, pitch, texture, amplitude, k, position, rotation, _NOISE)
 
 
 @njit(cache=True, fastmath=True)

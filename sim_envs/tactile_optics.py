@@ -39,9 +39,9 @@ class Unit:
         noise: tile of camera noise in counts, larger than the image by 64 pixels.
     """
 
-    background: Float32[np.ndarray, "h w 3"]
-    gain: Float32[np.ndarray, "h w 3"]
-    noise: Float32[np.ndarray, "h2 w2 3"]
+    background: Float32[np.ndarray, "3 h w"]
+    gain: Float32[np.ndarray, "3 h w"]
+    noise: Float32[np.ndarray, "3 h2 w2"]
 
 
 def sample_unit(shape: tuple[int, int], rng: np.random.Generator) -> Unit:
@@ -62,7 +62,8 @@ def sample_unit(shape: tuple[int, int], rng: np.random.Generator) -> Unit:
     gain = (0.75 + 0.5 * np.stack([v, 1 - u, 1 - v], -1)) * (1 + 0.05 * rng.normal(size=3))
     tile = (h + _NOISE_MARGIN, w + _NOISE_MARGIN, 3)
     noise = 0.97 * (0.6 * rng.normal(size=(*tile[:2], 1)) + 0.8 * rng.normal(size=tile))
-    return Unit(*(a.astype(np.float32) for a in (background, gain, noise)))
+    planar = (np.moveaxis(a, -1, 0) for a in (background, gain, noise))
+    return Unit(*(np.ascontiguousarray(a, np.float32) for a in planar))
 
 
 def deform(raw: HeightField, pitch: float) -> HeightField:
@@ -83,12 +84,13 @@ def deform(raw: HeightField, pitch: float) -> HeightField:
         smooth = np.where(contact, low, blurred)
     smooth = cv2.GaussianBlur(smooth, (5, 5), 0)  # the constraint's edge is no edge of the gel
     soft = cv2.GaussianBlur((low > 0).astype(np.float32), (5, 5), 0)
-    stack = cv2.resize(np.stack([smooth, low, soft], -1), (w, h), interpolation=cv2.INTER_LINEAR)
-    surface = stack[..., 0] + stack[..., 2] * (raw - stack[..., 1])
-    return cv2.GaussianBlur(surface, (3, 3), 0)
+    smooth, low, soft = (
+        cv2.resize(a, (w, h), interpolation=cv2.INTER_LINEAR) for a in (smooth, low, soft)
+    )
+    return cv2.GaussianBlur(smooth + soft * (raw - low), (3, 3), 0)
 
 
-def _shadow_depth(surface: HeightField, pitch: float) -> Float32[np.ndarray, "h w 3"]:
+def _shadow_depth(surface: HeightField, pitch: float) -> Float32[np.ndarray, "3 h w"]:
     """How far (m) each point lies below the shadow line of each of the three lights.
 
     Camera and lights look from inside the gel, so what presses in is a hill to them. A point is in
@@ -98,7 +100,7 @@ def _shadow_depth(surface: HeightField, pitch: float) -> Float32[np.ndarray, "h 
     h, w = surface.shape
     scale, steps = 2, 5
     low = cv2.resize(surface, (w // scale, h // scale), interpolation=cv2.INTER_AREA)
-    shadows = np.empty((*low.shape, 3), np.float32)
+    shadows = np.empty((3, h, w), np.float32)
     for channel, azimuth in enumerate(np.radians(LIGHT_AZIMUTH_DEG)):
         ridge = low
         for k in range(steps):
@@ -108,8 +110,9 @@ def _shadow_depth(surface: HeightField, pitch: float) -> Float32[np.ndarray, "h 
             raised = ridge.copy()
             np.maximum(ridge[here], ridge[there] - drop, out=raised[here])
             ridge = raised
-        shadows[..., channel] = ridge - low
-    return cv2.resize(cv2.blur(shadows, (3, 3)), (w, h), interpolation=cv2.INTER_LINEAR)
+        depth = cv2.blur(ridge - low, (3, 3))
+        cv2.resize(depth, (w, h), dst=shadows[channel], interpolation=cv2.INTER_LINEAR)
+    return shadows
 
 
 def _shifted(dx: int, dy: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
@@ -124,32 +127,34 @@ def _shifted(dx: int, dy: int) -> tuple[tuple[slice, slice], tuple[slice, slice]
 
 @njit(cache=True, fastmath=True)
 @no_type_check
-def _shade(surface, per_pitch, background, gain, linear, quadratic, shadow, noise, oy, ox, out):
+def _shade(surface, per_pitch, background, gain, response, shadow, noise, oy, ox, out):
+    """All planar (channel, row, column), so that the inner loops vectorise."""
     h, w = surface.shape
+    zero, half, one, full = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(255.0)
+    scale = half * per_pitch
+    nx, ny = np.empty(w, np.float32), np.empty(w, np.float32)
     for i in range(h):
-        up, down = max(i - 1, 0), min(i + 1, h - 1)
+        row, above, below = surface[i], surface[max(i - 1, 0)], surface[min(i + 1, h - 1)]
         for j in range(w):
-            left, right = max(j - 1, 0), min(j + 1, w - 1)
-            gx = (surface[i, right] - surface[i, left]) * per_pitch * np.float32(0.5)
-            gy = (surface[down, j] - surface[up, j]) * per_pitch * np.float32(0.5)
-            inverse = np.float32(1.0) / math.sqrt(np.float32(1.0) + gx * gx + gy * gy)
-            nx, ny = -gx * inverse, -gy * inverse
-            for c in range(3):
-                response = linear[c, 0] * nx + linear[c, 1] * ny
-                response += (
-                    quadratic[c, 0] * nx * nx + quadratic[c, 1] * ny * ny + quadratic[c, 2] * nx * ny
-                )
-                dark = min(max(shadow[i, j, c] * np.float32(_SHADOW_STRENGTH), np.float32(0.0)), np.float32(0.5))
-                value = background[i, j, c] + gain[i, j, c] * response
-                value = value * (np.float32(1.0) - dark) + noise[i + oy, j + ox, c]
-                out[i, j, c] = np.uint8(min(max(value, np.float32(0.0)), np.float32(255.0)))
+            gx = (row[min(j + 1, w - 1)] - row[max(j - 1, 0)]) * scale
+            gy = (below[j] - above[j]) * scale
+            inverse = -one / math.sqrt(one + gx * gx + gy * gy)
+            nx[j], ny[j] = gx * inverse, gy * inverse
+        for c in range(3):
+            a, b, aa, bb, ab = response[c]
+            base, strength, dark = background[c, i], gain[c, i], shadow[c, i]
+            grain, pixels = noise[c, i + oy, ox : ox + w], out[c, i]
+            for j in range(w):
+                x, y = nx[j], ny[j]
+                light = a * x + b * y + aa * x * x + bb * y * y + ab * x * y
+                left = one - min(max(dark[j] * np.float32(_SHADOW_STRENGTH), zero), half)
+                value = (base[j] + strength[j] * light) * left + grain[j]
+                pixels[j] = np.uint8(min(max(value, zero), full))
 
 
 _AZIMUTH = np.radians(LIGHT_AZIMUTH_DEG)
-_LINEAR = (np.stack([np.cos(_AZIMUTH), np.sin(_AZIMUTH)], -1) * np.array(_GAIN)[:, None]).astype(
-    np.float32
-)
-_QUADRATIC_TABLE = np.array(_QUADRATIC, np.float32)
+_LINEAR = np.stack([np.cos(_AZIMUTH), np.sin(_AZIMUTH)], -1) * np.array(_GAIN)[:, None]
+_RESPONSE = np.hstack([_LINEAR, _QUADRATIC]).astype(np.float32)  # per channel: x, y, xx, yy, xy
 
 
 def render(
@@ -157,26 +162,25 @@ def render(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """RGB frame of a gel surface; `rng` picks which part of the noise tile this frame gets."""
     oy, ox = rng.integers(0, _NOISE_MARGIN, 2)
-    out = np.empty((*surface.shape, 3), np.uint8)
+    out = np.empty((3, *surface.shape), np.uint8)
     _shade(
         surface,
         np.float32(1.0 / pitch),
         unit.background,
         unit.gain,
-        _LINEAR,
-        _QUADRATIC_TABLE,
+        _RESPONSE,
         _shadow_depth(surface, pitch),
         unit.noise,
         oy,
         ox,
         out,
     )
-    return out
+    return cv2.merge(list(out))
 
 
 def render_untouched(unit: Unit, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
     """RGB frame of a gel that nothing touches: background and noise alone."""
     oy, ox = rng.integers(0, _NOISE_MARGIN, 2)
-    h, w, _ = unit.background.shape
-    frame = unit.background + unit.noise[oy : oy + h, ox : ox + w]
-    return np.clip(frame, 0, 255).astype(np.uint8)
+    _, h, w = unit.background.shape
+    frame = unit.background + unit.noise[:, oy : oy + h, ox : ox + w]
+    return cv2.merge(list(np.clip(frame, 0, 255).astype(np.uint8)))

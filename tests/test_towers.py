@@ -93,7 +93,6 @@ def clip_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_image_tower_recognises_a_photo(offline: OfflineTowers, photo: np.ndarray) -> None:
     logits = offline.image_tower(imagenet_pixels(photo[None]))
     assert logits.argmax(1).item() == IMAGENET_MILITARY_UNIFORM
-    assert sum(p.numel() for p in offline.image_tower.parameters()) == 4_652_008
 
 
 def test_image_embedding_does_not_depend_on_the_batch(
