@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -75,12 +75,13 @@ def _env(config: Config) -> list[Row]:
     n = config.env_steps
     rows = []
     still = np.zeros(8)
-    for what, options, objects in (
-        ("physics alone", {"cameras": (), "tactile": False}, ["soda_can"]),
-        ("two tactile images", {"cameras": ()}, ["soda_can", "pebble"]),
-        ("two tactile + one 128x128 camera", {"cameras": ("front",)}, ["soda_can", "pebble"]),
+    both = ["soda_can", "pebble"]  # a primitive and a mesh
+    for what, task, objects in (
+        ("physics alone", PickPlaceConfig(cameras=(), tactile=False), ["soda_can"]),
+        ("two tactile images", PickPlaceConfig(cameras=()), both),
+        ("two tactile + one 128x128 camera", PickPlaceConfig(cameras=("front",)), both),
     ):
-        env = PickPlace(PickPlaceConfig(max_seconds=1e6, **options))
+        env = PickPlace(replace(task, max_seconds=1e6))
         for name in objects:
             _start(env, HOLDING, name)
 
@@ -88,7 +89,9 @@ def _env(config: Config) -> list[Row]:
                 for _ in range(n):
                     env.step(still)
 
-            rows.append(_measure(f"env step (50 physics steps), {what}, holding {name}", config, n, step))
+            rows.append(
+                _measure(f"env step (50 physics steps), {what}, holding {name}", config, n, step)
+            )
         env.close()
     return rows
 

@@ -172,6 +172,7 @@ def judge(successes: Sequence[Test], untouched: Sequence[Test]) -> list[Claim]:
     """The claims of Figures 8 and 9, and that an episode without touch does not look done."""
     own = [_common(t.own) for t in successes]
     lags = [m["tactile"].contact_lag for m in own]
+    known = [lag for lag in lags if lag is not None]
     prompt = SuccessRate(sum(lag is not None and 0 <= lag <= 3 for lag in lags), len(lags))
     peaks = {n: [float(m[n].peaks) for m in own] for n in ("image", "image+tactile")}
     fewer = [a - b for a, b in zip(peaks["image"], peaks["image+tactile"], strict=True)]
@@ -184,7 +185,7 @@ def judge(successes: Sequence[Test], untouched: Sequence[Test]) -> list[Claim]:
         Claim(
             "the tactile curve drops within 3 frames of true contact",
             prompt.successes == prompt.trials,
-            f"{prompt} of episodes, worst lag {max(l if l is not None else 999 for l in lags)}",
+            f"{prompt} of episodes, lags {min(known, default=None)} to {max(known, default=None)} frames",
         ),
         Claim(
             "the fused curve has fewer peaks than the image curve (mean)",
@@ -222,7 +223,9 @@ def _fall_after_contact(curves: Curves) -> float:
     d, contact = curves.values["text"], curves.contact.frame
     assert contact is not None  # the expert's successes touch
     second = round(curves.fps)
-    return float(np.median(d[max(0, contact - second) : contact]) - np.median(d[contact + 3 :][:second]))
+    return float(
+        np.median(d[max(0, contact - second) : contact]) - np.median(d[contact + 3 :][:second])
+    )
 
 
 def failure_auc(tests: Sequence[Test], outcome: str) -> dict[str, float]:

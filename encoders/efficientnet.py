@@ -134,4 +134,5 @@ def load_efficientnet_lite0() -> EfficientNetLite0:
     for module in network.modules():
         if isinstance(module, ConvNorm):
             module.fuse()
-    return network.to(memory_format=torch.channels_last)
+    network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    return network

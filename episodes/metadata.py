@@ -28,7 +28,7 @@ INFO = "meta/info.json"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 TASKS = "meta/tasks.parquet"
 STATS = "meta/stats.json"
-REPAIR = "run touchgoal's repair (touchgoal.episodes.store.repair)"
+REPAIR = "run: touchgoal repair --mend FOLDER"
 
 Row = dict[str, Any]
 

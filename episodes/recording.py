@@ -51,12 +51,12 @@ def run(
         actor: chooses the actions.
         observation, info: what the reset returned.
     """
-    done = False
-    while not done:
+    while True:
         action = np.asarray(actor.act(observation), np.float32)
         yield {**observation, v.ACTION: action, **info}
         observation, _, terminated, truncated, info = env.step(action)
-        done = terminated or truncated
+        if terminated or truncated:
+            break
     still = np.append(np.zeros(v.N_JOINTS), action[-1]).astype(np.float32)
     yield {**observation, v.ACTION: still, **info}
 

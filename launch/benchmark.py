@@ -31,7 +31,9 @@ def hardware() -> str:
     model = platform.processor() or platform.machine()
     try:
         with open("/proc/cpuinfo") as file:
-            names = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
+            names = [
+                line.split(":", 1)[1].strip() for line in file if line.startswith("model name")
+            ]
     except FileNotFoundError:
         return model
     return f"{len(names)} cores, {names[0]}" if names else model

@@ -119,7 +119,9 @@ def arms() -> Finding:
     """Client libraries of real arms."""
     clients = {"franky-control": "Franka", "ur-rtde": "UR"}
     found = [f"{arm} by {name} {_version(name)}" for name, arm in clients.items() if _version(name)]
-    return Finding("arm clients", bool(found) or None, ", ".join(found) or "none (not needed in sim)")
+    return Finding(
+        "arm clients", bool(found) or None, ", ".join(found) or "none (not needed in sim)"
+    )
 
 
 CHECKS: tuple[Callable[[], Finding], ...] = (

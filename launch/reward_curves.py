@@ -67,10 +67,7 @@ def summarise(curves: list[Curves], out: Path) -> None:
     """Print the table of all curves and write it to metrics.json."""
     write_json(
         out / "metrics.json",
-        [
-            {"source": c.source, **{k: m.as_dict() for k, m in c.metrics().items()}}
-            for c in curves
-        ],
+        [{"source": c.source, **{k: m.as_dict() for k, m in c.metrics().items()}} for c in curves],
     )
     print(overview(curves))
     print(f"plots, CSV and JSON of each: {out}")
@@ -117,6 +114,8 @@ def _open(config: Config) -> Sources:
         raise UserError(f"{source} has no episodes")
     sensors = {str(episodes.meta(i)["sensor"]) for i in chosen if "sensor" in episodes.meta(i)}
     if len(sensors) > 1:
-        raise UserError(f"{source} mixes the sensors {', '.join(sorted(sensors))}; choose --episodes")
+        raise UserError(
+            f"{source} mixes the sensors {', '.join(sorted(sensors))}; choose --episodes"
+        )
     items = [(f"episode_{i:03d}", i) for i in chosen]
     return Sources(config, items, next(iter(sensors), None), episodes)

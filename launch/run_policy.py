@@ -33,9 +33,7 @@ class Config:
     """Processes that simulate."""
     video: bool = True
     """Film the worst episode."""
-    env: PickPlaceConfig = field(
-        default_factory=lambda: PickPlaceConfig(cameras=(), tactile=False)
-    )
+    env: PickPlaceConfig = field(default_factory=lambda: PickPlaceConfig(cameras=(), tactile=False))
     """Options of the task; the expert needs no pictures."""
 
 

@@ -48,7 +48,7 @@ class EnvConfig:
     scene: SceneConfig = SceneConfig()
 
 
-class FrankaTactileEnv(gym.Env[Observation, np.ndarray], ABC):
+class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     """An FR3 with two fingertip sensors at a table; a task adds objects, progress and success.
 
     Observations are a flat dict with the keys of `control/vocabulary.py`; truth (`truth.*`) is in
@@ -62,7 +62,7 @@ class FrankaTactileEnv(gym.Env[Observation, np.ndarray], ABC):
     def __init__(self, config: EnvConfig, render_mode: str | None = None) -> None:
         self.config, self.render_mode = config, render_mode
         self.kinematics = Fr3Kinematics()
-        self.action_space = self._action_space()
+        self.action_space = self._limits = self._action_space()
         self.observation_space = gym.spaces.Dict(
             {key: _space(v.FEATURES[key], self._shape(key)) for key in self._observed()}
         )
@@ -110,14 +110,12 @@ class FrankaTactileEnv(gym.Env[Observation, np.ndarray], ABC):
         self._judge()
         return self._observe(), self._info(0.0, False)
 
-    def step(
-        self, action: np.ndarray
-    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control tick; the reward is the tick's gain in progress."""
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (8,) or not np.isfinite(action).all():
             raise ValueError(f"an action is 8 finite numbers, not {action}")
-        low, high = self.action_space.low, self.action_space.high
+        low, high = self._limits.low, self._limits.high
         action = np.clip(action, low, high)
         self._advance(action[:7], action[7], seconds=1 / self.config.control_hz)
         self._ticks += 1
@@ -248,7 +246,9 @@ class FrankaTactileEnv(gym.Env[Observation, np.ndarray], ABC):
         known = {key.removeprefix(v.IMAGE_PREFIX) for key in v.CAMERAS}
         for camera in self.config.cameras:
             if camera not in known:
-                raise UserError(f"unknown camera {camera!r}; choose from: {', '.join(sorted(known))}")
+                raise UserError(
+                    f"unknown camera {camera!r}; choose from: {', '.join(sorted(known))}"
+                )
             keys.append(v.IMAGE_PREFIX + camera)
         return keys + (list(v.TACTILE) if self.config.tactile else [])
 

@@ -62,7 +62,8 @@ class ContactReader:
         slip: list[float] = [0.0, 0.0]
         geoms: list[set[int]] = [set(), set()]
         external = np.zeros(6)
-        for i, contact in enumerate(data.contact):
+        for i in range(data.ncon):
+            contact = data.contact[i]
             first, second = (int(g) for g in contact.geom)
             if contact.efc_address < 0 or not (self._is_robot[first] or self._is_robot[second]):
                 continue

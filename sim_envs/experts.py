@@ -65,7 +65,7 @@ class PickPlaceExpert:
         position, _ = env.kinematics.forward(env.command)
         yaw, target_yaw = self._yaw_now(), self._grasp_yaw()
         stop = self._freeze_tick()
-        tick = 0
+        tick, width = 0, GRIPPER_MAX_WIDTH
         for segment in self._plan():
             ticks = round(segment.seconds * env.config.control_hz)
             start, start_yaw = position, yaw

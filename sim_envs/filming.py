@@ -48,6 +48,8 @@ def beside(scene: Picture, tactile: list[Picture]) -> Picture:
     labelled = []
     for name, image in zip(("left", "right"), tactile, strict=False):
         image = image.copy()
-        cv2.putText(image, name, (8, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
+        cv2.putText(
+            image, name, (8, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA
+        )
         labelled.append(image)
     return np.hstack([scene, np.vstack(labelled)]) if labelled else scene

@@ -168,4 +168,4 @@ def _spread(rng: np.random.Generator, n: int) -> list[np.ndarray]:
     return points
 
 
-gym.register(id="touchgoal/PickPlace-v0", entry_point=PickPlace)
+gym.register("touchgoal/PickPlace-v0", "touchgoal.sim_envs.pick_place:PickPlace")

@@ -82,13 +82,16 @@ def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
     option.tolerance = 1e-6
     spec.stat.extent = 1.0
-    spec.stat.center = [0.5, 0.0, 0.2]
+    spec.stat.center = np.array([0.5, 0.0, 0.2])
     visual = spec.visual
     visual.map.znear, visual.map.zfar = 0.001, 10.0  # m: the pad cameras look from 10 mm away
     visual.global_.offwidth, visual.global_.offheight = 1280, 960
     visual.headlight.active = 1
-    visual.headlight.ambient, visual.headlight.diffuse = [0.3] * 3, [0.3] * 3
-    visual.headlight.specular = [0.0] * 3
+    visual.headlight.ambient, visual.headlight.diffuse = (
+        np.full(3, 0.3, np.float32),
+        np.full(3, 0.3, np.float32),
+    )
+    visual.headlight.specular = np.zeros(3, np.float32)
     visual.quality.shadowsize = 0 if config.meshes == "fast" else 2048
     visual.quality.offsamples = 0 if config.meshes == "fast" else 4
     visual.quality.numslices = 24
@@ -103,7 +106,7 @@ def _strip(spec: mujoco.MjSpec, config: SceneConfig) -> None:
             spec.delete(geom)
         # Finger joints at their stops would otherwise be as soft as a contact.
     for joint in ("finger_joint1", "finger_joint2"):
-        spec.joint(joint).solref_limit = [0.004, 1]
+        spec.joint(joint).solref_limit = np.array([0.004, 1])
     for body in spec.bodies:
         for geom in list(body.geoms):
             is_visual = geom.meshname != "" and not geom.meshname.endswith("_coll")
@@ -176,7 +179,8 @@ def _add_gel(
     mass, damping_ratio = 0.005, 0.7  # kg of gel; critically enough damped to not ring
     gel = finger.add_body(name=f"{side}_gel", pos=[0, 0, z], gravcomp=1)
     gel.explicitinertial = True
-    gel.mass, gel.inertia, gel.ipos, gel.iquat = mass, [1e-6] * 3, [0, 0, 0], [1, 0, 0, 0]
+    gel.mass, gel.inertia = mass, np.full(3, 1e-6)
+    gel.ipos, gel.iquat = np.zeros(3), np.array([1.0, 0, 0, 0])
     springs = (
         ("normal", [0, 1, 0], sensor.normal_stiffness),
         ("shear_x", [0, 0, 1], sensor.shear_stiffness),
@@ -222,7 +226,7 @@ def _add_actuators(spec: mujoco.MjSpec) -> None:
             trntype=mujoco.mjtTrn.mjTRN_JOINT,
             gainprm=[stiffness] + [0] * 9,
             biasprm=[0, -stiffness, -0.1 * stiffness] + [0] * 7,
-            ctrlrange=joint.range,
+            ctrlrange=joint.range.tolist(),
             ctrllimited=mujoco.mjtLimited.mjLIMITED_TRUE,
             **affine,
         )
@@ -245,7 +249,7 @@ def _add_cameras_and_table(spec: mujoco.MjSpec) -> None:
     world = spec.worldbody
     hand = spec.body("hand")
     hand.add_site(name="tcp", pos=[0, 0, GELSIGHT_TCP], group=HIDDEN_GROUP)
-    eye = np.array([0.075, 0.0, 0.02])
+    eye = [0.075, 0.0, 0.02]
     hand.add_camera(name="wrist", pos=eye, quat=_look(eye, [0.012, 0, 0.17], [1, 0, 0]), fovy=62)
     for name, eye, target, fovy in (
         ("front", [1.15, 0.0, 0.55], [0.46, 0.0, 0.10], 40),
@@ -291,7 +295,7 @@ def _add_body(spec: mujoco.MjSpec, body: Body) -> None:
         shape["quat"] = [np.sqrt(0.5), 0, np.sqrt(0.5), 0]  # lies along the body's x axis
     if kind.shape == "mesh":
         assert body.hull is not None
-        spec.add_mesh(name=body.name, uservert=body.hull.ravel())
+        spec.add_mesh(name=body.name, uservert=body.hull.ravel().tolist())
         shape = {"meshname": body.name}
     # Round things get rolling friction (condim 6), or they never come to rest on the table.
     rolls = kind.shape in ("sphere", "capsule")
@@ -312,14 +316,14 @@ def _add_body(spec: mujoco.MjSpec, body: Body) -> None:
     )
 
 
-def _quaternion(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+def _quaternion(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> list[float]:
     """wxyz of the frame whose axes, in the parent frame, are x, y, z."""
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, np.stack([x, y, z], axis=1).ravel())
-    return quat
+    return quat.tolist()
 
 
-def _look(eye: list[float] | np.ndarray, target: list[float], up: list[float]) -> np.ndarray:
+def _look(eye: list[float], target: list[float], up: list[float]) -> list[float]:
     """Orientation of a camera at `eye` that looks at `target` with `up` upwards in its image."""
     z = np.asarray(eye) - np.asarray(target)
     z = z / np.linalg.norm(z)

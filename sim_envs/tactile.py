@@ -70,7 +70,9 @@ class TactilePad:
         self._coarse_grid = _gel_grid(sensor, _COARSE)
         self._mesh_grid = _gel_grid(sensor, _FINE)
         # An orthographic camera's fovy is the height it sees, m; the width follows from the aspect.
-        model.cam_fovy[model.camera(f"{side}_gel").id] = self._mesh_grid.rows * self._mesh_grid.pitch
+        model.cam_fovy[model.camera(f"{side}_gel").id] = (
+            self._mesh_grid.rows * self._mesh_grid.pitch
+        )
         self._renderer: mujoco.Renderer | None = None
 
     def sense(

@@ -131,9 +131,7 @@ def _cast(out, pitch, kind, position, rotation, size):
         elif kind == CYLINDER:
             for j in range(columns):
                 n = np.float32(j)
-                t = _cylinder(
-                    ax + n * ex, ay + n * ey, az + n * ez, d, across, inverse[2], size
-                )
+                t = _cylinder(ax + n * ex, ay + n * ey, az + n * ez, d, across, inverse[2], size)
                 row[j] = -_START - t
         else:
             for j in range(columns):

@@ -175,7 +175,7 @@ def render(
         ox,
         out,
     )
-    return cv2.merge(list(out))
+    return cv2.merge([out[0], out[1], out[2]])
 
 
 def render_untouched(unit: Unit, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
@@ -183,4 +183,5 @@ def render_untouched(unit: Unit, rng: np.random.Generator) -> UInt8[np.ndarray, 
     oy, ox = rng.integers(0, _NOISE_MARGIN, 2)
     _, h, w = unit.background.shape
     frame = unit.background + unit.noise[:, oy : oy + h, ox : ox + w]
-    return cv2.merge(list(np.clip(frame, 0, 255).astype(np.uint8)))
+    red, green, blue = np.clip(frame, 0, 255).astype(np.uint8)
+    return cv2.merge([red, green, blue])

@@ -1,6 +1,8 @@
 """The repository's layout: every folder is linked, is no package by itself, imports leftwards."""
 
 import ast
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -41,7 +43,9 @@ def test_folder_is_linked_and_bare(folder: str) -> None:
     assert not (ROOT / folder / "__init__.py").exists(), "would shadow python-control and ROS"
 
 
-@pytest.mark.parametrize("path", sorted(p for f in ORDER for p in (ROOT / f).rglob("*.py")), ids=str)
+@pytest.mark.parametrize(
+    "path", sorted(p for f in ORDER for p in (ROOT / f).rglob("*.py")), ids=str
+)
 def test_imports_point_left(path: Path) -> None:
     folder = path.relative_to(ROOT).parts[0]
     modules = imported_modules(path)
@@ -66,3 +70,9 @@ def test_version_is_said_once() -> None:
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["version"] == __version__
+
+
+def test_control_needs_no_torch() -> None:
+    modules = [f"touchgoal.control.{p.stem}" for p in (ROOT / "control").glob("*.py")]
+    program = f"import sys, {', '.join(modules)}; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", program], check=True)

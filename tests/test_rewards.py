@@ -269,9 +269,7 @@ def test_a_modality_with_a_larger_range_does_not_win() -> None:
     raw_ranges = Scale({"image": 0.3, "tactile": 1.9}, {"image": 0.2, "tactile": 0.1}, {}, {}, 1)
     same = {"image": "a", "tactile": "b"}
     raw = {"image": 0.2 + 0.1 * falling, "tactile": 0.1 + 1.8 * falling[::-1]}
-    both = with_fused(
-        replace(raw_ranges, space=same).normalise(raw, same, frozenset())
-    )
+    both = with_fused(replace(raw_ranges, space=same).normalise(raw, same, frozenset()))
     assert both["image+tactile"] == pytest.approx(np.full(30, 0.5))
 
 

@@ -35,9 +35,9 @@ def rotation(axis: int, angle: float) -> np.ndarray:
 def inside(kind: int, p: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Whether points in the object's frame lie in the primitive."""
     if kind == SPHERE:
-        return np.linalg.norm(p, axis=-1) <= size[0]
+        return np.asarray(np.linalg.norm(p, axis=-1) <= size[0])
     if kind == BOX:
-        return (np.abs(p) <= size).all(-1)
+        return np.asarray((np.abs(p) <= size).all(axis=-1))
     side = np.linalg.norm(p[..., :2], axis=-1)
     if kind == CYLINDER:
         return (side <= size[0]) & (np.abs(p[..., 2]) <= size[1])

