@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -24,6 +24,7 @@ from touchgoal.sim_envs.filming import Film
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
 
 
+@runtime_checkable
 class Actor(Protocol):
     """Anything that acts: an expert, a policy, a person."""
 

@@ -41,13 +41,17 @@ class Align:
     """The training."""
 
 
-def _preset(name: str) -> Align:
-    return Align(episodes=tyro.MISSING, validation=tyro.MISSING, align=PRESETS[name])
+@dataclass(frozen=True)
+class AlignPaper(Align):
+    """The same with the paper's training: ViT-H, 100 epochs, temperature 0.2, lambda 1."""
+
+    align: AlignConfig = PRESETS["paper"]
+    """The training."""
 
 
 Config = (
-    Annotated[Align, tyro.conf.subcommand("align", default=_preset("default"))]
-    | Annotated[Align, tyro.conf.subcommand("align-paper", default=_preset("paper"))]
+    Annotated[Align, tyro.conf.subcommand("align")]
+    | Annotated[AlignPaper, tyro.conf.subcommand("align-paper")]
 )
 
 
