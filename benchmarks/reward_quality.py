@@ -156,16 +156,20 @@ def _curves(
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim, judged."""
+    """One claim, judged.
+
+    Attributes:
+        verdict: "holds", "fails", or "unsure" where the interval of a mean includes 0.
+    """
 
     claim: str
-    holds: bool
+    verdict: str
     evidence: str
 
     @property
     def line(self) -> str:
         """For the table."""
-        return f"  {'holds' if self.holds else 'FAILS':<7}{self.claim}: {self.evidence}"
+        return f"  {self.verdict:<8}{self.claim}: {self.evidence}"
 
 
 def judge(successes: Sequence[Test], untouched: Sequence[Test]) -> list[Claim]:
@@ -176,39 +180,46 @@ def judge(successes: Sequence[Test], untouched: Sequence[Test]) -> list[Claim]:
     prompt = SuccessRate(sum(lag is not None and 0 <= lag <= 3 for lag in lags), len(lags))
     peaks = {n: [float(m[n].peaks) for m in own] for n in ("image", "image+tactile")}
     fewer = [a - b for a, b in zip(peaks["image"], peaks["image+tactile"], strict=True)]
-    drops = [(m["tactile"].t_drop_50, m["image+tactile"].t_drop_50) for m in own]
-    sooner = [float(a - b) for a, b in drops if a is not None and b is not None]
+    sooner = {f: _lead(own, f) for f in ("t_drop_50", "t_drop_25", "t_drop_10")}
     falls = [_fall_after_contact(t.words) for t in successes]
     kept = [t.other.raw["tactile"][-1] / np.median(t.other.raw["tactile"][:5]) for t in untouched]
     fallen = SuccessRate(sum(f > 0 for f in falls), len(falls))
     return [
         Claim(
             "the tactile curve drops within 3 frames of true contact",
-            prompt.successes == prompt.trials,
-            f"{prompt} of episodes, lags {min(known, default=None)} to {max(known, default=None)} frames",
+            _all(prompt),
+            f"{prompt} of episodes, lags {min(known)} to {max(known)} frames",
         ),
         Claim(
             "the fused curve has fewer peaks than the image curve (mean)",
-            float(np.mean(fewer)) > 0,
+            _sign(fewer),
             f"{np.mean(peaks['image+tactile']):.2f} against {np.mean(peaks['image']):.2f}, "
             f"difference {_interval(fewer)}",
         ),
         Claim(
             "the fused curve drops earlier than the tactile one (mean)",
-            float(np.mean(sooner)) > 0,
-            f"by {_interval(sooner)} frames",
+            _sign(sooner["t_drop_50"]),
+            f"half of its drop by {_interval(sooner['t_drop_50'])} frames "
+            f"(a quarter by {_interval(sooner['t_drop_25'])}, "
+            f"a tenth by {_interval(sooner['t_drop_10'])})",
         ),
         Claim(
             "with a sentence as goal the cost falls after contact",
-            fallen.successes == fallen.trials,
+            _all(fallen),
             f"{fallen} of episodes, by {_interval(falls)} of the way from start to goal",
         ),
         Claim(
             "an episode that never touches keeps 3/4 of its tactile cost",
-            min(kept) >= 0.75,
+            "holds" if min(kept) >= 0.75 else "fails",
             f"least {min(kept):.2f}, mean {np.mean(kept):.2f} of where it began",
         ),
     ]
+
+
+def _lead(episodes: Sequence[dict[str, CurveMetrics]], drop: str) -> list[float]:
+    """Frames by which the fused curve drops before the tactile one, where both do."""
+    pairs = [(getattr(m["tactile"], drop), getattr(m["image+tactile"], drop)) for m in episodes]
+    return [float(a - b) for a, b in pairs if a is not None and b is not None]
 
 
 def _common(curves: Curves) -> dict[str, CurveMetrics]:
@@ -254,11 +265,25 @@ def _auc(low: list[float], high: list[float]) -> float:
     return float((difference > 0).mean() + 0.5 * (difference == 0).mean())
 
 
-def _interval(values: Sequence[float]) -> str:
-    """Mean with a 95 % bootstrap interval over the episodes."""
-    rng = np.random.default_rng(0)
-    means = rng.choice(values, (10_000, len(values))).mean(1)
+def _all(rate: SuccessRate) -> str:
+    return "holds" if rate.successes == rate.trials else "fails"
+
+
+def _sign(values: Sequence[float]) -> str:
+    """Whether a mean that is claimed to be positive is."""
+    low, high = _bootstrap(values)
+    return "holds" if low > 0 else "fails" if high < 0 else "unsure"
+
+
+def _bootstrap(values: Sequence[float]) -> tuple[float, float]:
+    """95 % interval of the mean over the episodes."""
+    means = np.random.default_rng(0).choice(values, (10_000, len(values))).mean(axis=1)
     low, high = np.quantile(means, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def _interval(values: Sequence[float]) -> str:
+    low, high = _bootstrap(values)
     return f"{np.mean(values):.2f} [{low:.2f}, {high:.2f}]"
 
 
