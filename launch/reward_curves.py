@@ -112,6 +112,8 @@ def _open(config: Config) -> Sources:
     chosen = list(config.episodes or range(len(episodes)))
     if not chosen:
         raise UserError(f"{source} has no episodes")
+    for i in chosen:  # a damaged file is found now, before the work, not after half of it
+        episodes.read(i, [next(iter(episodes.features))], [0])
     sensors = {str(episodes.meta(i)["sensor"]) for i in chosen if "sensor" in episodes.meta(i)}
     if len(sensors) > 1:
         raise UserError(

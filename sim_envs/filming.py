@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.rendering import open_renderer
 
-Picture = UInt8[np.ndarray, "h w 3"]
+Picture = UInt8[np.ndarray, "_ _ 3"]  # pictures of different sizes meet in one call
 _HEIGHT = 480
 
 
