@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 CODE := control sim_envs episodes encoders rewards policies benchmarks launch tests
 
-.PHONY: demo test check format types build typings clean
+.PHONY: demo test check format build typings weights clean
 
 demo: $(READY)
 	$(BIN)/touchgoal doctor --quiet
@@ -37,6 +37,14 @@ build: $(READY)
 	$(PYTHON) -m venv .venv-wheel
 	.venv-wheel/bin/pip install -q -c constraints.txt "$$(echo dist/*.whl)[towers,dev]"
 	.venv-wheel/bin/python -m pytest -n auto -m "not slow" --ignore tests/test_layout.py
+
+# How the shipped touch encoder was made: about 25 minutes on 2 cores.
+weights: $(READY)
+	$(BIN)/touchgoal collect-demos --episodes 40 --seed 100000 --out runs/weights/val
+	$(BIN)/touchgoal collect-demos --episodes 240 --seed 0 --out runs/weights/train
+	$(BIN)/touchgoal train-encoder align --episodes runs/weights/train/episodes \
+		--validation runs/weights/val/episodes --scale-episodes 60 --out runs/weights/run
+	cp runs/weights/run/encoder/* encoders/weights/gelsight_mini_offline/
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
