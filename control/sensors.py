@@ -35,12 +35,6 @@ class SensorModel:
     shear_stiffness: float
     frame_rate: float
 
-    @property
-    def field_of_view(self) -> tuple[float, float]:
-        """Gel seen by the camera, (along x, along y), m."""
-        rows, columns = self.image_shape
-        return columns * self.pixel_pitch, rows * self.pixel_pitch
-
 
 # Image: the SDK's 320x240 crop; 0.059 mm/px is Tactile-MNIST's 18.88 x 14.16 mm (the datasheet says
 # 18.6 x 14.3; other sources up to 22.9 x 17.1: treat the pitch as a calibration parameter).

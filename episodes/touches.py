@@ -118,10 +118,15 @@ def _check(episodes: EpisodeSet) -> list[int]:
     return sides
 
 
+def touch_background(frames: UInt8[np.ndarray, "n h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """A fingertip untouched: the median of its first 5 frames, in training and in rewards alike."""
+    return np.median(frames[:_BACKGROUND_FRAMES], axis=0).astype(np.uint8)
+
+
 def _background(episodes: EpisodeSet, i: int, side: int) -> UInt8[np.ndarray, "h w 3"]:
     key = TACTILE[side]
     first = range(min(_BACKGROUND_FRAMES, episodes.lengths[i]))
-    return np.median(episodes.read(i, [key], first).frames[key], axis=0).astype(np.uint8)
+    return touch_background(episodes.read(i, [key], first).frames[key])
 
 
 def _contact(

@@ -12,14 +12,15 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from touchgoal.control.contact import detect_contact
 from touchgoal.control.errors import UserError
 from touchgoal.control.vocabulary import TACTILE, TRUTH_CONTACT
 from touchgoal.episodes.metadata import write_file
 from touchgoal.episodes.schema import Episode
-from touchgoal.rewards.metrics import START_FRAMES, CurveMetrics, measure_curve
+from touchgoal.episodes.touches import touch_background
+from touchgoal.rewards.metrics import CurveMetrics, measure_curve
 
 FUSED = {"image+tactile": ("image", "tactile"), "image+text": ("image", "text")}
 
@@ -199,11 +200,6 @@ def first_contact(episode: Episode) -> Contact:
         return Contact(None, "no touch")
     touching = [detect_contact(side, touch_background(side)) for side in sides]
     return Contact(_first(np.stack(touching, axis=1)), "detected")
-
-
-def touch_background(frames: UInt8[np.ndarray, "n h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """A fingertip untouched: the median of its first 5 frames, as in `episodes/touches.py`."""
-    return np.median(frames[:START_FRAMES], axis=0).astype(np.uint8)
 
 
 def _first(touching: Bool[np.ndarray, "n sides"]) -> int | None:

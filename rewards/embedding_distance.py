@@ -25,12 +25,12 @@ from touchgoal.control.vocabulary import FRONT, TACTILE, TRUTH_CONTACT
 from touchgoal.encoders.touch_encoder import TouchEncoder
 from touchgoal.encoders.towers import Towers
 from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import (
     Contact,
     Curves,
     Scale,
     first_contact,
-    touch_background,
     with_fused,
     yardstick,
 )

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.control.kinematics import FR3_HOME, Fr3Kinematics, fingers_down
-from touchgoal.sim_envs.contact import ContactReader, PadContact
+from touchgoal.sim_envs.contact import SLIP_SPEED, ContactReader, PadContact
 from touchgoal.sim_envs.objects import Body
 from touchgoal.sim_envs.rendering import open_renderer
 from touchgoal.sim_envs.scene import GRIPPER_MAX_FORCE, SIDES, SceneConfig, build
@@ -231,7 +231,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         return {
             v.TRUTH_PAD_WRENCH: wrench.astype(np.float32),
             v.TRUTH_CONTACT: np.array([pad.touching for pad in pads]),
-            v.TRUTH_SLIP: np.array([pad.slip_speed > 1e-3 for pad in pads]),
+            v.TRUTH_SLIP: np.array([pad.slip_speed > SLIP_SPEED for pad in pads]),
             v.TRUTH_OBJECT_POSE: self.object_pose().astype(np.float32),
             v.TRUTH_PROGRESS: np.array([progress], np.float32),
             v.TRUTH_SUCCESS: np.array([success]),

@@ -21,22 +21,21 @@ class Film:
     observations and its speed stay as they are.
     """
 
-    def __init__(self, env: FrankaTactileEnv, camera: str = "front") -> None:
-        self._env, self._camera = env, camera
+    def __init__(self, env: FrankaTactileEnv) -> None:
+        self._env = env
         spec = env.scene(replace(env.config.scene, meshes="full"))
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         self._renderer = open_renderer(self._model, _HEIGHT, _HEIGHT)
         self.frames: list[Picture] = []
 
-    def shoot(self) -> Picture:
+    def shoot(self) -> None:
         """Take and keep a picture of the environment as it is now."""
         self._data.qpos[:] = self._env.data.qpos
         mujoco.mj_forward(self._model, self._data)
-        self._renderer.update_scene(self._data, self._camera)
+        self._renderer.update_scene(self._data, "front")
         scene = self._renderer.render()
         self.frames.append(beside(scene, [f.image for f in self._env.tactile_frames()]))
-        return self.frames[-1]
 
     def close(self) -> None:
         """Free the OpenGL context."""

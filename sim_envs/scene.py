@@ -104,7 +104,7 @@ def _strip(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     for side in SIDES:
         for geom in list(spec.body(f"{side}_finger").geoms):
             spec.delete(geom)
-        # Finger joints at their stops would otherwise be as soft as a contact.
+    # Finger joints at their stops would otherwise be as soft as a contact.
     for joint in ("finger_joint1", "finger_joint2"):
         spec.joint(joint).solref_limit = np.array([0.004, 1])
     for body in spec.bodies:
