@@ -1,6 +1,23 @@
-"""Fingertip sensors as data: what a GelSight is, in numbers with unit and source."""
+"""Fingertip sensors as data: what a GelSight or a DIGIT is, in numbers with unit and source."""
 
 from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class MarkerGrid:
+    """Dots printed on a gel.
+
+    Attributes:
+        rows, columns: of the grid, which is centred on the image.
+        pitch: between neighbours, m.
+        diameter: of a dot, m.
+    """
+
+    rows: int
+    columns: int
+    pitch: float
+    diameter: float
 
 
 @dataclass(frozen=True)
@@ -8,50 +25,66 @@ class SensorModel:
     """A camera-based fingertip sensor.
 
     The sensor frame sits on the undeformed gel, in the middle of the image: x along the image's
-    columns, y along its rows (downwards), z out of the gel.
+    columns, y along its rows (downwards), z out of the gel. The gel is taken to be flat.
 
     Attributes:
         name: the id under which encoders and preprocessors know the sensor.
         image_shape: (rows, columns) of a frame.
         pixel_pitch: m of gel per pixel; square pixels.
+        pitch_range: m of gel per pixel, (least, most) that units and sources differ by.
         gel_size: (along x, along y) of the gel, m.
         gel_thickness: m.
         case_size: (along x, along y, depth) of the housing, m.
         foundation_modulus: gel pressure per indentation, Pa/m: how the gel's surface gives way
             under a contact, as the camera sees it.
+        shear_modulus: of the gel's material, Pa.
         normal_stiffness: of the gel as a whole under a typical curved contact, N/m.
         shear_stiffness: of the gel as a whole, N/m.
         frame_rate: Hz.
+        markers: dots of the gel that has them; gels without are sold as well.
     """
 
     name: str
     image_shape: tuple[int, int]
     pixel_pitch: float
+    pitch_range: tuple[float, float]
     gel_size: tuple[float, float]
     gel_thickness: float
     case_size: tuple[float, float, float]
     foundation_modulus: float
+    shear_modulus: float
     normal_stiffness: float
     shear_stiffness: float
     frame_rate: float
+    markers: MarkerGrid
+
+    @property
+    def calibration(self) -> Path:
+        """Folder of the sensor file that `touchgoal calibrate` wrote for a typical unit."""
+        return Path(__file__).parent / "sensor_files" / self.name
 
 
-# Image: the SDK's 320x240 crop; 0.059 mm/px is Tactile-MNIST's 18.88 x 14.16 mm (the datasheet says
-# 18.6 x 14.3; other sources up to 22.9 x 17.1: treat the pitch as a calibration parameter).
+# Image: the SDK's 320x240 crop; 0.059 mm/px is Tactile-MNIST's 18.88 x 14.16 mm and Taxim's Mini
+# (the datasheet says 18.6 x 14.3; other sources up to 22.9 x 17.1: calibrate your own).
 # Gel 25.4 x 20.9 x 4.0 mm: FEATS STEP file. Case 32.5 x 28.5 x 28.3 mm: GelSight STEP file.
-# Foundation modulus: a bonded, nearly incompressible 4 mm layer of E = 0.44 MPa (FEATS' Neo-Hooke
-# fit) is about three times stiffer than E/t; 3e8 Pa/m gives 0.8 mm under a 25 mm ball at 15 N,
-# within FEATS' measured range (up to 0.86 mm). Not fitted to one unit: `touchgoal calibrate` is.
+# Shear modulus: FEATS' Neo-Hooke fit, 2 C10 = 0.145 MPa.
+# Foundation modulus: a bonded, nearly incompressible 4 mm layer of E = 0.44 MPa (the same fit) is
+# about three times stiffer than E/t; 3e8 Pa/m gives 0.8 mm under a 25 mm ball at 15 N, within
+# FEATS' measured range (up to 0.86 mm).
 # Whole-gel stiffness: the same modulus over the patch of such a ball, and G A / t of the gel.
+# Markers: 63 found in three real pictures, pitch 31.4-32.5 px and diameter 14-18 px of 320.
 GELSIGHT_MINI = SensorModel(
     name="gelsight_mini",
     image_shape=(240, 320),
     pixel_pitch=0.059e-3,
+    pitch_range=(0.058e-3, 0.071e-3),
     gel_size=(25.4e-3, 20.9e-3),
     gel_thickness=4.0e-3,
     case_size=(32.5e-3, 28.5e-3, 28.3e-3),
     foundation_modulus=3.0e8,
+    shear_modulus=1.45e5,
     normal_stiffness=2.0e4,
     shear_stiffness=6.0e3,
     frame_rate=25.0,
+    markers=MarkerGrid(rows=7, columns=9, pitch=1.88e-3, diameter=0.94e-3),
 )

@@ -16,8 +16,8 @@ from touchgoal.sim_envs.contact import SLIP_SPEED, ContactReader, PadContact
 from touchgoal.sim_envs.objects import Body
 from touchgoal.sim_envs.rendering import open_renderer
 from touchgoal.sim_envs.scene import GRIPPER_MAX_FORCE, SIDES, SceneConfig, build
-from touchgoal.sim_envs.tactile import TactileFrame, TactilePad
-from touchgoal.sim_envs.tactile_optics import sample_unit
+from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
+from touchgoal.sim_envs.tactile.optics import sample_unit
 
 GRIPPER_MAX_WIDTH = 0.08  # m, Franka Hand
 GRIPPER_SPEED = 0.1  # m/s of width, Franka Hand's datasheet maximum

@@ -14,7 +14,7 @@ SHAPES: tuple[Shape, ...] = ("box", "cylinder", "sphere", "capsule", "mesh")
 
 
 class Texture(IntEnum):
-    """Height pattern on a surface; `sim_envs/tactile_geometry.py` evaluates it."""
+    """Height pattern on a surface; `sim_envs/tactile/geometry.py` evaluates it."""
 
     SMOOTH = 0
     RIBBED = 1

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from touchgoal.control.contact import contact_strength, detect_contact
+from touchgoal.control.touch.contact import contact_strength, detect_contact
 
 HEIGHT, WIDTH = 240, 320
 Y, X = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)

@@ -9,8 +9,8 @@ from touchgoal.sim_envs.experts import PickPlaceExpert
 from touchgoal.sim_envs.objects import CATALOGUE, Body
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
 from touchgoal.sim_envs.scene import build
-from touchgoal.sim_envs.tactile import TactilePad
-from touchgoal.sim_envs.tactile_geometry import (
+from touchgoal.sim_envs.tactile.pad import TactilePad
+from touchgoal.sim_envs.tactile.geometry import (
     BOX,
     CAPSULE,
     CYLINDER,
@@ -19,7 +19,7 @@ from touchgoal.sim_envs.tactile_geometry import (
     primitive_height,
     settle,
 )
-from touchgoal.sim_envs.tactile_optics import sample_unit
+from touchgoal.sim_envs.tactile.optics import sample_unit
 
 GRID = Grid(*MINI.image_shape, MINI.pixel_pitch)
 

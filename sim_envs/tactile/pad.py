@@ -12,7 +12,7 @@ from touchgoal.sim_envs.contact import PadContact
 from touchgoal.sim_envs.objects import Body
 from touchgoal.sim_envs.rendering import open_renderer
 from touchgoal.sim_envs.scene import OBJECT_GROUP, PAD_CAMERA_DISTANCE
-from touchgoal.sim_envs.tactile_geometry import (
+from touchgoal.sim_envs.tactile.geometry import (
     BOX,
     CAPSULE,
     CYLINDER,
@@ -23,7 +23,7 @@ from touchgoal.sim_envs.tactile_geometry import (
     primitive_height,
     settle,
 )
-from touchgoal.sim_envs.tactile_optics import Unit, deform, render, render_untouched
+from touchgoal.sim_envs.tactile.optics import Unit, deform, render, render_untouched
 
 _PRIMITIVES = {
     int(mujoco.mjtGeom.mjGEOM_BOX): BOX,
