@@ -47,13 +47,13 @@ def run(config: Config) -> dict[str, Any]:
     """Measure everything on one core; wall-clock time."""
     os.environ["LP_NUM_THREADS"] = "0"  # software OpenGL draws in this thread
     cv2.setNumThreads(1)
-    with _one_core():
+    with one_core():
         rows = [*_physics(config), *_env(config)]
     return {"rows": [vars(row) for row in rows], "table": _table(rows)}
 
 
 @contextmanager
-def _one_core() -> Iterator[None]:
+def one_core() -> Iterator[None]:
     """Keep this process on one core, where the system lets it choose (Linux)."""
     if not hasattr(os, "sched_setaffinity"):
         yield

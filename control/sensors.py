@@ -1,7 +1,10 @@
 """Fingertip sensors as data: what a GelSight or a DIGIT is, in numbers with unit and source."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.touch.photometry import load
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,8 @@ class SensorModel:
         normal_stiffness: of the gel as a whole under a typical curved contact, N/m.
         shear_stiffness: of the gel as a whole, N/m.
         frame_rate: Hz.
-        markers: dots of the gel that has them; gels without are sold as well.
+        sensor_file: folder with the colours of a typical unit (`control.touch.photometry`).
+        markers: dots printed on the gel, if any.
     """
 
     name: str
@@ -56,13 +60,11 @@ class SensorModel:
     normal_stiffness: float
     shear_stiffness: float
     frame_rate: float
-    markers: MarkerGrid
+    sensor_file: Path
+    markers: MarkerGrid | None = None
 
-    @property
-    def calibration(self) -> Path:
-        """Folder of the sensor file that `touchgoal calibrate` wrote for a typical unit."""
-        return Path(__file__).parent / "sensor_files" / self.name
 
+_FILES = Path(__file__).parent / "sensor_files"
 
 # Image: the SDK's 320x240 crop; 0.059 mm/px is Tactile-MNIST's 18.88 x 14.16 mm and Taxim's Mini
 # (the datasheet says 18.6 x 14.3; other sources up to 22.9 x 17.1: calibrate your own).
@@ -72,7 +74,6 @@ class SensorModel:
 # about three times stiffer than E/t; 3e8 Pa/m gives 0.8 mm under a 25 mm ball at 15 N, within
 # FEATS' measured range (up to 0.86 mm).
 # Whole-gel stiffness: the same modulus over the patch of such a ball, and G A / t of the gel.
-# Markers: 63 found in three real pictures, pitch 31.4-32.5 px and diameter 14-18 px of 320.
 GELSIGHT_MINI = SensorModel(
     name="gelsight_mini",
     image_shape=(240, 320),
@@ -86,5 +87,79 @@ GELSIGHT_MINI = SensorModel(
     normal_stiffness=2.0e4,
     shear_stiffness=6.0e3,
     frame_rate=25.0,
+    sensor_file=_FILES / "gelsight_mini",
+)
+
+# 63 dots found in three real pictures: pitch 31.4-32.5 px, diameter 14-18 px of 320.
+GELSIGHT_MINI_MARKERS = replace(
+    GELSIGHT_MINI,
+    name="gelsight_mini_markers",
     markers=MarkerGrid(rows=7, columns=9, pitch=1.88e-3, diameter=0.94e-3),
 )
+
+# The bench sensor of the Taxim paper: 0.0295 mm/px at 640x480, here at half of that. Its gel's
+# moduli are not published: the Mini's, whose silicone is the same maker's.
+# Dots 11 x 9, pitch 29 x 26 px of 320x240 at 0.051 mm/px: FOTS' GelSight; mean pitch, diameter
+# by analogy to the Mini's.
+GELSIGHT = replace(
+    GELSIGHT_MINI,
+    name="gelsight",
+    pitch_range=(0.051e-3, 0.063e-3),
+    gel_size=(25.0e-3, 25.0e-3),
+    sensor_file=_FILES / "gelsight",
+)
+GELSIGHT_MARKERS = replace(
+    GELSIGHT,
+    name="gelsight_markers",
+    markers=MarkerGrid(rows=9, columns=11, pitch=1.4e-3, diameter=0.7e-3),
+)
+
+# Image: QVGA at 60 Hz, upright as digit-interface returns it. Scale 0.0511 mm/px: FOTS; sources
+# range from 0.0405 (gs_sdk, at VGA) to 0.0667 (a 16 x 19 mm sensing field). Case 32.3 x 27 x 34 mm:
+# its STL. Gel 20 x 30 mm: TACTO, which also bends it by 5 mm (R 100 mm); flat here.
+# Thickness and moduli are not published: a third thinner than the Mini's, of the same silicone.
+DIGIT = SensorModel(
+    name="digit",
+    image_shape=(320, 240),
+    pixel_pitch=0.0511e-3,
+    pitch_range=(0.0405e-3, 0.0667e-3),
+    gel_size=(20.0e-3, 30.0e-3),
+    gel_thickness=2.7e-3,
+    case_size=(27.0e-3, 32.3e-3, 34.0e-3),
+    foundation_modulus=4.5e8,
+    shear_modulus=1.45e5,
+    normal_stiffness=3.0e4,
+    shear_stiffness=9.0e3,
+    frame_rate=60.0,
+    sensor_file=_FILES / "digit",
+)
+
+SENSORS = {
+    sensor.name: sensor
+    for sensor in (GELSIGHT_MINI, GELSIGHT_MINI_MARKERS, GELSIGHT, GELSIGHT_MARKERS, DIGIT)
+}
+
+
+def find_sensor(name: str) -> SensorModel:
+    """A sensor model by name, or one unit of it by the folder that `touchgoal calibrate` wrote.
+
+    Raises:
+        UserError: it is neither.
+    """
+    if name in SENSORS:
+        return SENSORS[name]
+    folder = Path(name)
+    if not folder.is_dir():
+        known = ", ".join(SENSORS)
+        raise UserError(f"{name} is no sensor and no folder; choose a sensor file or: {known}")
+    unit = load(folder)
+    if unit.sensor not in SENSORS:
+        raise UserError(f"{folder} is of an unknown sensor, {unit.sensor}")
+    pitch, shape = unit.pixel_pitch, unit.background.shape[:2]
+    return replace(
+        SENSORS[unit.sensor],
+        image_shape=shape,
+        pixel_pitch=pitch,
+        pitch_range=(pitch, pitch),
+        sensor_file=folder,
+    )

@@ -103,7 +103,7 @@ def to_episode(
             "success": success,
             "grasp_force": env.grasp_force,
             "mass": body.mass,
-            "sensor": env.config.scene.sensor.name,
+            "sensor": env.sensor.name,
         },
     )
 

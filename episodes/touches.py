@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 from tqdm import tqdm
 
-from touchgoal.control.touch.contact import detect_contact
 from touchgoal.control.errors import UserError
+from touchgoal.control.touch.contact import detect_contact
 from touchgoal.control.vocabulary import TACTILE, TRUTH_CONTACT, WRIST
 from touchgoal.episodes.store import EpisodeSet
 

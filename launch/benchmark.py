@@ -5,18 +5,22 @@ from typing import Annotated, Any
 
 import tyro
 
-from touchgoal.benchmarks import env_speed, reward_quality
+from touchgoal.benchmarks import env_speed, reward_quality, tactile_speed
 from touchgoal.launch.run_folder import open_run, write_json
 
+BENCHMARKS: dict[type, Any] = {
+    module.Config: module for module in (env_speed, reward_quality, tactile_speed)
+}
 Config = (
     Annotated[env_speed.Config, tyro.conf.subcommand("env-speed")]
     | Annotated[reward_quality.Config, tyro.conf.subcommand("reward-quality")]
+    | Annotated[tactile_speed.Config, tyro.conf.subcommand("tactile-speed")]
 )
 
 
-def main(config: env_speed.Config | reward_quality.Config) -> None:
+def main(config: Any) -> None:
     """Run the chosen benchmark."""
-    benchmark: Any = env_speed if isinstance(config, env_speed.Config) else reward_quality
+    benchmark = BENCHMARKS[type(config)]
     name = benchmark.__name__.rsplit(".", 1)[-1].replace("_", "-")
     out = open_run(config.out, f"benchmark-{name}", config)
     result = benchmark.run(config)

@@ -7,6 +7,7 @@ becomes dense cost curves against its goal in image, touch, image+touch, and wor
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from touchgoal.control.sensors import find_sensor
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.towers import load_towers
 from touchgoal.episodes.media import write_video
@@ -41,7 +42,7 @@ class Config:
 def main(config: Config) -> None:
     """Load the weights first, so that a missing one costs no simulation; then record and judge."""
     find(config.object)
-    encoder = pretrained.load(pretrained.SHIPPED, sensor=config.env.scene.sensor.name)
+    encoder = pretrained.load(pretrained.SHIPPED, sensor=find_sensor(config.env.scene.sensor).name)
     scale = Scale.load(pretrained.SHIPPED / "scale.json")
     embedder = EpisodeEmbedder(load_towers(encoder.config.towers), encoder)
     out = open_run(config.out, "demo", config)

@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from touchgoal.control.touch.contact import detect_contact
 from touchgoal.control.errors import UserError
+from touchgoal.control.touch.contact import detect_contact
 from touchgoal.control.vocabulary import TACTILE, TRUTH_CONTACT
 from touchgoal.episodes.metadata import write_file
 from touchgoal.episodes.schema import Episode

@@ -12,12 +12,13 @@ from jaxtyping import Float, UInt8
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.control.kinematics import FR3_HOME, Fr3Kinematics, fingers_down
+from touchgoal.control.sensors import find_sensor
 from touchgoal.sim_envs.contact import SLIP_SPEED, ContactReader, PadContact
 from touchgoal.sim_envs.objects import Body
 from touchgoal.sim_envs.rendering import open_renderer
 from touchgoal.sim_envs.scene import GRIPPER_MAX_FORCE, SIDES, SceneConfig, build
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
-from touchgoal.sim_envs.tactile.optics import sample_unit
+from touchgoal.sim_envs.tactile.unit import Spread, sample_unit
 
 GRIPPER_MAX_WIDTH = 0.08  # m, Franka Hand
 GRIPPER_SPEED = 0.1  # m/s of width, Franka Hand's datasheet maximum
@@ -37,6 +38,7 @@ class EnvConfig:
         tactile: whether the two fingertip images are observed.
         control_hz: control ticks per second.
         max_seconds: after which an episode is truncated.
+        spread: between the units of the sensor; every episode has two of its own.
         scene: robot, sensors, physics.
     """
 
@@ -45,6 +47,7 @@ class EnvConfig:
     tactile: bool = True
     control_hz: int = v.CONTROL_HZ
     max_seconds: float = 8.0
+    spread: Spread = Spread()
     scene: SceneConfig = SceneConfig()
 
 
@@ -61,6 +64,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
 
     def __init__(self, config: EnvConfig, render_mode: str | None = None) -> None:
         self.config, self.render_mode = config, render_mode
+        self.sensor = find_sensor(config.scene.sensor)
         self.kinematics = Fr3Kinematics()
         self.action_space = self._limits = self._action_space()
         self.observation_space = gym.spaces.Dict(
@@ -134,10 +138,10 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
 
     def close(self) -> None:
         """Free the OpenGL contexts."""
-        for renderer in (self._renderer, self._person, *self._pads):
+        for renderer in (self._renderer, self._person):
             if renderer is not None:
                 renderer.close()
-        self._renderer, self._person, self._pads = None, None, []
+        self._renderer, self._person = None, None
 
     # What experts and drivers use.
 
@@ -173,12 +177,11 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self._tcp = model.site("tcp").id
         self._reader = ContactReader(model)
         self._frames: list[TactileFrame] = []
-        sensor = self.config.scene.sensor
-        if self.config.tactile:
-            self._pads = [
-                TactilePad(model, side, sensor, sample_unit(sensor.image_shape, rng), self.bodies)
-                for side in SIDES
-            ]
+        sensor, spread = self.sensor, self.config.spread
+        self._pads = [
+            TactilePad(model, side, sensor, sample_unit(sensor, rng, spread), self.bodies)
+            for side in (SIDES if self.config.tactile else ())
+        ]
         if self.config.cameras:
             self._renderer = open_renderer(model, *self.config.camera_size)
 
@@ -256,7 +259,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         if key in v.CAMERAS:
             return (*self.config.camera_size, 3)
         if key in v.TACTILE:
-            return (*self.config.scene.sensor.image_shape, 3)
+            return (*self.sensor.image_shape, 3)
         return v.FEATURES[key].shape
 
     def _action_space(self) -> gym.spaces.Box:

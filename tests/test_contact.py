@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from touchgoal.control.touch.contact import contact_strength, detect_contact
+from touchgoal.control.touch.contact import THRESHOLD, contact_strength, detect_contact
 
 HEIGHT, WIDTH = 240, 320
 Y, X = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
@@ -41,11 +41,11 @@ def test_weak_shading_is_found_in_drifting_light() -> None:
 
 
 def test_contact_ends_only_below_half_the_threshold() -> None:
-    height = np.array([0, 0, 0, 0, 0, 2.2, 8, 2.2, 2.2, 0, 2.2], float)
+    height = np.array([0, 0, 0, 0, 0, 1.7, 8, 1.7, 1.7, 0, 1.7], float)
     frames = sensed(np.ones(len(height)), height)
     background = background_of(frames)
     weak = contact_strength(frames, background)[[5, 7, 8, 10]]
-    assert (weak > 1).all() and (weak < 2).all()
+    assert (weak > THRESHOLD / 2).all() and (weak < THRESHOLD).all()
     expected = [False] * 6 + [True] * 3 + [False] * 2
     assert detect_contact(frames, background).tolist() == expected
 

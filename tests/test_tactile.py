@@ -1,27 +1,34 @@
 """The simulated sensor: elastic-foundation laws, geometry against geometry, determinism."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 
+from touchgoal.control.sensors import DIGIT, SensorModel
 from touchgoal.control.sensors import GELSIGHT_MINI as MINI
-from touchgoal.sim_envs.contact import PadContact
+from touchgoal.control.touch.photometry import shade
 from touchgoal.sim_envs.experts import PickPlaceExpert
 from touchgoal.sim_envs.objects import CATALOGUE, Body
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
-from touchgoal.sim_envs.scene import build
-from touchgoal.sim_envs.tactile.pad import TactilePad
+from touchgoal.sim_envs.tactile import batched
 from touchgoal.sim_envs.tactile.geometry import (
     BOX,
     CAPSULE,
     CYLINDER,
+    ELLIPSOID,
     SPHERE,
     Grid,
-    primitive_height,
-    settle,
+    add_mesh,
+    add_primitive,
 )
-from touchgoal.sim_envs.tactile.optics import sample_unit
+from touchgoal.sim_envs.tactile.optics import render
+from touchgoal.sim_envs.tactile.pad import TactileFrame
+from touchgoal.sim_envs.tactile.rig import PressRig
+from touchgoal.sim_envs.tactile.unit import NOMINAL, Spread, sample_unit
 
-GRID = Grid(*MINI.image_shape, MINI.pixel_pitch)
+UNIT = sample_unit(MINI, np.random.default_rng(0), NOMINAL)
 
 
 def rotation(axis: int, angle: float) -> np.ndarray:
@@ -38,6 +45,8 @@ def inside(kind: int, p: np.ndarray, size: np.ndarray) -> np.ndarray:
         return np.asarray(np.linalg.norm(p, axis=-1) <= size[0])
     if kind == BOX:
         return np.asarray((np.abs(p) <= size).all(axis=-1))
+    if kind == ELLIPSOID:
+        return np.asarray(np.linalg.norm(p / size, axis=-1) <= 1)
     side = np.linalg.norm(p[..., :2], axis=-1)
     if kind == CYLINDER:
         return (side <= size[0]) & (np.abs(p[..., 2]) <= size[1])
@@ -45,7 +54,7 @@ def inside(kind: int, p: np.ndarray, size: np.ndarray) -> np.ndarray:
     return side**2 + beyond**2 <= size[0] ** 2
 
 
-@pytest.mark.parametrize("kind", [BOX, CYLINDER, SPHERE, CAPSULE])
+@pytest.mark.parametrize("kind", [BOX, CYLINDER, SPHERE, CAPSULE, ELLIPSOID])
 def test_rays_find_the_near_surface(kind: int) -> None:
     """Just beyond the surface a point lies in the object, just before it outside."""
     grid = Grid(30, 40, 0.5e-3)
@@ -55,7 +64,8 @@ def test_rays_find_the_near_surface(kind: int) -> None:
         R = rotation(0, rng.uniform(0, 3)) @ rotation(1, rng.uniform(0, 3))
         size = rng.uniform(0.004, 0.008, 3)
         position = np.array([*rng.uniform(-2e-3, 2e-3, 2), 0.01])
-        height = primitive_height(grid, kind, position, R, size)
+        height = grid.empty()
+        add_primitive(height, grid.pitch, kind, position, R, size)
         hit = height > -0.9
         assert 0.05 < hit.mean() < 1
         points = np.stack([(x - 19.5) * grid.pitch, (y - 14.5) * grid.pitch, -height], -1)
@@ -65,41 +75,44 @@ def test_rays_find_the_near_surface(kind: int) -> None:
             assert share > 0.98  # rays that graze the rim may go either way
 
 
+def test_scan_lines_find_what_rays_find() -> None:
+    """A box as twelve triangles and as a primitive, however it is turned."""
+    size = np.array([0.006, 0.004, 0.010])
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size
+    # Two triangles a face, counter-clockwise from outside; corner index = 4 x + 2 y + z.
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([[(a, b, c), (a, c, d)] for a, b, c, d in quads], np.int32).reshape(-1, 3)
+    grid = Grid(120, 160, 0.118e-3)
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        R = rotation(0, rng.uniform(0, 3)) @ rotation(1, rng.uniform(0, 3))
+        position = np.array([*rng.uniform(-3e-3, 3e-3, 2), 0.01])
+        rays, lines = grid.empty(), grid.empty()
+        add_primitive(rays, grid.pitch, BOX, position, R, size)
+        add_mesh(lines, grid.pitch, corners.astype(np.float32), faces, position, R)
+        assert ((rays > -0.9) != (lines > -0.9)).mean() < 1e-3
+        both = (rays > -0.9) & (lines > -0.9)
+        difference = np.abs(rays - lines)[both]
+        assert both.any() and (difference > 1e-7).mean() < 1e-3  # 0.1 um, but for the rim
+
+
+def sense(body: Body, at: np.ndarray | list[float], force: float = 10.0) -> TactileFrame:
+    """What a nominal Mini shows of a body held at `at` (m) in its frame."""
+    rig = PressRig(body, MINI, UNIT)
+    rig.place(np.asarray(at, float))
+    return rig.sense(force, np.random.default_rng(1), centre=(float(at[0]), float(at[1])))
+
+
 @pytest.mark.parametrize("force", [2.0, 15.0])
 def test_ball_sinks_as_the_elastic_foundation_says(force: float) -> None:
     """Pressed volume pi R d^2 times the modulus is the force, so d = sqrt(F / (pi R k))."""
     radius, k = 0.02, MINI.foundation_modulus
-    position = np.array([0, 0, radius + 0.003])
-    height = primitive_height(GRID, SPHERE, position, np.eye(3), np.full(3, radius))
-    shift = settle(height, GRID.pitch, force, k)
-    depth = height.max() + shift
-    assert depth == pytest.approx(np.sqrt(force / (np.pi * radius * k)), rel=0.03)
-    carried = k * np.maximum(height + shift, 0).sum() * GRID.pitch**2
-    assert carried == pytest.approx(force, rel=0.01)
-
-
-def sense(body: Body, at: np.ndarray, force: float = 10.0):
-    """What the left sensor shows of a body held at `at` (m) in its frame."""
-    model = build([body]).compile()
-    import mujoco
-
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    site = data.site("left_sensor")
-    R = site.xmat.reshape(3, 3)
-    data.joint(body.name).qpos[:3] = site.xpos + R @ at
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, R.ravel())
-    data.joint(body.name).qpos[3:] = quat
-    mujoco.mj_forward(model, data)
-    unit = sample_unit(MINI.image_shape, np.random.default_rng(0))
-    pad = TactilePad(model, "left", MINI, unit, [body])
-    contact = PadContact(
-        np.array([0, 0, -force]), np.zeros(3), 0.0, frozenset({model.geom(body.name).id})
-    )
-    frame = pad.sense(data, contact, np.random.default_rng(1))
-    pad.close()
-    return frame
+    overlap = sense(
+        Body(CATALOGUE["glass_ball"], (radius,), 0.1), at=[0, 0, 0.023], force=force
+    ).overlap
+    assert overlap.max() == pytest.approx(np.sqrt(force / (np.pi * radius * k)), rel=0.02)
+    carried = k * overlap.sum() * (2 * MINI.pixel_pitch) ** 2
+    assert carried == pytest.approx(force, rel=0.02)
 
 
 def test_mesh_feels_like_the_primitive_it_copies() -> None:
@@ -122,13 +135,49 @@ def test_contact_appears_where_it_is() -> None:
     rows, columns = np.nonzero(frame.mask)
     assert columns.mean() == pytest.approx(159.5 + dx / MINI.pixel_pitch, abs=1)
     assert rows.mean() == pytest.approx(119.5 + dy / MINI.pixel_pitch, abs=1)
-    # The red light stands below the image: it brightens the lower flank, blue the upper one.
-    unit = sample_unit(MINI.image_shape, np.random.default_rng(0))
-    change = frame.image.astype(float) - np.moveaxis(unit.background, 0, -1)
-    top = frame.mask & (np.arange(240)[:, None] < rows.mean() - 15)
-    bottom = frame.mask & (np.arange(240)[:, None] > rows.mean() + 15)
-    assert change[bottom, 0].mean() > 3 > -3 > change[top, 0].mean()
-    assert change[top, 2].mean() > 3 > -3 > change[bottom, 2].mean()
+    # Each flank shines in the colour of the light that it faces.
+    change = frame.image.astype(float) - UNIT.photometry.background
+    y, x = np.mgrid[0:240, 0:320] - np.array([rows.mean(), columns.mean()]).reshape(2, 1, 1)
+    for channel, (rx, ry) in enumerate(UNIT.photometry.response[:, :2, 0]):
+        towards = (x * rx + y * ry) / np.hypot(rx, ry)
+        near, far = frame.mask & (towards > 12), frame.mask & (towards < -12)
+        assert change[near, channel].mean() > change[far, channel].mean() + 10
+
+
+def test_fast_picture_is_the_photometry_s() -> None:
+    """Half the resolution and 1/16 count steps against the reference at full resolution."""
+    frame = sense(Body(CATALOGUE["glass_ball"], (0.008,), 0.1), at=[1e-3, 0, 0.007], force=6.0)
+    quiet = replace(UNIT, noise=np.zeros_like(UNIT.noise))
+    fast = render(frame.surface, quiet, np.random.default_rng(0)).astype(float)
+    slow = np.clip(shade(UNIT.photometry, frame.depth), 0, 255)
+    assert np.abs(slow - UNIT.photometry.background).max() > 40
+    error = np.abs(fast + 0.5 - slow)  # bytes are cut, not rounded
+    assert error.mean() < 0.6 and np.quantile(error, 0.999) < 6
+
+
+@pytest.mark.parametrize("sensor", [MINI, DIGIT])
+def test_torch_gives_the_same_picture_and_its_gradient(sensor: SensorModel) -> None:
+    unit = sample_unit(sensor, np.random.default_rng(0))
+    unit = replace(unit, noise=np.zeros_like(unit.noise))
+    rig = PressRig(Body(CATALOGUE["golf_ball"], (0.01,), 0.1), sensor, unit)
+    rig.place(np.array([1e-3, 0, 0.01]))
+    frame = rig.sense(8.0, np.random.default_rng(0))
+    overlap = torch.tensor(frame.overlap[None], requires_grad=True)
+    batched_surface = batched.deform(overlap, 2 * unit.pixel_pitch, unit.photometry.bulge)
+    assert np.abs(batched_surface.detach().numpy()[0] - frame.surface).max() < 1e-7  # 0.1 um
+    picture = batched.render(overlap, unit)
+    planes = np.moveaxis(frame.image, -1, 0)
+    assert np.abs(picture.detach().numpy()[0] - 0.5 - planes).max() < 0.7  # counts
+    picture[0, :, 80:160, 60:180].sum().backward()
+    assert overlap.grad is not None and torch.isfinite(overlap.grad).all()
+    # Pushing one point of the object deeper changes the picture as the gradient says.
+    exact = overlap.detach().double()
+    place = tuple(int(i) for i in np.unravel_index(frame.overlap.argmax(), frame.overlap.shape))
+    step = torch.zeros_like(exact)
+    step[0, place[0], place[1]] = 1e-8
+    up, down = (batched.render(exact + s * step, unit)[0, :, 80:160, 60:180] for s in (1, -1))
+    slope = float((up - down).sum()) / 2e-8
+    assert float(overlap.grad[0][place]) == pytest.approx(slope, rel=0.02)
 
 
 def test_softer_things_press_wider_and_shallower() -> None:
@@ -138,11 +187,33 @@ def test_softer_things_press_wider_and_shallower() -> None:
     assert soft.mask.sum() > 1.3 * hard.mask.sum() and soft.depth.max() < 0.8 * hard.depth.max()
 
 
-@pytest.mark.parametrize("at", [[0.0125, 0, 0.01], [0.03, 0, 0.01], [0, 0, -0.02]])
+@pytest.mark.parametrize("at", [[0.0125, 0, 0.01], [0.03, 0, 0.01], [0, 0, -0.02], [0, 0, 0.03]])
 @pytest.mark.parametrize("force", [1e-3, 500.0])
-def test_degenerate_contacts_stay_finite(at: list[float], force: float) -> None:
-    frame = sense(Body(CATALOGUE["brick"], (0.01, 0.01, 0.01), 0.1), np.array(at), force)
+@pytest.mark.parametrize("half", [0.0004, 0.01, 0.05])  # m: smaller and larger than the gel
+def test_degenerate_contacts_stay_finite(at: list[float], force: float, half: float) -> None:
+    """At the gel's edge, beside it, far too deep, out of reach, pressed beyond any gripper."""
+    frame = sense(Body(CATALOGUE["brick"], (half, half, half), 0.1), np.array(at), force)
     assert np.isfinite(frame.depth).all() and frame.depth.min() > -1e-4
+    assert frame.field is not None and np.isfinite(frame.field.wrench()).all()
+
+
+def test_same_seed_same_sensor() -> None:
+    one, again, other = (sample_unit(MINI, np.random.default_rng(s)) for s in (3, 3, 4))
+    for name in ("background", "noise", "gain"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(again, name))
+    assert (one.background != other.background).mean() > 0.5
+    assert one.pixel_pitch != other.pixel_pitch
+    assert MINI.pitch_range[0] <= other.pixel_pitch <= MINI.pitch_range[1]
+
+
+def test_turned_lights_turn_the_response() -> None:
+    """A unit's lights stand within the spread of the model's; the response's size stays."""
+    typical, spread = UNIT.photometry, Spread()
+    for seed in range(5):
+        unit = sample_unit(MINI, np.random.default_rng(seed)).photometry
+        was, now = (p.response[:, 0, 0] + 1j * p.response[:, 1, 0] for p in (typical, unit))
+        assert np.abs(np.angle(now / was, deg=True)).max() <= spread.azimuth
+        assert np.abs(np.abs(now / was) - 1).max() < 5 * spread.gain
 
 
 def test_untouched_sensor_shows_only_noise() -> None:

@@ -1,14 +1,44 @@
 """When a fingertip touches something, from its pictures alone."""
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-# Pictures are averaged over _CELL x _CELL pixels and then blurred. Measured on 320 x 240 frames:
-# pixel noise of 1 count gives a strength of at most 0.35 counts, whatever the light's drift, and a
-# bump of shading that falls off within 15 pixels (sigma 7.5) keeps six tenths of its height.
-_CELL = 4
-_BLUR_CELLS = 1.5
+from touchgoal.control.touch.background import Background, local_change
+
+THRESHOLD = 1.2  # counts; noise of 1 count has a strength of 0.3, at most 0.45
+_RELEASE = 0.1  # of a contact's peak strength
+
+
+class ContactDetector:
+    """Tells frame by frame whether a sensor touches something, and lets its background follow.
+
+    Contact begins when `strength` exceeds the threshold and ends when it falls below half of it,
+    so that strength about the threshold does not make contact flicker; or below a tenth of the
+    contact's peak, for during a long contact the light drifts on and the background cannot follow.
+
+    Args:
+        background: of the sensor; updated in place.
+        threshold: counts.
+
+    Attributes:
+        touching: whether the last frame was in contact.
+        strength: of the last frame, see `contact_strength`.
+    """
+
+    def __init__(self, background: Background, threshold: float | int = THRESHOLD) -> None:
+        self.background, self._threshold = background, threshold
+        self.touching, self.strength = False, 0.0
+        self._peak = 0.0  # strength
+
+    def update(self, frame: UInt8[np.ndarray, "h w 3"]) -> bool:
+        """Judge the next frame."""
+        self.strength = float(local_change(frame, self.background.image).max())
+        self._peak = max(self._peak, self.strength) if self.touching else self.strength
+        ends_at = np.clip(_RELEASE * self._peak, self._threshold / 2, self._threshold)
+        self.touching = self.strength > float(ends_at if self.touching else self._threshold)
+        if not self.touching:
+            self.background.update(frame)
+        return self.touching
 
 
 def contact_strength(
@@ -16,52 +46,27 @@ def contact_strength(
 ) -> Float32[np.ndarray, " n"]:
     """How much the strongest spot of each frame differs from the untouched gel, in counts.
 
-    The difference to the background is blurred; in each channel, what brighter or dimmer light
-    explains (the least-squares offset and gain of the background) is taken out; the largest norm
-    over the three channels of what remains is returned.
+    The largest `background.local_change`: what brighter or dimmer light, or a smooth change of it,
+    explains does not count.
 
     Args:
         frames: RGB pictures of one fingertip sensor.
         background: the same sensor untouched.
     """
-    reference = _blurred(background)
-    mean = reference.mean((0, 1))
-    varying = reference - mean
-    energy = (varying**2).sum((0, 1)) + 1e-6
-    strength = np.empty(len(frames), np.float32)
-    for i, frame in enumerate(frames):
-        difference = _blurred(frame) - reference
-        difference -= difference.mean((0, 1))
-        difference -= (difference * varying).sum((0, 1)) / energy * varying
-        strength[i] = np.sqrt((difference**2).sum(2).max())
-    return strength
+    return np.array([local_change(frame, background).max() for frame in frames], np.float32)
 
 
 def detect_contact(
     frames: UInt8[np.ndarray, "n h w 3"],
     background: UInt8[np.ndarray, "h w 3"],
-    threshold: float | int = 2.0,
+    threshold: float | int = THRESHOLD,
 ) -> Bool[np.ndarray, " n"]:
-    """Whether the sensor touches something, frame by frame.
-
-    Contact begins when `contact_strength` exceeds the threshold and ends when it falls below half
-    of it, so that strength about the threshold does not make contact flicker.
+    """Whether the sensor touches something, frame by frame: a `ContactDetector` over a recording.
 
     Args:
         frames: consecutive RGB pictures of one fingertip sensor.
         background: the same sensor untouched, such as the median of the first frames.
-        threshold: counts, in which pixel noise of 1 count has a strength of about 0.3.
+        threshold: counts.
     """
-    touching = False
-    contact = np.zeros(len(frames), bool)
-    for i, strength in enumerate(contact_strength(frames, background)):
-        touching = bool(strength > (threshold / 2 if touching else threshold))
-        contact[i] = touching
-    return contact
-
-
-def _blurred(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "H W 3"]:
-    height, width, _ = image.shape
-    size = max(width // _CELL, 1), max(height // _CELL, 1)
-    small = cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    return cv2.GaussianBlur(small, (0, 0), _BLUR_CELLS)
+    detector = ContactDetector(Background(background[None]), threshold)
+    return np.array([detector.update(frame) for frame in frames], bool)

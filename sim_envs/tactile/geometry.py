@@ -1,8 +1,8 @@
-"""What presses into a gel: height fields of primitives by analytic rays, textures, force balance.
+"""What presses into a gel: height fields of primitives by analytic rays, of meshes by scan lines.
 
 Sensor frame: x along image columns, y along rows, z out of the gel, origin on the undeformed
 surface in the middle of the image; metres. A height field says how far above the undeformed
-surface plane, into the gel, the object's near side lies: positive where it penetrates.
+surface plane, into the gel, an object's near side lies: positive where it penetrates.
 """
 
 import math
@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int32
 from numba import njit
 
-NO_SURFACE = np.float32(-0.95)  # m: a ray that meets nothing
+NO_SURFACE = np.float32(-0.95)  # m: nothing there
 HeightField = Float32[np.ndarray, "h w"]
 
-BOX, CYLINDER, SPHERE, CAPSULE = 0, 1, 2, 3
+BOX, CYLINDER, SPHERE, CAPSULE, ELLIPSOID = 0, 1, 2, 3, 4
 
 
 @dataclass(frozen=True)
@@ -27,16 +27,19 @@ class Grid:
     columns: int
     pitch: float
 
+    def empty(self) -> HeightField:
+        """A height field that nothing has been added to yet."""
+        return np.full((self.rows, self.columns), NO_SURFACE)
 
-# The kernels below are branchless so that the compiler vectorises them over a row: a missed ray gets
-# distance _FAR instead of leaving the loop. Rays start at z = _START and run along +z; in the
-# object's frame their direction is constant, d, and their origins move linearly over the image.
+
+# The kernels below are branchless so that the compiler vectorises them over a row: a missed ray
+# gets the distance _FAR. A ray's origin o is its point beside the object's centre, in the object's
+# frame, where the direction d is constant and the origins move linearly over the image.
 _FAR = np.float32(1.0)
-_START = np.float32(-0.05)
 _TINY = np.float32(1e-9)
 
 
-@njit(inline="always", fastmath=True)
+@njit(inline="always", fastmath=True, error_model="numpy")
 @no_type_check
 def _sphere(ox, oy, oz, d, radius):
     b = ox * d[0] + oy * d[1] + oz * d[2]
@@ -45,14 +48,27 @@ def _sphere(ox, oy, oz, d, radius):
     return t if disc >= 0 else _FAR
 
 
-@njit(inline="always", fastmath=True)
+@njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
+def _ellipsoid(ox, oy, oz, d, size):
+    """A unit sphere once every axis is divided by its half length."""
+    ox, oy, oz = ox / size[0], oy / size[1], oz / size[2]
+    dx, dy, dz = d[0] / size[0], d[1] / size[1], d[2] / size[2]
+    a = dx * dx + dy * dy + dz * dz
+    b = ox * dx + oy * dy + oz * dz
+    disc = b * b - a * (ox * ox + oy * oy + oz * oz - np.float32(1.0))
+    t = (-b - math.sqrt(max(disc, np.float32(0.0)))) / a
+    return t if disc >= 0 else _FAR
+
+
+@njit(inline="always", fastmath=True, error_model="numpy")
 @no_type_check
 def _slab(o, inverse, half):
     t0, t1 = (-half - o) * inverse, (half - o) * inverse
     return min(t0, t1), max(t0, t1)
 
 
-@njit(inline="always", fastmath=True)
+@njit(inline="always", fastmath=True, error_model="numpy")
 @no_type_check
 def _box(ox, oy, oz, inverse, size):
     x0, x1 = _slab(ox, inverse[0], size[0])
@@ -62,18 +78,18 @@ def _box(ox, oy, oz, inverse, size):
     return near if near <= far else _FAR
 
 
-@njit(inline="always", fastmath=True)
+@njit(inline="always", fastmath=True, error_model="numpy")
 @no_type_check
 def _side(ox, oy, oz, d, across, radius, half):
     """The curved side of a cylinder along z; `across` is 1 / (dx^2 + dy^2)."""
-    b = ox * d[0] + oy * d[1]
-    disc = b * b * across - (ox * ox + oy * oy - radius * radius)
-    t = -b * across - math.sqrt(max(disc, np.float32(0.0)) * across)
-    reach = abs(oz + t * d[2])
-    return max(t if disc >= 0 else _FAR, t if reach <= half else _FAR)
+    b = (ox * d[0] + oy * d[1]) * across
+    disc = b * b - (ox * ox + oy * oy - radius * radius) * across
+    t = -b - math.sqrt(max(disc, np.float32(0.0)))
+    hit = (disc >= 0) & (abs(oz + t * d[2]) <= half)
+    return t if hit else _FAR
 
 
-@njit(inline="always", fastmath=True)
+@njit(inline="always", fastmath=True, error_model="numpy")
 @no_type_check
 def _cap(ox, oy, oz, d, inverse_z, radius, end):
     t = (end - oz) * inverse_z
@@ -81,18 +97,14 @@ def _cap(ox, oy, oz, d, inverse_z, radius, end):
     return t if x * x + y * y <= radius * radius else _FAR
 
 
-@njit(inline="always", fastmath=True)
+@njit(inline="always", fastmath=True, error_model="numpy")
 @no_type_check
-def _cylinder(ox, oy, oz, d, across, inverse_z, size):
-    half = size[1]
-    ends = min(
-        _cap(ox, oy, oz, d, inverse_z, size[0], half),
-        _cap(ox, oy, oz, d, inverse_z, size[0], -half),
-    )
-    return min(_side(ox, oy, oz, d, across, size[0], half), ends)
+def _cylinder(ox, oy, oz, d, across, inverse_z, size, near_end):
+    cap = _cap(ox, oy, oz, d, inverse_z, size[0], near_end)
+    return min(_side(ox, oy, oz, d, across, size[0], size[1]), cap)
 
 
-@njit(inline="always", fastmath=True)
+@njit(inline="always", fastmath=True, error_model="numpy")
 @no_type_check
 def _capsule(ox, oy, oz, d, across, size):
     half = size[1]
@@ -100,153 +112,169 @@ def _capsule(ox, oy, oz, d, across, size):
     return min(_side(ox, oy, oz, d, across, size[0], half), ends)
 
 
-@njit(cache=True, fastmath=True)
+@njit(inline="always")
 @no_type_check
-def _cast(out, pitch, kind, position, rotation, size):
+def _inverse(value):
+    return np.float32(1.0) / (value if abs(value) > _TINY else _TINY)
+
+
+@njit(inline="always")
+@no_type_check
+def _span(centre, reach, cells):
+    """First and last + 1 of the cells within reach of a centre."""
+    return max(int(centre - reach), 0), min(int(centre + reach) + 2, cells)
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+@no_type_check
+def _add_primitive(out, pitch, kind, position, rotation, size, bound):
     rows, columns = out.shape
-    d = rotation[2]  # the sensor's z axis in the object's frame
-    tiny = _TINY
-    inverse = np.empty(3, np.float32)
-    for k in range(3):
-        inverse[k] = np.float32(1.0) / (d[k] if abs(d[k]) > tiny else tiny)
-    across = np.float32(1.0) / max(d[0] * d[0] + d[1] * d[1], tiny)
-    z = _START - position[2]
     y0, x0 = np.float32(0.5 * (rows - 1)), np.float32(0.5 * (columns - 1))
+    top, bottom = _span(y0 + position[1] / pitch, bound / pitch, rows)
+    left, right = _span(x0 + position[0] / pitch, bound / pitch, columns)
+    # The sensor's z axis in the object's frame. Tuples: an array might alias the output, which
+    # would keep the loops from being vectorised.
+    d = (rotation[2, 0], rotation[2, 1], rotation[2, 2])
+    size = (size[0], size[1], size[2])
+    inverse = (_inverse(d[0]), _inverse(d[1]), _inverse(d[2]))
+    across = np.float32(1.0) / max(d[0] * d[0] + d[1] * d[1], _TINY)
+    near_end = -size[1] if d[2] > 0 else size[1]
+    z = position[2]
+    # A table, for converting the loop's counter would keep it from being vectorised.
+    along = np.arange(columns).astype(np.float32)
     ex, ey, ez = rotation[0, 0] * pitch, rotation[0, 1] * pitch, rotation[0, 2] * pitch
-    for i in range(rows):
+    for i in range(top, bottom):
         y = (np.float32(i) - y0) * pitch - position[1]
-        x = -x0 * pitch - position[0]
-        ax = rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z
-        ay = rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z
-        az = rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z
-        row = out[i]
+        x = (np.float32(left) - x0) * pitch - position[0]
+        ax = rotation[0, 0] * x + rotation[1, 0] * y
+        ay = rotation[0, 1] * x + rotation[1, 1] * y
+        az = rotation[0, 2] * x + rotation[1, 2] * y
+        row = out[i, left:right]
         if kind == SPHERE:
-            for j in range(columns):
-                n = np.float32(j)
-                row[j] = -_START - _sphere(ax + n * ex, ay + n * ey, az + n * ez, d, size[0])
+            for j in range(right - left):
+                n = along[j]
+                t = _sphere(ax + n * ex, ay + n * ey, az + n * ez, d, size[0])
+                row[j] = max(row[j], -z - t)
         elif kind == BOX:
-            for j in range(columns):
-                n = np.float32(j)
-                row[j] = -_START - _box(ax + n * ex, ay + n * ey, az + n * ez, inverse, size)
+            for j in range(right - left):
+                n = along[j]
+                t = _box(ax + n * ex, ay + n * ey, az + n * ez, inverse, size)
+                row[j] = max(row[j], -z - t)
         elif kind == CYLINDER:
-            for j in range(columns):
-                n = np.float32(j)
-                t = _cylinder(ax + n * ex, ay + n * ey, az + n * ez, d, across, inverse[2], size)
-                row[j] = -_START - t
-        else:
-            for j in range(columns):
-                n = np.float32(j)
+            for j in range(right - left):
+                n = along[j]
+                ox, oy, oz = ax + n * ex, ay + n * ey, az + n * ez
+                t = _cylinder(ox, oy, oz, d, across, inverse[2], size, near_end)
+                row[j] = max(row[j], -z - t)
+        elif kind == CAPSULE:
+            for j in range(right - left):
+                n = along[j]
                 t = _capsule(ax + n * ex, ay + n * ey, az + n * ez, d, across, size)
-                row[j] = -_START - t
+                row[j] = max(row[j], -z - t)
+        else:
+            for j in range(right - left):
+                n = along[j]
+                t = _ellipsoid(ax + n * ex, ay + n * ey, az + n * ez, d, size)
+                row[j] = max(row[j], -z - t)
 
 
-def primitive_height(
-    grid: Grid,
+def _bounding_radius(kind: int, size: Float[np.ndarray, "3"]) -> float:
+    if kind == SPHERE:
+        return float(size[0])
+    if kind == CAPSULE:
+        return float(size[0] + size[1])
+    if kind == ELLIPSOID:
+        return float(size.max())
+    return float(np.linalg.norm(size if kind == BOX else size[:2]))
+
+
+def add_primitive(
+    height: HeightField,
+    pitch: float,
     kind: int,
     position: Float[np.ndarray, "3"],
     rotation: Float[np.ndarray, "3 3"],
     size: Float[np.ndarray, "3"],
-) -> HeightField:
-    """Height field of one primitive, given its pose in the sensor frame and MuJoCo size.
+) -> None:
+    """Raise a height field, in place, to the near side of one primitive.
 
     float32: at fingertip distances its rounding is 4 nm.
+
+    Args:
+        kind: BOX, CYLINDER, SPHERE, CAPSULE or ELLIPSOID.
+        position, rotation: of the primitive in the sensor frame.
+        size: as MuJoCo takes it, m.
     """
-    out = np.empty((grid.rows, grid.columns), np.float32)
-    pose = [np.asarray(a, np.float32) for a in (position, rotation, size)]
-    _cast(out, np.float32(grid.pitch), kind, *pose)
-    return out
+    pose = (np.asarray(a, np.float32) for a in (position, rotation, size))
+    bound = np.float32(_bounding_radius(kind, size))
+    _add_primitive(height, np.float32(pitch), kind, *pose, bound)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 @no_type_check
-def _pattern(texture, x, y, z, k, noise):
-    """Height of a solid texture at a point of the object's frame, in units of its amplitude.
+def _add_mesh(out, pitch, vertices, faces, position, rotation):
+    rows, columns = out.shape
+    zero, scale = np.float32(0.0), np.float32(1.0) / pitch
+    y0, x0 = np.float32(0.5 * (rows - 1)), np.float32(0.5 * (columns - 1))
+    px = np.empty(len(vertices), np.float32)
+    py, height = np.empty_like(px), np.empty_like(px)
+    for i in range(len(vertices)):
+        vx, vy, vz = vertices[i]
+        x = rotation[0, 0] * vx + rotation[0, 1] * vy + rotation[0, 2] * vz + position[0]
+        y = rotation[1, 0] * vx + rotation[1, 1] * vy + rotation[1, 2] * vz + position[1]
+        z = rotation[2, 0] * vx + rotation[2, 1] * vy + rotation[2, 2] * vz + position[2]
+        px[i], py[i], height[i] = x * scale + x0, y * scale + y0, -z
+    margin = np.float32(1e-3)  # of a pixel: neighbours share their edge, no crack stays
+    for f in range(len(faces)):
+        a, b, c = faces[f]
+        abx, aby, acx, acy = px[b] - px[a], py[b] - py[a], px[c] - px[a], py[c] - py[a]
+        area = acx * aby - abx * acy
+        if area <= np.float32(1e-9):  # seen from behind, or edge-on
+            continue
+        top = max(int(math.ceil(min(py[a], py[b], py[c]) - margin)), 0)
+        bottom = min(int(math.floor(max(py[a], py[b], py[c]) + margin)) + 1, rows)
+        left = max(math.ceil(min(px[a], px[b], px[c]) - margin), zero)
+        right = min(math.floor(max(px[a], px[b], px[c]) + margin), np.float32(columns - 1))
+        if top >= bottom or left > right:
+            continue
+        highest = max(height[a], height[b], height[c])
+        abh, ach = height[b] - height[a], height[c] - height[a]
+        along = (ach * aby - abh * acy) / area
+        down = (abh * acx - ach * abx) / area
+        for i in range(top, bottom):
+            first, last = left, right
+            for u, v in ((a, b), (b, c), (c, a)):  # this row's stretch inside all three edges
+                ex, ey = px[v] - px[u], py[v] - py[u]
+                if abs(ey) > margin * margin:
+                    x = px[u] + (np.float32(i) - py[u]) * ex / ey
+                    if ey > zero:
+                        first = max(first, x - margin)
+                    else:
+                        last = min(last, x + margin)
+            start, stop = int(math.ceil(first)), int(math.floor(last))
+            value = height[a] + down * (np.float32(i) - py[a]) - along * px[a]
+            row = out[i]
+            for j in range(start, stop + 1):
+                row[j] = max(row[j], min(value + along * np.float32(j), highest))
 
-    Solid (a function of 3-D position) so that it sticks to any shape without seams. `k` is
-    2 pi / wavelength.
-    """
-    if texture == 1:  # ribs: planes across the object's x + y diagonal, so that every side has some
-        return math.sin(k * 0.7071 * (x + y))
-    if texture == 2:  # dots: bumps on a lattice
-        return math.sin(k * x) * math.sin(k * y) + math.sin(k * y) * math.sin(k * z)
-    if texture == 4:  # weave: two crossed sets of threads, alternately above each other
-        over = math.sin(0.5 * k * x + 0.5 * k * y) * math.sin(0.5 * k * z)
-        along, across = math.sin(k * z), math.sin(k * 0.7071 * (x + y))
-        return 0.6 * (along if over > 0.0 else across) + 0.4 * abs(over)
-    n = noise.shape[0]
-    scale = k / (2.0 * math.pi) * 2.0  # rough: trilinear noise, two cells a wavelength
-    fx, fy, fz = x * scale, y * scale, z * scale
-    ix, iy, iz = math.floor(fx), math.floor(fy), math.floor(fz)
-    fx, fy, fz = fx - ix, fy - iy, fz - iz
-    value = 0.0
-    for a in range(2):
-        for b in range(2):
-            for c in range(2):
-                weight = (fx if a else 1 - fx) * (fy if b else 1 - fy) * (fz if c else 1 - fz)
-                value += weight * noise[int(ix + a) % n, int(iy + b) % n, int(iz + c) % n]
-    return value
 
-
-_NOISE = np.random.default_rng(20260101).uniform(-1.6, 1.6, (32, 32, 32)).astype(np.float32)
-
-
-@njit(cache=True, fastmath=True)
-@no_type_check
-def _add_texture(height, below, pitch, texture, amplitude, k, position, rotation, noise):
-    rows, columns = height.shape
-    for i in range(rows):
-        for j in range(columns):
-            if height[i, j] > below:
-                px = (j - 0.5 * (columns - 1)) * pitch - position[0]
-                py = (i - 0.5 * (rows - 1)) * pitch - position[1]
-                pz = -height[i, j] - position[2]
-                x = rotation[0, 0] * px + rotation[1, 0] * py + rotation[2, 0] * pz
-                y = rotation[0, 1] * px + rotation[1, 1] * py + rotation[2, 1] * pz
-                z = rotation[0, 2] * px + rotation[1, 2] * py + rotation[2, 2] * pz
-                height[i, j] += amplitude * _pattern(texture, x, y, z, k, noise)
-
-
-def add_texture(
+def add_mesh(
     height: HeightField,
     pitch: float,
-    below: float,
-    texture: int,
-    amplitude: float,
-    wavelength: float,
+    vertices: Float32[np.ndarray, "n 3"],
+    faces: Int32[np.ndarray, "m 3"],
     position: Float[np.ndarray, "3"],
     rotation: Float[np.ndarray, "3 3"],
 ) -> None:
-    """Add a surface pattern in place, where the surface lies higher than `below` m."""
-    if texture and amplitude > 0:
-        k = 2 * math.pi / wavelength
-        _add_texture(height, below, pitch, texture, amplitude, k, position, rotation, _NOISE)
+    """Raise a height field, in place, to the near side of a closed triangle mesh.
 
+    An orthographic z-buffer of our own: software OpenGL takes several times as long, and needs
+    OpenGL.
 
-@njit(cache=True, fastmath=True)
-@no_type_check
-def _volume(height, shift, cell):
-    total = 0.0
-    for i in range(height.shape[0]):
-        for j in range(height.shape[1]):
-            overlap = height[i, j] + shift
-            if overlap > 0.0:
-                total += overlap
-    return total * cell
-
-
-def settle(height: HeightField, pitch: float, force: float, modulus: float) -> float:
-    """How far to push the object in (m) so that the gel's pressure sums to `force` N.
-
-    The gel and the object's own give act as an elastic foundation: pressure = modulus x overlap.
-    MuJoCo's penetration is no such measure: it depends on solver settings and the object's mass.
+    Args:
+        vertices: in the mesh's frame, m.
+        faces: corners of the triangles, counter-clockwise seen from outside.
+        position, rotation: of the mesh in the sensor frame.
     """
-    target, cell = force / modulus, pitch * pitch
-    top = float(height.max())
-    low, high = -top, -top + 0.02  # m; 20 mm of overlap is beyond any gripper's force
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        if _volume(height, middle, cell) < target:
-            low = middle
-        else:
-            high = middle
-    return 0.5 * (low + high)
+    pose = (np.asarray(a, np.float32) for a in (position, rotation))
+    _add_mesh(height, np.float32(pitch), vertices, faces, *pose)

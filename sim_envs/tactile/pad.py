@@ -1,37 +1,45 @@
 """The simulated fingertip sensor: what a GelSight would show for the scene as it is now."""
 
 from dataclasses import dataclass
+from functools import reduce
 
 import cv2
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from touchgoal.control.sensors import SensorModel
+from touchgoal.control.touch.gel import deform
 from touchgoal.sim_envs.contact import PadContact
-from touchgoal.sim_envs.objects import Body
-from touchgoal.sim_envs.rendering import open_renderer
-from touchgoal.sim_envs.scene import OBJECT_GROUP, PAD_CAMERA_DISTANCE
+from touchgoal.sim_envs.objects import Body, Material
+from touchgoal.sim_envs.scene import OBJECT_GROUP
+from touchgoal.sim_envs.tactile.forces import ForceField, force_field
 from touchgoal.sim_envs.tactile.geometry import (
     BOX,
     CAPSULE,
     CYLINDER,
-    NO_SURFACE,
+    ELLIPSOID,
     SPHERE,
     Grid,
-    add_texture,
-    primitive_height,
-    settle,
+    HeightField,
+    add_mesh,
+    add_primitive,
 )
-from touchgoal.sim_envs.tactile.optics import Unit, deform, render, render_untouched
+from touchgoal.sim_envs.tactile.markers import GelMotion, draw
+from touchgoal.sim_envs.tactile.optics import render, render_untouched
+from touchgoal.sim_envs.tactile.press import Press, settle
+from touchgoal.sim_envs.tactile.texture import add_texture
+from touchgoal.sim_envs.tactile.unit import Unit
 
 _PRIMITIVES = {
     int(mujoco.mjtGeom.mjGEOM_BOX): BOX,
     int(mujoco.mjtGeom.mjGEOM_CYLINDER): CYLINDER,
     int(mujoco.mjtGeom.mjGEOM_SPHERE): SPHERE,
     int(mujoco.mjtGeom.mjGEOM_CAPSULE): CAPSULE,
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): ELLIPSOID,
 }
-# Geometry at half the image's resolution: between two of its rays a 20 mm ball deviates from a
+_MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
+# Surfaces at half the image's resolution: between two of its rays a 20 mm ball deviates from a
 # straight line by 0.09 um. The force balance, over the whole gel, needs a quarter.
 _FINE, _COARSE = 2, 4
 
@@ -42,136 +50,165 @@ class TactileFrame:
 
     Attributes:
         image: what the camera sees, RGB.
-        depth: of the gel's surface below its rest plane, m.
-        mask: where an object touches the gel.
+        surface: depth of the gel below its rest plane at half the image's resolution, m.
+        overlap: how deep the object itself lies in the undeformed gel, m; zero where it does not
+            touch.
+        field: forces over the whole gel; None where nothing touches.
     """
 
     image: UInt8[np.ndarray, "h w 3"]
-    depth: Float32[np.ndarray, "h w"]
-    mask: Bool[np.ndarray, "h w"]
+    surface: Float32[np.ndarray, "h2 w2"]
+    overlap: Float32[np.ndarray, "h2 w2"]
+    field: ForceField | None
+
+    @property
+    def depth(self) -> Float32[np.ndarray, "h w"]:
+        """Depth of the gel below its rest plane at the image's resolution, m."""
+        h, w, _ = self.image.shape
+        return cv2.resize(self.surface, (w, h), interpolation=cv2.INTER_LINEAR)
+
+    @property
+    def mask(self) -> Bool[np.ndarray, "h w"]:
+        """Where an object touches the gel, at the image's resolution."""
+        h, w, _ = self.image.shape
+        return cv2.resize(self.overlap, (w, h), interpolation=cv2.INTER_LINEAR) > 0
 
 
 class TactilePad:
     """One fingertip's sensor in a compiled model.
 
-    The exact normal force comes from the solver, the shape of the contact from geometry: objects
-    are pushed into the gel until an elastic foundation carries that force. The geometry is taken
-    in the sensor's frame, which the case carries, so that shear moves the contact in the image.
+    The solver says what force the pad carries and where, geometry gives the shape of the contact:
+    objects are pushed into the gel until an elastic foundation carries that force. The geometry is
+    taken in the sensor's frame, which the case carries, so that shear moves the contact in the
+    image. Stick and slip have a memory: frames are to be taken in order of time.
     """
 
     def __init__(
         self, model: mujoco.MjModel, side: str, sensor: SensorModel, unit: Unit, bodies: list[Body]
     ) -> None:
-        self._model, self._side, self._sensor, self._unit = model, side, sensor, unit
+        self._model, self._sensor, self._unit = model, sensor, unit
         self._site = model.site(f"{side}_sensor").id
-        self._bodies = {model.geom(body.name).id: body for body in bodies}
+        self._materials = {int(model.body(b.name).id): b.kind.material for b in bodies}
+        self._geoms = {body: _solid_geoms(model, body) for body in self._materials}
+        self._meshes = {
+            geom: _triangles(model, geom)
+            for geoms in self._geoms.values()
+            for geom in geoms
+            if int(model.geom_type[geom]) == _MESH
+        }
         rows, columns = sensor.image_shape
-        self._fine_grid = Grid(rows // _FINE, columns // _FINE, sensor.pixel_pitch * _FINE)
-        self._coarse_grid = _gel_grid(sensor, _COARSE)
-        self._mesh_grid = _gel_grid(sensor, _FINE)
-        # An orthographic camera's fovy is the height it sees, m; the width follows from the aspect.
-        model.cam_fovy[model.camera(f"{side}_gel").id] = (
-            self._mesh_grid.rows * self._mesh_grid.pitch
-        )
-        self._renderer: mujoco.Renderer | None = None
+        pitch = unit.pixel_pitch
+        self._image_grid = Grid(rows // _FINE, columns // _FINE, pitch * _FINE)
+        self._gel_grid = _gel_grid(sensor, pitch * _COARSE)
+        self._field: ForceField | None = None
+        self._motion = self._gel_motion() if len(unit.markers) else None
 
     def sense(
         self, data: mujoco.MjData, contact: PadContact, rng: np.random.Generator
     ) -> TactileFrame:
         """The reading for the present state; nothing is computed for a pad that touches nothing."""
-        shape = self._sensor.image_shape
-        body, geom = self._touched(contact)
-        if body is None or contact.normal_force <= 0:
-            flat = np.zeros(shape, np.float32)
-            return TactileFrame(render_untouched(self._unit, rng), flat, np.zeros(shape, bool))
-        raw = self._overlap(data, geom, body, contact.normal_force)
-        surface = deform(raw, self._sensor.pixel_pitch)
-        image = render(surface, self._sensor.pixel_pitch, self._unit, rng)
-        return TactileFrame(image, surface, raw > 0)
-
-    def close(self) -> None:
-        """Free the OpenGL context, if meshes needed one."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
-
-    def _touched(self, contact: PadContact) -> tuple[Body | None, int]:
-        """The object on the pad; the scene's own parts (table, case) leave no picture."""
-        for geom in sorted(contact.geoms):
-            if geom in self._bodies:
-                return self._bodies[geom], geom
-        return None, -1
-
-    def _overlap(
-        self, data: mujoco.MjData, geom: int, body: Body, force: float
-    ) -> Float32[np.ndarray, "h w"]:
-        """How deep the object sits in the gel over the image, m."""
-        material, gel = body.kind.material, self._sensor.foundation_modulus
-        R = data.site_xmat[self._site].reshape(3, 3)
-        rotation = R.T @ data.geom_xmat[geom].reshape(3, 3)
-        position = R.T @ (data.geom_xpos[geom] - data.site_xpos[self._site])
-        height, coarse = self._heights(data, geom, position, rotation)
-        # Gel and object in series: the softer one takes the larger share of the overlap.
-        modulus = 1 / (1 / gel + 1 / material.foundation_modulus)
-        shift = settle(coarse, self._sensor.pixel_pitch * _COARSE, force, modulus)
-        height += np.float32(shift)
-        add_texture(
-            height,
-            self._fine_grid.pitch,
-            -2 * material.amplitude,
-            material.texture,
-            material.amplitude,
-            material.wavelength,
-            position + np.array([0, 0, -shift]),
-            rotation,
+        touched = self._touched(contact)
+        if not touched or contact.normal_force <= 0:
+            return self._untouched(rng)
+        press = self._press(data, contact, touched)
+        overlap = self._overlap(data, press, touched)
+        self._field = force_field(
+            press, self._field, contact, self._friction(contact), self._sensor
         )
-        rows, columns = self._sensor.image_shape
-        height = cv2.resize(height, (columns, rows), interpolation=cv2.INTER_LINEAR)
-        return np.maximum(height, np.float32(0)) * np.float32(modulus / gel)
+        surface = deform(overlap, self._image_grid.pitch, self._unit.photometry.bulge)
+        image = render(surface, self._unit, rng)
+        if self._motion is not None:
+            moved = self._motion(self._field) / np.float32(self._unit.pixel_pitch)
+            draw(image, self._unit.markers + moved, self._unit.marker_radius)
+        return TactileFrame(image, surface, overlap, self._field)
 
-    def _heights(
-        self, data: mujoco.MjData, geom: int, position: np.ndarray, rotation: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Height fields over the image (fine grid) and over the whole gel (coarse grid), m."""
-        kind = _PRIMITIVES.get(int(self._model.geom_type[geom]))
-        if kind is not None:
-            pose = kind, position, rotation, self._model.geom_size[geom]
-            return (
-                primitive_height(self._fine_grid, *pose),
-                primitive_height(self._coarse_grid, *pose),
-            )
-        whole = self._mesh_height(data)
-        h, w = self._fine_grid.rows, self._fine_grid.columns
-        top, left = (whole.shape[0] - h) // 2, (whole.shape[1] - w) // 2
-        step = _COARSE // _FINE
-        fine = whole[top : top + h, left : left + w].copy()
-        return fine, np.ascontiguousarray(whole[::step, ::step])
+    def _untouched(self, rng: np.random.Generator) -> TactileFrame:
+        self._field = None
+        image = render_untouched(self._unit, rng)
+        draw(image, self._unit.markers, self._unit.marker_radius)
+        flat = np.zeros((self._image_grid.rows, self._image_grid.columns), np.float32)
+        return TactileFrame(image, flat, flat, None)
 
-    def _mesh_height(self, data: mujoco.MjData) -> Float32[np.ndarray, "h w"]:
-        """Height field of everything in the object group, by the camera inside the sensor."""
-        if self._renderer is None:
-            self._renderer = _depth_renderer(self._model, self._mesh_grid)
-        options = mujoco.MjvOption()
-        options.geomgroup[:] = 0
-        options.geomgroup[OBJECT_GROUP] = 1
-        self._renderer.update_scene(data, f"{self._side}_gel", options)
-        distance = self._renderer.render()
-        height = np.float32(PAD_CAMERA_DISTANCE) - distance
-        return np.where(distance < 0.1, height, NO_SURFACE)
+    def _gel_motion(self) -> GelMotion:
+        """How the printed dots follow the gel."""
+        h, w = self._sensor.image_shape
+        centre = np.array([w - 1, h - 1]) / 2
+        points = (self._unit.markers - centre) * self._unit.pixel_pitch
+        return GelMotion(self._sensor, self._gel_grid, points)
+
+    def _touched(self, contact: PadContact) -> list[int]:
+        """Bodies on the pad; the scene's own parts (table, case) leave no picture."""
+        bodies = {int(self._model.geom_bodyid[geom]) for geom in contact.geoms}
+        return sorted(bodies & self._geoms.keys())
+
+    def _friction(self, contact: PadContact) -> float:
+        """The solver's coefficient: an object's own, which has priority over the gel's."""
+        return max(float(self._model.geom_friction[geom, 0]) for geom in contact.geoms)
+
+    def _modulus(self, material: Material) -> float:
+        """Of gel and object in series: the softer one takes the larger share of the overlap."""
+        return 1 / (1 / self._sensor.foundation_modulus + 1 / material.foundation_modulus)
+
+    def _press(self, data: mujoco.MjData, contact: PadContact, touched: list[int]) -> Press:
+        height = reduce(np.maximum, (self._height(data, b, self._gel_grid) for b in touched))
+        modulus = min(self._modulus(self._materials[body]) for body in touched)
+        return settle(height, self._gel_grid.pitch, contact, modulus, self._sensor)
+
+    def _overlap(self, data: mujoco.MjData, press: Press, touched: list[int]) -> HeightField:
+        """How deep the objects sit in the gel over the image, m."""
+        return reduce(np.maximum, (self._one_overlap(data, press, body) for body in touched))
+
+    def _one_overlap(self, data: mujoco.MjData, press: Press, body: int) -> HeightField:
+        grid, material = self._image_grid, self._materials[body]
+        height = self._height(data, body, grid)
+        press.seat(height, grid.pitch)
+        position, rotation = self._pose(data, data.xpos[body], data.xmat[body])
+        add_texture(height, grid.pitch, material, position - [0, 0, press.shift], rotation)
+        share = self._modulus(material) / self._sensor.foundation_modulus
+        np.maximum(height, 0, out=height)
+        height *= np.float32(share)
+        return height
+
+    def _height(self, data: mujoco.MjData, body: int, grid: Grid) -> HeightField:
+        """Height field of one body before it is pushed into the gel, m."""
+        height, model = grid.empty(), self._model
+        for geom in self._geoms[body]:
+            pose = self._pose(data, data.geom_xpos[geom], data.geom_xmat[geom])
+            if geom in self._meshes:
+                add_mesh(height, grid.pitch, *self._meshes[geom], *pose)
+            else:
+                kind = _PRIMITIVES[int(model.geom_type[geom])]
+                add_primitive(height, grid.pitch, kind, *pose, model.geom_size[geom])
+        return height
+
+    def _pose(
+        self,
+        data: mujoco.MjData,
+        position: Float[np.ndarray, "3"],
+        matrix: Float[np.ndarray, "9"],
+    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+        """A world pose in the sensor's frame."""
+        R = data.site_xmat[self._site].reshape(3, 3)
+        return (position - data.site_xpos[self._site]) @ R, R.T @ matrix.reshape(3, 3)
 
 
-def _gel_grid(sensor: SensorModel, scale: int) -> Grid:
-    """The whole gel at 1/scale of the image's resolution; sizes are multiples of four."""
-    pitch = sensor.pixel_pitch * scale
+def _solid_geoms(model: mujoco.MjModel, body: int) -> list[int]:
+    """Geoms of a body that press into gels."""
+    first, count = int(model.body_geomadr[body]), int(model.body_geomnum[body])
+    return [g for g in range(first, first + count) if model.geom_group[g] == OBJECT_GROUP]
+
+
+def _triangles(
+    model: mujoco.MjModel, geom: int
+) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, "m 3"]]:
+    """Vertices and faces of a mesh geom, in its frame."""
+    mesh = model.geom_dataid[geom]
+    vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+    vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]]
+    return vertices, model.mesh_face[face : face + model.mesh_facenum[mesh]]
+
+
+def _gel_grid(sensor: SensorModel, pitch: float) -> Grid:
+    """A grid over the whole gel; its sizes are multiples of four."""
     columns, rows = (4 * round(size / pitch / 4) for size in sensor.gel_size)
     return Grid(rows, columns, pitch)
-
-
-def _depth_renderer(model: mujoco.MjModel, grid: Grid) -> mujoco.Renderer:
-    quality = model.vis.quality
-    kept = quality.offsamples, quality.shadowsize
-    quality.offsamples, quality.shadowsize = 0, 0  # multisampling would blend depths at edges
-    renderer = open_renderer(model, grid.rows, grid.columns)
-    quality.offsamples, quality.shadowsize = kept
-    renderer.enable_depth_rendering()
-    return renderer

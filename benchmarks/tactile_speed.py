@@ -1,0 +1,208 @@
+"""How fast a simulated pad makes its pictures on one core, beside the machine's limit and a peer."""
+
+import importlib.util
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, no_type_check
+
+import cv2
+import numpy as np
+from numba import njit
+
+from touchgoal.benchmarks.env_speed import one_core
+from touchgoal.control.sensors import GELSIGHT_MINI_MARKERS, SensorModel
+from touchgoal.sim_envs.objects import CATALOGUE, HARD, Body, Material, ObjectKind, Texture
+from touchgoal.sim_envs.tactile.rig import PressRig
+from touchgoal.sim_envs.tactile.unit import NOMINAL, sample_unit
+
+# What one 240x320 frame of a ball at least does, counted by hand from the kernels: multiplications
+# and additions, and bytes that leave or enter the first-level cache.
+FRAME_FLOP = 19_200 * (2 * 25 + 3 * 60 + 60) + 76_800 * 3 * 9
+FRAME_BYTES = 19_200 * 4 * 45 + 76_800 * 3 * (2 + 1 + 1 + 2)
+_TEXTURED = Material(Texture.DOTTED, 40e-6, 1.5e-3, HARD, 0.8, (0.7, 0.7, 0.7, 1.0))
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of tactile-speed."""
+
+    out: Path | None = None
+    """Folder of the run."""
+    repeats: int = 7
+    """Measurements of each figure; the median is printed."""
+    frames: int = 100
+    """Frames of one measurement."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured rate, frames per second of processor time."""
+
+    what: str
+    median: float
+    slowest: float
+    fastest: float
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Measure everything on one core. Processor time, which busy neighbours distort least."""
+    cv2.setNumThreads(1)
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+    with one_core():
+        rows = [*_ours(config), *_peer(config)]
+        limits = _limits(config)
+    return {"rows": [vars(row) for row in rows], **limits, "table": _table(rows, limits)}
+
+
+def _ours(config: Config) -> list[Row]:
+    full = GELSIGHT_MINI_MARKERS
+    half = replace(full, image_shape=(120, 160), pixel_pitch=2 * full.pixel_pitch)
+    rows = []
+    for sensor in (full, half):
+        h, w = sensor.image_shape
+        for name, body, distance in _bodies():
+            for what, kind in (("smooth", body.kind), ("textured", _textured(body.kind))):
+                rig = PressRig(replace(body, kind=kind), sensor, _unit(sensor))
+                rig.place(np.array([1e-3, -0.5e-3, distance - 5e-4]))
+                rows.append(_measure(f"{h}x{w} {name}, {what}", config, _frame(rig)))
+        rig = PressRig(_bodies()[0][1], sensor, _unit(sensor))
+        rows.append(_measure(f"{h}x{w} untouched", config, _frame(rig, force=0.0)))
+    return rows
+
+
+def _frame(rig: PressRig, force: float = 8.0) -> Callable[[], object]:
+    """All stages: geometry, force balance, stick and slip, gel, shadows, colours, noise, dots."""
+    rng = np.random.default_rng(0)
+    return lambda: rig.sense(force, rng, shear=(1.5, 0.5), centre=(1e-3, -0.5e-3))
+
+
+def _unit(sensor: SensorModel) -> Any:
+    unit = sample_unit(GELSIGHT_MINI_MARKERS, np.random.default_rng(0), NOMINAL)
+    if sensor.image_shape == unit.background.shape[1:]:
+        return unit
+    return replace(
+        unit,
+        background=unit.background[:, ::2, ::2].copy(),
+        gain=unit.gain[:, ::2, ::2].copy(),
+        pixel_pitch=sensor.pixel_pitch,
+        markers=unit.markers / 2,
+        marker_radius=unit.marker_radius / 2,
+    )
+
+
+def _bodies() -> list[tuple[str, Body, float]]:
+    """Name, body, and how far its centre lies above its near side, m."""
+    ball, pebble = CATALOGUE["glass_ball"], CATALOGUE["pebble"]
+    can = replace(ball, shape="cylinder")
+    box, rod = replace(ball, shape="box"), replace(ball, shape="capsule")
+    radius = 0.012
+    small, large = (_sphere_points(n) * radius for n in (642, 10_242))
+    return [
+        ("ball", Body(ball, (radius,), 0.1), radius),
+        ("cylinder, lying", Body(can, (0.01, 0.02), 0.1), 0.02),
+        ("box", Body(box, (0.006, 0.005, 0.01), 0.1), 0.01),
+        ("capsule", Body(rod, (0.006, 0.01), 0.1), 0.006),
+        ("mesh of 1,280 triangles", Body(pebble, (1.0,), 0.1, hull=small), radius),
+        ("mesh of 20,480 triangles", Body(pebble, (1.0,), 0.1, hull=large), radius),
+    ]
+
+
+def _textured(kind: ObjectKind) -> ObjectKind:
+    return replace(kind, material=_TEXTURED)
+
+
+def _sphere_points(n: int) -> np.ndarray:
+    """n points spread evenly over the unit sphere; their hull has 2 n - 4 triangles."""
+    k = np.arange(n) + 0.5
+    z, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), z], 1)
+
+
+def _peer(config: Config) -> list[Row]:
+    """Taxim's JAX port, where it is installed, with its own Mini calibration and a ball."""
+    if importlib.util.find_spec("taxim") is None or importlib.util.find_spec("jax") is None:
+        print("no peer: pip install 'touchgoal[peers]' to measure taxim beside us")
+        return []
+    from taxim import CALIB_GELSIGHT_MINI, Taxim  # pyright: ignore[reportMissingImports]
+
+    simulator = Taxim(calib_folder=CALIB_GELSIGHT_MINI, backend="jax", device="cpu")
+    x, y = np.meshgrid(np.arange(640) - 319.5, np.arange(480) - 239.5)
+    square = 12.0**2 - (0.0295 * x) ** 2 - (0.0295 * y) ** 2
+    height = (12.0 - np.sqrt(np.maximum(square, 0)) - 0.5).astype(np.float32)  # mm
+    fewer = replace(config, frames=max(config.frames // 50, 1), repeats=min(config.repeats, 3))
+    rows = []
+    for what, shadow in (("without shadows", False), ("with shadows", True)):
+
+        def render(shadow: bool = shadow) -> None:
+            np.asarray(simulator.render(height, with_shadow=shadow))
+
+        name = f"480x640 peer: taxim 1.4.1 (JAX), {what}, no force, no dots"
+        rows.append(_measure(name, fewer, render, clock=time.process_time))
+    return rows
+
+
+def _measure(
+    what: str,
+    config: Config,
+    work: Callable[[], object],
+    clock: Callable[[], float] = time.thread_time,
+) -> Row:
+    work()
+    rates = []
+    for _ in range(config.repeats):
+        start = clock()
+        for _ in range(config.frames):
+            work()
+        rates.append(config.frames / (clock() - start))
+    return Row(what, float(np.median(rates)), min(rates), max(rates))
+
+
+def _limits(config: Config) -> dict[str, float]:
+    """What this core can do at best, and how many frames a second that would be."""
+    source = np.zeros(1 << 16, np.float32)  # 256 kB: second-level cache, as a frame's arrays
+    target = np.empty_like(source)
+    copies = replace(config, frames=2000)
+    copied = _measure("copy", copies, lambda: np.copyto(target, source)).median * 2 * source.nbytes
+    flop = _measure("fma", replace(config, frames=20), _multiply_and_add).median * _FMA_FLOP
+    return {
+        "copy_gb_per_s": copied / 1e9,
+        "gflop_per_s": flop / 1e9,
+        "memory_limit_fps": copied / FRAME_BYTES,
+        "arithmetic_limit_fps": flop / FRAME_FLOP,
+    }
+
+
+_FMA_STEPS = 1 << 14
+_FMA_FLOP = _FMA_STEPS * 128 * 2
+_LANES = np.full(128, 0.5, np.float32)
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _chain(lanes, steps):
+    for _ in range(steps):
+        for k in range(128):
+            lanes[k] = lanes[k] * np.float32(0.999) + np.float32(0.0005)
+
+
+def _multiply_and_add() -> None:
+    _chain(_LANES, _FMA_STEPS)
+
+
+def _table(rows: list[Row], limits: dict[str, float]) -> str:
+    lines = [f"{'one core, processor time':<72}{'frames/s':>11}{'slowest':>10}{'fastest':>10}"]
+    lines += [f"{r.what:<72}{r.median:>11,.0f}{r.slowest:>10,.0f}{r.fastest:>10,.0f}" for r in rows]
+    ball = next(row for row in rows if row.what.startswith("240x320 ball"))
+    lines.append(
+        f"this core copies {limits['copy_gb_per_s']:.0f} GB/s and does "
+        f"{limits['gflop_per_s']:.0f} GFLOP/s: a 240x320 frame cannot be faster than "
+        f"{limits['memory_limit_fps']:,.0f}/s by memory, {limits['arithmetic_limit_fps']:,.0f}/s "
+        f"by arithmetic; the ball reaches "
+        f"{ball.median * (1 / limits['memory_limit_fps'] + 1 / limits['arithmetic_limit_fps']):.0%}"
+        " of both one after the other"
+    )
+    return "\n".join(lines)

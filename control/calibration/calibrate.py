@@ -1,0 +1,204 @@
+"""From labelled ball presses to a sensor file."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from touchgoal.control.calibration.ball import Circle, press_surface
+from touchgoal.control.calibration.press_fit import (
+    NARROWEST,
+    PYRAMID,
+    WIDEST,
+    FitState,
+    PressFit,
+)
+from touchgoal.control.calibration.press_set import PressSet
+from touchgoal.control.touch.photometry import N_FEATURES, Photometry, features, shade
+
+STEPS = 7
+"""How often `fit` reports progress."""
+
+# Position terms need presses spread over the picture: the standard deviation of the centres, as a
+# share of the picture, in both directions (evenly spread over all of it: 0.29).
+_SPREAD = 0.1
+_FAR = 4.0  # contact radii from which on a press leaves the gel as it was
+
+
+@dataclass(frozen=True)
+class LabelCorrection:
+    """How circles were labelled, learnt where pictures were fitted: per coordinate, a line.
+
+    Attributes:
+        offset, slope: true centre x, centre y and radius (px) are about offset + slope x label.
+    """
+
+    offset: Circle
+    slope: Circle
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A fitted sensor and what was learnt on the way.
+
+    Attributes:
+        photometry: the sensor file to be.
+        circles: of the fitted presses, where their pictures say they are, px.
+        ball_radius: of the fitted presses, m.
+        ball_fitted: whether the presses left the ball's radius open. Slopes and depths are then no
+            better known than that radius, which pictures tell poorly.
+        position: whether the response may vary over the image; not if all presses lie in one place.
+        labels: how the labels were off.
+    """
+
+    photometry: Photometry
+    circles: Float[np.ndarray, "n 3"]
+    ball_radius: Float[np.ndarray, " n"]
+    ball_fitted: bool
+    position: bool
+    labels: LabelCorrection
+
+    def balls(self, presses: PressSet) -> Float[np.ndarray, " n"]:
+        """Ball radii (m) of other presses: theirs, or the fitted one."""
+        known = presses.ball_radius
+        return np.where(np.isnan(known), self.ball_radius.mean(), known)
+
+    def place(self, presses: PressSet) -> Float[np.ndarray, "n 3"]:
+        """Where the labels of other presses are to be believed to lie (px), the pictures unseen."""
+        circles = self.labels.offset + self.labels.slope * presses.circles
+        widest = WIDEST * self.balls(presses) / self.photometry.pixel_pitch
+        circles[:, 2] = circles[:, 2].clip(NARROWEST, widest)
+        return circles
+
+    def register(self, presses: PressSet) -> Float[np.ndarray, "n 3"]:
+        """Circles (px) of other presses, moved from their labels to where their pictures say.
+
+        That looks at the pictures: an error at these circles is the model's alone, an error at
+        `place` the labels' as well.
+        """
+        steps = PressFit(presses, self.photometry.background, self.position)
+        state = FitState(self.photometry, self.place(presses), self.balls(presses))
+        for _ in range(8):
+            state = steps.registered(state)
+        return state.circles
+
+    def simulate(self, circle: Circle, ball_radius: float) -> Float32[np.ndarray, "h w 3"]:
+        """Picture of a press, RGB counts without noise; px and m."""
+        return shade(self.photometry, press_surface(self.photometry, circle, ball_radius))
+
+
+def fit(
+    presses: PressSet,
+    pitch: float,
+    sensor: str,
+    tick: Callable[[], object] = lambda: None,
+    trust_labels: bool = False,
+) -> Calibration:
+    """Calibrate a sensor.
+
+    Args:
+        presses: see `read_presses`.
+        pitch: m per pixel.
+        sensor: name of the sensor model.
+        tick: called STEPS times as the work proceeds.
+        trust_labels: leave the circles as they are, but for one common scale of their radii.
+    """
+    background, position = settled_background(presses), _spread_out(presses)
+    steps = PressFit(presses, background, position, trust_labels)
+    ball_fitted = bool(np.isnan(presses.ball_radius).any())
+    blank = _blank(background, pitch, sensor, noise(presses))
+    state = steps.started(blank, presses.ball_radius)
+    tick()
+    for _ in range(2):
+        state = steps.tuned(steps.lit(state))
+        tick()
+        state = steps.settled(state, 3)
+        tick()
+        if ball_fitted:
+            state = steps.with_ball(steps.resized(state))
+        tick()
+    state = steps.lit(steps.settled(state, 3))
+    return Calibration(
+        photometry=_limited(state),
+        circles=state.circles,
+        ball_radius=state.ball_radius,
+        ball_fitted=ball_fitted,
+        position=position,
+        labels=_label_correction(presses.circles, state.circles),
+    )
+
+
+def settled_background(presses: PressSet) -> UInt8[np.ndarray, "h w 3"]:
+    """The background as the presses show it away from their contacts.
+
+    A gel settles under the first presses: bands of several counts against the picture taken before
+    them. Where fewer than three presses lie far away, the given background stays.
+    """
+    rows, cols = np.ogrid[: presses.background.shape[0], : presses.background.shape[1]]
+    x, y, radius = presses.circles.T[:, :, None, None]
+    far = (cols - x) ** 2 + (rows - y) ** 2 > (_FAR * radius) ** 2
+    settled = presses.background.copy()
+    enough = far.sum(0) >= 3
+    for channel in range(3):
+        seen = np.ma.MaskedArray(presses.images[..., channel], ~far)
+        settled[enough, channel] = np.round(np.ma.median(seen, 0).filled(0)[enough])
+    return settled
+
+
+def noise(presses: PressSet) -> float:
+    """Standard deviation (counts) of what changes from one picture to the next, pixel by pixel."""
+    spreads = []
+    for one, other in zip(presses.images[:-1], presses.images[1:], strict=True):
+        change = (one.astype(np.float32) - other) / math.sqrt(2)
+        fine = np.abs(change - cv2.GaussianBlur(change, (0, 0), 3))
+        spreads.append(1.4826 * np.median(fine))  # robust against the contacts
+    return float(np.mean(spreads))
+
+
+def _blank(
+    background: UInt8[np.ndarray, "h w 3"], pitch: float, sensor: str, noise: float
+) -> Photometry:
+    """A sensor file to start from: no response, no limits, a typical gel."""
+    return Photometry(
+        sensor=sensor,
+        background=background,
+        pixel_pitch=pitch,
+        response=np.zeros((3, N_FEATURES, 3), np.float32),
+        light_azimuths=(0.0, 0.0, 0.0),
+        shadow_slope=0.1,
+        shadow=np.zeros((3, 3), np.float32),
+        penumbra=0.1e-3,
+        steepest=math.inf,
+        deepest=math.inf,
+        bulge=tuple(0.35 * sigma for sigma in PYRAMID),
+        noise=noise,
+    )
+
+
+def _spread_out(presses: PressSet) -> bool:
+    rows, cols, _ = presses.background.shape
+    return bool((presses.circles[:, :2].std(0) > _SPREAD * np.array([cols, rows])).all())
+
+
+def _limited(state: FitState) -> Photometry:
+    """With the steepest slope and the largest depth of the presses as the model's limits."""
+    photometry, steepest, deepest = state.photometry, 0.0, 0.0
+    for circle, ball in zip(state.circles, state.ball_radius, strict=True):
+        surface = press_surface(photometry, circle, ball)
+        nx, ny = features(surface, photometry.pixel_pitch, math.inf, math.inf)[:2]
+        steepest = max(steepest, float(np.hypot(nx, ny).max()))
+        deepest = max(deepest, float(surface.max()))
+    return replace(photometry, steepest=steepest, deepest=deepest)
+
+
+def _label_correction(
+    labels: Float[np.ndarray, "n 3"], found: Float[np.ndarray, "n 3"]
+) -> LabelCorrection:
+    centred = labels - labels.mean(0)
+    variance = (centred**2).mean(0)
+    covariance = (centred * (found - found.mean(0))).mean(0)
+    slope = np.where(variance > 1e-6, covariance / np.maximum(variance, 1e-6), 0.0)
+    return LabelCorrection(found.mean(0) - slope * labels.mean(0), slope)

@@ -1,0 +1,269 @@
+"""The steps by which a sensor's light and gel are fitted to ball presses.
+
+Given the surface under each press, the change of colour is linear in the unknown response
+(`photometry.columns`): least squares. Around that alternate where exactly each ball lies (hand-made
+circles are off by pixels) and the few numbers that are not linear, chosen by cross-validation.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int, UInt8
+
+from touchgoal.control.calibration.ball import Circle, press_surface
+from touchgoal.control.calibration.press_set import PressSet
+from touchgoal.control.touch.photometry import N_FEATURES, Photometry, columns, gain, weights
+
+REGION = 3.0
+"""Radius of the region that is fitted and judged around a press, in labelled contact radii."""
+NARROWEST, WIDEST = 2.0, 0.98
+"""Contact radius: px at least, and as a share of the ball's at most."""
+PYRAMID = (3.0e-3, 1.5e-3, 0.75e-3, 0.35e-3)
+"""Standard deviations of Taxim's gel, m; one factor scales them all."""
+
+_PIXELS = 5000  # of a press that take part in the fit
+_FOLDS = 4
+_RIDGE = 1e-3  # of each term's own energy; between 1e-4 and 1e-2 the held-out error hardly moves
+# What cross-validation chooses from.
+_BULGE_SCALES = (0.15, 0.25, 0.35, 0.5, 0.7, 1.0)
+_SHADOW_SLOPES = (0.05, 0.1, 0.2, 0.4, 0.8)
+_PENUMBRAS = (0.03e-3, 0.1e-3, 0.3e-3, 1e-3)
+_LABEL_SCALES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1)
+_RESIZES = (0.65, 0.8, 1.0, 1.25)
+_BALLS_PER_CONTACT = (1.1, 1.3, 1.6, 2.0, 2.5, 3.5)
+
+Weights = Float64[np.ndarray, "3 terms"]
+
+
+@dataclass(frozen=True)
+class FitState:
+    """Where the fit stands.
+
+    Attributes:
+        photometry: the sensor file so far.
+        circles: of the presses, px.
+        ball_radius: m, one a press.
+    """
+
+    photometry: Photometry
+    circles: Float64[np.ndarray, "n 3"]
+    ball_radius: Float64[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """The pixels of one press that take part: flat indices, and change of colour there."""
+
+    pixels: Int[np.ndarray, " n"]
+    change: Float32[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True)
+class _Normals:
+    """Normal equations of one press, per channel."""
+
+    square: Float64[np.ndarray, "3 terms terms"]
+    product: Float64[np.ndarray, "3 terms"]
+    energy: float
+
+    def loss(self, solved: Weights) -> float:
+        """Squared error (counts^2) of these weights, summed."""
+        fitted = np.einsum("ci,cij,cj->", solved, self.square, solved)
+        return self.energy - 2 * float((self.product * solved).sum()) + float(fitted)
+
+
+class PressFit:
+    """The steps of the fit; each takes a state and returns a better one.
+
+    Args:
+        presses: what to fit.
+        background: the untouched sensor (RGB) that changes are taken against.
+        position: whether the response may vary over the image.
+        trust_labels: whether circles stay as they are.
+    """
+
+    def __init__(
+        self,
+        presses: PressSet,
+        background: UInt8[np.ndarray, "h w 3"],
+        position: bool,
+        trust_labels: bool = False,
+    ) -> None:
+        self._labels = presses.circles
+        self._trust_labels = trust_labels
+        self._light = gain(background).reshape(-1, 3)
+        self._samples = [
+            _sample(image, background, circle)
+            for image, circle in zip(presses.images, presses.circles, strict=True)
+        ]
+        self._used = np.ones(3 * N_FEATURES + 3, bool)
+        self._used[N_FEATURES : 3 * N_FEATURES] = position
+
+    def started(self, blank: Photometry, ball_radius: Float64[np.ndarray, " n"]) -> FitState:
+        """With the common scale of the labelled radii that explains the pictures best.
+
+        Args:
+            blank: a sensor file without response.
+            ball_radius: m, one a press; NaN if open, then twice the largest contact's.
+        """
+        starts = []
+        for scale in _LABEL_SCALES:
+            circles = self._labels * [1, 1, scale]
+            contact = circles[:, 2] * blank.pixel_pitch
+            ball = np.where(np.isnan(ball_radius), 2 * contact.max(), ball_radius)
+            if (contact < WIDEST * ball).all():
+                starts.append(FitState(blank, circles, ball))
+        return self._best(starts)
+
+    def tuned(self, state: FitState) -> FitState:
+        """With the gel and the shadows that cross-validation prefers, one after the other."""
+        for choices in (
+            [{"bulge": tuple(scale * b for b in PYRAMID)} for scale in _BULGE_SCALES],
+            [{"shadow_slope": slope} for slope in _SHADOW_SLOPES],
+            [{"penumbra": penumbra} for penumbra in _PENUMBRAS],
+        ):
+            photometries = [replace(state.photometry, **choice) for choice in choices]
+            state = self._best([replace(state, photometry=p) for p in photometries])
+        return state
+
+    def settled(self, state: FitState, rounds: int) -> FitState:
+        """Response and circles in turn."""
+        for _ in range(rounds):
+            state = self.lit(state)
+            if not self._trust_labels:
+                state = self.registered(state)
+        return state
+
+    def resized(self, state: FitState) -> FitState:
+        """With all contacts and balls larger or smaller, if that explains the pictures better.
+
+        A weaker response to steeper slopes looks nearly the same: single steps would take long.
+        """
+        return self._best(
+            [
+                self.settled(
+                    replace(
+                        state,
+                        circles=state.circles * [1, 1, scale],
+                        ball_radius=state.ball_radius * scale,
+                    ),
+                    2,
+                )
+                for scale in _RESIZES
+            ]
+        )
+
+    def with_ball(self, state: FitState) -> FitState:
+        """With the ball radius (one for all presses) that explains the pictures best."""
+        widest = state.circles[:, 2].max() * state.photometry.pixel_pitch
+        balls = [np.full(len(state.circles), ratio * widest) for ratio in _BALLS_PER_CONTACT]
+        return self._best([self.settled(replace(state, ball_radius=ball), 2) for ball in balls])
+
+    def lit(self, state: FitState) -> FitState:
+        """With the response that fits best, and the lights where it says they stand."""
+        for _ in range(2):  # where the lights stand decides where shadows fall
+            solved = self._solve(self._normals(state))
+            state = replace(state, photometry=_with_weights(state.photometry, solved))
+        return state
+
+    def registered(self, state: FitState) -> FitState:
+        """With every circle moved towards where its picture says it is."""
+        everything = zip(state.circles, state.ball_radius, self._samples, self._labels, strict=True)
+        moved = [self._moved(state.photometry, *press) for press in everything]
+        return replace(state, circles=np.stack(moved))
+
+    def _best(self, candidates: Sequence[FitState]) -> FitState:
+        return min(candidates, key=self._held_out_loss)
+
+    def _held_out_loss(self, state: FitState) -> float:
+        """Squared error (counts^2) summed over the presses, each predicted without its fold."""
+        normals = self._normals(state)
+        loss = 0.0
+        for fold in range(_FOLDS):
+            solved = self._solve([n for i, n in enumerate(normals) if i % _FOLDS != fold])
+            loss += sum(n.loss(solved) for n in normals[fold::_FOLDS])
+        return loss
+
+    def _normals(self, state: FitState) -> list[_Normals]:
+        everything = zip(state.circles, state.ball_radius, self._samples, strict=True)
+        return [self._press_normals(state.photometry, *press) for press in everything]
+
+    def _press_normals(
+        self, photometry: Photometry, circle: Circle, ball: float, sample: _Sample
+    ) -> _Normals:
+        terms = columns(photometry, press_surface(photometry, circle, ball), sample.pixels)
+        squares, products = [], []
+        for channel in range(3):
+            lit = terms.astype(np.float64) * self._light[sample.pixels, channel]
+            squares.append(lit @ lit.T)
+            products.append(lit @ sample.change[:, channel])
+        energy = float((sample.change.astype(np.float64) ** 2).sum())
+        return _Normals(np.stack(squares), np.stack(products), energy)
+
+    def _solve(self, normals: Sequence[_Normals]) -> Weights:
+        product = np.sum([n.product for n in normals], 0)
+        square = np.sum([n.square for n in normals], 0)
+        solved = np.zeros_like(product)
+        for channel in range(3):
+            part = square[channel][np.ix_(self._used, self._used)]
+            energy = np.diag(part)
+            ridge = np.diag(_RIDGE * energy + 1e-12 * energy.max())
+            solved[channel, self._used] = np.linalg.solve(
+                part + ridge, product[channel, self._used]
+            )
+        return solved
+
+    def _moved(
+        self, photometry: Photometry, circle: Circle, ball: float, sample: _Sample, label: Circle
+    ) -> Circle:
+        """One damped Gauss-Newton step of centre and radius."""
+        model, light, step = weights(photometry), self._light[sample.pixels], 0.25
+        widest = WIDEST * ball / photometry.pixel_pitch
+
+        def bounded(at: Circle) -> Circle:
+            x, y, radius = label
+            least = [x - radius, y - radius, NARROWEST]
+            return at.clip(least, [x + radius, y + radius, min(1.5 * radius, widest)])
+
+        def residual(at: Circle) -> Float32[np.ndarray, " m"]:
+            surface = press_surface(photometry, bounded(at), ball)
+            terms = columns(photometry, surface, sample.pixels)
+            return ((model @ terms).T * light - sample.change).ravel()
+
+        here = residual(circle)
+        jacobian = np.stack([(residual(circle + step * e) - here) / step for e in np.eye(3)], 1)
+        curvature = jacobian.T @ jacobian
+        curvature += np.diag(0.01 * np.diag(curvature) + 1e-6)
+        move = -np.linalg.solve(curvature, jacobian.T @ here).clip(-3, 3)
+        for shorter in (1.0, 0.3, 0.1):
+            there = bounded(circle + shorter * move)
+            if (residual(there) ** 2).sum() < (here**2).sum():
+                return there
+        return circle
+
+
+def _sample(
+    image: UInt8[np.ndarray, "h w 3"], background: UInt8[np.ndarray, "h w 3"], circle: Circle
+) -> _Sample:
+    x, y, radius = circle
+    rows, cols = np.mgrid[: image.shape[0], : image.shape[1]]
+    reach = REGION * radius
+    stride = max(1, round(math.sqrt(math.pi * reach**2 / _PIXELS)))
+    near = (cols - x) ** 2 + (rows - y) ** 2 < reach**2
+    pixels = np.flatnonzero(near & (rows % stride == 0) & (cols % stride == 0))
+    change = image.reshape(-1, 3)[pixels].astype(np.float32) - background.reshape(-1, 3)[pixels]
+    return _Sample(pixels, change)
+
+
+def _with_weights(photometry: Photometry, solved: Weights) -> Photometry:
+    response, shadow = np.split(solved.astype(np.float32), [3 * N_FEATURES], 1)
+    response = response.reshape(3, 3, N_FEATURES).transpose(0, 2, 1)
+    azimuths = np.degrees(np.arctan2(response[:, 1, 0], response[:, 0, 0]))
+    return replace(
+        photometry,
+        response=response,
+        shadow=shadow,
+        light_azimuths=tuple(float(a) for a in azimuths),
+    )

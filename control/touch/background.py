@@ -1,0 +1,147 @@
+"""The untouched picture of a sensor: taken, followed as its light drifts, and judged."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from touchgoal.control.errors import UserError
+
+# Pictures are averaged over _CELL x _CELL pixels and then blurred. Measured on 320 x 240 frames:
+# pixel noise of 1 count leaves at most 0.45 counts of `local_change`, and a bump of shading that
+# falls off within 15 pixels (sigma 7.5) keeps half of its height.
+_CELL = 4
+_BLUR_CELLS = 1.5
+# Cosines down and across the image that count as drift: a half wave of 60 px at 320 x 240, the
+# smooth pattern by which a Mini differs from one day to the next (Tactile-MNIST).
+_WAVES = 4, 5
+# Share of a frame that enters the background: 2 s of a 25 Hz sensor, slower than any contact.
+_RATE = 0.02
+# Standard deviations between 150,000 real touches of Minis (Tactile-MNIST), counts.
+_GAIN_SPREAD, _OFFSET_SPREAD, _PATTERN_SPREAD = 0.047, 2.4, 2.4
+_MOVED = 1.5  # counts of local change among the first frames that are no noise
+_ANOTHER_SENSOR = 5.0  # counts of local change to a reference; drift of the full spread gives 3
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How the light changed since the reference, by channel (R, G, B).
+
+    Attributes:
+        gain: factor of the brightness, 1 for none.
+        offset: mean change beyond the gain's, counts.
+        pattern: largest smooth change beyond both, counts.
+    """
+
+    gain: Float[np.ndarray, "3"]
+    offset: Float[np.ndarray, "3"]
+    pattern: Float[np.ndarray, "3"]
+
+    @property
+    def large(self) -> bool:
+        """Whether to take a new reference: more than twice the spread between real touches.
+
+        The pattern's largest value over an image is twice its standard deviation already.
+        """
+        gain = np.abs(self.gain - 1) > 2 * _GAIN_SPREAD
+        offset = np.abs(self.offset) > 2 * _OFFSET_SPREAD
+        return bool((gain | offset | (self.pattern > 4 * _PATTERN_SPREAD)).any())
+
+
+class Background:
+    """The untouched frame of one sensor as it is now; `update` follows its drift.
+
+    Args:
+        frames: at least one RGB picture of the untouched sensor, better five or more: their median
+            is the first background.
+        reference: what drift is measured against, such as the sensor file's background; None: the
+            first background.
+
+    Raises:
+        UserError: something moved on the sensor while the frames were taken, or they differ from
+            the reference as by a contact.
+    """
+
+    def __init__(
+        self,
+        frames: UInt8[np.ndarray, "n h w 3"],
+        reference: UInt8[np.ndarray, "h w 3"] | None = None,
+    ) -> None:
+        first = np.median(frames, axis=0).astype(np.float32)
+        if max(float(local_change(frame, first).max()) for frame in frames) > _MOVED:
+            raise UserError(
+                "the touch sensor's picture changes while its background is taken: "
+                "keep it still and untouched, and start again"
+            )
+        self._current = first.copy()
+        self.reference = first if reference is None else reference.astype(np.float32)
+        if float(local_change(first, self.reference).max()) > _ANOTHER_SENSOR:
+            raise UserError(
+                "the touch sensor's first frames do not look like its untouched reference: "
+                "take away what touches it, or calibrate this sensor"
+            )
+
+    @property
+    def image(self) -> Float32[np.ndarray, "h w 3"]:
+        """The untouched frame as it would look now, counts."""
+        return self._current
+
+    def update(self, frame: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Follow the drift by one frame; only for frames in which nothing touches."""
+        cv2.accumulateWeighted(frame, self._current, _RATE)
+
+    def drift(self) -> Drift:
+        """How far the background went from the reference; see `Drift.large`."""
+        reference = _blurred(self.reference).reshape(-1, 3)
+        change = _blurred(self._current).reshape(-1, 3) - reference
+        gain, offset = np.empty(3), np.empty(3)
+        for c in range(3):
+            explain = np.stack([reference[:, c], np.ones(len(reference))], axis=1)
+            # Gain and offset of a smooth background look alike: the spread decides between them.
+            seen = len(explain) * _PATTERN_SPREAD**2 / (_WAVES[0] * _WAVES[1])
+            normal = explain.T @ explain / seen + np.diag([_GAIN_SPREAD**-2, _OFFSET_SPREAD**-2])
+            gain[c], offset[c] = np.linalg.solve(normal, explain.T @ change[:, c] / seen)
+        pattern = np.abs(change - gain * reference - offset).max(0)
+        return Drift(1 + gain, offset, pattern.astype(np.float64))
+
+
+def local_change(
+    frame: UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"],
+    background: UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"],
+) -> Float32[np.ndarray, "H W"]:
+    """How much a frame differs from the background beyond any drift of the light, counts.
+
+    Of the blurred difference, each channel loses what low spatial frequencies and a factor on the
+    background explain (least squares); the norm over the channels of the rest is returned, at a
+    quarter of the resolution.
+    """
+    reference = _blurred(background)
+    change = _high_pass(_blurred(frame) - reference)
+    structure = _high_pass(reference)
+    energy = (structure**2).sum((0, 1)) + 1.0
+    change -= (change * structure).sum((0, 1)) / energy * structure
+    return np.sqrt((change**2).sum(2))
+
+
+def _blurred(image: np.ndarray) -> Float32[np.ndarray, "H W 3"]:
+    height, width, _ = image.shape
+    size = max(width // _CELL, 1), max(height // _CELL, 1)
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return cv2.GaussianBlur(small.astype(np.float32), (0, 0), _BLUR_CELLS)
+
+
+def _high_pass(image: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
+    """The image without its lowest cosines."""
+    down, across = (
+        _cosines(size, waves) for size, waves in zip(image.shape[:2], _WAVES, strict=True)
+    )
+    waves = np.einsum("ih,hwc,jw->ijc", down, image, across, optimize=True)
+    return image - np.einsum("ih,ijc,jw->hwc", down, waves, across, optimize=True)
+
+
+def _cosines(size: int, count: int) -> Float32[np.ndarray, "k size"]:
+    """Orthonormal rows cos(pi k (n + 1/2) / size), at most `size` of them."""
+    k, n = np.arange(min(count, size))[:, None], np.arange(size) + 0.5
+    rows = np.cos(np.pi * k * n / size)
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)

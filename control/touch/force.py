@@ -1,0 +1,61 @@
+"""How hard something presses and pulls on a fingertip, from its gel's depth and its markers."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+
+from touchgoal.control.sensors import SensorModel
+
+# A gel bulges around what presses into it. Of a simulated press, what lies deeper than a quarter of
+# the deepest point holds as much volume as the object displaces: median of balls, edges and
+# textures 1.0, standard deviation 0.1.
+_CONTACT_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class TouchForce:
+    """Force of an object on a sensor.
+
+    Attributes:
+        normal: N, positive when pressed.
+        shear: N along the sensor's x and y; None without markers.
+    """
+
+    normal: float
+    shear: tuple[float, float] | None
+
+
+def estimate_force(
+    depth: Float32[np.ndarray, "h w"],
+    pixel_pitch: float,
+    sensor: SensorModel,
+    markers: Float32[np.ndarray, "*n 2"] | None = None,
+    displacement: Float32[np.ndarray, "*n 2"] | None = None,
+) -> TouchForce:
+    """Resultant force from one frame's depth and its markers' displacement.
+
+    Normal: the gel as an elastic foundation, `foundation_modulus` times the volume in contact.
+    It holds as far as the modulus does: calibrate it with one known weight. It sees only what the
+    camera sees, and nothing of a flat face that presses the whole view evenly.
+
+    Shear: `shear_stiffness` times the mean displacement of the markers, each counting as much as
+    the gel is deep there. It holds while the contact sticks; gross slip adds nothing to it.
+
+    Args:
+        depth: of the gel's surface, m (`depth.DepthEstimator`).
+        pixel_pitch: m per px.
+        sensor: its stiffnesses.
+        markers: (x, y) of the dots, px (`MarkerTracker.now.positions`).
+        displacement: how far they are from their rest, px (`MarkerTracker.displacement`).
+    """
+    contact = np.where(depth > _CONTACT_SHARE * max(float(depth.max()), 0.0), depth, 0)
+    normal = sensor.foundation_modulus * float(contact.sum()) * pixel_pitch**2
+    if markers is None or displacement is None:
+        return TouchForce(normal, None)
+    at = np.rint(markers.reshape(-1, 2)).astype(int)
+    column, row = np.clip(at, 0, np.array(depth.shape[::-1]) - 1).T
+    weight = contact[row, column].astype(np.float64)
+    moved = weight @ displacement.reshape(-1, 2) / max(float(weight.sum()), 1e-12)
+    x, y = sensor.shear_stiffness * pixel_pitch * moved
+    return TouchForce(normal, (float(x), float(y)))

@@ -1,0 +1,123 @@
+"""The same pictures in torch: batched, on any device, differentiable in the height of the object.
+
+Follows `control.touch.gel.deform` and `optics.render` step by step, without noise tile and markers;
+`tests/test_tactile.py` holds both to the same picture.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from touchgoal.control.touch.gel import CONTACT_SHARE, SHADOW_CELLS, cells
+from touchgoal.control.touch.photometry import Photometry
+from touchgoal.sim_envs.tactile.unit import STEP, Unit
+
+Fields = Float[Tensor, "b h w"]
+
+
+def deform(overlap: Fields, pitch: float, bulge: tuple[float, ...]) -> Fields:
+    """Surfaces of gels under objects' overlaps (m), as `gel.deform`."""
+    scale = cells(pitch)
+    low = F.avg_pool2d(overlap, scale)
+    contact = low > CONTACT_SHARE * low.amax((1, 2), keepdim=True)
+    smooth = low
+    for sigma in bulge:
+        smooth = torch.where(contact, low, _blur(smooth, _gaussian(sigma / (pitch * scale), low)))
+    smooth = _blur(smooth, _binomial(5, low))
+    soft = _blur(contact.to(low), _binomial(5, low))
+    smooth, low, soft = (_resize(a, *overlap.shape[1:]) for a in (smooth, low, soft))
+    return _blur(smooth + soft * (overlap - low), _binomial(3, low))
+
+
+def colour_change(surface: Fields, unit: Unit) -> Float[Tensor, "b 3 h w"]:
+    """What gel surfaces at half the image's resolution add to the untouched image, counts."""
+    photometry, pitch = unit.photometry, 2 * unit.pixel_pitch
+    gain, response, shadow = (
+        torch.as_tensor(a, dtype=surface.dtype, device=surface.device)
+        for a in (unit.gain, photometry.response, photometry.shadow)
+    )
+    _, h, w = surface.shape
+    u = (4 * torch.arange(w).to(surface) + 1) / (2 * w - 1) - 1
+    v = ((4 * torch.arange(h).to(surface) + 1) / (2 * h - 1) - 1)[:, None]
+    shadows = shadow_depth(surface, pitch, photometry.light_azimuths, photometry.shadow_slope)
+    shadows = shadows / (shadows + photometry.penumbra)
+    at_rest, along_u, along_v = torch.einsum(
+        "bkhw,ckm->mbchw", _features(surface, pitch, photometry), response
+    )
+    lit = at_rest + u * along_u + v * along_v
+    return gain * (lit + torch.einsum("blhw,cl->bchw", shadows, shadow))
+
+
+def render(overlap: Fields, unit: Unit) -> Float[Tensor, "b 3 h2 w2"]:
+    """Noise-free RGB pictures, counts, of overlaps (m) at half the pictures' resolution."""
+    surface = deform(overlap, 2 * unit.pixel_pitch, unit.photometry.bulge)
+    background = STEP * torch.as_tensor(unit.background).to(overlap)
+    change = F.interpolate(colour_change(surface, unit), scale_factor=2, mode="bilinear")
+    return (background + change).clamp(0, 255)
+
+
+def shadow_depth(
+    surface: Fields, pitch: float, azimuths: tuple[float, ...], slope: float
+) -> Float[Tensor, "b lights h w"]:
+    """How far (m) each point lies below the shadow line of each light, as `gel.shadow_depth`."""
+    scale = cells(pitch)
+    low = F.avg_pool2d(surface, scale)
+    third = torch.full((1, 3), 1 / 3).to(surface)[0]
+    depths = []
+    for azimuth in azimuths:
+        cos, sin = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
+        ridge = low
+        for n in range(1, SHADOW_CELLS + 1):
+            dx, dy = round(n * cos), round(n * sin)
+            drop = slope * pitch * scale * (dx * cos + dy * sin)
+            ridge = torch.maximum(ridge, _shifted(low, dx, dy) - drop)
+        depths.append(_resize(_blur(ridge - low, third), *surface.shape[1:]))
+    return torch.stack(depths, 1)
+
+
+def _features(surface: Fields, pitch: float, photometry: Photometry) -> Float[Tensor, "b 10 h w"]:
+    padded = F.pad(surface[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
+    gx = (padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]) * (0.5 / pitch)
+    gy = (padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]) * (0.5 / pitch)
+    square = gx * gx + gy * gy
+    inverse = -torch.rsqrt(torch.maximum(1 + square, square / photometry.steepest**2))
+    x, y = gx * inverse, gy * inverse
+    xx, xy, yy = x * x, x * y, y * y
+    depth = surface.clamp(max=photometry.deepest)
+    return torch.stack([x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y, depth], 1)
+
+
+def _shifted(field: Fields, dx: int, dy: int) -> Fields:
+    """The field at (x + dx, y + dy); far below where that is outside."""
+    _, h, w = field.shape
+    padded = F.pad(field, (max(-dx, 0), max(dx, 0), max(-dy, 0), max(dy, 0)), value=-1.0)
+    top, left = max(dy, 0), max(dx, 0)
+    return padded[:, top : top + h, left : left + w]
+
+
+def _resize(field: Fields, rows: int, columns: int) -> Float[Tensor, "b rows columns"]:
+    return F.interpolate(field[:, None], (rows, columns), mode="bilinear")[:, 0]
+
+
+def _blur(field: Fields, kernel: Float[Tensor, " k"]) -> Fields:
+    """Separable blur, mirrored at the border without repeating its pixels (OpenCV's default)."""
+    r = len(kernel) // 2
+    padded = F.pad(field[:, None], (r, r, r, r), mode="reflect")
+    return F.conv2d(F.conv2d(padded, kernel[None, None, None]), kernel[None, None, :, None])[:, 0]
+
+
+def _gaussian(sigma: float, like: Tensor) -> Float[Tensor, " k"]:
+    """OpenCV's kernel for float images: four standard deviations to each side."""
+    size = round(sigma * 8 + 1) | 1
+    x = torch.arange(size).to(like) - size // 2
+    kernel = torch.exp(-0.5 * (x / sigma) ** 2)
+    return kernel / kernel.sum()
+
+
+def _binomial(size: int, like: Tensor) -> Float[Tensor, " k"]:
+    """OpenCV's kernel of a given small size without a standard deviation."""
+    row = [math.comb(size - 1, k) / 2 ** (size - 1) for k in range(size)]
+    return torch.tensor(row, dtype=like.dtype, device=like.device)

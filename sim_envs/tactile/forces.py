@@ -1,0 +1,323 @@
+"""The forces between a gel and what presses into it, cell by cell: pressure, shear, stick and slip.
+
+Pressure comes from how the object sits in the gel (`press`). Shear is a brush's: every cell of the
+gel is a bristle whose tip sticks to the object until friction lets it go, and the object moves over
+the gel until the bristles carry the tangential force and torsion that MuJoCo's solver found.
+
+Sensor frame as in `geometry`: x along columns, y along rows, z out of the gel; m, N, Nm, Pa.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from numba import njit
+
+from touchgoal.control.sensors import SensorModel
+from touchgoal.sim_envs.contact import PadContact
+from touchgoal.sim_envs.tactile.press import Press, solve3
+
+INCIPIENT = 0.25  # share of the normal force whose cells slip
+# Not all: cells that a sliding object has just reached are not loaded yet, and carry up to 1 %.
+GROSS = 0.98
+_ON_CONE = 0.99  # of the friction limit
+_MOST_LEAN = 0.9  # of a cell's normal force
+# What beyond friction's reach keeps the bristles' motion finite, as a share of their stiffness. The
+# force comes first: torsion gives way where the patch cannot bear both.
+_GIVE, _GIVE_TURN = 1e-5, 1e-3
+_FORCE_TOLERANCE = 1e-4  # of the friction limit
+
+
+@dataclass(frozen=True)
+class ForceField:
+    """Forces of an object on the cells of a gel.
+
+    The cells are the gel's own: they move with it when it shears, and rest on a grid centred on
+    the sensor frame.
+
+    Attributes:
+        normal: N per cell, positive where pressed.
+        tangential: N per cell, along the sensor's x and y.
+        slipping: cells where the object slides: their traction lies on the friction cone.
+        slip_fraction: share of the normal force that slipping cells carry.
+        pitch: of the cells, m.
+        displacement: of the whole gel from rest, (x, y, z) in m.
+    """
+
+    normal: Float32[np.ndarray, "h w"]
+    tangential: Float32[np.ndarray, "2 h w"]
+    slipping: Bool[np.ndarray, "h w"]
+    slip_fraction: float
+    pitch: float
+    displacement: tuple[float, float, float]
+
+    @property
+    def incipient(self) -> bool:
+        """Whether slip has begun at the contact's rim: a quarter of the load slips.
+
+        A ball then bears 1 - (1 - sqrt(0.25))^2 = 75 % of the tangential force that it can.
+        """
+        return self.slip_fraction >= INCIPIENT
+
+    @property
+    def gross(self) -> bool:
+        """Whether everything slips: the object slides."""
+        return self.slip_fraction >= GROSS
+
+    def wrench(self) -> Float[np.ndarray, "6"]:
+        """Sum of the field: force (N) and torque (Nm) on the pad about the sensor's origin."""
+        h, w = self.normal.shape
+        x = (np.arange(w) - (w - 1) / 2) * self.pitch + self.displacement[0]
+        y = (np.arange(h)[:, None] - (h - 1) / 2) * self.pitch + self.displacement[1]
+        z, (fx, fy), fz = self.displacement[2], self.tangential.astype(float), -self.normal
+        moments = y * fz - z * fy, z * fx - x * fz, x * fy - y * fx
+        return np.array([np.sum(a) for a in (fx, fy, fz, *moments)], float)
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _pool(pressure, area, out):
+    """N per force cell from Pa per pressure cell of `area` m^2; two by two."""
+    for i in range(out.shape[0]):
+        row, above, below = out[i], pressure[2 * i], pressure[2 * i + 1]
+        for j in range(out.shape[1]):
+            pressed = above[2 * j] + above[2 * j + 1] + below[2 * j] + below[2 * j + 1]
+            row[j] = pressed * area
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _lean(normal, pitch, place, mx, my):
+    """Weight the forces, linearly across the patch, so that their first moments become mx and my.
+
+    That neither moves nor spreads the patch; no cell loses or gains more than `_MOST_LEAN`.
+    """
+    rows, columns = normal.shape
+    load = sx = sy = sxx = sxy = syy = 0.0
+    for i in range(rows):
+        y = (i - 0.5 * (rows - 1)) * pitch + place[1]
+        for j in range(columns):
+            p = normal[i, j]
+            if p > 0.0:
+                x = (j - 0.5 * (columns - 1)) * pitch + place[0]
+                load += p
+                sx += p * x
+                sy += p * y
+                sxx += p * x * x
+                sxy += p * x * y
+                syy += p * y * y
+    if load == 0.0:
+        return
+    cx, cy = sx / load, sy / load
+    # A thousandth of a cell keeps lines and single cells from leaning without end.
+    least = 1e-3 * load * pitch * pitch
+    vxx, vxy, vyy = sxx - cx * sx + least, sxy - cx * sy, syy - cy * sy + least
+    determinant = vxx * vyy - vxy * vxy
+    a = (vyy * (mx - sx) - vxy * (my - sy)) / determinant
+    b = (vxx * (my - sy) - vxy * (mx - sx)) / determinant
+    most = 0.0
+    for i in range(rows):
+        y = (i - 0.5 * (rows - 1)) * pitch + place[1] - cy
+        for j in range(columns):
+            if normal[i, j] > 0.0:
+                x = (j - 0.5 * (columns - 1)) * pitch + place[0] - cx
+                most = max(most, abs(a * x + b * y))
+    share = _MOST_LEAN / max(most, _MOST_LEAN)
+    for i in range(rows):
+        y = (i - 0.5 * (rows - 1)) * pitch + place[1] - cy
+        for j in range(columns):
+            x = (j - 0.5 * (columns - 1)) * pitch + place[0] - cx
+            normal[i, j] *= 1.0 + share * (a * x + b * y)
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _bristles(normal, before, pitch, place, friction):
+    """Of each pressed cell: x, y from the centre of pressure, traction of before, friction limit.
+
+    Returns them with the centre of pressure and the load.
+    """
+    rows, columns = normal.shape
+    found = np.empty((5, rows * columns), np.float32)
+    load = cx = cy = 0.0
+    n = 0
+    for i in range(rows):
+        for j in range(columns):
+            p = normal[i, j]
+            if p > 0.0:
+                x = (j - 0.5 * (columns - 1)) * pitch + place[0]
+                y = (i - 0.5 * (rows - 1)) * pitch + place[1]
+                limit = friction * p
+                # Less pressure holds less: the traction of before, cut to today's cone.
+                size = math.sqrt(before[0, i, j] ** 2 + before[1, i, j] ** 2)
+                share = limit / max(size, limit)
+                found[0, n], found[1, n] = x, y
+                found[2, n], found[3, n] = before[0, i, j] * share, before[1, i, j] * share
+                found[4, n] = limit
+                load += p
+                cx += p * x
+                cy += p * y
+                n += 1
+    found = found[:, :n].copy()
+    if n > 0:
+        cx, cy = cx / load, cy / load
+        found[0] -= np.float32(cx)
+        found[1] -= np.float32(cy)
+    return found, cx, cy, load
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")  # a check for zero is no vector code
+@no_type_check
+def _brush_sums(bristles, stiffness, ux, uy, turn, total):
+    """Force, torsion, and how they grow with a motion, of bristles whose tips have moved."""
+    zero, one = np.float32(0.0), np.float32(1.0)
+    x, y, qx, qy, limit = bristles[0], bristles[1], bristles[2], bristles[3], bristles[4]
+    k, ux, uy, turn = np.float32(stiffness), np.float32(ux), np.float32(uy), np.float32(turn)
+    fx, fy, torsion = zero, zero, zero
+    hxx, hxy, hyy, hxt, hyt, htt = zero, zero, zero, zero, zero, zero
+    for n in range(x.size):
+        tx = qx[n] + k * (ux - turn * y[n])
+        ty = qy[n] + k * (uy + turn * x[n])
+        inverse = one / math.sqrt(tx * tx + ty * ty + np.float32(1e-24))
+        share = min(limit[n] * inverse, one)
+        sx, sy = share * tx, share * ty
+        fx += sx
+        fy += sy
+        torsion += x[n] * sy - y[n] * sx
+        # A slipping bristle resists only across its traction.
+        along = share * inverse * inverse if share < one else zero
+        axx, axy, ayy = share - along * tx * tx, -along * tx * ty, share - along * ty * ty
+        axt, ayt = x[n] * axy - y[n] * axx, x[n] * ayy - y[n] * axy
+        hxx += axx
+        hxy += axy
+        hyy += ayy
+        hxt += axt
+        hyt += ayt
+        htt += x[n] * ayt - y[n] * axt
+    total[0], total[1], total[2] = fx, fy, torsion
+    total[3], total[4], total[5] = k * hxx, k * hxy, k * hxt
+    total[6], total[7], total[8] = k * hyy, k * hyt, k * htt
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _balance(bristles, stiffness, area, force_x, force_y, torsion):
+    """The rigid motion (x, y, turn) of the tips that makes them carry force and torsion."""
+    x, y, limit = bristles[0], bristles[1], bristles[4]
+    most, radius = limit.sum(), math.sqrt((x * x + y * y).mean() + area)
+    give = _GIVE * stiffness * x.size
+    give_turn = _GIVE_TURN * stiffness * x.size * radius * radius
+    ux = uy = turn = 0.0
+    total, trial = np.empty(9), np.empty(9)
+    _brush_sums(bristles, stiffness, ux, uy, turn, total)
+    for _ in range(40):
+        g0 = total[0] - force_x + give * ux
+        g1 = total[1] - force_y + give * uy
+        g2 = total[2] - torsion + give_turn * turn
+        if max(abs(g0), abs(g1), abs(g2) / radius) < _FORCE_TOLERANCE * most:
+            break
+        s0, s1, s2 = solve3(
+            total[3] + give,
+            total[4],
+            total[5],
+            total[6] + give,
+            total[7],
+            total[8] + give_turn,
+            -g0,
+            -g1,
+            -g2,
+        )
+        start = g0 * s0 + g1 * s1 + g2 * s2
+        step = 1.0
+        for _ in range(12):
+            t0, t1, t2 = ux + step * s0, uy + step * s1, turn + step * s2
+            _brush_sums(bristles, stiffness, t0, t1, t2, trial)
+            end = (trial[0] - force_x + give * t0) * s0 + (trial[1] - force_y + give * t1) * s1
+            end += (trial[2] - torsion + give_turn * t2) * s2
+            if end <= -0.2 * start:
+                break
+            step *= start / (start - end)
+        ux, uy, turn = t0, t1, t2
+        total[:] = trial
+    return ux, uy, turn
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _brush(normal, before, pitch, place, friction, stiffness, force, torque, out, slip):
+    """Tractions that balance force and torque about the origin; the share of the load that slips."""
+    bristles, cx, cy, load = _bristles(normal, before, pitch, place, friction)
+    if load == 0.0:
+        return 0.0
+    torsion = torque - (cx * force[1] - cy * force[0])
+    ux, uy, turn = _balance(bristles, stiffness, pitch * pitch, force[0], force[1], torsion)
+    carried = np.empty(9)
+    _brush_sums(bristles, stiffness, ux, uy, turn, carried)
+    # What is left over, be it beyond friction's reach, goes where the pressure is.
+    x, y, limit = bristles[0], bristles[1], bristles[4]
+    polar = (limit * (x * x + y * y)).sum() / friction
+    left_x, left_y = (force[0] - carried[0]) / load, (force[1] - carried[1]) / load
+    left_turn = (torsion - carried[2]) / polar if polar > 0.0 else 0.0
+    n, sliding = 0, 0.0
+    for i in range(normal.shape[0]):
+        for j in range(normal.shape[1]):
+            p = normal[i, j]
+            out[0, i, j] = out[1, i, j] = 0.0
+            slip[i, j] = False
+            if p > 0.0:
+                x, y, qx, qy, limit = bristles[:, n]
+                tx, ty = qx + stiffness * (ux - turn * y), qy + stiffness * (uy + turn * x)
+                size = math.sqrt(tx * tx + ty * ty)
+                share = limit / max(size, limit)
+                out[0, i, j] = tx * share + p * (left_x - left_turn * y)
+                out[1, i, j] = ty * share + p * (left_y + left_turn * x)
+                slip[i, j] = size >= _ON_CONE * limit
+                sliding += p * slip[i, j]
+                n += 1
+    return sliding / load
+
+
+def force_field(
+    press: Press,
+    before: ForceField | None,
+    contact: PadContact,
+    friction: float,
+    sensor: SensorModel,
+) -> ForceField:
+    """Spread the solver's wrench on a pad over the gel's cells; each is 2 x 2 of the pressure's.
+
+    A bristle is as stiff as the gel under it in shear: shear_modulus / gel_thickness, Pa/m.
+
+    Force and torsion are met exactly, the moments about x and y as far as the patch reaches. MuJoCo
+    gives each contact point a friction against torsion; where that bears more than the patch can,
+    all cells slip, and what is missing is added to them in proportion to their pressure.
+
+    Args:
+        press: how the object sits in the gel, with an even number of pressure cells each way.
+        before: this pad's field of the frame before; None if nothing touched it.
+        contact: the solver's.
+        friction: coefficient that the solver used.
+    """
+    rows, columns = (n // 2 for n in press.pressure.shape)
+    pitch = 2 * press.pitch
+    normal = np.empty((rows, columns), np.float32)
+    tangential = np.zeros((2, rows, columns), np.float32)
+    slipping = np.zeros((rows, columns), bool)
+    _pool(press.pressure, np.float32(press.pitch**2), normal)
+    (fx, fy, _), (tx, ty, tz), (_, _, z) = contact.force, contact.torque, press.displacement
+    _lean(normal, pitch, press.displacement, ty - z * fx, -tx - z * fy)
+    slip_fraction = _brush(
+        normal,
+        tangential if before is None else before.tangential,
+        pitch,
+        press.displacement,
+        max(friction, 1e-5),  # MuJoCo's own least
+        sensor.shear_modulus / sensor.gel_thickness * pitch * pitch,
+        contact.force,
+        tz,
+        tangential,
+        slipping,
+    )
+    return ForceField(normal, tangential, slipping, slip_fraction, pitch, press.displacement)

@@ -1,0 +1,263 @@
+"""How an object sits in a gel: pushed in, and tilted a little, until pressure balances the solver.
+
+MuJoCo says what force one pad carries, and where; the object's height field says with what shape.
+Sensor frame as in `geometry`: x along columns, y along rows, z out of the gel; m, N, Nm, Pa.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float32
+from numba import njit
+
+from touchgoal.control.sensors import SensorModel
+from touchgoal.sim_envs.contact import PadContact
+from touchgoal.sim_envs.tactile.geometry import NO_SURFACE, HeightField
+
+MAX_TILT = math.radians(3.0)
+MAX_OVERLAP = 0.02  # m; beyond any gripper's force
+# Nm/rad with which what holds the object resists its tilting in the gel: about what a second gel
+# does. A flat face or a line tilts until the moments balance (3 to 9 Nm/rad of its own); a ball
+# (0.1 to 0.7), whose tilting would only shift its print, hardly does, and no vertex tips over.
+TILT_STIFFNESS = 1.0
+_FIRST_OVERLAP = 3e-4  # m, where the search begins
+_CENTRE_TOLERANCE = 5e-6  # m
+
+
+@dataclass(frozen=True)
+class Press:
+    """How an object sits in a gel.
+
+    Attributes:
+        shift: how far it is pushed in, m, and
+        tilt: its slope along x and y: `shift + tilt[0] x + tilt[1] y` is added to its height.
+        pressure: on the gel's own cells, Pa; zero where nothing touches.
+        pitch: of the cells, m.
+        displacement: of the cells from their rest grid, centred on the sensor frame: (x, y, z) in
+            m. The whole gel shears and sinks under the solver's force, as its plate does.
+    """
+
+    shift: float
+    tilt: tuple[float, float]
+    pressure: Float32[np.ndarray, "h w"]
+    pitch: float
+    displacement: tuple[float, float, float]
+
+    def seat(self, height: HeightField, pitch: float) -> None:
+        """Move the object's height field, of any grid centred on the sensor frame, in place."""
+        _add_plane(height, _columns(height, pitch), pitch, self.shift, *self.tilt)
+
+
+def _columns(height: HeightField, pitch: float) -> Float32[np.ndarray, " w"]:
+    """x of the columns, m. A table: AVX2 cannot convert loop counters to floats eight at a time."""
+    n = height.shape[1]
+    return ((np.arange(n) - (n - 1) / 2) * pitch).astype(np.float32)
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _add_plane(height, xs, pitch, shift, a, b):
+    slope = np.float32(a)
+    for i in range(height.shape[0]):
+        base, row = np.float32(shift + b * (i - 0.5 * (height.shape[0] - 1)) * pitch), height[i]
+        for j in range(height.shape[1]):
+            row[j] += base + slope * xs[j]
+
+
+@njit(inline="always", fastmath=True)
+@no_type_check
+def solve3(a, b, c, d, e, f, u, v, w):
+    """Solution of the symmetric positive [[a, b, c], [b, d, e], [c, e, f]] against (u, v, w)."""
+    ba, ca = b / a, c / a
+    d2, e2, f2 = d - ba * b, e - ba * c, f - ca * c
+    ed = e2 / d2
+    y2, z2 = v - ba * u, w - ca * u
+    z = (z2 - ed * y2) / (f2 - ed * e2)
+    y = (y2 - e2 * z) / d2
+    return (u - b * y - c * z) / a, y, z
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _shear(height, shift_x, shift_y, out):
+    """The height field (shift_x, shift_y) cells off, interpolated; at outlines the nearest cell."""
+    rows, columns = height.shape
+    one, none = np.float32(1.0), NO_SURFACE * np.float32(0.5)
+    shift_x = min(max(shift_x, -1.0 * columns), columns - 1.0)
+    iy, ix = int(math.floor(shift_y)), int(math.floor(shift_x))
+    fx, fy = np.float32(shift_x - ix), np.float32(shift_y - iy)
+    round_x, round_y = np.float32(fx > 0.5), np.float32(fy > 0.5)
+    first, last = min(max(-ix, 0), columns), max(min(columns - ix, columns + 1), 1)
+    line = np.empty(columns + 1, np.float32)
+    inside, left, right = line[first:last], line[:-1], line[1:]
+    for i in range(rows):
+        above = height[min(max(i + iy, 0), rows - 1), first + ix : last + ix]
+        below = height[min(max(i + iy + 1, 0), rows - 1), first + ix : last + ix]
+        for j in range(inside.size):
+            smooth = min(above[j], below[j]) > none
+            share = fy if smooth else round_y
+            inside[j] = (one - share) * above[j] + share * below[j]
+        line[:first], line[last:] = line[first], line[last - 1]
+        row = out[i]
+        for j in range(columns):
+            smooth = min(left[j], right[j]) > none
+            share = fx if smooth else round_x
+            row[j] = (one - share) * left[j] + share * right[j]
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _overlap_sums(height, top, xs, pitch, shift, a, b, total):
+    """Over the contact: number of cells times 1, x, y, xx, xy, yy; overlap times 1, x, y."""
+    rows, columns = height.shape
+    zero, one = np.float32(0.0), np.float32(1.0)
+    reach, slope = abs(a) * xs[-1], np.float32(a)
+    total[:] = 0.0
+    for i in range(rows):
+        y = (i - 0.5 * (rows - 1)) * pitch
+        base = np.float32(shift + b * y)
+        if top[i] + base + reach <= 0.0:
+            continue
+        n, nx, nxx, o, ox = zero, zero, zero, zero, zero
+        row = height[i]
+        for j in range(columns):
+            x = xs[j]
+            overlap = max(row[j] + base + slope * x, zero)
+            on = one if overlap > zero else zero
+            n += on
+            nx += on * x
+            nxx += on * x * x
+            o += overlap
+            ox += overlap * x
+        total[0] += n
+        total[1] += nx
+        total[2] += n * y
+        total[3] += nxx
+        total[4] += nx * y
+        total[5] += n * y * y
+        total[6] += o
+        total[7] += ox
+        total[8] += o * y
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _push(height, top, xs, pitch, volume, shift, a, b, most, tolerance, total):
+    """The shift at which the overlap sums to `volume`: Newton's steps on a convex function."""
+    for _ in range(60):
+        _overlap_sums(height, top, xs, pitch, shift, a, b, total)
+        error = total[6] - volume
+        if abs(error) <= tolerance * volume or (shift >= most and error < 0.0):
+            break
+        shift = min(shift - error / max(total[0], 1.0), most)
+    return shift
+
+
+@njit(inline="always", fastmath=True)
+@no_type_check
+def _room(value, step, limit):
+    """How many steps lead to the limit."""
+    return (math.copysign(limit, step) - value) / step if step != 0.0 else 1.0
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _settle(height, xs, pitch, volume, mx, my, stiffness, limit):
+    """Shift and slopes; forces in units of a cell's area times the foundation modulus."""
+    top = np.empty(height.shape[0], np.float32)
+    for i in range(height.shape[0]):
+        top[i] = height[i].max()
+    highest = top.max()
+    most = MAX_OVERLAP - highest
+    total, trial = np.empty(9), np.empty(9)
+    a = b = 0.0
+    shift = _push(height, top, xs, pitch, volume, _FIRST_OVERLAP - highest, a, b, most, 0.05, total)
+    for _ in range(25):
+        g0 = total[6] - volume
+        g1 = total[7] - mx + stiffness * a
+        g2 = total[8] - my + stiffness * b
+        # A slope at its limit that wants beyond stays there.
+        free1 = not ((a >= limit and g1 < 0.0) or (a <= -limit and g1 > 0.0))
+        free2 = not ((b >= limit and g2 < 0.0) or (b <= -limit and g2 > 0.0))
+        g1, g2 = g1 * free1, g2 * free2
+        if abs(g0) < 1e-3 * volume and max(abs(g1), abs(g2)) < _CENTRE_TOLERANCE * volume:
+            break
+        s0, s1, s2 = solve3(
+            max(total[0], 1.0),
+            total[1] * free1,
+            total[2] * free2,
+            total[3] + stiffness,
+            total[4] * (free1 and free2),
+            total[5] + stiffness,
+            -g0,
+            -g1,
+            -g2,
+        )
+        start = g0 * s0 + g1 * s1 + g2 * s2
+        step = min(1.0, _room(a, s1, limit), _room(b, s2, limit))
+        # Along a convex energy's descent the slope rises: a step that ends well uphill is too long.
+        for _ in range(12):
+            t0, t1, t2 = min(shift + step * s0, most), a + step * s1, b + step * s2
+            _overlap_sums(height, top, xs, pitch, t0, t1, t2, trial)
+            end = (trial[6] - volume) * s0
+            end += (trial[7] - mx + stiffness * t1) * s1 + (trial[8] - my + stiffness * t2) * s2
+            if end <= -0.2 * start:
+                break
+            step *= start / (start - end)
+        shift, a, b = t0, t1, t2
+        total[:] = trial
+    return _push(height, top, xs, pitch, volume, shift, a, b, most, 1e-6, total), a, b
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _pressure(height, xs, pitch, shift, a, b, modulus, force, out):
+    rows, columns = height.shape
+    zero, slope, stiffness = np.float32(0.0), np.float32(a), np.float32(modulus)
+    total = 0.0
+    for i in range(rows):
+        base = np.float32(shift + b * (i - 0.5 * (rows - 1)) * pitch)
+        row, source, line = out[i], height[i], zero
+        for j in range(columns):
+            row[j] = stiffness * max(source[j] + base + slope * xs[j], zero)
+            line += row[j]
+        total += line
+    if total > 0.0:  # 1, unless the overlap is at its most or lost in rounding
+        out *= np.float32(force / (total * pitch * pitch))
+
+
+def settle(
+    height: HeightField, pitch: float, contact: PadContact, modulus: float, sensor: SensorModel
+) -> Press:
+    """Push an object into the gel, and tilt it, until the pressure balances the solver's force.
+
+    The gel and the object's own give act as an elastic foundation: pressure = modulus x overlap.
+    MuJoCo's penetration is no such measure: it depends on solver settings and the object's mass.
+    The normal force is met exactly; its moments as far as the patch, `MAX_TILT` and
+    `TILT_STIFFNESS` let them.
+
+    Args:
+        height: of the object over the whole gel, m; where it is all NO_SURFACE, nothing presses.
+        pitch: of its grid, m.
+        contact: the solver's, with a normal force above zero.
+        modulus: of gel and object in series, Pa/m.
+    """
+    force, torque, normal = contact.force, contact.torque, contact.normal_force
+    dx, dy = float(force[0]) / sensor.shear_stiffness, float(force[1]) / sensor.shear_stiffness
+    dz = -normal / sensor.normal_stiffness
+    displacement = dx, dy, dz
+    sheared, pressure = np.empty_like(height), np.zeros_like(height)
+    _shear(height, dx / pitch, dy / pitch, sheared)
+    if sheared.max() <= NO_SURFACE / 2:
+        return Press(0.0, (0.0, 0.0), pressure, pitch, displacement)
+    stiffness = modulus * pitch * pitch
+    volume = normal / stiffness
+    # First moments of the normal force about the sheared gel's centre; shear pulls at depth dz.
+    mx = (float(torque[1]) - dz * float(force[0])) / stiffness - volume * dx
+    my = (-float(torque[0]) - dz * float(force[1])) / stiffness - volume * dy
+    xs = _columns(height, pitch)
+    shift, a, b = _settle(sheared, xs, pitch, volume, mx, my, TILT_STIFFNESS / stiffness, MAX_TILT)
+    _pressure(sheared, xs, pitch, shift, a, b, modulus, normal, pressure)
+    return Press(shift - a * dx - b * dy, (a, b), pressure, pitch, displacement)

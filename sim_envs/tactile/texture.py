@@ -1,0 +1,123 @@
+"""The fine structure of surfaces: height patterns in micrometres that stick to any shape."""
+
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, Float32
+from numba import njit
+
+from touchgoal.sim_envs.objects import Material
+
+# Wave vectors of the rough pattern, cycles per wavelength: directions from all around, lengths that
+# share no period.
+_ROUGH = (
+    (0.41, 0.33, 0.77),
+    (-0.83, 0.52, 0.21),
+    (0.29, -1.07, 0.37),
+    (0.61, 0.57, -0.93),
+    (-0.67, -0.45, -1.21),
+    (1.31, -0.23, -0.49),
+)
+
+
+@njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
+def _wave(cycles):
+    """sin(2 pi cycles) to 0.1 %, from two parabolas: unlike sin, the compiler vectorises it."""
+    t = cycles - np.floor(cycles + np.float32(0.5))
+    y = np.float32(8.0) * t * (np.float32(1.0) - np.float32(2.0) * abs(t))
+    return y * (np.float32(0.776) + np.float32(0.224) * abs(y))
+
+
+@njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
+def _ribs(x, y, z):
+    """Planes across the x + y diagonal, so that every side of an object has some."""
+    return _wave(np.float32(0.7071) * (x + y))
+
+
+@njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
+def _dots(x, y, z):
+    """Bumps on a lattice."""
+    return _wave(y) * (_wave(x) + _wave(z))
+
+
+@njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
+def _rough(x, y, z):
+    total = np.float32(0.0)
+    for a, b, c in _ROUGH:
+        total += _wave(np.float32(a) * x + np.float32(b) * y + np.float32(c) * z)
+    return np.float32(0.5) * total
+
+
+@njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
+def _weave(x, y, z):
+    """Two crossed sets of threads, alternately above each other."""
+    half = np.float32(0.5)
+    over = _wave(half * (x + y)) * _wave(half * z)
+    thread = _wave(z) if over > 0 else _wave(np.float32(0.7071) * (x + y))
+    return np.float32(0.6) * thread + np.float32(0.4) * abs(over)
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+@no_type_check
+def _add(height, below, pitch, texture, amplitude, frequency, position, rotation):
+    rows, columns = height.shape
+    scale = pitch * frequency
+    ex, ey, ez = rotation[0, 0] * scale, rotation[0, 1] * scale, rotation[0, 2] * scale
+    dx, dy, dz = rotation[2, 0] * frequency, rotation[2, 1] * frequency, rotation[2, 2] * frequency
+    z0 = position[2]
+    along = np.arange(columns).astype(np.float32)
+    for i in range(rows):
+        row = height[i]
+        left, right = 0, columns
+        while left < right and row[left] <= below:
+            left += 1
+        while left < right and row[right - 1] <= below:
+            right -= 1
+        py = (np.float32(i) - np.float32(0.5 * (rows - 1))) * pitch - position[1]
+        px = np.float32(-0.5 * (columns - 1)) * pitch - position[0]
+        ax = (rotation[0, 0] * px + rotation[1, 0] * py) * frequency
+        ay = (rotation[0, 1] * px + rotation[1, 1] * py) * frequency
+        az = (rotation[0, 2] * px + rotation[1, 2] * py) * frequency
+        for j in range(left, right):
+            n, depth = along[j], -(row[j] + z0)
+            x = ax + n * ex + dx * depth
+            y = ay + n * ey + dy * depth
+            z = az + n * ez + dz * depth
+            if texture == 1:
+                pattern = _ribs(x, y, z)
+            elif texture == 2:
+                pattern = _dots(x, y, z)
+            elif texture == 4:
+                pattern = _weave(x, y, z)
+            else:
+                pattern = _rough(x, y, z)
+            row[j] += amplitude * pattern if row[j] > below else np.float32(0.0)
+
+
+def add_texture(
+    height: Float32[np.ndarray, "h w"],
+    pitch: float,
+    material: Material,
+    position: Float[np.ndarray, "3"],
+    rotation: Float[np.ndarray, "3 3"],
+) -> None:
+    """Add a material's pattern to a height field, in place, where it may touch the gel.
+
+    The patterns are solid, functions of the point in the object's frame, so that they stick to any
+    shape without seams.
+
+    Args:
+        position, rotation: of the object in the sensor frame.
+    """
+    if not material.texture or not material.amplitude:
+        return
+    scalars = -2 * material.amplitude, pitch
+    below, step = (np.float32(a) for a in scalars)
+    amplitude, frequency = np.float32(material.amplitude), np.float32(1 / material.wavelength)
+    pose = (np.asarray(a, np.float32) for a in (position, rotation))
+    _add(height, below, step, int(material.texture), amplitude, frequency, *pose)

@@ -1,0 +1,287 @@
+"""From frames back to touch: background, contact, markers, depth and force, on simulated presses."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.sensors import DIGIT, GELSIGHT, GELSIGHT_MINI, SensorModel
+from touchgoal.control.sensors import GELSIGHT_MINI_MARKERS as DOTTED
+from touchgoal.control.touch.background import Background
+from touchgoal.control.touch.contact import ContactDetector
+from touchgoal.control.touch.depth import DepthEstimator
+from touchgoal.control.touch.force import estimate_force
+from touchgoal.control.touch.markers import MarkerTracker, find_markers, without_markers
+from touchgoal.sim_envs.objects import CATALOGUE, Body, ObjectKind
+from touchgoal.sim_envs.tactile.markers import draw
+from touchgoal.sim_envs.tactile.optics import render, render_untouched
+from touchgoal.sim_envs.tactile.pad import TactileFrame
+from touchgoal.sim_envs.tactile.rig import PressRig
+from touchgoal.sim_envs.tactile.unit import NOMINAL, STEP, Unit, sample_unit
+
+HEIGHT, WIDTH = GELSIGHT_MINI.image_shape
+MINI = sample_unit(GELSIGHT_MINI, np.random.default_rng(0), NOMINAL)
+GLASS = CATALOGUE["glass_ball"]
+BLOCK = ObjectKind("block", "box", GLASS.material, ())
+
+
+def turned(axis: int, degrees: float) -> np.ndarray:
+    vector = np.zeros(3)
+    vector[axis] = np.radians(degrees)
+    return np.asarray(cv2.Rodrigues(vector)[0])
+
+
+def press(
+    body: Body,
+    force: float,
+    sensor: SensorModel = GELSIGHT_MINI,
+    unit: Unit = MINI,
+    rotation: np.ndarray | None = None,
+    at: tuple[float, float] = (1e-3, -0.5e-3),
+) -> TactileFrame:
+    rig = PressRig(body, sensor, unit)
+    rig.place(np.array([*at, 0.03]), rotation)
+    return rig.sense(force, np.random.default_rng(1), centre=at)
+
+
+def untouched(unit: Unit, n: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.stack([render_untouched(unit, rng) for _ in range(n)])
+
+
+class DriftingUnit:
+    """A Mini whose light goes as far from its start as real touches differ, and comes back."""
+
+    def __init__(self, rng: np.random.Generator, period: int = 2000) -> None:
+        self._period, self._start = period, MINI.background.astype(np.float32)
+        pattern = cv2.resize(
+            rng.normal(size=(4, 5, 3)), (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC
+        )
+        change = self._start * 0.047 * rng.normal(size=(3, 1, 1))
+        change += 0.0094 * 255 / STEP * rng.normal(size=(3, 1, 1))
+        self._change = change + 0.0093 * 255 / STEP * np.moveaxis(pattern, -1, 0)
+
+    def at(self, frame: int) -> Unit:
+        share = np.sin(2 * np.pi * frame / self._period)
+        return replace(MINI, background=(self._start + share * self._change).astype(np.int16))
+
+
+# Background.
+
+
+def test_background_follows_the_light_and_says_when_it_went_far() -> None:
+    frames = untouched(MINI, 5)
+    background = Background(frames)
+    assert not background.drift().large
+    for gain, large in ((1.04, False), (1.15, True)):
+        for frame in untouched(MINI, 20) * gain:
+            for _ in range(15):
+                background.update(frame.astype(np.uint8))
+        assert background.image.mean() == pytest.approx(gain * frames.mean(), rel=0.01)
+        drift = background.drift()
+        assert drift.large == large
+        np.testing.assert_allclose(drift.gain, gain, atol=0.05)
+
+
+def test_a_touch_is_no_background() -> None:
+    still = untouched(MINI, 5)
+    touch = press(Body(GLASS, (0.01,), 0.1), 3.0).image
+    with pytest.raises(UserError, match="untouched"):
+        Background(np.concatenate([still, touch[None]]))
+    with pytest.raises(UserError, match="reference"):
+        Background(touch[None], reference=MINI.photometry.background)
+
+
+# Contact.
+
+
+def test_no_false_alarm_in_drifting_light() -> None:
+    rng = np.random.default_rng(3)
+    light = DriftingUnit(rng)
+    unit = light.at(0)
+    detector = ContactDetector(Background(untouched(unit, 5)))
+    far = 0.0
+    for i in range(1000):
+        if i % 10 == 0:  # light drifts much slower than frames come
+            unit = light.at(i)
+        frame = render_untouched(unit, rng)
+        assert not detector.update(frame), f"frame {i}"
+        far = max(far, abs(float(frame.mean() - detector.background.reference.mean())))
+    assert far > 1, "the light must really drift"
+
+
+def area_under_roc(positive: list[float], negative: list[float]) -> float:
+    above = np.array(positive)[:, None] - np.array(negative)
+    return float((above > 0).mean() + 0.5 * (above == 0).mean())
+
+
+def test_contact_is_told_from_drift() -> None:
+    """Objects of all shapes at 0.3 N and more: the area under the ROC curve is at least 0.995."""
+    strengths: dict[bool, list[float]] = {True: [], False: []}
+    rng = np.random.default_rng(4)
+    for name in ("golf_ball", "brick", "cushion", "bottle_cap", "sausage", "walnut"):
+        light, kind = DriftingUnit(rng, period=600), CATALOGUE[name]
+        detector = ContactDetector(Background(untouched(light.at(0), 5)))
+        size = {"box": (0.02,) * 3, "sphere": (0.025,), "mesh": (0.025,)}.get(
+            kind.shape, (0.02, 0.03)
+        )
+        hull = rng.normal(size=(30, 3)) if kind.shape == "mesh" else None
+        hull = None if hull is None else 0.025 * hull / np.linalg.norm(hull, axis=1, keepdims=True)
+        rig = PressRig(Body(kind, size, 0.1, hull=hull), GELSIGHT_MINI, MINI)
+        i = 0
+        for _ in range(3):
+            rig.place(np.array([*rng.uniform(-3e-3, 3e-3, 2), 0.03]), turned(1, 90) @ turned(0, 9))
+            for force in (*[0.0] * 15, 0.3, 0.5, 1, 5, 20, 20, 20, 5, 1, 0.3):
+                unit = light.at(i)
+                if force:
+                    frame = render(rig.sense(force, rng).surface, unit, rng)
+                else:
+                    frame = render_untouched(unit, rng)
+                detector.update(frame)
+                strengths[force > 0].append(detector.strength)
+                i += 1
+    assert area_under_roc(strengths[True], strengths[False]) >= 0.995
+
+
+# Markers.
+
+
+def dotted(image: np.ndarray, unit: Unit, moved: np.ndarray | float = 0.0) -> np.ndarray:
+    image = image.copy()
+    draw(image, (unit.markers + moved).astype(np.float32), unit.marker_radius)
+    return image
+
+
+@pytest.fixture(scope="module")
+def gel() -> Unit:
+    return sample_unit(DOTTED, np.random.default_rng(0), NOMINAL)
+
+
+@pytest.mark.parametrize("name", ["golf_ball", "brick", "rope_coil"])
+def test_markers_are_followed_to_half_the_pitch(gel: Unit, name: str) -> None:
+    rng = np.random.default_rng(5)
+    assert DOTTED.markers is not None
+    tracker = MarkerTracker(
+        dotted(render_untouched(gel, rng), gel), DOTTED.markers, gel.pixel_pitch
+    )
+    kind = CATALOGUE[name]
+    size = (0.02, 0.02, 0.02)[: {"sphere": 1, "cylinder": 2}.get(kind.shape, 3)]
+    rig = PressRig(Body(kind, size, 0.1), DOTTED, gel)
+    rig.place(np.array([0, 0, 0.03]), turned(1, 90))
+    away = gel.markers - np.array([180, 100])
+    dragged = np.exp(-(away**2).sum(1) / (2 * 70**2))[:, None] * [13.0, -9.0]  # 15.8 px, px
+    worst, steps = 0.0, 12
+    for step in [*range(steps + 1), *range(steps, -1, -1)]:
+        moved = dragged * step / steps
+        shaded = render(rig.sense(0.3 + step, rng).surface, gel, rng)
+        now = tracker.update(dotted(shaded, gel, moved))
+        assert now.found.all() and now.found.size == 63
+        error = now.positions.reshape(-1, 2) - (gel.markers + moved)
+        worst = max(worst, float(np.linalg.norm(error, axis=1).max()))
+    assert worst < 0.3
+    assert np.linalg.norm(tracker.displacement, axis=-1).max() < 0.3
+
+
+def test_a_hidden_marker_is_flagged_and_found_again(gel: Unit) -> None:
+    rng = np.random.default_rng(6)
+    plain = render_untouched(gel, rng)
+    assert DOTTED.markers is not None
+    tracker = MarkerTracker(dotted(plain, gel), DOTTED.markers, gel.pixel_pitch)
+    hidden = 31
+    for step in range(12):
+        moved = np.full((63, 2), [1.2 * step, 0.4 * step])
+        frame = dotted(plain, gel, moved)
+        if 3 <= step < 9:
+            x, y = np.rint(gel.markers[hidden] + moved[hidden]).astype(int)
+            frame[y - 12 : y + 13, x - 12 : x + 13] = plain[y - 12 : y + 13, x - 12 : x + 13]
+        now = tracker.update(frame)
+        lost = np.flatnonzero(~now.found)
+        assert lost.tolist() == ([hidden] if 3 <= step < 9 else [])
+        error = np.linalg.norm(now.positions.reshape(-1, 2) - gel.markers - moved, axis=1)
+        assert error.max() < 0.3  # the neighbours carry the lost one along
+
+
+@pytest.mark.parametrize(
+    ("degrees", "scale", "shift"), [(12, 1.0, 4), (-20, 0.9, 0), (3, 1.15, -6)]
+)
+def test_the_grid_is_ordered_however_it_lies(
+    gel: Unit, degrees: float, scale: float, shift: float
+) -> None:
+    matrix = cv2.getRotationMatrix2D((159.5, 119.5), degrees, 0.8 * scale)
+    matrix[:, 2] += shift
+    image = cv2.warpAffine(
+        dotted(untouched(gel, 1)[0], gel), matrix, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REPLICATE
+    )
+    expected = gel.markers @ matrix[:, :2].T + matrix[:, 2]
+    assert DOTTED.markers is not None
+    markers = find_markers(image, DOTTED.markers, gel.pixel_pitch / 0.8)
+    assert markers.found.all()
+    assert np.abs(markers.positions.reshape(-1, 2) - expected).max() < 0.3
+
+
+def test_a_gel_without_markers_is_refused() -> None:
+    assert DOTTED.markers is not None
+    with pytest.raises(UserError, match="63 markers"):
+        find_markers(untouched(MINI, 1)[0], DOTTED.markers, MINI.pixel_pitch)
+
+
+def test_painting_markers_over_gives_the_plain_gel(gel: Unit) -> None:
+    plain = press(Body(GLASS, (0.01,), 0.1), 2.0).image
+    painted = without_markers(dotted(plain, gel), gel.markers, gel.marker_radius)
+    changed = (painted != plain).any(2)
+    error = np.abs(painted.astype(float) - plain)[changed]
+    assert changed.mean() > 0.15 and error.mean() < 1.5 and np.quantile(error, 0.99) < 6
+
+
+# Depth and force.
+
+PRESSES = {
+    "ball": (Body(GLASS, (0.02,), 0.1), 5.0, None),
+    "small ball": (Body(GLASS, (0.004,), 0.1), 2.0, None),
+    "edge": (Body(BLOCK, (0.003, 0.003, 0.01), 0.1), 2.0, turned(2, 25)),
+    "texture": (Body(CATALOGUE["golf_ball"], (0.02,), 0.1), 6.0, turned(0, 50)),
+}
+
+
+@pytest.mark.parametrize("sensor", [GELSIGHT_MINI, GELSIGHT, DIGIT], ids=lambda s: s.name)
+@pytest.mark.parametrize("name", PRESSES)
+def test_depth_comes_back(sensor: SensorModel, name: str) -> None:
+    """Within 5 % of the indentation, averaged over the contact."""
+    unit = sample_unit(sensor, np.random.default_rng(0), NOMINAL)
+    body, force, rotation = PRESSES[name]
+    frame = press(body, force, sensor, unit, rotation)
+    background = Background(untouched(unit, 8)).image
+    depth = DepthEstimator(unit.photometry).estimate(frame.image, background)
+    contact = frame.depth > 0.05 * frame.depth.max()
+    assert contact.mean() > 0.02
+    assert np.abs(depth - frame.depth)[contact].mean() < 0.05 * frame.depth.max()
+    assert np.abs(depth)[~contact].mean() < 0.05 * frame.depth.max()
+
+
+def test_an_untouched_gel_is_flat() -> None:
+    background = Background(untouched(MINI, 8)).image
+    depth = DepthEstimator(MINI.photometry).estimate(untouched(MINI, 1, seed=1)[0], background)
+    assert np.abs(depth).max() < 10e-6
+
+
+@pytest.mark.parametrize("force", [1.0, 4.0, 10.0])
+def test_force_from_depth_and_markers(gel: Unit, force: float) -> None:
+    """On a marker gel: depth within 5 %, the normal force within 15 %, shear to the stiffness."""
+    frame = press(Body(GLASS, (0.015,), 0.1), force, DOTTED, gel)
+    still = dotted(untouched(gel, 1)[0], gel)
+    assert DOTTED.markers is not None
+    tracker = MarkerTracker(still, DOTTED.markers, gel.pixel_pitch)
+    moved = np.array([3.0, -2.0])
+    image = dotted(render(frame.surface, gel, np.random.default_rng(2)), gel, moved)
+    now = tracker.update(image)
+    rest = without_markers(still, tracker.rest.positions, gel.marker_radius)
+    depth = DepthEstimator(gel.photometry).estimate(
+        without_markers(image, now.positions, gel.marker_radius), rest.astype(np.float32)
+    )
+    assert np.abs(depth - frame.depth).mean() < 0.05 * frame.depth.max()
+    estimate = estimate_force(depth, gel.pixel_pitch, DOTTED, now.positions, tracker.displacement)
+    assert estimate.normal == pytest.approx(force, rel=0.15)
+    expected = DOTTED.shear_stiffness * gel.pixel_pitch * moved
+    assert estimate.shear == pytest.approx(tuple(expected), rel=0.03)
