@@ -3,17 +3,19 @@
 import platform
 from typing import Annotated, Any
 
+import cv2
 import tyro
 
-from touchgoal.benchmarks import env_speed, reward_quality, tactile_speed
+from touchgoal.benchmarks import env_speed, reward_quality, tactile_realism, tactile_speed
 from touchgoal.launch.run_folder import open_run, write_json
 
 BENCHMARKS: dict[type, Any] = {
-    module.Config: module for module in (env_speed, reward_quality, tactile_speed)
+    module.Config: module for module in (env_speed, reward_quality, tactile_realism, tactile_speed)
 }
 Config = (
     Annotated[env_speed.Config, tyro.conf.subcommand("env-speed")]
     | Annotated[reward_quality.Config, tyro.conf.subcommand("reward-quality")]
+    | Annotated[tactile_realism.Config, tyro.conf.subcommand("tactile-realism")]
     | Annotated[tactile_speed.Config, tyro.conf.subcommand("tactile-speed")]
 )
 
@@ -25,6 +27,9 @@ def main(config: Any) -> None:
     out = open_run(config.out, f"benchmark-{name}", config)
     result = benchmark.run(config)
     print(result.pop("table"))
+    if "picture" in result:
+        cv2.imwrite(str(out / "picture.png"), result.pop("picture")[..., ::-1])
+        print(f"picture: {out / 'picture.png'}")
     print(f"hardware: {hardware()}")
     write_json(out / "metrics.json", {**result, "hardware": hardware()})
     print(f"numbers: {out / 'metrics.json'}")

@@ -1,7 +1,13 @@
 import numpy as np
 import pytest
 
-from touchgoal.control.touch.contact import THRESHOLD, contact_strength, detect_contact
+from touchgoal.control.touch.background import Background
+from touchgoal.control.touch.contact import (
+    THRESHOLD,
+    ContactDetector,
+    contact_strength,
+    detect_contact,
+)
 
 HEIGHT, WIDTH = 240, 320
 Y, X = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
@@ -48,6 +54,17 @@ def test_contact_ends_only_below_half_the_threshold() -> None:
     assert (weak > THRESHOLD / 2).all() and (weak < THRESHOLD).all()
     expected = [False] * 6 + [True] * 3 + [False] * 2
     assert detect_contact(frames, background).tolist() == expected
+
+
+def test_what_a_long_contact_leaves_behind_is_no_contact() -> None:
+    """Light that drifted during a strong contact stays above half the threshold; it is absorbed."""
+    height = np.array([0] * 3 + [60] * 3 + [1.7] * 200, float)
+    frames = sensed(np.ones(len(height)), height)
+    background = background_of(frames[:3])
+    assert THRESHOLD / 2 < contact_strength(frames[-1:], background)[0] < THRESHOLD
+    detector = ContactDetector(Background(background[None]))
+    assert [detector.update(frame) for frame in frames] == [False] * 3 + [True] * 3 + [False] * 200
+    assert detector.strength < THRESHOLD / 2
 
 
 @pytest.mark.parametrize("size", [(2, 3), (30, 41)])

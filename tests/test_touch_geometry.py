@@ -221,10 +221,14 @@ def test_the_grid_is_ordered_however_it_lies(
     assert np.abs(markers.positions.reshape(-1, 2) - expected).max() < 0.3
 
 
-def test_a_gel_without_markers_is_refused() -> None:
+def test_a_gel_without_its_markers_is_refused() -> None:
     assert DOTTED.markers is not None
-    with pytest.raises(UserError, match="63 markers"):
-        find_markers(untouched(MINI, 1)[0], DOTTED.markers, MINI.pixel_pitch)
+    plain = untouched(MINI, 1)[0]
+    lonely = plain.copy()
+    draw(lonely, np.array([[100, 80], [140, 90]], np.float32), 8.0)
+    for image in (plain, lonely, np.zeros_like(plain)):
+        with pytest.raises(UserError, match="63 markers"):
+            find_markers(image, DOTTED.markers, MINI.pixel_pitch)
 
 
 def test_painting_markers_over_gives_the_plain_gel(gel: Unit) -> None:
@@ -264,6 +268,16 @@ def test_an_untouched_gel_is_flat() -> None:
     background = Background(untouched(MINI, 8)).image
     depth = DepthEstimator(MINI.photometry).estimate(untouched(MINI, 1, seed=1)[0], background)
     assert np.abs(depth).max() < 10e-6
+
+
+@pytest.mark.parametrize("frame", ["background", "black", "white", "snow"])
+def test_strange_frames_give_finite_depths(frame: str) -> None:
+    background = MINI.photometry.background
+    snow = np.random.default_rng(0).integers(0, 256, background.shape, np.uint8)
+    black, white = np.zeros_like(background), np.full_like(background, 255)
+    image = {"background": background, "black": black, "white": white, "snow": snow}[frame]
+    depth = DepthEstimator(MINI.photometry).estimate(image)
+    assert np.isfinite(depth).all() and (frame != "background" or not depth.any())
 
 
 @pytest.mark.parametrize("force", [1.0, 4.0, 10.0])

@@ -15,14 +15,14 @@ _GREY, _INK, _PAPER = (150, 150, 150), (40, 40, 40), 255
 
 
 def side_by_side(
-    measured: Sequence[UInt8[np.ndarray, "h w 3"]],
+    measured: Sequence[UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"]],
     simulated: Sequence[Float32[np.ndarray, "h w 3"]],
     pairs_a_row: int = 2,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Rows of measured | simulated | difference times CONTRAST about grey, RGB, with a heading.
 
     Args:
-        measured: RGB.
+        measured: RGB counts.
         simulated: RGB counts, as many.
         pairs_a_row: presses next to each other.
     """
@@ -30,7 +30,7 @@ def side_by_side(
     for real, made in zip(measured, simulated, strict=True):
         picture = made.clip(0, 255)
         difference = (128 + CONTRAST * (real - picture)).clip(0, 255)
-        tiles.append(np.hstack([real, picture.astype(np.uint8), difference.astype(np.uint8)]))
+        tiles.append(np.hstack([real, picture, difference]).astype(np.uint8))
     tiles += [np.full_like(tiles[0], _PAPER)] * (-len(tiles) % pairs_a_row)
     rows = [np.hstack(tiles[i : i + pairs_a_row]) for i in range(0, len(tiles), pairs_a_row)]
     heading = _heading(tiles[0].shape[1] // 3, pairs_a_row)
@@ -49,7 +49,7 @@ def light_compass(photometry: Photometry, size: int = 320) -> UInt8[np.ndarray, 
     for text, dx, dy in (("0", 1, 0), ("90", 0, 1), ("180", -1, 0), ("-90", 0, -1)):
         _write(picture, text, centre + dx * 1.18 * reach, centre + dy * 1.18 * reach, _GREY)
     strength = np.linalg.norm(photometry.response[:, :2, 0], axis=1)
-    lengths = reach * strength / strength.max()
+    lengths = (reach * strength / strength.max()).tolist()
     for (name, colour), azimuth, length in zip(
         _LIGHTS.items(), photometry.light_azimuths, lengths, strict=True
     ):

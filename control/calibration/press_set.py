@@ -50,6 +50,12 @@ class PressSet:
         return PressSet(self.background, self.images[chosen], circles, balls, files)
 
 
+def split(presses: PressSet, n_held_out: int, seed: int) -> tuple[PressSet, PressSet]:
+    """Presses to fit, and presses to judge the fit on."""
+    order = np.random.default_rng(seed).permutation(len(presses))
+    return presses.take(np.sort(order[n_held_out:])), presses.take(np.sort(order[:n_held_out]))
+
+
 def write_presses(presses: PressSet, folder: Path) -> None:
     """Make the folder that `read_presses` reads."""
     folder.mkdir(parents=True, exist_ok=True)

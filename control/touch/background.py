@@ -134,14 +134,14 @@ def _blurred(image: np.ndarray) -> Float32[np.ndarray, "H W 3"]:
 def _high_pass(image: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
     """The image without its lowest cosines."""
     down, across = (
-        _cosines(size, waves) for size, waves in zip(image.shape[:2], _WAVES, strict=True)
+        cosines(size, waves) for size, waves in zip(image.shape[:2], _WAVES, strict=True)
     )
     waves = np.einsum("ih,hwc,jw->ijc", down, image, across, optimize=True)
     return image - np.einsum("ih,ijc,jw->hwc", down, waves, across, optimize=True)
 
 
-def _cosines(size: int, count: int) -> Float32[np.ndarray, "k size"]:
-    """Orthonormal rows cos(pi k (n + 1/2) / size), at most `size` of them."""
+def cosines(size: int, count: int) -> Float32[np.ndarray, "k size"]:
+    """The lowest waves of the cosine transform (type II): orthonormal rows, at most `size`."""
     k, n = np.arange(min(count, size))[:, None], np.arange(size) + 0.5
     rows = np.cos(np.pi * k * n / size)
     return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)

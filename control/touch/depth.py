@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from touchgoal.control.touch import gel
+from touchgoal.control.touch.background import cosines
 from touchgoal.control.touch.photometry import Photometry, gain
 
 Map = Float32[np.ndarray, "h w"]
@@ -26,8 +27,7 @@ _OUTLIER = 4.0  # standard deviations beyond which a pixel counts less
 _DAMPING = 0.01  # of the usual curvature
 # The lowest tenth of the surface is believed to be gel at rest: to lie within _REST, once for each
 # patch of _PATCH pixels. It decides where the colours themselves do not tell the depth.
-_LOWEST = 10  # percent
-_FLAT = 4e-6  # m around that percentile
+_FLAT = 4e-6  # m around its upper end
 _REST = 40e-6  # m
 _PATCH = 400
 # A pixel that fits badly is tried at _LENGTHS other slopes in the same direction, and takes one
@@ -105,7 +105,8 @@ class _Level:
         self._coefficients = _coefficients(p.response[..., :waves])
         per_depth = np.tensordot(p.response[:, 9, :waves], self._places, 1)
         self._per_depth = (self._gain * per_depth).astype(np.float32)
-        self._down, self._across = _cosines(h), _cosines(w)
+        # As products, cosine transforms of these sizes are faster than cv2.dct.
+        self._down, self._across = cosines(h, h), cosines(w, w)
         down, across = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in (h, w))
         self._laplace = ((down[:, None] + across) / self._pitch**2).astype(np.float32)
 
@@ -138,16 +139,18 @@ class _Level:
     def _linearise(self, seen: Colours, surface: Map, search: bool) -> _Linear:
         p = self._photometry
         gx, gy = self._slopes(surface)
-        dark = gel.shadow_depth(surface, self._pitch, p.light_azimuths, p.shadow_slope)
+        known = np.minimum(surface, np.float32(p.deepest))
+        dark = gel.shadow_depth(known, self._pitch, p.light_azimuths, p.shadow_slope)
         dark /= dark + np.float32(p.penumbra)
-        by_slopes = seen - self._per_depth * np.minimum(surface, np.float32(p.deepest))
-        by_slopes -= self._gain * np.tensordot(p.shadow, dark, 1)
+        # What shadows and depth leave for the slopes to explain.
+        left = seen - self._per_depth * np.minimum(surface, np.float32(p.deepest))
+        left -= self._gain * np.tensordot(p.shadow, dark, 1)
         lit, by_gx, by_gy = self._lit(gx, gy)
-        error = by_slopes - lit
-        moved = self._search(by_slopes, error, gx, gy) if search else None
+        error = left - lit
+        moved = self._search(left, error, gx, gy) if search else None
         if moved is not None:
             lit, by_gx, by_gy = self._lit(*moved)
-            error = by_slopes - lit
+            error = left - lit
         size = np.sqrt(np.einsum("chw,chw->hw", error, error)) / self._noise
         weight = self._noise**-2 / np.maximum(size / np.float32(_OUTLIER), 1)
         if moved is not None:
@@ -171,9 +174,7 @@ class _Level:
         xx, xy, yy = inverse - bend * gx * gx, -bend * gx * gy, inverse - bend * gy * gy
         return value, by_nx * xx + by_ny * xy, by_nx * xy + by_ny * yy
 
-    def _search(
-        self, by_slopes: Colours, error: Colours, gx: Map, gy: Map
-    ) -> tuple[Map, Map] | None:
+    def _search(self, left: Colours, error: Colours, gx: Map, gy: Map) -> tuple[Map, Map] | None:
         """Slopes, where some others in their direction fit the colours much better; else None."""
         before = np.einsum("chw,chw->hw", error, error)
         square = gx * gx + gy * gy
@@ -187,7 +188,7 @@ class _Level:
         values = self._coefficients[: 3 * len(self._places)] @ _monomials(x, y).reshape(10, -1)
         values = values.reshape(3, len(self._places), *x.shape)
         values = np.einsum("cpkn,pn->ckn", values, self._places[:, i, j])
-        errors = by_slopes[:, i, j][:, None] - self._gain[:, i, j][:, None] * values
+        errors = left[:, i, j][:, None] - self._gain[:, i, j][:, None] * values
         after = np.einsum("ckn,ckn->kn", errors, errors)
         n = lengths[after.argmin(0)]
         factor = np.where(
@@ -206,17 +207,20 @@ class _Level:
         usual = (a.mean() + c.mean()) / 2
         a += np.float32(_DAMPING) * usual
         c += np.float32(_DAMPING) * usual
-        lowest = np.float32(np.percentile(surface, _LOWEST))
+        tenth = surface.size // 10
+        lowest = np.partition(surface, tenth, axis=None)[tenth]
         rest = self._rest / (1 + ((surface - lowest) / np.float32(_FLAT)) ** 2)
         f += rest
         residual = self._against_slopes(_dot(wx, linear.error), _dot(wy, linear.error))
         residual += _dot(wh, linear.error) - rest * surface
-        filter_ = 1 / (usual * self._laplace + f.mean())
+        smooth = 1 / (usual * self._laplace + f.mean())
         step = np.zeros_like(surface)
         direction, size = step, np.float32(1)
         for _ in range(inner):
-            z = self._down.T @ (self._down @ residual @ self._across.T * filter_) @ self._across
+            z = self._down.T @ (self._down @ residual @ self._across.T * smooth) @ self._across
             before, size = size, np.vdot(residual, z)
+            if size == 0:  # nothing left to explain: a frame equal to its background
+                break
             direction = z + size / before * direction
             gx, gy = self._slopes(direction)
             curved = self._against_slopes(
@@ -251,13 +255,6 @@ class _Level:
 
 def _dot(a: Colours, b: Colours) -> Map:
     return np.einsum("chw,chw->hw", a, b)
-
-
-def _cosines(n: int) -> Float32[np.ndarray, "n n"]:
-    """The cosine transform (type II, orthonormal); as a product it is faster than cv2.dct."""
-    k, x = np.arange(n)[:, None], np.arange(n) + 0.5
-    rows = np.cos(np.pi * k * x / n)
-    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
 def _monomials(

@@ -7,9 +7,8 @@ from jaxtyping import Float32
 
 from touchgoal.control.sensors import SensorModel
 
-# A gel bulges around what presses into it. Of a simulated press, what lies deeper than a quarter of
-# the deepest point holds as much volume as the object displaces: median of balls, edges and
-# textures 1.0, standard deviation 0.1.
+# A gel bulges around what presses into it: only what lies deeper than a quarter of the deepest point
+# counts. With it simulated balls of 3 to 25 mm at 0.5 to 15 N come out within 5 %.
 _CONTACT_SHARE = 0.25
 
 
@@ -36,11 +35,13 @@ def estimate_force(
     """Resultant force from one frame's depth and its markers' displacement.
 
     Normal: the gel as an elastic foundation, `foundation_modulus` times the volume in contact.
-    It holds as far as the modulus does: calibrate it with one known weight. It sees only what the
-    camera sees, and nothing of a flat face that presses the whole view evenly.
+    On simulated presses balls are right within 5 %, flat faces 10 to 25 % too strong, edges up to
+    half too strong; of a contact that reaches beyond the view only the part in view counts. On a
+    real sensor it holds as far as the modulus does: compare with one known weight.
 
     Shear: `shear_stiffness` times the mean displacement of the markers, each counting as much as
-    the gel is deep there. It holds while the contact sticks; gross slip adds nothing to it.
+    the gel is deep there: within 10 % for curved simulated contacts that stick, within 30 % for
+    edges, which few markers feel.
 
     Args:
         depth: of the gel's surface, m (`depth.DepthEstimator`).

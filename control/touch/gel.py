@@ -15,11 +15,14 @@ HeightField = Float32[np.ndarray, "h w"]
 # Bulge and shadows are smooth: they are computed on cells of about this size, m. In metres, so that
 # a surface gives the same at every resolution.
 CELL = 0.236e-3
-SHADOW_CELLS = 31  # how far a shadow reaches at most
+SHADOW_CELLS = 16  # how far a shadow reaches at most; on real presses 31 gains nothing
 
-# The gel touches the object where the overlap exceeds this share of its maximum; around that it
-# has already come loose and bulges. Taxim's value; on real ball presses 0.3 to 0.4 fit best.
+# The gel touches the object where the overlap exceeds this share of its maximum nearby; around that
+# it has already come loose and bulges. Taxim's value; on real ball presses 0.3 to 0.4 fit best.
 CONTACT_SHARE = 0.4
+NEARBY_CELLS = (
+    12  # 2.8 mm: a press twice as far away, or the other end of a tilted edge, is another
+)
 
 
 def cells(pitch: float) -> int:
@@ -43,7 +46,8 @@ def deform(raw: HeightField, pitch: float, bulge: tuple[float, ...]) -> HeightFi
     h, w = raw.shape
     scale = cells(pitch)
     low = cv2.resize(raw, (w // scale, h // scale), interpolation=cv2.INTER_AREA)
-    contact = low > CONTACT_SHARE * float(low.max())
+    around = 2 * NEARBY_CELLS + 1
+    contact = low > CONTACT_SHARE * cv2.dilate(low, np.ones((around, around), np.uint8))
     smooth = low
     for sigma in bulge:
         blurred = cv2.GaussianBlur(smooth, (0, 0), sigma / (pitch * scale))

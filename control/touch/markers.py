@@ -176,7 +176,7 @@ def _spots(
     light = cv2.resize(grey, (w // scale, h // scale), interpolation=cv2.INTER_AREA)
     light = cv2.GaussianBlur(light, (0, 0), 0.5)
     around = cv2.morphologyEx(light, cv2.MORPH_CLOSE, kernel)
-    dark = cv2.GaussianBlur(1 - light / np.maximum(around, 1), (0, 0), size / 3)
+    dark = cv2.GaussianBlur((around - light) / np.maximum(around, 1), (0, 0), size / 3)
     peak = (dark == cv2.dilate(dark, kernel)) & (dark > _NOISE)
     peak[[0, -1]] = peak[:, [0, -1]] = False
     y, x = np.nonzero(peak)
@@ -204,7 +204,7 @@ def _ordered(spots: Float32[np.ndarray, "n 2"], pitch: float) -> Int[np.ndarray,
     Spots that no chain of steps reaches get a cell far outside.
     """
     cells = np.full((len(spots), 2), -(10**6))
-    if len(spots) < 4:
+    if not len(spots):
         return cells
     apart = spots[None] - spots[:, None]
     distance = np.linalg.norm(apart, axis=-1)

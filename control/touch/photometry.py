@@ -11,7 +11,7 @@ across columns and rows, and the shadow depths s_l of `gel.shadow_depth`, channe
 
 The gain is the blurred background divided by its mean: where little light falls, slopes change the
 picture little. The polynomial holds for what the presses showed and no further: a normal steeper
-than `steepest` is shortened to it, a depth beyond `deepest` counts as `deepest`.
+than `steepest` is shortened to it, a depth beyond `deepest` counts as `deepest`, for shadows too.
 """
 
 import json
@@ -116,7 +116,10 @@ def columns(
     shape = shape.reshape(N_FEATURES, -1)[:, pixels]
     v, u = np.divmod(pixels, w) * (2 / np.array([[h - 1], [w - 1]], np.float32)) - 1
     shadows = gel.shadow_depth(
-        surface, photometry.pixel_pitch, photometry.light_azimuths, photometry.shadow_slope
+        np.minimum(surface, np.float32(photometry.deepest)),
+        photometry.pixel_pitch,
+        photometry.light_azimuths,
+        photometry.shadow_slope,
     ).reshape(-1, h * w)[:, pixels]
     shadows /= shadows + np.float32(photometry.penumbra)
     terms = np.concatenate([shape, shape * u, shape * v, shadows])

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from touchgoal.control.touch.gel import CONTACT_SHARE, SHADOW_CELLS, cells
+from touchgoal.control.touch.gel import CONTACT_SHARE, NEARBY_CELLS, SHADOW_CELLS, cells
 from touchgoal.control.touch.photometry import Photometry
 from touchgoal.sim_envs.tactile.unit import STEP, Unit
 
@@ -22,7 +22,8 @@ def deform(overlap: Fields, pitch: float, bulge: tuple[float, ...]) -> Fields:
     """Surfaces of gels under objects' overlaps (m), as `gel.deform`."""
     scale = cells(pitch)
     low = F.avg_pool2d(overlap, scale)
-    contact = low > CONTACT_SHARE * low.amax((1, 2), keepdim=True)
+    around = 2 * NEARBY_CELLS + 1
+    contact = low > CONTACT_SHARE * F.max_pool2d(low, around, stride=1, padding=NEARBY_CELLS)
     smooth = low
     for sigma in bulge:
         smooth = torch.where(contact, low, _blur(smooth, _gaussian(sigma / (pitch * scale), low)))
@@ -42,7 +43,8 @@ def colour_change(surface: Fields, unit: Unit) -> Float[Tensor, "b 3 h w"]:
     _, h, w = surface.shape
     u = (4 * torch.arange(w).to(surface) + 1) / (2 * w - 1) - 1
     v = ((4 * torch.arange(h).to(surface) + 1) / (2 * h - 1) - 1)[:, None]
-    shadows = shadow_depth(surface, pitch, photometry.light_azimuths, photometry.shadow_slope)
+    known = surface.clamp(max=photometry.deepest)
+    shadows = shadow_depth(known, pitch, photometry.light_azimuths, photometry.shadow_slope)
     shadows = shadows / (shadows + photometry.penumbra)
     at_rest, along_u, along_v = torch.einsum(
         "bkhw,ckm->mbchw", _features(surface, pitch, photometry), response

@@ -88,7 +88,8 @@ def _colours(surface, per_pitch, response, limits, depth, shadow, gain, out):
 def colour_change(surface: HeightField, unit: Unit) -> Float32[np.ndarray, "3 h w"]:
     """What a gel's shape adds to the untouched image, counts; all at half its resolution."""
     photometry, pitch = unit.photometry, 2 * unit.pixel_pitch
-    depth = shadow_depth(surface, pitch, photometry.light_azimuths, photometry.shadow_slope)
+    known = np.minimum(surface, np.float32(photometry.deepest))
+    depth = shadow_depth(known, pitch, photometry.light_azimuths, photometry.shadow_slope)
     change = np.empty((3, *surface.shape), np.float32)
     limits = photometry.steepest, photometry.deepest, photometry.penumbra
     _colours(
@@ -110,7 +111,8 @@ def _blend(change, background, noise, oy, ox, out):
     """Bilinear doubling of the change, plus background and noise, cut to bytes."""
     _, h, w = change.shape
     near, far = np.float32(0.75), np.float32(0.25)
-    zero, full, step = np.float32(0.0), np.float32(255.0), np.float32(STEP)
+    zero, half, full = np.float32(0.0), np.float32(0.5), np.float32(255.0)
+    step = np.float32(STEP)
     coarse, fine = np.empty(w + 2, np.float32), np.empty(2 * w, np.float32)
     for c in range(3):
         for i in range(2 * h):
@@ -126,7 +128,7 @@ def _blend(change, background, noise, oy, ox, out):
             base, grain = background[c, i], noise[c, i + oy, ox : ox + 2 * w]
             pixels = out[c, i]
             for j in range(2 * w):
-                value = np.float32(base[j]) * step + fine[j] + np.float32(grain[j]) * step
+                value = half + fine[j] + step * (np.float32(base[j]) + np.float32(grain[j]))
                 pixels[j] = np.uint8(min(max(value, zero), full))
 
 
@@ -149,5 +151,5 @@ def render_untouched(unit: Unit, rng: np.random.Generator) -> UInt8[np.ndarray, 
     oy, ox = rng.integers(0, NOISE_MARGIN, 2)
     _, h, w = unit.background.shape
     frame = unit.background + unit.noise[:, oy : oy + h, ox : ox + w]  # in steps
-    red, green, blue = np.clip(frame * np.float32(STEP), 0, 255).astype(np.uint8)
+    red, green, blue = np.clip(np.float32(STEP) * frame + np.float32(0.5), 0, 255).astype(np.uint8)
     return cv2.merge([red, green, blue])
