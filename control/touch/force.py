@@ -7,9 +7,9 @@ from jaxtyping import Float32
 
 from touchgoal.control.sensors import SensorModel
 
-# A gel bulges around what presses into it: only what lies deeper than a quarter of the deepest point
-# counts. With it simulated balls of 3 to 25 mm at 0.5 to 15 N come out within 5 %.
-_CONTACT_SHARE = 0.25
+# A gel bulges around what presses into it: only what lies deeper than this share of the deepest point
+# counts. With it simulated balls of 3 to 25 mm at 0.5 to 15 N come out within 6 %.
+_CONTACT_SHARE = 0.35
 
 
 @dataclass(frozen=True)
