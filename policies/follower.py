@@ -29,8 +29,8 @@ class FollowerConfig:
 class WireFollower:
     """Follows a wire that it does not know, from force and joint positions.
 
-    It starts along the hand's x axis, which the person who put the bead into the hand has laid
-    along the wire. Force control along a constraint is Mason's (1981); the gains are ours.
+    It starts along the hand's x axis, which whoever put the bead into the hand has laid along the
+    wire. Compliance across a constraint and motion along it are Mason's (1981).
     """
 
     def __init__(self, control_hz: int = v.CONTROL_HZ, config: FollowerConfig | None = None):
@@ -46,7 +46,7 @@ class WireFollower:
         position, R = self._kinematics.forward(joints)
         if self._command is None:
             self._command, self._target, self._before = joints, position, position
-            self._velocity, self._force = config.speed * R[:, 0], np.zeros(3)
+            self._velocity = config.speed * R[:, 0]
         share = tick / config.memory
         self._velocity += share * ((position - self._before) / tick - self._velocity)
         self._before = position

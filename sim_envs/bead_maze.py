@@ -139,7 +139,7 @@ class BeadMaze(FrankaTactileEnv):
         self.s = START
         self.failure = np.zeros(3, bool)
         self._furthest, self._stalled_ticks = START, 0
-        self._wind = np.zeros(6)
+        self._drift = np.zeros(6)
 
     def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, "7"]:
         """Joint positions with the bead between the fingers, not quite in their middle."""
@@ -164,8 +164,8 @@ class BeadMaze(FrankaTactileEnv):
         """Joint change (rad) that nobody commanded: a random walk of the hand's velocity."""
         tick = 1 / self.config.control_hz
         keep = np.exp(-tick / STRAY_SECONDS)
-        self._wind = keep * self._wind + np.sqrt(1 - keep**2) * self.np_random.normal(size=6)
-        twist = self.config.disturbance * np.repeat([1.0, STRAY_TURN], 3) * self._wind
+        self._drift = keep * self._drift + np.sqrt(1 - keep**2) * self.np_random.normal(size=6)
+        twist = self.config.disturbance * np.repeat([1.0, STRAY_TURN], 3) * self._drift
         return np.linalg.pinv(self.kinematics.jacobian(self.command)) @ (twist * tick)
 
     def _judge(self) -> tuple[float, bool]:
@@ -218,7 +218,7 @@ def add_wire(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
         maze.add_geom(size=[1.5 * WIRE_RADIUS, 0, 0], fromto=post, **steel)
 
 
-def thread(spec: mujoco.MjSpec, wire: Wire, friction: float, capsules: int = 8) -> None:
+def thread(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
     """Give the bead its hole, a ring of capsules along its axis (z), and put it on the wire.
 
     The hole's clearance, friction and binding then follow from contacts. Eight capsules drag 8 %
@@ -230,7 +230,7 @@ def thread(spec: mujoco.MjSpec, wire: Wire, friction: float, capsules: int = 8) 
     bead.quat = quat
     outside = spec.geom("object")
     outside.contype, outside.conaffinity = 0, _ROBOT_BIT
-    radius = 0.0015
+    capsules, radius = 8, 0.0015
     half = BEAD_LENGTH / 2 - radius
     for angle in np.arange(capsules) * (2 * np.pi / capsules):
         x, y = (HOLE_RADIUS + radius) * np.array([np.cos(angle), np.sin(angle)])

@@ -6,7 +6,7 @@ from touchgoal.control.kinematics import fingers_across, rotation_vector
 from touchgoal.sim_envs.base import Observation
 from touchgoal.sim_envs.bead_maze import BeadMaze
 
-_RETURN = 0.25  # share of the distance to the course that a tick takes back
+_RETURN = 5.8  # 1/s: rate at which a distance to the course is taken back, a quarter at 20 Hz
 _LEAD = 0.006  # m that the commanded bead may be ahead of the real one: more is a jam
 _SLOW = 0.004  # m (or, times _LEVER, rad) off the course at which there is no going on
 _LEVER = 0.02  # m by which a turn counts as a displacement: the size of the bead
@@ -26,7 +26,7 @@ class BeadMazeExpert:
     def act(self, observation: Observation) -> np.ndarray:
         """The action for the next tick; the observation is not looked at."""
         env = self._env
-        grip = self._grip()
+        tick, grip = 1 / env.config.control_hz, self._grip()
         position, R = env.kinematics.forward(env.command)
         bead = position + R @ grip
         s = env.wire.project(bead, env.s)
@@ -34,10 +34,11 @@ class BeadMazeExpert:
         off = bead - point
         turned = rotation_vector(fingers_across(tangent).T @ R)
         astray = max(float(np.linalg.norm(off)), _LEVER * float(np.linalg.norm(turned)))
-        ahead = self._speed / env.config.control_hz * max(0.0, 1 - astray / _SLOW)
+        ahead = self._speed * tick * max(0.0, 1 - astray / _SLOW)
+        left = np.exp(-_RETURN * tick)
         point, tangent = env.wire.at(min(s + ahead, env.s + _LEAD))
-        R = fingers_across(tangent) @ _rotation((1 - _RETURN) * turned)
-        target = point + (1 - _RETURN) * off - R @ grip
+        R = fingers_across(tangent) @ _rotation(left * turned)
+        target = point + left * off - R @ grip
         joints = env.kinematics.inverse(target, R, env.command).q
         return np.append(joints - env.command, 0.0)
 

@@ -140,10 +140,9 @@ def test_it_takes_touch(maze: BeadMaze) -> None:
 
 def test_drop_and_jam(maze: BeadMaze) -> None:
     maze.reset(seed=0)
-    for _ in range(10):
-        _, _, terminated, _, info = maze.step(np.append(np.zeros(7), 0.08))
-        if terminated:
-            break
+    terminated, info = False, {}
+    while not terminated:
+        *_, terminated, _, info = maze.step(np.append(np.zeros(7), 0.08))
     assert info[v.TRUTH_FAILURE].tolist() == [True, False, False] and not info[v.TRUTH_SUCCESS]
     env = BeadMaze(replace(BLIND, stall_seconds=0.5))
     env.reset(seed=0)
