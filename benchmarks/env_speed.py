@@ -12,10 +12,12 @@ import cv2
 import mujoco
 import numpy as np
 
+from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
 from touchgoal.sim_envs.experts import PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
 from touchgoal.sim_envs.scene import robot_model
 
+STILL = np.zeros(8)
 HOLDING = 70  # ticks after which the expert holds the object in the air
 
 
@@ -48,7 +50,7 @@ def run(config: Config) -> dict[str, Any]:
     os.environ["LP_NUM_THREADS"] = "0"  # software OpenGL draws in this thread
     cv2.setNumThreads(1)
     with one_core():
-        rows = [*_physics(config), *_env(config)]
+        rows = [*_physics(config), *_env(config), *_maze(config)]
     return {"rows": [vars(row) for row in rows], "table": _table(rows)}
 
 
@@ -85,7 +87,6 @@ def _physics(config: Config) -> list[Row]:
 def _env(config: Config) -> list[Row]:
     n = config.env_steps
     rows = []
-    still = np.zeros(8)
     both = ["soda_can", "pebble"]  # a primitive and a mesh
     for what, task, objects in (
         ("physics alone", PickPlaceConfig(cameras=(), tactile=False), ["soda_can"]),
@@ -98,11 +99,33 @@ def _env(config: Config) -> list[Row]:
 
             def step(env: PickPlace = env) -> None:
                 for _ in range(n):
-                    env.step(still)
+                    env.step(STILL)
 
             rows.append(
                 _measure(f"env step (50 physics steps), {what}, holding {name}", config, n, step)
             )
+        env.close()
+    return rows
+
+
+def _maze(config: Config) -> list[Row]:
+    """The bead held on a wire."""
+    rows = []
+    for what, tactile in (("physics alone", False), ("two tactile images", True)):
+        env = BeadMaze(BeadMazeConfig(tactile=tactile, max_seconds=1e6))
+        env.reset(seed=1, options={"wire": "fourier-3"})
+        if not tactile:
+            n = config.physics_steps
+            rows.append(
+                _rate("physics, whole cell, bead on the wire", config, n, env.model, env.data)
+            )
+
+        def step(env: BeadMaze = env) -> None:
+            for _ in range(config.env_steps):
+                env.step(STILL)
+
+        name = f"env step (50 physics steps), {what}, bead on the wire"
+        rows.append(_measure(name, config, config.env_steps, step))
         env.close()
     return rows
 

@@ -155,3 +155,14 @@ def fingers_down(yaw: float) -> Matrix3:
     """TCP rotation in the base frame: approach straight down, hand turned by `yaw` about base z."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
+
+
+def fingers_across(direction: Vector3) -> Matrix3:
+    """TCP rotation in the base frame: x along a direction, approach as straight down as that lets.
+
+    The fingers then close across the direction. It must not be vertical.
+    """
+    x = direction / np.linalg.norm(direction)
+    z = np.array([0.0, 0.0, -1.0]) + x[2] * x
+    z /= np.linalg.norm(z)
+    return np.stack([x, np.cross(z, x), z], axis=1)

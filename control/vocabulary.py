@@ -27,6 +27,7 @@ TRUTH_SLIP = "truth.slip"
 TRUTH_OBJECT_POSE = "truth.object_pose"
 TRUTH_PROGRESS = "truth.progress"
 TRUTH_SUCCESS = "truth.success"
+TRUTH_FAILURE = "truth.failure"  # of tasks that can fail before their time is up
 
 N_JOINTS = 7
 CONTROL_HZ = 20
@@ -82,4 +83,7 @@ FEATURES: dict[str, Feature] = {
     TRUTH_OBJECT_POSE: Feature("float32", (7,), _POSE, "object in the base frame: m, wxyz"),
     TRUTH_PROGRESS: Feature("float32", (1,), ("progress",), "task progress in [0, 1]"),
     TRUTH_SUCCESS: Feature("bool", (1,), ("success",), "task done"),
+    TRUTH_FAILURE: Feature(
+        "bool", (3,), ("drop", "jam", "over_force"), "object lost, stuck, pressed too hard"
+    ),
 }

@@ -2,7 +2,7 @@
 
 import multiprocessing
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,9 +19,9 @@ from touchgoal.episodes.encoding import EncodedEpisode, encode
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
-from touchgoal.sim_envs.experts import Outcome, PickPlaceExpert
+from touchgoal.sim_envs.experts import Outcome
 from touchgoal.sim_envs.filming import Film
-from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.tasks import TaskConfig, make_env, make_expert
 
 
 @runtime_checkable
@@ -62,21 +62,24 @@ def run(
     yield {**observation, v.ACTION: still, **info}
 
 
-def demonstrate(env: PickPlace, demonstration: Demonstration) -> Episode:
+def demonstrate(env: FrankaTactileEnv, demonstration: Demonstration) -> Episode:
     """Record the expert, succeeding or failing as the demonstration asks."""
     observation, info = env.reset(seed=demonstration.seed, options=demonstration.options)
-    expert = PickPlaceExpert(env, demonstration.outcome)
+    expert = make_expert(env, demonstration.outcome)
     return to_episode(env, list(run(env, expert, observation, info)), demonstration)
 
 
 def demonstrate_on_film(
-    env: PickPlace, demonstration: Demonstration
+    env: FrankaTactileEnv,
+    demonstration: Demonstration,
+    policy: Callable[[Any], Actor] | None = None,
 ) -> tuple[Episode, UInt8[np.ndarray, "n h w 3"]]:
-    """Record the expert and film it, tick by tick."""
+    """Record and film, tick by tick, the expert or what a policy makes for the environment."""
     observation, info = env.reset(seed=demonstration.seed, options=demonstration.options)
-    expert, film = PickPlaceExpert(env, demonstration.outcome), Film(env)
+    actor = policy(env) if policy else make_expert(env, demonstration.outcome)
+    film = Film(env)
     ticks = []
-    for tick in tqdm(run(env, expert, observation, info), desc="filming", unit="frame"):
+    for tick in tqdm(run(env, actor, observation, info), desc="filming", unit="frame"):
         ticks.append(tick)
         film.shoot()
     film.close()
@@ -84,32 +87,25 @@ def demonstrate_on_film(
 
 
 def to_episode(
-    env: PickPlace, ticks: list[dict[str, np.ndarray]], demonstration: Demonstration
+    env: FrankaTactileEnv, ticks: list[dict[str, np.ndarray]], demonstration: Demonstration
 ) -> Episode:
     """The episode of the ticks that were run in an environment."""
-    body = env.bodies[0]
     success = bool(ticks[-1][v.TRUTH_SUCCESS][0])
     asked_to_fail = demonstration.outcome != "success"
-    name = body.kind.name.replace("_", " ")
     return Episode(
         frames={key: np.stack([tick[key] for tick in ticks]) for key in ticks[0]},
-        task=f"pick up the {name} and place it on the disc",
-        meta={
-            "object": body.kind.name,
-            "shape": body.kind.shape,
-            "descriptions": list(body.kind.descriptions),
+        task=env.instruction(),
+        meta=env.facts()
+        | {
             "seed": demonstration.seed,
             "outcome": demonstration.outcome if success or asked_to_fail else "failure",
             "success": success,
-            "grasp_force": env.grasp_force,
-            "mass": body.mass,
-            "sensor": env.sensor.name,
         },
     )
 
 
 def collect(
-    root: Path, config: PickPlaceConfig, demonstrations: Sequence[Demonstration], workers: int
+    root: Path, config: TaskConfig, demonstrations: Sequence[Demonstration], workers: int
 ) -> list[dict[str, MetaValue]]:
     """Append demonstrations to the episode set in `root`, in their order.
 
@@ -144,8 +140,8 @@ def _use_one_core() -> None:
     os.environ["LP_NUM_THREADS"] = "1"
 
 
-def _record(config: PickPlaceConfig, demonstration: Demonstration) -> EncodedEpisode:
-    env = PickPlace(config)
+def _record(config: TaskConfig, demonstration: Demonstration) -> EncodedEpisode:
+    env = make_env(config)
     try:
         return encode(demonstrate(env, demonstration), config.control_hz)
     finally:

@@ -1,32 +1,45 @@
 """Run a policy in a task and say how often it succeeds, with a 95 % Wilson interval."""
 
 import os
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+
+import numpy as np
 
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.media import write_video
-from touchgoal.episodes.recording import Demonstration, demonstrate_on_film
+from touchgoal.episodes.recording import Actor, Demonstration, demonstrate_on_film
 from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.policies.follower import WireFollower
+from touchgoal.policies.maze_trials import MazeTrial, evaluate, trials_of
 from touchgoal.policies.rollout import Trial, evaluate_expert
 from touchgoal.policies.success import SuccessRate
+from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
+from touchgoal.sim_envs.maze_expert import BeadMazeExpert
 from touchgoal.sim_envs.objects import CATALOGUE, SHAPES, find
-from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.pick_place import PickPlaceConfig
+from touchgoal.sim_envs.tasks import TaskConfig, make_env
+from touchgoal.sim_envs.wires import FAMILIES, choose
 
 
 @dataclass(frozen=True)
 class Config:
     """Options of run-policy."""
 
-    policy: Literal["expert"] = "expert"
-    """Which policy: the scripted expert, which sees the simulator's state."""
+    task: Literal["pick-place", "bead-maze"] = "pick-place"
+    """Where to run it."""
+    policy: Literal["expert", "follower"] = "expert"
+    """Which policy: the scripted expert, which sees the simulator's state, or (bead-maze) the
+    classical follower, which feels the force on the hand."""
     out: Path | None = None
     """Folder of the run."""
     episodes: int = 20
-    """How many; objects are taken from the catalogue in turn."""
+    """How many; objects are taken from the catalogue in turn, wires one each."""
     objects: tuple[str, ...] = ()
-    """Catalogue names; default: all."""
+    """pick-place: catalogue names; default: all."""
     seed: int = 1_000_000
     """Of the first episode; each further one adds one."""
     workers: int = os.cpu_count() or 1
@@ -34,13 +47,26 @@ class Config:
     video: bool = True
     """Film the worst episode."""
     env: PickPlaceConfig = field(default_factory=lambda: PickPlaceConfig(cameras=(), tactile=False))
-    """Options of the task; the expert needs no pictures."""
+    """Options of pick-place; the expert needs no pictures."""
+    maze: BeadMazeConfig = field(
+        default_factory=lambda: BeadMazeConfig(split="validation", tactile=False)
+    )
+    """Options of bead-maze; neither the expert nor the follower needs pictures."""
 
 
 def main(config: Config) -> None:
     """Run the episodes, print the table, film the worst one."""
     if config.episodes < 1:
         raise UserError("nothing to run: ask for at least one episode")
+    if config.task == "bead-maze":
+        _run_maze(config)
+    elif config.policy == "expert":
+        _run_pick_place(config)
+    else:
+        raise UserError(f"policy {config.policy} is for the bead maze; add: --task bead-maze")
+
+
+def _run_pick_place(config: Config) -> None:
     names = [find(name).name for name in config.objects] or list(CATALOGUE)
     jobs = [
         Demonstration(config.seed + i, options={"object": names[i % len(names)]})
@@ -48,19 +74,44 @@ def main(config: Config) -> None:
     ]
     out = open_run(config.out, "run-policy", config)
     trials = evaluate_expert(config.env, jobs, config.workers)
-    write_json(out / "metrics.json", summary(trials))
-    print(table(trials))
+    worst = min(range(len(trials)), key=lambda i: (trials[i].progress, -trials[i].error))
+    _report(out, trials, table(trials))
     if config.video:
-        worst = min(range(len(trials)), key=lambda i: (trials[i].progress, -trials[i].error))
-        env = PickPlace(replace(config.env, tactile=True))
-        _, frames = demonstrate_on_film(env, jobs[worst])
-        env.close()
-        write_video(out / "worst.mp4", frames, config.env.control_hz)
-        print(f"worst episode (seed {jobs[worst].seed}): {out / 'worst.mp4'}")
-    print(f"all trials: {out / 'metrics.json'}")
+        _film(out, config.env, jobs[worst], None)
 
 
-def summary(trials: list[Trial]) -> dict:
+def _run_maze(config: Config) -> None:
+    wires = choose(config.maze.split, config.episodes, config.maze.families)
+    jobs = trials_of(wires, config.seed)
+    out = open_run(config.out, "run-policy", config)
+    policy = BeadMazeExpert if config.policy == "expert" else _follower
+    trials = evaluate(config.maze, policy, jobs, config.workers)
+    worst = min(range(len(trials)), key=lambda i: (trials[i].progress, -trials[i].peak_force))
+    _report(out, trials, maze_table(trials))
+    if config.video:
+        _film(out, config.maze, jobs[worst], policy)
+
+
+def _follower(env: BeadMaze) -> WireFollower:
+    return WireFollower(env.config.control_hz)
+
+
+def _report(out: Path, trials: list[Trial] | list[MazeTrial], printed: str) -> None:
+    write_json(out / "metrics.json", summary(trials))
+    print(f"{printed}\nall trials: {out / 'metrics.json'}")
+
+
+def _film(
+    out: Path, task: TaskConfig, job: Demonstration, policy: Callable[[Any], Actor] | None
+) -> None:
+    env = make_env(replace(task, tactile=True))
+    _, frames = demonstrate_on_film(env, job, policy)
+    env.close()
+    write_video(out / "worst.mp4", frames, task.control_hz)
+    print(f"worst episode (seed {job.seed}): {out / 'worst.mp4'}")
+
+
+def summary(trials: list[Trial] | list[MazeTrial]) -> dict:
     """What metrics.json holds."""
     rate = SuccessRate(sum(t.success for t in trials), len(trials))
     return {
@@ -85,4 +136,25 @@ def table(trials: list[Trial]) -> str:
         f"masses {1e3 * min(masses):.0f} to {1e3 * max(masses):.0f} g, "
         f"grasp forces {min(forces):.1f} to {max(forces):.1f} N"
     )
+    return "\n".join(lines)
+
+
+def maze_table(trials: list[MazeTrial]) -> str:
+    """Success, completed fraction and forces by family of wires and in all; what went wrong."""
+    lines = [
+        f"{'family':<12}{'success [95 % Wilson]':<26}{'completed':>10}"
+        f"{'mean force N':>14}{'peak force N':>14}{'seconds':>9}"
+    ]
+    for family in (*FAMILIES, "all"):
+        some = [t for t in trials if family in (t.family, "all")]
+        if some:
+            rate = SuccessRate(sum(t.success for t in some), len(some))
+            lines.append(
+                f"{family:<12}{rate!s:<26}{np.mean([t.progress for t in some]):>10.0%}"
+                f"{np.mean([t.mean_force for t in some]):>14.1f}"
+                f"{max(t.peak_force for t in some):>14.1f}"
+                f"{np.mean([t.seconds for t in some]):>9.1f}"
+            )
+    failures = Counter(t.failure for t in trials if t.failure)
+    lines.append("failures: " + (", ".join(f"{k} {n}" for k, n in failures.items()) or "none"))
     return "\n".join(lines)

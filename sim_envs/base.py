@@ -79,6 +79,10 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     # What a task defines.
 
     @abstractmethod
+    def instruction(self) -> str:
+        """The episode's task in words."""
+
+    @abstractmethod
     def _sample(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
         """Choose the episode: set `bodies` and `grasp_force`, UserError on a bad option."""
 
@@ -110,7 +114,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.data.qpos[self._arm] = self.command
         self.data.qpos[self._fingers] = self._opening
         self._ticks = 0
-        self._advance(np.zeros(v.N_JOINTS), GRIPPER_MAX_WIDTH, seconds=0.3)  # objects settle
+        self._settle()
         self._judge()
         return self._observe(), self._info(0.0, False)
 
@@ -145,6 +149,18 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
 
     # What experts and drivers use.
 
+    def facts(self) -> dict[str, Any]:
+        """What distinguishes the present episode: the object and how it is gripped."""
+        body = self.bodies[0]
+        return {
+            "object": body.kind.name,
+            "shape": body.kind.shape,
+            "descriptions": list(body.kind.descriptions),
+            "grasp_force": self.grasp_force,
+            "mass": body.mass,
+            "sensor": self.sensor.name,
+        }
+
     def scene(self, config: SceneConfig) -> mujoco.MjSpec:
         """The present episode's scene, built with these options."""
         spec = build(self.bodies, config)
@@ -165,6 +181,10 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         return self._contacts
 
     # Insides.
+
+    def _settle(self) -> None:
+        """Physics before the first observation: objects come to rest, the hand is open."""
+        self._advance(np.zeros(v.N_JOINTS), GRIPPER_MAX_WIDTH, seconds=0.3)
 
     def _compile(self, rng: np.random.Generator) -> None:
         self.close()

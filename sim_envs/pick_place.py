@@ -62,6 +62,10 @@ class PickPlace(FrankaTactileEnv):
         super().__init__(config or PickPlaceConfig(), render_mode)
         self.kinds = [find(name) for name in self.config.objects] or list(CATALOGUE.values())
 
+    def instruction(self) -> str:
+        """The episode's task in words."""
+        return f"pick up the {self.bodies[0].kind.name.replace('_', ' ')} and place it on the disc"
+
     def _sample(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
         config = self.config
         unknown = options.keys() - {"object", "mass", "grasp_force"}

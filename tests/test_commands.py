@@ -117,6 +117,19 @@ def test_run_policy(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert json.loads((tmp_path / "metrics.json").read_text())["successes"] == 2
 
 
+def test_bead_maze(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    maze = "--task bead-maze --workers 1".split()
+    run("collect-demos", *maze, "--episodes", 1, "--maze.max-seconds", 1, "--out", tmp_path / "a")
+    found = EpisodeSet(tmp_path / "a" / "episodes")
+    assert found.lengths[0] == 21 and found.meta(0)["wire"] == "fourier-2000000"
+    assert found.meta(0)["outcome"] == "failure" and found.meta(0)["disturbance"] == 0.004
+    run("run-policy", *maze, "--episodes", 1, "--policy", "follower", "--no-video", "--out",
+        tmp_path / "b")  # fmt: skip
+    assert "1/1 [0.21, 1.00]" in capsys.readouterr().out
+    message = refused(capsys, "run-policy", "--policy", "follower", "--out", tmp_path / "c")
+    assert "add: --task bead-maze" in message and not (tmp_path / "c").exists()
+
+
 def test_doctor_and_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     run("doctor")
     run(*"benchmark env-speed --repeats 1 --physics-steps 100 --env-steps 1".split(), "--out",

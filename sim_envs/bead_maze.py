@@ -1,0 +1,259 @@
+"""The bead maze: lead a bead along a bent wire by feel.
+
+`gymnasium.make("touchgoal.sim_envs.bead_maze:touchgoal/BeadMaze-v0")` imports and makes it.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
+from touchgoal.control.kinematics import FR3_HOME, fingers_across
+from touchgoal.sim_envs import wires
+from touchgoal.sim_envs.base import EnvConfig, FrankaTactileEnv, Observation
+from touchgoal.sim_envs.objects import HARD, Body, Material, ObjectKind, Texture
+from touchgoal.sim_envs.scene import VISUAL_GROUP
+from touchgoal.sim_envs.wires import LENGTH, Wire
+
+START, END = 0.03, LENGTH - 0.03  # m of arc: where the bead starts and where it has arrived
+
+BEAD_RADIUS, BEAD_LENGTH, BEAD_MASS = 0.010, 0.016, 0.010  # m, m, kg
+HOLE_RADIUS, WIRE_RADIUS = 0.0024, 0.00175  # m
+STRAY_SECONDS = 0.5  # for which a disturbance keeps its direction
+STRAY_TURN = 20.0  # rad of disturbance per m of it
+_SAG = 6e-5  # m between the wire and its straight pieces, a tenth of the hole's clearance
+_WOOD = Material(Texture.SMOOTH, 0.0, 1e-3, HARD, 0.8, (0.78, 0.16, 0.12, 1.0))
+BEADS = {
+    shape: ObjectKind(
+        f"{shape}_bead",
+        shape,
+        _WOOD,
+        ("a hard smooth wooden bead on a wire", "a small smooth bead that slides on a wire"),
+    )
+    for shape in ("sphere", "cylinder")
+}
+_SIZES = {"sphere": (BEAD_RADIUS,), "cylinder": (BEAD_RADIUS, BEAD_LENGTH / 2)}
+
+# Bits of MuJoCo's contact masks: the robot (bit 1) meets the bead's outside and the wire; the wire
+# (bit 4) meets the bead's hole, but not its outside.
+_ROBOT_BIT, _HOLE_BIT = 1, 4
+
+
+@dataclass(frozen=True)
+class BeadMazeConfig(EnvConfig):
+    """Options of the bead maze; reset's `options` override the random draws.
+
+    Attributes:
+        split: of the wires.
+        families: of the wires.
+        n_wires: of the split, from which each episode draws one.
+        bead: a cylinder feels the wire's direction as a torque, a sphere much less.
+        grasp_force: range of the force of each finger, N.
+        wire_friction: range of the friction coefficient between bead and wire.
+        disturbance: rms speed (m/s) along each axis at which the hand strays from what is
+            commanded, and, times `STRAY_TURN`, its rms rate of turn (rad/s). An expert then shows
+            how to come back, and what it is recorded to do is right (DART, Laskey 2017).
+        stall_seconds: without 2 mm of progress after which the bead counts as jammed.
+        max_force: external force on the hand that counts as too much, N.
+    """
+
+    cameras: tuple[str, ...] = ()
+    max_seconds: float = 40.0
+    split: wires.Split = "training"
+    families: tuple[wires.Family, ...] = wires.TRAINED
+    n_wires: int = 200
+    bead: Literal["sphere", "cylinder"] = "sphere"
+    grasp_force: tuple[float, float] = (8.0, 12.0)
+    wire_friction: tuple[float, float] = (0.15, 0.25)
+    disturbance: float = 0.0
+    stall_seconds: float = 5.0
+    max_force: float = 30.0
+
+
+class BeadMaze(FrankaTactileEnv):
+    """Lead the bead, held from the start, to the wire's other end.
+
+    | reset option | meaning |
+    |---|---|
+    | `wire` | name of a wire, such as helix-17 |
+    | `grasp_force` | N of each finger |
+
+    Progress: the fraction of the wire between start and end, 30 mm from the posts. An episode also
+    ends when the bead is dropped, jams, or the hand presses too hard: `truth.failure`.
+    """
+
+    config: BeadMazeConfig
+
+    def __init__(self, config: BeadMazeConfig | None = None, render_mode: str | None = None):
+        super().__init__(config or BeadMazeConfig(), render_mode)
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One control tick; the reward is the tick's gain in progress."""
+        action = np.asarray(action, dtype=np.float64)
+        if self.config.disturbance > 0 and action.shape == (8,):
+            action = action + np.append(self._stray(), 0.0)
+        observation, reward, success, truncated, info = super().step(action)
+        return observation, reward, success or bool(self.failure.any()), truncated, info
+
+    def instruction(self) -> str:
+        """The episode's task in words."""
+        return "lead the bead along the wire to its other end"
+
+    def facts(self) -> dict[str, Any]:
+        """What distinguishes the episode: body and wire."""
+        return super().facts() | {
+            "wire": self.wire.name,
+            "family": self.wire.family,
+            "disturbance": self.config.disturbance,
+        }
+
+    def _sample(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
+        config = self.config
+        unknown = options.keys() - {"wire", "grasp_force"}
+        if unknown:
+            raise UserError(
+                f"unknown reset option {sorted(unknown)[0]!r}; there are: wire, grasp_force"
+            )
+        if "wire" in options:
+            wire = wires.find(options["wire"])
+        else:
+            drawn = wires.choose(config.split, config.n_wires, config.families)
+            wire = drawn[rng.integers(len(drawn))]
+        place = np.array([0.5, 0.0, 0.17]) + rng.uniform(-0.02, 0.02, 3)
+        self.wire = wire.moved(place, rng.uniform(-0.15, 0.15))
+        force = rng.uniform(*config.grasp_force)
+        self.grasp_force = float(options.get("grasp_force", force))
+        self._friction = rng.uniform(*config.wire_friction)
+        self.bodies = [Body(BEADS[config.bead], _SIZES[config.bead], BEAD_MASS)]
+
+    def _extend(self, spec: mujoco.MjSpec) -> None:
+        add_wire(spec, self.wire, self._friction)
+        thread(spec, self.wire, self._friction)
+
+    def _place(self, rng: np.random.Generator) -> None:
+        self.s = START
+        self.failure = np.zeros(3, bool)
+        self._furthest, self._stalled_ticks = START, 0
+        self._drift = np.zeros(6)
+
+    def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, "7"]:
+        """Joint positions with the bead between the fingers, not quite in their middle."""
+        point, tangent = self.wire.at(START)
+        R = fingers_across(tangent)
+        offset = R @ np.array([rng.uniform(-0.001, 0.001), 0.0, rng.uniform(-0.001, 0.001)])
+        guess = FR3_HOME.copy()
+        guess[6] -= np.arctan2(tangent[1], tangent[0])  # the hand's yaw
+        return self.kinematics.reach(point + offset, R, guess)
+
+    def _settle(self) -> None:
+        """The fingers close on the bead while a fixture holds it: on a slope it would slide off."""
+        fixture = self.model.equality("fixture").id
+        self._opening = BEAD_RADIUS + 0.004
+        self.data.qpos[self._fingers] = self._opening
+        self.data.eq_active[fixture] = 1
+        self._advance(np.zeros(v.N_JOINTS), 0.0, seconds=0.3)
+        self.data.eq_active[fixture] = 0
+        self._advance(np.zeros(v.N_JOINTS), 0.0, seconds=0.2)
+
+    def _stray(self) -> Float[np.ndarray, "7"]:
+        """Joint change (rad) that nobody commanded: a random walk of the hand's velocity."""
+        tick = 1 / self.config.control_hz
+        keep = np.exp(-tick / STRAY_SECONDS)
+        self._drift = keep * self._drift + np.sqrt(1 - keep**2) * self.np_random.normal(size=6)
+        twist = self.config.disturbance * np.repeat([1.0, STRAY_TURN], 3) * self._drift
+        return np.linalg.pinv(self.kinematics.jacobian(self.command)) @ (twist * tick)
+
+    def _judge(self) -> tuple[float, bool]:
+        bead = self.object_pose()[:3]
+        self.s = self.wire.project(bead, self.s)
+        if self.s > self._furthest + 0.002:
+            self._furthest, self._stalled_ticks = self.s, 0
+        else:
+            self._stalled_ticks += 1
+        self.failure = np.array([self._dropped(bead), self._jammed(), self._over_force()])
+        progress = float(np.clip((self.s - START) / (END - START), 0.0, 1.0))
+        return progress, progress == 1.0 and not self.failure.any()
+
+    def _dropped(self, bead: np.ndarray) -> bool:
+        """Whether the bead left the fingers, or (which physics should forbid) the wire."""
+        geom = self.model.geom("object").id
+        held = any(geom in pad.geoms for pad in self.pad_contacts())
+        point, _ = self.wire.at(self.s)
+        return not held or bool(np.linalg.norm(bead - point) > 0.003)
+
+    def _jammed(self) -> bool:
+        return self._stalled_ticks > self.config.stall_seconds * self.config.control_hz
+
+    def _over_force(self) -> bool:
+        return bool(np.linalg.norm(self._external[:3]) > self.config.max_force)
+
+    def _info(self, progress: float, success: bool) -> dict[str, Any]:
+        return super()._info(progress, success) | {v.TRUTH_FAILURE: self.failure}
+
+
+def add_wire(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
+    """The wire as a chain of capsules, on two posts."""
+    steel = {
+        "type": mujoco.mjtGeom.mjGEOM_CAPSULE,
+        "contype": 0,
+        "conaffinity": _ROBOT_BIT | _HOLE_BIT,
+        "friction": [friction, 0.0, 0.0],
+        "condim": 3,
+        "priority": 2,
+        "solref": [0.003, 1],
+        "solimp": [0.9, 0.99, 0.0005, 0.5, 2],
+        "group": VISUAL_GROUP,
+        "rgba": [0.75, 0.76, 0.8, 1],
+    }
+    maze = spec.worldbody.add_body(name="wire")  # a body of its own: one box to rule it out
+    for start, end in wire.chords(sag=_SAG, longest=0.012):
+        maze.add_geom(size=[WIRE_RADIUS, 0, 0], fromto=[*start, *end], **steel)
+    for foot in wire.points[[0, -1]]:
+        post = [*foot[:2], 0.0, *foot]
+        maze.add_geom(size=[1.5 * WIRE_RADIUS, 0, 0], fromto=post, **steel)
+
+
+def thread(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
+    """Give the bead its hole, a ring of capsules along its axis (z), and put it on the wire.
+
+    The hole's clearance, friction and binding then follow from contacts. Eight capsules drag 8 %
+    more than Coulomb's law, for two of them wedge the wire; twelve drag 5 % more and cost more.
+    """
+    bead = spec.body("object")
+    bead.pos, tangent = wire.at(START)
+    mujoco.mju_quatZ2Vec(quat := np.zeros(4), tangent)
+    bead.quat = quat
+    outside = spec.geom("object")
+    outside.contype, outside.conaffinity = 0, _ROBOT_BIT
+    capsules, radius = 8, 0.0015
+    half = BEAD_LENGTH / 2 - radius
+    for angle in np.arange(capsules) * (2 * np.pi / capsules):
+        x, y = (HOLE_RADIUS + radius) * np.array([np.cos(angle), np.sin(angle)])
+        bead.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            size=[radius, 0, 0],
+            fromto=[x, y, -half, x, y, half],
+            mass=0.0,
+            contype=_HOLE_BIT,
+            conaffinity=0,
+            friction=[friction, 0.0, 0.0],
+            condim=3,
+            group=VISUAL_GROUP,
+            rgba=[0.3, 0.1, 0.1, 1],
+        )
+    spec.add_equality(
+        name="fixture",
+        type=mujoco.mjtEq.mjEQ_WELD,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        name1="object",
+        name2="world",
+        active=False,
+    )
+
+
+gym.register("touchgoal/BeadMaze-v0", "touchgoal.sim_envs.bead_maze:BeadMaze")

@@ -1,0 +1,182 @@
+"""Wires that differ, a bead that obeys friction, and a maze that takes touch to solve."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
+from touchgoal.episodes.recording import run
+from touchgoal.policies.follower import WireFollower
+from touchgoal.policies.maze_trials import evaluate, trials_of
+from touchgoal.sim_envs import wires
+from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig, add_wire, thread
+from touchgoal.sim_envs.maze_expert import BeadMazeExpert
+from touchgoal.sim_envs.wires import FAMILIES, LENGTH, MIN_RADIUS, Wire, choose, find
+
+BLIND = BeadMazeConfig(tactile=False)
+STILL = np.zeros(8)
+
+
+@pytest.fixture(scope="module")
+def maze():
+    env = BeadMaze(BLIND)
+    yield env
+    env.close()
+
+
+def lead(env, actor_of, wire, seed=0):
+    """Run an actor along a wire; all ticks."""
+    observation, info = env.reset(seed=seed, options={"wire": wire.name})
+    return list(run(env, actor_of(env), observation, info))
+
+
+def follower(env):
+    return WireFollower(env.config.control_hz)
+
+
+class FeelsSomethingElse:
+    """The follower, with the forces of another run, or none."""
+
+    def __init__(self, forces):
+        self.follower, self.forces = WireFollower(), iter(forces)
+
+    def act(self, observation):
+        return self.follower.act({**observation, v.WRENCH: next(self.forces, np.zeros(6))})
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_wires_are_sound_and_differ(family) -> None:
+    drawn = [*choose("test", 30, (family,)), *choose("validation", 20, (family,))]
+    drawn += choose("training", 30, (family,))
+    assert len({wire.name for wire in drawn}) == 80
+    shapes = np.stack([wires.shape(wire) for wire in drawn])
+    for i, wire in enumerate(drawn):
+        assert wires.distance(shapes[i], np.delete(shapes, i, axis=0)) > wires.APART
+        lengths = np.linalg.norm(np.diff(wire.points, axis=0), axis=1)
+        np.testing.assert_allclose(lengths, wires.STEP, rtol=1e-3)
+        assert wire.min_radius > MIN_RADIUS and np.abs(wire.tangents[:, 2]).max() < 0.57
+        np.testing.assert_array_equal(find(wire.name).points, wire.points)
+    turned = drawn[0].moved(np.array([0.4, 0.1, 0.2]), 0.7)  # counts as the same wire
+    assert wires.distance(wires.shape(turned), shapes[:1]) < 1e-6
+
+
+def test_more_wires_begin_with_the_same() -> None:
+    few, many = choose("training", 10), choose("training", 30)
+    assert [w.name for w in few] == [w.name for w in many[:10]]
+    assert {w.family for w in many} == set(FAMILIES) - {wires.HELD_OUT}
+
+
+def test_projection_and_chords() -> None:
+    wire = find("fourier-3").moved(np.array([0.5, 0.0, 0.2]), 0.3)
+    for s in (0.0, 0.123, 0.31, LENGTH):
+        point, tangent = wire.at(s)
+        aside = np.cross(tangent, [0, 0, 1.0])
+        assert wire.project(point + 1e-3 * aside, s - 0.004) == pytest.approx(s, abs=2e-4)
+    chords = wire.chords(sag=6e-5, longest=0.012)
+    np.testing.assert_array_equal(chords[1:, 0], chords[:-1, 1])
+    np.testing.assert_array_equal(chords[[0, -1], [0, 1]], wire.points[[0, -1]])
+    s = 0.0
+    for middle in chords.mean(axis=1):
+        s = wire.project(middle, s + 0.004)
+        assert np.linalg.norm(middle - wire.at(s)[0]) < 1e-4
+
+
+@pytest.mark.parametrize(("degrees", "slides"), [(9.5, False), (14.0, True)])
+def test_bead_slides_as_coulomb_says(degrees: float, slides: bool) -> None:
+    """Friction 0.2 holds on slopes up to 11.3 degrees."""
+    import mujoco  # after touchgoal, which chooses the OpenGL platform
+
+    slope = np.radians(degrees)
+    line = np.arange(0.0, LENGTH + 1e-9, wires.STEP)[:, None]
+    straight = Wire("arc", 0, line * [0, np.cos(slope), -np.sin(slope)] + [0, 0, 0.3])
+    spec = mujoco.MjSpec()
+    spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 1000
+    spec.option.timestep = 1e-3
+    bead = spec.worldbody.add_body(name="object")
+    bead.add_freejoint()
+    bead.add_geom(name="object", size=[0.01, 0, 0], mass=0.01, contype=0, conaffinity=0)
+    add_wire(spec, straight, friction=0.2)
+    thread(spec, straight, friction=0.2)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, nstep=500)
+    moved = straight.project(data.qpos[:3], 0.03) - 0.03
+    off = np.linalg.norm(data.qpos[:3] - straight.at(0.03 + moved)[0])
+    assert off < 0.8e-3  # m: the clearance and what the contact gives
+    expected = 0.5 * 9.81 * 0.5**2 * (np.sin(slope) - 0.2 * np.cos(slope))
+    assert moved == pytest.approx(expected, rel=0.25) if slides else moved < 1e-3
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_expert_leads_the_bead_to_the_end(maze: BeadMaze, family) -> None:
+    ticks = lead(maze, BeadMazeExpert, choose("validation", 3, (family,))[2])
+    assert ticks[-1][v.TRUTH_SUCCESS] and ticks[-1][v.TRUTH_PROGRESS] == 1
+    force = np.linalg.norm([tick[v.WRENCH][:3] for tick in ticks], axis=1)
+    assert force.max() < 3 and len(ticks) < 320
+    assert not any(tick[v.TRUTH_FAILURE].any() for tick in ticks)
+
+
+@pytest.mark.parametrize("bead", ["sphere", "cylinder"])
+def test_expert_comes_back_when_led_astray(bead) -> None:
+    env = BeadMaze(replace(BLIND, disturbance=0.004, bead=bead))
+    ticks = lead(env, BeadMazeExpert, find("roller-3"))
+    force = np.linalg.norm([tick[v.WRENCH][:3] for tick in ticks], axis=1)
+    assert ticks[-1][v.TRUTH_SUCCESS] and 5 < force.max() < env.config.max_force
+
+
+def test_it_takes_touch(maze: BeadMaze) -> None:
+    """The follower finishes, of the held-out family too; blind or misled, it does not."""
+    other = lead(maze, follower, find("helix-6"), seed=1)
+    wrenches = [tick[v.WRENCH] for tick in other]
+    for name in ("fourier-3", "serpentine-5"):
+        assert lead(maze, follower, find(name))[-1][v.TRUTH_SUCCESS]
+        for felt in ([], wrenches):
+            ticks = lead(maze, lambda env, felt=felt: FeelsSomethingElse(felt), find(name))
+            assert ticks[-1][v.TRUTH_FAILURE].any()
+            assert max(tick[v.TRUTH_PROGRESS] for tick in ticks) < 0.6
+
+
+def test_drop_and_jam(maze: BeadMaze) -> None:
+    maze.reset(seed=0)
+    terminated, info = False, {}
+    while not terminated:
+        *_, terminated, _, info = maze.step(np.append(np.zeros(7), 0.08))
+    assert info[v.TRUTH_FAILURE].tolist() == [True, False, False] and not info[v.TRUTH_SUCCESS]
+    env = BeadMaze(replace(BLIND, stall_seconds=0.5))
+    env.reset(seed=0)
+    *_, info = [env.step(STILL) for _ in range(12)][-1]
+    assert info[v.TRUTH_FAILURE].tolist() == [False, True, False]
+
+
+def test_bead_stays_on_the_wire_whatever_the_hand_does(maze: BeadMaze) -> None:
+    maze.reset(seed=0)
+    maze.action_space.seed(0)
+    pressed = False
+    for _ in range(40):
+        action = maze.action_space.sample()
+        action[7] = 0.0
+        *_, info = maze.step(action)
+        pressed |= info[v.TRUTH_FAILURE][2]
+        point, _ = maze.wire.at(maze.wire.project(maze.object_pose()[:3], maze.s))
+        assert np.linalg.norm(maze.object_pose()[:3] - point) < 2e-3
+    assert pressed
+
+
+def test_trials_depend_on_wire_and_seed_alone() -> None:
+    jobs = trials_of(choose("validation", 2), seed=7)
+    both = evaluate(BLIND, BeadMazeExpert, jobs, workers=2)
+    assert both[1:] == evaluate(BLIND, BeadMazeExpert, jobs[1:], workers=1)
+    assert [t.family for t in both] == ["fourier", "roller"] and both[0].failure == ""
+
+
+def test_bad_requests_say_what_to_do(maze: BeadMaze) -> None:
+    with pytest.raises(UserError, match="unknown wire 'knot-1'; a wire is FAMILY-SEED"):
+        maze.reset(options={"wire": "knot-1"})
+    with pytest.raises(UserError, match="makes no sound wire"):
+        find(next(f"roller-{i}" for i in range(100) if wires.make("roller", i) is None))
+    with pytest.raises(UserError, match="unknown reset option 'bead'; there are: wire"):
+        maze.reset(options={"bead": "cube"})
+    with pytest.raises(UserError, match="there are 20 validation wires a family"):
+        choose("validation", 100)
