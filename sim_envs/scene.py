@@ -300,8 +300,8 @@ def _add_body(spec: mujoco.MjSpec, body: Body) -> None:
         # The object's contact parameters hold against gel and table alike.
         priority=1,
         condim=6 if rolls else 4,
-        # Torsion as a patch of 4 mm radius bears it (8/15 of it, Hertz' pressure, times friction).
-        friction=[kind.material.friction, 0.0015, 0.0005 if rolls else 0.0001],
+        # Torsion as a patch of 5 mm radius, a 10 N grasp's, bears it (8/15 of that, Hertz' pressure).
+        friction=[kind.material.friction, 0.0025, 0.0005 if rolls else 0.0001],
         solref=[0.008 if soft else 0.004, 1],
         solimp=[0.95, 0.99, 0.001, 0.5, 2],
         **shape,

@@ -8,6 +8,7 @@ circles are off by pixels) and the few numbers that are not linear, chosen by cr
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int, UInt8
@@ -119,14 +120,9 @@ class PressFit:
 
     def tuned(self, state: FitState) -> FitState:
         """With the gel and the shadows that cross-validation prefers, one after the other."""
-        for choices in (
-            [{"bulge": tuple(scale * b for b in PYRAMID)} for scale in _BULGE_SCALES],
-            [{"shadow_slope": slope} for slope in _SHADOW_SLOPES],
-            [{"penumbra": penumbra} for penumbra in _PENUMBRAS],
-        ):
-            photometries = [replace(state.photometry, **choice) for choice in choices]
-            state = self._best([replace(state, photometry=p) for p in photometries])
-        return state
+        state = self._with_bulge(state)
+        state = self._with_choice(state, "shadow_slope", _SHADOW_SLOPES)
+        return self._with_choice(state, "penumbra", _PENUMBRAS)
 
     def settled(self, state: FitState, rounds: int) -> FitState:
         """Response and circles in turn."""
@@ -139,21 +135,15 @@ class PressFit:
     def resized(self, state: FitState) -> FitState:
         """With all contacts and balls larger or smaller, if that explains the pictures better.
 
-        A weaker response to steeper slopes looks nearly the same: single steps would take long.
+        A weaker response to steeper slopes, or a wider bulge around a smaller contact, looks nearly
+        the same: single steps would take long.
         """
-        return self._best(
-            [
-                self.settled(
-                    replace(
-                        state,
-                        circles=state.circles * [1, 1, scale],
-                        ball_radius=state.ball_radius * scale,
-                    ),
-                    2,
-                )
-                for scale in _RESIZES
-            ]
-        )
+        candidates = []
+        for scale in _RESIZES:
+            circles = state.circles * [1, 1, scale]
+            resized = replace(state, circles=circles, ball_radius=state.ball_radius * scale)
+            candidates.append(self._with_bulge(self.settled(resized, 2)))
+        return self._best(candidates)
 
     def with_ball(self, state: FitState) -> FitState:
         """With the ball radius (one for all presses) that explains the pictures best."""
@@ -173,6 +163,15 @@ class PressFit:
         everything = zip(state.circles, state.ball_radius, self._samples, self._labels, strict=True)
         moved = [self._moved(state.photometry, *press) for press in everything]
         return replace(state, circles=np.stack(moved))
+
+    def _with_bulge(self, state: FitState) -> FitState:
+        bulges = [tuple(scale * sigma for sigma in PYRAMID) for scale in _BULGE_SCALES]
+        return self._with_choice(state, "bulge", bulges)
+
+    def _with_choice(self, state: FitState, name: str, values: Sequence[Any]) -> FitState:
+        """With the value of one number of the sensor file that cross-validation prefers."""
+        photometries = [replace(state.photometry, **{name: value}) for value in values]
+        return self._best([replace(state, photometry=p) for p in photometries])
 
     def _best(self, candidates: Sequence[FitState]) -> FitState:
         return min(candidates, key=self._held_out_loss)
