@@ -59,21 +59,21 @@ class Scale(nn.Module):
         self.register_buffer("centre", torch.zeros(shape))
         self.register_buffer("size", torch.ones(shape))
 
-    def fit_range(self, values: Float[Tensor, "n *s"]) -> None:
+    def fit_range(self, values: Float[Tensor, "n ..."]) -> None:
         """From now on, the least and the greatest of these values become -1 and 1."""
         low, high = values.amin(0), values.amax(0)
         self._set((low + high) / 2, (high - low) / 2)
 
-    def fit_spread(self, values: Float[Tensor, "n *s"]) -> None:
+    def fit_spread(self, values: Float[Tensor, "n ..."]) -> None:
         """From now on, these values become ones of mean 0 and variance 1."""
         self._set(values.mean(0), values.std(0, correction=0))
 
-    def forward(self, values: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    def forward(self, values: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
         """To the network's range."""
         constant = self.size == 0
         return (values - self.centre) * ~constant / (self.size + constant)
 
-    def inverse(self, scaled: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    def inverse(self, scaled: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
         """Back from it."""
         return scaled * self.size + self.centre
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from touchgoal.control.errors import UserError
 
 FLOW_STEPS = 100.0  # what flow time 1 is called to the network, so that its embedding resolves it
-Denoise = Callable[[Float[Tensor, "b *s"], Float[Tensor, " b"]], Float[Tensor, "b *s"]]
+Denoise = Callable[[Float[Tensor, "b h a"], Float[Tensor, " b"]], Float[Tensor, "b h a"]]
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,8 @@ def visited(config: SamplerConfig) -> Int[Tensor, " {config.plan_steps}"]:
 
 
 def spoil(
-    config: SamplerConfig, clean: Float[Tensor, "b *s"], generator: torch.Generator
-) -> tuple[Float[Tensor, "b *s"], Float[Tensor, " b"], Float[Tensor, "b *s"]]:
+    config: SamplerConfig, clean: Float[Tensor, "b h a"], generator: torch.Generator
+) -> tuple[Float[Tensor, "b h a"], Float[Tensor, " b"], Float[Tensor, "b h a"]]:
     """A training example of every sample, at a random step.
 
     Args:
@@ -97,9 +97,9 @@ def spoil(
 def mend(
     config: SamplerConfig,
     network: Denoise,
-    noise: Float[Tensor, "b *s"],
+    noise: Float[Tensor, "b h a"],
     generator: torch.Generator,
-) -> Float[Tensor, "b *s"]:
+) -> Float[Tensor, "b h a"]:
     """Samples from noise.
 
     Args:
@@ -142,5 +142,5 @@ def _mend_diffusion(
     return x
 
 
-def _as(values: Float[Tensor, " b"], like: Float[Tensor, "b *s"]) -> Tensor:
+def _as(values: Float[Tensor, " b"], like: Float[Tensor, "b h a"]) -> Tensor:
     return values.reshape(-1, *[1] * (like.ndim - 1))
