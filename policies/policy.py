@@ -117,7 +117,8 @@ class Policy(nn.Module):
         Inputs get variance 1, actions the range -1 to 1, for each tick of the chunk by itself: the
         first of a chunk-relative plan moves an eighth of what the last does.
         """
-        self.touch_scale.fit_spread(touch)
+        if self.project is not None:
+            self.touch_scale.fit_spread(touch)
         self.state_scale.fit_spread(state)
         self.action_scale.fit_range(represent(actions, joints, self.config.representation))
 

@@ -122,9 +122,8 @@ class _Run:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.policy = Policy(policy)
-        condition, actions = windows.take(torch.arange(len(windows)))
-        recorded = windows.recorded
-        self.policy.fit_scales(recorded.touch.float(), recorded.state, condition.joints, actions)
+        touch, state = windows.recorded.touch.float(), windows.recorded.state
+        self.policy.fit_scales(touch, state, windows.joints, windows.actions)
         self.policy.to(config.device)
         self.average = copy.deepcopy(self.policy).eval().requires_grad_(False)
         self.optimiser = torch.optim.AdamW(

@@ -161,6 +161,16 @@ class Windows:
         """Number of windows."""
         return len(self._seen)
 
+    @property
+    def joints(self) -> Float[Tensor, "n 7"]:
+        """Joint positions at the latest tick of every window, rad."""
+        return self.recorded.state[:, : v.N_JOINTS]
+
+    @property
+    def actions(self) -> Float[Tensor, "n h 8"]:
+        """What was done in every window."""
+        return self.recorded.actions[self._done]
+
     def take(self, rows: Int[Tensor, " b"]) -> tuple[Condition, Float[Tensor, "b h 8"]]:
         """Some windows: what was seen, what was done."""
         seen, recorded = self._seen[rows], self.recorded
