@@ -16,6 +16,7 @@ from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies import checkpoint, ema
 from touchgoal.policies import train as train_module
+from touchgoal.policies.acting import PolicyActor
 from touchgoal.policies.actions import Representation, Scale, represent, to_actions
 from touchgoal.policies.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.policy import Condition, Policy, PolicyConfig
@@ -273,6 +274,26 @@ def test_a_saved_policy_plans_the_same(
     assert loaded.config == config
     condition, _ = windows.take(torch.arange(3))
     assert torch.equal(loaded.plan(condition, rng()), policy.plan(condition, rng()))
+
+
+def test_an_actor_does_its_plans_in_order() -> None:
+    config = replace(TOY, touch_dim=2, execution_horizon=3)
+    windows = toy_windows(config)
+    policy = policy_for(config, windows).eval()
+    ticks = [
+        {
+            v.STATE: state[:15].numpy(),
+            v.TCP_POSE: state[15:].numpy(),
+            v.TACTILE_LEFT: touch.float().numpy(),
+        }
+        for touch, state in zip(windows.recorded.touch, windows.recorded.state, strict=True)
+    ]
+    actor = PolicyActor(policy, lambda observation: observation[v.TACTILE_LEFT], seed=5)
+    done = torch.from_numpy(np.stack([actor.act(tick) for tick in ticks[:5]]))
+    generator = rng(5)
+    seen = [windows.take(torch.tensor([tick]))[0] for tick in (0, 3)]
+    plans = [policy.plan(condition, generator)[0, :3] for condition in seen]
+    torch.testing.assert_close(done, torch.cat(plans)[:5])
 
 
 def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
