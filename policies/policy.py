@@ -129,7 +129,7 @@ class Policy(nn.Module):
         chunk = represent(actions, condition.joints, self.config.representation)
         return self.head.loss(self.action_scale(chunk), self._encode(condition), generator)
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def plan(self, condition: Condition, generator: torch.Generator) -> Float[Tensor, "b h 8"]:
         """Actions (`vocabulary.ACTION`) of the ticks from the latest observation on.
 

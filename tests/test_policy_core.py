@@ -29,7 +29,7 @@ from touchgoal.policies.samplers import (
     visited,
 )
 from touchgoal.policies.train import TrainConfig, train
-from touchgoal.policies.unet import PRESETS, UNet
+from touchgoal.policies.unet import PRESETS, ShortConv1d, UNet
 from touchgoal.policies.windows import Recorded, TouchEmbedder, Windows, read
 
 DIFFUSION = DiffusionConfig(PRESETS["tiny"], SamplerConfig(plan_steps=5))
@@ -62,6 +62,13 @@ def test_unet_is_the_published_one() -> None:
     assert out.shape == chunk.shape
     assert not torch.allclose(small(chunk, step + 1, condition), out, atol=1e-5)
     assert not torch.allclose(small(chunk, step, condition + 1), out, atol=1e-5)
+
+
+@pytest.mark.parametrize("ticks", [1, 2, 8])
+def test_short_convolution_is_a_convolution(ticks: int) -> None:
+    x, conv = torch.randn(3, 4, ticks, generator=rng()), ShortConv1d(4, 6, 5)
+    expected = torch.nn.functional.conv1d(x, conv.weight, conv.bias, padding=2)
+    torch.testing.assert_close(conv(x), expected)
 
 
 def exact(config: SamplerConfig):
