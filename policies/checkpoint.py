@@ -21,6 +21,7 @@ from touchgoal.policies.samplers import SamplerConfig
 from touchgoal.policies.unet import UNetConfig
 
 FORMAT = 1
+TOUCH = "touch"  # folder of the touch encoder beside the weights
 _JSON, _WEIGHTS = "policy.json", "policy.safetensors"
 _TRAIN = "train one with: touchgoal train-policy"
 

@@ -5,8 +5,9 @@ Touch is embedded once, by a frozen encoder, and kept on disk beside what it was
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,26 +18,12 @@ from tqdm import tqdm
 
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
-from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.policy import Condition, PolicyConfig
+from touchgoal.policies.touch import TouchEmbedder
 
 _IDENTITY = "cache.json"
-
-
-@dataclass(frozen=True)
-class TouchEmbedder:
-    """A frozen encoder of both fingertips.
-
-    Attributes:
-        name: changes whenever the embeddings would; becomes `PolicyConfig.touch`.
-        dim: of both fingertips together.
-        embed: an episode with the columns `vocabulary.TACTILE` to a row for each frame.
-    """
-
-    name: str
-    dim: int
-    embed: Callable[[Episode], Float32[np.ndarray, "t e"]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +49,9 @@ def read(
     config: PolicyConfig,
     embedder: TouchEmbedder | None,
     cache: Path,
+    workers: int = 1,
 ) -> Recorded:
-    """Reads episodes, embedding those that the cache has not; a kill loses one of them at most.
+    """Reads episodes, embedding those that the cache has not; a kill loses those in progress.
 
     Args:
         episodes: the set.
@@ -71,6 +59,7 @@ def read(
         config: says which columns are read.
         embedder: of touch; None for a policy without.
         cache: folder for the embeddings of this set by this embedder.
+        workers: processes that embed.
 
     Raises:
         UserError: nothing chosen, a missing column, another rate or embedder than the config's, or
@@ -79,6 +68,7 @@ def read(
     _check(episodes, chosen, config, embedder)
     if embedder:
         _open_cache(cache, episodes, embedder)
+        _fill_cache(cache, episodes, chosen, embedder, workers)
     keys = [*config.proprioception, v.ACTION]
     touch, state, actions = [], [], []
     for i in tqdm(chosen, desc="episodes", unit="episode"):
@@ -86,7 +76,7 @@ def read(
         state.append(np.concatenate([frames[key] for key in config.proprioception], 1))
         actions.append(frames[v.ACTION])
         if embedder:
-            touch.append(_embed(episodes, i, embedder, cache / f"{i:06d}.npy"))
+            touch.append(_load(episodes, i, embedder, _path(cache, i)))
         else:
             touch.append(np.empty((len(actions[-1]), 0), np.float16))
     parts = (torch.from_numpy(np.concatenate(rows)) for rows in (touch, state, actions))
@@ -106,7 +96,7 @@ def _check(
             f"{episodes.root} runs at {episodes.fps} Hz, the policy at {config.control_hz}: set "
             "control_hz to the episodes' rate"
         )
-    made = (embedder.name, embedder.dim) if embedder else (config.touch, 0)
+    made = (embedder.name, embedder.dim) if embedder else ("", 0)
     if made != (config.touch, config.touch_dim):
         raise UserError(
             f"the policy wants touch {config.touch!r} of width {config.touch_dim}, this is "
@@ -124,14 +114,40 @@ def _open_cache(cache: Path, episodes: EpisodeSet, embedder: TouchEmbedder) -> N
         raise UserError(f"{cache} caches other episodes or another encoder: choose another folder")
 
 
-def _embed(
+def _path(cache: Path, i: int) -> Path:
+    return cache / f"{i:06d}.npy"
+
+
+def _fill_cache(
+    cache: Path,
+    episodes: EpisodeSet,
+    chosen: Sequence[int],
+    embedder: TouchEmbedder,
+    workers: int,
+) -> None:
+    missing = [i for i in chosen if not _path(cache, i).exists()]
+    if not missing:
+        return
+    embed = partial(_embed, episodes, embedder, cache)
+    progress = partial(tqdm, total=len(missing), desc="embed", unit="episode")
+    if workers == 1:
+        list(progress(map(embed, missing)))
+        return
+    with one_core_workers(workers) as pool:
+        list(progress(pool.map(embed, missing)))
+
+
+def _embed(episodes: EpisodeSet, embedder: TouchEmbedder, cache: Path, i: int) -> None:
+    torch.set_num_threads(1)
+    rows = embedder.embed(episodes, i).astype(np.float16)
+    with open(temporary := _path(cache, i).with_suffix(".tmp"), "wb") as file:
+        np.save(file, rows)
+    os.replace(temporary, _path(cache, i))
+
+
+def _load(
     episodes: EpisodeSet, i: int, embedder: TouchEmbedder, path: Path
 ) -> Float16[np.ndarray, "t e"]:
-    if not path.exists():
-        rows = embedder.embed(episodes.read(i, v.TACTILE)).astype(np.float16)
-        with open(temporary := path.with_suffix(".tmp"), "wb") as file:
-            np.save(file, rows)
-        os.replace(temporary, path)
     rows = np.load(path)
     if rows.shape != (episodes.lengths[i], embedder.dim):
         raise UserError(f"{path} does not fit episode {i} of {episodes.root}: delete {path.parent}")

@@ -12,6 +12,8 @@ from safetensors.torch import load_file, save_file
 
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
+from touchgoal.encoders.trunk import TouchTrunk, TouchTrunkConfig
+from touchgoal.encoders.vit import PRESETS as VITS
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies import checkpoint, ema
@@ -28,9 +30,10 @@ from touchgoal.policies.samplers import (
     spoil,
     visited,
 )
+from touchgoal.policies.touch import TouchEmbedder
 from touchgoal.policies.train import TrainConfig, train
 from touchgoal.policies.unet import PRESETS, ShortConv1d, UNet
-from touchgoal.policies.windows import Recorded, TouchEmbedder, Windows, read
+from touchgoal.policies.windows import Recorded, Windows, read
 
 DIFFUSION = DiffusionConfig(PRESETS["tiny"], SamplerConfig(plan_steps=5))
 FLOW = DiffusionConfig(PRESETS["tiny"], SamplerConfig("flow", plan_steps=5))
@@ -283,24 +286,53 @@ def test_a_saved_policy_plans_the_same(
     assert torch.equal(loaded.plan(condition, rng()), policy.plan(condition, rng()))
 
 
-def test_an_actor_does_its_plans_in_order() -> None:
-    config = replace(TOY, touch_dim=2, execution_horizon=3)
-    windows = toy_windows(config)
-    policy = policy_for(config, windows).eval()
-    ticks = [
+def feeling() -> TouchEmbedder:
+    torch.manual_seed(0)
+    trunk = TouchTrunk(TouchTrunkConfig.for_sensor(VITS["tiny"], "gelsight_mini"))
+    return TouchEmbedder(trunk.eval(), "toy")
+
+
+def toy_ticks(n: int) -> list[dict[str, np.ndarray]]:
+    generator = np.random.default_rng(1)
+    return [
         {
-            v.STATE: state[:15].numpy(),
-            v.TCP_POSE: state[15:].numpy(),
-            v.TACTILE_LEFT: touch.float().numpy(),
+            v.STATE: generator.normal(size=15).astype(np.float32),
+            v.TCP_POSE: generator.normal(size=7).astype(np.float32),
+            **{k: generator.integers(0, 255, (6, 8, 3), np.uint8) for k in v.TACTILE},
         }
-        for touch, state in zip(windows.recorded.touch, windows.recorded.state, strict=True)
+        for _ in range(n)
     ]
-    actor = PolicyActor(policy, lambda observation: observation[v.TACTILE_LEFT], seed=5)
-    done = torch.from_numpy(np.stack([actor.act(tick) for tick in ticks[:5]]))
-    generator = rng(5)
-    seen = [windows.take(torch.tensor([tick]))[0] for tick in (0, 3)]
-    plans = [policy.plan(condition, generator)[0, :3] for condition in seen]
-    torch.testing.assert_close(done, torch.cat(plans)[:5])
+
+
+@pytest.mark.parametrize("latency", [0, 1, 3])
+def test_an_actor_does_its_plans_in_order_and_on_time(latency: int) -> None:
+    touch = feeling()
+    config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
+    policy, ticks = policy_for(config, toy_windows(config)).eval(), toy_ticks(8)
+    actor = PolicyActor(policy, touch, seed=5, latency=latency)
+    done = [actor.act(tick) for tick in ticks]
+    rows = np.stack([touch.embed_tick(tick, ticks[0]) for tick in ticks])
+    states = np.stack([np.concatenate([tick[v.STATE], tick[v.TCP_POSE]]) for tick in ticks])
+    generator, expected = rng(5), []
+    for asked in range(0, 8, 3):  # ticks on whose observation a plan is made
+        asked = max(asked - latency, 0)
+        seen = [max(asked - 1, 0), asked]
+        condition = Condition(
+            torch.from_numpy(rows[seen])[None], torch.from_numpy(states[seen])[None]
+        )
+        plan = policy.plan(condition, generator)[0].numpy()
+        first = latency if expected else 0
+        expected += list(plan[first : first + 3])
+    np.testing.assert_allclose(done, expected[:8], rtol=1e-5)
+
+
+def test_an_actor_refuses_what_it_cannot_do() -> None:
+    touch = feeling()
+    policy = Policy(replace(TOY, touch_dim=touch.dim))
+    with pytest.raises(UserError, match="load the touch encoder"):
+        PolicyActor(policy, None)
+    with pytest.raises(UserError, match="5 ticks late"):
+        PolicyActor(policy, touch, latency=5)
 
 
 def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
@@ -325,36 +357,28 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         checkpoint.load(tmp_path)
 
 
-def test_episodes_are_embedded_once(tmp_path: Path) -> None:
-    generator, writer = np.random.default_rng(0), EpisodeWriter(tmp_path / "set")
-    config = replace(TOY, touch_dim=2)
+def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    writer, embedder = EpisodeWriter(tmp_path / "set"), feeling()
+    config = replace(TOY, touch_dim=embedder.dim)
     for n in (4, 6):
-        frames = {
-            key: generator.normal(size=(n, *v.FEATURES[key].shape)).astype(np.float32)
-            for key in (v.STATE, v.TCP_POSE, v.ACTION)
-        }
-        frames |= {k: generator.integers(0, 255, (n, 6, 8, 3), np.uint8) for k in v.TACTILE}
-        writer.append(Episode(frames, "feel"))
-    episodes, calls = EpisodeSet(tmp_path / "set"), []
-
-    def brightness(episode: Episode) -> np.ndarray:
-        calls.append(len(episode))
-        return np.stack([episode.frames[k].mean((1, 2, 3)) for k in v.TACTILE], 1).astype(
-            np.float32
-        )
-
-    embedder = TouchEmbedder("toy", 2, brightness)
-    cache = tmp_path / "cache"
+        ticks = [{**tick, v.ACTION: tick[v.STATE][:8]} for tick in toy_ticks(n)]
+        writer.append(Episode({k: np.stack([t[k] for t in ticks]) for k in ticks[0]}, "feel"))
+    episodes, cache = EpisodeSet(tmp_path / "set"), tmp_path / "cache"
     first = read(episodes, [0, 1], config, embedder, cache)
+    monkeypatch.setattr(embedder, "embed", None)  # a second embedding would fail
     again = read(episodes, [1], config, embedder, cache)
-    assert calls == [4, 6] and first.lengths == (4, 6)
+    assert first.lengths == (4, 6)
     assert torch.equal(first.touch[4:], again.touch)
     assert first.state.shape == (10, 22) and torch.equal(first.actions[4:], again.actions)
+    frames = toy_ticks(4)
+    row = torch.from_numpy(embedder.embed_tick(frames[3], frames[0])).half()
+    torch.testing.assert_close(first.touch[3], row, rtol=1e-2, atol=1e-2)
+    embedder.name = "b"
     with pytest.raises(UserError, match="other episodes or another encoder"):
-        read(episodes, [0], replace(config, touch="b"), replace(embedder, name="b"), cache)
+        read(episodes, [0], replace(config, touch="b"), embedder, cache)
     with pytest.raises(UserError, match="make its config"):
         read(episodes, [0], config, None, cache)
-    blind = read(episodes, [0], replace(config, touch_dim=0), None, cache)
+    blind = read(episodes, [0], replace(config, touch_dim=0, touch=""), None, cache)
     assert blind.touch.shape == (4, 0)
     Policy(replace(config, touch_dim=0)).plan(
         Condition(blind.touch[None, :2].float(), blind.state[None, :2]), rng()
