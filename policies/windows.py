@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16, Float32, Int
+from jaxtyping import Float, Float16, Float32, Int, UInt8
 from torch import Tensor
 from tqdm import tqdm
 
@@ -20,6 +20,7 @@ from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.policies.eyes import EyeConfig, shrink
 from touchgoal.policies.policy import Condition, PolicyConfig
 from touchgoal.policies.touch import TouchEmbedder
 
@@ -35,12 +36,14 @@ class Recorded:
         state: proprioception.
         actions: `vocabulary.ACTION`.
         lengths: ticks of each episode.
+        pictures: for the policy's eye; None without.
     """
 
     touch: Float16[Tensor, "n e"]
     state: Float32[Tensor, "n s"]
     actions: Float32[Tensor, "n 8"]
     lengths: tuple[int, ...]
+    pictures: UInt8[Tensor, "n k h w 3"] | None = None
 
 
 def read(
@@ -70,7 +73,7 @@ def read(
         _open_cache(cache, episodes, embedder)
         _fill_cache(cache, episodes, chosen, embedder, workers)
     keys = [*config.proprioception, v.ACTION]
-    touch, state, actions = [], [], []
+    touch, state, actions, pictures = [], [], [], []
     for i in tqdm(chosen, desc="episodes", unit="episode"):
         frames = episodes.read(i, keys).frames
         state.append(np.concatenate([frames[key] for key in config.proprioception], 1))
@@ -79,8 +82,20 @@ def read(
             touch.append(_load(episodes, i, embedder, _path(cache, i)))
         else:
             touch.append(np.empty((len(actions[-1]), 0), np.float16))
+        if config.eye:
+            pictures.append(_look(episodes, i, config.eye))
     parts = (torch.from_numpy(np.concatenate(rows)) for rows in (touch, state, actions))
-    return Recorded(*parts, lengths=tuple(len(rows) for rows in actions))
+    return Recorded(
+        *parts,
+        lengths=tuple(len(rows) for rows in actions),
+        pictures=torch.from_numpy(np.concatenate(pictures)) if config.eye else None,
+    )
+
+
+def _look(episodes: EpisodeSet, i: int, eye: EyeConfig) -> UInt8[np.ndarray, "t k h w 3"]:
+    frames = episodes.read(i, eye.keys).frames
+    columns = [shrink(frames[key], key, frames[key][0], eye.size) for key in eye.keys]
+    return np.stack(columns, 1)
 
 
 def _check(
@@ -190,5 +205,6 @@ class Windows:
     def take(self, rows: Int[Tensor, " b"]) -> tuple[Condition, Float[Tensor, "b h 8"]]:
         """Some windows: what was seen, what was done."""
         seen, recorded = self._seen[rows], self.recorded
-        condition = Condition(recorded.touch[seen].float(), recorded.state[seen])
+        pictures = None if recorded.pictures is None else recorded.pictures[rows]
+        condition = Condition(recorded.touch[seen].float(), recorded.state[seen], pictures)
         return condition, recorded.actions[self._done[rows]]

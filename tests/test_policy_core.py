@@ -2,6 +2,7 @@
 
 import json
 import math
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,10 +19,11 @@ from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies import checkpoint, ema
 from touchgoal.policies import train as train_module
-from touchgoal.policies.acting import PolicyActor
+from touchgoal.policies.acting import Planner, PolicyActor
 from touchgoal.policies.actions import Representation, Scale, represent, to_actions
 from touchgoal.policies.diffusion import DiffusionConfig, RegressionConfig
-from touchgoal.policies.policy import Condition, Policy, PolicyConfig
+from touchgoal.policies.policy import Condition, Policy, PolicyConfig, unroll
+from touchgoal.policies.realtime import RealTimeActor
 from touchgoal.policies.samplers import (
     FLOW_STEPS,
     SamplerConfig,
@@ -309,7 +311,7 @@ def test_an_actor_does_its_plans_in_order_and_on_time(latency: int) -> None:
     touch = feeling()
     config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
     policy, ticks = policy_for(config, toy_windows(config)).eval(), toy_ticks(8)
-    actor = PolicyActor(policy, touch, seed=5, latency=latency)
+    actor = PolicyActor(Planner(policy, touch, seed=5), latency)
     done = [actor.act(tick) for tick in ticks]
     rows = np.stack([touch.embed_tick(tick, ticks[0]) for tick in ticks])
     states = np.stack([np.concatenate([tick[v.STATE], tick[v.TCP_POSE]]) for tick in ticks])
@@ -330,9 +332,22 @@ def test_an_actor_refuses_what_it_cannot_do() -> None:
     touch = feeling()
     policy = Policy(replace(TOY, touch_dim=touch.dim))
     with pytest.raises(UserError, match="load the touch encoder"):
-        PolicyActor(policy, None)
+        Planner(policy, None)
     with pytest.raises(UserError, match="5 ticks late"):
-        PolicyActor(policy, touch, latency=5)
+        PolicyActor(Planner(policy, touch), latency=5)
+
+
+def test_a_turn_looks_the_same_by_either_quaternion() -> None:
+    state = torch.randn(5, 22)
+    state[:, 18:] /= state[:, 18:].norm(dim=1, keepdim=True)
+    other = torch.cat([state[:, :18], -state[:, 18:]], 1)
+    seen = unroll(state, (v.STATE, v.TCP_POSE))
+    torch.testing.assert_close(seen, unroll(other, (v.STATE, v.TCP_POSE)))
+    matrix = np.zeros(9)
+    import mujoco  # after touchgoal, which chooses the OpenGL platform
+
+    mujoco.mju_quat2Mat(matrix, state[0, 18:].double().numpy())
+    np.testing.assert_allclose(seen[0, 18:].reshape(2, 3).T, matrix.reshape(3, 3)[:, :2], atol=1e-6)
 
 
 def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
@@ -355,6 +370,45 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     path.write_text(json.dumps(description))
     with pytest.raises(UserError, match="damaged"):
         checkpoint.load(tmp_path)
+
+
+class SlowPlanner(Planner):
+    """Takes its time; remembers its plans."""
+
+    def __init__(self, policy: Policy, pause: float) -> None:
+        super().__init__(policy, None)
+        self.pause, self.plans = pause, []
+
+    def plan(self, seen):
+        time.sleep(self.pause if self.plans else 0.0)
+        actions = super().plan(seen)
+        self.plans.append((int(seen[-1][v.STATE][0]), actions))
+        return actions
+
+
+def test_a_late_plan_is_joined_where_it_should_be_by_now() -> None:
+    """Every action is one that a plan meant for this very tick; none waits for a plan."""
+    config = replace(TOY, touch_dim=0, touch="", execution_horizon=3)
+    planner = SlowPlanner(policy_for(config, toy_windows(config)).eval(), pause=0.05)
+    actor, done = RealTimeActor(planner), []
+    for i, tick in enumerate(toy_ticks(40)):
+        tick[v.STATE][0] = i
+        done.append(actor.act(tick))
+        time.sleep(0.02)
+    actor.close()
+    for i, action in enumerate(done):
+        meant = [p[i - tick] for tick, p in planner.plans if 0 <= i - tick < 8]
+        assert any(np.array_equal(action, m) for m in meant) or not action[:7].any()
+    assert len(planner.plans) > 4 and sum(not a[:7].any() for a in done) == actor.starved
+    assert len(actor.latencies) == len(planner.plans) - 1
+
+
+def test_a_failing_planner_stops_the_actor() -> None:
+    config = replace(TOY, touch_dim=0, touch="")
+    actor = RealTimeActor(Planner(policy_for(config, toy_windows(config)).eval(), None))
+    with pytest.raises(KeyError):
+        actor.act({})
+    actor.close()
 
 
 def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
