@@ -71,10 +71,7 @@ def main(config: Config) -> None:
 
 def _run_pick_place(config: Config) -> None:
     names = [find(name).name for name in config.objects] or list(CATALOGUE)
-    jobs = [
-        Demonstration(config.seed + i, options={"object": names[i % len(names)]})
-        for i in range(config.episodes)
-    ]
+    jobs = rollout.demonstrations_of(names, config.episodes, config.seed)
     if config.policy == "follower":
         raise UserError("the follower is for the bead maze; add: --task bead-maze")
     policy = PickPlaceExpert if config.policy == "expert" else _learned(config)

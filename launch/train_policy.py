@@ -1,21 +1,23 @@
-"""Train a policy on recorded episodes, on frozen touch embeddings; choose its snapshot by trials."""
+"""Train a policy on recorded episodes; choose among its snapshots by trials in the task."""
 
 import os
 import shlex
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.policies import maze_trials, rollout
 from touchgoal.policies.acting import ActorMaker
 from touchgoal.policies.actions import Representation
 from touchgoal.policies.diffusion import DiffusionConfig, RegressionConfig
-from touchgoal.policies.maze_trials import evaluate, trials_of
+from touchgoal.policies.eyes import EyeConfig
 from touchgoal.policies.policy import PolicyConfig
 from touchgoal.policies.samplers import SamplerConfig
 from touchgoal.policies.selection import Score, select
@@ -24,7 +26,11 @@ from touchgoal.policies.train import TrainConfig, train
 from touchgoal.policies.unet import PRESETS
 from touchgoal.policies.windows import Windows, read
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
+from touchgoal.sim_envs.objects import CATALOGUE
+from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.wires import choose
+
+_TRIALS = 2_000_000  # seed of the first trial
 
 
 @dataclass(frozen=True)
@@ -35,8 +41,14 @@ class Config:
     """Set of episodes to learn from; the successful ones are."""
     validation: Path
     """Set of other episodes, on which losses are measured."""
+    task: Literal["pick-place", "bead-maze"] = "bead-maze"
+    """Where snapshots are tried."""
     touch: Path | None = None
     """Folder of a frozen touch encoder (train-encoder); without one the policy does not feel."""
+    end_to_end: bool = False
+    """Feel through a touch ViT that is trained along, instead of a frozen encoder."""
+    cameras: tuple[str, ...] = ()
+    """Cameras to look at, front or wrist, through networks that are trained along."""
     out: Path | None = None
     """Folder of the run; the policy goes to its `policy/`."""
     share: float = 1.0
@@ -54,9 +66,11 @@ class Config:
     train: TrainConfig = TrainConfig()
     """The training."""
     trials: int = 24
-    """Validation wires on which every snapshot is tried; 0 keeps the last one."""
+    """Validation wires or placements on which every snapshot is tried; 0 keeps the last one."""
+    env: PickPlaceConfig = field(default_factory=PickPlaceConfig)
+    """Options of pick-place, when snapshots are tried."""
     maze: BeadMazeConfig = field(default_factory=lambda: BeadMazeConfig(split="validation"))
-    """Where snapshots are tried."""
+    """Options of bead-maze, when snapshots are tried."""
     workers: int = os.cpu_count() or 1
     """Processes that simulate."""
     resume: bool = False
@@ -69,6 +83,8 @@ def main(config: Config) -> None:
         raise UserError("to resume a run, name its folder with --out")
     if not 0 < config.share <= 1:
         raise UserError("share must be above 0 and at most 1")
+    if config.end_to_end and (config.touch or config.cameras):
+        raise UserError("end-to-end touch takes no frozen encoder and no cameras: leave them out")
     touch = load_touch(config.touch) if config.touch else None
     sets = EpisodeSet(config.episodes), EpisodeSet(config.validation)
     policy = _policy_config(config, sets[0], touch)
@@ -100,12 +116,21 @@ def _policy_config(
     return PolicyConfig(
         touch_dim=touch.dim if touch else 0,
         touch=touch.name if touch else "",
+        eye=_eye(config),
         representation=config.representation,
         observation_horizon=config.observation_horizon,
         execution_horizon=config.execution_horizon,
         control_hz=episodes.fps,
         head=head,
     )
+
+
+def _eye(config: Config) -> EyeConfig | None:
+    if config.end_to_end:
+        return EyeConfig(v.TACTILE, size=(120, 160), network="vit")
+    if config.cameras:
+        return EyeConfig(tuple(v.IMAGE_PREFIX + name for name in config.cameras))
+    return None
 
 
 def _successful(episodes: EpisodeSet) -> list[int]:
@@ -121,10 +146,13 @@ def _cache(episodes: EpisodeSet, touch: TouchEmbedder | None) -> Path:
 def _try(config: Config, directory: Path) -> Score:
     if config.trials == 0:
         return 0.0, 0.0
-    maze = config.maze
-    if not config.touch:
-        maze = replace(maze, tactile=False)
-    wires = choose(maze.split, config.trials, maze.families)
-    trials = evaluate(maze, ActorMaker(directory), trials_of(wires, 2_000_000), config.workers)
+    maker = ActorMaker(directory)
+    if config.task == "bead-maze":
+        wires = choose(config.maze.split, config.trials, config.maze.families)
+        jobs = maze_trials.trials_of(wires, _TRIALS)
+        trials = maze_trials.evaluate(maker.observing(config.maze), maker, jobs, config.workers)
+    else:
+        jobs = rollout.demonstrations_of(list(CATALOGUE), config.trials, _TRIALS)
+        trials = rollout.evaluate(maker.observing(config.env), maker, jobs, config.workers)
     success = float(np.mean([t.success for t in trials]))
     return success, float(np.mean([t.progress for t in trials]))

@@ -50,7 +50,7 @@ class Planner:
                 f"the policy feels through {config.touch!r}, not {touch.name if touch else ''!r}: "
                 "load the touch encoder that it was trained with"
             )
-        self._policy, self._touch = policy, touch
+        self._policy, self.touch = policy, touch
         self._generator = torch.Generator().manual_seed(seed)
         self._first: Observation = {}
         self._felt: dict[int, np.ndarray] = {}
@@ -71,10 +71,10 @@ class Planner:
         return self._policy.plan(condition, self._generator)[0].numpy()
 
     def _feel(self, observation: Observation) -> Float32[np.ndarray, " e"]:
-        if self._touch is None:
+        if self.touch is None:
             return np.empty(0, np.float32)
         row = self._felt.get(id(observation))
-        return self._touch.embed_tick(observation, self._first) if row is None else row
+        return self.touch.embed_tick(observation, self._first) if row is None else row
 
     def _look(self, observation: Observation) -> UInt8[Tensor, "1 k h w 3"] | None:
         eye = self.config.eye

@@ -114,6 +114,7 @@ class Policy(nn.Module):
         if config.eye:
             self.eye = Eye(config.eye)
             condition += len(config.eye.keys) * config.eye.width
+        self.condition_dim = condition
         if isinstance(config.head, DiffusionConfig):
             self.head = Diffusion(config.head, ticks, ACTION_DIM, condition)
         else:

@@ -33,6 +33,13 @@ class Trial:
     ticks: int
 
 
+def demonstrations_of(objects: list[str], count: int, seed: int) -> list[Demonstration]:
+    """So many trials, with the objects in turn; the seeds, from `seed` on, do the rest."""
+    return [
+        Demonstration(seed + i, options={"object": objects[i % len(objects)]}) for i in range(count)
+    ]
+
+
 def evaluate(
     config: PickPlaceConfig,
     policy: Callable[[PickPlace], Actor],
