@@ -9,7 +9,9 @@ from touchgoal.control.kinematics import (
     FR3_HOME,
     FR3_LOWER,
     FR3_UPPER,
+    UR5E,
     Fr3Kinematics,
+    Ur5eKinematics,
     fingers_down,
     rotation_vector,
 )
@@ -61,3 +63,50 @@ def test_rotation_vector_inverts_rodrigues(angle: float) -> None:
     R = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
     found = rotation_vector(R)
     assert min(np.linalg.norm(found - angle * axis), np.linalg.norm(found + angle * axis)) < 1e-5
+
+
+def _ur5e_in_mujoco() -> mujoco.MjModel:
+    """The UR5e from its lengths, joint by joint along the controller's base frame at q = 0.
+
+    Written from the drawing (axis directions and distances), not from DH frames.
+    """
+    axes = [(0, 0, 1), (0, -1, 0), (0, -1, 0), (0, -1, 0), (0, 0, -1), (0, -1, 0)]
+    offsets = [
+        (0, 0, 0),
+        (0, 0, 0.1625),
+        (-0.425, 0, 0),
+        (-0.3922, 0, 0),
+        (0, -0.1333, 0),
+        (0, 0, -0.0997),
+    ]
+    spec = mujoco.MjSpec()
+    body = spec.worldbody
+    for i, (axis, offset) in enumerate(zip(axes, offsets, strict=True)):
+        body = body.add_body(pos=offset)
+        body.add_joint(name=f"joint_{i}", axis=axis)
+        body.add_geom(size=[0.01, 0, 0], mass=1.0)
+    flange = body.add_site(name="flange", pos=[0, -0.0996, 0])
+    flange.quat = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]  # z out of the flange, along -y
+    return spec.compile()
+
+
+def test_ur5e_matches_mujoco_and_its_inverse_returns() -> None:
+    model = _ur5e_in_mujoco()
+    data, arm, rng = mujoco.MjData(model), Ur5eKinematics(tcp_offset=0.0), np.random.default_rng(0)
+    linear, angular = np.zeros((3, 6)), np.zeros((3, 6))
+    for _ in range(50):
+        q = rng.uniform(UR5E.lower, UR5E.upper)
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_jacSite(model, data, linear, angular, 0)
+        position, rotation = arm.forward(q)
+        np.testing.assert_allclose(position, data.site_xpos[0], atol=1e-9)
+        np.testing.assert_allclose(rotation, data.site_xmat[0].reshape(3, 3), atol=1e-9)
+        np.testing.assert_allclose(arm.jacobian(q), np.vstack([linear, angular]), atol=1e-9)
+    tool = Ur5eKinematics()
+    for _ in range(50):
+        position = rng.uniform([0.38, -0.25, 0.017], [0.62, 0.25, 0.3])
+        rotation = fingers_down(rng.uniform(-1.5, 1.5))
+        reached, _ = tool.forward(tool.reach(position, rotation, UR5E.home))
+        assert np.linalg.norm(reached - position) < 1e-4
