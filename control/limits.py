@@ -80,7 +80,7 @@ class Box:
 
     def holds(self, points: Float[np.ndarray, "*k 3"]) -> Bool[np.ndarray, "*k"]:
         """Whether each point lies inside; False for what is not a number."""
-        return ((points >= self.lower) & (points <= self.upper)).all(axis=-1)
+        return np.all((points >= self.lower) & (points <= self.upper), axis=-1)
 
 
 @dataclass(frozen=True)

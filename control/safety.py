@@ -256,4 +256,4 @@ class Safety:
             velocity = braked(velocity, self.joints.acceleration, self.dt)
             path.append(path[-1] + velocity * self.dt)
         inside = self.inside_workspace(np.concatenate(path))
-        return inside.reshape(len(path), -1).all(axis=0)
+        return np.all(inside.reshape(len(path), -1), axis=0)

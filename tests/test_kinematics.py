@@ -86,7 +86,7 @@ def _ur5e_in_mujoco() -> mujoco.MjModel:
         body.add_joint(name=f"joint_{i}", axis=axis)
         body.add_geom(size=[0.01, 0, 0], mass=1.0)
     flange = body.add_site(name="flange", pos=[0, -0.0996, 0])
-    flange.quat = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]  # z out of the flange, along -y
+    flange.quat = np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0])  # z out of the flange, along -y
     return spec.compile()
 
 
