@@ -141,12 +141,13 @@ class Kinematics:
         iterations: int = 60,
         margin: float = 0.02,
         posture: float = 0.02,
+        tolerance: float = 1e-5,
     ) -> Solution:
         """Damped least squares from `start`, drawn to the arm's home in the null space.
 
         Damping (1e-3) keeps steps finite near singularities; `posture` (share a step) keeps the
         elbow where a person expects it; 0 moves the joints least. Joints stay `margin` rad inside
-        their limits.
+        their limits. It ends within `tolerance` m and ten times that in rad.
         """
         q = np.asarray(start, dtype=np.float64)
         eye = np.eye(q.size)
@@ -155,7 +156,7 @@ class Kinematics:
         for _ in range(iterations):
             p, R, J = (m.full() for m in self._chain(q))
             error = np.concatenate([position - p.ravel(), rotation_vector(rotation @ R.T)])
-            if np.linalg.norm(error[:3]) < 1e-5 and np.linalg.norm(error[3:]) < 1e-4:
+            if max(np.linalg.norm(error[:3]), np.linalg.norm(error[3:]) / 10) < tolerance:
                 break
             pseudo = J.T @ np.linalg.inv(J @ J.T + 1e-6 * np.eye(6))
             task = np.concatenate([np.clip(error[:3], -0.1, 0.1), np.clip(error[3:], -0.5, 0.5)])
@@ -213,6 +214,14 @@ def rotation_vector(R: Matrix3) -> Vector3:
     axis = np.sqrt(np.maximum((np.diag(R) + 1) / 2, 0))  # half a turn: R = 2 a a^T - 1
     k = int(np.argmax(axis))
     return angle * (R[:, k] + np.eye(3)[k]) / (2 * axis[k])
+
+
+def rotation_matrix(vector: Vector3) -> Matrix3:
+    """The rotation about `vector` by its length (rad): Rodrigues, the inverse of the above."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector / max(angle, 1e-12)
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
 
 
 def fingers_down(yaw: float) -> Matrix3:

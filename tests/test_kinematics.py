@@ -13,6 +13,7 @@ from touchgoal.control.kinematics import (
     Fr3Kinematics,
     Ur5eKinematics,
     fingers_down,
+    rotation_matrix,
     rotation_vector,
 )
 from touchgoal.sim_envs.scene import build
@@ -59,9 +60,7 @@ def test_out_of_reach_is_said() -> None:
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 0.3, 2.0, np.pi - 1e-6, np.pi])
 def test_rotation_vector_inverts_rodrigues(angle: float) -> None:
     axis = np.array([2.0, -1.0, 0.5]) / np.linalg.norm([2.0, -1.0, 0.5])
-    K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    R = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
-    found = rotation_vector(R)
+    found = rotation_vector(rotation_matrix(angle * axis))
     assert min(np.linalg.norm(found - angle * axis), np.linalg.norm(found + angle * axis)) < 1e-5
 
 
