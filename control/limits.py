@@ -121,11 +121,14 @@ class RobotLimits:
     )
 
     @property
+    def interface(self) -> JointLimits:
+        """What the 1 kHz command and the arm's own moves stay within: the maker's, less a margin."""
+        return self.hardware.inside(self.margin)
+
+    @property
     def policy(self) -> JointLimits:
-        """What a policy's commands are clamped to."""
-        return self.hardware.scaled(self.velocity_share, self.acceleration_share).inside(
-            self.margin
-        )
+        """What a policy's commands are clamped to, tick by tick."""
+        return self.interface.scaled(self.velocity_share, self.acceleration_share)
 
 
 # Shares, margin, step, forces: proposals of shared/research/drivers.md 6, after what DROID (0.1 rad

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from touchgoal.control.braking import braked, highest_speed
 from touchgoal.control.errors import UserError
@@ -169,11 +169,15 @@ class Safety:
             return self._brake(state, Mode.HOLD, stale, None)
         return self._move(state, action)
 
-    def inside_workspace(self, q: Float[np.ndarray, "k n"]) -> np.ndarray:
+    def inside_workspace(self, q: Float[np.ndarray, "k n"]) -> Bool[np.ndarray, " k"]:
         """Whether flange and finger edges lie in their boxes, for each of k postures."""
-        points = self._points(q.T).full().T.reshape(len(q), -1, 3)
+        points = self.monitored(q)
         flange = self.limits.flange.holds(points[:, 0])
         return flange & self.limits.fingertips.holds(points[:, 1:]).all(axis=1)
+
+    def monitored(self, q: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k 3 3"]:
+        """Flange and the two finger edges in the base frame (m), for each of k postures."""
+        return self._points(q.T).full().T.reshape(len(q), 3, 3)
 
     def _ages(self, reading: Reading) -> list[tuple[Limit, float, Deadline]]:
         w = self.watchdogs
@@ -239,8 +243,8 @@ class Safety:
         """The wanted velocity, or as much of it as lets braking end inside the boxes.
 
         Braking itself is the path checked a tick ago, computed by the same operations in the same
-        order, hence inside to the last bit. Between two ticks the joints move by less than 0.03 rad
-        and a point leaves the chord by less than 0.1 mm.
+        order, hence inside to the last bit. Postures between two ticks are not looked at: the joints
+        move by less than 0.03 rad, and a point leaves the chord by less than 0.1 mm.
         """
         if self._stops_inside(state.q, wanted[None])[0]:
             return wanted
@@ -249,7 +253,9 @@ class Safety:
         good = np.flatnonzero(self._stops_inside(state.q, tries))
         return tries[good[0]] if good.size else rest
 
-    def _stops_inside(self, q: Joints, velocity: Float[np.ndarray, "c n"]) -> np.ndarray:
+    def _stops_inside(
+        self, q: Joints, velocity: Float[np.ndarray, "c n"]
+    ) -> Bool[np.ndarray, " c"]:
         """For each candidate velocity: are this tick and the braking after it inside the boxes?"""
         path = [q + velocity * self.dt]
         for _ in range(self._braking_ticks):

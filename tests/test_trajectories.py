@@ -39,7 +39,7 @@ def peak_shares(trajectory: Trajectory, limits: JointLimits) -> np.ndarray:
 def test_full_speed_joint_moves_use_a_limit_up_and_exceed_none(
     robot: RobotLimits, arm: Kinematics
 ) -> None:
-    limits, rng = robot.hardware.inside(robot.margin), np.random.default_rng(0)
+    limits, rng = robot.interface, np.random.default_rng(0)
     q = arm.arm.home
     for _ in range(40):
         goal = rng.uniform(limits.lower, limits.upper)
