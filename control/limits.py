@@ -133,8 +133,8 @@ class RobotLimits:
 
 # Shares, margin, step, forces: proposals of shared/research/drivers.md 6, after what DROID (0.1 rad
 # margin, 20 N) and LeRobot (0.05 per step) do; Franka's reflex is set at 20 N and above. Half the
-# acceleration, not 30 %, because it also brakes. Touch: half of what a gel bears without
-# creeping (our choice; compare with your sensor's sheet).
+# acceleration, not 30 %, because it also brakes. Touch and tracking: our choice, without a source;
+# compare the former with your sensor's sheet.
 
 FR3 = RobotLimits(
     arm=kinematics.FR3,
@@ -161,8 +161,8 @@ FR3 = RobotLimits(
 UR5E = RobotLimits(
     arm=kinematics.UR5E,
     # Range and speed: Universal_Robots_ROS2_Description ur5e/joint_limits.yaml (180 deg/s).
-    # Acceleration is unpublished: MoveIt's configuration of it uses 3.14. Jerk is unpublished and
-    # not enforced by the controller: full acceleration in 20 ms, its lookahead at the shortest 30.
+    # Acceleration is unpublished; 3.14 is our choice (drivers.md 6). So is jerk, which the controller
+    # does not enforce: full acceleration in 20 ms; its lookahead at the shortest is 30.
     hardware=JointLimits(
         lower=kinematics.UR5E_LOWER,
         upper=kinematics.UR5E_UPPER,
