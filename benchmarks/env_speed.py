@@ -1,9 +1,6 @@
 """How fast the simulated cell runs on one core: physics, and whole environment steps."""
 
 import os
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +9,7 @@ import cv2
 import mujoco
 import numpy as np
 
+from touchgoal.benchmarks.speed import Row, measure, one_core, table
 from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
 from touchgoal.sim_envs.experts import PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
@@ -35,37 +33,16 @@ class Config:
     """Ticks of one measurement of the environment."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """One measured rate, per second."""
-
-    what: str
-    median: float
-    slowest: float
-    fastest: float
-
-
 def run(config: Config) -> dict[str, Any]:
     """Measure everything on one core; wall-clock time."""
     os.environ["LP_NUM_THREADS"] = "0"  # software OpenGL draws in this thread
     cv2.setNumThreads(1)
     with one_core():
         rows = [*_physics(config), *_env(config), *_maze(config)]
-    return {"rows": [vars(row) for row in rows], "table": _table(rows)}
-
-
-@contextmanager
-def one_core() -> Iterator[None]:
-    """Keep this process on one core, where the system lets it choose (Linux)."""
-    if not hasattr(os, "sched_setaffinity"):
-        yield
-        return
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(before)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)
+    return {
+        "rows": [vars(row) for row in rows],
+        "table": table("on one core, wall clock", "per second", rows),
+    }
 
 
 def _physics(config: Config) -> list[Row]:
@@ -102,7 +79,9 @@ def _env(config: Config) -> list[Row]:
                     env.step(STILL)
 
             rows.append(
-                _measure(f"env step (50 physics steps), {what}, holding {name}", config, n, step)
+                measure(
+                    f"env step (50 physics steps), {what}, holding {name}", config.repeats, n, step
+                )
             )
         env.close()
     return rows
@@ -125,7 +104,7 @@ def _maze(config: Config) -> list[Row]:
                 env.step(STILL)
 
         name = f"env step (50 physics steps), {what}, bead on the wire"
-        rows.append(_measure(name, config, config.env_steps, step))
+        rows.append(measure(name, config.repeats, config.env_steps, step))
         env.close()
     return rows
 
@@ -146,20 +125,4 @@ def _wheel_model() -> str:
 
 
 def _rate(what: str, config: Config, n: int, model: mujoco.MjModel, data: mujoco.MjData) -> Row:
-    return _measure(what, config, n, lambda: mujoco.mj_step(model, data, nstep=n))
-
-
-def _measure(what: str, config: Config, n: int, work: Callable[[], None]) -> Row:
-    work()
-    rates = []
-    for _ in range(config.repeats):
-        start = time.perf_counter()
-        work()
-        rates.append(n / (time.perf_counter() - start))
-    return Row(what, float(np.median(rates)), min(rates), max(rates))
-
-
-def _table(rows: list[Row]) -> str:
-    lines = [f"{'on one core':<72}{'per second':>11}{'slowest':>10}{'fastest':>10}"]
-    lines += [f"{r.what:<72}{r.median:>11,.0f}{r.slowest:>10,.0f}{r.fastest:>10,.0f}" for r in rows]
-    return "\n".join(lines)
+    return measure(what, config.repeats, n, lambda: mujoco.mj_step(model, data, nstep=n))

@@ -1,6 +1,5 @@
 """How fast a simulated pad makes its pictures on one core, beside the machine's limit and a peer."""
 
-import importlib.util
 import os
 import time
 from collections.abc import Callable
@@ -12,11 +11,12 @@ import cv2
 import numpy as np
 from numba import njit
 
-from touchgoal.benchmarks.env_speed import one_core
+from touchgoal.benchmarks.speed import Row, measure, one_core, table
+from touchgoal.benchmarks.taxim_peer import has_jax, has_taxim
 from touchgoal.control.sensors import GELSIGHT_MINI_MARKERS, SensorModel
 from touchgoal.sim_envs.objects import CATALOGUE, HARD, Body, Material, ObjectKind, Texture
 from touchgoal.sim_envs.tactile.rig import PressRig
-from touchgoal.sim_envs.tactile.unit import NOMINAL, sample_unit
+from touchgoal.sim_envs.tactile.unit import NOMINAL, Unit, sample_unit
 
 # What one 240x320 frame of a ball at least does, counted by hand from the kernels: multiplications
 # and additions, and bytes that leave or enter the first-level cache.
@@ -35,16 +35,6 @@ class Config:
     """Measurements of each figure; the median is printed."""
     frames: int = 100
     """Frames of one measurement."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One measured rate, frames per second of processor time."""
-
-    what: str
-    median: float
-    slowest: float
-    fastest: float
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -79,15 +69,15 @@ def _frame(rig: PressRig, force: float = 8.0) -> Callable[[], object]:
     return lambda: rig.sense(force, rng, shear=(1.5, 0.5), centre=(1e-3, -0.5e-3))
 
 
-def _unit(sensor: SensorModel) -> Any:
+def _unit(sensor: SensorModel) -> Unit:
     unit = sample_unit(GELSIGHT_MINI_MARKERS, np.random.default_rng(0), NOMINAL)
     if sensor.image_shape == unit.background.shape[1:]:
         return unit
     return replace(
         unit,
+        photometry=replace(unit.photometry, pixel_pitch=sensor.pixel_pitch),
         background=unit.background[:, ::2, ::2].copy(),
         gain=unit.gain[:, ::2, ::2].copy(),
-        pixel_pitch=sensor.pixel_pitch,
         markers=unit.markers / 2,
         marker_radius=unit.marker_radius / 2,
     )
@@ -124,7 +114,7 @@ def _sphere_points(n: int) -> np.ndarray:
 
 def _peer(config: Config) -> list[Row]:
     """Taxim's JAX port, where it is installed, with its own Mini calibration and a ball."""
-    if importlib.util.find_spec("taxim") is None or importlib.util.find_spec("jax") is None:
+    if not (has_taxim() and has_jax()):
         print("no peer: pip install 'touchgoal[peers]' to measure taxim beside us")
         return []
     from taxim import CALIB_GELSIGHT_MINI, Taxim  # pyright: ignore[reportMissingImports]
@@ -151,22 +141,18 @@ def _measure(
     work: Callable[[], object],
     clock: Callable[[], float] = time.thread_time,
 ) -> Row:
-    work()
-    rates = []
-    for _ in range(config.repeats):
-        start = clock()
+    """Rate of one `work` of many in a row."""
+
+    def frames() -> None:
         for _ in range(config.frames):
             work()
-        rates.append(config.frames / (clock() - start))
-    return Row(what, float(np.median(rates)), min(rates), max(rates))
+
+    return measure(what, config.repeats, config.frames, frames, clock)
 
 
 def _limits(config: Config) -> dict[str, float]:
     """What this core can do at best, and how many frames a second that would be."""
-    source = np.zeros(1 << 16, np.float32)  # 256 kB: second-level cache, as a frame's arrays
-    target = np.empty_like(source)
-    copies = replace(config, frames=2000)
-    copied = _measure("copy", copies, lambda: np.copyto(target, source)).median * 2 * source.nbytes
+    copied = max(_copy_rate(config, offset) for offset in (0, 16, 1024))
     flop = _measure("fma", replace(config, frames=20), _multiply_and_add).median * _FMA_FLOP
     return {
         "copy_gb_per_s": copied / 1e9,
@@ -174,6 +160,17 @@ def _limits(config: Config) -> dict[str, float]:
         "memory_limit_fps": copied / FRAME_BYTES,
         "arithmetic_limit_fps": flop / FRAME_FLOP,
     }
+
+
+def _copy_rate(config: Config, offset: int) -> float:
+    """Bytes read and written a second by copies of 256 kB, as large as a frame's arrays.
+
+    Where the two arrays lie to each other changes it tenfold on some machines: the best counts.
+    """
+    source = np.ones((1 << 16) + offset, np.float32)[offset:]
+    target = np.ones(1 << 16, np.float32)
+    copies = replace(config, frames=2000)
+    return _measure("", copies, lambda: np.copyto(target, source)).median * 2 * source.nbytes
 
 
 _FMA_STEPS = 1 << 14
@@ -194,15 +191,13 @@ def _multiply_and_add() -> None:
 
 
 def _table(rows: list[Row], limits: dict[str, float]) -> str:
-    lines = [f"{'one core, processor time':<72}{'frames/s':>11}{'slowest':>10}{'fastest':>10}"]
-    lines += [f"{r.what:<72}{r.median:>11,.0f}{r.slowest:>10,.0f}{r.fastest:>10,.0f}" for r in rows]
     ball = next(row for row in rows if row.what.startswith("240x320 ball"))
-    lines.append(
-        f"this core copies {limits['copy_gb_per_s']:.0f} GB/s and does "
+    rates = table("one core, processor time", "frames/s", rows)
+    return (
+        f"{rates}\nthis core copies {limits['copy_gb_per_s']:.0f} GB/s and does "
         f"{limits['gflop_per_s']:.0f} GFLOP/s: a 240x320 frame cannot be faster than "
         f"{limits['memory_limit_fps']:,.0f}/s by memory, {limits['arithmetic_limit_fps']:,.0f}/s "
         f"by arithmetic; the ball reaches "
         f"{ball.median * (1 / limits['memory_limit_fps'] + 1 / limits['arithmetic_limit_fps']):.0%}"
         " of both one after the other"
     )
-    return "\n".join(lines)

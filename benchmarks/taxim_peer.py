@@ -44,6 +44,11 @@ def real_presses(sensor: str) -> PressSet:
     return PressSet(_half(pack["f0"]), images, circles, balls, files)
 
 
+def has_taxim() -> bool:
+    """Whether the wheel is installed."""
+    return importlib.util.find_spec("taxim") is not None
+
+
 def has_jax() -> bool:
     """Whether taxim can draw: the wheel's other back end needs torchvision."""
     return importlib.util.find_spec("jax") is not None

@@ -5,6 +5,7 @@ with the columns file, x_px, y_px, radius_px (centre and radius of the circle in
 touch; the first pixel is 0, 0) and ball_mm (the ball's radius; empty if not known).
 """
 
+import shlex
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -71,7 +72,7 @@ def main(config: Config) -> None:
     for line in _remarks(calibration):
         print(line)
     record = _record(calibration, presses, errors, len(test))
-    command = " ".join(["touchgoal", *sys.argv[1:]])
+    command = shlex.join(["touchgoal", *sys.argv[1:]])
     source = {"source": config.source or str(config.presses), "command": command}
     save(calibration.photometry, out / "sensor_file", {**source, **record})
     write_json(out / "metrics.json", record)

@@ -1,5 +1,6 @@
 """Train a touch encoder on recorded episodes: align touch with frozen image and text towers."""
 
+import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,7 +69,7 @@ def main(config: Align) -> None:
     )
     print(f"{len(train)} touches of {len(train.descriptions)} objects; {len(val)} for validation")
     recipe = {
-        "command": " ".join(["touchgoal", *sys.argv[1:]]),
+        "command": shlex.join(["touchgoal", *sys.argv[1:]]),
         "data": "simulated: touchgoal collect-demos",
         "episodes": len(episodes),
         "validation_episodes": len(validation),

@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from touchgoal.control.touch import gel
 from touchgoal.control.touch.background import cosines
-from touchgoal.control.touch.photometry import Photometry, gain
+from touchgoal.control.touch.photometry import Photometry, gain, monomials, shadows
 
 Map = Float32[np.ndarray, "h w"]
 Colours = Float32[np.ndarray, "3 h w"]
@@ -139,9 +138,7 @@ class _Level:
     def _linearise(self, seen: Colours, surface: Map, search: bool) -> _Linear:
         p = self._photometry
         gx, gy = self._slopes(surface)
-        known = np.minimum(surface, np.float32(p.deepest))
-        dark = gel.shadow_depth(known, self._pitch, p.light_azimuths, p.shadow_slope)
-        dark /= dark + np.float32(p.penumbra)
+        dark = shadows(p, surface, self._pitch)
         # What shadows and depth leave for the slopes to explain.
         left = seen - self._per_depth * np.minimum(surface, np.float32(p.deepest))
         left -= self._gain * np.tensordot(p.shadow, dark, 1)
@@ -166,7 +163,7 @@ class _Level:
         squared = np.where(steep, square / np.float32(p.steepest**2), 1 + square)
         bend = np.where(steep, 1 / np.maximum(square, 1e-6), 1 / squared)
         inverse = -1 / np.sqrt(squared)
-        terms = self._coefficients @ _monomials(gx * inverse, gy * inverse).reshape(10, -1)
+        terms = self._coefficients @ _terms(gx * inverse, gy * inverse).reshape(10, -1)
         terms = terms.reshape(3, 3, len(self._places), *self._shape)
         value, by_nx, by_ny = self._gain * np.einsum("dcphw,phw->dchw", terms, self._places)
         # dn/dg = -(1 - bend g g^T) / length
@@ -185,7 +182,7 @@ class _Level:
         lengths = np.linspace(0, self._photometry.steepest, _LENGTHS + 2)[1:-1].astype(np.float32)
         slope = np.sqrt(square[i, j])
         x, y = (-lengths[:, None] * g[i, j] / slope for g in (gx, gy))
-        values = self._coefficients[: 3 * len(self._places)] @ _monomials(x, y).reshape(10, -1)
+        values = self._coefficients[: 3 * len(self._places)] @ _terms(x, y).reshape(10, -1)
         values = values.reshape(3, len(self._places), *x.shape)
         values = np.einsum("cpkn,pn->ckn", values, self._places[:, i, j])
         errors = left[:, i, j][:, None] - self._gain[:, i, j][:, None] * values
@@ -257,16 +254,15 @@ def _dot(a: Colours, b: Colours) -> Map:
     return np.einsum("chw,chw->hw", a, b)
 
 
-def _monomials(
+def _terms(
     x: Float32[np.ndarray, "a b"], y: Float32[np.ndarray, "a b"]
 ) -> Float32[np.ndarray, "10 a b"]:
-    """1, x, y, x^2, xy, y^2, x^3, x^2 y, x y^2, y^3."""
-    xx, xy, yy = x * x, x * y, y * y
-    return np.stack([np.ones_like(x), x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y])
+    """1 and the monomials: what they and their derivatives are made of."""
+    return np.concatenate([np.ones((1, *x.shape), np.float32), monomials(x, y)])
 
 
 def _coefficients(response: Float32[np.ndarray, "3 10 waves"]) -> Float32[np.ndarray, "rows 10"]:
-    """What `_monomials` of the normal (x, y) are multiplied by.
+    """What `_terms` of the normal (x, y) are multiplied by.
 
     Rows: the colour, its derivative by x, by y; each for R, G, B; each for 1, u, v.
     """

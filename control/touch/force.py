@@ -35,13 +35,11 @@ def estimate_force(
     """Resultant force from one frame's depth and its markers' displacement.
 
     Normal: the gel as an elastic foundation, `foundation_modulus` times the volume in contact.
-    On simulated presses balls are right within 5 %, flat faces 10 to 25 % too strong, edges up to
-    half too strong; of a contact that reaches beyond the view only the part in view counts. On a
+    Flat faces and edges come out too strong, for the gel bulges beside them; of a contact that reaches beyond the view only the part in view counts. On a
     real sensor it holds as far as the modulus does: compare with one known weight.
 
     Shear: `shear_stiffness` times the mean displacement of the markers, each counting as much as
-    the gel is deep there: within 10 % for curved simulated contacts that stick, within 30 % for
-    edges, which few markers feel.
+    the gel is deep there. Edges, which few markers feel, are the least certain.
 
     Args:
         depth: of the gel's surface, m (`depth.DepthEstimator`).

@@ -4,7 +4,7 @@ Heights are metres into the gel; x runs along the columns of an image, y down it
 """
 
 import math
-from functools import cache
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -88,7 +88,7 @@ def shadow_depth(
     return shadows
 
 
-@cache
+@lru_cache(maxsize=256)  # a calibration asks for thousands
 def _plane(azimuth: float, rise: float, shape: tuple[int, int]) -> HeightField:
     """A plane that climbs by `rise` each cell in a direction, degrees."""
     y, x = (rise * np.arange(n) for n in shape)
@@ -96,7 +96,7 @@ def _plane(azimuth: float, rise: float, shape: tuple[int, int]) -> HeightField:
     return np.add.outer(math.sin(angle) * y, math.cos(angle) * x).astype(np.float32)
 
 
-@cache
+@lru_cache(maxsize=256)
 def _towards(azimuth: float, reach: int) -> UInt8[np.ndarray, "k k"]:
     """Mask of the cells within reach of the middle one in a direction, degrees."""
     steps, angle = np.arange(reach + 1), math.radians(azimuth)

@@ -24,7 +24,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.touch import gel
@@ -95,10 +95,32 @@ def features(
     # |n| = s / sqrt(1 + s^2) for slope s; at most `steepest`
     square = gx * gx + gy * gy
     inverse = -1 / np.sqrt(np.maximum(1 + square, square / np.float32(steepest**2)))
-    x, y = gx * inverse, gy * inverse
-    xx, xy, yy = x * x, x * y, y * y
     depth = np.minimum(surface, np.float32(deepest))
-    return np.stack([x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y, depth])
+    return np.stack([*monomials(gx * inverse, gy * inverse), depth])
+
+
+def monomials(
+    x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]
+) -> Float[np.ndarray, "9 ..."]:
+    """Of a normal's part in the image plane: x, y, x^2, xy, y^2, x^3, x^2 y, x y^2, y^3."""
+    xx, xy, yy = x * x, x * y, y * y
+    return np.stack([x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y])
+
+
+def shadows(
+    photometry: Photometry, surface: Float32[np.ndarray, "h w"], pitch: float
+) -> Float32[np.ndarray, "lights h w"]:
+    """Share of each light's full shadow, 0 to 1, on a gel surface of any resolution.
+
+    Args:
+        photometry: where the lights stand and how their shadows begin.
+        surface: of the gel, m; a depth beyond `deepest` counts as `deepest`.
+        pitch: of the surface, m per pixel.
+    """
+    known = np.minimum(surface, np.float32(photometry.deepest))
+    depth = gel.shadow_depth(known, pitch, photometry.light_azimuths, photometry.shadow_slope)
+    depth /= depth + np.float32(photometry.penumbra)
+    return depth
 
 
 def columns(
@@ -115,14 +137,8 @@ def columns(
     shape = features(surface, photometry.pixel_pitch, photometry.steepest, photometry.deepest)
     shape = shape.reshape(N_FEATURES, -1)[:, pixels]
     v, u = np.divmod(pixels, w) * (2 / np.array([[h - 1], [w - 1]], np.float32)) - 1
-    shadows = gel.shadow_depth(
-        np.minimum(surface, np.float32(photometry.deepest)),
-        photometry.pixel_pitch,
-        photometry.light_azimuths,
-        photometry.shadow_slope,
-    ).reshape(-1, h * w)[:, pixels]
-    shadows /= shadows + np.float32(photometry.penumbra)
-    terms = np.concatenate([shape, shape * u, shape * v, shadows])
+    dark = shadows(photometry, surface, photometry.pixel_pitch).reshape(-1, h * w)[:, pixels]
+    terms = np.concatenate([shape, shape * u, shape * v, dark])
     return terms.astype(np.float32, copy=False)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numba import njit
 
-from touchgoal.control.touch.gel import shadow_depth
+from touchgoal.control.touch.photometry import shadows
 from touchgoal.sim_envs.tactile.unit import NOISE_MARGIN, STEP, Unit
 
 HeightField = Float32[np.ndarray, "h w"]
@@ -49,16 +49,15 @@ def _along(k, slope, v):
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 @no_type_check
-def _colours(surface, per_pitch, response, limits, depth, shadow, gain, out):
+def _colours(surface, per_pitch, response, limits, dark, shadow, gain, out):
     """`photometry.shade` less the background, at half its resolution, planar."""
     h, w = surface.shape
     half, one, zero = np.float32(0.5), np.float32(1.0), np.float32(0.0)
     across = ((4.0 * np.arange(w) + 1.0) / (2 * w - 1) - 1.0).astype(np.float32)
     scale = half * per_pitch
-    steepest, deepest, penumbra = limits
+    steepest, deepest = limits
     flattest = one / (steepest * steepest)
     nx, ny, pressed = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
-    shade = np.empty((3, w), np.float32)
     for i in range(h):
         row, above, below = surface[i], surface[max(i - 1, 0)], surface[min(i + 1, h - 1)]
         for j in range(w):
@@ -69,11 +68,7 @@ def _colours(surface, per_pitch, response, limits, depth, shadow, gain, out):
             nx[j], ny[j] = gx * inverse, gy * inverse
             pressed[j] = min(row[j], deepest)
         v = np.float32((4 * i + 1) / (2 * h - 1) - 1)
-        for light in range(3):
-            dark, line = depth[light, i], shade[light]
-            for j in range(w):
-                line[j] = dark[j] / (dark[j] + penumbra)
-        d0, d1, d2 = shade[0], shade[1], shade[2]
+        d0, d1, d2 = dark[0, i], dark[1, i], dark[2, i]
         for c in range(3):
             a = _along(response[c, :, 0], response[c, :, 2], v)
             b = _along(response[c, :, 1], response[c, :, 1], zero)
@@ -88,16 +83,14 @@ def _colours(surface, per_pitch, response, limits, depth, shadow, gain, out):
 def colour_change(surface: HeightField, unit: Unit) -> Float32[np.ndarray, "3 h w"]:
     """What a gel's shape adds to the untouched image, counts; all at half its resolution."""
     photometry, pitch = unit.photometry, 2 * unit.pixel_pitch
-    known = np.minimum(surface, np.float32(photometry.deepest))
-    depth = shadow_depth(known, pitch, photometry.light_azimuths, photometry.shadow_slope)
     change = np.empty((3, *surface.shape), np.float32)
-    limits = photometry.steepest, photometry.deepest, photometry.penumbra
+    limits = photometry.steepest, photometry.deepest
     _colours(
         surface,
         np.float32(1 / pitch),
         photometry.response,
         tuple(np.float32(a) for a in limits),
-        depth,
+        shadows(photometry, surface, pitch),
         photometry.shadow,
         unit.gain,
         change,

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int8, Int16, Shaped
 
 from touchgoal.control.sensors import SensorModel
-from touchgoal.control.touch.photometry import Photometry, gain, load
+from touchgoal.control.touch.photometry import Photometry, gain, load, monomials
 from touchgoal.sim_envs.tactile.markers import rest_positions
 
 NOISE_MARGIN = 64  # px by which the noise tile is larger than a frame
@@ -52,7 +52,6 @@ class Unit:
         background: the untouched frame, RGB in STEPs.
         gain: how strongly the light falls, per channel, at half the image's resolution.
         noise: tile of camera noise in STEPs, larger than the image by NOISE_MARGIN.
-        pixel_pitch: m per pixel.
         markers: resting (x, y) of the gel's printed dots, px; none on a plain gel.
         marker_radius: px.
     """
@@ -61,9 +60,13 @@ class Unit:
     background: Int16[np.ndarray, "3 h w"]
     gain: Float32[np.ndarray, "3 h3 w3"]
     noise: Int8[np.ndarray, "3 h2 w2"]
-    pixel_pitch: float
     markers: Float32[np.ndarray, "n 2"]
     marker_radius: float
+
+    @property
+    def pixel_pitch(self) -> float:
+        """m per pixel."""
+        return self.photometry.pixel_pitch
 
 
 def sample_unit(
@@ -78,12 +81,14 @@ def sample_unit(
     typical = load(sensor.sensor_file)
     brightness = 1 + spread.gain * rng.normal(size=3)
     turns = np.radians(spread.azimuth) * rng.uniform(-1, 1, 3)
+    bulge = tuple(b * (1 + spread.bulge * rng.uniform(-1, 1)) for b in typical.bulge)
+    pitch = rng.uniform(*sensor.pitch_range) if spread.pitch else sensor.pixel_pitch
     photometry = replace(
         typical,
+        pixel_pitch=pitch,
         response=_turned(typical.response, turns) * brightness[:, None, None].astype(np.float32),
-        bulge=tuple(b * (1 + spread.bulge * rng.uniform(-1, 1)) for b in typical.bulge),
+        bulge=bulge,
     )
-    pitch = rng.uniform(*sensor.pitch_range) if spread.pitch else sensor.pixel_pitch
     h, w = sensor.image_shape
     smooth = cv2.resize(rng.normal(0, 1, (4, 5, 3)), (w, h), interpolation=cv2.INTER_CUBIC)
     background = typical.background * brightness
@@ -98,7 +103,6 @@ def sample_unit(
         _planar(background / STEP, np.int16),
         _planar(light, np.float32),
         _planar(np.clip(typical.noise / STEP * noise, -127, 127), np.int8),
-        pitch,
         markers,
         radius,
     )
@@ -117,18 +121,13 @@ def _turned(
     so are found by least squares, which is exact.
     """
     x, y = np.random.default_rng(0).uniform(-1, 1, (2, 64))
-    seen = _monomials(x, y)
+    seen = monomials(x, y).T
     n = seen.shape[1]
     turned = response.copy()
     for channel, c, s in zip(turned, np.cos(turns), np.sin(turns), strict=True):
-        wanted = _monomials(x * c + y * s, y * c - x * s) @ channel[:n]
+        wanted = monomials(x * c + y * s, y * c - x * s).T @ channel[:n]
         channel[:n] = np.linalg.lstsq(seen, wanted, rcond=None)[0]
     return turned
-
-
-def _monomials(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 9"]:
-    """What `photometry.features` makes of a normal."""
-    return np.stack([x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], 1)
 
 
 def _markers(

@@ -1,0 +1,57 @@
+"""Rates on one core, for the speed benchmarks."""
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured rate, per second."""
+
+    what: str
+    median: float
+    slowest: float
+    fastest: float
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Keep this process on one core, where the system lets it choose (Linux)."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def measure(
+    what: str,
+    repeats: int,
+    count: int,
+    work: Callable[[], object],
+    clock: Callable[[], float] = time.perf_counter,
+) -> Row:
+    """How often something happens per second of a clock, if each `work` does it `count` times."""
+    work()
+    rates = []
+    for _ in range(repeats):
+        start = clock()
+        work()
+        rates.append(count / (clock() - start))
+    return Row(what, float(np.median(rates)), min(rates), max(rates))
+
+
+def table(what: str, unit: str, rows: Sequence[Row]) -> str:
+    """The rates as people read them, one a line."""
+    lines = [f"{what:<72}{unit:>11}{'slowest':>10}{'fastest':>10}"]
+    lines += [f"{r.what:<72}{r.median:>11,.0f}{r.slowest:>10,.0f}{r.fastest:>10,.0f}" for r in rows]
+    return "\n".join(lines)

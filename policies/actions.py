@@ -1,0 +1,82 @@
+"""What a policy predicts of a chunk of actions, and the scales it learns in.
+
+An action (8,) is the joint change (7) of one tick, rad, and the gripper width target, m
+(`vocabulary.ACTION`). A chunk is the actions of h ticks from the latest observation on.
+"""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from touchgoal.control.vocabulary import N_JOINTS
+
+ACTION_DIM = N_JOINTS + 1
+Representation = Literal["delta", "chunk", "absolute"]
+"""Of the joints: each tick's change; the change since the chunk's start; the joint positions that
+these changes lead to from the measured ones. The gripper's width is a target in all three."""
+
+_CONSTANT = 1e-6  # in SI units: smaller than anything that a policy should learn to vary
+
+
+def represent(
+    actions: Float[Tensor, "b h 8"], joints: Float[Tensor, "b 7"], kind: Representation
+) -> Float[Tensor, "b h 8"]:
+    """Actions in a representation; `joints` (rad) are those measured at the chunk's start."""
+    if kind == "delta":
+        return actions
+    targets = actions[..., :N_JOINTS].cumsum(1)
+    if kind == "absolute":
+        targets = joints[:, None] + targets
+    return torch.cat([targets, actions[..., N_JOINTS:]], -1)
+
+
+def to_actions(
+    represented: Float[Tensor, "b h 8"], joints: Float[Tensor, "b 7"], kind: Representation
+) -> Float[Tensor, "b h 8"]:
+    """The inverse of `represent`."""
+    if kind == "delta":
+        return represented
+    targets = represented[..., :N_JOINTS]
+    start = joints if kind == "absolute" else torch.zeros_like(joints)
+    changes = torch.cat([targets[:, :1] - start[:, None], targets.diff(dim=1)], 1)
+    return torch.cat([changes, represented[..., N_JOINTS:]], -1)
+
+
+class Scale(nn.Module):
+    """An affine map of every component to the range that a network likes, and back.
+
+    A component that was constant becomes 0, and comes back as the constant.
+    """
+
+    centre: Tensor
+    size: Tensor
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        """The identity, until fitted."""
+        super().__init__()
+        self.register_buffer("centre", torch.zeros(shape))
+        self.register_buffer("size", torch.ones(shape))
+
+    def fit_range(self, values: Float[Tensor, "n ..."]) -> None:
+        """From now on, the least and the greatest of these values become -1 and 1."""
+        low, high = values.amin(0), values.amax(0)
+        self._set((low + high) / 2, (high - low) / 2)
+
+    def fit_spread(self, values: Float[Tensor, "n ..."]) -> None:
+        """From now on, these values become ones of mean 0 and variance 1."""
+        self._set(values.mean(0), values.std(0, correction=0))
+
+    def forward(self, values: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+        """To the network's range."""
+        constant = self.size == 0
+        return (values - self.centre) * ~constant / (self.size + constant)
+
+    def inverse(self, scaled: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+        """Back from it."""
+        return scaled * self.size + self.centre
+
+    def _set(self, centre: Tensor, size: Tensor) -> None:
+        self.centre.copy_(centre)
+        self.size.copy_(torch.where(size < _CONSTANT, 0.0, size))

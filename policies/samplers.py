@@ -1,0 +1,152 @@
+"""From noise to samples and back: DDPM, DDIM and flow matching.
+
+Each is a way to spoil a clean sample for training, and a way to walk from noise to a sample with a
+network that was trained to mend. The two diffusions are one formula (Song et al. 2021, eq. 12).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from touchgoal.control.errors import UserError
+
+FLOW_STEPS = 100.0  # what flow time 1 is called to the network, so that its embedding resolves it
+Denoise = Callable[[Float[Tensor, "b h a"], Float[Tensor, " b"]], Float[Tensor, "b h a"]]
+
+
+@dataclass(frozen=True)
+class SamplerConfig:
+    """How samples are spoiled and mended.
+
+    Attributes:
+        kind: "ddpm" draws fresh noise at every step (Ho et al. 2020), "ddim" none (Song et al.
+            2021); both learn the same, so a network trained for one serves the other. "flow" goes
+            straight from noise to data (Lipman et al. 2023).
+        predict: what the network answers: the noise ("epsilon") or the flow's velocity, as
+            published, or the clean sample. The last needs fewer steps and less training where
+            samples vary little (3D diffusion policy, Ze et al. 2024, which takes it as well).
+        train_steps: of the squared-cosine schedule (Nichol and Dhariwal 2021).
+        plan_steps: network calls for one sample.
+        clip: clean samples lie in [-clip, clip].
+    """
+
+    kind: Literal["ddpm", "ddim", "flow"] = "ddim"
+    predict: Literal["epsilon", "velocity", "sample"] = "sample"
+    train_steps: int = 100
+    plan_steps: int = 8
+    clip: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Raises UserError for steps that make no sampler."""
+        if self.plan_steps < 1 or self.train_steps < 2:
+            raise UserError("a sampler needs plan_steps >= 1 and train_steps >= 2")
+        if self.predict == ("epsilon" if self.kind == "flow" else "velocity"):
+            raise UserError(f"a network for {self.kind} cannot predict {self.predict}: try sample")
+        if self.kind != "flow" and self.plan_steps > self.train_steps:
+            raise UserError(
+                f"plan_steps {self.plan_steps} exceed train_steps {self.train_steps}: some would "
+                "do nothing, so ask for fewer"
+            )
+
+
+@lru_cache
+def signal_power(steps: int) -> Float[Tensor, " {steps}"]:
+    """Share of the variance that is signal after each step (alpha-bar), float64."""
+    t = torch.arange(steps + 1, dtype=torch.float64) / steps
+    power = torch.cos((t + 0.008) / 1.008 * torch.pi / 2) ** 2
+    return (1 - (1 - power[1:] / power[:-1]).clamp(max=0.999)).cumprod(0)
+
+
+def visited(config: SamplerConfig) -> Int[Tensor, " {config.plan_steps}"]:
+    """Steps of the schedule that a plan visits, from pure noise on.
+
+    Spaced backwards from the last one ("trailing", Lin et al. 2024): the first must be noise alone,
+    as that is what a plan starts from.
+    """
+    share = torch.arange(config.plan_steps, 0, -1, dtype=torch.float64) / config.plan_steps
+    return (share * config.train_steps).round().long() - 1
+
+
+def spoil(
+    config: SamplerConfig, clean: Float[Tensor, "b h a"], generator: torch.Generator
+) -> tuple[Float[Tensor, "b h a"], Float[Tensor, " b"], Float[Tensor, "b h a"]]:
+    """A training example of every sample, at a random step.
+
+    Args:
+        config: the sampler trained for.
+        clean: samples.
+        generator: of step and noise, on the CPU.
+
+    Returns:
+        Noisy samples, the step to tell the network, what the network should answer.
+    """
+    b = len(clean)
+    noise = torch.randn(clean.shape, generator=generator).to(clean)
+    if config.kind == "flow":
+        time = torch.rand(b, generator=generator).to(clean)
+        t = _as(time, clean)
+        wanted = clean - noise if config.predict == "velocity" else clean
+        return (1 - t) * noise + t * clean, FLOW_STEPS * time, wanted
+    step = torch.randint(config.train_steps, (b,), generator=generator)
+    power = _as(signal_power(config.train_steps)[step].to(clean), clean)
+    noisy = power.sqrt() * clean + (1 - power).sqrt() * noise
+    return noisy, step.to(clean), noise if config.predict == "epsilon" else clean
+
+
+def mend(
+    config: SamplerConfig,
+    network: Denoise,
+    noise: Float[Tensor, "b h a"],
+    generator: torch.Generator,
+) -> Float[Tensor, "b h a"]:
+    """Samples from noise.
+
+    Args:
+        config: the sampler that the network was trained for.
+        network: noisy samples and step to its prediction.
+        noise: standard normal.
+        generator: of the noise that "ddpm" adds, on the CPU.
+    """
+    walk = _mend_flow if config.kind == "flow" else _mend_diffusion
+    return walk(config, network, noise, generator)
+
+
+def _mend_flow(
+    config: SamplerConfig, network: Denoise, x: Tensor, generator: torch.Generator
+) -> Tensor:
+    n = config.plan_steps
+    for i in range(n):
+        answer = network(x, x.new_full((len(x),), FLOW_STEPS * i / n))
+        clean = answer if config.predict == "sample" else x + (1 - i / n) * answer
+        x = x + (clean.clamp(-config.clip, config.clip) - x) / (n - i)
+    return x
+
+
+def _mend_diffusion(
+    config: SamplerConfig, network: Denoise, x: Tensor, generator: torch.Generator
+) -> Tensor:
+    steps = visited(config).tolist()
+    powers = signal_power(config.train_steps)[steps].tolist()
+    for step, power, after in zip(steps, powers, [*powers[1:], 1.0], strict=True):
+        answer = network(x, x.new_full((len(x),), step))
+        if config.predict == "epsilon":
+            answer = (x - (1 - power) ** 0.5 * answer) / power**0.5
+        clean = answer.clamp(-config.clip, config.clip)
+        # of the clipped sample: the step then is DDPM's posterior even where it clips
+        noise = (x - power**0.5 * clean) / (1 - power) ** 0.5
+        fresh = 0.0
+        if config.kind == "ddpm":
+            fresh = ((1 - after) / (1 - power) * (1 - power / after)) ** 0.5
+        x = after**0.5 * clean + max(1 - after - fresh**2, 0.0) ** 0.5 * noise
+        if fresh > 0:
+            x = x + fresh * torch.randn(x.shape, generator=generator).to(x)
+    return x
+
+
+def _as(values: Float[Tensor, " b"], like: Float[Tensor, "b h a"]) -> Tensor:
+    return values.reshape(-1, *[1] * (like.ndim - 1))

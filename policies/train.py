@@ -1,0 +1,217 @@
+"""Training a policy on recorded windows (the recipe of Chi et al. 2023)."""
+
+import copy
+import json
+import math
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from touchgoal.control.errors import UserError
+from touchgoal.policies import checkpoint, ema
+from touchgoal.policies.policy import Condition, Policy, PolicyConfig
+from touchgoal.policies.windows import Windows
+
+_CHECKPOINT, _METRICS, POLICY, SNAPSHOTS = "checkpoint.pt", "metrics.jsonl", "policy", "snapshots"
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How to train a policy.
+
+    Attributes:
+        epochs: passes over the windows.
+        batch_size: windows a step; all of them if there are fewer.
+        lr: highest learning rate, of AdamW; reached from 0, left by a cosine to 0.
+        betas: of AdamW.
+        weight_decay: of AdamW.
+        warmup: steps in which the rate rises; a tenth of the training if that is shorter.
+        snapshot_epochs: a policy is kept for trial every so many epochs.
+        validation_windows: on which losses are measured, evenly spaced.
+        device: of the training.
+        seed: of everything random.
+    """
+
+    epochs: int = 60
+    batch_size: int = 256
+    lr: float = 5e-4
+    betas: tuple[float, float] = (0.95, 0.999)
+    weight_decay: float = 1e-6
+    warmup: int = 500
+    snapshot_epochs: int = 10
+    validation_windows: int = 1024
+    device: str = "cpu"
+    seed: int = 0
+
+
+def train(
+    policy: PolicyConfig,
+    windows: Windows,
+    validation: Windows,
+    config: TrainConfig,
+    out_dir: Path,
+    recipe: dict[str, Any],
+    resume: bool = False,
+) -> Policy:
+    """Trains a policy; its weights' average is what is kept.
+
+    Writes `metrics.jsonl` (a line an epoch), `checkpoint.pt` (after every epoch), a policy to
+    `snapshots/epoch-<n>/` every so often, and the last one to `policy/`. Which snapshot acts best,
+    only closed-loop trials can tell. Killed and resumed, it ends with the same weights as
+    uninterrupted.
+
+    Args:
+        policy: what to train.
+        windows: to learn from.
+        validation: of other episodes.
+        config: how to train.
+        out_dir: a new run's directory, or with `resume` the one to go on with.
+        recipe: JSON-able; where the episodes come from, kept with the weights.
+        resume: go on after the last finished epoch.
+
+    Returns:
+        The policy as saved in `out_dir/policy`.
+
+    Raises:
+        UserError: no such device, or a directory that does not fit `resume`.
+    """
+    _check(config, out_dir, resume)
+    run = _Run(policy, windows, config)
+    if resume:
+        run.restore(out_dir / _CHECKPOINT)
+    out_dir.mkdir(parents=True, exist_ok=True)
+    for epoch in range(len(run.history), config.epochs):
+        losses = {"epoch": epoch + 1, "loss": run.train_epoch(epoch)}
+        run.history.append(losses | run.validate(validation))
+        provenance = {
+            **recipe,
+            "train": asdict(config),
+            "windows": len(windows),
+            "metrics": run.history[-1],
+        }
+        if (epoch + 1) % config.snapshot_epochs == 0:
+            checkpoint.save(run.average, out_dir / SNAPSHOTS / f"epoch-{epoch + 1:04d}", provenance)
+        if epoch + 1 == config.epochs:
+            checkpoint.save(run.average, out_dir / POLICY, provenance)
+        run.checkpoint(out_dir)
+        tqdm.write(_line(run.history[-1], config.epochs))
+    return checkpoint.load(out_dir / POLICY)
+
+
+def _check(config: TrainConfig, out_dir: Path, resume: bool) -> None:
+    exists = (out_dir / _CHECKPOINT).is_file()
+    if resume and not exists:
+        raise UserError(f"nothing to resume in {out_dir}: start without resuming")
+    if exists and not resume:
+        raise UserError(f"{out_dir} holds a run already: resume it, or choose another directory")
+    if config.device.startswith("cuda") and not torch.cuda.is_available():
+        raise UserError("no CUDA device here: choose the device cpu")
+    if config.epochs < 1 or config.batch_size < 1 or config.snapshot_epochs < 1:
+        raise UserError("training needs epochs, batch_size and snapshot_epochs of at least 1")
+
+
+class _Run:
+    """State of a training that survives a kill."""
+
+    def __init__(self, policy: PolicyConfig, windows: Windows, config: TrainConfig) -> None:
+        self.config, self.windows = config, windows
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            self.policy = Policy(policy)
+        touch, state = windows.recorded.touch.float(), windows.recorded.state
+        self.policy.fit_scales(touch, state, windows.joints, windows.actions)
+        self.policy.to(config.device)
+        self.average = copy.deepcopy(self.policy).eval().requires_grad_(False)
+        self.optimiser = torch.optim.AdamW(
+            self.policy.parameters(), config.lr, config.betas, weight_decay=config.weight_decay
+        )
+        self.history: list[dict[str, float]] = []
+        self.batch_size = min(config.batch_size, len(windows))
+        self.steps = len(windows) // self.batch_size
+
+    def train_epoch(self, epoch: int) -> float:
+        """One pass, its mean loss; random by seed and epoch only, so a resumed run repeats it."""
+        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + epoch)
+        self.policy.train()
+        order = torch.randperm(len(self.windows), generator=generator)
+        batches = order[: self.steps * self.batch_size].split(self.batch_size)
+        total = 0.0
+        progress = tqdm(batches, desc=f"epoch {epoch + 1}/{self.config.epochs}", leave=False)
+        for i, rows in enumerate(progress):
+            step = epoch * self.steps + i
+            for group in self.optimiser.param_groups:
+                group["lr"] = _rate(self.config, step, self.config.epochs * self.steps)
+            loss = self.policy.loss(*self._take(self.windows, rows), generator)
+            self.optimiser.zero_grad()
+            loss.backward()
+            self.optimiser.step()
+            ema.update(self.average, self.policy, step)
+            total += loss.item()
+            progress.set_postfix(loss=f"{loss.item():.4f}")
+        return total / self.steps
+
+    @torch.no_grad()
+    def validate(self, windows: Windows) -> dict[str, float]:
+        """The average's loss, and the error of the joint change (rad) it plans over the chunk."""
+        n = min(self.config.validation_windows, len(windows))
+        rows = torch.linspace(0, len(windows) - 1, n).long()
+        condition, actions = self._take(windows, rows)
+        generator = torch.Generator().manual_seed(self.config.seed)
+        planned = self.average.plan(condition, generator)
+        error = (planned - actions)[..., :7].sum(1).norm(dim=1).mean()
+        loss = self.average.loss(condition, actions, generator)
+        return {"validation_loss": loss.item(), "validation_error": error.item()}
+
+    def checkpoint(self, out_dir: Path) -> None:
+        """Writes everything needed to go on; a kill leaves the old or the new checkpoint."""
+        state = {
+            "setting": self._setting(),
+            "policy": self.policy.state_dict(),
+            "average": self.average.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "history": self.history,
+        }
+        temporary = out_dir / f"{_CHECKPOINT}.tmp"
+        torch.save(state, temporary)
+        os.replace(temporary, out_dir / _CHECKPOINT)
+        lines = "".join(json.dumps(epoch) + "\n" for epoch in self.history)
+        (out_dir / _METRICS).write_text(lines)
+
+    def restore(self, path: Path) -> None:
+        """Reads a checkpoint; UserError if it is of another training."""
+        state = torch.load(path, self.config.device, weights_only=True)
+        if state["setting"] != self._setting():
+            raise UserError(f"{path} is of other episodes or another config: resume with its own")
+        self.policy.load_state_dict(state["policy"])
+        self.average.load_state_dict(state["average"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.history = state["history"]
+
+    def _take(self, windows: Windows, rows: torch.Tensor) -> tuple[Condition, torch.Tensor]:
+        condition, actions = windows.take(rows)
+        device = self.config.device
+        seen = Condition(condition.touch.to(device), condition.state.to(device))
+        return seen, actions.to(device)
+
+    def _setting(self) -> str:
+        lengths = self.windows.recorded.lengths
+        return json.dumps((asdict(self.config), asdict(self.policy.config), lengths))
+
+
+def _rate(config: TrainConfig, step: int, steps: int) -> float:
+    warmup = min(config.warmup, steps // 10)
+    if step < warmup:
+        return config.lr * (step + 1) / (warmup + 1)
+    return config.lr * (1 + math.cos(math.pi * (step - warmup) / max(steps - warmup, 1))) / 2
+
+
+def _line(metrics: dict[str, float], epochs: int) -> str:
+    return (
+        f"epoch {metrics['epoch']}/{epochs}  loss {metrics['loss']:.4f}  "
+        f"validation {metrics['validation_loss']:.4f}, "
+        f"plan off by {1000 * metrics['validation_error']:.2f} mrad"
+    )

@@ -1,0 +1,178 @@
+"""Training windows over episodes: what was seen on the last ticks, and what was done on the next.
+
+Touch is embedded once, by a frozen encoder, and kept on disk beside what it was made from.
+"""
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float16, Float32, Int
+from torch import Tensor
+from tqdm import tqdm
+
+from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
+from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.policies.policy import Condition, PolicyConfig
+
+_IDENTITY = "cache.json"
+
+
+@dataclass(frozen=True)
+class TouchEmbedder:
+    """A frozen encoder of both fingertips.
+
+    Attributes:
+        name: changes whenever the embeddings would; becomes `PolicyConfig.touch`.
+        dim: of both fingertips together.
+        embed: an episode with the columns `vocabulary.TACTILE` to a row for each frame.
+    """
+
+    name: str
+    dim: int
+    embed: Callable[[Episode], Float32[np.ndarray, "t e"]]
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """n ticks of several episodes, one after the other.
+
+    Attributes:
+        touch: embeddings of both fingertips; float16, as they are many.
+        state: proprioception.
+        actions: `vocabulary.ACTION`.
+        lengths: ticks of each episode.
+    """
+
+    touch: Float16[Tensor, "n e"]
+    state: Float32[Tensor, "n s"]
+    actions: Float32[Tensor, "n 8"]
+    lengths: tuple[int, ...]
+
+
+def read(
+    episodes: EpisodeSet,
+    chosen: Sequence[int],
+    config: PolicyConfig,
+    embedder: TouchEmbedder | None,
+    cache: Path,
+) -> Recorded:
+    """Reads episodes, embedding those that the cache has not; a kill loses one of them at most.
+
+    Args:
+        episodes: the set.
+        chosen: which of them, e.g. the successful ones.
+        config: says which columns are read.
+        embedder: of touch; None for a policy without.
+        cache: folder for the embeddings of this set by this embedder.
+
+    Raises:
+        UserError: nothing chosen, a missing column, another rate or embedder than the config's, or
+            a cache of another set or embedder.
+    """
+    _check(episodes, chosen, config, embedder)
+    if embedder:
+        _open_cache(cache, episodes, embedder)
+    keys = [*config.proprioception, v.ACTION]
+    touch, state, actions = [], [], []
+    for i in tqdm(chosen, desc="episodes", unit="episode"):
+        frames = episodes.read(i, keys).frames
+        state.append(np.concatenate([frames[key] for key in config.proprioception], 1))
+        actions.append(frames[v.ACTION])
+        if embedder:
+            touch.append(_embed(episodes, i, embedder, cache / f"{i:06d}.npy"))
+        else:
+            touch.append(np.empty((len(actions[-1]), 0), np.float16))
+    parts = (torch.from_numpy(np.concatenate(rows)) for rows in (touch, state, actions))
+    return Recorded(*parts, lengths=tuple(len(rows) for rows in actions))
+
+
+def _check(
+    episodes: EpisodeSet,
+    chosen: Sequence[int],
+    config: PolicyConfig,
+    embedder: TouchEmbedder | None,
+) -> None:
+    if not chosen:
+        raise UserError(f"no episode of {episodes.root} to learn from: record successful ones")
+    if episodes.fps != config.control_hz:
+        raise UserError(
+            f"{episodes.root} runs at {episodes.fps} Hz, the policy at {config.control_hz}: set "
+            "control_hz to the episodes' rate"
+        )
+    made = (embedder.name, embedder.dim) if embedder else (config.touch, 0)
+    if made != (config.touch, config.touch_dim):
+        raise UserError(
+            f"the policy wants touch {config.touch!r} of width {config.touch_dim}, this is "
+            f"{made[0]!r} of width {made[1]}: make its config for this embedder"
+        )
+
+
+def _open_cache(cache: Path, episodes: EpisodeSet, embedder: TouchEmbedder) -> None:
+    identity = {"touch": embedder.name, "episodes": str(episodes.root.resolve())}
+    path = cache / _IDENTITY
+    if not path.exists():
+        cache.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(identity) + "\n")
+    if json.loads(path.read_text()) != identity:
+        raise UserError(f"{cache} caches other episodes or another encoder: choose another folder")
+
+
+def _embed(
+    episodes: EpisodeSet, i: int, embedder: TouchEmbedder, path: Path
+) -> Float16[np.ndarray, "t e"]:
+    if not path.exists():
+        rows = embedder.embed(episodes.read(i, v.TACTILE)).astype(np.float16)
+        with open(temporary := path.with_suffix(".tmp"), "wb") as file:
+            np.save(file, rows)
+        os.replace(temporary, path)
+    rows = np.load(path)
+    if rows.shape != (episodes.lengths[i], embedder.dim):
+        raise UserError(f"{path} does not fit episode {i} of {episodes.root}: delete {path.parent}")
+    return rows
+
+
+class Windows:
+    """One window for every recorded tick.
+
+    Before an episode's start its first observation is repeated, and after its end its last action,
+    which is to stay: as in diffusion_policy.
+    """
+
+    def __init__(self, recorded: Recorded, config: PolicyConfig) -> None:
+        """Windows of the config's horizons."""
+        self.recorded = recorded
+        ends = np.cumsum(recorded.lengths)
+        first = np.repeat(ends - recorded.lengths, recorded.lengths)[:, None]
+        last = np.repeat(ends - 1, recorded.lengths)[:, None]
+        tick = np.arange(ends[-1])[:, None]
+        seen = tick + np.arange(1 - config.observation_horizon, 1)
+        done = tick + np.arange(config.prediction_horizon)
+        self._seen = torch.from_numpy(np.maximum(seen, first))
+        self._done = torch.from_numpy(np.minimum(done, last))
+
+    def __len__(self) -> int:
+        """Number of windows."""
+        return len(self._seen)
+
+    @property
+    def joints(self) -> Float[Tensor, "n 7"]:
+        """Joint positions at the latest tick of every window, rad."""
+        return self.recorded.state[:, : v.N_JOINTS]
+
+    @property
+    def actions(self) -> Float[Tensor, "n h 8"]:
+        """What was done in every window."""
+        return self.recorded.actions[self._done]
+
+    def take(self, rows: Int[Tensor, " b"]) -> tuple[Condition, Float[Tensor, "b h 8"]]:
+        """Some windows: what was seen, what was done."""
+        seen, recorded = self._seen[rows], self.recorded
+        condition = Condition(recorded.touch[seen].float(), recorded.state[seen])
+        return condition, recorded.actions[self._done[rows]]
