@@ -19,7 +19,6 @@ from touchgoal.control.protocols import ArmReading, DriverError, Joints
 from touchgoal.control.tracker import Tracker, TrackerState
 
 _LATE = 4  # periods that a late tick makes up for at once
-_RECOVERY = 15.0  # s that a recovery may take
 _BRAKING = 1.5  # s for coming to rest on closing
 _REST, _LOOK = 0.01, 0.05  # rad/s over so many s that count as rest
 
@@ -46,28 +45,29 @@ class ArmConfig:
 class ArmClient(ABC):
     """In the child: a vendor's client behind five methods. `config.rate` times a second it ticks.
 
-    After `silence` s without news of the controller the arm counts as lost.
+    When the link is lost, `silence` s without news of the controller included, the process ends:
+    no library mends its link while nobody looks, and a controller stops the arm of a dead client.
     """
 
     silence: float
     _commanded: Joints  # the controller's own present command, rad; `_measure` sets it
 
-    def __init__(self, config: ArmConfig) -> None:
+    def __init__(self, config: ArmConfig, recover: bool) -> None:
         self.config, self.period = config, 1 / config.rate
         self._state: TrackerState | None = None
-        self._refusal, self._lost = "", False
-        self._tracker = Tracker(self._connect(), 1 / config.hz, self.period)
+        self._tracker = Tracker(self._connect(recover), 1 / config.hz, self.period)
         self._clock, self._stamp = -1.0, time.monotonic()
         self._reading = self._measure()
+        self._refusal = self._reading.fault
         self._ticked = time.monotonic()
 
     @abstractmethod
-    def _connect(self) -> JointLimits:
-        """Take the arm, again if need be; what the stream may use. The library's errors may pass."""
+    def _connect(self, recover: bool) -> JointLimits:
+        """Take the arm, clearing its errors if a person asked for that; what the stream may use."""
 
     @abstractmethod
     def _measure(self) -> ArmReading:
-        """The newest state, stamped by `_stamped`; an exception means that the arm is lost."""
+        """The newest state, stamped by `_stamped`. It and `_send` raise when the link is lost."""
 
     @abstractmethod
     def _send(self, q: Joints, velocity: Joints) -> None:
@@ -100,52 +100,37 @@ class ArmClient(ABC):
         """Brake, and take no command until `recover`."""
         self._latch("stopped on request; recover the arm to go on")
 
-    def recover(self) -> None:
-        """Connect anew, which clears what the controller lets a client clear."""
-        self._let_go()
-        self._connect()
-        self._reading, self._lost = self._measure(), False
-        self._refusal = self._reading.fault
-        if self._refusal:
-            raise DriverError(f"not recovered: {self._refusal}")
-
     def tick(self) -> None:
         """Read the state and stream the next command."""
         now = time.monotonic()
         periods = min(max(round((now - self._ticked) / self.period), 1), _LATE)
         punctual = now - self._ticked < self.silence / 2
         self._ticked = now
-        if self._lost:
-            return
-        try:
-            self._reading = self._measure()
-        except Exception as error:
-            self._lose(f"{_line(error)}; check power and cable, then recover the arm")
-            return
+        self._reading = self._measure()
         if punctual and now - self._reading.stamp > self.silence:
-            self._lose(f"no state for {1e3 * self.silence:.0f} ms: check the cable, then recover")
-        elif self._reading.fault:
+            raise DriverError(
+                f"no state for {1e3 * self.silence:.0f} ms: check power and cable, then recover"
+            )
+        if self._reading.fault:
             self._latch(self._reading.fault)
         if self._state is None:
             return
         before = self._state.q
         for _ in range(periods):
             self._state = self._tracker.step(self._state)
-        try:
-            self._send(self._state.q, (self._state.q - before) / (periods * self.period))
-        except Exception as error:
-            self._latch(f"{_line(error)}; recover the arm to go on")
+        self._send(self._state.q, (self._state.q - before) / (periods * self.period))
 
     def close(self) -> None:
         """Bring the arm to rest and let go of it."""
         self._latch("closed")
         end = time.monotonic() + _BRAKING
-        while time.monotonic() < end and not self._lost:
-            before = self._reading.q
-            time.sleep(_LOOK)
-            self.tick()
-            if np.abs(self._reading.q - before).max() < _REST * _LOOK:
-                break
+        with suppress(Exception):
+            while time.monotonic() < end:
+                before = self._reading.q
+                time.sleep(_LOOK)
+                self.tick()
+                if np.abs(self._reading.q - before).max() < _REST * _LOOK:
+                    break
         self._let_go()
 
     def _latch(self, reason: str) -> None:
@@ -155,12 +140,6 @@ class ArmClient(ABC):
             self._refusal = reason
             with suppress(Exception):
                 self._halt()
-
-    def _lose(self, reason: str) -> None:
-        """The link is gone: let go before the client's library tries to mend it by itself."""
-        self._latch(reason)
-        self._lost = True
-        self._let_go()
 
     def _let_go(self) -> None:
         with suppress(Exception):
@@ -179,28 +158,34 @@ class ArmProcess:
     def __init__(
         self, client: type[ArmClient], config: ArmConfig, connect_timeout: float = 10.0
     ) -> None:
-        self._make = lambda: Child(client, config, connect_timeout=connect_timeout)
-        self._child = self._make()
+        self._make = lambda recover: Child(client, config, recover, connect_timeout=connect_timeout)
+        self._child = self._make(False)
+        self._last: ArmReading = self._child.call("read")
 
     def read(self) -> ArmReading:
-        """See Arm."""
-        return self._child.call("read")
+        """See Arm. Of a lost arm it is the last reading, with the reason as its fault."""
+        try:
+            self._last = self._child.call("read")
+        except DriverError as error:
+            self._last = replace(self._last, fault=str(error))
+        return self._last
 
     def command(self, q: Joints) -> None:
         """See Arm."""
         self._child.call("command", q)
 
     def stop(self) -> None:
-        """See Arm."""
-        self._child.call("stop")
+        """See Arm. There is nothing to do for a lost arm: its controller stops it."""
+        if self._child.alive:
+            with suppress(DriverError):
+                self._child.call("stop")
 
     def recover(self) -> None:
-        """See Arm. A child that crashed is replaced."""
-        if self._child.alive:
-            self._child.call("recover", timeout=_RECOVERY)
-        else:
-            self._child.close()
-            self._child = self._make()
+        """See Arm."""
+        self._child.close()
+        self._child = self._make(True)
+        if fault := self.read().fault:
+            raise DriverError(f"not recovered: {fault}")
 
     def close(self) -> None:
         """See Arm."""
@@ -212,7 +197,3 @@ def moved_wrench(
 ) -> Float[np.ndarray, "6"]:
     """A wrench (N, Nm) about `origin` as seen about `point` (m), all in one frame."""
     return np.concatenate([wrench[:3], wrench[3:] + np.cross(origin - point, wrench[:3])])
-
-
-def _line(error: Exception) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"

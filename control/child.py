@@ -23,6 +23,7 @@ from touchgoal.control.protocols import DriverError
 
 _GRACE = 1.0  # s that the kernel's alarm gives beyond the parent's patience
 _CLOSING = 3.0  # s to bring an arm to rest and disconnect
+_GAVE_UP = 3  # exit code; the reason is the last line of output
 
 
 class ChildDriver(Protocol):
@@ -31,7 +32,7 @@ class ChildDriver(Protocol):
     period: float
 
     def tick(self) -> None:
-        """Keep the device going; an exception ends the child."""
+        """Keep the device going; an exception ends the process at once, without `close`."""
         ...
 
     def close(self) -> None:
@@ -120,6 +121,8 @@ class Child:
         self._output.seek(0)
         lines = self._output.read().decode(errors="replace").split("\n")
         last = next((line.strip()[:200] for line in reversed(lines) if line.strip()), "")
+        if code == _GAVE_UP:
+            return last
         how = signal.Signals(-code).name if code < 0 else f"code {code}"
         return f"{self._name} ended by itself ({how}): {last or 'it said nothing'}"
 
@@ -128,7 +131,13 @@ def _as_sent(error: Exception) -> Exception:
     """An exception that the parent can unpickle without the client's library."""
     if isinstance(error, UserError | DriverError):
         return error
-    return DriverError(f"{type(error).__name__}: {' '.join(str(error).split())}")
+    return DriverError(one_line(error))
+
+
+def one_line(error: Exception) -> str:
+    """What a library says, for a person; the project's own errors are for a person already."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, UserError | DriverError) else f"{type(error).__name__}: {text}"
 
 
 def _alarm(seconds: float) -> None:
@@ -170,14 +179,14 @@ def _main(pipe: Connection) -> None:
     pipe.send((None, None))
     try:
         _serve(driver, pipe)
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        pass  # the parent closed, or is gone
-    finally:
+    except (EOFError, BrokenPipeError, ConnectionResetError):  # the parent closed, or is gone
         _alarm(_CLOSING)
         driver.close()
+    except Exception as error:
+        print(one_line(error), file=sys.stderr, flush=True)
+        os._exit(_GAVE_UP)
 
 
 if __name__ == "__main__":
     _main(Connection(int(sys.argv[1])))
-    sys.stdout.flush()
     os._exit(0)  # a client library's threads must not hold the process back

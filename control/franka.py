@@ -29,7 +29,7 @@ class FrankaClient(ArmClient):
 
     silence = 0.5  # libfranka itself gives up after 1 s
 
-    def _connect(self) -> JointLimits:
+    def _connect(self, recover: bool) -> JointLimits:
         import franky
 
         self._franky, self._aborted = franky, ""
@@ -41,9 +41,8 @@ class FrankaClient(ArmClient):
             default_force_threshold=_FORCE_REFLEX,
             realtime_config=franky.RealtimeConfig.Ignore,
         )
-        mode = franky.RobotMode
-        if self._robot.state.robot_mode == mode.Reflex and not self._robot.recover_from_errors():
-            raise DriverError("the arm's errors cannot be cleared: look at Desk")
+        if recover and self._robot.state.robot_mode == franky.RobotMode.Reflex:
+            self._robot.recover_from_errors()
         return self._limits(self._robot)
 
     def _limits(self, robot: "franky.Robot") -> JointLimits:
