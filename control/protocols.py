@@ -7,7 +7,7 @@ than a time-out; what is broken for good raises DriverError.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -76,6 +76,7 @@ class LoadReading:
     stamp: float
 
 
+@runtime_checkable
 class Arm(Protocol):
     """A position-controlled arm.
 
@@ -104,6 +105,7 @@ class Arm(Protocol):
         ...
 
 
+@runtime_checkable
 class Gripper(Protocol):
     """A parallel gripper; `command` takes the width (m) to go to, or to hold something before it."""
 
@@ -124,6 +126,7 @@ class Gripper(Protocol):
         ...
 
 
+@runtime_checkable
 class Camera(Protocol):
     """A stream of pictures of which only the newest matters."""
 
@@ -146,6 +149,7 @@ class Camera(Protocol):
         ...
 
 
+@runtime_checkable
 class TactileSensor(Camera, Protocol):
     """A fingertip camera whose frames have the shape of its sensor model's."""
 
@@ -155,6 +159,7 @@ class TactileSensor(Camera, Protocol):
         ...
 
 
+@runtime_checkable
 class LoadCell(Protocol):
     """A one-axis force sensor."""
 
