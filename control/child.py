@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection, Pipe
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.protocols import DriverError
@@ -26,6 +26,7 @@ _CLOSING = 3.0  # s to bring an arm to rest and disconnect
 _GAVE_UP = 3  # exit code; the reason is the last line of output
 
 
+@runtime_checkable
 class ChildDriver(Protocol):
     """What runs in the child: `tick` every `period` s, any other method when the parent calls it."""
 
