@@ -1,6 +1,7 @@
 """CasADi kinematics against MuJoCo, and the inverse against the forward."""
 
-import mujoco
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 
@@ -9,8 +10,8 @@ from touchgoal.control.kinematics import (
     FR3_HOME,
     FR3_LOWER,
     FR3_UPPER,
-    UR5E,
     Fr3Kinematics,
+    Kinematics,
     Ur5eKinematics,
     fingers_down,
     rotation_matrix,
@@ -18,26 +19,41 @@ from touchgoal.control.kinematics import (
 )
 from touchgoal.sim_envs.scene import build
 
+if TYPE_CHECKING:
+    import mujoco
 
-def test_forward_and_jacobian_match_mujoco() -> None:
-    model = build([]).compile()
-    data, arm = mujoco.MjData(model), Fr3Kinematics()
-    rng = np.random.default_rng(0)
-    site = model.site("tcp").id
+POSES = 1000
+
+
+def check_against_mujoco(
+    model: "mujoco.MjModel", arm: Kinematics, site: str, dofs: list[int]
+) -> None:
+    """Position, rotation and Jacobian to 1e-9 at random joint positions over the whole range."""
+    import mujoco  # after touchgoal, which chooses the OpenGL platform
+
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
     linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-    dofs = [model.joint(f"fr3_joint{i}").dofadr[0] for i in range(1, 8)]
-    for _ in range(50):
-        q = rng.uniform(FR3_LOWER, FR3_UPPER)
-        data.qpos[:7] = q
+    index = model.site(site).id
+    for _ in range(POSES):
+        q = rng.uniform(arm.arm.lower, arm.arm.upper)
+        data.qpos[dofs] = q
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        mujoco.mj_jacSite(model, data, linear, angular, site)
+        mujoco.mj_jacSite(model, data, linear, angular, index)
         position, rotation = arm.forward(q)
-        # The MJCF rounds the hand's quaternion to 7 digits.
-        np.testing.assert_allclose(position, data.site_xpos[site], atol=1e-9)
-        np.testing.assert_allclose(rotation, data.site_xmat[site].reshape(3, 3), atol=1e-7)
+        np.testing.assert_allclose(position, data.site_xpos[index], atol=1e-9)
+        np.testing.assert_allclose(rotation, data.site_xmat[index].reshape(3, 3), atol=1e-9)
         expected = np.vstack([linear[:, dofs], angular[:, dofs]])
-        np.testing.assert_allclose(arm.jacobian(q), expected, atol=1e-7)
+        np.testing.assert_allclose(arm.jacobian(q), expected, atol=1e-9)
+
+
+def test_fr3_matches_mujoco() -> None:
+    spec = build([])
+    # Franka's MJCF rounds half of -45 degrees to 7 digits.
+    spec.body("hand").quat = np.array([np.cos(np.pi / 8), 0, 0, -np.sin(np.pi / 8)])
+    model = spec.compile()
+    dofs = [int(model.joint(f"fr3_joint{i}").dofadr[0]) for i in range(1, 8)]
+    check_against_mujoco(model, Fr3Kinematics(), "tcp", dofs)
 
 
 def test_inverse_reaches_the_workspace_within_limits() -> None:
@@ -64,11 +80,13 @@ def test_rotation_vector_inverts_rodrigues(angle: float) -> None:
     assert min(np.linalg.norm(found - angle * axis), np.linalg.norm(found + angle * axis)) < 1e-5
 
 
-def _ur5e_in_mujoco() -> mujoco.MjModel:
+def _ur5e_in_mujoco() -> "mujoco.MjModel":
     """The UR5e from its lengths, joint by joint along the controller's base frame at q = 0.
 
     Written from the drawing (axis directions and distances), not from DH frames.
     """
+    import mujoco
+
     axes = [(0, 0, 1), (0, -1, 0), (0, -1, 0), (0, -1, 0), (0, 0, -1), (0, -1, 0)]
     offsets = [
         (0, 0, 0),
@@ -89,23 +107,30 @@ def _ur5e_in_mujoco() -> mujoco.MjModel:
     return spec.compile()
 
 
-def test_ur5e_matches_mujoco_and_its_inverse_returns() -> None:
-    model = _ur5e_in_mujoco()
-    data, arm, rng = mujoco.MjData(model), Ur5eKinematics(tcp_offset=0.0), np.random.default_rng(0)
-    linear, angular = np.zeros((3, 6)), np.zeros((3, 6))
-    for _ in range(50):
-        q = rng.uniform(UR5E.lower, UR5E.upper)
-        data.qpos[:] = q
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_jacSite(model, data, linear, angular, 0)
-        position, rotation = arm.forward(q)
-        np.testing.assert_allclose(position, data.site_xpos[0], atol=1e-9)
-        np.testing.assert_allclose(rotation, data.site_xmat[0].reshape(3, 3), atol=1e-9)
-        np.testing.assert_allclose(arm.jacobian(q), np.vstack([linear, angular]), atol=1e-9)
-    tool = Ur5eKinematics()
-    for _ in range(50):
-        position = rng.uniform([0.38, -0.25, 0.017], [0.62, 0.25, 0.3])
-        rotation = fingers_down(rng.uniform(-1.5, 1.5))
-        reached, _ = tool.forward(tool.reach(position, rotation, UR5E.home))
+def test_ur5e_matches_mujoco() -> None:
+    check_against_mujoco(
+        _ur5e_in_mujoco(), Ur5eKinematics(tcp_offset=0.0), "flange", list(range(6))
+    )
+
+
+@pytest.mark.parametrize("arm", [Fr3Kinematics(), Ur5eKinematics()], ids=["FR3", "UR5e"])
+def test_what_is_reachable_is_reached_in_any_orientation(arm: Kinematics) -> None:
+    """999 of 1000 poses that some joint positions have, inside the box over the table."""
+    rng, limits = np.random.default_rng(7), arm.arm
+    lower, upper = np.maximum(limits.lower, -np.pi) + 0.05, np.minimum(limits.upper, np.pi) - 0.05
+    missed, count = 0, 0
+    while count < POSES:
+        position, rotation = arm.forward(rng.uniform(lower, upper))
+        if not (np.abs(position - [0.5, 0, 0.3]) < [0.25, 0.45, 0.3]).all():
+            continue
+        count += 1
+        try:
+            q = arm.reach(position, rotation, limits.home)
+        except UserError:
+            missed += 1
+            continue
+        assert (q > limits.lower).all() and (q < limits.upper).all()
+        reached, turned = arm.forward(q)
         assert np.linalg.norm(reached - position) < 1e-4
+        assert np.linalg.norm(rotation_vector(turned @ rotation.T)) < 1e-3
+    assert missed <= POSES // 1000
