@@ -4,6 +4,7 @@ Frames: `base` is the robot's first link, `flange` its last, `tcp` the tool cent
 the two fingertip sensors. Positions in metres, rotations as 3x3 matrices, angles in radians.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi
@@ -93,22 +94,23 @@ FR3 = Arm("FR3", _FR3_LINKS, 0.107, -np.pi / 4, FR3_LOWER, FR3_UPPER, FR3_HOME)
 UR5E = Arm("UR5e", _UR5E_LINKS, 0.0996, 0.0, UR5E_LOWER, UR5E_UPPER, UR5E_HOME)
 
 
+def _frames(arm: Arm, q: casadi.SX) -> list[tuple[casadi.SX, casadi.SX]]:
+    """Origin and rotation of the base, of each link behind its joint, and of the hand."""
+    p, R = casadi.SX.zeros(3), casadi.SX.eye(3)
+    frames = [(p, R)]
+    for i, (offset, twist) in enumerate(arm.links):
+        p = p + R @ casadi.DM(offset)
+        R = R @ _rotation("x", twist) @ _rotation("z", q[i])
+        frames.append((p, R))
+    return [*frames, (p + R[:, 2] * arm.flange, R @ _rotation("z", arm.hand_yaw))]
+
+
 def _chain(arm: Arm, tcp_offset: float) -> casadi.Function:
     """CasADi function q -> TCP position (3), rotation (3, 3), geometric Jacobian (6, n)."""
     q = casadi.SX.sym("q", len(arm.links))
-    p, R = casadi.SX.zeros(3), casadi.SX.eye(3)
-    origins, axes = [], []
-    for i, (offset, twist) in enumerate(arm.links):
-        p = p + R @ casadi.DM(offset)
-        R = R @ _rotation("x", twist)
-        origins.append(p)
-        axes.append(R[:, 2])
-        R = R @ _rotation("z", q[i])
-    p = p + R[:, 2] * (arm.flange + tcp_offset)
-    R = R @ _rotation("z", arm.hand_yaw)
-    columns = [
-        casadi.vertcat(casadi.cross(z, p - o), z) for o, z in zip(origins, axes, strict=True)
-    ]
+    _, *joints, (hand, R) = _frames(arm, q)
+    p = hand + R[:, 2] * tcp_offset
+    columns = [casadi.vertcat(casadi.cross(r[:, 2], p - o), r[:, 2]) for o, r in joints]
     return casadi.Function("chain", [q], [p, R, casadi.horzcat(*columns)])
 
 
@@ -247,16 +249,23 @@ class Kinematics:
             f"{solution.rotation_error:.3f} rad); move the target closer"
         )
 
-    def track(self, points: Float[np.ndarray, "k 3"]) -> casadi.Function:
-        """CasADi function of joint positions (n, m) -> points (m) fixed to the hand.
+    def track(
+        self, points: Float[np.ndarray, "k 3"], frames: Sequence[int] | None = None
+    ) -> casadi.Function:
+        """CasADi function of joint positions (n, m) -> points (m) fixed to parts of the arm.
 
-        `points` lie in the hand frame (m); the result (3, m k) has the k points of the first
-        column first, in the base frame.
+        `frames` says of each point which part it is on and in whose frame it is given (m): 0 the
+        base, i the link behind joint i, n + 1 the hand; None: all on the hand. The result (3, m k)
+        has the k points of the first column first, in the base frame.
         """
         q = casadi.SX.sym("q", self.arm.home.size)
-        p, R, _ = _chain(self.arm, 0.0)(q)
-        placed = [p + R @ casadi.DM(point) for point in points]
-        return casadi.Function("points", [q], [casadi.horzcat(*placed)])
+        placed = _frames(self.arm, q)
+        on = frames or [len(placed) - 1] * len(points)
+        columns = [
+            placed[i][0] + placed[i][1] @ casadi.DM(point)
+            for i, point in zip(on, points, strict=True)
+        ]
+        return casadi.Function("points", [q], [casadi.horzcat(*columns)])
 
 
 class Fr3Kinematics(Kinematics):

@@ -98,6 +98,7 @@ class RobotLimits:
         finger_edges: those edges in the hand frame (m).
         force, torque: N and Nm from outside at the TCP and in a joint, below the reflex.
         touch: N, normal force on one fingertip.
+        stroke: m, least and largest width that a gripper is asked for.
     """
 
     arm: Arm
@@ -112,6 +113,7 @@ class RobotLimits:
     force: float = 15.0
     torque: float = 10.0
     touch: float = 15.0
+    stroke: tuple[float, float] = (0.0, 0.08)  # of the Franka Hand
 
     # Franka Hand fully open (80 mm) with GelSight Minis: outer faces 28.3 mm behind the gels, lower
     # edges half of 32.5 mm below the sensor's centre (GelSight STEP file), rounded outwards.

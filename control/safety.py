@@ -169,6 +169,16 @@ class Safety:
             return self._brake(state, Mode.HOLD, stale, None)
         return self._move(state, action)
 
+    def width(self, state: SafetyState, target: float, last: float) -> float:
+        """The gripper width (m) to command in the tick that led to `state`.
+
+        The target inside the stroke; the last command while the arm holds or is stopped, so that
+        nothing is dropped or squeezed then, and for a target that is not finite.
+        """
+        if state.mode is not Mode.MOVE or not np.isfinite(target):
+            return last
+        return float(np.clip(target, *self.limits.stroke))
+
     def inside_workspace(self, q: Float[np.ndarray, "k n"]) -> Bool[np.ndarray, " k"]:
         """Whether flange and finger edges lie in their boxes, for each of k postures."""
         points = self.monitored(q)

@@ -174,3 +174,17 @@ def test_no_start_outside(robot: RobotLimits) -> None:
     turned[0] += 2.0
     with pytest.raises(UserError, match="workspace"):
         layer.start(turned)
+
+
+@given(st.floats(width=64))
+def test_the_gripper_is_asked_for_widths_inside_its_stroke_and_kept_while_the_arm_holds(
+    target: float,
+) -> None:
+    layer = LAYERS["FR3"]
+    start = layer.start(layer.limits.arm.home)
+    moving = layer.advance(start, np.zeros(7), reading(start.q))
+    width = layer.width(moving, target, 0.03)
+    assert width == (np.clip(target, 0, 0.08) if np.isfinite(target) else 0.03)
+    for age in (0.2, 1.0):  # hold, stop
+        held = layer.advance(moving, np.zeros(7), reading(start.q, state_age=age))
+        assert layer.width(held, target, 0.03) == 0.03
