@@ -183,7 +183,11 @@ class ArmProcess:
     def recover(self) -> None:
         """See Arm."""
         self._child.close()
-        self._child = self._make(True)
+        try:
+            self._child = self._make(True)
+        except DriverError as error:
+            self._child.end = f"not recovered: {error}"
+            raise
         if fault := self.read().fault:
             raise DriverError(f"not recovered: {fault}")
 

@@ -47,6 +47,9 @@ class Child:
     `driver` is a class at the top of an importable module; arguments and answers are pickled. Calls
     may come from several threads, not from a signal handler.
 
+    Attributes:
+        end: why there is no process any more; empty while there is.
+
     Raises:
         UserError, DriverError: what the driver raised, or it did not connect in time.
     """
@@ -55,7 +58,7 @@ class Child:
         self, driver: Callable[..., ChildDriver], *args: Any, connect_timeout: float = 10.0
     ) -> None:
         self._name, self._lock = driver.__qualname__, threading.Lock()
-        self._end = ""  # why there is no process any more
+        self.end = ""
         self._output = tempfile.TemporaryFile()
         self._pipe, theirs = Pipe()
         # Its own session: Ctrl-C is for the parent, which then stops the arm in good order.
@@ -87,7 +90,7 @@ class Child:
                 self._process.wait(_CLOSING + _GRACE)
             except subprocess.TimeoutExpired:
                 self._kill()
-        self._end = self._end or f"{self._name} is closed"
+        self.end = self.end or f"{self._name} is closed"
         self._pipe.close()
         self._output.close()
 
@@ -97,15 +100,15 @@ class Child:
                 self._pipe.send(request)
                 if not self._pipe.poll(timeout):
                     self._kill()
-                    self._end = (
+                    self.end = (
                         f"{self._name} did not {what} within {timeout:g} s and was ended: check "
                         "power, cable and address, and that no other program holds the device"
                     )
-                    raise DriverError(self._end)
+                    raise DriverError(self.end)
                 failure, result = self._pipe.recv()
             except (EOFError, OSError) as error:
-                self._end = self._end or self._obituary()
-                raise DriverError(self._end) from error
+                self.end = self.end or self._obituary()
+                raise DriverError(self.end) from error
         if failure is not None:
             raise failure
         return result

@@ -6,6 +6,8 @@ process, and only a person's `recover` starts a new one. The controller's own wa
 arm if this process dies.
 """
 
+import time
+
 import numpy as np
 
 from touchgoal.control.arm_process import ArmClient, ArmConfig, ArmProcess, moved_wrench
@@ -17,6 +19,7 @@ RATE = 125.0  # Hz of servoJ; 20 to 500
 _GAIN = 300.0  # of servoJ, 100 to 2000; URScript's default
 _LOOKAHEAD = 0.03, 0.2  # s, servoJ's range; the arm lags by about this much
 _BRAKING = 10.0  # rad/s^2 of servoStop; ur-rtde's default
+_UNLOCKING = 2.0  # s that clearing a protective stop may take
 _WATCHDOG = 10.0  # Hz; with fewer commands the controller stops its program, and so the arm
 
 
@@ -32,12 +35,27 @@ class UrClient(ArmClient):
         self._kinematics = Kinematics(self.config.robot.arm, self.config.tcp_offset)
         self._refused = False
         self._receive = RTDEReceiveInterface(self.config.address)
+        if recover and self._receive.isProtectiveStopped():
+            self._unlock()
         if self._stopped():
             raise DriverError(self._stopped())
         self._control = RTDEControlInterface(self.config.address)
         self._control.setWatchdog(_WATCHDOG)
         self._lookahead = float(np.clip(2 * self.period, *_LOOKAHEAD))
         return self.config.robot.interface
+
+    def _unlock(self) -> None:
+        """As a person does it at the pendant; the controller refuses for the first 5 s."""
+        from dashboard_client import DashboardClient
+
+        dashboard = DashboardClient(self.config.address)
+        dashboard.connect(int(1e3 * _UNLOCKING))
+        dashboard.closeSafetyPopup()
+        dashboard.unlockProtectiveStop()
+        end = time.monotonic() + _UNLOCKING
+        while self._receive.isProtectiveStopped() and time.monotonic() < end:
+            time.sleep(0.05)
+        dashboard.disconnect()
 
     def _measure(self) -> ArmReading:
         receive = self._receive
@@ -65,7 +83,9 @@ class UrClient(ArmClient):
         if self._receive.isEmergencyStopped():
             return "emergency stop: release it and restart the arm at the pendant, then recover"
         if self._receive.isProtectiveStopped():
-            return "protective stop: clear the cause, unlock at the pendant after 5 s, then recover"
+            return (
+                "protective stop: clear the cause, wait 5 s, then recover or unlock at the pendant"
+            )
         return ""
 
     def _fault(self) -> str:
