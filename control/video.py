@@ -5,6 +5,7 @@ A thread empties the driver's queue into one slot: a slow reader of a queue sees
 source that fails is opened again until it comes back, and meanwhile frames keep their old stamps.
 """
 
+import os
 import time
 from collections import deque
 from dataclasses import dataclass
@@ -15,6 +16,10 @@ import numpy as np
 from touchgoal.control.errors import UserError
 from touchgoal.control.newest import Newest
 from touchgoal.control.protocols import Frame
+
+# A lost stream is told in `trouble`; what the libraries print about it would tear a live view apart.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 _READ_TIMEOUT = 1000  # ms without a frame after which OpenCV gives up on a stream
 _REOPEN = 0.5  # s between attempts
