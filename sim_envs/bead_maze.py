@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
-from touchgoal.control.kinematics import FR3_HOME, fingers_across
+from touchgoal.control.kinematics import fingers_across
 from touchgoal.sim_envs import wires
 from touchgoal.sim_envs.base import EnvConfig, FrankaTactileEnv, Observation
 from touchgoal.sim_envs.objects import HARD, Body, Material, ObjectKind, Texture
@@ -95,7 +95,7 @@ class BeadMaze(FrankaTactileEnv):
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control tick; the reward is the tick's gain in progress."""
         action = np.asarray(action, dtype=np.float64)
-        if self.config.disturbance > 0 and action.shape == (8,):
+        if self.config.disturbance > 0 and action.shape == self.action_space.shape:
             action = action + np.append(self._stray(), 0.0)
         observation, reward, success, truncated, info = super().step(action)
         return observation, reward, success or bool(self.failure.any()), truncated, info
@@ -146,8 +146,8 @@ class BeadMaze(FrankaTactileEnv):
         point, tangent = self.wire.at(START)
         R = fingers_across(tangent)
         offset = R @ np.array([rng.uniform(-0.001, 0.001), 0.0, rng.uniform(-0.001, 0.001)])
-        guess = FR3_HOME.copy()
-        guess[6] -= np.arctan2(tangent[1], tangent[0])  # the hand's yaw
+        guess = self.robot.arm.home.copy()
+        guess[-1] -= np.arctan2(tangent[1], tangent[0])  # the hand's yaw
         return self.kinematics.reach(point + offset, R, guess)
 
     def _settle(self) -> None:
@@ -156,9 +156,9 @@ class BeadMaze(FrankaTactileEnv):
         self._opening = BEAD_RADIUS + 0.004
         self.data.qpos[self._fingers] = self._opening
         self.data.eq_active[fixture] = 1
-        self._advance(np.zeros(v.N_JOINTS), 0.0, seconds=0.3)
+        self._advance(np.zeros(self.n_joints), 0.0, seconds=0.3)
         self.data.eq_active[fixture] = 0
-        self._advance(np.zeros(v.N_JOINTS), 0.0, seconds=0.2)
+        self._advance(np.zeros(self.n_joints), 0.0, seconds=0.2)
 
     def _stray(self) -> Float[np.ndarray, "7"]:
         """Joint change (rad) that nobody commanded: a random walk of the hand's velocity."""

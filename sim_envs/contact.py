@@ -8,6 +8,13 @@ from jaxtyping import Float
 
 from touchgoal.sim_envs.scene import SIDES
 
+_CONTACT = tuple(
+    int(kind)
+    for kind in (
+        mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS,
+        mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC,
+    )
+)
 SLIP_SPEED = 1e-3  # m/s of sliding between pad and object that counts as slip
 
 
@@ -87,6 +94,12 @@ class ContactReader:
             PadContact(force[s], torque[s], slip[s], frozenset(geoms[s])) for s in range(2)
         )
         return (left, right), external
+
+    def joint_torque(self, data: mujoco.MjData) -> Float[np.ndarray, "nv"]:
+        """Generalised force of all contacts, J^T f; what the hand does to itself cancels out."""
+        contact = np.isin(data.efc_type, _CONTACT)
+        jacobian = data.efc_J.reshape(-1, self._model.nv)
+        return data.efc_force[contact] @ jacobian[contact]
 
     def touches(self, data: mujoco.MjData, one: int, other: int) -> bool:
         """Whether two geoms are in contact."""
