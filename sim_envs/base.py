@@ -118,7 +118,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self._place(rng)
         self.command = self.start_joints(rng)
         self._opening = GRIPPER_MAX_WIDTH / 2
-        self.data.qpos[self._arm] = self.command
+        self.data.qpos[self.arm_positions] = self.command
         self.data.qpos[self._fingers] = self._opening
         self._ticks = 0
         self._settle()
@@ -219,15 +219,23 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
 
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
         """Joint positions (rad) and velocities (rad/s)."""
-        return self.data.qpos[self._arm], self.data.qvel[self._arm_dof]
+        return self.data.qpos[self.arm_positions], self.data.qvel[self.arm_dofs]
 
     def joint_contact_torque(self) -> np.ndarray:
         """Torque (N m) on each joint of what touches the robot, from the last physics step."""
-        return self._reader.joint_torque(self.data)[self._arm_dof]
+        return self._reader.joint_torque(self.data)[self.arm_dofs]
 
     def width(self) -> float:
         """Of the gripper, m."""
         return float(self.data.qpos[self._fingers].sum())
+
+    def width_target(self) -> float:
+        """Where the gripper has been sent, m."""
+        return 2 * self._opening
+
+    def external_wrench(self) -> Float[np.ndarray, "6"]:
+        """Force (N) and torque (N m) from outside at the TCP, base frame, at the last `refresh`."""
+        return self._external
 
     def picture(self, camera: str) -> UInt8[np.ndarray, "h w 3"]:
         """What a camera sees, RGB."""
@@ -250,8 +258,8 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.model = model = self.scene(self.config.scene).compile()
         self.data = mujoco.MjData(model)
         joints = [model.joint(name) for name in arm_joints(self.config.scene.arm)]
-        self._arm = [joint.qposadr[0] for joint in joints]
-        self._arm_dof = [joint.dofadr[0] for joint in joints]
+        self.arm_positions = [joint.qposadr[0] for joint in joints]
+        self.arm_dofs = [joint.dofadr[0] for joint in joints]
         self._fingers = [model.joint(f"finger_joint{i}").qposadr[0] for i in (1, 2)]
         self._gripper = model.actuator("gripper").id
         self._tcp = model.site("tcp").id

@@ -8,13 +8,10 @@ from jaxtyping import Float
 
 from touchgoal.sim_envs.scene import SIDES
 
-_CONTACT = tuple(
-    int(kind)
-    for kind in (
-        mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS,
-        mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC,
-    )
-)
+# Which of the solver's kinds of constraint are contacts (with elliptic cones).
+_IS_CONTACT = np.zeros(16, bool)
+_IS_CONTACT[int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)] = True
+_IS_CONTACT[int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)] = True
 SLIP_SPEED = 1e-3  # m/s of sliding between pad and object that counts as slip
 
 
@@ -95,9 +92,9 @@ class ContactReader:
         )
         return (left, right), external
 
-    def joint_torque(self, data: mujoco.MjData) -> Float[np.ndarray, "nv"]:
+    def joint_torque(self, data: mujoco.MjData) -> Float[np.ndarray, " nv"]:
         """Generalised force of all contacts, J^T f; what the hand does to itself cancels out."""
-        contact = np.isin(data.efc_type, _CONTACT)
+        contact = _IS_CONTACT[data.efc_type]
         jacobian = data.efc_J.reshape(-1, self._model.nv)
         return data.efc_force[contact] @ jacobian[contact]
 
