@@ -14,6 +14,7 @@ from touchgoal.sim_envs.scene import GRIPPER_MAX_FORCE, SERVO_DAMPING
 DT = 1e-3  # s, of the Franka control interface and of the physics
 AT_REST = 0.01  # rad/s
 _FILTER = 0.02  # s, first order: how fast the arm's estimate of external torque follows; our choice
+_YIELD = 0.02  # s, likewise: how fast an arm that was hit gives way; our choice
 
 Joints = Float[np.ndarray, " n"]
 
@@ -72,6 +73,7 @@ class Cell:
         self._friction = model.dof_frictionloss.copy()
         self._torque: Joints | None = None
         self._braking: Joints | None = None
+        self._yielding = False
         self.time, self._steps = 0.0, 0
         self.q_d, self.dq_d, self.tau_ext = env.command.copy(), np.zeros(n), np.zeros(n)
         self.q, self.dq = env.joints()
@@ -93,12 +95,17 @@ class Cell:
             self._release(torque=True)
         self._torque = torque
 
-    def brake(self, acceleration: Joints, measured: bool = False) -> None:
-        """Come to rest from the set-point, or from where the arm is; rad/s^2 for each joint."""
-        if measured or self._torque is not None:
+    def brake(self, acceleration: Joints) -> None:
+        """Bring the set-point to rest, by rad/s^2 for each joint."""
+        if self._torque is not None:
             self.q_d, self.dq_d = self.q.copy(), self.dq.copy()
         self._release(torque=False)
         self._braking = acceleration
+
+    def yield_(self) -> None:
+        """Stop here, at once, as hard as the joints can, and then give way to what presses."""
+        self._release(torque=False)
+        self.q_d, self.dq_d, self._yielding = self.q.copy(), np.zeros_like(self.dq), True
 
     def grasp(self, width: float, speed: float, force: float) -> None:
         """Send the gripper to `width` (m) at `speed` (m/s), pressing with `force` (N) a finger."""
@@ -116,6 +123,8 @@ class Cell:
         if self._braking is not None:
             self.dq_d = braked(self.dq_d, self._braking, DT)
             self.q_d = self.q_d + DT * self.dq_d
+        if self._yielding:
+            self.q_d = self.q_d + (DT / _YIELD) * (self.q - self.q_d)
         env.grasp_force = self.grip.force
         if self._torque is not None:
             env.data.qfrc_applied[env.arm_dofs] = self._torque
@@ -203,8 +212,8 @@ class Cell:
         worst.speed = max(worst.speed, float((np.abs(self.dq) / limits.velocity).max()))
 
     def _release(self, torque: bool) -> None:
-        """Leave braking, and change between position servo and torque control."""
-        self._braking = None
+        """Leave braking and yielding, and change between position servo and torque control."""
+        self._braking, self._yielding = None, False
         if torque == (self._torque is not None):
             return
         env, n = self.env, self.env.n_joints

@@ -69,7 +69,7 @@ class FrankaArm:
         self._motion: Motion | None = None
         self._recovery: wire.Request | None = None
         self._sent = self._echoed = 0
-        self._success = 0.0
+        self._success = 1.0
         self._thresholds = Thresholds.default()
         self._ee, self._k = np.eye(4), np.eye(4)  # NE_T_EE and EE_T_K
         self._state = np.zeros((), wire.ROBOT_STATE)
@@ -88,7 +88,7 @@ class FrankaArm:
             self._end(None)
         elif motion is not None and motion.begun:
             self._wait(motion)
-        if self._recovery is not None and not self.cell.moving:
+        if self._recovery is not None and not self.cell.moving and self._feel().fault is None:
             self.link.answer(self._recovery, 0)
             self._recovery, self.mode, self.error = None, RobotMode.IDLE, ""
 
@@ -110,8 +110,9 @@ class FrankaArm:
     def abort(self, error: str) -> None:
         """Stop with an error, in any motion or none: the arm brakes and waits for recovery."""
         self.error, self.mode = error, RobotMode.REFLEX
-        touched = error in ("joint_reflex", "cartesian_reflex")
-        self._end(MoveStatus.REFLEX_ABORTED, measured=touched)
+        self._end(MoveStatus.REFLEX_ABORTED)
+        if error in ("joint_reflex", "cartesian_reflex"):
+            self.cell.yield_()
 
     def user_stop(self, pressed: bool) -> None:
         """Press or release the user's stop."""
@@ -121,10 +122,10 @@ class FrankaArm:
         elif self.mode == RobotMode.USER_STOPPED:
             self.mode = RobotMode.IDLE
 
-    def _end(self, status: MoveStatus | None, measured: bool = False) -> None:
+    def _end(self, status: MoveStatus | None) -> None:
         """End the motion, if there is one, tell the client how, and brake."""
         motion, self._motion = self._motion, None
-        self.cell.brake(_STRONGEST, measured)
+        self.cell.brake(_STRONGEST)
         self._rest()
         if motion is not None and status is not None:
             self._send_state(self._feel())  # the error first, as on the robot
@@ -180,7 +181,7 @@ class FrankaArm:
         controller, generator = (int(n) for n in np.frombuffer(request.payload, "<u4", 2))
         if controller == _EXTERNAL:
             generator = _TORQUE
-        self._motion = Motion(request, generator, controller)
+        self._motion, self._success = Motion(request, generator, controller), 1.0
         self.cell.follow(self.cell.q_d.copy(), np.zeros(7))
         self._rest()
         self.link.answer(request, MoveStatus.STARTED)
