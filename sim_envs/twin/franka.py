@@ -139,7 +139,8 @@ class FrankaArm:
             self._move(request)
         elif command == RobotCommand.STOP_MOVE:
             self.link.answer(request, 0)
-            self._end(MoveStatus.PREEMPTED)
+            if self._motion is not None:
+                self._end(MoveStatus.PREEMPTED)
         elif command == RobotCommand.AUTOMATIC_ERROR_RECOVERY:
             if self.mode == RobotMode.USER_STOPPED:
                 self.link.answer(request, 2)  # rejected: a safety function is active
