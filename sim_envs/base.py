@@ -237,6 +237,10 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         """Force (N) and torque (N m) from outside at the TCP, base frame, at the last `refresh`."""
         return self._external
 
+    def table_load(self) -> float:
+        """Force (N) with which objects and robot press down on the table."""
+        return self._reader.load(self.data, self.model.geom("table").id)
+
     def picture(self, camera: str) -> UInt8[np.ndarray, "h w 3"]:
         """What a camera sees, RGB."""
         assert self._renderer is not None

@@ -98,6 +98,16 @@ class ContactReader:
         jacobian = data.efc_J.reshape(-1, self._model.nv)
         return data.efc_force[contact] @ jacobian[contact]
 
+    def load(self, data: mujoco.MjData, geom: int) -> float:
+        """Force (N) with which everything presses down on a geom."""
+        force = 0.0
+        for i in range(data.ncon):
+            contact = data.contact[i]
+            if geom in contact.geom and contact.efc_address >= 0:
+                f, _ = self._wrench(data, i, contact)
+                force += -f[2] if contact.geom[1] == geom else f[2]
+        return float(force)
+
     def touches(self, data: mujoco.MjData, one: int, other: int) -> bool:
         """Whether two geoms are in contact."""
         return any({int(g) for g in pair} == {one, other} for pair in data.contact.geom)

@@ -74,6 +74,7 @@ class Cell:
         self._torque: Joints | None = None
         self._braking: Joints | None = None
         self._yielding = False
+        self._nudge, self._nudged_until = np.zeros(3), 0.0
         self.time, self._steps = 0.0, 0
         self.q_d, self.dq_d, self.tau_ext = env.command.copy(), np.zeros(n), np.zeros(n)
         self.q, self.dq = env.joints()
@@ -112,6 +113,10 @@ class Cell:
         width = float(np.clip(width, 0.0, GRIPPER_MAX_WIDTH))
         self.grip = Grip(width, min(speed, GRIPPER_SPEED), min(force, GRIPPER_MAX_FORCE / 2))
 
+    def nudge(self, force: Float[np.ndarray, "3"], seconds: float) -> None:
+        """Push the hand with a force (N, base frame) for a while, as a person might."""
+        self._nudge, self._nudged_until = force, self.time + seconds
+
     # Time.
 
     def step(self) -> None:
@@ -125,6 +130,7 @@ class Cell:
             self.q_d = self.q_d + DT * self.dq_d
         if self._yielding:
             self.q_d = self.q_d + (DT / _YIELD) * (self.q - self.q_d)
+        pushed = self._push()
         env.grasp_force = self.grip.force
         if self._torque is not None:
             env.data.qfrc_applied[env.arm_dofs] = self._torque
@@ -132,7 +138,7 @@ class Cell:
         env.advance(self.q_d + SERVO_DAMPING * self.dq_d, self.grip.width, self.grip.speed)
         self._steps += 1
         self.time = self._steps * DT
-        self._measure()
+        self._measure(pushed)
         if self._steps % tick == 0:
             env.refresh()
             self.progress, self.success = env.end_tick()
@@ -199,10 +205,22 @@ class Cell:
     def _tick_steps(self) -> int:
         return round(1 / (self.env.config.control_hz * DT))
 
-    def _measure(self) -> None:
+    def _push(self) -> Joints:
+        """Apply the nudge; its torque (N m) on each joint."""
+        env = self.env
+        force = self._nudge if self.time < self._nudged_until else np.zeros(3)
+        hand = env.model.body("hand").id
+        env.data.xfrc_applied[hand, :3] = force
+        if not force.any():
+            return np.zeros(env.n_joints)
+        jacobian = np.zeros((3, env.model.nv))
+        mujoco.mj_jac(env.model, env.data, jacobian, None, env.data.xipos[hand], hand)
+        return force @ jacobian[:, env.arm_dofs]
+
+    def _measure(self, pushed: Joints) -> None:
         env, limits = self.env, self.env.robot.hardware
         self.q, self.dq = env.joints()
-        now = env.joint_contact_torque()
+        now = env.joint_contact_torque() + pushed
         self.tau_ext = self.tau_ext + (DT / _FILTER) * (now - self.tau_ext)
         if self.moving:
             self._rest_since = self.time

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from touchgoal.control.errors import UserError
 from touchgoal.control.kinematics import GELSIGHT_TCP, rotation_vector
 from touchgoal.control.limits import FR3
 from touchgoal.sim_envs.scene import robot_model
@@ -62,10 +63,12 @@ class FrankaArm:
         error: the error in force.
     """
 
-    def __init__(self, cell: Cell, host: str, patience: float) -> None:
+    def __init__(self, cell: Cell, host: str, patience: float, hand: wire.Link) -> None:
+        """`hand`: the hand's link, which shares the arm's cable."""
         self.cell, self.patience = cell, patience
         self.link = wire.Link(host, wire.ROBOT_PORT, wire.ROBOT_VERSION, wide=True)
         self.mode, self.error = RobotMode.IDLE, ""
+        self._hand = hand
         self._motion: Motion | None = None
         self._recovery: wire.Request | None = None
         self._sent = self._echoed = 0
@@ -109,12 +112,22 @@ class FrankaArm:
 
     def abort(self, error: str) -> None:
         """Stop with an error, in any motion or none: the arm brakes and waits for recovery."""
+        if error not in wire.ERRORS:
+            raise UserError(f"there is no error {error!r}; choose from: {', '.join(wire.ERRORS)}")
         self.error, self.mode = error, RobotMode.REFLEX
         self._end(MoveStatus.REFLEX_ABORTED)
         if error in ("joint_reflex", "cartesian_reflex"):
             self.cell.yield_()
 
-    def user_stop(self, pressed: bool) -> None:
+    def freeze(self, frozen: bool) -> None:
+        """Let nothing through in either direction, or let it through again."""
+        self.link.frozen = self._hand.frozen = frozen
+
+    def drop(self) -> None:
+        """Hang up on the client."""
+        self.link.drop()
+
+    def stop_button(self, pressed: bool) -> None:
         """Press or release the user's stop."""
         if pressed:
             self.mode, self.error = RobotMode.USER_STOPPED, ""

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 
+from touchgoal.control.errors import UserError
 from touchgoal.control.limits import UR5E
 from touchgoal.sim_envs.twin import ur_wire as wire
 from touchgoal.sim_envs.twin.cell import DT, Cell
@@ -97,7 +98,17 @@ class UrController:
         self.safety, self._stopped_at = Safety.PROTECTIVE_STOP, self._clock
         self._program.end()
 
-    def emergency_stop(self, pressed: bool) -> None:
+    def abort(self, error: str) -> None:
+        """Stop for a fault; all of a UR's are protective stops."""
+        if error != "protective_stop":
+            raise UserError(f"a UR has no error {error!r}; ask for protective_stop")
+        self.protective_stop()
+
+    def freeze(self, frozen: bool) -> None:
+        """Let nothing through in either direction, or let it through again."""
+        self.frozen = frozen
+
+    def stop_button(self, pressed: bool) -> None:
         """Press the emergency stop, which takes the power off, or release it."""
         self.safety = Safety.ROBOT_EMERGENCY_STOP if pressed else Safety.NORMAL
         if pressed:
