@@ -169,6 +169,10 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
             "sensor": self.sensor.name,
         }
 
+    def layout(self) -> dict[str, list[float]]:
+        """Where things are in the base frame, as plain numbers: the object's pose (m, wxyz)."""
+        return {"object": self.object_pose().tolist()}
+
     def scene(self, config: SceneConfig) -> mujoco.MjSpec:
         """The present episode's scene, built with these options."""
         spec = build(self.bodies, config)

@@ -27,6 +27,8 @@ _CAPSULES = (
 )
 _ARMATURE = (0.2, 0.2, 0.2, 0.1, 0.1, 0.1)  # kg m^2, of rotor and gear: our choice
 
+_RGBA = "0.72 0.76 0.8 1"
+
 
 def with_ur5e(franka: Path) -> str:
     """MJCF of the model in `franka`, its arm replaced by a UR5e that carries the same hand."""
@@ -38,8 +40,16 @@ def with_ur5e(franka: Path) -> str:
             tree.remove(part)
     world.clear()
     base = ET.SubElement(world, "body", name="base", childclass="fr3")
-    foot = {"type": "cylinder", "size": "0.075 0.02", "pos": "0 0 0.02"}
-    ET.SubElement(base, "geom", contype="0", conaffinity="0", **foot, **_LOOK)
+    ET.SubElement(
+        base,
+        "geom",
+        type="cylinder",
+        size="0.075 0.02",
+        pos="0 0 0.02",
+        contype="0",
+        conaffinity="0",
+        rgba=_RGBA,
+    )
     link = base
     for i in range(len(_MASSES)):
         link = _add_link(link, i)
@@ -47,9 +57,6 @@ def with_ur5e(franka: Path) -> str:
     hand.set("quat", _text(np.cos(UR5E.hand_yaw / 2), 0, 0, np.sin(UR5E.hand_yaw / 2)))
     link.append(hand)
     return ET.tostring(tree, encoding="unicode")
-
-
-_LOOK = {"rgba": "0.72 0.76 0.8 1"}
 
 
 def _add_link(parent: ET.Element, i: int) -> ET.Element:
@@ -73,7 +80,7 @@ def _add_link(parent: ET.Element, i: int) -> ET.Element:
             fromto=_text(*start, *end),
             size=_text(radius),
             mass=_text(_MASSES[i] / len(_CAPSULES[i])),
-            **_LOOK,
+            rgba=_RGBA,
         )
     return link
 

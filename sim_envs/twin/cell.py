@@ -188,7 +188,7 @@ class Cell:
             "instruction": self.env.instruction(),
             "progress": float(self.progress),
             "success": bool(self.success),
-            "object_pose": self.env.object_pose().tolist(),
+            "layout": self.env.layout(),
             "pad_forces": [pad.normal_force for pad in self.env.pad_contacts()],
             "facts": self.env.facts(),
             "q": self.q.tolist(),

@@ -20,7 +20,7 @@ import os
 import signal
 import socket
 import time
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from touchgoal.sim_envs.twin.mjpeg import Stream
 from touchgoal.sim_envs.twin.serial_ports import SerialPort
 
 
+@runtime_checkable
 class Arm(Protocol):
     """What can go wrong with an arm's controller and its link."""
 

@@ -71,6 +71,7 @@ class FrankaArm:
         self._hand = hand
         self._motion: Motion | None = None
         self._recovery: wire.Request | None = None
+        self._cleared = False
         self._sent = self._echoed = 0
         self._success = 1.0
         self._thresholds = Thresholds.default()
@@ -91,9 +92,8 @@ class FrankaArm:
             self._end(None)
         elif motion is not None and motion.begun:
             self._wait(motion)
-        if self._recovery is not None and not self.cell.moving and self._feel().fault is None:
-            self.link.answer(self._recovery, 0)
-            self._recovery, self.mode, self.error = None, RobotMode.IDLE, ""
+        if self._recovery is not None:
+            self._recover(self._recovery)
 
     def send(self) -> None:
         """Look for faults after a millisecond, and send the state."""
@@ -144,6 +144,14 @@ class FrankaArm:
             self._send_state(self._feel())  # the error first, as on the robot
             self.link.answer(motion.request, status)
 
+    def _recover(self, request: wire.Request) -> None:
+        """Clear an error once the arm rests and nothing presses; answer when states have said so."""
+        if self._cleared:
+            self.link.answer(request, 0)
+            self._recovery = None
+        elif not self.cell.moving and self._feel().fault is None:
+            self.mode, self.error, self._cleared = RobotMode.IDLE, "", True
+
     # Commands.
 
     def _handle(self, request: wire.Request) -> None:
@@ -158,7 +166,7 @@ class FrankaArm:
             if self.mode == RobotMode.USER_STOPPED:
                 self.link.answer(request, 2)  # rejected: a safety function is active
             else:
-                self._recovery = request
+                self._recovery, self._cleared = request, False
         elif command == RobotCommand.GET_ROBOT_MODEL:
             urdf = Path(robot_model()).with_name("fr3_clean.urdf").read_bytes()
             self.link.answer(request, 0, urdf)

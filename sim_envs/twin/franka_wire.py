@@ -134,7 +134,7 @@ class HandStatus(IntEnum):
     ABORTED = 3
 
 
-# Bits of a state's `errors`, in libfranka's order.
+# Bits of a state's `errors`, in the order libfranka 0.21 reads them (asked of it one by one).
 ERRORS = (
     "joint_position_limits_violation",
     "cartesian_position_limits_violation",
@@ -145,7 +145,7 @@ ERRORS = (
     "joint_reflex",
     "cartesian_reflex",
     "max_goal_pose_deviation_violation",
-    "max_path_deviation_violation",
+    "max_path_pose_deviation_violation",
     "cartesian_velocity_profile_safety_violation",
     "joint_position_motion_generator_start_pose_invalid",
     "joint_motion_generator_position_limits_violation",
@@ -159,16 +159,16 @@ ERRORS = (
     "cartesian_motion_generator_acceleration_discontinuity",
     "cartesian_motion_generator_elbow_sign_inconsistent",
     "cartesian_motion_generator_start_elbow_invalid",
+    "force_controller_desired_force_tolerance_violation",
+    "start_elbow_sign_inconsistent",
+    "communication_constraints_violation",
+    "power_limit_violation",
     "cartesian_motion_generator_joint_position_limits_violation",
     "cartesian_motion_generator_joint_velocity_limits_violation",
     "cartesian_motion_generator_joint_velocity_discontinuity",
     "cartesian_motion_generator_joint_acceleration_discontinuity",
     "cartesian_position_motion_generator_invalid_frame",
-    "force_controller_desired_force_tolerance_violation",
     "controller_torque_discontinuity",
-    "start_elbow_sign_inconsistent",
-    "communication_constraints_violation",
-    "power_limit_violation",
     "joint_p2p_insufficient_torque_for_planning",
     "tau_j_range_violation",
     "instability_detected",

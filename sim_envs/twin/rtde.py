@@ -1,6 +1,7 @@
 """A UR controller in front of the cell: RTDE, dashboard and script port; ur-rtde's clients fit."""
 
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -246,10 +247,10 @@ class UrController:
         numbers: list[float] = []
         for name in client.outputs:
             value = self._value(name)
-            numbers.extend(value) if isinstance(value, list) else numbers.append(value)
+            numbers.extend(value if isinstance(value, Sequence) else [value])
         return b"\x01" + wire.layout(client.outputs, wire.OUTPUTS).pack(*numbers)
 
-    def _value(self, name: str) -> float | list[float]:
+    def _value(self, name: str) -> float | Sequence[float]:
         program, cell = self._program, self.cell
         if name.startswith("output_int"):
             return program.ints[int(name.rpartition("_")[2])]
@@ -265,7 +266,7 @@ class UrController:
         return 0 if size is None else [0] * size
 
 
-_CONSTANTS: dict[str, float | list[float]] = {
+_CONSTANTS: dict[str, float | Sequence[float]] = {
     "actual_main_voltage": 48.0,
     "actual_robot_voltage": 48.0,
     "joint_mode": [255] * 6,  # running

@@ -4,7 +4,7 @@ import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH
@@ -47,6 +47,7 @@ class TwinConfig:
     folder: Path
 
 
+@runtime_checkable
 class Service(Protocol):
     """Something that clients talk to; never blocks."""
 

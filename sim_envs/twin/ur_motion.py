@@ -1,7 +1,7 @@
 """How a UR moves between commands: moves with trapezoidal speed, servo, speed, stop."""
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,7 @@ Joints = Float[np.ndarray, "6"]
 Target = tuple[Joints, Joints]  # rad, rad/s
 
 
+@runtime_checkable
 class Activity(Protocol):
     """Something the arm is doing."""
 

@@ -32,6 +32,7 @@ _READY, _DONE = 1, 2
 _STREAMED = {6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71}  # acknowledged at once
 _IGNORED = {0, 8, 13, 14, 17, 20, 21, 48, 59, 65, 99}  # payload, force sensor, outputs, a kick
 _STOP_SCRIPT = 255
+_REACH = 0.85  # m, UR5e data sheet
 _FLANGE_TO_TCP = np.array([0.0, 0.0, GELSIGHT_TCP])
 
 Pose = Float[np.ndarray, "6"]  # m, rotation vector (rad)
@@ -108,7 +109,7 @@ class UrProgram:
             33: lambda: self._stop(asynchronous=self._int(1) == 1),
             34: lambda: self._stop(asynchronous=self._int(1) == 1),
             35: self._set_watchdog,
-            36: lambda: self._say(np.linalg.norm(self._doubles(0)[:3]) < 0.85),
+            36: lambda: self._say(bool(np.linalg.norm(self._doubles(0)[:3]) < _REACH)),
             37: lambda: self._say(_inside(self._doubles(0))),
             38: lambda: self._answer(self.cell.joint_torque),
             40: lambda: self._answer(self.tcp),
