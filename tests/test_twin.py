@@ -69,7 +69,7 @@ def ur5e(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict]:
 def at_rest(rig: dict) -> dict:
     """The truth once the arm is at rest."""
     deadline = time.monotonic() + 10
-    while (truth := ask(rig["faults"], "truth"))["rest"] == 0:
+    while (truth := ask(rig["faults"], "truth"))["rest"] < 0.1:
         assert time.monotonic() < deadline
         time.sleep(0.05)
     return truth
@@ -132,15 +132,17 @@ def moves(address: str, home: list[float]) -> dict:
     panda = refused(np.array(home) + 0.4)
     robot.joint_acceleration_limit.set([9.9, 7.5, 9.9, 9.9, 9.9, 9.9, 9.9])
     errors, rng = [], np.random.default_rng(0)
-    for i in range(6):
+    for i in range(4):
         target = np.array(home) + (rng.uniform(-0.5, 0.5, 7) if i % 2 else 0)
         robot.move(franky.JointMotion(target.tolist()))
         time.sleep(0.2)
         errors.append(float(np.abs(np.array(robot.state.q) - target).max()))
     robot.move(franky.JointMotion(home))
+    time.sleep(0.2)
     pose = np.array(robot.state.O_T_EE.translation)
     down = franky.Affine([0, 0, 0.03])
     robot.move(franky.CartesianMotion(down, franky.ReferenceType.Relative))
+    time.sleep(0.2)
     fell = pose - np.array(robot.state.O_T_EE.translation)
     robot.move(franky.JointMotion(home))
     before = np.array(robot.state.q)
@@ -151,7 +153,7 @@ def moves(address: str, home: list[float]) -> dict:
         tracker.set_target(np.array(home), np.zeros(7))
         time.sleep(0.8)
         held = float(np.abs(np.array(robot.state.q) - home).max())
-    robot.relative_dynamics_factor = 0.2
+    robot.relative_dynamics_factor = 0.5
     far = refused(np.array([2.9, *home[1:]]))
     return {
         "panda": panda,
@@ -169,7 +171,7 @@ def test_franka_holds_clients_to_its_limits(fr3: dict) -> None:
     assert "joint_motion_generator" in said["panda"] and "discontinuity" in said["panda"]
     assert "joint_motion_generator_" in said["far"] and "limits_violation" in said["far"]
     assert max(said["errors"]) < 2e-3
-    np.testing.assert_allclose(said["fell"], [0, 0, 0.03], atol=1e-3)
+    np.testing.assert_allclose(said["fell"], [0, 0, 0.03], atol=2e-3)
     assert 0.05 < said["turned"][0] < 0.07 and np.abs(said["turned"][1:]).max() < 3e-3
     assert said["held"] < 0.02
     worst = ask(fr3["faults"], "truth")["worst"]
@@ -181,7 +183,7 @@ def picks(address: str, home: list[float], position: list[float], yaw: float) ->
     import franky
 
     robot, gripper = connect(address), franky.Gripper(address)
-    robot.relative_dynamics_factor = 0.4
+    robot.relative_dynamics_factor = 0.6
     robot.move(franky.JointMotion(home))
     air = gripper.grasp(0.03, 0.1, 20.0)
     opened = gripper.open(0.1)
@@ -248,7 +250,7 @@ def suffers(address: str, home: list[float]) -> dict:
     except franky.CommandException:
         recovered = False
     if recovered:
-        robot.relative_dynamics_factor = 0.2
+        robot.relative_dynamics_factor = 0.5
         robot.move(franky.JointMotion(home))
     return {"said": said, "mode": mode, "rejected": rejected, "recovered": recovered}
 
@@ -323,7 +325,7 @@ def drives(address: str) -> dict:
     said["servo"] = []
     for rate in (20, 125, 500):
         began, worst, taken = time.monotonic(), 0.0, True
-        while (now := time.monotonic() - began) < 1.2:
+        while (now := time.monotonic() - began) < 0.8:
             goal = start.copy()
             goal[0] += 0.1 * np.sin(2 * now)
             taken &= control.servoJ(goal.tolist(), 0, 0, 1 / rate, 0.1, 300)
@@ -462,15 +464,15 @@ def places(address: str, port: str, pick: list[float], place: list[float], yaw: 
 
     def go(position: list[float], height: float, speed: float) -> None:
         pose = [position[0], position[1], position[2] + height, *down]
-        control.moveL(pose, speed, 0.5)
+        control.moveL(pose, speed, 1.0)
 
     said = {"air": grip(3)}
-    go(pick, 0.12, 0.3)
-    go(pick, 0.0, 0.1)
+    go(pick, 0.12, 0.5)
+    go(pick, 0.0, 0.2)
     said["object"] = grip(230)
-    go(pick, 0.12, 0.2)
-    go(place, 0.12, 0.2)
-    go(place, 0.0, 0.05)
+    go(pick, 0.12, 0.3)
+    go(place, 0.12, 0.3)
+    go(place, 0.0, 0.1)
     time.sleep(1.0)
     return said
 

@@ -14,6 +14,7 @@ from touchgoal.sim_envs.twin.ur_program import UrProgram
 from touchgoal.sim_envs.twin.ur_wire import Package, Safety
 
 _CYCLE = 2  # ms, of a controller of the e-Series
+_SELDOM = 10  # ms between looks at what is not real-time
 _UNLOCK_DELAY = 5.0  # s after a protective stop before it can be unlocked
 _FORCE_LIMIT = 150.0  # N at the tool; the factory's safety presets run from 100 to 250
 _STOPPED, _PLAYING = 1, 2  # runtime_state
@@ -47,6 +48,7 @@ class UrController:
         self._rtde = Door(host, wire.RTDE)
         self._silent = [Door(host, wire.PRIMARY), Door(host, wire.SECONDARY)]
         self._clients: dict[Connection, Client] = {}
+        self._said: dict[str, float | Sequence[float]] = {}  # in this millisecond, to any client
         self._inputs: dict[str, float] = dict.fromkeys(wire.INPUTS, 0)
         self.frozen = False
         self.safety, self._mode = Safety.NORMAL, _RUNNING
@@ -83,6 +85,7 @@ class UrController:
             self.cell.yield_()
         if self.frozen:
             return
+        self._said.clear()
         for client in self._clients.values():
             if client.started and self.cell.steps % client.period == 0:
                 client.connection.send(wire.package(Package.DATA, self._data(client)))
@@ -123,6 +126,17 @@ class UrController:
     # Clients.
 
     def _listen(self) -> None:
+        if self.cell.steps % _SELDOM == 0:
+            self._listen_to_people()
+        connections = self._rtde.poll()
+        self._clients = {c: self._clients.get(c) or Client(c) for c in connections}
+        for connection, client in self._clients.items():
+            packages, connection.unread = wire.split(connection.unread)
+            for kind, payload in packages:
+                self._handle(client, kind, payload)
+
+    def _listen_to_people(self) -> None:
+        """Dashboard and scripts."""
         for client in self._dashboard.poll():
             for line in client.lines():
                 client.send(self._answer(line).encode() + b"\n")
@@ -134,12 +148,6 @@ class UrController:
         for door in self._silent:
             for client in door.poll():
                 client.unread = b""
-        connections = self._rtde.poll()
-        self._clients = {c: self._clients.get(c) or Client(c) for c in connections}
-        for connection, client in self._clients.items():
-            packages, connection.unread = wire.split(connection.unread)
-            for kind, payload in packages:
-                self._handle(client, kind, payload)
 
     def _handle(self, client: Client, kind: int, payload: bytes) -> None:
         def answer(body: bytes) -> None:
@@ -246,7 +254,9 @@ class UrController:
     def _data(self, client: Client) -> bytes:
         numbers: list[float] = []
         for name in client.outputs:
-            value = self._value(name)
+            value = self._said.get(name)
+            if value is None:
+                value = self._said[name] = self._value(name)
             numbers.extend(value if isinstance(value, Sequence) else [value])
         return b"\x01" + wire.layout(client.outputs, wire.OUTPUTS).pack(*numbers)
 
