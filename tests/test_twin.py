@@ -81,7 +81,7 @@ def begin(rig: dict, line: str) -> None:
     ask(rig["faults"], line)
 
 
-def client(function: Callable, *arguments: object, seconds: float = 40) -> dict:
+def client(function: Callable, *arguments: object, seconds: float = 150) -> dict:
     """What a function returns in a process of its own."""
     source = inspect.getsource(connect) + inspect.getsource(function)
     program = (
@@ -148,6 +148,7 @@ def moves(address: str, home: list[float]) -> dict:
     before = np.array(robot.state.q)
     robot.move(franky.JointVelocityMotion([0.2, 0, 0, 0, 0, 0, 0], franky.Duration(300)))
     turned = np.array(robot.state.q) - before
+    held = np.inf
     stiffness = np.array([600, 600, 600, 600, 250, 150, 50.0])
     with franky.JointImpedanceTracker(robot, stiffness=stiffness) as tracker:
         tracker.set_target(np.array(home), np.zeros(7))
@@ -233,7 +234,7 @@ def suffers(address: str, home: list[float]) -> dict:
 
     robot = connect(address)
     robot.set_collision_behavior([20.0] * 7, [20.0] * 6)
-    speed = [0.05, 0, 0, 0, 0, 0, 0]
+    said, speed = "", [0.05, 0, 0, 0, 0, 0, 0]
     try:
         robot.move(franky.JointVelocityMotion(speed, franky.Duration(20_000)))
     except franky.ControlException as error:
