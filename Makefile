@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 CODE := control sim_envs episodes encoders rewards policies benchmarks launch tests
 
-.PHONY: demo test check format build typings weights clean
+.PHONY: demo test check format build typings weights maze-policy clean
 
 demo: $(READY)
 	$(BIN)/touchgoal doctor --quiet
@@ -45,6 +45,20 @@ weights: $(READY)
 	$(BIN)/touchgoal train-encoder align --episodes runs/weights/train/episodes \
 		--validation runs/weights/val/episodes --scale-episodes 60 --out runs/weights/run
 	cp runs/weights/run/encoder/* encoders/weights/gelsight_mini_offline/
+
+# How the shipped bead-maze policy and its touch encoder were made: two to three hours on 2 cores.
+MAZE := runs/maze
+maze-policy: $(READY)
+	$(BIN)/touchgoal collect-demos --task bead-maze --episodes 16 --seed 20000 \
+		--maze.split validation --maze.n-wires 16 --out $(MAZE)/val
+	$(BIN)/touchgoal collect-demos --task bead-maze --episodes 260 --seed 0 --maze.n-wires 260 \
+		--out $(MAZE)/train
+	$(BIN)/touchgoal train-encoder mae --episodes $(MAZE)/train/episodes \
+		--validation $(MAZE)/val/episodes --frames 30 --mae.epochs 12 --out $(MAZE)/mae
+	$(BIN)/touchgoal train-policy --episodes $(MAZE)/train/episodes \
+		--validation $(MAZE)/val/episodes --touch $(MAZE)/mae/encoder --out $(MAZE)/policy
+	rm -rf policies/weights/bead_maze && mkdir -p policies/weights
+	cp -r $(MAZE)/policy/policy policies/weights/bead_maze
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

@@ -71,7 +71,8 @@ class TactilePreprocessor:
 
 
 PREPROCESSORS: dict[str, TactilePreprocessor] = {
-    "gelsight_mini": TactilePreprocessor("gelsight_mini", version=1, size=(120, 160), scale=16.0),
+    sensor: TactilePreprocessor(sensor, version=1, size=(120, 160), scale=16.0)
+    for sensor in ("gelsight_mini", "gelsight_mini_markers")
 }
 
 

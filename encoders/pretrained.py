@@ -8,7 +8,7 @@ import json
 import os
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError
@@ -18,16 +18,22 @@ from touchgoal.control.errors import UserError
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.towers import same_towers
+from touchgoal.encoders.trunk import TouchTrunk, TouchTrunkConfig
 from touchgoal.encoders.vit import ViTConfig
 
 FORMAT = 1
 SHIPPED = Path(__file__).parent / "weights" / "gelsight_mini_offline"
+Encoder = TypeVar("Encoder", TouchEncoder, TouchTrunk)
+Config = TypeVar("Config", TouchEncoderConfig, TouchTrunkConfig)
 _JSON, _WEIGHTS = "encoder.json", "encoder.safetensors"
-_TRAIN = "train one with: touchgoal train-encoder align"
+_TRAIN = "train one with: touchgoal train-encoder"
 
 
 def save(
-    encoder: TouchEncoder, directory: Path, provenance: dict[str, Any], half: bool = True
+    encoder: TouchEncoder | TouchTrunk,
+    directory: Path,
+    provenance: dict[str, Any],
+    half: bool = True,
 ) -> None:
     """Writes an encoder; an older one in the directory is replaced.
 
@@ -62,15 +68,36 @@ def load(directory: Path, sensor: str | None = None, towers: str | None = None) 
         UserError: Nothing there, damaged, or not made for this sensor, these towers or this
             version of the preprocessor.
     """
-    config = _read_config(directory)
-    if sensor is not None and sensor != config.sensor:
-        raise UserError(
-            f"the encoder in {directory} is for {config.sensor}, not {sensor}: {_TRAIN}"
-        )
+    config = _read_config(directory, TouchEncoderConfig)
     if towers is not None and not same_towers(towers, config.towers):
         raise UserError(
             f"the encoder in {directory} was trained with the towers {config.towers}, not {towers}: "
             "load those towers, or train an encoder with these"
+        )
+    return _load(TouchEncoder(config), directory, sensor)
+
+
+def load_trunk(directory: Path, sensor: str | None = None) -> TouchTrunk:
+    """Reads a self-supervised trunk for inference, as float32 on the CPU; UserError as `load`."""
+    return _load(TouchTrunk(_read_config(directory, TouchTrunkConfig)), directory, sensor)
+
+
+def load_any(directory: Path) -> TouchEncoder | TouchTrunk:
+    """Reads an encoder of either kind for inference; UserError as `load`."""
+    aligned = "towers" in _read_description(directory).get("config", {})
+    return load(directory) if aligned else load_trunk(directory)
+
+
+def weights_path(directory: Path) -> Path:
+    """The weights' file in an encoder's folder."""
+    return directory / _WEIGHTS
+
+
+def _load(encoder: Encoder, directory: Path, sensor: str | None) -> Encoder:
+    config = encoder.config
+    if sensor is not None and sensor != config.sensor:
+        raise UserError(
+            f"the encoder in {directory} is for {config.sensor}, not {sensor}: {_TRAIN}"
         )
     current = preprocessor_for(config.sensor).id
     if config.preprocessor != current:
@@ -78,7 +105,6 @@ def load(directory: Path, sensor: str | None = None, towers: str | None = None) 
             f"the encoder in {directory} needs the preprocessor {config.preprocessor}, this is "
             f"{current}: {_TRAIN}"
         )
-    encoder = TouchEncoder(config)
     encoder.load_state_dict(_read_weights(directory / _WEIGHTS, encoder))
     return encoder.eval().requires_grad_(False)
 
@@ -102,17 +128,17 @@ def _read_description(directory: Path) -> dict[str, Any]:
     return description
 
 
-def _read_config(directory: Path) -> TouchEncoderConfig:
+def _read_config(directory: Path, kind: type[Config]) -> Config:
     try:
         fields = dict(_read_description(directory)["config"])
         vit = fields.pop("vit")
         vit["image_size"] = tuple(vit["image_size"])
-        return TouchEncoderConfig(vit=ViTConfig(**vit), **fields)
+        return kind(vit=ViTConfig(**vit), **fields)
     except (KeyError, TypeError) as error:
         raise UserError(f"{directory / _JSON} is damaged ({error}): {_TRAIN}") from error
 
 
-def _read_weights(path: Path, encoder: TouchEncoder) -> dict[str, torch.Tensor]:
+def _read_weights(path: Path, encoder: TouchEncoder | TouchTrunk) -> dict[str, torch.Tensor]:
     if not path.is_file():
         raise UserError(f"{path} is missing: {_TRAIN}")
     try:

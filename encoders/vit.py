@@ -46,6 +46,7 @@ class ViTConfig:
 
 PRESETS: dict[str, ViTConfig] = {
     "tiny": ViTConfig(patch_size=40, width=32, depth=2, heads=2, mlp_ratio=2.0),
+    "compact": ViTConfig(width=128, depth=4, heads=4),
     "small": ViTConfig(),
     # ViT-H/14 as in ImageBind and the MMWand paper, which pool by the class token.
     "huge": ViTConfig(patch_size=14, width=1280, depth=32, heads=16, class_token=True),

@@ -12,6 +12,7 @@ COMMANDS = {
     "doctor": "what this machine can do, and how to mend what is missing",
     "collect-demos": "record expert episodes of a task, or failures to order",
     "train-encoder": "train a touch encoder",
+    "train-policy": "train a policy on recorded episodes",
     "run-policy": "run a policy in a task: success rate, video",
     "reward-curves": "dense cost and reward curves for episodes or plain videos",
     "calibrate": "fit a sensor's light and gel to ball presses",

@@ -6,14 +6,31 @@ from typing import Annotated, Any
 import cv2
 import tyro
 
-from touchgoal.benchmarks import env_speed, reward_quality, tactile_realism, tactile_speed
+from touchgoal.benchmarks import (
+    bead_maze,
+    env_speed,
+    policy_latency,
+    reward_quality,
+    tactile_realism,
+    tactile_speed,
+)
 from touchgoal.launch.run_folder import open_run, write_json
 
 BENCHMARKS: dict[type, Any] = {
-    module.Config: module for module in (env_speed, reward_quality, tactile_realism, tactile_speed)
+    module.Config: module
+    for module in (
+        bead_maze,
+        env_speed,
+        policy_latency,
+        reward_quality,
+        tactile_realism,
+        tactile_speed,
+    )
 }
 Config = (
-    Annotated[env_speed.Config, tyro.conf.subcommand("env-speed")]
+    Annotated[bead_maze.Config, tyro.conf.subcommand("bead-maze")]
+    | Annotated[env_speed.Config, tyro.conf.subcommand("env-speed")]
+    | Annotated[policy_latency.Config, tyro.conf.subcommand("policy-latency")]
     | Annotated[reward_quality.Config, tyro.conf.subcommand("reward-quality")]
     | Annotated[tactile_realism.Config, tyro.conf.subcommand("tactile-realism")]
     | Annotated[tactile_speed.Config, tyro.conf.subcommand("tactile-speed")]

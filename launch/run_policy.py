@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -13,16 +13,21 @@ from touchgoal.control.errors import UserError
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.recording import Actor, Demonstration, demonstrate_on_film
 from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.policies import maze_trials, rollout
+from touchgoal.policies.acting import SHIPPED, ActorMaker
 from touchgoal.policies.follower import WireFollower
-from touchgoal.policies.maze_trials import MazeTrial, evaluate, trials_of
-from touchgoal.policies.rollout import Trial, evaluate_expert
+from touchgoal.policies.maze_trials import MazeTrial
+from touchgoal.policies.rollout import Trial
 from touchgoal.policies.success import SuccessRate
 from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
+from touchgoal.sim_envs.experts import PickPlaceExpert
 from touchgoal.sim_envs.maze_expert import BeadMazeExpert
 from touchgoal.sim_envs.objects import CATALOGUE, SHAPES, find
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.tasks import TaskConfig, make_env
 from touchgoal.sim_envs.wires import FAMILIES, choose
+
+Task = TypeVar("Task", PickPlaceConfig, BeadMazeConfig)
 
 
 @dataclass(frozen=True)
@@ -31,9 +36,11 @@ class Config:
 
     task: Literal["pick-place", "bead-maze"] = "pick-place"
     """Where to run it."""
-    policy: Literal["expert", "follower"] = "expert"
-    """Which policy: the scripted expert, which sees the simulator's state, or (bead-maze) the
-    classical follower, which feels the force on the hand."""
+    policy: str = "shipped"
+    """Which policy: shipped; a folder that train-policy made; expert, which sees the simulator's
+    state; or (bead-maze) follower, the classical one, which feels the force on the hand."""
+    latency: int = 0
+    """Ticks that a learned policy's plans come late, as on the arm."""
     out: Path | None = None
     """Folder of the run."""
     episodes: int = 20
@@ -46,12 +53,10 @@ class Config:
     """Processes that simulate."""
     video: bool = True
     """Film the worst episode."""
-    env: PickPlaceConfig = field(default_factory=lambda: PickPlaceConfig(cameras=(), tactile=False))
-    """Options of pick-place; the expert needs no pictures."""
-    maze: BeadMazeConfig = field(
-        default_factory=lambda: BeadMazeConfig(split="validation", tactile=False)
-    )
-    """Options of bead-maze; neither the expert nor the follower needs pictures."""
+    env: PickPlaceConfig = field(default_factory=PickPlaceConfig)
+    """Options of pick-place; what the policy does not look at is not rendered."""
+    maze: BeadMazeConfig = field(default_factory=lambda: BeadMazeConfig(split="validation"))
+    """Options of bead-maze; what the policy does not look at is not rendered."""
 
 
 def main(config: Config) -> None:
@@ -60,40 +65,55 @@ def main(config: Config) -> None:
         raise UserError("nothing to run: ask for at least one episode")
     if config.task == "bead-maze":
         _run_maze(config)
-    elif config.policy == "expert":
-        _run_pick_place(config)
     else:
-        raise UserError(f"policy {config.policy} is for the bead maze; add: --task bead-maze")
+        _run_pick_place(config)
 
 
 def _run_pick_place(config: Config) -> None:
     names = [find(name).name for name in config.objects] or list(CATALOGUE)
-    jobs = [
-        Demonstration(config.seed + i, options={"object": names[i % len(names)]})
-        for i in range(config.episodes)
-    ]
+    jobs = rollout.demonstrations_of(names, config.episodes, config.seed)
+    if config.policy == "follower":
+        raise UserError("the follower is for the bead maze; add: --task bead-maze")
+    policy = PickPlaceExpert if config.policy == "expert" else _learned(config)
+    env = _observe(config.env, policy)
     out = open_run(config.out, "run-policy", config)
-    trials = evaluate_expert(config.env, jobs, config.workers)
+    trials = rollout.evaluate(env, policy, jobs, config.workers)
     worst = min(range(len(trials)), key=lambda i: (trials[i].progress, -trials[i].error))
     _report(out, trials, table(trials))
     if config.video:
-        _film(out, config.env, jobs[worst], None)
+        _film(out, env, jobs[worst], policy)
 
 
 def _run_maze(config: Config) -> None:
     wires = choose(config.maze.split, config.episodes, config.maze.families)
-    jobs = trials_of(wires, config.seed)
+    jobs = maze_trials.trials_of(wires, config.seed)
+    classical = {"expert": BeadMazeExpert, "follower": _follower}
+    policy = classical.get(config.policy) or _learned(config)
+    env = _observe(config.maze, policy)
     out = open_run(config.out, "run-policy", config)
-    policy = BeadMazeExpert if config.policy == "expert" else _follower
-    trials = evaluate(config.maze, policy, jobs, config.workers)
+    trials = maze_trials.evaluate(env, policy, jobs, config.workers)
     worst = min(range(len(trials)), key=lambda i: (trials[i].progress, -trials[i].peak_force))
     _report(out, trials, maze_table(trials))
     if config.video:
-        _film(out, config.maze, jobs[worst], policy)
+        _film(out, env, jobs[worst], policy)
 
 
 def _follower(env: BeadMaze) -> WireFollower:
     return WireFollower(env.config.control_hz)
+
+
+def _learned(config: Config) -> ActorMaker:
+    """A policy on disk; UserError if it does not fit the task, before anything is simulated."""
+    directory = SHIPPED[config.task] if config.policy == "shipped" else Path(config.policy)
+    task = config.maze if config.task == "bead-maze" else config.env
+    return ActorMaker(directory, latency=config.latency).checked(task)
+
+
+def _observe(task: Task, policy: object) -> Task:
+    """The task with the pictures that the policy looks at, and no others."""
+    if isinstance(policy, ActorMaker):
+        return policy.observing(task)
+    return replace(task, tactile=False, cameras=())
 
 
 def _report(out: Path, trials: list[Trial] | list[MazeTrial], printed: str) -> None:
@@ -101,9 +121,7 @@ def _report(out: Path, trials: list[Trial] | list[MazeTrial], printed: str) -> N
     print(f"{printed}\nall trials: {out / 'metrics.json'}")
 
 
-def _film(
-    out: Path, task: TaskConfig, job: Demonstration, policy: Callable[[Any], Actor] | None
-) -> None:
+def _film(out: Path, task: TaskConfig, job: Demonstration, policy: Callable[[Any], Actor]) -> None:
     env = make_env(replace(task, tactile=True))
     _, frames = demonstrate_on_film(env, job, policy)
     env.close()

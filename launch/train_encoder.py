@@ -1,16 +1,18 @@
-"""Train a touch encoder on recorded episodes: align touch with frozen image and text towers."""
+"""Train a touch encoder on recorded episodes: align it with frozen towers, or by masking alone."""
 
 import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
+from touchgoal.encoders import touch_frames
 from touchgoal.encoders.align import PRESETS, AlignConfig, align
+from touchgoal.encoders.mae import MaeConfig, train_mae
 from touchgoal.encoders.towers import load_towers
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import collect
@@ -50,16 +52,61 @@ class AlignPaper(Align):
     """The training."""
 
 
+@dataclass(frozen=True)
+class Mae:
+    """Options of train-encoder mae."""
+
+    episodes: Path
+    """Set of episodes to learn from."""
+    validation: Path
+    """Set of other episodes, on which losses are measured."""
+    out: Path | None = None
+    """Folder of the run; the trunk goes to its `encoder/`."""
+    frames: int = 40
+    """Ticks drawn from each episode, both fingertips of each."""
+    resume: bool = False
+    """Go on with an interrupted run in `out`."""
+    mae: MaeConfig = MaeConfig()
+    """The training."""
+
+
 Config = (
     Annotated[Align, tyro.conf.subcommand("align")]
     | Annotated[AlignPaper, tyro.conf.subcommand("align-paper")]
+    | Annotated[Mae, tyro.conf.subcommand("mae")]
 )
 
 
-def main(config: Align) -> None:
-    """Cut touches from the episodes, train, fit the scale of the costs."""
+def main(config: Align | Mae) -> None:
+    """Train one kind of encoder."""
     if config.resume and config.out is None:
         raise UserError("to resume a run, name its folder with --out")
+    if isinstance(config, Mae):
+        _train_mae(config)
+    else:
+        _align(config)
+
+
+def _train_mae(config: Mae) -> None:
+    sets = EpisodeSet(config.episodes), EpisodeSet(config.validation)
+    out = open_run(config.out, "train-encoder", config)
+    mae = config.mae
+    train, val = (touch_frames.draw(s, mae.sensor, config.frames, mae.seed) for s in sets)
+    train_mae(train, val, mae, out, _recipe(*sets), config.resume)
+    print(f"trunk: {out / 'encoder'}")
+
+
+def _recipe(episodes: EpisodeSet, validation: EpisodeSet) -> dict[str, Any]:
+    return {
+        "command": shlex.join(["touchgoal", *sys.argv[1:]]),
+        "data": "simulated: touchgoal collect-demos",
+        "episodes": len(episodes),
+        "validation_episodes": len(validation),
+    }
+
+
+def _align(config: Align) -> None:
+    """Cut touches from the episodes, train, fit the scale of the costs."""
     episodes, validation = EpisodeSet(config.episodes), EpisodeSet(config.validation)
     towers = load_towers(config.towers)
     out = open_run(config.out, "train-encoder", config)
@@ -68,12 +115,7 @@ def main(config: Align) -> None:
         for s in (episodes, validation)
     )
     print(f"{len(train)} touches of {len(train.descriptions)} objects; {len(val)} for validation")
-    recipe = {
-        "command": shlex.join(["touchgoal", *sys.argv[1:]]),
-        "data": "simulated: touchgoal collect-demos",
-        "episodes": len(episodes),
-        "validation_episodes": len(validation),
-    }
+    recipe = _recipe(episodes, validation)
     encoder = align(train, val, towers, config.align, out, recipe, config.resume)
     embedder = EpisodeEmbedder(towers, encoder)
     chosen = [i for i in range(len(episodes)) if episodes.meta(i).get("success", True)]

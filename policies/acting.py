@@ -1,53 +1,185 @@
 """Acting by plans: the policy as an actor in an environment or on the arm."""
 
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
+from torch import Tensor
 
-from touchgoal.policies.policy import Condition, Policy
+from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
+from touchgoal.control.sensors import find_sensor
+from touchgoal.policies import checkpoint
+from touchgoal.policies.eyes import shrink
+from touchgoal.policies.policy import Condition, Policy, PolicyConfig
+from touchgoal.policies.touch import TouchEmbedder, load_touch
+from touchgoal.sim_envs.base import EnvConfig
 
-EmbedTick = Callable[[dict[str, np.ndarray]], Float32[np.ndarray, " e"]]
+_WEIGHTS = Path(__file__).parent / "weights"
+Task = TypeVar("Task", bound=EnvConfig)
+SHIPPED = {"bead-maze": _WEIGHTS / "bead_maze", "pick-place": _WEIGHTS / "pick_place"}
 
 
-class PolicyActor:
-    """Does `execution_horizon` ticks of a plan, then plans again, waiting for it.
+Observation = Mapping[str, np.ndarray]
 
-    The same seed and observations give the same actions.
+
+class Planner:
+    """From the last observations of an episode to a plan.
+
+    The same seed and observations give the same plans.
     """
 
-    def __init__(self, policy: Policy, embed: EmbedTick | None, seed: int = 0) -> None:
-        """Starts an episode.
+    def __init__(self, policy: Policy, touch: TouchEmbedder | None, seed: int = 0) -> None:
+        """For one episode.
 
         Args:
             policy: for inference.
-            embed: an observation to the embedding of both fingertips, the one of training; None
-                for a policy without touch.
+            touch: embedder of the training; None for a policy without touch.
             seed: of the plans' noise.
+
+        Raises:
+            UserError: the embedder is not the training's.
         """
-        self._policy, self._embed = policy, embed
+        self.config = config = policy.config
+        if (touch.name if touch else "") != config.touch:
+            raise UserError(
+                f"the policy feels through {config.touch!r}, not {touch.name if touch else ''!r}: "
+                "load the touch encoder that it was trained with"
+            )
+        self._policy, self.touch = policy, touch
         self._generator = torch.Generator().manual_seed(seed)
-        self._seen: list[tuple[np.ndarray, np.ndarray]] = []
-        self._plan: list[np.ndarray] = []
+        self._first: Observation = {}
+        self._felt: dict[int, np.ndarray] = {}
 
-    def act(self, observation: dict[str, np.ndarray]) -> Float32[np.ndarray, "8"]:
+    def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]:
+        """Actions from the latest observation on.
+
+        Args:
+            seen: the last `observation_horizon` observations, oldest first. The oldest one of the
+                first call is the episode's first, untouched one.
+        """
+        self._first = self._first or seen[0]
+        rows = [self._feel(observation) for observation in seen]
+        self._felt = {id(o): row for o, row in zip(seen, rows, strict=True)}
+        state = [np.concatenate([o[key] for key in self.config.proprioception]) for o in seen]
+        touch, state = (torch.from_numpy(np.stack(x)).float()[None] for x in (rows, state))
+        condition = Condition(touch, state, self._look(seen[-1]))
+        return self._policy.plan(condition, self._generator)[0].numpy()
+
+    def _feel(self, observation: Observation) -> Float32[np.ndarray, " e"]:
+        if self.touch is None:
+            return np.empty(0, np.float32)
+        row = self._felt.get(id(observation))
+        return self.touch.embed_tick(observation, self._first) if row is None else row
+
+    def _look(self, observation: Observation) -> UInt8[Tensor, "1 k h w 3"] | None:
+        eye = self.config.eye
+        if eye is None:
+            return None
+        pictures = [
+            shrink(observation[key][None], key, self._first[key], eye.size) for key in eye.keys
+        ]
+        return torch.from_numpy(np.stack(pictures, 1))
+
+
+class PolicyActor:
+    """Does `execution_horizon` ticks of a plan, then the next plan's.
+
+    An inference that takes `latency` ticks is asked for so much earlier, and the ticks that have
+    gone by when its plan arrives are left out: no tick is done twice, none waits.
+    """
+
+    def __init__(self, planner: Planner, latency: int = 0) -> None:
+        """Starts an episode.
+
+        Args:
+            planner: of this episode.
+            latency: ticks from an observation to its plan. On the first tick the arm stands, and
+                the plan is waited for.
+
+        Raises:
+            UserError: plans too short for the latency.
+        """
+        config = planner.config
+        spare = config.prediction_horizon - config.execution_horizon
+        if not 0 <= latency <= min(spare, config.execution_horizon):
+            raise UserError(
+                f"a plan of {config.prediction_horizon} ticks, {config.execution_horizon} of them "
+                f"done, cannot come {latency} ticks late: change execution_horizon"
+            )
+        self._planner, self._latency = planner, latency
+        self._seen: list[Observation] = []
+        self._todo: list[np.ndarray] = []  # actions of the present plan
+        self._next: list[np.ndarray] = []  # of the one that is on its way
+
+    def act(self, observation: Observation) -> Float32[np.ndarray, "8"]:
         """The action for the next tick."""
-        config = self._policy.config
-        self._see(observation)
-        if not self._plan:
-            actions = self._policy.plan(self._condition(), self._generator)[0]
-            self._plan = list(actions[: config.execution_horizon].numpy())
-        return self._plan.pop(0)
+        config, first = self._planner.config, not self._seen
+        before = self._seen or [observation] * config.observation_horizon
+        self._seen = [*before[1:], observation]
+        if first:
+            self._todo = list(self._planner.plan(self._seen)[: config.execution_horizon])
+        self._take_over()
+        if len(self._todo) == self._latency:
+            upto = self._latency + config.execution_horizon
+            self._next = list(self._planner.plan(self._seen)[self._latency : upto])
+            self._take_over()
+        return self._todo.pop(0)
 
-    def _see(self, observation: dict[str, np.ndarray]) -> None:
-        config = self._policy.config
-        state = np.concatenate([observation[key] for key in config.proprioception])
-        touch = self._embed(observation) if self._embed else np.empty(0, np.float32)
-        before = self._seen or [(touch, state)] * config.observation_horizon
-        self._seen = [*before[1:], (touch, state)]
+    def _take_over(self) -> None:
+        """Go on with the next plan where the present one is done."""
+        if not self._todo:
+            self._todo, self._next = self._next, []
 
-    def _condition(self) -> Condition:
-        touch, state = (torch.from_numpy(np.stack(rows)) for rows in zip(*self._seen, strict=True))
-        assert touch.shape[1] == self._policy.config.touch_dim, "the embedder is of another policy"
-        return Condition(touch.float()[None], state.float()[None])
+
+@dataclass(frozen=True)
+class ActorMaker:
+    """Makes actors of a policy on disk, in any process.
+
+    Attributes:
+        directory: of the policy, with its touch encoder in `touch/`.
+        seed: of the plans' noise.
+        latency: see `PolicyActor`.
+    """
+
+    directory: Path
+    seed: int = 0
+    latency: int = 0
+
+    def __call__(self, env: object = None) -> PolicyActor:
+        """An actor for one episode, on one core; which environment does not matter."""
+        torch.set_num_threads(1)  # two lose badly when the other core is taken
+        return PolicyActor(self.planner(), self.latency)
+
+    def planner(self) -> Planner:
+        """What makes its plans in one episode."""
+        policy = checkpoint.load(self.directory)
+        return Planner(policy, self._touch(policy.config), self.seed)
+
+    def checked(self, task: EnvConfig) -> "ActorMaker":
+        """Itself; UserError if the policy cannot act in the task."""
+        policy = checkpoint.load(self.directory, control_hz=task.control_hz)
+        touch = self._touch(policy.config)
+        sensor = find_sensor(task.scene.sensor).name
+        if touch and touch.sensor != sensor:
+            raise UserError(
+                f"the policy in {self.directory} feels with {touch.sensor}, the task has {sensor}: "
+                "choose that sensor for the scene"
+            )
+        PolicyActor(Planner(policy, touch), self.latency)
+        return self
+
+    def observing(self, task: Task) -> Task:
+        """The task with the pictures that the policy looks at, and no others."""
+        config = checkpoint.load(self.directory).config
+        keys = config.eye.keys if config.eye else ()
+        cameras = tuple(k.removeprefix(v.IMAGE_PREFIX) for k in keys if k in v.CAMERAS)
+        tactile = config.touch_dim > 0 or any(key in v.TACTILE for key in keys)
+        return replace(task, tactile=tactile, cameras=cameras)
+
+    def _touch(self, config: PolicyConfig) -> TouchEmbedder | None:
+        return load_touch(self.directory / checkpoint.TOUCH) if config.touch_dim else None

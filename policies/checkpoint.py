@@ -16,11 +16,13 @@ from safetensors.torch import load_file, save_file
 
 from touchgoal.control.errors import UserError
 from touchgoal.policies.diffusion import DiffusionConfig, RegressionConfig
+from touchgoal.policies.eyes import EyeConfig
 from touchgoal.policies.policy import Policy, PolicyConfig
 from touchgoal.policies.samplers import SamplerConfig
 from touchgoal.policies.unet import UNetConfig
 
 FORMAT = 1
+TOUCH = "touch"  # folder of the touch encoder beside the weights
 _JSON, _WEIGHTS = "policy.json", "policy.safetensors"
 _TRAIN = "train one with: touchgoal train-policy"
 
@@ -98,6 +100,8 @@ def _read_config(directory: Path) -> PolicyConfig:
     try:
         fields = dict(_read_description(directory)["config"])
         head = fields.pop("head")
+        if eye := fields.pop("eye", None):
+            fields["eye"] = EyeConfig(**eye | {k: tuple(eye[k]) for k in ("keys", "size")})
         fields["proprioception"] = tuple(fields["proprioception"])
         return PolicyConfig(**fields, head=_read_head(head))
     except (KeyError, TypeError) as error:

@@ -6,6 +6,7 @@ import numpy as np
 
 from touchgoal.control import vocabulary as v
 from touchgoal.control.kinematics import Fr3Kinematics, fingers_across
+from touchgoal.sim_envs.bead_maze import GRASP_SECONDS
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class FollowerConfig:
 class WireFollower:
     """Follows a wire that it does not know, from force and joint positions.
 
-    It starts along the hand's x axis, which whoever put the bead into the hand has laid along the
+    While the hand closes it waits. It starts along the hand's x axis, which whoever put the bead into the hand has laid along the
     wire. Compliance across a constraint and motion along it are Mason's (1981).
     """
 
@@ -38,9 +39,13 @@ class WireFollower:
         self._config = config or FollowerConfig()
         self._kinematics = Fr3Kinematics()
         self._command: np.ndarray | None = None
+        self._grasping = round(GRASP_SECONDS * control_hz)
 
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """The action for the next tick, from joint positions and the external force."""
+        if self._grasping > 0:
+            self._grasping -= 1
+            return np.zeros(8)
         config, tick = self._config, self._tick
         joints = observation[v.STATE][:7].astype(np.float64)
         position, R = self._kinematics.forward(joints)

@@ -3,13 +3,14 @@
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.policies.actions import ACTION_DIM, Representation, Scale, represent, to_actions
 from touchgoal.policies.diffusion import Diffusion, DiffusionConfig, Regression, RegressionConfig
+from touchgoal.policies.eyes import Eye, EyeConfig
 
 _FAR = 5.0  # standard deviations beyond which an input is as surprising as it gets
 
@@ -23,6 +24,7 @@ class PolicyConfig:
             touch.
         touch: names what made the embeddings: encoder, sensor, background.
         touch_width: to which an embedding is projected.
+        eye: for pictures that no frozen encoder reads; None for a policy without.
         proprioception: columns of `vocabulary.FEATURES`, the state first.
         observation_horizon: ticks seen, the latest included.
         prediction_horizon: ticks planned. The first is the latest observation's, so that all of
@@ -36,6 +38,7 @@ class PolicyConfig:
     touch_dim: int
     touch: str
     touch_width: int = 64
+    eye: EyeConfig | None = None
     proprioception: tuple[str, ...] = (v.STATE, v.TCP_POSE)
     observation_horizon: int = 2
     prediction_horizon: int = 8
@@ -66,6 +69,11 @@ class PolicyConfig:
         """Width of the proprioception of one tick."""
         return sum(v.FEATURES[key].shape[0] for key in self.proprioception)
 
+    @property
+    def seen_dim(self) -> int:
+        """Width of the proprioception as the network sees it, see `unroll`."""
+        return self.state_dim + (2 if v.TCP_POSE in self.proprioception else 0)
+
 
 @dataclass(frozen=True, eq=False)
 class Condition:
@@ -74,10 +82,12 @@ class Condition:
     Attributes:
         touch: frozen embeddings of the left and the right fingertip, side by side.
         state: columns of `PolicyConfig.proprioception`, side by side, SI units.
+        pictures: of the latest tick, for the policy's eye, see `eyes.shrink`; None without.
     """
 
     touch: Float[Tensor, "b o e"]
     state: Float[Tensor, "b o s"]
+    pictures: UInt8[Tensor, "b k h w 3"] | None = None
 
     @property
     def joints(self) -> Float[Tensor, "b 7"]:
@@ -94,12 +104,17 @@ class Policy(nn.Module):
         self.config = config
         ticks = config.prediction_horizon
         self.touch_scale = Scale((config.touch_dim,))
-        self.state_scale = Scale((config.state_dim,))
+        self.state_scale = Scale((config.seen_dim,))
         self.action_scale = Scale((ticks, ACTION_DIM))
         width = config.touch_width if config.touch_dim else 0
         # projected before the U-Net, whose FiLM would multiply the embedding's width
         self.project = nn.Linear(config.touch_dim, width) if width else None
-        condition = config.observation_horizon * (width + config.state_dim)
+        condition = config.observation_horizon * (width + config.seen_dim)
+        self.eye = None
+        if config.eye:
+            self.eye = Eye(config.eye)
+            condition += len(config.eye.keys) * config.eye.width
+        self.condition_dim = condition
         if isinstance(config.head, DiffusionConfig):
             self.head = Diffusion(config.head, ticks, ACTION_DIM, condition)
         else:
@@ -119,7 +134,7 @@ class Policy(nn.Module):
         """
         if self.project is not None:
             self.touch_scale.fit_spread(touch)
-        self.state_scale.fit_spread(state)
+        self.state_scale.fit_spread(unroll(state, self.config.proprioception))
         self.action_scale.fit_range(represent(actions, joints, self.config.representation))
 
     def loss(
@@ -139,8 +154,36 @@ class Policy(nn.Module):
         return to_actions(chunk, condition.joints, self.config.representation)
 
     def _encode(self, condition: Condition) -> Float[Tensor, "b c"]:
-        seen = self.state_scale(condition.state).clamp(-_FAR, _FAR)
+        state = unroll(condition.state, self.config.proprioception)
+        seen = self.state_scale(state).clamp(-_FAR, _FAR)
         if self.project is not None:
             touch = self.touch_scale(condition.touch).clamp(-_FAR, _FAR)
             seen = torch.cat([self.project(touch), seen], -1)
-        return seen.flatten(1)
+        if self.eye is None:
+            return seen.flatten(1)
+        assert condition.pictures is not None, "this policy looks at pictures"
+        return torch.cat([seen.flatten(1), self.eye(condition.pictures)], 1)
+
+
+def unroll(
+    state: Float[Tensor, "... s"], proprioception: tuple[str, ...]
+) -> Float[Tensor, "... r"]:
+    """Proprioception with the TCP's quaternion as the first two columns of its rotation matrix.
+
+    A quaternion and its negative are the same turn, and a measured one jumps between the two as
+    the hand turns about the vertical; the matrix does not (Zhou et al. 2019).
+    """
+    parts, start = [], 0
+    for key in proprioception:
+        part = state[..., start : (start := start + v.FEATURES[key].shape[0])]
+        parts += [part[..., :3], _two_columns(part[..., 3:])] if key == v.TCP_POSE else [part]
+    return torch.cat(parts, -1)
+
+
+def _two_columns(quaternion: Float[Tensor, "... 4"]) -> Float[Tensor, "... 6"]:
+    w, x, y, z = quaternion.unbind(-1)
+    columns = [
+        1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y),
+        2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
+    ]  # fmt: skip
+    return torch.stack(columns, -1)

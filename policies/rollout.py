@@ -1,13 +1,13 @@
-"""Running actors in a task: many episodes, on all cores, judged by the simulator."""
+"""Running actors in pick-and-place: many episodes, on all cores, judged by the simulator."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from tqdm import tqdm
 
 from touchgoal.control import vocabulary as v
-from touchgoal.episodes.recording import Demonstration, one_core_workers, run
-from touchgoal.sim_envs.experts import PickPlaceExpert
+from touchgoal.episodes.recording import Actor, Demonstration, one_core_workers, run
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
 
 
@@ -33,20 +33,32 @@ class Trial:
     ticks: int
 
 
-def evaluate_expert(
-    config: PickPlaceConfig, demonstrations: list[Demonstration], workers: int
+def demonstrations_of(objects: list[str], count: int, seed: int) -> list[Demonstration]:
+    """So many trials, with the objects in turn; the seeds, from `seed` on, do the rest."""
+    return [
+        Demonstration(seed + i, options={"object": objects[i % len(objects)]}) for i in range(count)
+    ]
+
+
+def evaluate(
+    config: PickPlaceConfig,
+    policy: Callable[[PickPlace], Actor],
+    demonstrations: list[Demonstration],
+    workers: int,
 ) -> list[Trial]:
-    """Run the expert on every demonstration's seed and options."""
+    """Run what `policy` makes for each demonstration's environment; it must pickle."""
+    n = len(demonstrations)
     with one_core_workers(workers) as pool:
-        trials = pool.map(_try_expert, [config] * len(demonstrations), demonstrations)
-        return list(tqdm(trials, total=len(demonstrations), desc="trials", unit="episode"))
+        trials = pool.map(_try, [config] * n, [policy] * n, demonstrations)
+        return list(tqdm(trials, total=n, desc="trials", unit="episode"))
 
 
-def _try_expert(config: PickPlaceConfig, demonstration: Demonstration) -> Trial:
+def _try(
+    config: PickPlaceConfig, policy: Callable[[PickPlace], Actor], demonstration: Demonstration
+) -> Trial:
     env = PickPlace(config)
     observation, info = env.reset(seed=demonstration.seed, options=demonstration.options)
-    expert = PickPlaceExpert(env, demonstration.outcome)
-    ticks = list(run(env, expert, observation, info))
+    ticks = list(run(env, policy(env), observation, info))
     body, last = env.bodies[0], ticks[-1]
     error = np.linalg.norm(last[v.TRUTH_OBJECT_POSE][:2] - env.goal)
     normal = np.stack([tick[v.TRUTH_PAD_WRENCH][[2, 8]] for tick in ticks])

@@ -194,7 +194,8 @@ class _Run:
     def _take(self, windows: Windows, rows: torch.Tensor) -> tuple[Condition, torch.Tensor]:
         condition, actions = windows.take(rows)
         device = self.config.device
-        seen = Condition(condition.touch.to(device), condition.state.to(device))
+        pictures = None if condition.pictures is None else condition.pictures.to(device)
+        seen = Condition(condition.touch.to(device), condition.state.to(device), pictures)
         return seen, actions.to(device)
 
     def _setting(self) -> str:

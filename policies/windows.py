@@ -5,38 +5,26 @@ Touch is embedded once, by a frozen encoder, and kept on disk beside what it was
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16, Float32, Int
+from jaxtyping import Float, Float16, Float32, Int, UInt8
 from torch import Tensor
 from tqdm import tqdm
 
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
-from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.policies.eyes import EyeConfig, shrink
 from touchgoal.policies.policy import Condition, PolicyConfig
+from touchgoal.policies.touch import TouchEmbedder
 
 _IDENTITY = "cache.json"
-
-
-@dataclass(frozen=True)
-class TouchEmbedder:
-    """A frozen encoder of both fingertips.
-
-    Attributes:
-        name: changes whenever the embeddings would; becomes `PolicyConfig.touch`.
-        dim: of both fingertips together.
-        embed: an episode with the columns `vocabulary.TACTILE` to a row for each frame.
-    """
-
-    name: str
-    dim: int
-    embed: Callable[[Episode], Float32[np.ndarray, "t e"]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +36,14 @@ class Recorded:
         state: proprioception.
         actions: `vocabulary.ACTION`.
         lengths: ticks of each episode.
+        pictures: for the policy's eye; None without.
     """
 
     touch: Float16[Tensor, "n e"]
     state: Float32[Tensor, "n s"]
     actions: Float32[Tensor, "n 8"]
     lengths: tuple[int, ...]
+    pictures: UInt8[Tensor, "n k h w 3"] | None = None
 
 
 def read(
@@ -62,8 +52,9 @@ def read(
     config: PolicyConfig,
     embedder: TouchEmbedder | None,
     cache: Path,
+    workers: int = 1,
 ) -> Recorded:
-    """Reads episodes, embedding those that the cache has not; a kill loses one of them at most.
+    """Reads episodes, embedding those that the cache has not; a kill loses those in progress.
 
     Args:
         episodes: the set.
@@ -71,6 +62,7 @@ def read(
         config: says which columns are read.
         embedder: of touch; None for a policy without.
         cache: folder for the embeddings of this set by this embedder.
+        workers: processes that embed.
 
     Raises:
         UserError: nothing chosen, a missing column, another rate or embedder than the config's, or
@@ -79,18 +71,31 @@ def read(
     _check(episodes, chosen, config, embedder)
     if embedder:
         _open_cache(cache, episodes, embedder)
+        _fill_cache(cache, episodes, chosen, embedder, workers)
     keys = [*config.proprioception, v.ACTION]
-    touch, state, actions = [], [], []
+    touch, state, actions, pictures = [], [], [], []
     for i in tqdm(chosen, desc="episodes", unit="episode"):
         frames = episodes.read(i, keys).frames
         state.append(np.concatenate([frames[key] for key in config.proprioception], 1))
         actions.append(frames[v.ACTION])
         if embedder:
-            touch.append(_embed(episodes, i, embedder, cache / f"{i:06d}.npy"))
+            touch.append(_load(episodes, i, embedder, _path(cache, i)))
         else:
             touch.append(np.empty((len(actions[-1]), 0), np.float16))
+        if config.eye:
+            pictures.append(_look(episodes, i, config.eye))
     parts = (torch.from_numpy(np.concatenate(rows)) for rows in (touch, state, actions))
-    return Recorded(*parts, lengths=tuple(len(rows) for rows in actions))
+    return Recorded(
+        *parts,
+        lengths=tuple(len(rows) for rows in actions),
+        pictures=torch.from_numpy(np.concatenate(pictures)) if config.eye else None,
+    )
+
+
+def _look(episodes: EpisodeSet, i: int, eye: EyeConfig) -> UInt8[np.ndarray, "t k h w 3"]:
+    frames = episodes.read(i, eye.keys).frames
+    columns = [shrink(frames[key], key, frames[key][0], eye.size) for key in eye.keys]
+    return np.stack(columns, 1)
 
 
 def _check(
@@ -106,7 +111,7 @@ def _check(
             f"{episodes.root} runs at {episodes.fps} Hz, the policy at {config.control_hz}: set "
             "control_hz to the episodes' rate"
         )
-    made = (embedder.name, embedder.dim) if embedder else (config.touch, 0)
+    made = (embedder.name, embedder.dim) if embedder else ("", 0)
     if made != (config.touch, config.touch_dim):
         raise UserError(
             f"the policy wants touch {config.touch!r} of width {config.touch_dim}, this is "
@@ -124,14 +129,40 @@ def _open_cache(cache: Path, episodes: EpisodeSet, embedder: TouchEmbedder) -> N
         raise UserError(f"{cache} caches other episodes or another encoder: choose another folder")
 
 
-def _embed(
+def _path(cache: Path, i: int) -> Path:
+    return cache / f"{i:06d}.npy"
+
+
+def _fill_cache(
+    cache: Path,
+    episodes: EpisodeSet,
+    chosen: Sequence[int],
+    embedder: TouchEmbedder,
+    workers: int,
+) -> None:
+    missing = [i for i in chosen if not _path(cache, i).exists()]
+    if not missing:
+        return
+    embed = partial(_embed, episodes, embedder, cache)
+    progress = partial(tqdm, total=len(missing), desc="embed", unit="episode")
+    if workers == 1:
+        list(progress(map(embed, missing)))
+        return
+    with one_core_workers(workers) as pool:
+        list(progress(pool.map(embed, missing)))
+
+
+def _embed(episodes: EpisodeSet, embedder: TouchEmbedder, cache: Path, i: int) -> None:
+    torch.set_num_threads(1)
+    rows = embedder.embed(episodes, i).astype(np.float16)
+    with open(temporary := _path(cache, i).with_suffix(".tmp"), "wb") as file:
+        np.save(file, rows)
+    os.replace(temporary, _path(cache, i))
+
+
+def _load(
     episodes: EpisodeSet, i: int, embedder: TouchEmbedder, path: Path
 ) -> Float16[np.ndarray, "t e"]:
-    if not path.exists():
-        rows = embedder.embed(episodes.read(i, v.TACTILE)).astype(np.float16)
-        with open(temporary := path.with_suffix(".tmp"), "wb") as file:
-            np.save(file, rows)
-        os.replace(temporary, path)
     rows = np.load(path)
     if rows.shape != (episodes.lengths[i], embedder.dim):
         raise UserError(f"{path} does not fit episode {i} of {episodes.root}: delete {path.parent}")
@@ -174,5 +205,6 @@ class Windows:
     def take(self, rows: Int[Tensor, " b"]) -> tuple[Condition, Float[Tensor, "b h 8"]]:
         """Some windows: what was seen, what was done."""
         seen, recorded = self._seen[rows], self.recorded
-        condition = Condition(recorded.touch[seen].float(), recorded.state[seen])
+        pictures = None if recorded.pictures is None else recorded.pictures[rows]
+        condition = Condition(recorded.touch[seen].float(), recorded.state[seen], pictures)
         return condition, recorded.actions[self._done[rows]]

@@ -17,13 +17,14 @@ from touchgoal.control.kinematics import fingers_across
 from touchgoal.sim_envs import wires
 from touchgoal.sim_envs.base import EnvConfig, FrankaTactileEnv, Observation
 from touchgoal.sim_envs.objects import HARD, Body, Material, ObjectKind, Texture
-from touchgoal.sim_envs.scene import VISUAL_GROUP
+from touchgoal.sim_envs.scene import VISUAL_GROUP, SceneConfig
 from touchgoal.sim_envs.wires import LENGTH, Wire
 
 START, END = 0.03, LENGTH - 0.03  # m of arc: where the bead starts and where it has arrived
 
 BEAD_RADIUS, BEAD_LENGTH, BEAD_MASS = 0.010, 0.016, 0.010  # m, m, kg
 HOLE_RADIUS, WIRE_RADIUS = 0.0024, 0.00175  # m
+GRASP_SECONDS = 0.5  # for which a fixture holds the bead while the hand closes on it
 STRAY_SECONDS = 0.5  # for which a disturbance keeps its direction
 STRAY_TURN = 20.0  # rad of disturbance per m of it
 _SAG = 6e-5  # m between the wire and its straight pieces, a tenth of the hole's clearance
@@ -49,6 +50,8 @@ class BeadMazeConfig(EnvConfig):
     """Options of the bead maze; reset's `options` override the random draws.
 
     Attributes:
+        scene: robot, sensors, physics. Only a gel with markers shows the shear, which is what the
+            wire's sideways force is felt by.
         split: of the wires.
         families: of the wires.
         n_wires: of the split, from which each episode draws one.
@@ -64,6 +67,7 @@ class BeadMazeConfig(EnvConfig):
 
     cameras: tuple[str, ...] = ()
     max_seconds: float = 40.0
+    scene: SceneConfig = SceneConfig(sensor="gelsight_mini_markers")
     split: wires.Split = "training"
     families: tuple[wires.Family, ...] = wires.TRAINED
     n_wires: int = 200
@@ -76,7 +80,10 @@ class BeadMazeConfig(EnvConfig):
 
 
 class BeadMaze(FrankaTactileEnv):
-    """Lead the bead, held from the start, to the wire's other end.
+    """Grasp the bead, around which the hand starts open, and lead it to the wire's other end.
+
+    The first frames of the fingertips are untouched, as every task's. A fixture holds the bead
+    for `GRASP_SECONDS`: on a slope it would slide off while the fingers close.
 
     | reset option | meaning |
     |---|---|
@@ -95,10 +102,25 @@ class BeadMaze(FrankaTactileEnv):
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control tick; the reward is the tick's gain in progress."""
         action = np.asarray(action, dtype=np.float64)
-        if self.config.disturbance > 0 and action.shape == self.action_space.shape:
+        known = action.shape == self.action_space.shape
+        if self.config.disturbance > 0 and known and not self.grasping:
             action = action + np.append(self._stray(), 0.0)
         observation, reward, success, truncated, info = super().step(action)
         return observation, reward, success or bool(self.failure.any()), truncated, info
+
+    @property
+    def grasping(self) -> bool:
+        """Whether the fixture still holds the bead."""
+        return self._ticks < GRASP_SECONDS * self.config.control_hz
+
+    def begin_tick(self) -> None:
+        """The fixture holds the bead while the hand closes on it, and lets go of it then."""
+        self.data.eq_active[self.model.equality("fixture").id] = self.grasping
+
+    def troubles(self) -> list[str]:
+        """Of drop, jam and over_force, what is so after the last tick."""
+        names = v.FEATURES[v.TRUTH_FAILURE].names
+        return [name for name, true in zip(names, self.failure, strict=True) if true]
 
     def instruction(self) -> str:
         """The episode's task in words."""
@@ -141,26 +163,24 @@ class BeadMaze(FrankaTactileEnv):
         self._furthest, self._stalled_ticks = START, 0
         self._drift = np.zeros(6)
 
-    def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, "7"]:
+    def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
         """Joint positions with the bead between the fingers, not quite in their middle."""
         point, tangent = self.wire.at(START)
         R = fingers_across(tangent)
         offset = R @ np.array([rng.uniform(-0.001, 0.001), 0.0, rng.uniform(-0.001, 0.001)])
         guess = self.robot.arm.home.copy()
-        guess[-1] -= np.arctan2(tangent[1], tangent[0])  # the hand's yaw
+        # the hand's yaw; wires head into the half plane y > 0, or nearly so
+        guess[-1] -= (np.arctan2(tangent[1], tangent[0]) + np.pi / 2) % (2 * np.pi) - np.pi / 2
         return self.kinematics.reach(point + offset, R, guess)
 
     def _settle(self) -> None:
-        """The fingers close on the bead while a fixture holds it: on a slope it would slide off."""
-        fixture = self.model.equality("fixture").id
+        """The hand is open around the bead, just wide enough to keep off the wire."""
         self._opening = BEAD_RADIUS + 0.004
         self.data.qpos[self._fingers] = self._opening
-        self.data.eq_active[fixture] = 1
-        self._advance(np.zeros(self.n_joints), 0.0, seconds=0.3)
-        self.data.eq_active[fixture] = 0
-        self._advance(np.zeros(self.n_joints), 0.0, seconds=0.2)
+        self.data.eq_active[self.model.equality("fixture").id] = 1
+        self._advance(np.zeros(self.n_joints), 2 * self._opening, seconds=0.1)
 
-    def _stray(self) -> Float[np.ndarray, "7"]:
+    def _stray(self) -> Float[np.ndarray, " n"]:
         """Joint change (rad) that nobody commanded: a random walk of the hand's velocity."""
         tick = 1 / self.config.control_hz
         keep = np.exp(-tick / STRAY_SECONDS)
@@ -171,7 +191,7 @@ class BeadMaze(FrankaTactileEnv):
     def _judge(self) -> tuple[float, bool]:
         bead = self.object_pose()[:3]
         self.s = self.wire.project(bead, self.s)
-        if self.s > self._furthest + 0.002:
+        if self.grasping or self.s > self._furthest + 0.002:
             self._furthest, self._stalled_ticks = self.s, 0
         else:
             self._stalled_ticks += 1
@@ -181,6 +201,8 @@ class BeadMaze(FrankaTactileEnv):
 
     def _dropped(self, bead: np.ndarray) -> bool:
         """Whether the bead left the fingers, or (which physics should forbid) the wire."""
+        if self.grasping:
+            return False
         geom = self.model.geom("object").id
         held = any(geom in pad.geoms for pad in self.pad_contacts())
         point, _ = self.wire.at(self.s)

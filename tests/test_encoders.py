@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from safetensors.torch import load_file, save_file
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.sensors import GELSIGHT_MINI
+from touchgoal.control.sensors import GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.infonce import info_nce, loss_floor, symmetric_info_nce
 from touchgoal.encoders.preprocess import PREPROCESSORS
@@ -57,7 +57,7 @@ def make_encoder(pretrained_together: bool = False) -> TouchEncoder:
 
 
 def test_preprocessor_is_named_after_the_sensor() -> None:
-    assert set(PREPROCESSORS) == {GELSIGHT_MINI.name}
+    assert set(PREPROCESSORS) == {GELSIGHT_MINI.name, GELSIGHT_MINI_MARKERS.name}
     assert MINI.id == "gelsight_mini/v1"
 
 
@@ -283,7 +283,7 @@ def cut_short(directory: Path) -> None:
 
 
 DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
-    "no json": (lambda d: (d / "encoder.json").unlink(), "no touch encoder.*train-encoder align"),
+    "no json": (lambda d: (d / "encoder.json").unlink(), "no touch encoder.*train-encoder"),
     "no weights": (lambda d: (d / "encoder.safetensors").unlink(), "missing"),
     "no json inside": (lambda d: (d / "encoder.json").write_text("{"), "damaged"),
     "old preprocessor": (

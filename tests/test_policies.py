@@ -3,8 +3,9 @@
 import pytest
 
 from touchgoal.episodes.recording import Demonstration
-from touchgoal.policies.rollout import evaluate_expert
+from touchgoal.policies.rollout import evaluate
 from touchgoal.policies.success import SuccessRate
+from touchgoal.sim_envs.experts import PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 
 
@@ -20,7 +21,7 @@ def test_wilson_interval(successes: int, trials: int, low: float, high: float) -
 def test_trials_depend_on_their_seed_alone() -> None:
     config = PickPlaceConfig(cameras=(), tactile=False)
     jobs = [Demonstration(seed, options={"object": "toy_brick"}) for seed in (1, 2)]
-    assert evaluate_expert(config, jobs, workers=2) == [
-        *evaluate_expert(config, jobs[:1], workers=1),
-        *evaluate_expert(config, jobs[1:], workers=1),
+    assert evaluate(config, PickPlaceExpert, jobs, workers=2) == [
+        *evaluate(config, PickPlaceExpert, jobs[:1], workers=1),
+        *evaluate(config, PickPlaceExpert, jobs[1:], workers=1),
     ]

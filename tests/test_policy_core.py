@@ -2,6 +2,7 @@
 
 import json
 import math
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,14 +13,17 @@ from safetensors.torch import load_file, save_file
 
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
+from touchgoal.encoders.trunk import TouchTrunk, TouchTrunkConfig
+from touchgoal.encoders.vit import PRESETS as VITS
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies import checkpoint, ema
 from touchgoal.policies import train as train_module
-from touchgoal.policies.acting import PolicyActor
+from touchgoal.policies.acting import Planner, PolicyActor
 from touchgoal.policies.actions import Representation, Scale, represent, to_actions
 from touchgoal.policies.diffusion import DiffusionConfig, RegressionConfig
-from touchgoal.policies.policy import Condition, Policy, PolicyConfig
+from touchgoal.policies.policy import Condition, Policy, PolicyConfig, unroll
+from touchgoal.policies.realtime import RealTimeActor
 from touchgoal.policies.samplers import (
     FLOW_STEPS,
     SamplerConfig,
@@ -28,9 +32,10 @@ from touchgoal.policies.samplers import (
     spoil,
     visited,
 )
+from touchgoal.policies.touch import TouchEmbedder
 from touchgoal.policies.train import TrainConfig, train
 from touchgoal.policies.unet import PRESETS, ShortConv1d, UNet
-from touchgoal.policies.windows import Recorded, TouchEmbedder, Windows, read
+from touchgoal.policies.windows import Recorded, Windows, read
 
 DIFFUSION = DiffusionConfig(PRESETS["tiny"], SamplerConfig(plan_steps=5))
 FLOW = DiffusionConfig(PRESETS["tiny"], SamplerConfig("flow", plan_steps=5))
@@ -283,24 +288,66 @@ def test_a_saved_policy_plans_the_same(
     assert torch.equal(loaded.plan(condition, rng()), policy.plan(condition, rng()))
 
 
-def test_an_actor_does_its_plans_in_order() -> None:
-    config = replace(TOY, touch_dim=2, execution_horizon=3)
-    windows = toy_windows(config)
-    policy = policy_for(config, windows).eval()
-    ticks = [
+def feeling() -> TouchEmbedder:
+    torch.manual_seed(0)
+    trunk = TouchTrunk(TouchTrunkConfig.for_sensor(VITS["tiny"], "gelsight_mini"))
+    return TouchEmbedder(trunk.eval(), "toy")
+
+
+def toy_ticks(n: int) -> list[dict[str, np.ndarray]]:
+    generator = np.random.default_rng(1)
+    return [
         {
-            v.STATE: state[:15].numpy(),
-            v.TCP_POSE: state[15:].numpy(),
-            v.TACTILE_LEFT: touch.float().numpy(),
+            v.STATE: generator.normal(size=15).astype(np.float32),
+            v.TCP_POSE: generator.normal(size=7).astype(np.float32),
+            **{k: generator.integers(0, 255, (6, 8, 3), np.uint8) for k in v.TACTILE},
         }
-        for touch, state in zip(windows.recorded.touch, windows.recorded.state, strict=True)
+        for _ in range(n)
     ]
-    actor = PolicyActor(policy, lambda observation: observation[v.TACTILE_LEFT], seed=5)
-    done = torch.from_numpy(np.stack([actor.act(tick) for tick in ticks[:5]]))
-    generator = rng(5)
-    seen = [windows.take(torch.tensor([tick]))[0] for tick in (0, 3)]
-    plans = [policy.plan(condition, generator)[0, :3] for condition in seen]
-    torch.testing.assert_close(done, torch.cat(plans)[:5])
+
+
+@pytest.mark.parametrize("latency", [0, 1, 3])
+def test_an_actor_does_its_plans_in_order_and_on_time(latency: int) -> None:
+    touch = feeling()
+    config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
+    policy, ticks = policy_for(config, toy_windows(config)).eval(), toy_ticks(8)
+    actor = PolicyActor(Planner(policy, touch, seed=5), latency)
+    done = [actor.act(tick) for tick in ticks]
+    rows = np.stack([touch.embed_tick(tick, ticks[0]) for tick in ticks])
+    states = np.stack([np.concatenate([tick[v.STATE], tick[v.TCP_POSE]]) for tick in ticks])
+    generator, expected = rng(5), []
+    for asked in range(0, 8, 3):  # ticks on whose observation a plan is made
+        asked = max(asked - latency, 0)
+        seen = [max(asked - 1, 0), asked]
+        condition = Condition(
+            torch.from_numpy(rows[seen])[None], torch.from_numpy(states[seen])[None]
+        )
+        plan = policy.plan(condition, generator)[0].numpy()
+        first = latency if expected else 0
+        expected += list(plan[first : first + 3])
+    np.testing.assert_allclose(done, expected[:8], rtol=1e-5)
+
+
+def test_an_actor_refuses_what_it_cannot_do() -> None:
+    touch = feeling()
+    policy = Policy(replace(TOY, touch_dim=touch.dim))
+    with pytest.raises(UserError, match="load the touch encoder"):
+        Planner(policy, None)
+    with pytest.raises(UserError, match="5 ticks late"):
+        PolicyActor(Planner(policy, touch), latency=5)
+
+
+def test_a_turn_looks_the_same_by_either_quaternion() -> None:
+    state = torch.randn(5, 22)
+    state[:, 18:] /= state[:, 18:].norm(dim=1, keepdim=True)
+    other = torch.cat([state[:, :18], -state[:, 18:]], 1)
+    seen = unroll(state, (v.STATE, v.TCP_POSE))
+    torch.testing.assert_close(seen, unroll(other, (v.STATE, v.TCP_POSE)))
+    matrix = np.zeros(9)
+    import mujoco  # after touchgoal, which chooses the OpenGL platform
+
+    mujoco.mju_quat2Mat(matrix, state[0, 18:].double().numpy())
+    np.testing.assert_allclose(seen[0, 18:].reshape(2, 3).T, matrix.reshape(3, 3)[:, :2], atol=1e-6)
 
 
 def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
@@ -325,36 +372,67 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         checkpoint.load(tmp_path)
 
 
-def test_episodes_are_embedded_once(tmp_path: Path) -> None:
-    generator, writer = np.random.default_rng(0), EpisodeWriter(tmp_path / "set")
-    config = replace(TOY, touch_dim=2)
+class SlowPlanner(Planner):
+    """Takes its time; remembers its plans."""
+
+    def __init__(self, policy: Policy, pause: float) -> None:
+        super().__init__(policy, None)
+        self.pause, self.plans = pause, []
+
+    def plan(self, seen):
+        time.sleep(self.pause if self.plans else 0.0)
+        actions = super().plan(seen)
+        self.plans.append((int(seen[-1][v.STATE][0]), actions))
+        return actions
+
+
+def test_a_late_plan_is_joined_where_it_should_be_by_now() -> None:
+    """Every action is one that a plan meant for this very tick; none waits for a plan."""
+    config = replace(TOY, touch_dim=0, touch="", execution_horizon=3)
+    planner = SlowPlanner(policy_for(config, toy_windows(config)).eval(), pause=0.05)
+    actor, done = RealTimeActor(planner), []
+    for i, tick in enumerate(toy_ticks(40)):
+        tick[v.STATE][0] = i
+        done.append(actor.act(tick))
+        time.sleep(0.02)
+    actor.close()
+    for i, action in enumerate(done):
+        meant = [p[i - tick] for tick, p in planner.plans if 0 <= i - tick < 8]
+        assert any(np.array_equal(action, m) for m in meant) or not action[:7].any()
+    assert len(planner.plans) > 4 and sum(not a[:7].any() for a in done) == actor.starved
+    assert len(actor.latencies) == len(planner.plans) - 1
+
+
+def test_a_failing_planner_stops_the_actor() -> None:
+    config = replace(TOY, touch_dim=0, touch="")
+    actor = RealTimeActor(Planner(policy_for(config, toy_windows(config)).eval(), None))
+    with pytest.raises(KeyError):
+        actor.act({})
+    actor.close()
+
+
+def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    writer, embedder = EpisodeWriter(tmp_path / "set"), feeling()
+    config = replace(TOY, touch_dim=embedder.dim)
     for n in (4, 6):
-        frames = {
-            key: generator.normal(size=(n, *v.FEATURES[key].shape)).astype(np.float32)
-            for key in (v.STATE, v.TCP_POSE, v.ACTION)
-        }
-        frames |= {k: generator.integers(0, 255, (n, 6, 8, 3), np.uint8) for k in v.TACTILE}
-        writer.append(Episode(frames, "feel"))
-    episodes, calls = EpisodeSet(tmp_path / "set"), []
-
-    def brightness(episode: Episode) -> np.ndarray:
-        calls.append(len(episode))
-        return np.stack([episode.frames[k].mean((1, 2, 3)) for k in v.TACTILE], 1).astype(
-            np.float32
-        )
-
-    embedder = TouchEmbedder("toy", 2, brightness)
-    cache = tmp_path / "cache"
+        ticks = [{**tick, v.ACTION: tick[v.STATE][:8]} for tick in toy_ticks(n)]
+        writer.append(Episode({k: np.stack([t[k] for t in ticks]) for k in ticks[0]}, "feel"))
+    episodes, cache = EpisodeSet(tmp_path / "set"), tmp_path / "cache"
     first = read(episodes, [0, 1], config, embedder, cache)
+    monkeypatch.setattr(embedder, "embed", None)  # a second embedding would fail
     again = read(episodes, [1], config, embedder, cache)
-    assert calls == [4, 6] and first.lengths == (4, 6)
+    assert first.lengths == (4, 6)
     assert torch.equal(first.touch[4:], again.touch)
     assert first.state.shape == (10, 22) and torch.equal(first.actions[4:], again.actions)
+    frames = toy_ticks(4)
+    row = torch.from_numpy(embedder.embed_tick(frames[3], frames[0])).half()
+    torch.testing.assert_close(first.touch[3], row, rtol=1e-2, atol=1e-2)
+    embedder.name = "b"
     with pytest.raises(UserError, match="other episodes or another encoder"):
-        read(episodes, [0], replace(config, touch="b"), replace(embedder, name="b"), cache)
+        read(episodes, [0], replace(config, touch="b"), embedder, cache)
     with pytest.raises(UserError, match="make its config"):
         read(episodes, [0], config, None, cache)
-    blind = read(episodes, [0], replace(config, touch_dim=0), None, cache)
+    blind = read(episodes, [0], replace(config, touch_dim=0, touch=""), None, cache)
     assert blind.touch.shape == (4, 0)
     Policy(replace(config, touch_dim=0)).plan(
         Condition(blind.touch[None, :2].float(), blind.state[None, :2]), rng()

@@ -389,7 +389,10 @@ def protected(address: str, reset: str) -> dict:
     deadline = time.monotonic() + 5
     while control.servoJ(q, 0, 0, 0.008, 0.1, 300) and time.monotonic() < deadline:
         time.sleep(0.008)
-    said = {"noticed": receive.isProtectiveStopped()}
+    said = {"refused": time.monotonic() < deadline}
+    while not receive.isProtectiveStopped() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    said["noticed"] = receive.isProtectiveStopped()
     dashboard = DashboardClient(address)
     dashboard.connect()
     try:
@@ -424,7 +427,7 @@ def protected(address: str, reset: str) -> dict:
 
 def test_ur_protective_stop_and_reconnection(ur5e: dict) -> None:
     said = client(protected, ur5e["address"], ur5e["faults"])
-    assert said["noticed"] and "5s" in said["early"] and said["unlocked"]
+    assert said["refused"] and said["noticed"] and "5s" in said["early"] and said["unlocked"]
     assert said["emergency"] == [True, "Safetystatus: ROBOT_EMERGENCY_STOP"]
     assert said["anew"] < 2e-3
 

@@ -1,0 +1,150 @@
+"""How long a plan takes on one core, stage by stage, beside networks of the published sizes.
+
+Warm-up is not counted. The published U-Net and the ViTs of the touch literature carry random
+weights here: they are timed, not used.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from touchgoal.benchmarks.speed import one_core
+from touchgoal.control import vocabulary as v
+from touchgoal.encoders.vit import ViT, ViTConfig
+from touchgoal.policies import checkpoint
+from touchgoal.policies.acting import SHIPPED, ActorMaker
+from touchgoal.policies.diffusion import Diffusion, DiffusionConfig
+from touchgoal.policies.eyes import shrink
+from touchgoal.policies.samplers import SamplerConfig
+from touchgoal.policies.unet import PRESETS
+
+_VITS = {
+    "ViT-tiny": ViTConfig((224, 224), width=192, depth=12, heads=3),
+    "ViT-small": ViTConfig((224, 224), width=384, depth=12, heads=6),
+    "ViT-base": ViTConfig((224, 224), width=768, depth=12, heads=12),
+}
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of benchmark policy-latency."""
+
+    out: Path | None = None
+    """Folder of the run."""
+    policy: Path = SHIPPED["bead-maze"]
+    """A policy that train-policy made."""
+    repeats: int = 200
+    """Plans timed."""
+    large_repeats: int = 5
+    """Runs of each network of a published size; 0 leaves them out."""
+    control_hz: int = v.CONTROL_HZ
+    """Ticks per second that the plan has to fit."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Times of one stage, ms."""
+
+    what: str
+    median: float
+    p95: float
+    slowest: float
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Time all stages on one core; `table` and the numbers behind it."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with one_core(), torch.inference_mode():
+            stages = _stages(config) + _published(config)
+    finally:
+        torch.set_num_threads(threads)
+    period = 1000 / config.control_hz
+    lines = [f"{'one core, ms':<58}{'median':>9}{'p95':>9}{'slowest':>9}"]
+    lines += [f"{s.what:<58}{s.median:>9.1f}{s.p95:>9.1f}{s.slowest:>9.1f}" for s in stages]
+    lines.append(f"a tick at {config.control_hz} Hz has {period:.0f} ms")
+    return {"table": "\n".join(lines), "stages": [s.__dict__ for s in stages]}
+
+
+def _stages(config: Config) -> list[Stage]:
+    maker = ActorMaker(config.policy)
+    planner = maker.planner()
+    policy, ticks = checkpoint.load(config.policy), _observations(planner.config)
+    stages = []
+    if planner.touch is not None:
+        encoder = planner.touch.encoder
+        frame = ticks[0][v.TACTILE_LEFT]
+        both = np.concatenate([encoder.preprocess(frame[None], frame)] * 2)
+        touch = torch.from_numpy(both)
+        stages += [
+            _time(
+                "preprocess both fingertips",
+                config.repeats,
+                lambda: [encoder.preprocess(ticks[1][k][None], ticks[0][k]) for k in v.TACTILE],
+            ),
+            _time("touch encoder, both", config.repeats, lambda: encoder.embed_touch(touch)),
+        ]
+    if (eye := policy.config.eye) is not None and policy.eye is not None:
+        pictures = [shrink(ticks[1][k][None], k, ticks[0][k], eye.size) for k in eye.keys]
+        seen = torch.from_numpy(np.stack(pictures, 1))
+        look = policy.eye
+        stages.append(_time("pictures through the eye", config.repeats, lambda: look(seen)))
+    condition = torch.zeros(1, policy.condition_dim)
+    generator = torch.Generator().manual_seed(0)
+    stages.append(
+        _time("denoising", config.repeats, lambda: policy.head.plan(condition, generator))
+    )
+    turn = iter(range(10**9))
+
+    def tick() -> None:
+        i = next(turn)
+        planner.plan([ticks[i % 8], ticks[(i + 1) % 8]])  # one new observation, as on the arm
+
+    stages.append(_time("a whole plan, observation to actions", config.repeats, tick))
+    return stages
+
+
+def _published(config: Config) -> list[Stage]:
+    if config.large_repeats == 0:
+        return []
+    generator = torch.Generator().manual_seed(0)
+    sampler = SamplerConfig("ddim", "epsilon", plan_steps=16)
+    head = Diffusion(DiffusionConfig(PRESETS["published"], sampler), 8, 8, 1550).eval()
+    condition = torch.zeros(1, 1550)
+    size = sum(p.numel() for p in head.parameters()) / 1e6
+    name = f"published U-Net, {size:.0f} M, 16 DDIM steps (random weights)"
+    stages = [_time(name, config.large_repeats, lambda: head.plan(condition, generator))]
+    for name, vit in _VITS.items():
+        trunk, both = ViT(vit).eval(), torch.zeros(2, 3, 224, 224)
+        what = f"{name} at 224 x 224, both fingertips (random weights)"
+        stages.append(_time(what, config.large_repeats, lambda t=trunk, b=both: t.features(b)))
+    return stages
+
+
+def _observations(config: Any) -> list[dict[str, np.ndarray]]:
+    rng = np.random.default_rng(0)
+    keys = [*config.proprioception, *v.TACTILE, *v.CAMERAS]
+    return [{key: _random(v.FEATURES[key], rng) for key in keys} for _ in range(8)]
+
+
+def _random(feature: v.Feature, rng: np.random.Generator) -> np.ndarray:
+    if feature.dtype == "uint8":
+        return rng.integers(90, 110, feature.shape, np.uint8)
+    return rng.normal(size=feature.shape).astype(np.float32)
+
+
+def _time(what: str, repeats: int, work: Callable[[], object]) -> Stage:
+    for _ in range(3):
+        work()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        times.append(1e3 * (time.perf_counter() - start))
+    return Stage(what, float(np.median(times)), float(np.quantile(times, 0.95)), max(times))

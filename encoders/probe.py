@@ -1,0 +1,31 @@
+"""What a frozen embedding knows, as a ridge regression can read it."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def ridge_r2(
+    inputs: Float[Tensor, "n d"],
+    targets: Float[Tensor, "n k"],
+    test_inputs: Float[Tensor, "m d"],
+    test_targets: Float[Tensor, "m k"],
+    strength: float = 1e-3,
+) -> Float[Tensor, " k"]:
+    """Share of each target's variance that a linear reading of new inputs explains.
+
+    Args:
+        inputs: Embeddings to fit on; columns are brought to variance 1.
+        targets: What to read from them.
+        test_inputs: Other embeddings.
+        test_targets: Their targets.
+        strength: Of the ridge, as a share of the number of samples.
+    """
+    mean, spread = inputs.mean(0), inputs.std(0).clamp(min=1e-6)
+    X, Y = ((inputs - mean) / spread).double(), targets.double()
+    offset = Y.mean(0)
+    gram = X.T @ X + strength * len(X) * torch.eye(X.shape[1], dtype=X.dtype)
+    weights = torch.linalg.solve(gram, X.T @ (Y - offset))
+    read = ((test_inputs - mean) / spread).double() @ weights + offset
+    error = ((read - test_targets) ** 2).mean(0)
+    return (1 - error / test_targets.double().var(0, correction=0)).float()

@@ -1,0 +1,71 @@
+"""A touch trunk: a ViT over touch alone, as self-supervision leaves it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int, UInt8
+from torch import Tensor, nn
+
+from touchgoal.encoders.preprocess import TactilePreprocessor, preprocessor_for
+from touchgoal.encoders.vit import ViT, ViTConfig
+
+BATCH = 64
+
+
+@dataclass(frozen=True)
+class TouchTrunkConfig:
+    """What a trunk is and what it was trained with.
+
+    Attributes:
+        vit: Its size.
+        sensor: Name of the fingertip sensor.
+        preprocessor: `TactilePreprocessor.id` in use at training.
+    """
+
+    vit: ViTConfig
+    sensor: str
+    preprocessor: str
+
+    @classmethod
+    def for_sensor(cls, vit: ViTConfig, sensor: str) -> "TouchTrunkConfig":
+        """The configuration for a sensor; UserError for an unknown one."""
+        return cls(vit, sensor, preprocessor_for(sensor).id)
+
+    @property
+    def embedding_dim(self) -> int:
+        """Width of an embedding."""
+        return self.vit.width
+
+
+class TouchTrunk(nn.Module):
+    """Touch as the mean of a ViT's tokens."""
+
+    def __init__(self, config: TouchTrunkConfig) -> None:
+        """Builds a randomly initialised trunk; UserError for an unknown sensor."""
+        super().__init__()
+        self.config = config
+        self.preprocess: TactilePreprocessor = preprocessor_for(config.sensor)
+        self.vit = ViT(config.vit)
+
+    def embed_touch(
+        self, touch: Float[Tensor, "n 3 h w"], keep: Int[Tensor, "n k"] | None = None
+    ) -> Float[Tensor, "n d"]:
+        """Embeds preprocessed frames, of which only the patches in `keep` are seen if given."""
+        return self.vit.features(touch, keep)
+
+    @torch.no_grad()
+    def embed_frames(
+        self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
+    ) -> Float32[np.ndarray, "n d"]:
+        """Embeds raw frames of one sensor, given the same sensor untouched.
+
+        Raises:
+            UserError: The frames are not of this trunk's sensor.
+        """
+        rows = np.empty((len(frames), self.config.embedding_dim), np.float32)
+        device = next(self.parameters()).device
+        for i in range(0, len(frames), BATCH):
+            touch = torch.from_numpy(self.preprocess(frames[i : i + BATCH], background))
+            rows[i : i + BATCH] = self.embed_touch(touch.to(device)).cpu().numpy()
+        return rows

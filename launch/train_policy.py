@@ -1,0 +1,158 @@
+"""Train a policy on recorded episodes; choose among its snapshots by trials in the task."""
+
+import os
+import shlex
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.policies import maze_trials, rollout
+from touchgoal.policies.acting import ActorMaker
+from touchgoal.policies.actions import Representation
+from touchgoal.policies.diffusion import DiffusionConfig, RegressionConfig
+from touchgoal.policies.eyes import EyeConfig
+from touchgoal.policies.policy import PolicyConfig
+from touchgoal.policies.samplers import SamplerConfig
+from touchgoal.policies.selection import Score, select
+from touchgoal.policies.touch import TouchEmbedder, load_touch
+from touchgoal.policies.train import TrainConfig, train
+from touchgoal.policies.unet import PRESETS
+from touchgoal.policies.windows import Windows, read
+from touchgoal.sim_envs.bead_maze import BeadMazeConfig
+from touchgoal.sim_envs.objects import CATALOGUE
+from touchgoal.sim_envs.pick_place import PickPlaceConfig
+from touchgoal.sim_envs.wires import choose
+
+_TRIALS = 2_000_000  # seed of the first trial
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of train-policy."""
+
+    episodes: Path
+    """Set of episodes to learn from; the successful ones are."""
+    validation: Path
+    """Set of other episodes, on which losses are measured."""
+    task: Literal["pick-place", "bead-maze"] = "bead-maze"
+    """Where snapshots are tried."""
+    touch: Path | None = None
+    """Folder of a frozen touch encoder (train-encoder); without one the policy does not feel."""
+    end_to_end: bool = False
+    """Feel through a touch ViT that is trained along, instead of a frozen encoder."""
+    cameras: tuple[str, ...] = ()
+    """Cameras to look at, front or wrist, through networks that are trained along."""
+    out: Path | None = None
+    """Folder of the run; the policy goes to its `policy/`."""
+    share: float = 1.0
+    """Of the episodes to learn from, the first so many."""
+    head: Literal["small", "published", "tiny", "regression"] = "small"
+    """Size of the diffusion's U-Net, or regression instead."""
+    sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig(plan_steps=4))
+    """How the diffusion is trained and sampled."""
+    representation: Representation = "chunk"
+    """Of the actions while learning."""
+    observation_horizon: int = 2
+    """Ticks seen."""
+    execution_horizon: int = 4
+    """Ticks of a plan that are done before the next one."""
+    train: TrainConfig = TrainConfig()
+    """The training."""
+    trials: int = 24
+    """Validation wires or placements on which every snapshot is tried; 0 keeps the last one."""
+    env: PickPlaceConfig = field(default_factory=PickPlaceConfig)
+    """Options of pick-place, when snapshots are tried."""
+    maze: BeadMazeConfig = field(default_factory=lambda: BeadMazeConfig(split="validation"))
+    """Options of bead-maze, when snapshots are tried."""
+    workers: int = os.cpu_count() or 1
+    """Processes that simulate."""
+    resume: bool = False
+    """Go on with an interrupted run in `out`."""
+
+
+def main(config: Config) -> None:
+    """Embed, train, choose."""
+    if config.resume and config.out is None:
+        raise UserError("to resume a run, name its folder with --out")
+    if not 0 < config.share <= 1:
+        raise UserError("share must be above 0 and at most 1")
+    if config.end_to_end and (config.touch or config.cameras):
+        raise UserError("end-to-end touch takes no frozen encoder and no cameras: leave them out")
+    touch = load_touch(config.touch) if config.touch else None
+    sets = EpisodeSet(config.episodes), EpisodeSet(config.validation)
+    policy = _policy_config(config, sets[0], touch)
+    out = open_run(config.out, "train-policy", config)
+    chosen = [_successful(s) for s in sets]
+    chosen[0] = chosen[0][: max(1, round(config.share * len(chosen[0])))]
+    windows, validation = (
+        Windows(read(s, rows, policy, touch, _cache(s, touch), config.workers), policy)
+        for s, rows in zip(sets, chosen, strict=True)
+    )
+    print(f"{len(windows)} windows of {len(chosen[0])} episodes; {len(validation)} for validation")
+    recipe = {
+        "command": shlex.join(["touchgoal", *sys.argv[1:]]),
+        "data": "simulated: touchgoal collect-demos",
+        "episodes": len(chosen[0]),
+    }
+    train(policy, windows, validation, config.train, out, recipe, config.resume)
+    scores = select(out, config.touch, lambda directory: _try(config, directory))
+    write_json(out / "metrics.json", {"snapshots": scores})
+    print(f"policy: {out / 'policy'}")
+
+
+def _policy_config(
+    config: Config, episodes: EpisodeSet, touch: TouchEmbedder | None
+) -> PolicyConfig:
+    head = RegressionConfig()
+    if config.head != "regression":
+        head = DiffusionConfig(PRESETS[config.head], config.sampler)
+    return PolicyConfig(
+        touch_dim=touch.dim if touch else 0,
+        touch=touch.name if touch else "",
+        eye=_eye(config),
+        representation=config.representation,
+        observation_horizon=config.observation_horizon,
+        execution_horizon=config.execution_horizon,
+        control_hz=episodes.fps,
+        head=head,
+    )
+
+
+def _eye(config: Config) -> EyeConfig | None:
+    if config.end_to_end:
+        return EyeConfig(v.TACTILE, size=(120, 160), network="vit")
+    if config.cameras:
+        return EyeConfig(tuple(v.IMAGE_PREFIX + name for name in config.cameras))
+    return None
+
+
+def _successful(episodes: EpisodeSet) -> list[int]:
+    return [i for i in range(len(episodes)) if episodes.meta(i).get("success", True)]
+
+
+def _cache(episodes: EpisodeSet, touch: TouchEmbedder | None) -> Path:
+    """Beside the episodes, so that every training on them shares it."""
+    name = touch.name.replace("/", "_") if touch else "none"
+    return episodes.root.parent / "embeddings" / name
+
+
+def _try(config: Config, directory: Path) -> Score:
+    if config.trials == 0:
+        return 0.0, 0.0
+    maker = ActorMaker(directory)
+    if config.task == "bead-maze":
+        wires = choose(config.maze.split, config.trials, config.maze.families)
+        jobs = maze_trials.trials_of(wires, _TRIALS)
+        trials = maze_trials.evaluate(maker.observing(config.maze), maker, jobs, config.workers)
+    else:
+        jobs = rollout.demonstrations_of(list(CATALOGUE), config.trials, _TRIALS)
+        trials = rollout.evaluate(maker.observing(config.env), maker, jobs, config.workers)
+    success = float(np.mean([t.success for t in trials]))
+    return success, float(np.mean([t.progress for t in trials]))

@@ -1,0 +1,108 @@
+"""Planning while the arm moves: an inference thread, and a hand-over that skips what has gone by."""
+
+import threading
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from touchgoal.control import vocabulary as v
+from touchgoal.policies.acting import Observation, Planner
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    tick: int  # at which its first action belongs
+    actions: Float32[np.ndarray, "h 8"]
+
+
+class RealTimeActor:
+    """Answers at once, from the newest plan that is ready; the next one is made in a thread.
+
+    A plan's action k belongs to the tick k after its observation, so what has gone by while it was
+    made is left out: a late plan makes no jump. If plans run out the arm is told to stand still,
+    and that is counted. The first plan, which warms everything up, is waited for and not counted.
+
+    Attributes:
+        latencies: seconds from an observation to its plan, of every plan but the first.
+        starved: ticks for which no plan was ready.
+        failure: what ended the planning thread, if something did; `act` raises it.
+    """
+
+    def __init__(self, planner: Planner) -> None:
+        """Starts an episode; `close` ends the thread."""
+        self._planner, self._config = planner, planner.config
+        self.latencies: list[float] = []
+        self.starved = 0
+        self.failure: BaseException | None = None
+        self._tick = -1
+        self._seen: list[Observation] = []
+        self._asked = 0.0  # when the newest observation came, monotonic s
+        self._plan: _Plan | None = None
+        self._width = 0.0
+        self._condition = threading.Condition()
+        self._closed = False
+        self._thread = threading.Thread(target=self._work, name="planner", daemon=True)
+
+    def act(self, observation: Observation) -> Float32[np.ndarray, "8"]:
+        """The action for the next tick."""
+        with self._condition:
+            first = self._tick < 0
+            self._tick += 1
+            before = self._seen or [observation] * self._config.observation_horizon
+            self._seen = [*before[1:], observation]
+            self._asked = time.monotonic()
+            self._condition.notify_all()
+            if first:
+                self._thread.start()
+                self._condition.wait_for(lambda: self._plan is not None or self.failure is not None)
+            if self.failure is not None:
+                raise self.failure
+            return self._action()
+
+    def close(self) -> None:
+        """Ends the thread."""
+        with self._condition:
+            self._closed = True
+            self._condition.notify_all()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _action(self) -> np.ndarray:
+        assert self._plan is not None
+        k = self._tick - self._plan.tick
+        if k < len(self._plan.actions):
+            action = self._plan.actions[k]
+            self._width = float(action[v.N_JOINTS])
+            return action
+        self.starved += 1
+        return np.append(np.zeros(v.N_JOINTS), self._width).astype(np.float32)
+
+    def _work(self) -> None:
+        torch.set_num_threads(1)  # of this thread; two lose badly when the other core is taken
+        try:
+            while (task := self._wait()) is not None:
+                tick, seen, asked = task
+                actions = self._planner.plan(seen)
+                with self._condition:
+                    if self._plan is not None:
+                        self.latencies.append(time.monotonic() - asked)
+                    self._plan = _Plan(tick, actions)
+                    self._condition.notify_all()
+        except BaseException as error:
+            with self._condition:
+                self.failure = error
+                self._condition.notify_all()
+
+    def _wait(self) -> tuple[int, list[Observation], float] | None:
+        """What to plan from: the newest observation, once enough of the present plan is done."""
+        with self._condition:
+            self._condition.wait_for(self._due)
+            return None if self._closed else (self._tick, list(self._seen), self._asked)
+
+    def _due(self) -> bool:
+        if self._closed or self._plan is None:
+            return self._closed or self._tick >= 0
+        return self._tick - self._plan.tick >= self._config.execution_horizon - 1
