@@ -21,6 +21,10 @@ import pytest
 import serial
 
 from touchgoal.control.errors import UserError
+from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
+from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.scene import SceneConfig
+from touchgoal.sim_envs.twin.cell import Cell
 from touchgoal.sim_envs.twin.faults import ask
 from touchgoal.sim_envs.twin.serial_ports import NEWTONS_PER_COUNT, ZERO
 
@@ -97,6 +101,40 @@ def client(function: Callable, *arguments: object, seconds: float = 150) -> dict
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
+
+
+# The cell, without a wire.
+
+
+@pytest.mark.parametrize("arm", ["fr3", "ur5e"])
+def test_arm_follows_without_lag(arm: str) -> None:
+    scene = SceneConfig(arm=arm)  # type: ignore[arg-type]
+    cell = Cell(PickPlace(PickPlaceConfig(cameras=(), tactile=False, scene=scene)), 3, {})
+    start, error = cell.q_d.copy(), 0.0
+    for _ in range(1500):
+        phase = 4 * (cell.time + 1e-3)  # 0.8 rad/s and 3.2 rad/s^2 at most
+        cell.follow(start + 0.2 * (1 - np.cos(phase)), np.full(len(start), 0.8 * np.sin(phase)))
+        cell.step()
+        error = max(error, float(np.abs(cell.q - cell.q_d).max()))
+    assert error < 5e-3  # 0.08 rad without feed-forward
+    cell.brake(np.full(len(start), 10.0))
+    for _ in range(300):
+        cell.step()
+    assert not cell.moving and cell.worst.excess <= 0
+
+
+def test_fixture_waits_for_the_first_grasp() -> None:
+    maze = BeadMazeConfig(split="validation", n_wires=20, tactile=False)
+    cell = Cell(BeadMaze(maze), 3, {})
+    for _ in range(2000):
+        cell.step()
+    fixture = cell.env.model.equality("fixture").id
+    assert cell.env.data.eq_active[fixture]
+    cell.grasp(0.0, 0.1, 10.0)
+    for _ in range(1000):
+        cell.step()
+    assert not cell.env.data.eq_active[fixture] and not cell.failures
+    np.testing.assert_allclose(cell.truth()["pad_forces"], 10.0, rtol=0.05)
 
 
 # The Franka control interface, through libfranka.
