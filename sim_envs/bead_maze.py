@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
-from touchgoal.control.kinematics import FR3_HOME, fingers_across
+from touchgoal.control.kinematics import fingers_across
 from touchgoal.sim_envs import wires
 from touchgoal.sim_envs.base import EnvConfig, FrankaTactileEnv, Observation
 from touchgoal.sim_envs.objects import HARD, Body, Material, ObjectKind, Texture
@@ -102,8 +102,8 @@ class BeadMaze(FrankaTactileEnv):
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control tick; the reward is the tick's gain in progress."""
         action = np.asarray(action, dtype=np.float64)
-        self.data.eq_active[self.model.equality("fixture").id] = self.grasping
-        if self.config.disturbance > 0 and action.shape == (8,) and not self.grasping:
+        known = action.shape == self.action_space.shape
+        if self.config.disturbance > 0 and known and not self.grasping:
             action = action + np.append(self._stray(), 0.0)
         observation, reward, success, truncated, info = super().step(action)
         return observation, reward, success or bool(self.failure.any()), truncated, info
@@ -112,6 +112,15 @@ class BeadMaze(FrankaTactileEnv):
     def grasping(self) -> bool:
         """Whether the fixture still holds the bead."""
         return self._ticks < GRASP_SECONDS * self.config.control_hz
+
+    def begin_tick(self) -> None:
+        """The fixture holds the bead while the hand closes on it, and lets go of it then."""
+        self.data.eq_active[self.model.equality("fixture").id] = self.grasping
+
+    def troubles(self) -> list[str]:
+        """Of drop, jam and over_force, what is so after the last tick."""
+        names = v.FEATURES[v.TRUTH_FAILURE].names
+        return [name for name, true in zip(names, self.failure, strict=True) if true]
 
     def instruction(self) -> str:
         """The episode's task in words."""
@@ -154,14 +163,14 @@ class BeadMaze(FrankaTactileEnv):
         self._furthest, self._stalled_ticks = START, 0
         self._drift = np.zeros(6)
 
-    def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, "7"]:
+    def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
         """Joint positions with the bead between the fingers, not quite in their middle."""
         point, tangent = self.wire.at(START)
         R = fingers_across(tangent)
         offset = R @ np.array([rng.uniform(-0.001, 0.001), 0.0, rng.uniform(-0.001, 0.001)])
-        guess = FR3_HOME.copy()
+        guess = self.robot.arm.home.copy()
         # the hand's yaw; wires head into the half plane y > 0, or nearly so
-        guess[6] -= (np.arctan2(tangent[1], tangent[0]) + np.pi / 2) % (2 * np.pi) - np.pi / 2
+        guess[-1] -= (np.arctan2(tangent[1], tangent[0]) + np.pi / 2) % (2 * np.pi) - np.pi / 2
         return self.kinematics.reach(point + offset, R, guess)
 
     def _settle(self) -> None:
@@ -169,9 +178,9 @@ class BeadMaze(FrankaTactileEnv):
         self._opening = BEAD_RADIUS + 0.004
         self.data.qpos[self._fingers] = self._opening
         self.data.eq_active[self.model.equality("fixture").id] = 1
-        self._advance(np.zeros(v.N_JOINTS), 2 * self._opening, seconds=0.1)
+        self._advance(np.zeros(self.n_joints), 2 * self._opening, seconds=0.1)
 
-    def _stray(self) -> Float[np.ndarray, "7"]:
+    def _stray(self) -> Float[np.ndarray, " n"]:
         """Joint change (rad) that nobody commanded: a random walk of the hand's velocity."""
         tick = 1 / self.config.control_hz
         keep = np.exp(-tick / STRAY_SECONDS)
