@@ -123,7 +123,7 @@ def _arms(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
     for directory in policies:
         config = checkpoint.load(directory).config
         touch = "frozen touch" if config.touch_dim else "state only"
-        episodes = checkpoint.read_provenance(directory)["episodes"]
+        episodes = checkpoint.POLICY.provenance(directory)["episodes"]
         head = "" if hasattr(config.head, "unet") else ", regression"
         arms.setdefault(f"{touch}, {episodes} demos{head}", []).append(directory)
     return arms

@@ -93,7 +93,7 @@ def test_train_encoder_then_use_it(episodes: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     run("train-encoder", "align", "--episodes", episodes, "--validation", episodes, "--out", out,
         "--align.vit", "tiny", "--align.epochs", 12, "--align.batch-size", 32)  # fmt: skip
-    kept = pretrained.read_provenance(out / "encoder")
+    kept = pretrained.ENCODER.provenance(out / "encoder")
     assert kept["episodes"] == 2 and kept["command"].startswith("touchgoal")
     run("reward-curves", episodes, "--encoder", out / "encoder", "--out", tmp_path / "curves")
     report = json.loads((tmp_path / "curves" / "episode_001.json").read_text())
