@@ -30,6 +30,7 @@ from touchgoal.sim_envs.objects import CATALOGUE
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.wires import choose
 
+Head = Literal["small", "published", "tiny", "regression"]
 _TRIALS = 2_000_000  # seed of the first trial
 
 
@@ -53,7 +54,7 @@ class Config:
     """Folder of the run; the policy goes to its `policy/`."""
     share: float = 1.0
     """Of the episodes to learn from, the first so many."""
-    head: Literal["small", "published", "tiny", "regression"] = "small"
+    head: Head = "small"
     """Size of the diffusion's U-Net, or regression instead."""
     sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig(plan_steps=4))
     """How the diffusion is trained and sampled."""
