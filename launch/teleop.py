@@ -66,15 +66,20 @@ def main(config: Config) -> None:
                 print(f"{wire}, {i + 1} of {config.episodes}: {HELP}  q give up  Ctrl-C end")
                 job = Demonstration(config.seed + i, options={"wire": wire})
                 episode = lead(env, job, keyboard, config.hand)
-                print("\nsaving" if episode else "\ngiven up: not kept")
-                if episode:
-                    writer.append(episode)
-                    metas.append(episode.meta)
+                if episode is None:
+                    print("\ngiven up: not kept")
+                    continue
+                failed = ", ".join(env.troubles()) or "out of time"
+                ending = "arrived" if episode.meta["success"] else failed
+                print(f"\n{ending}: saving")
+                writer.append(episode)
+                metas.append(episode.meta)
         finally:
             env.close()
             write_json(out / "metrics.json", {"episodes": metas})
             done = sum(bool(meta["success"]) for meta in metas)
-            print(f"\n{len(metas)} episodes kept in {out / 'episodes'}, {done} to the wire's end")
+            kept = f"{len(metas)} of {config.episodes} episodes kept, {done} to the wire's end"
+            print(f"\n{kept}: {out / 'episodes'}")
 
 
 def lead(

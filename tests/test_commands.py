@@ -1,8 +1,8 @@
 """Every command at toy size, and one clear line for every mistake."""
 
 import importlib.util
-import io
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -138,7 +138,7 @@ def test_teleop_needs_a_terminal(
 ) -> None:
     """What it does at one: test_teleop.py."""
     out = tmp_path / "out"
-    monkeypatch.setattr("sys.stdin", io.StringIO("wwww"))
+    monkeypatch.setattr("sys.stdin", open(os.devnull))
     assert "in a terminal" in refused(capsys, "teleop", "--out", out)
     assert "unknown wire" in refused(capsys, "teleop", "--wires", "knot-1", "--out", out)
     assert not out.exists()

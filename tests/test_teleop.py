@@ -112,7 +112,8 @@ def test_a_person_leads_the_bead(tmp_path: Path) -> None:
         if "of the way" in seen[seen.rfind(header) :] and typed[header]:
             os.write(end, typed[header].encode())
             typed[header] = "w" if header == "1 of 3" else ""
-    assert program.wait(20) == 130 and "1 episodes kept" in seen and "given up" in seen
+    assert program.wait(20) == 130 and "1 of 3 episodes kept" in seen
+    assert "out of time" in seen and "given up" in seen
     assert termios.tcgetattr(terminal) == settings
     for one in (end, terminal):
         os.close(one)
