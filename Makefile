@@ -13,8 +13,8 @@ demo: $(READY)
 
 # What runs in real time needs a core to itself, so it comes after the rest.
 test: $(READY)
-	$(BIN)/python -m pytest -n auto -m "not realtime"
-	$(BIN)/python -m pytest -m realtime
+	$(BIN)/python -m pytest -n auto -m "not realtime" --durations 20
+	$(BIN)/python -m pytest -m realtime --durations 10
 
 # The quick loop before every commit.
 check: $(READY) typings
