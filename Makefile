@@ -35,7 +35,7 @@ build: $(READY)
 	rm -rf dist .venv-wheel
 	$(BIN)/python -m build --outdir dist
 	$(PYTHON) -m venv .venv-wheel
-	.venv-wheel/bin/pip install -q -c constraints.txt "$$(echo dist/*.whl)[towers,dev]"
+	.venv-wheel/bin/pip install -q -c constraints.txt "$$(echo dist/*.whl)[towers,franka,dev]"
 	.venv-wheel/bin/python -m pytest -n auto -m "not slow" --ignore tests/test_layout.py
 
 # How the shipped touch encoder was made: about 25 minutes on 2 cores.
@@ -62,7 +62,7 @@ maze-policy: $(READY)
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install -q -c constraints.txt -e '.[towers,dev]'
+	$(BIN)/pip install -q -c constraints.txt -e '.[towers,franka,dev]'
 	touch $@
 
 clean:

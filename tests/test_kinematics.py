@@ -1,6 +1,7 @@
 """CasADi kinematics against MuJoCo, and the inverse against the forward."""
 
-import mujoco
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 
@@ -10,31 +11,49 @@ from touchgoal.control.kinematics import (
     FR3_LOWER,
     FR3_UPPER,
     Fr3Kinematics,
+    Kinematics,
+    Ur5eKinematics,
     fingers_down,
+    rotation_matrix,
     rotation_vector,
 )
 from touchgoal.sim_envs.scene import build
 
+if TYPE_CHECKING:
+    import mujoco
 
-def test_forward_and_jacobian_match_mujoco() -> None:
-    model = build([]).compile()
-    data, arm = mujoco.MjData(model), Fr3Kinematics()
-    rng = np.random.default_rng(0)
-    site = model.site("tcp").id
+POSES = 1000
+
+
+def check_against_mujoco(
+    model: "mujoco.MjModel", arm: Kinematics, site: str, dofs: list[int]
+) -> None:
+    """Position, rotation and Jacobian to 1e-9 at random joint positions over the whole range."""
+    import mujoco  # after touchgoal, which chooses the OpenGL platform
+
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
     linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-    dofs = [model.joint(f"fr3_joint{i}").dofadr[0] for i in range(1, 8)]
-    for _ in range(50):
-        q = rng.uniform(FR3_LOWER, FR3_UPPER)
-        data.qpos[:7] = q
+    index = model.site(site).id
+    for _ in range(POSES):
+        q = rng.uniform(arm.arm.lower, arm.arm.upper)
+        data.qpos[dofs] = q
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        mujoco.mj_jacSite(model, data, linear, angular, site)
+        mujoco.mj_jacSite(model, data, linear, angular, index)
         position, rotation = arm.forward(q)
-        # The MJCF rounds the hand's quaternion to 7 digits.
-        np.testing.assert_allclose(position, data.site_xpos[site], atol=1e-9)
-        np.testing.assert_allclose(rotation, data.site_xmat[site].reshape(3, 3), atol=1e-7)
+        np.testing.assert_allclose(position, data.site_xpos[index], atol=1e-9)
+        np.testing.assert_allclose(rotation, data.site_xmat[index].reshape(3, 3), atol=1e-9)
         expected = np.vstack([linear[:, dofs], angular[:, dofs]])
-        np.testing.assert_allclose(arm.jacobian(q), expected, atol=1e-7)
+        np.testing.assert_allclose(arm.jacobian(q), expected, atol=1e-9)
+
+
+def test_fr3_matches_mujoco() -> None:
+    spec = build([])
+    # Franka's MJCF rounds half of -45 degrees to 7 digits.
+    spec.body("hand").quat = np.array([np.cos(np.pi / 8), 0, 0, -np.sin(np.pi / 8)])
+    model = spec.compile()
+    dofs = [int(model.joint(f"fr3_joint{i}").dofadr[0]) for i in range(1, 8)]
+    check_against_mujoco(model, Fr3Kinematics(), "tcp", dofs)
 
 
 def test_inverse_reaches_the_workspace_within_limits() -> None:
@@ -57,7 +76,61 @@ def test_out_of_reach_is_said() -> None:
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 0.3, 2.0, np.pi - 1e-6, np.pi])
 def test_rotation_vector_inverts_rodrigues(angle: float) -> None:
     axis = np.array([2.0, -1.0, 0.5]) / np.linalg.norm([2.0, -1.0, 0.5])
-    K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    R = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
-    found = rotation_vector(R)
+    found = rotation_vector(rotation_matrix(angle * axis))
     assert min(np.linalg.norm(found - angle * axis), np.linalg.norm(found + angle * axis)) < 1e-5
+
+
+def _ur5e_in_mujoco() -> "mujoco.MjModel":
+    """The UR5e from its lengths, joint by joint along the controller's base frame at q = 0.
+
+    Written from the drawing (axis directions and distances), not from DH frames.
+    """
+    import mujoco
+
+    axes = [(0, 0, 1), (0, -1, 0), (0, -1, 0), (0, -1, 0), (0, 0, -1), (0, -1, 0)]
+    offsets = [
+        (0, 0, 0),
+        (0, 0, 0.1625),
+        (-0.425, 0, 0),
+        (-0.3922, 0, 0),
+        (0, -0.1333, 0),
+        (0, 0, -0.0997),
+    ]
+    spec = mujoco.MjSpec()
+    body = spec.worldbody
+    for i, (axis, offset) in enumerate(zip(axes, offsets, strict=True)):
+        body = body.add_body(pos=offset)
+        body.add_joint(name=f"joint_{i}", axis=axis)
+        body.add_geom(size=[0.01, 0, 0], mass=1.0)
+    flange = body.add_site(name="flange", pos=[0, -0.0996, 0])
+    flange.quat = np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0])  # z out of the flange, along -y
+    return spec.compile()
+
+
+def test_ur5e_matches_mujoco() -> None:
+    check_against_mujoco(
+        _ur5e_in_mujoco(), Ur5eKinematics(tcp_offset=0.0), "flange", list(range(6))
+    )
+
+
+@pytest.mark.parametrize("arm", [Fr3Kinematics(), Ur5eKinematics()], ids=["FR3", "UR5e"])
+def test_what_is_reachable_is_reached_in_any_orientation(arm: Kinematics) -> None:
+    """999 of 1000 poses that some joint positions have, inside the box over the table."""
+    rng, limits = np.random.default_rng(7), arm.arm
+    lower, upper = np.maximum(limits.lower, -np.pi) + 0.05, np.minimum(limits.upper, np.pi) - 0.05
+    missed, count = 0, 0
+    while count < POSES:
+        position, rotation = arm.forward(rng.uniform(lower, upper))
+        if not (np.abs(position - [0.5, 0, 0.3]) < [0.25, 0.45, 0.3]).all():
+            continue
+        count += 1
+        try:
+            q = arm.reach(position, rotation, limits.home)
+        except UserError:
+            missed += 1
+            continue
+        assert (q > limits.lower).all() and (q < limits.upper).all()
+        reached, turned = arm.forward(q)
+        assert np.linalg.norm(reached - position) < 1e-4
+        assert np.linalg.norm(rotation_vector(turned @ rotation.T)) < 1e-3
+    assert missed <= POSES // 1000

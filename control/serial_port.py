@@ -1,0 +1,20 @@
+"""Serial ports, opened with one message for what usually goes wrong."""
+
+import serial
+
+from touchgoal.control.errors import UserError
+
+
+def open_port(device: str, baud: int, timeout: float) -> serial.Serial:
+    """Opens a device such as /dev/ttyUSB0 for this program alone; reads wait `timeout` s.
+
+    Raises:
+        UserError: it is missing, in use or not permitted.
+    """
+    try:
+        return serial.Serial(device, baud, timeout=timeout, write_timeout=timeout, exclusive=True)
+    except serial.SerialException as error:
+        raise UserError(
+            f"cannot open {device}: check the cable and that nothing else uses it, and that you are "
+            f"in the group dialout ({error})"
+        ) from error

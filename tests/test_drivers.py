@@ -1,0 +1,278 @@
+"""One contract for all drivers, against the twin: vendors' client libraries over the wire."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from touchgoal.control import franka, ur
+from touchgoal.control.arm_process import ArmConfig, ArmProcess, moved_wrench
+from touchgoal.control.errors import UserError
+from touchgoal.control.franka_hand import FrankaHand
+from touchgoal.control.gelsight import UNCHANGED, Fingertip
+from touchgoal.control.kinematics import GELSIGHT_TCP
+from touchgoal.control.limits import FR3, UR5E
+from touchgoal.control.load_cell import LoadCellConfig, SerialLoadCell
+from touchgoal.control.protocols import (
+    Arm,
+    Camera,
+    DriverError,
+    Gripper,
+    LoadCell,
+    TactileSensor,
+)
+from touchgoal.control.robotiq import Robotiq, RobotiqConfig
+from touchgoal.control.sensors import find_sensor
+from touchgoal.control.video import VideoCamera, VideoConfig
+
+pytest.importorskip("franky", reason="pip install 'touchgoal[franka]'")
+faults = pytest.importorskip("touchgoal.sim_envs.twin.faults")
+
+HZ = 20.0
+
+# A parent that moves the arm and is then killed; its first line of output says that it moves.
+DRIVING = """
+import sys, time
+import numpy as np
+from touchgoal.control import franka, ur
+from touchgoal.control.arm_process import ArmConfig, ArmProcess
+from touchgoal.control.limits import FR3, UR5E
+name, address = sys.argv[1:]
+client, rate, robot = {
+    "fr3": (franka.FrankaClient, franka.RATE, FR3), "ur5e": (ur.UrClient, ur.RATE, UR5E)
+}[name]
+arm = ArmProcess(client, ArmConfig(address, robot, 0.1, 20.0, rate))
+q = arm.read().q
+while True:
+    q[0] += 0.01
+    arm.command(q)
+    time.sleep(0.05)
+    if arm.read().velocity[0] > 0.1:
+        print("moves", flush=True)
+"""
+
+
+class Twin:
+    """A twin in real time, and its driver's parts."""
+
+    def __init__(self, name: str, out: Path) -> None:
+        number, self.name = os.getpid(), name
+        host = f"127.{('fr3', 'ur5e').index(name) + 30}.{number // 250 % 250}.{number % 250 + 1}"
+        options = ["--arm", name, "--host", host, "--port", "0", "--out", str(out)]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "touchgoal.launch", "twin", "--seed", "3", *options],
+            stdout=subprocess.DEVNULL,
+        )
+        rig = out / "rig.json"
+        until(lambda: rig.exists() or self.process.poll() is not None, 60)
+        self.rig: dict[str, Any] = json.loads(rig.read_text())
+        self.client, rate, robot = {
+            "fr3": (franka.FrankaClient, franka.RATE, FR3),
+            "ur5e": (ur.UrClient, ur.RATE, UR5E),
+        }[name]
+        self.config = ArmConfig(host, robot, GELSIGHT_TCP, HZ, rate)
+
+    def ask(self, line: str) -> dict[str, Any]:
+        return faults.ask(self.rig["faults"], line)
+
+    def connect(self) -> ArmProcess:
+        return ArmProcess(self.client, self.config)
+
+    def at_rest(self) -> bool:
+        return self.ask("truth")["rest"] > 0.1
+
+    def gripper(self) -> Gripper:
+        gripper = self.rig["gripper"]
+        if gripper["kind"] == "franka_hand":
+            return FrankaHand(gripper["address"])
+        widths = tuple(gripper["widths"])
+        return Robotiq(RobotiqConfig(gripper["port"], activate=True, widths=widths))
+
+
+def until(holds: Callable[[], bool], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, "it does not happen"
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module", params=["fr3", "ur5e"])
+def twin(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Twin]:
+    twin = Twin(request.param, tmp_path_factory.mktemp(request.param))
+    yield twin
+    twin.process.send_signal(signal.SIGINT)
+    twin.process.wait(20)
+
+
+@pytest.fixture
+def arm(twin: Twin) -> Iterator[ArmProcess]:
+    twin.ask("reset 3")
+    arm = twin.connect()
+    yield arm
+    arm.close()
+
+
+def swing(arm: Arm, ticks: int = 10, change: float = 0.01) -> np.ndarray:
+    """Turns the base by `change` rad a tick; the last target."""
+    target = arm.read().q
+    for _ in range(ticks):
+        target = target + change * np.eye(target.size)[0]
+        arm.command(target)
+        time.sleep(1 / HZ)
+    return target
+
+
+def arrives(arm: Arm, target: np.ndarray) -> None:
+    until(lambda: bool(np.abs(arm.read().q - target).max() < 5e-3))
+
+
+def test_an_arm_reads_fresh_follows_and_rests_at_the_last_target(twin: Twin, arm: Arm) -> None:
+    first, n = arm.read(), twin.config.robot.arm.home.size
+    assert isinstance(arm, Arm) and first.fault == ""
+    assert first.q.shape == first.velocity.shape == first.torque.shape == (n,)
+    until(lambda: arm.read().stamp > first.stamp)
+    target = swing(arm)
+    arrives(arm, target)
+    until(twin.at_rest)
+    np.testing.assert_allclose(twin.ask("truth")["q"], target, atol=5e-3)
+    assert arm.read().stamp > first.stamp + 0.4 and arm.read().fault == ""
+
+
+def test_a_stopped_arm_rests_and_refuses_until_recovered(twin: Twin, arm: Arm) -> None:
+    swing(arm)
+    arm.stop()
+    until(twin.at_rest)
+    assert "stopped" in arm.read().fault
+    with pytest.raises(DriverError, match="stopped"):
+        arm.command(arm.read().q)
+    arm.recover()
+    arrives(arm, swing(arm, change=-0.01))
+
+
+def test_targets_beyond_the_range_are_refused(arm: Arm) -> None:
+    q = arm.read().q
+    for bad in (7.0, np.nan, -np.inf):
+        with pytest.raises(UserError, match="range"):
+            arm.command(np.where(np.arange(q.size) == 0, bad, q))
+    assert arm.read().fault == ""
+
+
+def test_an_error_of_the_controller_is_said_and_kept_until_recovered(twin: Twin, arm: Arm) -> None:
+    error = {"fr3": "cartesian_reflex", "ur5e": "protective_stop"}[twin.name]
+    swing(arm)
+    twin.ask(f"error {error}")
+    words = error.replace("_", " ") if twin.name == "ur5e" else error
+    until(lambda: words in arm.read().fault)
+    until(twin.at_rest)
+    with pytest.raises(DriverError, match=words):
+        arm.command(arm.read().q)
+    until(lambda: recovered(arm))  # a UR lets nobody unlock it for 5 s
+    arrives(arm, swing(arm, change=-0.01))
+
+
+def recovered(arm: Arm) -> bool:
+    try:
+        arm.recover()
+    except DriverError:
+        return False
+    return True
+
+
+def test_a_frozen_link_stops_the_arm_and_is_said(twin: Twin, arm: Arm) -> None:
+    swing(arm)
+    twin.ask("freeze 1.5")
+    until(lambda: "no state" in arm.read().fault)
+    lost = arm.read()
+    with pytest.raises(DriverError, match="no state"):
+        arm.command(lost.q)
+    arm.stop()
+    assert arm.read().stamp == lost.stamp
+    until(twin.at_rest)
+    until(lambda: recovered(arm))
+    arrives(arm, swing(arm, change=-0.01))
+
+
+def test_a_pressed_stop_is_not_recovered_by_software(twin: Twin, arm: Arm) -> None:
+    swing(arm)
+    twin.ask("stop-button on")
+    until(lambda: "user stop" in arm.read().fault or "emergency stop" in arm.read().fault)
+    with pytest.raises(DriverError, match="stop"):
+        arm.recover()
+    assert "stop" in arm.read().fault
+    until(twin.at_rest)
+    twin.ask("stop-button off")
+
+
+def test_a_killed_program_leaves_the_arm_at_rest(twin: Twin) -> None:
+    twin.ask("reset 3")
+    parent = subprocess.Popen(
+        [sys.executable, "-c", DRIVING, twin.name, twin.config.address], stdout=subprocess.PIPE
+    )
+    assert parent.stdout and parent.stdout.readline() == b"moves\n"
+    parent.kill()
+    parent.wait()
+    until(twin.at_rest)
+
+
+def test_a_gripper_opens_closes_and_is_clipped_to_its_stroke(twin: Twin) -> None:
+    gripper = twin.gripper()
+    assert isinstance(gripper, Gripper)
+    stamp = gripper.read().stamp
+    for asked, width in ((0.06, 0.06), (0.03, 0.03), (9.0, 0.08)):
+        gripper.command(asked)
+        until(lambda w=width: abs(gripper.read().width - w) < 2e-3)
+    assert gripper.read().fault == "" and gripper.read().stamp > stamp
+    gripper.stop()
+    gripper.close()
+
+
+def test_cameras_fingertips_and_load_cell_give_fresh_readings(twin: Twin) -> None:
+    model = find_sensor(twin.rig["sensor"])
+    for name, address in twin.rig["images"].items():
+        camera: Camera = VideoCamera(VideoConfig(address, rate=10.0, frozen_after=np.inf))
+        if "tactile" in name:
+            camera = Fingertip(camera, model, UNCHANGED)
+            assert isinstance(camera, TactileSensor)
+            assert camera.read().image.shape == (*model.image_shape, 3)
+        first = camera.read()
+        until(lambda c=camera, f=first: c.read().stamp > f.stamp + 0.3)
+        assert isinstance(camera, Camera) and first.image.dtype == np.uint8
+        camera.close()
+    cell = SerialLoadCell(LoadCellConfig(**twin.rig["load_cell"], highest=100.0))
+    reading = cell.read()
+    assert isinstance(cell, LoadCell) and abs(reading.force) < 5
+    until(lambda: cell.read().stamp > reading.stamp)
+    cell.close()
+
+
+def test_a_taken_franka_is_said_and_not_waited_for(twin: Twin) -> None:
+    if twin.name != "fr3":
+        pytest.skip("a UR takes several clients")
+    twin.ask("reset 3")
+    arm = twin.connect()
+    with pytest.raises(DriverError, match="no other program"):
+        ArmProcess(twin.client, twin.config, connect_timeout=3.0)
+    arm.close()
+
+
+@pytest.mark.parametrize("client", [franka.FrankaClient, ur.UrClient])
+def test_no_controller_is_said(client: type) -> None:
+    robot = FR3 if client is franka.FrankaClient else UR5E
+    with pytest.raises(DriverError, match="FCI|verify the IP"):
+        ArmProcess(client, ArmConfig("127.99.99.99", robot, 0.1, HZ, 100.0))
+
+
+def test_a_wrench_is_moved_with_its_lever() -> None:
+    down = np.array([0, 0, -10.0, 0, 0, 0])
+    moved = moved_wrench(down, np.array([0.1, 0, 0]), np.zeros(3))
+    np.testing.assert_allclose(moved, [0, 0, -10, 0, 1, 0])

@@ -1,0 +1,190 @@
+"""The safety layer against whatever a policy or a sensor may say.
+
+TOUCHGOAL_SAFETY_TICKS scales the random run (default 400 ticks; a million before a release).
+"""
+
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from touchgoal.control import limits as robots
+from touchgoal.control.errors import UserError
+from touchgoal.control.limits import RobotLimits
+from touchgoal.control.safety import Limit, Mode, Reading, Safety, SafetyState
+
+HZ = 20
+TICKS = int(os.environ.get("TOUCHGOAL_SAFETY_TICKS", "400"))
+LAYERS = {robot.arm.name: Safety(robot, HZ) for robot in (robots.FR3, robots.UR5E)}
+EPS = 1e-9
+
+
+def reading(q: np.ndarray, **changes: object) -> Reading:
+    calm = Reading(q, np.zeros(3), np.zeros(q.size), np.zeros(2), 0.0, 0.0, 0.0)
+    return replace(calm, **changes)  # pyright: ignore[reportArgumentType]
+
+
+def check(layer: Safety, before: SafetyState, after: SafetyState) -> None:
+    """Nothing that comes out is beyond any limit, the maker's taper included."""
+    j, dt = layer.joints, layer.dt
+    assert np.isfinite(after.q).all()
+    assert (after.q >= j.lower - EPS).all() and (after.q <= j.upper + EPS).all()
+    np.testing.assert_allclose(after.velocity, (after.q - before.q) / dt, atol=EPS)
+    low, high = layer.limits.hardware.speed_range(after.q)
+    assert (np.abs(after.velocity) <= j.velocity + EPS).all()
+    assert (after.velocity >= low).all() and (after.velocity <= high).all()
+    assert (np.abs(after.q - before.q) <= layer.limits.max_step + EPS).all()
+    assert (np.abs(after.velocity - before.velocity) <= j.acceleration * dt + EPS).all()
+    assert layer.inside_workspace(after.q[None])[0]
+
+
+def run(layer: Safety, actions: list[np.ndarray]) -> SafetyState:
+    state = layer.start(layer.limits.arm.home)
+    for action in actions:
+        after = layer.advance(state, action, reading(state.q))
+        check(layer, state, after)
+        state = after
+    return state
+
+
+def pushes(n: int) -> st.SearchStrategy:
+    """Runs of one action: floats of every size, infinities and NaN among them, or full speed."""
+    anything = arrays(np.float64, n, elements=st.floats(width=64))
+    full = arrays(np.float64, n, elements=st.sampled_from([-1.0, -0.02, 0.0, 0.02, 1.0]))
+    return st.lists(st.tuples(st.one_of(full, anything), st.integers(1, 12)), max_size=4)
+
+
+def _down(n: int) -> np.ndarray:
+    return np.eye(n)[1] * 1.0
+
+
+@settings(max_examples=50, deadline=None)
+@given(pushes(7))
+@example([(_down(7), 60)])  # shoulder over: fingers into the table
+@example([(np.full(7, 1e308), 40), (np.full(7, -1e308), 40)])  # overflows a division by dt
+@example([(np.eye(7)[0], 30), (np.full(7, np.nan), 1), (np.eye(7)[0], 5)])
+@example([(-np.eye(7)[5], 60), (np.eye(7)[5], 120)])  # wrist through its whole range
+def test_nothing_leaves_the_limits_of_the_fr3(pushes: list[tuple[np.ndarray, int]]) -> None:
+    run(LAYERS["FR3"], [action for action, ticks in pushes for _ in range(ticks)])
+
+
+@settings(max_examples=30, deadline=None)
+@given(pushes(6))
+@example([(-_down(6), 80)])
+def test_nothing_leaves_the_limits_of_the_ur5e(pushes: list[tuple[np.ndarray, int]]) -> None:
+    run(LAYERS["UR5e"], [action for action, ticks in pushes for _ in range(ticks)])
+
+
+@pytest.mark.parametrize("name", LAYERS)
+def test_nothing_leaves_the_limits_in_a_long_random_walk(name: str) -> None:
+    layer, rng = LAYERS[name], np.random.default_rng(5)
+    state, seen, n = layer.start(layer.limits.arm.home), set(), layer.joints.lower.size
+    push = np.zeros(n)
+    for tick in range(TICKS):
+        if tick % 25 == 0:
+            push = rng.choice([0.0, 0.01, 0.05, 1.0, 1e300]) * rng.standard_normal(n)
+        action = push + 0.02 * rng.standard_normal(n)
+        after = layer.advance(state, action, reading(state.q))
+        check(layer, state, after)
+        state, seen = after, seen | set(after.acted)
+    assert {Limit.STEP, Limit.VELOCITY, Limit.ACCELERATION, Limit.WORKSPACE} <= seen
+
+
+def test_a_gentle_command_passes_untouched() -> None:
+    layer = LAYERS["FR3"]
+    state = layer.start(layer.limits.arm.home)
+    action = np.full(7, 0.002)
+    after = layer.advance(state, action, reading(state.q))
+    np.testing.assert_allclose(after.q, state.q + action, atol=1e-15)
+    assert after.mode is Mode.MOVE and after.acted == ()
+
+
+def test_the_joint_margin_is_reached_and_named() -> None:
+    layer = LAYERS["FR3"]
+    state = layer.start(layer.limits.arm.home)
+    named = set()
+    for _ in range(150):
+        state = layer.advance(state, np.eye(7)[6], reading(state.q))
+        named |= set(state.acted)
+    assert state.q[6] == pytest.approx(layer.joints.upper[6], abs=1e-9) and Limit.MARGIN in named
+
+
+FAULTS = [
+    ("force", np.array([0, 0, -16.0]), Limit.FORCE),
+    ("torque", np.full(7, -11.0), Limit.TORQUE),
+    ("touch", np.array([0.0, 20.0]), Limit.TOUCH),
+    ("force", np.full(3, np.nan), Limit.FORCE),
+    ("q", np.full(7, np.nan), Limit.TRACKING),
+    ("observation_age", 0.6, Limit.STALE_OBSERVATION),
+    ("action_age", 0.6, Limit.STALE_ACTION),
+    ("state_age", float("nan"), Limit.STALE_STATE),
+]
+
+
+@pytest.mark.parametrize(("field", "value", "limit"), FAULTS)
+def test_the_first_fault_brakes_within_limits_and_stays(
+    field: str, value: object, limit: Limit
+) -> None:
+    layer = LAYERS["FR3"]
+    state = run(layer, [np.full(7, -0.02)] * 8)
+    assert np.abs(state.velocity).max() > 0.3
+    bad = replace(reading(state.q), **{field: value})
+    for tick in range(12):
+        # Later faults and calm readings change nothing.
+        now = bad if tick == 0 else reading(state.q, touch=np.full(2, 99.0 * (tick % 2)))
+        after = layer.advance(state, np.full(7, -0.02), now)
+        check(layer, state, after)
+        state = after
+        assert state.mode is Mode.STOP and state.fault and state.fault.limit is limit
+    assert (state.velocity == 0).all()
+
+
+@pytest.mark.parametrize("age", ["observation_age", "action_age", "state_age"])
+def test_what_is_stale_holds_then_resumes_or_stops(age: str) -> None:
+    layer = LAYERS["FR3"]
+    state = run(layer, [np.full(7, 0.01)] * 3)
+    held = layer.advance(state, np.full(7, 0.01), reading(state.q, **{age: 0.12}))
+    assert held.mode is Mode.HOLD and held.fault is None
+    assert (np.abs(held.velocity) < np.abs(state.velocity)).all()
+    assert layer.advance(held, np.full(7, 0.01), reading(held.q)).mode is Mode.MOVE
+    assert layer.advance(held, np.full(7, 0.01), reading(held.q, **{age: 1.0})).fault
+
+
+def test_actions_that_are_no_numbers_hold_then_stop() -> None:
+    layer = LAYERS["FR3"]
+    state = layer.start(layer.limits.arm.home)
+    modes = []
+    for _ in range(12):
+        state = layer.advance(state, np.full(7, np.nan), reading(state.q))
+        modes.append(state.mode)
+    assert modes[0] is Mode.HOLD and modes[-1] is Mode.STOP
+    assert state.fault and state.fault.limit is Limit.NOT_A_NUMBER
+
+
+@pytest.mark.parametrize("robot", [robots.FR3, robots.UR5E], ids=lambda r: r.arm.name)
+def test_no_start_outside(robot: RobotLimits) -> None:
+    layer = LAYERS[robot.arm.name]
+    with pytest.raises(UserError, match="joint 3"):
+        layer.start(np.where(np.arange(robot.arm.home.size) == 2, 9.0, robot.arm.home))
+    turned = robot.arm.home.copy()
+    turned[0] += 2.0
+    with pytest.raises(UserError, match="workspace"):
+        layer.start(turned)
+
+
+@given(st.floats(width=64))
+def test_the_gripper_is_asked_for_widths_inside_its_stroke_and_kept_while_the_arm_holds(
+    target: float,
+) -> None:
+    layer = LAYERS["FR3"]
+    start = layer.start(layer.limits.arm.home)
+    moving = layer.advance(start, np.zeros(7), reading(start.q))
+    width = layer.width(moving, target, 0.03)
+    assert width == (np.clip(target, 0, 0.08) if np.isfinite(target) else 0.03)
+    for age in (0.2, 1.0):  # hold, stop
+        held = layer.advance(moving, np.zeros(7), reading(start.q, state_age=age))
+        assert layer.width(held, target, 0.03) == 0.03

@@ -1,0 +1,208 @@
+"""Serial drivers against devices on pseudo-terminals: good lines, garbled ones, unplugged ones."""
+
+import os
+import struct
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.load_cell import LoadCellConfig, SerialLoadCell, xor
+from touchgoal.control.modbus import crc
+from touchgoal.control.protocols import DriverError
+from touchgoal.control.robotiq import Robotiq, RobotiqConfig
+
+
+@pytest.fixture
+def line() -> Iterator[tuple[int, str]]:
+    """The device's end of a serial line, and the path of the computer's."""
+    device, computer = os.openpty()
+    tty.setraw(device)
+    tty.setraw(computer)
+    yield device, os.ttyname(computer)
+    for end in (device, computer):
+        try:
+            os.close(end)
+        except OSError:
+            pass  # a test unplugged it
+
+
+def until(holds: Callable[[], bool], seconds: float = 5.0) -> None:
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, "it does not happen"
+        time.sleep(0.005)
+
+
+def counted(k: int) -> bytes:
+    """Line k: time k, value 1000 + k."""
+    text = b"%d,%d" % (k, 1000 + k)
+    return text + b"*%02X\n" % xor(text)
+
+
+def test_a_load_cell_is_read_in_newtons(line: tuple[int, str]) -> None:
+    device, port = line
+    cell = SerialLoadCell(LoadCellConfig(port, newtons_per_count=0.01, zero=1000.0, highest=50.0))
+    before = time.monotonic()
+    for k in range(6):
+        os.write(device, counted(k))
+    until(lambda: cell.read().force == pytest.approx(0.05))
+    reading = cell.read()
+    assert reading.rejected == 0 and before < reading.stamp < time.monotonic()
+    cell.close()
+
+
+def test_a_garbled_line_is_never_believed(line: tuple[int, str]) -> None:
+    """A fifth of the lines lose bytes, newlines among them; every force comes from a sent line."""
+    device, port = line
+    cell = SerialLoadCell(LoadCellConfig(port, newtons_per_count=1.0, zero=0.0, highest=1e5))
+    rng, seen = np.random.default_rng(0), set()
+    os.write(device, b"\n")
+    for k in range(1, 400):
+        text = counted(k * 37)
+        if rng.random() < 0.2:
+            cut = rng.integers(0, len(text))
+            text = text[:cut] + text[cut + rng.integers(1, 6) :]
+        os.write(device, text)
+        if k % 4 == 0:
+            time.sleep(0.002)
+        if k > 8:
+            seen.add(cell.read().force)
+    until(lambda: cell.read().rejected > 30)
+    assert seen <= {1000.0 + k * 37 for k in range(400)} and len(seen) > 20
+    cell.close()
+
+
+@pytest.mark.parametrize("bad", [b"5,9e9", b"5,nan", b"5", b"5,x", b"2,1"])
+def test_wrong_ranges_fields_and_times_are_refused(line: tuple[int, str], bad: bytes) -> None:
+    device, port = line
+    cell = SerialLoadCell(LoadCellConfig(port, 1.0, 0.0, highest=10.0, checksum=False))
+    os.write(device, b"half a li\n3,4\n" + bad + b"\n")
+    until(lambda: cell.read().rejected == 0 and cell.read().force == 4.0)
+    os.write(device, b"6,7\n")
+    until(lambda: cell.read().force == 7.0)
+    assert cell.read().rejected == 1
+    cell.close()
+
+
+def test_an_unplugged_load_cell_is_said(line: tuple[int, str]) -> None:
+    device, port = line
+    cell = SerialLoadCell(LoadCellConfig(port, 1.0, 0.0, 1e4))
+    os.write(device, counted(1) + counted(2))
+    until(lambda: cell.read().force == 1002.0)
+    os.close(device)
+    with pytest.raises(DriverError, match="load cell"):
+        until(lambda: cell.read().force < 0)
+    cell.close()
+
+
+def test_a_missing_port_is_said_in_a_line() -> None:
+    with pytest.raises(UserError, match="dialout"):
+        SerialLoadCell(LoadCellConfig("/dev/no_such_port", 1.0, 0.0, 1.0))
+
+
+class Gripper2F85(threading.Thread):
+    """The gripper's side of the wire: registers and a finger that takes 10 counts an exchange.
+
+    `block` is the count at which something lies between the fingers.
+    """
+
+    def __init__(self, device: int, active: bool, block: int = 255) -> None:
+        super().__init__(daemon=True)
+        self.device, self.block = device, block
+        self.output, self.position, self.fault = bytes(6), 3, 0
+        self.active_after = 0 if active else 3  # exchanges
+        self.garble = 0  # answers to spoil
+        self.start()
+
+    def run(self) -> None:
+        try:
+            while True:
+                self._serve()
+        except OSError:
+            pass  # unplugged
+
+    def _take(self, n: int) -> bytes:
+        data = b""
+        while len(data) < n:
+            data += os.read(self.device, n - len(data))
+        return data
+
+    def _serve(self) -> None:
+        head = self._take(6)
+        slave, code, register, count = struct.unpack(">BBHH", head)
+        body = self._take(1 + 2 * count) if code == 16 else b""
+        assert crc(head + body) == self._take(2)
+        if code == 16:
+            assert register == 0x03E8
+            self.output = body[1:]
+            answer = head
+        else:
+            assert (code, register) == (4, 0x07D0)
+            answer = bytes([slave, code, 2 * count]) + self._input()
+        answer += crc(answer)
+        if self.garble:
+            self.garble -= 1
+            answer = answer[:-1] + bytes([answer[-1] ^ 1])
+        os.write(self.device, answer)
+
+    def _input(self) -> bytes:
+        activate, go = self.output[0] & 1 or self.active_after == 0, self.output[0] >> 3 & 1
+        if activate and self.active_after:
+            self.active_after -= 1
+        status = (3 if not self.active_after else 1) << 4 | go << 3 | 1
+        wanted, contact = self.output[3], 0
+        if go and not self.active_after:
+            self.position += int(np.clip(wanted - self.position, -10, 10))
+            contact = 3 if self.position == wanted else 0
+            if self.position >= self.block:
+                self.position, contact = self.block, 2
+        return bytes([status | contact << 6, 0, self.fault, wanted, self.position, 0])
+
+
+def test_the_check_is_that_of_the_grippers_manual() -> None:
+    """Its examples: clear the activation, read the status while active."""
+    assert crc(bytes.fromhex("091003E8000306000000000000")) == bytes.fromhex("7330")
+    assert crc(bytes.fromhex("090407D00003")) == bytes.fromhex("B1CE")
+
+
+def test_the_robotiq_opens_closes_and_holds(line: tuple[int, str]) -> None:
+    device, port = line
+    wire = Gripper2F85(device, active=False, block=150)
+    with pytest.raises(UserError, match="activate"):
+        Robotiq(RobotiqConfig(port))
+    gripper = Robotiq(RobotiqConfig(port, activate=True))
+    assert gripper.read().width == pytest.approx(0.085)
+    gripper.command(0.06)
+    until(lambda: abs(gripper.read().width - 0.06) < 4e-4)
+    assert not gripper.read().grasped
+    gripper.command(-1.0)  # clipped
+    until(lambda: gripper.read().grasped)
+    held = gripper.read()
+    assert held.width == pytest.approx(0.085 * (230 - 150) / 227) and wire.output[3] == 230
+    gripper.stop()
+    until(lambda: wire.output[0] == 1)
+    gripper.close()
+
+
+def test_the_robotiq_bears_a_garbled_answer_and_says_faults(line: tuple[int, str]) -> None:
+    device, port = line
+    wire = Gripper2F85(device, active=True)
+    gripper = Robotiq(RobotiqConfig(port))
+    gripper.read()
+    wire.garble = 3
+    gripper.command(0.0)
+    until(lambda: gripper.read().width < 1e-3)
+    assert wire.garble == 0
+    wire.fault = 0x0E
+    until(lambda: "overcurrent" in gripper.read().fault)
+    with pytest.raises(DriverError, match="overcurrent"):
+        gripper.command(0.05)
+    os.close(device)
+    with pytest.raises(DriverError, match="gripper"):
+        until(lambda: gripper.read().width > 1)
+    gripper.close()

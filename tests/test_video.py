@@ -1,0 +1,217 @@
+"""Cameras over a real MJPEG stream and real files: newest frame, rate, stall, freeze, return."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.gelsight import DIGIT_VIEW, GELSIGHT_MINI_VIEW, UNCHANGED, Fingertip, cut
+from touchgoal.control.protocols import DriverError
+from touchgoal.control.sensors import DIGIT, GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
+from touchgoal.control.usb_cameras import find_sensor_camera, list_cameras
+from touchgoal.control.video import VideoCamera, VideoConfig
+
+BITS = 12
+
+
+def numbered(k: int, shape: tuple[int, int] = (96, 128)) -> np.ndarray:
+    """A reddish RGB picture that carries `k` in black and white stripes."""
+    image = np.full((*shape, 3), (180, 60, 20), np.uint8)
+    for bit in range(BITS):
+        image[:32, bit * 10 : bit * 10 + 10] = 255 * (k >> bit & 1)
+    return image
+
+
+def number(image: np.ndarray) -> int:
+    return sum(int(image[16, bit * 10 + 5, 0] > 128) << bit for bit in range(BITS))
+
+
+class Streamer(ThreadingHTTPServer):
+    """An MJPEG server at 50 Hz that can stall, freeze on a picture, or hang up."""
+
+    daemon_threads = True
+
+    def __init__(self, port: int = 0) -> None:
+        super().__init__(("127.0.0.1", port), _Stream)
+        self.count, self.stalled, self.frozen, self.shut = 0, False, False, False
+        threading.Thread(target=self.serve_forever, args=(0.01,), daemon=True).start()
+        threading.Thread(target=self._count, daemon=True).start()
+        self.url = f"http://127.0.0.1:{self.server_port}/stream.mjpg"
+
+    def _count(self) -> None:
+        while not self.shut:
+            self.count += not self.frozen
+            time.sleep(0.02)
+
+    def hang_up(self) -> None:
+        self.shut = True
+        self.shutdown()
+        self.server_close()
+
+
+class _Stream(BaseHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None: ...
+
+    def do_GET(self) -> None:
+        streamer = self.server
+        assert isinstance(streamer, Streamer)
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+        self.end_headers()
+        try:
+            while not streamer.shut:
+                if not streamer.stalled:
+                    picture = cv2.cvtColor(numbered(streamer.count), cv2.COLOR_RGB2BGR)
+                    jpeg = cv2.imencode(".jpg", picture)[1].tobytes()
+                    head = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+                    self.wfile.write(b"--frame\r\n" + head.encode() + jpeg + b"\r\n")
+                time.sleep(0.02)
+        except OSError:
+            pass  # the reader is gone
+
+
+@pytest.fixture
+def streamer() -> Iterator[Streamer]:
+    server = Streamer()
+    yield server
+    if not server.shut:
+        server.hang_up()
+
+
+def until(holds: Callable[[], bool], seconds: float = 8.0) -> None:
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, "it does not happen"
+        time.sleep(0.01)
+
+
+def test_a_slow_reader_of_a_stream_sees_the_present(streamer: Streamer) -> None:
+    camera = VideoCamera(VideoConfig(streamer.url, rate=50.0))
+    assert camera.read().image.shape == (96, 128, 3)
+    time.sleep(1.0)
+    frame = camera.read()
+    # A queue would still hold the first pictures, 50 behind.
+    assert streamer.count - number(frame.image) < 20 < frame.sequence
+    assert frame.image[80, 64, 0] > 140 > 60 > frame.image[80, 64, 2], "RGB, not BGR"
+    assert frame.stamp <= time.monotonic() and camera.rate > 10
+    until(lambda: camera.trouble == "")
+    camera.close()
+
+
+def test_a_frozen_picture_and_a_stalled_stream_grow_old_and_are_said(streamer: Streamer) -> None:
+    camera = VideoCamera(VideoConfig(streamer.url, rate=50.0))
+    camera.read()
+    streamer.frozen = True
+    until(lambda: "one picture" in camera.trouble)
+    frozen = camera.read()
+    time.sleep(0.2)
+    assert camera.read().stamp == frozen.stamp and camera.read().sequence > frozen.sequence
+    streamer.frozen = False
+    until(lambda: camera.read().stamp > frozen.stamp and camera.trouble == "")
+    streamer.stalled = True
+    until(lambda: "last frame" in camera.trouble or "gone" in camera.trouble)
+    stalled = camera.read()
+    time.sleep(0.2)
+    assert camera.read() is stalled
+    streamer.stalled = False
+    until(lambda: camera.read().sequence > stalled.sequence and camera.trouble == "")
+    camera.close()
+
+
+def test_a_lost_stream_is_joined_again(streamer: Streamer) -> None:
+    camera = VideoCamera(VideoConfig(streamer.url, rate=50.0))
+    last = camera.read().sequence
+    streamer.hang_up()
+    until(lambda: "gone" in camera.trouble)
+    again = Streamer(streamer.server_port)
+    until(lambda: camera.trouble == "" and camera.read().sequence > last + 5)
+    camera.close()
+    again.hang_up()
+
+
+@pytest.mark.parametrize("kind", ["images", "film"])
+def test_files_are_played_at_their_rate_then_said_to_have_ended(tmp_path: Path, kind: str) -> None:
+    bgr = [np.ascontiguousarray(numbered(k)[..., ::-1]) for k in range(1, 13)]
+    if kind == "images":
+        for k, image in enumerate(bgr):
+            cv2.imwrite(str(tmp_path / f"frame_{k:04d}.png"), image)
+        source = str(tmp_path / "frame_%04d.png")
+    else:
+        source = str(tmp_path / "film.avi")
+        writer = cv2.VideoWriter(source, cv2.VideoWriter.fourcc(*"MJPG"), 25, (128, 96))
+        for image in bgr:
+            writer.write(image)
+        writer.release()
+    start = time.monotonic()
+    camera = VideoCamera(VideoConfig(source, rate=50.0))
+    assert camera.read().sequence < 12
+    until(lambda: "ended" in camera.trouble)
+    assert time.monotonic() - start > 11 / 50 and number(camera.read().image) == 12
+    camera.close()
+
+
+def test_a_missing_source_is_said_in_a_line(tmp_path: Path) -> None:
+    for source in (str(tmp_path / "none.mp4"), "http://127.0.0.1:9/x", "77"):
+        with pytest.raises(UserError, match="cannot open"):
+            VideoCamera(VideoConfig(source))
+
+
+def test_a_fingertip_is_cut_turned_and_scaled(tmp_path: Path) -> None:
+    whole = np.zeros((616, 820, 3), np.uint8)
+    whole[88:528, 117:703] = (10, 200, 30)  # all but a seventh at each side
+    seen = cut(whole, GELSIGHT_MINI, GELSIGHT_MINI_VIEW)
+    assert seen.shape == (240, 320, 3) and (seen[1:-1, 1:-1] == (10, 200, 30)).all()
+    lying = np.zeros((240, 320, 3), np.uint8)
+    lying[:, -1] = 255  # its right edge is the top of the upright picture
+    assert cut(lying, DIGIT, DIGIT_VIEW).shape == (320, 240, 3)
+    assert (cut(lying, DIGIT, DIGIT_VIEW)[0] == 255).all()
+    with pytest.raises(UserError, match="quarter_turns"):
+        cut(lying, DIGIT, UNCHANGED)
+    cv2.imwrite(str(tmp_path / "0.png"), whole[..., ::-1])
+    sensor = Fingertip(
+        VideoCamera(VideoConfig(str(tmp_path / "%d.png"))), GELSIGHT_MINI, GELSIGHT_MINI_VIEW
+    )
+    assert sensor.read().image.shape[:2] == sensor.model.image_shape
+    assert sensor.read() is sensor.read()
+    sensor.close()
+
+
+def plug(root: Path, node: int, product: str, serial: str, index: int = 0) -> None:
+    """Nodes as Linux makes them: class/videoN/device links to an interface of a USB device."""
+    usb = root / "devices" / f"usb-{serial}"
+    (usb / "1-1:1.0").mkdir(parents=True, exist_ok=True)
+    for name, text in (("product", product), ("serial", serial), ("idProduct", "636d")):
+        (usb / name).write_text(text + "\n")
+    folder = root / "class" / f"video{node}"
+    folder.mkdir(parents=True)
+    (folder / "device").symlink_to(usb / "1-1:1.0")
+    (folder / "name").write_text(f"{product}: {product}\n")
+    (folder / "index").write_text(f"{index}\n")
+
+
+def test_fingertips_are_found_by_name_and_serial_number(tmp_path: Path) -> None:
+    plug(tmp_path, 0, "Integrated Webcam", "W1")
+    plug(tmp_path, 2, "GelSight Mini R0B 28GH-EJZ8", "28GHEJZ8")
+    plug(tmp_path, 3, "GelSight Mini R0B 28GH-EJZ8", "28GHEJZ8", index=1)  # metadata
+    plug(tmp_path, 10, "DIGIT", "D20001")
+    root = tmp_path / "class"
+    assert [c.device for c in list_cameras(root)] == ["/dev/video0", "/dev/video2", "/dev/video10"]
+    assert find_sensor_camera(GELSIGHT_MINI_MARKERS, root=root).device == "/dev/video2"
+    assert find_sensor_camera(DIGIT, "D20001", root).device == "/dev/video10"
+    with pytest.raises(UserError, match="GelSight Mini R0B 28GH-EJZ8"):
+        find_sensor_camera(DIGIT, "D99", root)
+    plug(tmp_path, 12, "DIGIT", "D20002")
+    with pytest.raises(UserError, match="D20001, D20002"):
+        find_sensor_camera(DIGIT, root=root)
+
+
+def test_a_stream_that_never_gives_a_picture_is_said(streamer: Streamer) -> None:
+    streamer.stalled = True
+    with pytest.raises((UserError, DriverError)):
+        VideoCamera(VideoConfig(streamer.url)).read()
