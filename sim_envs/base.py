@@ -11,18 +11,23 @@ from jaxtyping import Float, UInt8
 
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
-from touchgoal.control.kinematics import FR3_HOME, Fr3Kinematics, fingers_down
+from touchgoal.control.kinematics import GELSIGHT_TCP, Kinematics, fingers_down
 from touchgoal.control.sensors import find_sensor
 from touchgoal.sim_envs.contact import SLIP_SPEED, ContactReader, PadContact
 from touchgoal.sim_envs.objects import Body
 from touchgoal.sim_envs.rendering import open_renderer
-from touchgoal.sim_envs.scene import GRIPPER_MAX_FORCE, SIDES, SceneConfig, build
+from touchgoal.sim_envs.scene import (
+    ROBOTS,
+    SIDES,
+    SceneConfig,
+    arm_joints,
+    build,
+)
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
 from touchgoal.sim_envs.tactile.unit import Spread, sample_unit
 
 GRIPPER_MAX_WIDTH = 0.08  # m, Franka Hand
 GRIPPER_SPEED = 0.1  # m/s of width, Franka Hand's datasheet maximum
-MAX_JOINT_SPEED = np.array([2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26])  # rad/s, FR3
 _SETPOINT_PERIOD = 0.002  # s: set-points coarser than 2 ms shake the wrist (MuJoCo 4.0.0)
 
 Observation = dict[str, np.ndarray]
@@ -65,7 +70,9 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     def __init__(self, config: EnvConfig, render_mode: str | None = None) -> None:
         self.config, self.render_mode = config, render_mode
         self.sensor = find_sensor(config.scene.sensor)
-        self.kinematics = Fr3Kinematics()
+        self.robot = ROBOTS[config.scene.arm]
+        self.n_joints = self.robot.arm.home.size
+        self.kinematics = Kinematics(self.robot.arm, GELSIGHT_TCP)
         self.action_space = self._limits = self._action_space()
         self.observation_space = gym.spaces.Dict(
             {key: _space(v.FEATURES[key], self._shape(key)) for key in self._observed()}
@@ -111,7 +118,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self._place(rng)
         self.command = self.start_joints(rng)
         self._opening = GRIPPER_MAX_WIDTH / 2
-        self.data.qpos[self._arm] = self.command
+        self.data.qpos[self.arm_positions] = self.command
         self.data.qpos[self._fingers] = self._opening
         self._ticks = 0
         self._settle()
@@ -121,14 +128,15 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control tick; the reward is the tick's gain in progress."""
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != (8,) or not np.isfinite(action).all():
-            raise ValueError(f"an action is 8 finite numbers, not {action}")
+        if action.shape != self.action_space.shape or not np.isfinite(action).all():
+            size = self.n_joints + 1
+            raise ValueError(f"an action is {size} finite numbers, not {action}")
         low, high = self._limits.low, self._limits.high
         action = np.clip(action, low, high)
-        self._advance(action[:7], action[7], seconds=1 / self.config.control_hz)
-        self._ticks += 1
         before = self._progress
-        progress, success = self._judge()
+        self.begin_tick()
+        self._advance(action[:-1], action[-1], seconds=1 / self.config.control_hz)
+        progress, success = self.end_tick()
         truncated = self._ticks >= self.config.max_seconds * self.config.control_hz
         info = self._info(progress, success)
         return self._observe(), progress - before, success, truncated, info
@@ -161,6 +169,10 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
             "sensor": self.sensor.name,
         }
 
+    def layout(self) -> dict[str, list[float]]:
+        """Where things are in the base frame, as plain numbers: the object's pose (m, wxyz)."""
+        return {"object": self.object_pose().tolist()}
+
     def scene(self, config: SceneConfig) -> mujoco.MjSpec:
         """The present episode's scene, built with these options."""
         spec = build(self.bodies, config)
@@ -170,7 +182,9 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, "7"]:
         """Joint positions with the open hand over the table, a little different each time."""
         position = np.array([0.45, 0.0, 0.26]) + rng.uniform(-0.03, 0.03, 3)
-        return self.kinematics.reach(position, fingers_down(rng.uniform(-0.2, 0.2)), FR3_HOME)
+        return self.kinematics.reach(
+            position, fingers_down(rng.uniform(-0.2, 0.2)), self.robot.arm.home
+        )
 
     def tactile_frames(self) -> list[TactileFrame]:
         """The last reading of the left and right sensor, with depth and contact mask."""
@@ -180,18 +194,80 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         """Exact wrench and slip of the left and right pad after the last tick."""
         return self._contacts
 
+    # What the digital twin uses: the same cell, a physics step at a time.
+
+    def begin_tick(self) -> None:
+        """What happens in the cell by itself as a control tick begins; here nothing."""
+
+    def advance(self, joints: np.ndarray, width: float, speed: float, steps: int = 1) -> None:
+        """Physics steps under a servo set-point (rad), while the gripper goes to `width` (m).
+
+        The gripper moves at `speed` (m/s of width) and presses with `grasp_force` at most.
+        """
+        travel = speed / 2 * steps * self.model.opt.timestep  # m of one finger
+        self._opening += min(max(width / 2 - self._opening, -travel), travel)
+        self.model.actuator_forcerange[self._gripper, 0] = -2 * self.grasp_force
+        self.data.ctrl[: self.n_joints] = joints
+        self.data.ctrl[self._gripper] = self._opening
+        mujoco.mj_step(self.model, self.data, nstep=steps)
+
+    def refresh(self) -> None:
+        """Bring contacts, poses and all else that follows from the state up to date with it."""
+        mujoco.mj_forward(self.model, self.data)
+        self._contacts, self._external = self._reader.read(self.data)
+
+    def end_tick(self) -> tuple[float, bool]:
+        """Progress in [0, 1] and success after a control tick; `refresh` first."""
+        self._ticks += 1
+        return self._judge()
+
+    def joints(self) -> tuple[np.ndarray, np.ndarray]:
+        """Joint positions (rad) and velocities (rad/s)."""
+        return self.data.qpos[self.arm_positions], self.data.qvel[self.arm_dofs]
+
+    def joint_contact_torque(self) -> np.ndarray:
+        """Torque (N m) on each joint of what touches the robot, from the last physics step."""
+        return self._reader.joint_torque(self.data)[self.arm_dofs]
+
+    def width(self) -> float:
+        """Of the gripper, m."""
+        return float(self.data.qpos[self._fingers].sum())
+
+    def width_target(self) -> float:
+        """Where the gripper has been sent, m."""
+        return 2 * self._opening
+
+    def external_wrench(self) -> Float[np.ndarray, "6"]:
+        """Force (N) and torque (N m) from outside at the TCP, base frame, at the last `refresh`."""
+        return self._external
+
+    def table_load(self) -> float:
+        """Force (N) with which objects and robot press down on the table."""
+        return self._reader.load(self.data, self.model.geom("table").id)
+
+    def picture(self, camera: str) -> UInt8[np.ndarray, "h w 3"]:
+        """What a camera sees, RGB."""
+        assert self._renderer is not None
+        self._renderer.update_scene(self.data, camera)
+        return self._renderer.render()
+
+    def feel(self, side: int) -> TactileFrame:
+        """What the left (0) or right (1) sensor shows; `refresh` first, keep to the order of time."""
+        return self._pads[side].sense(self.data, self._contacts[side], self.np_random)
+
     # Insides.
 
     def _settle(self) -> None:
         """Physics before the first observation: objects come to rest, the hand is open."""
-        self._advance(np.zeros(v.N_JOINTS), GRIPPER_MAX_WIDTH, seconds=0.3)
+        self._advance(np.zeros(self.n_joints), GRIPPER_MAX_WIDTH, seconds=0.3)
 
     def _compile(self, rng: np.random.Generator) -> None:
         self.close()
         self.model = model = self.scene(self.config.scene).compile()
         self.data = mujoco.MjData(model)
-        self._arm = [model.joint(f"fr3_joint{i}").qposadr[0] for i in range(1, 8)]
-        self._arm_dof = [model.joint(f"fr3_joint{i}").dofadr[0] for i in range(1, 8)]
+        joints = [model.joint(name) for name in arm_joints(self.config.scene.arm)]
+        self.arm_positions = [joint.qposadr[0] for joint in joints]
+        self.arm_dofs = [joint.dofadr[0] for joint in joints]
         self._fingers = [model.joint(f"finger_joint{i}").qposadr[0] for i in (1, 2)]
         self._gripper = model.actuator("gripper").id
         self._tcp = model.site("tcp").id
@@ -210,39 +286,27 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         setpoints = round(seconds / _SETPOINT_PERIOD)
         steps = round(_SETPOINT_PERIOD / self.model.opt.timestep)
         start = self.command
-        limits = self.model.actuator_ctrlrange[:7]
+        limits = self.model.actuator_ctrlrange[: self.n_joints]
         self.command = np.clip(start + delta, limits[:, 0], limits[:, 1])
-        travel = GRIPPER_SPEED / 2 * _SETPOINT_PERIOD  # m of one finger in one set-point
-        self.model.actuator_forcerange[self._gripper, 0] = -2 * self.grasp_force
-        self.model.actuator_forcerange[self._gripper, 1] = GRIPPER_MAX_FORCE
         for k in range(1, setpoints + 1):
-            self._opening += min(max(width / 2 - self._opening, -travel), travel)
-            self.data.ctrl[:7] = start + (self.command - start) * (k / setpoints)
-            self.data.ctrl[self._gripper] = self._opening
-            mujoco.mj_step(self.model, self.data, nstep=steps)
-        mujoco.mj_forward(self.model, self.data)
-        self._contacts, self._external = self._reader.read(self.data)
+            joints = start + (self.command - start) * (k / setpoints)
+            self.advance(joints, width, GRIPPER_SPEED, steps)
+        self.refresh()
 
     def _observe(self) -> Observation:
         data = self.data
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, data.site_xmat[self._tcp])
-        width = data.qpos[self._fingers].sum()
         values = {
-            v.STATE: np.concatenate([data.qpos[self._arm], data.qvel[self._arm_dof], [width]]),
+            v.STATE: np.concatenate([*self.joints(), [self.width()]]),
             v.TCP_POSE: np.concatenate([data.site_xpos[self._tcp], quat]),
             v.WRENCH: self._external,
         }
         observation = {key: value.astype(np.float32) for key, value in values.items()}
-        if self._renderer is not None:
-            for camera in self.config.cameras:
-                self._renderer.update_scene(data, camera)
-                observation[v.IMAGE_PREFIX + camera] = self._renderer.render()
+        for camera in self.config.cameras:
+            observation[v.IMAGE_PREFIX + camera] = self.picture(camera)
         if self._pads:
-            self._frames = [
-                pad.sense(data, contact, self.np_random)
-                for pad, contact in zip(self._pads, self._contacts, strict=True)
-            ]
+            self._frames = [self.feel(side) for side in range(2)]
             for key, frame in zip(v.TACTILE, self._frames, strict=True):
                 observation[key] = frame.image
         return observation
@@ -276,6 +340,8 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         return keys + (list(v.TACTILE) if self.config.tactile else [])
 
     def _shape(self, key: str) -> tuple[int, ...]:
+        if key == v.STATE:
+            return (2 * self.n_joints + 1,)
         if key in v.CAMERAS:
             return (*self.config.camera_size, 3)
         if key in v.TACTILE:
@@ -283,7 +349,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         return v.FEATURES[key].shape
 
     def _action_space(self) -> gym.spaces.Box:
-        step = MAX_JOINT_SPEED / self.config.control_hz
+        step = self.robot.hardware.velocity / self.config.control_hz
         return gym.spaces.Box(
             np.append(-step, 0.0).astype(np.float32),
             np.append(step, GRIPPER_MAX_WIDTH).astype(np.float32),

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
-from touchgoal.control.kinematics import FR3_HOME, fingers_across
+from touchgoal.control.kinematics import fingers_across
 from touchgoal.sim_envs import wires
 from touchgoal.sim_envs.base import EnvConfig, FrankaTactileEnv, Observation
 from touchgoal.sim_envs.objects import HARD, Body, Material, ObjectKind, Texture
@@ -103,7 +103,8 @@ class BeadMaze(FrankaTactileEnv):
         """One control tick; the reward is the tick's gain in progress."""
         action = np.asarray(action, dtype=np.float64)
         self.data.eq_active[self.model.equality("fixture").id] = self.grasping
-        if self.config.disturbance > 0 and action.shape == (8,) and not self.grasping:
+        welcome = action.shape == self.action_space.shape
+        if self.config.disturbance > 0 and welcome and not self.grasping:
             action = action + np.append(self._stray(), 0.0)
         observation, reward, success, truncated, info = super().step(action)
         return observation, reward, success or bool(self.failure.any()), truncated, info
@@ -159,9 +160,9 @@ class BeadMaze(FrankaTactileEnv):
         point, tangent = self.wire.at(START)
         R = fingers_across(tangent)
         offset = R @ np.array([rng.uniform(-0.001, 0.001), 0.0, rng.uniform(-0.001, 0.001)])
-        guess = FR3_HOME.copy()
+        guess = self.robot.arm.home.copy()
         # the hand's yaw; wires head into the half plane y > 0, or nearly so
-        guess[6] -= (np.arctan2(tangent[1], tangent[0]) + np.pi / 2) % (2 * np.pi) - np.pi / 2
+        guess[-1] -= (np.arctan2(tangent[1], tangent[0]) + np.pi / 2) % (2 * np.pi) - np.pi / 2
         return self.kinematics.reach(point + offset, R, guess)
 
     def _settle(self) -> None:
@@ -169,7 +170,7 @@ class BeadMaze(FrankaTactileEnv):
         self._opening = BEAD_RADIUS + 0.004
         self.data.qpos[self._fingers] = self._opening
         self.data.eq_active[self.model.equality("fixture").id] = 1
-        self._advance(np.zeros(v.N_JOINTS), 2 * self._opening, seconds=0.1)
+        self._advance(np.zeros(self.n_joints), 2 * self._opening, seconds=0.1)
 
     def _stray(self) -> Float[np.ndarray, "7"]:
         """Joint change (rad) that nobody commanded: a random walk of the hand's velocity."""

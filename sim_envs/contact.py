@@ -8,6 +8,10 @@ from jaxtyping import Float
 
 from touchgoal.sim_envs.scene import SIDES
 
+# Which of the solver's kinds of constraint are contacts (with elliptic cones).
+_IS_CONTACT = np.zeros(16, bool)
+_IS_CONTACT[int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)] = True
+_IS_CONTACT[int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)] = True
 SLIP_SPEED = 1e-3  # m/s of sliding between pad and object that counts as slip
 
 
@@ -87,6 +91,22 @@ class ContactReader:
             PadContact(force[s], torque[s], slip[s], frozenset(geoms[s])) for s in range(2)
         )
         return (left, right), external
+
+    def joint_torque(self, data: mujoco.MjData) -> Float[np.ndarray, " nv"]:
+        """Generalised force of all contacts, J^T f; what the hand does to itself cancels out."""
+        contact = _IS_CONTACT[data.efc_type]
+        jacobian = data.efc_J.reshape(-1, self._model.nv)
+        return data.efc_force[contact] @ jacobian[contact]
+
+    def load(self, data: mujoco.MjData, geom: int) -> float:
+        """Force (N) with which everything presses down on a geom."""
+        force = 0.0
+        for i in range(data.ncon):
+            contact = data.contact[i]
+            if geom in contact.geom and contact.efc_address >= 0:
+                f, _ = self._wrench(data, i, contact)
+                force += -f[2] if contact.geom[1] == geom else f[2]
+        return float(force)
 
     def touches(self, data: mujoco.MjData, one: int, other: int) -> bool:
         """Whether two geoms are in contact."""

@@ -86,7 +86,7 @@ class PickPlaceExpert:
                 break
             width = segment.width
         while True:
-            yield np.append(np.zeros(7), width)
+            yield np.append(np.zeros(env.n_joints), width)
 
     def _plan(self) -> list[Segment]:
         env = self._env

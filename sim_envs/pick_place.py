@@ -66,6 +66,10 @@ class PickPlace(FrankaTactileEnv):
         """The episode's task in words."""
         return f"pick up the {self.bodies[0].kind.name.replace('_', ' ')} and place it on the disc"
 
+    def layout(self) -> dict[str, list[float]]:
+        """The object's pose, and where on the table it is to go (m)."""
+        return super().layout() | {"goal": self.goal.tolist()}
+
     def _sample(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
         config = self.config
         unknown = options.keys() - {"object", "mass", "grasp_force"}

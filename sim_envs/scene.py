@@ -1,4 +1,4 @@
-"""The MuJoCo scene: an FR3 with a fingertip sensor on each finger, a table, cameras, objects.
+"""The MuJoCo scene: an FR3 or UR5e with a fingertip sensor on each finger, a table, cameras, objects.
 
 Solver settings and their measured effects (creep of a held object, speed) are explained where they
 are set. World frame = the robot's base frame, table top at z = 0.
@@ -12,17 +12,24 @@ from typing import Literal
 import mujoco
 import numpy as np
 
+from touchgoal.control import limits
 from touchgoal.control.errors import UserError
 from touchgoal.control.kinematics import GELSIGHT_TCP
 from touchgoal.control.sensors import SensorModel, find_sensor
 from touchgoal.sim_envs.objects import FIRM, Body
+from touchgoal.sim_envs.ur5e import with_ur5e
 
 SIDES = ("left", "right")
 OBJECT_GROUP, VISUAL_GROUP, HIDDEN_GROUP = 1, 2, 3
 GRIPPER_MAX_FORCE = 80.0  # N, both fingers; opening never needs a limit below it
 
-# Franka's default joint impedance (N m/rad) with 10 % of it as damping (N m s/rad): fr3.xml.
-_ARM_STIFFNESS = np.array([4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0])
+ROBOTS = {"fr3": limits.FR3, "ur5e": limits.UR5E}
+# N m/rad. Franka's default joint impedance: fr3.xml. Stiff enough for the UR5e, too: our choice.
+_STIFFNESS = {
+    "fr3": (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0),
+    "ur5e": (4500.0, 4500.0, 4500.0, 2000.0, 2000.0, 2000.0),
+}
+SERVO_DAMPING = 0.1  # s: N m s/rad for each N m/rad of stiffness, fr3.xml
 _SENSOR_DEPTH_IN_FINGER = GELSIGHT_TCP - 0.0584  # finger frame to sensor centre, along z
 
 
@@ -31,6 +38,7 @@ class SceneConfig:
     """What the scene is made of.
 
     Attributes:
+        arm: whose flange carries the hand.
         sensor: on both fingers: a name in `control.sensors.SENSORS`, or the folder of a sensor file
             that `touchgoal calibrate` wrote.
         meshes: "fast" draws the collision meshes (2.5k triangles, 1 ms a frame in software GL),
@@ -38,6 +46,7 @@ class SceneConfig:
         timestep: of the physics, s.
     """
 
+    arm: Literal["fr3", "ur5e"] = "fr3"
     sensor: str = "gelsight_mini"
     meshes: Literal["fast", "full"] = "fast"
     timestep: float = 1e-3
@@ -54,14 +63,17 @@ def robot_model() -> Path:
 def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpec:
     """The scene's spec; tasks add to it before they compile it."""
     config = config or SceneConfig()
-    spec = mujoco.MjSpec.from_file(str(robot_model()))
+    if config.arm == "ur5e":
+        spec = mujoco.MjSpec.from_string(with_ur5e(robot_model()))
+    else:
+        spec = mujoco.MjSpec.from_file(str(robot_model()))
     spec.meshdir = str(robot_model().parent / "meshes")
     _set_options(spec, config)
     _strip(spec, config)
     _compensate_gravity(spec.body("base"))
     for side in SIDES:
         _add_fingertip(spec, side, find_sensor(config.sensor))
-    _add_actuators(spec)
+    _add_actuators(spec, config.arm)
     _add_cameras_and_table(spec)
     for body in bodies:
         _add_body(spec, body)
@@ -204,19 +216,24 @@ def _add_gel(
     spec.add_exclude(bodyname1="hand", bodyname2=f"{side}_finger")
 
 
-def _add_actuators(spec: mujoco.MjSpec) -> None:
+def arm_joints(arm: str) -> list[str]:
+    """Names of an arm's joints, from the base outwards."""
+    return [f"{arm}_joint{i}" for i in range(1, ROBOTS[arm].arm.home.size + 1)]
+
+
+def _add_actuators(spec: mujoco.MjSpec, arm: str) -> None:
     affine = {
         "gaintype": mujoco.mjtGain.mjGAIN_FIXED,
         "biastype": mujoco.mjtBias.mjBIAS_AFFINE,
     }
-    for i, stiffness in enumerate(_ARM_STIFFNESS, start=1):
-        joint = spec.joint(f"fr3_joint{i}")
+    for i, (name, stiffness) in enumerate(zip(arm_joints(arm), _STIFFNESS[arm], strict=True), 1):
+        joint = spec.joint(name)
         spec.add_actuator(
             name=f"joint_{i}",
             target=joint.name,
             trntype=mujoco.mjtTrn.mjTRN_JOINT,
             gainprm=[stiffness] + [0] * 9,
-            biasprm=[0, -stiffness, -0.1 * stiffness] + [0] * 7,
+            biasprm=[0, -stiffness, -SERVO_DAMPING * stiffness] + [0] * 7,
             ctrlrange=joint.range.tolist(),
             ctrllimited=mujoco.mjtLimited.mjLIMITED_TRUE,
             **affine,

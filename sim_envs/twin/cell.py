@@ -1,0 +1,244 @@
+"""The simulated cell behind the wire: physics at 1 kHz, set-points and gripper from outside."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.control.braking import braked
+from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH, GRIPPER_SPEED, FrankaTactileEnv
+from touchgoal.sim_envs.scene import GRIPPER_MAX_FORCE, SERVO_DAMPING
+
+DT = 1e-3  # s, of the Franka control interface and of the physics
+AT_REST = 0.01  # rad/s
+_FILTER = 0.02  # s, first order: how fast the arm's estimate of external torque follows; our choice
+_YIELD = 0.02  # s, likewise: how fast an arm that was hit gives way; our choice
+
+Joints = Float[np.ndarray, " n"]
+
+
+@dataclass
+class Grip:
+    """What the gripper is told: width (m), its speed (m/s of width), force of each finger (N)."""
+
+    width: float
+    speed: float
+    force: float
+
+
+@dataclass
+class Worst:
+    """What has been worst since the episode began, for whoever injects faults.
+
+    Attributes:
+        excess: rad beyond the maker's joint range.
+        speed: share of the maker's joint speed.
+        force: N, on the robot from outside, as seen once a control tick.
+    """
+
+    excess: float = 0.0
+    speed: float = 0.0
+    force: float = 0.0
+
+
+class Cell:
+    """A task's cell, advanced a millisecond at a time and judged once a control tick.
+
+    The arm is position controlled with velocity feed-forward, so that it follows its set-point
+    without the servo's lag, or torque controlled, without friction, as a Franka's torque loop is.
+
+    Attributes:
+        time: s since the episode began, simulated.
+        q, dq: measured joint positions (rad) and velocities (rad/s).
+        q_d, dq_d: their set-points.
+        tau_ext: torque (N m) on each joint from outside, filtered.
+        grip: the gripper's orders.
+    """
+
+    def __init__(self, env: FrankaTactileEnv, seed: int, options: dict[str, Any]) -> None:
+        self.env = env
+        self.reset(seed, options)
+
+    def reset(self, seed: int, options: dict[str, Any]) -> None:
+        """Begin an episode: arm and objects jump to where it starts."""
+        env = self.env
+        env.reset(seed=seed, options=options)
+        n = env.n_joints
+        model = env.model
+        model.actuator_ctrllimited[:n] = 0  # feed-forward reaches beyond the range; arms check it
+        self._scratch = mujoco.MjData(model)
+        self._servo = model.actuator_gainprm[:n].copy(), model.actuator_biasprm[:n].copy()
+        self._friction = model.dof_frictionloss.copy()
+        self._torque: Joints | None = None
+        self._braking: Joints | None = None
+        self._yielding = False
+        self._nudge, self._nudged_until = np.zeros(3), 0.0
+        self.time, self._steps = 0.0, 0
+        self.q_d, self.dq_d, self.tau_ext = env.command.copy(), np.zeros(n), np.zeros(n)
+        self.q, self.dq = env.joints()
+        self.grip = Grip(env.width_target(), GRIPPER_SPEED, env.grasp_force)
+        self.worst = Worst()
+        self.progress, self.success = 0.0, False
+        self._rest_since = 0.0
+
+    # What arms and grippers command.
+
+    def follow(self, q_d: Joints, dq_d: Joints) -> None:
+        """Be at `q_d` (rad), moving with `dq_d` (rad/s)."""
+        self._release(torque=False)
+        self.q_d, self.dq_d = q_d, dq_d
+
+    def push(self, torque: Joints) -> None:
+        """Apply torques (N m) to the joints, on top of gravity compensation."""
+        if self._torque is None:
+            self._release(torque=True)
+        self._torque = torque
+
+    def brake(self, acceleration: Joints) -> None:
+        """Bring the set-point to rest, by rad/s^2 for each joint."""
+        if self._torque is not None:
+            self.q_d, self.dq_d = self.q.copy(), self.dq.copy()
+        self._release(torque=False)
+        self._braking = acceleration
+
+    def yield_(self) -> None:
+        """Stop here, at once, as hard as the joints can, and then give way to what presses."""
+        self._release(torque=False)
+        self.q_d, self.dq_d, self._yielding = self.q.copy(), np.zeros_like(self.dq), True
+
+    def grasp(self, width: float, speed: float, force: float) -> None:
+        """Send the gripper to `width` (m) at `speed` (m/s), pressing with `force` (N) a finger."""
+        width = float(np.clip(width, 0.0, GRIPPER_MAX_WIDTH))
+        self.grip = Grip(width, min(speed, GRIPPER_SPEED), min(force, GRIPPER_MAX_FORCE / 2))
+
+    def nudge(self, force: Float[np.ndarray, "3"], seconds: float) -> None:
+        """Push the hand with a force (N, base frame) for a while, as a person might."""
+        self._nudge, self._nudged_until = force, self.time + seconds
+
+    # Time.
+
+    def step(self) -> None:
+        """One millisecond."""
+        env = self.env
+        tick = self._tick_steps
+        if self._steps % tick == 0:
+            env.begin_tick()
+        if self._braking is not None:
+            self.dq_d = braked(self.dq_d, self._braking, DT)
+            self.q_d = self.q_d + DT * self.dq_d
+        if self._yielding:
+            self.q_d = self.q_d + (DT / _YIELD) * (self.q - self.q_d)
+        pushed = self._push()
+        env.grasp_force = self.grip.force
+        if self._torque is not None:
+            env.data.qfrc_applied[env.arm_dofs] = self._torque
+            self.q_d, self.dq_d = self.q, self.dq
+        env.advance(self.q_d + SERVO_DAMPING * self.dq_d, self.grip.width, self.grip.speed)
+        self._steps += 1
+        self.time = self._steps * DT
+        self._measure(pushed)
+        if self._steps % tick == 0:
+            env.refresh()
+            self.progress, self.success = env.end_tick()
+            force = float(np.linalg.norm(env.external_wrench()[:3]))
+            self.worst.force = max(self.worst.force, force)
+
+    @property
+    def steps(self) -> int:
+        """Milliseconds since the episode began."""
+        return self._steps
+
+    @property
+    def moving(self) -> bool:
+        """Whether any joint moves."""
+        return bool(np.abs(self.dq).max() > AT_REST)
+
+    @property
+    def joint_torque(self) -> Joints:
+        """Torque (N m) of each joint's drive, gravity compensation included."""
+        data, dofs = self.env.data, self.env.arm_dofs
+        driven = data.qfrc_actuator[dofs] + data.qfrc_applied[dofs]
+        return driven + data.qfrc_gravcomp[dofs]
+
+    def kinematics(
+        self, q: Joints, offset: Float[np.ndarray, "3"]
+    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], Float[np.ndarray, "6 n"]]:
+        """Position (m), rotation and Jacobian, base frame, of a point `offset` (m) from the TCP.
+
+        By MuJoCo: ten times as fast as CasADi's interpreter, which a millisecond does not allow.
+        """
+        env, data = self.env, self._scratch
+        data.qpos[env.arm_positions] = q
+        mujoco.mj_kinematics(env.model, data)
+        mujoco.mj_comPos(env.model, data)
+        site = data.site("tcp")
+        R = site.xmat.reshape(3, 3).copy()
+        point = site.xpos + R @ offset
+        jacobian = np.zeros((6, env.model.nv))
+        body = env.model.site_bodyid[site.id]
+        mujoco.mj_jac(env.model, data, jacobian[:3], jacobian[3:], point, body)
+        return point, R, jacobian[:, env.arm_dofs]
+
+    def truth(self) -> dict[str, Any]:
+        """What only a simulator knows, as plain numbers; also where arm and gripper are."""
+        return {
+            "time": self.time,
+            "instruction": self.env.instruction(),
+            "progress": float(self.progress),
+            "success": bool(self.success),
+            "layout": self.env.layout(),
+            "pad_forces": [pad.normal_force for pad in self.env.pad_contacts()],
+            "facts": self.env.facts(),
+            "q": self.q.tolist(),
+            "dq": self.dq.tolist(),
+            "q_d": self.q_d.tolist(),
+            "width": self.env.width(),
+            "rest": self.time - self._rest_since if not self.moving else 0.0,
+            "worst": vars(self.worst),
+        }
+
+    # Insides.
+
+    @property
+    def _tick_steps(self) -> int:
+        return round(1 / (self.env.config.control_hz * DT))
+
+    def _push(self) -> Joints:
+        """Apply the nudge; its torque (N m) on each joint."""
+        env = self.env
+        force = self._nudge if self.time < self._nudged_until else np.zeros(3)
+        hand = env.model.body("hand").id
+        env.data.xfrc_applied[hand, :3] = force
+        if not force.any():
+            return np.zeros(env.n_joints)
+        jacobian = np.zeros((3, env.model.nv))
+        mujoco.mj_jac(env.model, env.data, jacobian, None, env.data.xipos[hand], hand)
+        return force @ jacobian[:, env.arm_dofs]
+
+    def _measure(self, pushed: Joints) -> None:
+        env, limits = self.env, self.env.robot.hardware
+        self.q, self.dq = env.joints()
+        now = env.joint_contact_torque() + pushed
+        self.tau_ext = self.tau_ext + (DT / _FILTER) * (now - self.tau_ext)
+        if self.moving:
+            self._rest_since = self.time
+        worst = self.worst
+        outside = np.maximum(limits.lower - self.q, self.q - limits.upper).max()
+        worst.excess = max(worst.excess, float(outside))
+        worst.speed = max(worst.speed, float((np.abs(self.dq) / limits.velocity).max()))
+
+    def _release(self, torque: bool) -> None:
+        """Leave braking and yielding, and change between position servo and torque control."""
+        self._braking, self._yielding = None, False
+        if torque == (self._torque is not None):
+            return
+        env, n = self.env, self.env.n_joints
+        gain, bias = self._servo
+        env.model.actuator_gainprm[:n] = 0.0 if torque else gain
+        env.model.actuator_biasprm[:n] = 0.0 if torque else bias
+        env.model.dof_frictionloss[env.arm_dofs] = 0.0 if torque else self._friction[env.arm_dofs]
+        self._torque = None
+        if not torque:
+            env.data.qfrc_applied[env.arm_dofs] = 0.0

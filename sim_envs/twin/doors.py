@@ -1,0 +1,92 @@
+"""TCP ports that are looked after between two physics steps, and never wait for anyone."""
+
+import socket
+
+_MOST_UNSENT = 1_000_000  # bytes a client may leave unread before it is cut off
+
+
+class Connection:
+    """A client; what it has sent is in `unread` until someone takes it."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        sock.setblocking(False)
+        if sock.family == socket.AF_INET:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket = sock
+        self.unread, self._unsent = b"", b""
+        self.open = True
+
+    def read(self) -> None:
+        """Take in what has come."""
+        try:
+            chunk = self._socket.recv(65536)
+        except BlockingIOError:
+            return
+        except OSError:
+            chunk = b""
+        self.unread += chunk
+        self.open &= bool(chunk)
+
+    def lines(self) -> list[str]:
+        """Whole lines that have come."""
+        *lines, self.unread = self.unread.split(b"\n")
+        return [line.decode(errors="replace").strip() for line in lines]
+
+    def send(self, data: bytes) -> None:
+        """Send; what the client does not take yet is kept."""
+        self._unsent += data
+        try:
+            self._unsent = self._unsent[self._socket.send(self._unsent) :]
+        except BlockingIOError:
+            self.open &= len(self._unsent) < _MOST_UNSENT
+        except OSError:
+            self.open = False
+
+    def close(self) -> None:
+        """Hang up."""
+        self._socket.close()
+        self.open = False
+
+
+class Door:
+    """A listening port; `greeting` is said to every client."""
+
+    def __init__(self, host: str, port: int, greeting: bytes = b"") -> None:
+        self._socket = socket.socket()
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self._socket.bind((host, port))
+        self._socket.listen(8)
+        self._socket.setblocking(False)
+        self._greeting = greeting
+        self.clients: list[Connection] = []
+
+    @property
+    def port(self) -> int:
+        """The port's number."""
+        return self._socket.getsockname()[1]
+
+    def poll(self) -> list[Connection]:
+        """Let new clients in, hear the others, forget those who left."""
+        try:
+            client = Connection(self._socket.accept()[0])
+            client.send(self._greeting)
+            self.clients.append(client)
+        except BlockingIOError:
+            pass
+        for client in self.clients:
+            client.read()
+            if not client.open:
+                client.close()
+        self.clients = [client for client in self.clients if client.open]
+        return self.clients
+
+    def drop_all(self) -> None:
+        """Hang up on every client."""
+        for client in self.clients:
+            client.close()
+        self.clients = []
+
+    def close(self) -> None:
+        """Hang up and stop listening."""
+        self.drop_all()
+        self._socket.close()

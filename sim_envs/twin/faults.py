@@ -1,0 +1,143 @@
+"""One line-based port by which another process breaks the twin, mends it and asks for the truth.
+
+    truth                         what only a simulator knows, and where the arm is
+    reset SEED [OPTIONS]          begin an episode; OPTIONS is a JSON object of the task's
+    freeze SECONDS                nothing passes between the arm (and its hand) and its clients
+    drop                          hang up on the arm's clients
+    stop-button on|off            user stop of a Franka, emergency stop of a UR
+    error NAME                    stop the arm with an error, such as cartesian_reflex
+    nudge FX FY FZ SECONDS        push the hand, N in the base frame
+    stall|repeat|lose NAME SECONDS  a camera or sensor sends nothing, one picture, cuts clients off
+    garble NAME SHARE             a serial port's messages lose bytes
+    unplug|plug NAME              a serial port
+    kill                          end the twin's process at once, as kill -9 does
+
+Every answer is one line of JSON; a mistake is {"error": ...}.
+"""
+
+import json
+import os
+import signal
+import socket
+import time
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from touchgoal.control.errors import UserError
+from touchgoal.sim_envs.twin.cell import Cell
+from touchgoal.sim_envs.twin.doors import Door
+from touchgoal.sim_envs.twin.mjpeg import Stream
+from touchgoal.sim_envs.twin.serial_ports import SerialPort
+
+
+@runtime_checkable
+class Arm(Protocol):
+    """What can go wrong with an arm's controller and its link."""
+
+    def freeze(self, frozen: bool) -> None:
+        """Let nothing through in either direction, or let it through again."""
+
+    def drop(self) -> None:
+        """Hang up on its clients."""
+
+    def stop_button(self, pressed: bool) -> None:
+        """Press or release the stop that people press."""
+
+    def abort(self, error: str) -> None:
+        """Stop with an error; UserError if there is none of that name."""
+
+
+class Faults:
+    """Serves the lines above at a port of its own."""
+
+    def __init__(
+        self,
+        cell: Cell,
+        arm: Arm,
+        streams: dict[str, Stream],
+        ports: dict[str, SerialPort],
+        host: str,
+        port: int,
+    ) -> None:
+        self._cell, self._arm, self._streams, self._ports = cell, arm, streams, ports
+        self._door = Door(host, port)
+        self._thaw = 0.0
+        self.address = f"{host}:{self._door.port}"
+
+    def receive(self) -> None:
+        """Do what has been asked."""
+        if self._thaw and time.monotonic() > self._thaw:
+            self._thaw = 0.0
+            self._arm.freeze(False)
+        for client in self._door.poll():
+            for line in client.lines():
+                client.send(json.dumps(self._answer(line)).encode() + b"\n")
+
+    def send(self) -> None:
+        """Nothing is said unasked."""
+
+    def close(self) -> None:
+        """Free the port."""
+        self._door.close()
+
+    def _answer(self, line: str) -> dict[str, Any]:
+        command, _, rest = line.partition(" ")
+        actions = {
+            "truth": self._cell.truth,
+            "reset": lambda: self._reset(*rest.split(" ", 1)),
+            "freeze": lambda: self._freeze(float(rest)),
+            "drop": self._arm.drop,
+            "stop-button": lambda: self._arm.stop_button({"on": True, "off": False}[rest]),
+            "error": lambda: self._arm.abort(rest),
+            "nudge": lambda: self._nudge(*(float(number) for number in rest.split())),
+            "stall": lambda: self._spoil("stalled", *rest.split()),
+            "repeat": lambda: self._spoil("frozen", *rest.split()),
+            "lose": lambda: self._spoil("lost", *rest.split()),
+            "garble": lambda: self._garble(*rest.split()),
+            "unplug": lambda: self._ports[rest].unplug(),
+            "plug": lambda: self._ports[rest].plug(),
+            "kill": lambda: os.kill(os.getpid(), signal.SIGKILL),
+        }
+        if command not in actions:
+            return {"error": f"unknown command {command!r}; there are: {', '.join(actions)}"}
+        try:
+            return actions[command]() or {"ok": True}
+        except (UserError, ValueError, TypeError, KeyError) as error:
+            return {"error": f"{line!r} cannot be done: {error}"}
+
+    def _reset(self, seed: str, options: str = "{}") -> None:
+        if self._cell.moving:
+            raise UserError("the arm moves; stop it first")
+        self._cell.reset(int(seed), json.loads(options))
+
+    def _freeze(self, seconds: float) -> None:
+        self._arm.freeze(True)
+        self._thaw = time.monotonic() + seconds
+
+    def _nudge(self, x: float, y: float, z: float, seconds: float) -> None:
+        self._cell.nudge(np.array([x, y, z]), seconds)
+
+    def _spoil(self, fault: str, name: str, seconds: str) -> None:
+        setattr(self._streams[name], fault, time.monotonic() + float(seconds))
+
+    def _garble(self, name: str, share: str) -> None:
+        self._ports[name].garble = float(share)
+
+
+def ask(address: str, line: str) -> dict[str, Any]:
+    """Send one line to a twin's port (`host:port`) and return the answer.
+
+    Raises:
+        UserError: the twin refuses, or has ended.
+    """
+    host, _, port = address.rpartition(":")
+    try:
+        with socket.create_connection((host, int(port)), timeout=10) as connection:
+            connection.sendall(line.encode() + b"\n")
+            answer = json.loads(connection.makefile().readline())
+    except (OSError, json.JSONDecodeError) as error:
+        raise UserError(f"no twin answers at {address}; start one: touchgoal twin") from error
+    if "error" in answer:
+        raise UserError(answer["error"])
+    return answer

@@ -1,0 +1,164 @@
+"""The cell's cameras and fingertip sensors as MJPEG streams over HTTP, with faults to order."""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from touchgoal.control import vocabulary as v
+from touchgoal.sim_envs.twin.cell import Cell
+
+_CAMERA_RATE = 30  # Hz, a webcam's
+_CAMERA_NOISE = 1.5  # counts: by it a driver tells a still scene from a frozen camera
+_QUALITY = 95  # of JPEG; real GelSight Minis send MJPEG, too
+_PATIENCE = 0.2  # s between looks at whether the stream is to end
+
+Picture = UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass
+class Stream:
+    """One source of pictures.
+
+    Attributes:
+        rate: Hz, simulated.
+        take: takes a picture, RGB.
+        stalled, frozen, lost: until when (s, time.monotonic) nothing comes, one picture repeats, or
+            clients are cut off and turned away.
+    """
+
+    rate: int
+    take: Callable[[], Picture]
+    stalled: float = 0.0
+    frozen: float = 0.0
+    lost: float = 0.0
+    watchers: int = 0
+    count: int = 0
+    picture: Picture | None = None
+    news: threading.Condition = field(default_factory=threading.Condition)
+
+    def publish(self) -> None:
+        """A new picture for whoever watches."""
+        now = time.monotonic()
+        if now < self.stalled or not self.watchers:
+            return
+        picture = self.take()  # even if it is not shown: a sensor goes on feeling
+        with self.news:
+            if now >= self.frozen or self.picture is None:
+                self.picture = picture
+            self.count += 1
+            self.news.notify_all()
+
+
+class Streams:
+    """Serves every camera and sensor of the cell at `http://host:port/NAME`.
+
+    Attributes:
+        streams: by name, such as tactile_left.
+    """
+
+    def __init__(self, cell: Cell, host: str, port: int) -> None:
+        self._cell, self._host = cell, host
+        self._rng = np.random.default_rng(0)
+        env = cell.env
+        self.streams = {
+            camera: Stream(_CAMERA_RATE, partial(self._picture, camera))
+            for camera in env.config.cameras
+        }
+        if env.config.tactile:
+            for side, key in enumerate(v.TACTILE):
+                take = partial(self._feel, side)
+                name = key.removeprefix(v.IMAGE_PREFIX)
+                self.streams[name] = Stream(round(env.sensor.frame_rate), take)
+        handler = type("Handler", (_Handler,), {"streams": self.streams})
+        self._server = ThreadingHTTPServer((host, port), handler)
+        self._server.daemon_threads = True
+        threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True).start()
+
+    def addresses(self) -> dict[str, str]:
+        """Address of each stream, by its key in the vocabulary."""
+        port = self._server.server_address[1]
+        return {
+            v.IMAGE_PREFIX + name: f"http://{self._host}:{port}/{name}" for name in self.streams
+        }
+
+    def receive(self) -> None:
+        """Nobody says anything here."""
+
+    def send(self) -> None:
+        """Take the pictures that are due."""
+        due = [s for s in self.streams.values() if _is_due(self._cell.steps, s.rate)]
+        if due:
+            self._cell.env.refresh()  # watched or not: watching must not change the physics
+        for stream in due:
+            stream.publish()
+
+    def close(self) -> None:
+        """Hang up on everyone."""
+        for stream in self.streams.values():
+            stream.lost = np.inf
+        self._server.shutdown()
+        self._server.server_close()
+
+    def _picture(self, camera: str) -> Picture:
+        picture = self._cell.env.picture(camera)
+        noise = self._rng.normal(0.0, _CAMERA_NOISE, picture.shape)
+        return np.clip(picture + noise, 0, 255).astype(np.uint8)
+
+    def _feel(self, side: int) -> Picture:
+        return self._cell.env.feel(side).image
+
+
+def _is_due(steps: int, rate: int) -> bool:
+    """Whether something at `rate` Hz is due in this millisecond."""
+    return steps * rate // 1000 > (steps - 1) * rate // 1000
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Sends one stream to one client until either is gone."""
+
+    streams: dict[str, Stream]
+
+    def do_GET(self) -> None:  # noqa: N802, the base class's name
+        """Serve a stream."""
+        stream = self.streams.get(self.path.strip("/"))
+        if stream is None:
+            self.send_error(404, "there are: " + ", ".join(self.streams))
+            return
+        if time.monotonic() < stream.lost:
+            self.close_connection = True
+            return
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+        self.end_headers()
+        with stream.news:
+            stream.watchers += 1
+        try:
+            self._serve(stream)
+        except OSError:  # the client has gone
+            pass
+        finally:
+            with stream.news:
+                stream.watchers -= 1
+
+    def _serve(self, stream: Stream) -> None:
+        seen = stream.count
+        while time.monotonic() >= stream.lost:
+            with stream.news:
+                if stream.count == seen and not stream.news.wait(_PATIENCE):
+                    continue
+                seen, picture = stream.count, stream.picture
+            assert picture is not None
+            bgr = np.ascontiguousarray(picture[..., ::-1])
+            _, jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+            self.wfile.write(head.encode() + jpeg.tobytes() + b"\r\n")
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing."""

@@ -1,0 +1,156 @@
+"""The twin put together: one loop with everything on the wire and the physics, 1 ms at a time."""
+
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
+
+from touchgoal.control.errors import UserError
+from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH
+from touchgoal.sim_envs.tasks import TaskConfig, make_env
+from touchgoal.sim_envs.twin import serial_ports
+from touchgoal.sim_envs.twin.cell import DT, Cell
+from touchgoal.sim_envs.twin.faults import Faults
+from touchgoal.sim_envs.twin.franka import FrankaArm
+from touchgoal.sim_envs.twin.franka_hand import FrankaHand
+from touchgoal.sim_envs.twin.mjpeg import Streams
+from touchgoal.sim_envs.twin.rtde import UrController
+
+_BACKLOG = 0.1  # s behind real time beyond which the twin stops trying to catch up
+# s to wait for a client that drives the arm. In lock-step for as long as a loaded machine needs; in
+# real time about as long as a busy one hiccups.
+_LOCK_STEP_PATIENCE, _PATIENCE = 2.0, 0.1
+
+
+@dataclass(frozen=True)
+class TwinConfig:
+    """A twin.
+
+    Attributes:
+        task: what the cell is for; its `scene.arm` is overruled by `arm`.
+        arm: an FR3 with the Franka Hand, or a UR5e whose gripper talks as a Robotiq does.
+        seed, options: of the first episode.
+        host: loopback address of everything; twins at different ones run side by side.
+        port: of the pictures; the next one is for faults. 0: any that are free.
+        lock_step: wait for the client that drives the arm, so that runs repeat.
+        folder: where serial devices appear.
+    """
+
+    task: TaskConfig
+    arm: Literal["fr3", "ur5e"]
+    seed: int
+    options: dict[str, Any]
+    host: str
+    port: int
+    lock_step: bool
+    folder: Path
+
+
+@runtime_checkable
+class Service(Protocol):
+    """Something that clients talk to; never blocks."""
+
+    def receive(self) -> None:
+        """Before a physics step: take what clients have sent."""
+
+    def send(self) -> None:
+        """After it: answer them."""
+
+    def close(self) -> None:
+        """Free ports and files."""
+
+
+class Twin:
+    """The cell with its services, in one thread.
+
+    In lock-step simulated time never runs faster than the clock; in real time the cell catches up
+    with the clock.
+
+    Attributes:
+        rig: where everything is, for whoever deploys on it.
+        stopped: set it to end `run`.
+    """
+
+    def __init__(self, config: TwinConfig) -> None:
+        scene = replace(config.task.scene, arm=config.arm)
+        self.cell = Cell(
+            make_env(replace(config.task, scene=scene)), config.seed, dict(config.options)
+        )
+        self._lock_step, self._due = config.lock_step, time.monotonic()
+        self.stopped = False
+        self._services: list[Service] = []
+        with ExitStack() as undo:
+            undo.callback(self.close)
+            try:
+                self.rig = self._open(config)
+            except OSError as error:
+                raise UserError(
+                    f"cannot serve at {config.host} ({error.strerror}); if another twin is there, "
+                    "end it or choose another address: --host 127.0.0.2"
+                ) from error
+            undo.pop_all()
+
+    def run(self) -> None:
+        """Serve until `stopped`."""
+        while not self.stopped:
+            self.step()
+
+    def step(self) -> None:
+        """One millisecond of everything."""
+        for service in self._services:
+            service.receive()
+        self.cell.step()
+        for service in self._services:
+            service.send()
+        self._keep_pace()
+
+    def close(self) -> None:
+        """Free ports, files and the OpenGL contexts."""
+        for service in self._services:
+            service.close()
+        self.cell.env.close()
+
+    def _keep_pace(self) -> None:
+        now = time.monotonic()
+        allowed = 0.0 if self._lock_step else _BACKLOG
+        self._due = max(self._due + DT, now - allowed)
+        if self._due > now:
+            time.sleep(self._due - now)
+
+    def _open(self, config: TwinConfig) -> dict[str, Any]:
+        """Open every service; returns the rig."""
+        cell, host, folder = self.cell, config.host, config.folder
+        folder.mkdir(parents=True, exist_ok=True)
+        services = self._services
+        services.append(load_cell := serial_ports.LoadCell(cell, folder / "load_cell"))
+        ports = {"load_cell": load_cell.port}
+        if config.arm == "fr3":
+            patience = _LOCK_STEP_PATIENCE if config.lock_step else _PATIENCE
+            services.append(hand := FrankaHand(cell, host))
+            services.append(arm := FrankaArm(cell, host, patience, hand.link))
+            gripper: dict[str, Any] = {"kind": "franka_hand", "address": host}
+        else:
+            services.append(arm := UrController(cell, host))
+            services.append(robotiq := serial_ports.Robotiq(cell, folder / "gripper"))
+            ports["gripper"] = robotiq.port
+            widths = [GRIPPER_MAX_WIDTH, 0.0]
+            gripper = {"kind": "robotiq", "port": str(robotiq.port.path), "widths": widths}
+        services.append(streams := Streams(cell, host, config.port))
+        control = config.port + 1 if config.port else 0
+        services.append(faults := Faults(cell, arm, streams.streams, ports, host, control))
+        return {
+            "arm": config.arm,
+            "address": host,
+            "gripper": gripper,
+            "images": streams.addresses(),
+            "sensor": config.task.scene.sensor,
+            "load_cell": {
+                "port": str(load_cell.port.path),
+                "newtons_per_count": serial_ports.NEWTONS_PER_COUNT,
+                "zero": serial_ports.ZERO,
+            },
+            "faults": faults.address,
+            "instruction": cell.env.instruction(),
+            "lock_step": config.lock_step,
+        }
