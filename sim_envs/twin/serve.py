@@ -8,6 +8,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH
+from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.tasks import TaskConfig, make_env
 from touchgoal.sim_envs.twin import serial_ports
 from touchgoal.sim_envs.twin.cell import DT, Cell
@@ -151,6 +152,9 @@ class Twin:
                 "zero": serial_ports.ZERO,
             },
             "faults": faults.address,
+            "task": "bead-maze" if isinstance(config.task, BeadMazeConfig) else "pick-place",
+            "seed": config.seed,
+            "options": config.options,
             "instruction": cell.env.instruction(),
             "lock_step": config.lock_step,
         }
