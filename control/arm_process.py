@@ -33,6 +33,8 @@ class ArmConfig:
         tcp_offset: m along the hand's z axis from the flange to the tool centre point.
         hz: of the commands that come.
         rate: Hz of the stream that goes out.
+        silence: s without news of the controller after which it is lost. Each driver has its own;
+            a simulator on a loaded machine needs more.
     """
 
     address: str
@@ -40,16 +42,16 @@ class ArmConfig:
     tcp_offset: float
     hz: float
     rate: float
+    silence: float
 
 
 class ArmClient(ABC):
     """In the child: a vendor's client behind five methods. `config.rate` times a second it ticks.
 
-    When the link is lost, `silence` s without news of the controller included, the process ends:
-    no library mends its link while nobody looks, and a controller stops the arm of a dead client.
+    When the link is lost, by the controller's silence too, the process ends: no library mends its
+    link while nobody looks, and a controller stops the arm of a dead client.
     """
 
-    silence: float
     _commanded: Joints  # the controller's own present command, rad; `_measure` sets it
 
     def __init__(self, config: ArmConfig, recover: bool) -> None:
@@ -104,12 +106,12 @@ class ArmClient(ABC):
         """Read the state and stream the next command."""
         now = time.monotonic()
         periods = min(max(round((now - self._ticked) / self.period), 1), _LATE)
-        punctual = now - self._ticked < self.silence / 2
+        punctual = now - self._ticked < self.config.silence / 2
         self._ticked = now
         self._reading = self._measure()
-        if punctual and now - self._reading.stamp > self.silence:
+        if punctual and now - self._reading.stamp > self.config.silence:
             raise DriverError(
-                f"no state for {1e3 * self.silence:.0f} ms: check power and cable, then recover"
+                f"no state for {1e3 * self.config.silence:.0f} ms: check power and cable, then recover"
             )
         if self._reading.fault:
             self._latch(self._reading.fault)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import franky
 
 RATE = 200.0  # Hz of velocity commands
+SILENCE = 0.5  # s; libfranka itself gives up after 1 s
 _LASTS_MS = 100  # of each
 _PULL = 10.0  # 1/s towards the commanded position
 _SHARE = 0.9  # of franky's limits that the stream uses; the rest is for the pull
@@ -26,8 +27,6 @@ _TORQUE_REFLEX, _FORCE_REFLEX = 20.0, 30.0  # Nm and N; franky's defaults, beyon
 
 class FrankaClient(ArmClient):
     """In the child: one FR3."""
-
-    silence = 0.5  # libfranka itself gives up after 1 s
 
     def _connect(self, recover: bool) -> JointLimits:
         import franky

@@ -16,6 +16,7 @@ from touchgoal.control.limits import JointLimits
 from touchgoal.control.protocols import ArmReading, DriverError, Joints
 
 RATE = 125.0  # Hz of servoJ; 20 to 500
+SILENCE = 0.05  # s
 _GAIN = 300.0  # of servoJ, 100 to 2000; URScript's default
 _LOOKAHEAD = 0.03, 0.2  # s, servoJ's range; the arm lags by about this much
 _BRAKING = 10.0  # rad/s^2 of servoStop; ur-rtde's default
@@ -25,8 +26,6 @@ _WATCHDOG = 10.0  # Hz; with fewer commands the controller stops its program, an
 
 class UrClient(ArmClient):
     """In the child: one UR."""
-
-    silence = 0.05
 
     def _connect(self, recover: bool) -> JointLimits:
         from rtde_control import RTDEControlInterface

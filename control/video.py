@@ -86,8 +86,8 @@ class VideoCamera:
         frame, now = self.read(), time.monotonic()
         if self._lost:
             return f"{self.config.source} {self._lost}"
-        if now - self._changed > self.config.frozen_after and now - self._times[-1] < _REOPEN:
-            return f"{self.config.source} shows one picture for {now - self._changed:.1f} s"
+        if self._times[-1] - frame.stamp > self.config.frozen_after:
+            return f"{self.config.source} shows one picture for {now - frame.stamp:.1f} s"
         if now - frame.stamp > _LATE / self.config.rate:
             return f"{self.config.source} gave its last frame {now - frame.stamp:.2f} s ago"
         return ""

@@ -12,7 +12,7 @@ import pytest
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.gelsight import DIGIT_VIEW, GELSIGHT_MINI_VIEW, UNCHANGED, Fingertip, cut
-from touchgoal.control.protocols import DriverError
+from touchgoal.control.protocols import DriverError, TactileSensor
 from touchgoal.control.sensors import DIGIT, GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
 from touchgoal.control.usb_cameras import find_sensor_camera, list_cameras
 from touchgoal.control.video import VideoCamera, VideoConfig
@@ -178,7 +178,7 @@ def test_a_fingertip_is_cut_turned_and_scaled(tmp_path: Path) -> None:
         VideoCamera(VideoConfig(str(tmp_path / "%d.png"))), GELSIGHT_MINI, GELSIGHT_MINI_VIEW
     )
     assert sensor.read().image.shape[:2] == sensor.model.image_shape
-    assert sensor.read() is sensor.read()
+    assert sensor.read() is sensor.read() and isinstance(sensor, TactileSensor)
     sensor.close()
 
 
