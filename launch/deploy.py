@@ -91,7 +91,11 @@ def _deploy(config: Config, rig: Rig, station: Station, out: Path) -> Result:
             show=terminal.show,
             truth=truth,
         )
-        return session.run()
+        try:
+            return session.run()
+        finally:
+            if judge is not None:
+                judge.close()
 
 
 def _done(truth: Callable[[], dict[str, Any]]) -> str:

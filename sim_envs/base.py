@@ -179,7 +179,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self._extend(spec)
         return spec
 
-    def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, "7"]:
+    def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
         """Joint positions with the open hand over the table, a little different each time."""
         position = np.array([0.45, 0.0, 0.26]) + rng.uniform(-0.03, 0.03, 3)
         return self.kinematics.reach(
@@ -216,10 +216,17 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         mujoco.mj_forward(self.model, self.data)
         self._contacts, self._external = self._reader.read(self.data)
 
-    def end_tick(self) -> tuple[float, bool]:
-        """Progress in [0, 1] and success after a control tick; `refresh` first."""
-        self._ticks += 1
+    def end_tick(self, begun: bool = True) -> tuple[float, bool]:
+        """Progress in [0, 1] and success after a control tick; `refresh` first.
+
+        The episode's clock stands still until it has `begun`.
+        """
+        self._ticks += begun
         return self._judge()
+
+    def troubles(self) -> list[str]:
+        """Names of what has failed after the last tick; here nothing can."""
+        return []
 
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
         """Joint positions (rad) and velocities (rad/s)."""

@@ -102,30 +102,25 @@ class BeadMaze(FrankaTactileEnv):
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control tick; the reward is the tick's gain in progress."""
         action = np.asarray(action, dtype=np.float64)
-        welcome = action.shape == self.action_space.shape
-        if self.config.disturbance > 0 and welcome and not self.grasping:
+        known = action.shape == self.action_space.shape
+        if self.config.disturbance > 0 and known and not self.grasping:
             action = action + np.append(self._stray(), 0.0)
         observation, reward, success, truncated, info = super().step(action)
         return observation, reward, success or bool(self.failure.any()), truncated, info
 
-    def begin_tick(self) -> None:
-        """The fixture lets go of the bead in time."""
-        self.data.eq_active[self.model.equality("fixture").id] = self.grasping
-
-    def advance(self, joints: np.ndarray, width: float, speed: float, steps: int = 1) -> None:
-        """As every task's; and remember whether the hand is told to close."""
-        self._closes = width < 2 * BEAD_RADIUS
-        super().advance(joints, width, speed, steps)
-
-    def end_tick(self) -> tuple[float, bool]:
-        """Progress in [0, 1] and success after a control tick; `refresh` first."""
-        self._closing += self._closes
-        return super().end_tick()
-
     @property
     def grasping(self) -> bool:
-        """Whether the fixture still holds the bead: for some time after the hand begins to close."""
-        return self._closing < GRASP_SECONDS * self.config.control_hz
+        """Whether the fixture still holds the bead."""
+        return self._ticks < GRASP_SECONDS * self.config.control_hz
+
+    def begin_tick(self) -> None:
+        """The fixture holds the bead while the hand closes on it, and lets go of it then."""
+        self.data.eq_active[self.model.equality("fixture").id] = self.grasping
+
+    def troubles(self) -> list[str]:
+        """Of drop, jam and over_force, what is so after the last tick."""
+        names = v.FEATURES[v.TRUTH_FAILURE].names
+        return [name for name, true in zip(names, self.failure, strict=True) if true]
 
     def instruction(self) -> str:
         """The episode's task in words."""
@@ -164,12 +159,11 @@ class BeadMaze(FrankaTactileEnv):
 
     def _place(self, rng: np.random.Generator) -> None:
         self.s = START
-        self._closing, self._closes = 0, False  # ticks for which the hand has been told to close
         self.failure = np.zeros(3, bool)
         self._furthest, self._stalled_ticks = START, 0
         self._drift = np.zeros(6)
 
-    def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, "7"]:
+    def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
         """Joint positions with the bead between the fingers, not quite in their middle."""
         point, tangent = self.wire.at(START)
         R = fingers_across(tangent)
@@ -186,7 +180,7 @@ class BeadMaze(FrankaTactileEnv):
         self.data.eq_active[self.model.equality("fixture").id] = 1
         self._advance(np.zeros(self.n_joints), 2 * self._opening, seconds=0.1)
 
-    def _stray(self) -> Float[np.ndarray, "7"]:
+    def _stray(self) -> Float[np.ndarray, " n"]:
         """Joint change (rad) that nobody commanded: a random walk of the hand's velocity."""
         tick = 1 / self.config.control_hz
         keep = np.exp(-tick / STRAY_SECONDS)

@@ -21,6 +21,10 @@ import pytest
 import serial
 
 from touchgoal.control.errors import UserError
+from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
+from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.scene import SceneConfig
+from touchgoal.sim_envs.twin.cell import Cell
 from touchgoal.sim_envs.twin.faults import ask
 from touchgoal.sim_envs.twin.serial_ports import NEWTONS_PER_COUNT, ZERO
 
@@ -81,7 +85,7 @@ def begin(rig: dict, line: str) -> None:
     ask(rig["faults"], line)
 
 
-def client(function: Callable, *arguments: object, seconds: float = 40) -> dict:
+def client(function: Callable, *arguments: object, seconds: float = 150) -> dict:
     """What a function returns in a process of its own."""
     source = inspect.getsource(connect) + inspect.getsource(function)
     program = (
@@ -97,6 +101,40 @@ def client(function: Callable, *arguments: object, seconds: float = 40) -> dict:
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
+
+
+# The cell, without a wire.
+
+
+@pytest.mark.parametrize("arm", ["fr3", "ur5e"])
+def test_arm_follows_without_lag(arm: str) -> None:
+    scene = SceneConfig(arm=arm)  # type: ignore[arg-type]
+    cell = Cell(PickPlace(PickPlaceConfig(cameras=(), tactile=False, scene=scene)), 3, {})
+    start, error = cell.q_d.copy(), 0.0
+    for _ in range(1500):
+        phase = 4 * (cell.time + 1e-3)  # 0.8 rad/s and 3.2 rad/s^2 at most
+        cell.follow(start + 0.2 * (1 - np.cos(phase)), np.full(len(start), 0.8 * np.sin(phase)))
+        cell.step()
+        error = max(error, float(np.abs(cell.q - cell.q_d).max()))
+    assert error < 5e-3  # 0.08 rad without feed-forward
+    cell.brake(np.full(len(start), 10.0))
+    for _ in range(300):
+        cell.step()
+    assert not cell.moving and cell.worst.excess <= 0
+
+
+def test_fixture_waits_for_the_first_grasp() -> None:
+    maze = BeadMazeConfig(split="validation", n_wires=20, tactile=False)
+    cell = Cell(BeadMaze(maze), 3, {})
+    for _ in range(2000):
+        cell.step()
+    fixture = cell.env.model.equality("fixture").id
+    assert cell.env.data.eq_active[fixture]
+    cell.grasp(0.0, 0.1, 10.0)
+    for _ in range(1000):
+        cell.step()
+    assert not cell.env.data.eq_active[fixture] and not cell.failures
+    np.testing.assert_allclose(cell.truth()["pad_forces"], 10.0, rtol=0.05)
 
 
 # The Franka control interface, through libfranka.
@@ -148,6 +186,7 @@ def moves(address: str, home: list[float]) -> dict:
     before = np.array(robot.state.q)
     robot.move(franky.JointVelocityMotion([0.2, 0, 0, 0, 0, 0, 0], franky.Duration(300)))
     turned = np.array(robot.state.q) - before
+    held = np.inf
     stiffness = np.array([600, 600, 600, 600, 250, 150, 50.0])
     with franky.JointImpedanceTracker(robot, stiffness=stiffness) as tracker:
         tracker.set_target(np.array(home), np.zeros(7))
@@ -233,7 +272,7 @@ def suffers(address: str, home: list[float]) -> dict:
 
     robot = connect(address)
     robot.set_collision_behavior([20.0] * 7, [20.0] * 6)
-    speed = [0.05, 0, 0, 0, 0, 0, 0]
+    said, speed = "", [0.05, 0, 0, 0, 0, 0, 0]
     try:
         robot.move(franky.JointVelocityMotion(speed, franky.Duration(20_000)))
     except franky.ControlException as error:
@@ -388,7 +427,10 @@ def protected(address: str, reset: str) -> dict:
     deadline = time.monotonic() + 5
     while control.servoJ(q, 0, 0, 0.008, 0.1, 300) and time.monotonic() < deadline:
         time.sleep(0.008)
-    said = {"noticed": receive.isProtectiveStopped()}
+    said = {"refused": time.monotonic() < deadline}
+    while not receive.isProtectiveStopped() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    said["noticed"] = receive.isProtectiveStopped()
     dashboard = DashboardClient(address)
     dashboard.connect()
     try:
@@ -423,7 +465,7 @@ def protected(address: str, reset: str) -> dict:
 
 def test_ur_protective_stop_and_reconnection(ur5e: dict) -> None:
     said = client(protected, ur5e["address"], ur5e["faults"])
-    assert said["noticed"] and "5s" in said["early"] and said["unlocked"]
+    assert said["refused"] and said["noticed"] and "5s" in said["early"] and said["unlocked"]
     assert said["emergency"] == [True, "Safetystatus: ROBOT_EMERGENCY_STOP"]
     assert said["anew"] < 2e-3
 

@@ -80,7 +80,8 @@ class Cell:
         self.q, self.dq = env.joints()
         self.grip = Grip(env.width_target(), GRIPPER_SPEED, env.grasp_force)
         self.worst = Worst()
-        self.progress, self.success = 0.0, False
+        self.progress, self.success, self.failures = 0.0, False, set[str]()
+        self._begun = False  # nobody knows when a client comes: the clock waits for the first grasp
         self._rest_since = 0.0
 
     # What arms and grippers command.
@@ -111,6 +112,7 @@ class Cell:
     def grasp(self, width: float, speed: float, force: float) -> None:
         """Send the gripper to `width` (m) at `speed` (m/s), pressing with `force` (N) a finger."""
         width = float(np.clip(width, 0.0, GRIPPER_MAX_WIDTH))
+        self._begun |= width < self.grip.width
         self.grip = Grip(width, min(speed, GRIPPER_SPEED), min(force, GRIPPER_MAX_FORCE / 2))
 
     def nudge(self, force: Float[np.ndarray, "3"], seconds: float) -> None:
@@ -141,7 +143,8 @@ class Cell:
         self._measure(pushed)
         if self._steps % tick == 0:
             env.refresh()
-            self.progress, self.success = env.end_tick()
+            self.progress, self.success = env.end_tick(self._begun)
+            self.failures.update(env.troubles())
             force = float(np.linalg.norm(env.external_wrench()[:3]))
             self.worst.force = max(self.worst.force, force)
 
@@ -188,6 +191,7 @@ class Cell:
             "instruction": self.env.instruction(),
             "progress": float(self.progress),
             "success": bool(self.success),
+            "failures": sorted(self.failures),
             "layout": self.env.layout(),
             "pad_forces": [pad.normal_force for pad in self.env.pad_contacts()],
             "facts": self.env.facts(),

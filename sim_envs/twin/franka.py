@@ -25,7 +25,12 @@ from touchgoal.sim_envs.twin.franka_wire import MoveStatus, RobotCommand, RobotM
 _LOST = 20  # packets in a row after which the arm stops: Franka's documentation
 _POSITION, _VELOCITY, _POSE, _TWIST, _TORQUE = range(5)  # motion generators; 4 is none
 _EXTERNAL, _OTHER = 2, 3  # controllers
-_ANSWERED = {  # setters that change nothing here
+_SETTERS = {
+    RobotCommand.SET_COLLISION_BEHAVIOUR,
+    RobotCommand.SET_EE_TO_K,
+    RobotCommand.SET_NE_TO_EE,
+    RobotCommand.SET_LOAD,
+    # These change nothing here.
     RobotCommand.SET_JOINT_IMPEDANCE,
     RobotCommand.SET_CARTESIAN_IMPEDANCE,
     RobotCommand.SET_GUIDING_MODE,
@@ -170,9 +175,12 @@ class FrankaArm:
         elif command == RobotCommand.GET_ROBOT_MODEL:
             urdf = Path(robot_model()).with_name("fr3_clean.urdf").read_bytes()
             self.link.answer(request, 0, urdf)
-        else:
+        elif command in _SETTERS:
             self._configure(request)
             self.link.answer(request, 0)
+        else:
+            print(f"the twin does not know the Franka command {command}; client dropped")
+            self.link.drop()
 
     def _configure(self, request: wire.Request) -> None:
         payload = request.payload
@@ -191,8 +199,6 @@ class FrankaArm:
             load = np.frombuffer(payload, "<f8", 13)
             self._state["m_load"], self._state["F_x_Cload"] = load[0], load[1:4]
             self._state["I_load"] = load[4:]
-        else:
-            assert request.command in _ANSWERED, f"libfranka sent command {request.command}"
 
     def _move(self, request: wire.Request) -> None:
         if self.mode != RobotMode.IDLE or self._motion is not None:
