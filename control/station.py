@@ -144,8 +144,8 @@ def _box(box: Box, own: SafetyRig, name: str) -> Box:
 
 def _arm(rig: Rig, robot: RobotLimits, hz: float) -> Arm:
     if rig.arm == "ur5e":
-        return ur.universal_robot(ArmConfig(rig.address, robot, GELSIGHT_TCP, hz, ur.RATE))
-    return franka.franka(ArmConfig(rig.address, robot, GELSIGHT_TCP, hz, franka.RATE))
+        return ur.universal_robot(ArmConfig(rig.address, robot, GELSIGHT_TCP, hz, ur.RATE, ur.SILENCE))
+    return franka.franka(ArmConfig(rig.address, robot, GELSIGHT_TCP, hz, franka.RATE, franka.SILENCE))
 
 
 def _gripper(rig: GripperRig) -> Gripper:

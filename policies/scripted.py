@@ -1,7 +1,7 @@
 """What moves a deployed arm without learning: the start move, and picking and placing by plan."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -24,7 +24,7 @@ _CLEARANCE = 0.12  # m above the object before and after the grasp
 _LOWEST = 0.0185, 0.0172  # m of a grasp, of a placement: the sensors' cases stay above the table
 _FEEL_DOWN = 0.004  # m below the grasp's height to look for the table
 _SUPPORT = 2.5  # N upwards, more than while it was carried, that mean the table carries it
-_CLOSE, _HOLD = 1.0, 0.8  # s for closing the hand, and at the end
+_CLOSE, _FEEL, _HOLD = 1.0, 3.0, 0.8  # s for closing the hand, feeling for the table, at the end
 
 
 @dataclass(frozen=True)
@@ -69,13 +69,14 @@ class Script:
             hz: ticks per second.
         """
         self._commanded, self._tick = commanded, 1 / hz
-        self._wrench = np.zeros(6)
+        self._wrench, self._measured = np.zeros(6), commanded()
         self.done = False
         self._actions = self._run(segments)
 
     def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
         """The action for the next tick."""
         self._wrench = observation[v.WRENCH]
+        self._measured = observation[v.STATE][: self._measured.size].astype(np.float64)
         return next(self._actions)
 
     def close(self) -> None:
@@ -87,6 +88,8 @@ class Script:
             width, t, weight = segment.width, 0.0, self._wrench[2]
             while t < segment.seconds:
                 if segment.until_supported and self._wrench[2] - weight > _SUPPORT:
+                    # Command what is, not what was asked: the lag would press on the table.
+                    yield np.append(self._measured - self._commanded(), width)
                     break
                 wanted = still
                 if segment.path is None:
@@ -131,12 +134,13 @@ def pick_and_place(place: Place, safety: Safety, commanded: Callable[[], np.ndar
     up, opened = np.array([0, 0, _CLEARANCE]), robot.stroke[1]
     q = commanded()
 
-    def line(to: np.ndarray, width: float, until_supported: bool = False) -> Segment:
+    def line(to: np.ndarray, width: float, least: float = 0.0, felt: bool = False) -> Segment:
         nonlocal q
         path = straight_line(kinematics, q, to, fingers_down(yaw), limits)
         require_inside(path, safety)
         q = path.at(path.duration)
-        return Segment(path, width, path.duration, until_supported)
+        path = replace(path, duration=max(path.duration, least))
+        return Segment(path, width, path.duration, felt)
 
     segments = [
         line(pick + up, opened),
@@ -144,8 +148,8 @@ def pick_and_place(place: Place, safety: Safety, commanded: Callable[[], np.ndar
         Segment(None, 0.0, _CLOSE),
         line(pick + up, 0.0),
         line(put + up, 0.0),
-        line(put + [0, 0, 0.004], 0.0, until_supported=True),
-        line(deepest, 0.0, until_supported=True),
+        line(put + [0, 0, 0.004], 0.0),
+        line(deepest, 0.0, _FEEL, felt=True),
         Segment(None, 0.0, _HOLD),
     ]
     return Script(segments, commanded, 1 / safety.dt)
