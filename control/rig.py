@@ -34,11 +34,18 @@ class GripperRig:
 
 @dataclass(frozen=True)
 class FingertipsRig:
-    """The two fingertip sensors: of which model, and each one's USB serial number or stream."""
+    """The two fingertip sensors.
+
+    Attributes:
+        sensor: which model both are.
+        left, right: USB serial number, or address of a stream.
+        rate: Hz; none: the model's.
+    """
 
     sensor: str
     left: str
     right: str
+    rate: float | None = None
 
 
 @dataclass(frozen=True)
@@ -101,6 +108,7 @@ class SafetyRig:
         velocity_share: of the maker's speed that a policy may use.
         force, torque, touch: ceilings, N, Nm and N.
         observation_age, state_age: s at which the arm holds; five times that stops it.
+        silence: s without news of the controller after which it is lost; none: the driver's own.
     """
 
     flange_lower: tuple[float, float, float] | None = None
@@ -113,6 +121,7 @@ class SafetyRig:
     touch: float | None = None
     observation_age: float = 0.1
     state_age: float = 0.05
+    silence: float | None = None
 
 
 @dataclass(frozen=True)
@@ -182,15 +191,21 @@ def _check(rig: Rig) -> None:
 
 
 def _of_twin(rig: dict[str, Any]) -> dict[str, Any]:
-    """A twin's description of itself as a rig."""
+    """A twin's description of itself as a rig.
+
+    In lock-step time goes as slowly as the machine needs, so ages and rates by the clock on the wall
+    are held to little.
+    """
     images = {key.removeprefix(v.IMAGE_PREFIX): url for key, url in rig["images"].items()}
     sides = {key.removeprefix("tactile_"): images.pop(key) for key in list(images) if "tac" in key}
     pick_place = rig["task"] == "pick-place"
+    patient = rig["lock_step"]
+    slow = {"rate": 2.0} if patient else {}
     table = {
         "arm": rig["arm"],
         "address": rig["address"],
         "gripper": rig["gripper"],
-        "cameras": {name: {"source": url} for name, url in images.items()},
+        "cameras": {name: {"source": url, **slow} for name, url in images.items()},
         "load_cell": rig["load_cell"],
         "task": {
             "name": rig["task"],
@@ -202,7 +217,11 @@ def _of_twin(rig: dict[str, Any]) -> dict[str, Any]:
             **rig["options"],
         },
     }
-    return table | ({"fingertips": {"sensor": rig["sensor"], **sides}} if sides else {})
+    if patient:
+        table["safety"] = {"observation_age": 1.0, "state_age": 0.5, "silence": 2.0}
+    if sides:
+        table["fingertips"] = {"sensor": rig["sensor"], **sides, **slow}
+    return table
 
 
 def _read(kind: Any, value: Any, where: str) -> Any:

@@ -19,7 +19,7 @@ from touchgoal.control.kinematics import GELSIGHT_TCP
 from touchgoal.control.limits import FR3, UR5E, Box, RobotLimits
 from touchgoal.control.load_cell import LoadCellConfig, SerialLoadCell
 from touchgoal.control.protocols import Arm, Camera, Gripper, LoadCell
-from touchgoal.control.rig import GripperRig, Rig, SafetyRig
+from touchgoal.control.rig import FingertipsRig, GripperRig, Rig, SafetyRig
 from touchgoal.control.robotiq import Robotiq, RobotiqConfig
 from touchgoal.control.safety import Deadline, Watchdogs
 from touchgoal.control.sensors import DIGIT, find_sensor
@@ -101,7 +101,7 @@ def open_station(rig: Rig, hz: float) -> Station:
             for key, source in zip(
                 v.TACTILE, (rig.fingertips.left, rig.fingertips.right), strict=True
             ):
-                cameras[key] = keep(_fingertip(rig.fingertips.sensor, source))
+                cameras[key] = keep(_fingertip(rig.fingertips, source))
         load_cell = keep(SerialLoadCell(_load_cell(rig))) if rig.load_cell else None
         gripper = keep(_gripper(rig.gripper))
         arm = keep(_arm(rig, robot, hz))
@@ -143,9 +143,11 @@ def _box(box: Box, own: SafetyRig, name: str) -> Box:
 
 
 def _arm(rig: Rig, robot: RobotLimits, hz: float) -> Arm:
-    if rig.arm == "ur5e":
-        return ur.universal_robot(ArmConfig(rig.address, robot, GELSIGHT_TCP, hz, ur.RATE, ur.SILENCE))
-    return franka.franka(ArmConfig(rig.address, robot, GELSIGHT_TCP, hz, franka.RATE, franka.SILENCE))
+    ur5e = rig.arm == "ur5e"
+    rate, silence = (ur.RATE, ur.SILENCE) if ur5e else (franka.RATE, franka.SILENCE)
+    silence = rig.safety.silence or silence
+    config = ArmConfig(rig.address, robot, GELSIGHT_TCP, hz, rate, silence)
+    return ur.universal_robot(config) if ur5e else franka.franka(config)
 
 
 def _gripper(rig: GripperRig) -> Gripper:
@@ -160,11 +162,12 @@ def _load_cell(rig: Rig) -> LoadCellConfig:
     return LoadCellConfig(cell.port, cell.newtons_per_count, cell.zero, cell.highest)
 
 
-def _fingertip(sensor: str, source: str) -> Fingertip:
+def _fingertip(rig: FingertipsRig, source: str) -> Fingertip:
     """By serial number over USB, or a stream whose pictures are the sensor's already."""
-    model = find_sensor(sensor)
+    model = find_sensor(rig.sensor)
+    rate = rig.rate or model.frame_rate
     if "/" in source:
-        return Fingertip(VideoCamera(VideoConfig(source, rate=model.frame_rate)), model, UNCHANGED)
+        return Fingertip(VideoCamera(VideoConfig(source, rate=rate)), model, UNCHANGED)
     view = DIGIT_VIEW if model.name == DIGIT.name else GELSIGHT_MINI_VIEW
     device = find_sensor_camera(model, source).device
-    return Fingertip(VideoCamera(VideoConfig(device, rate=model.frame_rate)), model, view)
+    return Fingertip(VideoCamera(VideoConfig(device, rate=rate)), model, view)

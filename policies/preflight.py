@@ -14,6 +14,7 @@ from touchgoal.control.finding import Finding
 from touchgoal.control.protocols import Camera, DriverError, TactileSensor
 from touchgoal.control.rig import Rig
 from touchgoal.control.safety import Safety
+from touchgoal.control.sensors import find_sensor
 from touchgoal.control.station import Station
 from touchgoal.control.touch.contact import contact_strength
 from touchgoal.control.touch.photometry import load
@@ -107,17 +108,18 @@ def _gripper(station: Station) -> str:
     return f"{1e3 * reading.width:.0f} mm"
 
 
-def _nominal(rig: Rig, key: str) -> float | None:
-    camera = rig.cameras.get(key.removeprefix(v.IMAGE_PREFIX))
-    return camera.rate if camera else None
+def _nominal(rig: Rig, key: str) -> float:
+    if key in v.TACTILE:
+        assert rig.fingertips is not None
+        return rig.fingertips.rate or find_sensor(rig.sensor).frame_rate
+    return rig.cameras[key.removeprefix(v.IMAGE_PREFIX)].rate
 
 
-def _camera(camera: Camera, nominal: float | None) -> str:
+def _camera(camera: Camera, nominal: float) -> str:
     if camera.trouble:
         raise UserError(camera.trouble)
     untouched = ""
     if isinstance(camera, TactileSensor):
-        nominal = camera.model.frame_rate
         frame = camera.read().image
         background = load(camera.model.sensor_file).background
         # A unit differs from the sensor file's; a contact is told by far more than that.
@@ -129,7 +131,7 @@ def _camera(camera: Camera, nominal: float | None) -> str:
             )
         untouched = f", {strength:.1f} counts from the sensor file's untouched gel"
     rate = camera.rate
-    if nominal is not None and rate < _LEAST_RATE * nominal:
+    if rate < _LEAST_RATE * nominal:
         raise UserError(f"{rate:.1f} of {nominal:g} pictures a second: check cable, light and load")
     return f"{rate:.1f} Hz{untouched}"
 

@@ -1,0 +1,266 @@
+"""Every fault that a deployment must survive, on the twin through the makers' own client libraries.
+
+Each row is one deployment of the pick-and-place expert (or of a broken policy) on an FR3's twin. A
+process of its own runs it, as `deploy --execute` does, the fault comes while the arm moves, and the
+twin's truth says what the arm did.
+"""
+
+import json
+import multiprocessing
+import os
+import resource
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
+from touchgoal.control.rig import Rig, read_rig
+from touchgoal.control.safety import Safety
+from touchgoal.control.station import open_station, watchdogs_of
+from touchgoal.episodes.metadata import write_file
+from touchgoal.episodes.store import EpisodeSet, validate
+from touchgoal.policies.deployed import make_actor
+from touchgoal.policies.deployment import DeployedActor, Deployment
+from touchgoal.policies.session import Session
+from touchgoal.sim_envs.pick_place import PickPlaceConfig
+from touchgoal.sim_envs.twin.faults import ask
+from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
+
+_PATIENCE = 60.0  # s for anything to happen
+_SPAWN = multiprocessing.get_context("spawn")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of faults."""
+
+    out: Path | None = None
+    """Folder of the run."""
+    faults: tuple[str, ...] = ()
+    """Which rows; default: all."""
+    lock_step: bool = True
+    """Simulated time waits for the client: for a machine that is busy."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One fault: a line to the twin's port, or a signal, or a policy, or none of these."""
+
+    name: str
+    line: str = ""
+    policy: str = "expert"
+    kills: bool = False
+    full: bool = False
+
+
+CASES = (
+    Case("none"),
+    Case("server killed in motion", "kill"),
+    Case("link frozen 0.1 s", "freeze 0.1"),
+    Case("link frozen 0.5 s", "freeze 0.5"),
+    Case("link frozen 2 s", "freeze 4"),
+    Case("camera stalled", "stall front 60"),
+    Case("camera frozen on a frame", "repeat front 60"),
+    Case("fingertip unplugged", "lose tactile_left 60"),
+    Case("load cell garbled", "garble load_cell 1.0"),
+    Case("policy: not a number", policy="nan"),
+    Case("policy hangs", policy="hangs"),
+    Case("joint limit ahead", policy="outwards"),
+    Case("force ceiling met", "nudge 0 22 0 3"),
+    Case("contact reflex", "error cartesian_reflex"),
+    Case("user stop", "stop-button on"),
+    Case("deploy killed (-9)", kills=True),
+    Case("disk full", full=True),
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one fault did.
+
+    Attributes:
+        seen: what the operator is told.
+        rest: s (simulated) from the fault, or from the stop if it has no moment, until the arm is
+            at rest; not a number if the twin could not say.
+        excess: rad beyond the maker's joint range; speed: share of the maker's joint speed.
+        kept: finished episodes that were there before and are still whole.
+        late: ms by which 99 % of the ticks were late at most.
+    """
+
+    name: str
+    seen: str
+    rest: float
+    excess: float
+    speed: float
+    kept: bool
+    late: float
+
+
+def run(config: Config) -> dict[str, Any]:
+    """The table and its numbers."""
+    names = [case.name for case in CASES]
+    if unknown := [name for name in config.faults if name not in names]:
+        raise UserError(f"there is no fault {unknown[0]!r}; there are: {', '.join(names)}")
+    cases = [c for c in CASES if not config.faults or c.name in config.faults]
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for i, case in enumerate(cases):
+            rows.append(_run(case, Path(folder) / str(i), config.lock_step, i))
+            print(_line(rows[-1]), flush=True)
+    return {"table": _table(rows), "rows": [vars(row) for row in rows]}
+
+
+def _run(case: Case, folder: Path, lock_step: bool, number: int) -> Row:
+    folder.mkdir()
+    pid = os.getpid()
+    host = f"127.{60 + number}.{pid // 250 % 250}.{1 + pid % 250}"
+    twin = _spawn(_serve, host, folder, lock_step)
+    _until(lambda: (folder / "rig.json").exists() or not twin.is_alive())
+    rig = read_rig(folder / "rig.json")
+    rig = replace(rig, task=replace(rig.task, start=None))
+    episodes, said = folder / "episodes", folder / "said"
+    deploy = _spawn(_deploy, rig, case, episodes, said)
+    try:
+        before, after = _inject(case, rig, deploy, said)
+        deploy.join(_PATIENCE)
+        hung = deploy.is_alive()
+    finally:
+        for process in (deploy, twin):
+            process.kill()
+            process.join()
+    seen, late = "it hangs", float("nan")
+    if said.exists():
+        late, seen = said.read_text().split("\n", 1)
+    elif not hung:
+        seen = "its process is gone; the driver's child brings the arm to rest"
+    worst = after["worst"] if after else {"excess": float("nan"), "speed": float("nan")}
+    rest = after["time"] - after["rest"] - before if after else float("nan")
+    kept = len(EpisodeSet(episodes)) >= 1 and not _damaged(episodes)
+    return Row(case.name, seen, max(rest, 0.0), worst["excess"], worst["speed"], kept, float(late))
+
+
+def _inject(
+    case: Case, rig: Rig, deploy: SpawnProcess, said: Path
+) -> tuple[float, dict[str, Any] | None]:
+    """Break it while the arm moves; the twin's time then, and its truth once the arm rests."""
+    port = rig.task.twin
+
+    def truth() -> dict[str, Any]:
+        return ask(port, "truth")
+
+    _until(lambda: max(np.abs(truth()["dq"])) > 0.1 or said.exists() or not deploy.is_alive())
+    moment = truth()["time"]
+    if case.kills:
+        deploy.kill()
+    elif case.line:
+        try:
+            ask(port, case.line)
+        except UserError:  # the twin is gone, as asked
+            return moment, None
+    if case.name in ("none", "link frozen 0.1 s", "disk full"):
+        deploy.join(_PATIENCE)
+    else:
+        _until(lambda: said.exists() or case.kills or not deploy.is_alive())
+    _until(lambda: truth()["rest"] > 0.2)
+    return moment, truth()
+
+
+def _serve(host: str, folder: Path, lock_step: bool) -> None:
+    """The twin's process."""
+    task = PickPlaceConfig(cameras=("front",))
+    options = {"object": "wooden_block"}
+    twin = Twin(TwinConfig(task, "fr3", 3, options, host, 0, lock_step, folder))
+    write_file(folder / "rig.json", json.dumps(twin.rig).encode())
+    twin.run()
+
+
+def _deploy(rig: Rig, case: Case, episodes: Path, said: Path) -> None:
+    """The deployment's process; a first, short episode is there before the fault comes."""
+    station = open_station(rig, v.CONTROL_HZ)
+    safety = Safety(station.robot, v.CONTROL_HZ, watchdogs_of(rig))
+    truth = lambda: ask(rig.task.twin, "truth")  # noqa: E731
+
+    def session(make: Callable[[Deployment], DeployedActor], seconds: float) -> Session:
+        short = replace(rig, task=replace(rig.task, seconds=seconds))
+        return Session(
+            short, station, safety, episodes, True, make, lambda: "", lambda _: None, truth
+        )
+
+    def expert(deployment: Deployment) -> DeployedActor:
+        return make_actor(rig, None, safety, truth, deployment.commanded)
+
+    session(lambda d: Broken("still", d), 0.5).run()
+    if case.full:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+    broken = case.policy != "expert"
+    result = session(lambda d: Broken(case.policy, d) if broken else expert(d), 40.0).run()
+    late = 1e3 * np.percentile(result.ticks.late or [np.nan], 99)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
+    said.write_text(f"{late}\n{result.trouble or result.ending.reason}")
+    station.close()
+
+
+class Broken:
+    """A policy that moves well for a second and then breaks as it is told."""
+
+    done = False
+
+    def __init__(self, how: str, deployment: Deployment) -> None:
+        self._how, self._deployment, self._ticks = how, deployment, 0
+        self.overdue = 0.0
+
+    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """See DeployedActor."""
+        self._ticks += 1
+        n, width = self._deployment.commanded().size, self._deployment.width
+        step = np.zeros(n)
+        step[0] = 0.0 if self._how == "still" else 0.02
+        broken = self._ticks > v.CONTROL_HZ
+        if broken and self._how == "nan":
+            step[0] = np.nan
+        if broken and self._how == "hangs":
+            step[0], self.overdue = 0.0, self.overdue + 1 / v.CONTROL_HZ
+        return np.append(step, width)
+
+    def close(self) -> None:
+        """Nothing is left behind."""
+
+
+def _spawn(target: Callable[..., None], *arguments: Any) -> SpawnProcess:
+    process = _SPAWN.Process(target=target, args=arguments)
+    process.start()
+    return process
+
+
+def _until(holds: Callable[[], bool]) -> None:
+    end = time.monotonic() + _PATIENCE
+    while not holds() and time.monotonic() < end:
+        time.sleep(0.01)
+
+
+def _damaged(episodes: Path) -> bool:
+    """Whether a finished episode is; what an interrupted one left behind belongs to none."""
+    return any("belongs to no episode" not in line for line in validate(episodes))
+
+
+def _line(row: Row) -> str:
+    kept = "whole" if row.kept else "LOST"
+    return (
+        f"{row.name:<25}{row.rest:>7.2f}{row.excess:>9.3f}{row.speed:>7.0%}{row.late:>8.1f}  "
+        f"{kept:<7}{row.seen[:90]}"
+    )
+
+
+def _table(rows: list[Row]) -> str:
+    head = (
+        f"{'fault':<25}{'rest s':>7}{'beyond':>9}{'speed':>7}{'p99 ms':>8}  {'kept':<7}"
+        "what the operator sees"
+    )
+    return "\n".join([head, *(_line(row) for row in rows)])
