@@ -9,9 +9,11 @@ import json
 import multiprocessing
 import os
 import resource
+import signal
 import tempfile
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
@@ -26,7 +28,8 @@ from touchgoal.control.safety import Safety
 from touchgoal.control.station import open_station, watchdogs_of
 from touchgoal.episodes.metadata import write_file
 from touchgoal.episodes.store import EpisodeSet, validate
-from touchgoal.policies.deployed import make_actor
+from touchgoal.policies.acting import Observation
+from touchgoal.policies.deployed import Learned, make_actor
 from touchgoal.policies.deployment import DeployedActor, Deployment
 from touchgoal.policies.session import Session
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
@@ -197,10 +200,15 @@ def _deploy(rig: Rig, case: Case, episodes: Path, said: Path) -> None:
         return make_actor(rig, None, safety, truth, deployment.commanded)
 
     session(lambda d: Broken("still", d), 0.5).run()
-    if case.full:
+    if case.full:  # a file that may not grow fails as on a full disk, in the middle of a write
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
-    broken = case.policy != "expert"
-    result = session(lambda d: Broken(case.policy, d) if broken else expert(d), 40.0).run()
+    makers: dict[str, Callable[[Deployment], DeployedActor]] = {
+        "expert": expert,
+        "hangs": lambda d: Learned(Hanging(d.width)),
+    }
+    make = makers.get(case.policy, lambda d: Broken(case.policy, d))
+    result = session(make, 15.0 if case.policy == "outwards" else 40.0).run()
     late = 1e3 * np.percentile(result.ticks.late or [np.nan], 99)
     resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
     said.write_text(f"{late}\n{result.trouble or result.ending.reason}")
@@ -210,11 +218,10 @@ def _deploy(rig: Rig, case: Case, episodes: Path, said: Path) -> None:
 class Broken:
     """A policy that moves well for a second and then breaks as it is told."""
 
-    done = False
+    done, overdue = False, 0.0
 
     def __init__(self, how: str, deployment: Deployment) -> None:
         self._how, self._deployment, self._ticks = how, deployment, 0
-        self.overdue = 0.0
 
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """See DeployedActor."""
@@ -225,12 +232,38 @@ class Broken:
         broken = self._ticks > v.CONTROL_HZ
         if broken and self._how == "nan":
             step[0] = np.nan
-        if broken and self._how == "hangs":
-            step[0], self.overdue = 0.0, self.overdue + 1 / v.CONTROL_HZ
         return np.append(step, width)
 
     def close(self) -> None:
         """Nothing is left behind."""
+
+
+@dataclass(frozen=True)
+class Horizons:
+    """What the planning thread asks of a policy's config."""
+
+    observation_horizon: int = 1
+    execution_horizon: int = 8
+    prediction_horizon: int = 16
+    control_hz: int = v.CONTROL_HZ
+
+
+class Hanging:
+    """A planner that turns the base and then never answers again, in the real planning thread."""
+
+    config = Horizons()
+
+    def __init__(self, width: float) -> None:
+        self._width, self._plans = width, 0
+
+    def plan(self, seen: Sequence[Observation]) -> np.ndarray:
+        """Three plans, then none."""
+        self._plans += 1
+        if self._plans > 3:
+            threading.Event().wait()
+        plan = np.zeros((self.config.prediction_horizon, v.N_JOINTS + 1), np.float32)
+        plan[:, 0], plan[:, -1] = 0.02, self._width
+        return plan
 
 
 def _spawn(target: Callable[..., None], *arguments: Any) -> SpawnProcess:

@@ -2,7 +2,9 @@
 
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -10,7 +12,7 @@ from jaxtyping import Float32
 
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
-from touchgoal.policies.acting import Observation, Planner
+from touchgoal.policies.acting import Observation
 
 _FIRST = 20.0  # s for the first plan; it warms everything up
 _CLOSING = 2.0  # s for a plan under way when the episode ends
@@ -20,6 +22,27 @@ _CLOSING = 2.0  # s for a plan under way when the episode ends
 class _Plan:
     tick: int  # at which its first action belongs
     actions: Float32[np.ndarray, "h 8"]
+
+
+@runtime_checkable
+class Horizons(Protocol):
+    """What of a policy's config the hand-over needs; see `PolicyConfig`."""
+
+    @property
+    def observation_horizon(self) -> int: ...  # noqa: D102
+    @property
+    def execution_horizon(self) -> int: ...  # noqa: D102
+    @property
+    def control_hz(self) -> int: ...  # noqa: D102
+
+
+@runtime_checkable
+class Plans(Protocol):
+    """Anything that plans: a `Planner`."""
+
+    @property
+    def config(self) -> Horizons: ...  # noqa: D102
+    def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]: ...  # noqa: D102
 
 
 class RealTimeActor:
@@ -36,7 +59,7 @@ class RealTimeActor:
         failure: what ended the planning thread, if something did; `act` raises it.
     """
 
-    def __init__(self, planner: Planner) -> None:
+    def __init__(self, planner: Plans) -> None:
         """Starts an episode; `close` ends the thread."""
         self._planner, self._config = planner, planner.config
         self.latencies: list[float] = []
