@@ -31,9 +31,11 @@ class MaeConfig:
         sensor: Name of the fingertip sensor.
         vit: Size of the trunk.
         visible: Share of the patches that the trunk sees.
-        bottleneck: The decoder sees the mean of the trunk's tokens and nothing else, so that this
-            mean, which is the embedding, holds all that is needed to draw the picture. Otherwise it
-            sees the tokens, as published.
+        decoder: What the decoder draws from. "tokens": what the trunk says of the patches it saw, as
+            published. "mean": the mean of these tokens, which is the embedding, so that it holds
+            all that is needed. "partner": the mean, and another touch of the same fingertip (as in
+            SiamMAE, Gupta et al. 2023), so that the mean holds what is felt and need not hold what
+            makes this sensor unlike others, such as where its markers were printed.
         decoder_width: Size of the decoder's tokens.
         decoder_depth: Its blocks.
         epochs: Passes over the touches.
@@ -48,7 +50,7 @@ class MaeConfig:
     sensor: str = "gelsight_mini_markers"
     vit: Literal["tiny", "compact", "small"] = "compact"
     visible: float = 0.5
-    bottleneck: bool = True
+    decoder: Literal["tokens", "mean", "partner"] = "partner"
     decoder_width: int = 96
     decoder_depth: int = 2
     epochs: int = 30
@@ -70,32 +72,43 @@ class MaskedAutoencoder(nn.Module):
         self.trunk = TouchTrunk(TouchTrunkConfig.for_sensor(vit, config.sensor))
         width = config.decoder_width
         self.enter = nn.Linear(vit.width, width)
+        self.recall = nn.Linear(vit.channels * vit.patch_size**2, width)
         self.unseen = nn.Parameter(torch.zeros(width))
         self.blocks = nn.ModuleList(Block(width, 4, 4.0) for _ in range(config.decoder_depth))
         self.norm = nn.LayerNorm(width)
         self.leave = nn.Linear(width, vit.channels * vit.patch_size**2)
 
-    def loss(self, touch: Float[Tensor, "b 3 h w"], keep: Int[Tensor, "b k"]) -> Float[Tensor, ""]:
+    def loss(
+        self,
+        touch: Float[Tensor, "b 3 h w"],
+        partner: Float[Tensor, "b 3 h w"],
+        keep: Int[Tensor, "b k"],
+    ) -> Float[Tensor, ""]:
         """Mean squared error of the drawn patches, in the preprocessor's units.
 
         All patches count with a bottleneck, else the unseen ones. Patches are not brought to
         variance 1, as He et al. do: most of a touch is untouched, and would be noise at full size.
         """
-        error = (self.draw(touch, keep) - patches(touch, self.trunk.config.vit)) ** 2
-        if self.config.bottleneck:
+        error = (self.draw(touch, partner, keep) - patches(touch, self.trunk.config.vit)) ** 2
+        if self.config.decoder != "tokens":
             return error.mean()
         unseen = torch.ones(error.shape[:2], device=error.device).scatter(1, keep, 0.0)
         return (error.mean(2) * unseen).sum() / unseen.sum()
 
     def draw(
-        self, touch: Float[Tensor, "b 3 h w"], keep: Int[Tensor, "b k"]
+        self,
+        touch: Float[Tensor, "b 3 h w"],
+        partner: Float[Tensor, "b 3 h w"],
+        keep: Int[Tensor, "b k"],
     ) -> Float[Tensor, "b n p"]:
-        """All patches of touches, of which the trunk sees those in `keep`."""
+        """All patches of touches, of which the trunk sees those in `keep`; see `MaeConfig`."""
         tokens = self.enter(self.trunk.vit(touch, keep))
         rows, columns = _grid(self.trunk.config.vit)
         b, d = len(tokens), tokens.shape[2]
-        if self.config.bottleneck:
+        if self.config.decoder == "mean":
             x = tokens.mean(1, keepdim=True).expand(b, rows * columns, d)
+        elif self.config.decoder == "partner":
+            x = tokens.mean(1, keepdim=True) + self.recall(patches(partner, self.trunk.config.vit))
         else:
             x = self.unseen.expand(b, rows * columns, d)
             x = x.scatter(1, keep[:, :, None].expand(-1, -1, d), tokens)
@@ -179,10 +192,11 @@ def validate(model: MaskedAutoencoder, train: TouchFrames, val: TouchFrames) -> 
     vit, device = model.trunk.config.vit, model.unseen.device
     generator = torch.Generator().manual_seed(0)
     total, power = 0.0, 0.0
-    for batch in val.touch.split(BATCH):
-        touch = batch.to(device).float()
+    for rows in torch.arange(len(val)).split(BATCH):
+        touch = val.touch[rows].to(device).float()
+        partner = val.touch[val.draw_partners(rows, generator)].to(device).float()
         keep = random_patches(vit, len(touch), model.config.visible, generator).to(device)
-        total += model.loss(touch, keep).item() * len(touch)
+        total += model.loss(touch, partner, keep).item() * len(touch)
         power += patches(touch, vit).square().mean().item() * len(touch)
     metrics = {"validation_loss": total / len(val), "validation_power": power / len(val)}
     if train.wrench is None or val.wrench is None:
@@ -235,8 +249,11 @@ class _Run:
             for group in self.optimiser.param_groups:
                 group["lr"] = _rate(config, epoch * self.steps + i, config.epochs * self.steps)
             keep = random_patches(vit, len(rows), config.visible, generator)
-            touch = self.data.touch[rows].to(config.device).float()
-            loss = self.model.loss(touch, keep.to(config.device))
+            partners = self.data.draw_partners(rows, generator)
+            touch, partner = (
+                self.data.touch[r].to(config.device).float() for r in (rows, partners)
+            )
+            loss = self.model.loss(touch, partner, keep.to(config.device))
             self.optimiser.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)

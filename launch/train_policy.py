@@ -59,6 +59,12 @@ class Config:
     """How the diffusion is trained and sampled."""
     representation: Representation = "chunk"
     """Of the actions while learning."""
+    touch_width: int = 64
+    """Numbers to which a frozen embedding is projected, see `PolicyConfig`."""
+    touch_noise: float = 0.5
+    """Of frozen embeddings while learning, see `PolicyConfig`."""
+    place_noise: float = 0.3
+    """Of joint and TCP positions while learning, see `PolicyConfig`."""
     observation_horizon: int = 2
     """Ticks seen."""
     execution_horizon: int = 4
@@ -116,6 +122,9 @@ def _policy_config(
     return PolicyConfig(
         touch_dim=touch.dim if touch else 0,
         touch=touch.name if touch else "",
+        touch_width=config.touch_width,
+        touch_noise=config.touch_noise,
+        place_noise=config.place_noise,
         eye=_eye(config),
         representation=config.representation,
         observation_horizon=config.observation_horizon,

@@ -53,7 +53,7 @@ class Planner:
         self._policy, self.touch = policy, touch
         self._generator = torch.Generator().manual_seed(seed)
         self._first: Observation = {}
-        self._felt: dict[int, np.ndarray] = {}
+        self._felt: list[tuple[Observation, np.ndarray]] = []
 
     def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]:
         """Actions from the latest observation on.
@@ -64,7 +64,7 @@ class Planner:
         """
         self._first = self._first or seen[0]
         rows = [self._feel(observation) for observation in seen]
-        self._felt = {id(o): row for o, row in zip(seen, rows, strict=True)}
+        self._felt = list(zip(seen, rows, strict=True))
         state = [np.concatenate([o[key] for key in self.config.proprioception]) for o in seen]
         touch, state = (torch.from_numpy(np.stack(x)).float()[None] for x in (rows, state))
         condition = Condition(touch, state, self._look(seen[-1]))
@@ -73,8 +73,10 @@ class Planner:
     def _feel(self, observation: Observation) -> Float32[np.ndarray, " e"]:
         if self.touch is None:
             return np.empty(0, np.float32)
-        row = self._felt.get(id(observation))
-        return self.touch.embed_tick(observation, self._first) if row is None else row
+        for before, row in self._felt:
+            if before is observation:
+                return row
+        return self.touch.embed_tick(observation, self._first)
 
     def _look(self, observation: Observation) -> UInt8[Tensor, "1 k h w 3"] | None:
         eye = self.config.eye

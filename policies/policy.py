@@ -24,6 +24,12 @@ class PolicyConfig:
             touch.
         touch: names what made the embeddings: encoder, sensor, background.
         touch_width: to which an embedding is projected.
+        touch_noise: standard deviation of noise added to the touch while learning, of embeddings
+            scaled to variance 1. Without it a network knows each recorded episode again by its
+            sensors, and learns its wire by heart.
+        place_noise: likewise of the joint and TCP positions, one draw for all ticks seen: where on
+            the table a wire ran shall not tell how it goes on. Velocities and the hand's
+            orientation stay as they are.
         eye: for pictures that no frozen encoder reads; None for a policy without.
         proprioception: columns of `vocabulary.FEATURES`, the state first.
         observation_horizon: ticks seen, the latest included.
@@ -38,6 +44,8 @@ class PolicyConfig:
     touch_dim: int
     touch: str
     touch_width: int = 64
+    touch_noise: float = 0.5
+    place_noise: float = 0.3
     eye: EyeConfig | None = None
     proprioception: tuple[str, ...] = (v.STATE, v.TCP_POSE)
     observation_horizon: int = 2
@@ -142,7 +150,8 @@ class Policy(nn.Module):
     ) -> Float[Tensor, ""]:
         """Training loss on windows; the generator is the CPU's."""
         chunk = represent(actions, condition.joints, self.config.representation)
-        return self.head.loss(self.action_scale(chunk), self._encode(condition), generator)
+        encoded = self._encode(condition, generator)
+        return self.head.loss(self.action_scale(chunk), encoded, generator)
 
     @torch.inference_mode()
     def plan(self, condition: Condition, generator: torch.Generator) -> Float[Tensor, "b h 8"]:
@@ -153,16 +162,36 @@ class Policy(nn.Module):
         chunk = self.action_scale.inverse(self.head.plan(self._encode(condition), generator))
         return to_actions(chunk, condition.joints, self.config.representation)
 
-    def _encode(self, condition: Condition) -> Float[Tensor, "b c"]:
-        state = unroll(condition.state, self.config.proprioception)
+    def _encode(
+        self, condition: Condition, noise: torch.Generator | None = None
+    ) -> Float[Tensor, "b c"]:
+        """What the head sees, with the training's noise if there is a generator for it."""
+        config = self.config
+        state = unroll(condition.state, config.proprioception)
         seen = self.state_scale(state).clamp(-_FAR, _FAR)
+        if noise is not None:
+            shift = torch.randn(len(seen), 1, seen.shape[2], generator=noise).to(seen)
+            seen = seen + config.place_noise * shift * self._places.to(seen)
         if self.project is not None:
             touch = self.touch_scale(condition.touch).clamp(-_FAR, _FAR)
+            if noise is not None:
+                grain = torch.randn(touch.shape, generator=noise).to(touch)
+                touch = touch + config.touch_noise * grain
             seen = torch.cat([self.project(touch), seen], -1)
         if self.eye is None:
             return seen.flatten(1)
         assert condition.pictures is not None, "this policy looks at pictures"
         return torch.cat([seen.flatten(1), self.eye(condition.pictures)], 1)
+
+    @property
+    def _places(self) -> Float[Tensor, " r"]:
+        """1 for joint and TCP positions, 0 for all else that `unroll` gives."""
+        marks = []
+        for key in self.config.proprioception:
+            places = {v.STATE: v.N_JOINTS, v.TCP_POSE: 3}.get(key, 0)
+            size = v.FEATURES[key].shape[0] + (2 if key == v.TCP_POSE else 0)
+            marks += [1.0] * places + [0.0] * (size - places)
+        return torch.tensor(marks)
 
 
 def unroll(

@@ -132,18 +132,38 @@ def test_bead_maze(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
 
 
 @pytest.mark.slow
-def test_learning_the_bead_maze(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    maze = "--task bead-maze --workers 1 --maze.max-seconds 1".split()
-    run("collect-demos", *maze, "--episodes", 2, "--out", tmp_path)
-    found = tmp_path / "episodes"
-    meta = found / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
-    assert meta.exists()
-    both = ("--episodes", found, "--validation", found)
-    run("train-encoder", "mae", *both, "--frames", 4, "--mae.vit", "tiny", "--mae.epochs", 1,
-        "--mae.batch-size", 8, "--out", tmp_path / "mae")  # fmt: skip
-    small = ("--head", "tiny", "--train.epochs", 2, "--train.snapshot-epochs", 1, "--trials", 1)
-    # cut off after a second, the demonstrations failed, and are refused
-    refused(capsys, "train-policy", *both, *small, "--out", tmp_path / "none")
+def test_learning_the_bead_maze(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From demonstrations to a policy that runs; too little of everything to be any good."""
+    monkeypatch.chdir(tmp_path)
+    one = ("--workers", 1)
+    run("collect-demos", "--task", "bead-maze", "--episodes", 1, "--maze.disturbance", 0, *one,
+        "--out", "demos")  # fmt: skip
+    both = ("--episodes", "demos/episodes", "--validation", "demos/episodes")
+    run("train-encoder", "mae", *both, "--frames", 8, "--mae.vit", "tiny", "--mae.epochs", 1,
+        "--mae.batch-size", 8, "--out", "mae")  # fmt: skip
+    learn = ("train-policy", *both, *one, "--head", "tiny", "--train.epochs", 2, "--trials", 1,
+             "--train.snapshot-epochs", 1, "--maze.max-seconds", 1)  # fmt: skip
+    run(*learn, "--touch", "mae/encoder", "--out", "policy")
+    tried = json.loads(Path("policy/metrics.json").read_text())["snapshots"]
+    assert set(tried) == {"epoch-0001", "epoch-0002"}
+    capsys.readouterr()
+    run("run-policy", "--task", "bead-maze", "--policy", "policy/policy", "--episodes", 1, *one,
+        "--latency", 2, "--no-video", "--maze.max-seconds", 1)  # fmt: skip
+    assert "0/1" in capsys.readouterr().out
+    run("benchmark", "bead-maze", "--policies", "policy/policy", "--wires", 1, "--held-out", 1,
+        "--demonstrations", 2, "--latencies", *one)  # fmt: skip
+    printed = capsys.readouterr().out
+    assert "frozen touch, 1 demos, shuffled" in printed and "zero motion" in printed
+    run("benchmark", "policy-latency", "--policy", "policy/policy", "--repeats", 3,
+        "--large-repeats", 0)  # fmt: skip
+    assert "denoising" in capsys.readouterr().out
+    missing = refused(capsys, "run-policy", "--task", "bead-maze", "--policy", "nowhere")
+    assert "no policy in nowhere" in missing
+    other = refused(capsys, "run-policy", "--task", "bead-maze", "--policy", "policy/policy",
+                    "--maze.scene.sensor", "gelsight_mini")  # fmt: skip
+    assert "feels with gelsight_mini_markers" in other
 
 
 def test_doctor_and_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

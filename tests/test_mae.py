@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ def blobs(count: int, seed: int) -> TouchFrames:
     blob = strength[:, None, None] * np.exp(-distance2 / 20**2)
     touch = torch.from_numpy(np.repeat(blob[:, None], 3, 1)).half()
     wrench = np.column_stack([place / 100, strength, np.zeros((count, 3))])
-    return TouchFrames(touch, torch.from_numpy(wrench).float())
+    return TouchFrames(touch, torch.arange(count) // 8, torch.from_numpy(wrench).float())
 
 
 def test_the_mean_of_the_tokens_learns_where_and_how_strong(tmp_path: Path) -> None:
@@ -42,11 +43,11 @@ def test_the_mean_of_the_tokens_learns_where_and_how_strong(tmp_path: Path) -> N
     assert np.allclose(*trunk.embed_frames(frames, frames[0]))  # the same touch, twice
 
 
-@pytest.mark.parametrize("bottleneck", [True, False])
+@pytest.mark.parametrize("decoder", ["tokens", "mean", "partner"])
 def test_a_killed_training_ends_with_the_same_weights(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bottleneck: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, decoder: Any
 ) -> None:
-    data, config = blobs(32, 0), replace(TOY, bottleneck=bottleneck)
+    data, config = blobs(32, 0), replace(TOY, decoder=decoder)
     whole = train_mae(data, data, config, tmp_path / "whole", {})
     with monkeypatch.context() as patch:
         epoch = mae_module._Run.train_epoch
@@ -68,16 +69,23 @@ def test_a_killed_training_ends_with_the_same_weights(
         train_mae(data, data, replace(config, lr=1e-3), tmp_path / "killed", {}, resume=True)
 
 
-def test_only_unseen_patches_count_without_a_bottleneck() -> None:
+def test_only_unseen_patches_count_where_tokens_are_seen() -> None:
     torch.manual_seed(0)
-    model = MaskedAutoencoder(replace(TOY, bottleneck=False))
+    model = MaskedAutoencoder(replace(TOY, decoder="tokens"))
     vit = model.trunk.config.vit
     touch = torch.randn(2, 3, 120, 160)
     keep = random_patches(vit, 2, 0.5, torch.Generator().manual_seed(0))
-    drawn, real = model.draw(touch, keep), patches(touch, vit)
+    drawn, real = model.draw(touch, touch, keep), patches(touch, vit)
     seen = torch.zeros(drawn.shape[:2], dtype=torch.bool).scatter(1, keep, True)
     expected = ((drawn - real) ** 2)[~seen].mean()
-    torch.testing.assert_close(model.loss(touch, keep), expected)
+    torch.testing.assert_close(model.loss(touch, touch, keep), expected)
+
+
+def test_partners_are_felt_by_the_same_fingertip() -> None:
+    data = blobs(32, 0)
+    rows = torch.randperm(32)
+    partners = data.draw_partners(rows, torch.Generator().manual_seed(0))
+    assert torch.equal(data.of[rows], data.of[partners]) and len(partners.unique()) > 10
 
 
 def test_patches_are_where_the_trunk_sees_them() -> None:

@@ -312,7 +312,7 @@ def test_an_actor_does_its_plans_in_order_and_on_time(latency: int) -> None:
     config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
     policy, ticks = policy_for(config, toy_windows(config)).eval(), toy_ticks(8)
     actor = PolicyActor(Planner(policy, touch, seed=5), latency)
-    done = [actor.act(tick) for tick in ticks]
+    done = [actor.act(dict(tick)) for tick in ticks]  # nobody else keeps them
     rows = np.stack([touch.embed_tick(tick, ticks[0]) for tick in ticks])
     states = np.stack([np.concatenate([tick[v.STATE], tick[v.TCP_POSE]]) for tick in ticks])
     generator, expected = rng(5), []
