@@ -20,6 +20,8 @@ from touchgoal.sim_envs.base import Observation
 _SHARE = 0.9  # of what the safety layer lets a policy do: a plan should not be clamped
 _START_SHARE = 0.3  # of that, for the start move: a person watches where it goes
 _BEHIND = 0.02  # rad; the arm was held: the plan waits until it has caught up
+_LAG = 0.12  # rad between command and arm beyond which the plan waits; 0.06 is usual at this speed
+_MOVING = 5e-4  # m a tick that the gripper does when it moves
 _CLEARANCE = 0.12  # m above the object before and after the grasp
 _LOWEST = 0.0185, 0.0172  # m of a grasp, of a placement: the sensors' cases stay above the table
 _FEEL_DOWN = 0.004  # m below the grasp's height to look for the table
@@ -70,6 +72,7 @@ class Script:
         """
         self._commanded, self._tick = commanded, 1 / hz
         self._wrench, self._measured = np.zeros(6), commanded()
+        self._width, self._still = np.inf, False
         self.done = False
         self._actions = self._run(segments)
 
@@ -77,6 +80,8 @@ class Script:
         """The action for the next tick."""
         self._wrench = observation[v.WRENCH]
         self._measured = observation[v.STATE][: self._measured.size].astype(np.float64)
+        width = float(observation[v.STATE][-1])
+        self._still, self._width = abs(width - self._width) < _MOVING, width
         return next(self._actions)
 
     def close(self) -> None:
@@ -92,11 +97,12 @@ class Script:
                     yield np.append(self._measured - self._commanded(), width)
                     break
                 wanted = still
-                if segment.path is None:
-                    t += self._tick
+                lag = np.abs(self._commanded() - self._measured).max()
+                if segment.path is None:  # seconds in which nothing moves
+                    t = t + self._tick if self._still and lag < _BEHIND else 0.0
                 else:
                     at = segment.path.at(t)
-                    if np.abs(at - self._commanded()).max() < _BEHIND:
+                    if np.abs(at - self._commanded()).max() < _BEHIND and lag < _LAG:
                         t += self._tick
                         at = segment.path.at(t)
                     wanted = at - self._commanded()
