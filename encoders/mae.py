@@ -50,7 +50,7 @@ class MaeConfig:
     sensor: str = "gelsight_mini_markers"
     vit: Literal["tiny", "compact", "small"] = "compact"
     visible: float = 0.5
-    decoder: Literal["tokens", "mean", "partner"] = "partner"
+    decoder: Literal["tokens", "mean", "partner"] = "mean"
     decoder_width: int = 96
     decoder_depth: int = 2
     epochs: int = 30

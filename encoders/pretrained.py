@@ -74,12 +74,15 @@ def load(directory: Path, sensor: str | None = None, towers: str | None = None) 
             f"the encoder in {directory} was trained with the towers {config.towers}, not {towers}: "
             "load those towers, or train an encoder with these"
         )
-    return _load(TouchEncoder(config), directory, sensor)
+    _check_sensor(config, directory, sensor)
+    return _filled(TouchEncoder(config), directory)
 
 
 def load_trunk(directory: Path, sensor: str | None = None) -> TouchTrunk:
     """Reads a self-supervised trunk for inference, as float32 on the CPU; UserError as `load`."""
-    return _load(TouchTrunk(_read_config(directory, TouchTrunkConfig)), directory, sensor)
+    config = _read_config(directory, TouchTrunkConfig)
+    _check_sensor(config, directory, sensor)
+    return _filled(TouchTrunk(config), directory)
 
 
 def load_any(directory: Path) -> TouchEncoder | TouchTrunk:
@@ -93,8 +96,9 @@ def weights_path(directory: Path) -> Path:
     return directory / _WEIGHTS
 
 
-def _load(encoder: Encoder, directory: Path, sensor: str | None) -> Encoder:
-    config = encoder.config
+def _check_sensor(
+    config: TouchEncoderConfig | TouchTrunkConfig, directory: Path, sensor: str | None
+) -> None:
     if sensor is not None and sensor != config.sensor:
         raise UserError(
             f"the encoder in {directory} is for {config.sensor}, not {sensor}: {_TRAIN}"
@@ -105,6 +109,9 @@ def _load(encoder: Encoder, directory: Path, sensor: str | None) -> Encoder:
             f"the encoder in {directory} needs the preprocessor {config.preprocessor}, this is "
             f"{current}: {_TRAIN}"
         )
+
+
+def _filled(encoder: Encoder, directory: Path) -> Encoder:
     encoder.load_state_dict(_read_weights(directory / _WEIGHTS, encoder))
     return encoder.eval().requires_grad_(False)
 

@@ -31,9 +31,9 @@ from touchgoal.control.protocols import (
 from touchgoal.control.robotiq import Robotiq, RobotiqConfig
 from touchgoal.control.video import VideoCamera, VideoConfig
 from touchgoal.control.vocabulary import FRONT
+from touchgoal.sim_envs.twin import faults
 
-pytest.importorskip("franky", reason="pip install 'touchgoal[franka]'")
-faults = pytest.importorskip("touchgoal.sim_envs.twin.faults")
+pytestmark = pytest.mark.realtime
 
 HZ = 20.0
 

@@ -28,6 +28,8 @@ from touchgoal.sim_envs.twin.cell import Cell
 from touchgoal.sim_envs.twin.faults import ask
 from touchgoal.sim_envs.twin.serial_ports import NEWTONS_PER_COUNT, ZERO
 
+pytestmark = pytest.mark.realtime
+
 HOME = [0.0, -0.3, 0.0, -2.2, 0.0, 1.9, 0.785]
 FR3 = ["--lock-step", "--arm", "fr3", "--object", "wooden_block", "--seed", "3"]
 UR5E = ["--arm", "ur5e", "--object", "wooden_block", "--seed", "3"]
