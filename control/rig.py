@@ -126,7 +126,12 @@ class SafetyRig:
 
 @dataclass(frozen=True)
 class Rig:
-    """Everything `deploy` needs to know; arm "sim" is a simulated FR3 in place of what is named."""
+    """Everything `deploy` needs to know.
+
+    Attributes:
+        arm: "sim" is a simulated FR3 in place of what is named.
+        lock_step: the arm is a twin that waits for its client, so the control loop goes by its clock.
+    """
 
     arm: Literal["fr3", "ur5e", "sim"]
     gripper: GripperRig
@@ -136,6 +141,7 @@ class Rig:
     cameras: dict[str, CameraRig] = field(default_factory=dict)
     load_cell: LoadCellRig | None = None
     safety: SafetyRig = field(default_factory=SafetyRig)
+    lock_step: bool = False
 
     @property
     def sensor(self) -> str:
@@ -193,20 +199,20 @@ def _check(rig: Rig) -> None:
 def _of_twin(rig: dict[str, Any]) -> dict[str, Any]:
     """A twin's description of itself as a rig.
 
-    In lock-step time goes as slowly as the machine needs, so ages and rates by the clock on the wall
-    are held to little.
+    In lock-step time goes as slowly as the machine needs: by the clock on the wall, which drivers go
+    by, pictures may be rare and the link silent for longer.
     """
     images = {key.removeprefix(v.IMAGE_PREFIX): url for key, url in rig["images"].items()}
     sides = {key.removeprefix("tactile_"): images.pop(key) for key in list(images) if "tac" in key}
     pick_place = rig["task"] == "pick-place"
-    patient = rig["lock_step"]
-    slow = {"rate": 2.0} if patient else {}
+    slow = {"rate": 1.0} if rig["lock_step"] else {}
     table = {
         "arm": rig["arm"],
         "address": rig["address"],
         "gripper": rig["gripper"],
         "cameras": {name: {"source": url, **slow} for name, url in images.items()},
         "load_cell": rig["load_cell"],
+        "lock_step": rig["lock_step"],
         "task": {
             "name": rig["task"],
             "policy": "expert" if pick_place else "shipped",
@@ -217,8 +223,8 @@ def _of_twin(rig: dict[str, Any]) -> dict[str, Any]:
             **rig["options"],
         },
     }
-    if patient:
-        table["safety"] = {"observation_age": 1.0, "state_age": 0.5, "silence": 2.0}
+    if rig["lock_step"]:
+        table["safety"] = {"silence": 2.0}
     if sides:
         table["fingertips"] = {"sensor": rig["sensor"], **sides, **slow}
     return table

@@ -1,6 +1,7 @@
 """A rig's devices, connected: what the control loop reads and commands, and by which clock."""
 
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -27,14 +28,21 @@ from touchgoal.control.usb_cameras import find_sensor_camera
 from touchgoal.control.video import VideoCamera, VideoConfig
 
 _STOP_AFTER = 5  # times the age at which the arm holds
+_STANDS = 1.0  # s on the wall for which an arm's clock may stand
+_LOOK = 0.002  # s between looks at it
+_REMEMBERED = 2000  # of them
 
 
 @runtime_checkable
 class Clock(Protocol):
-    """Time as the stamps of a station count it, s."""
+    """What a control loop goes by, in s."""
 
     def now(self) -> float:
-        """The present."""
+        """The present, from any origin."""
+        ...
+
+    def age(self, stamp: float) -> float:
+        """Since a reading's stamp."""
         ...
 
     def wait(self, until: float) -> None:
@@ -49,9 +57,43 @@ class RealClock:
         """See Clock."""
         return time.monotonic()
 
+    def age(self, stamp: float) -> float:
+        """See Clock."""
+        return time.monotonic() - stamp
+
     def wait(self, until: float) -> None:
         """See Clock."""
         time.sleep(max(0.0, until - time.monotonic()))
+
+
+class ArmClock:
+    """The arm's own: of a twin in lock-step, whose time passes as slowly as the machine needs.
+
+    Stamps count the time on the wall; what the arm's clock said then is remembered. When it stands
+    for longer than a loaded machine explains, time goes on all the same, so that ages tell.
+    """
+
+    def __init__(self, arm: Arm) -> None:
+        self._arm = arm
+        self._told = deque([(time.monotonic(), arm.read().time)], maxlen=_REMEMBERED)
+
+    def now(self) -> float:
+        """See Clock."""
+        news, wall = self._arm.read().time, time.monotonic()
+        since, last = self._told[-1]
+        if news > last:
+            self._told.append((wall, news))
+            return news
+        return last + max(0.0, wall - since - _STANDS)
+
+    def age(self, stamp: float) -> float:
+        """See Clock."""
+        return self.now() - float(np.interp(stamp, *np.array(self._told).T))
+
+    def wait(self, until: float) -> None:
+        """See Clock."""
+        while self.now() < until:
+            time.sleep(_LOOK)
 
 
 @dataclass(frozen=True)
@@ -106,7 +148,8 @@ def open_station(rig: Rig, hz: float) -> Station:
         gripper = keep(_gripper(rig.gripper))
         arm = keep(_arm(rig, robot, hz))
         undo.pop_all()
-    return Station(robot, arm, gripper, cameras, load_cell)
+    clock = ArmClock(arm) if rig.lock_step else RealClock()
+    return Station(robot, arm, gripper, cameras, load_cell, clock)
 
 
 def limits_of(rig: Rig) -> RobotLimits:

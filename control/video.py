@@ -19,7 +19,7 @@ from touchgoal.control.protocols import Frame
 
 # A lost stream is told in `trouble`; what the libraries print about it would tear a live view apart.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_FATAL)
 
 _READ_TIMEOUT = 1000  # ms without a frame after which OpenCV gives up on a stream
 _REOPEN = 0.5  # s between attempts

@@ -21,7 +21,8 @@ from touchgoal.policies.sensing import Sensed, Senses
 from touchgoal.sim_envs.base import Observation
 
 _REST = 0.01  # rad/s
-_RESTING = 3.0  # s to wait for that
+_RESTING = 3.0  # s to wait for that by the loop's clock
+_PATIENCE = 10.0  # s on the wall for the same
 
 ADVICE = {
     Limit.NOT_A_NUMBER: "the policy's output is broken: do not use this checkpoint",
@@ -180,16 +181,17 @@ class Deployment:
         """Stop the arm and watch it come to rest."""
         if not self._execute:
             return Ending(reason, True, advice)
-        station, began = self._station, time.monotonic()
-        station.arm.stop()
-        rest = np.inf
-        while time.monotonic() - began < _RESTING:
-            station.clock.wait(station.clock.now() + self._safety.dt / 5)
-            reading = station.arm.read()
-            fresh = station.clock.now() - reading.stamp < self._safety.dt
-            if fresh and np.abs(reading.velocity).max() < _REST:
-                rest = time.monotonic() - began
+        arm, clock = self._station.arm, self._station.clock
+        began, end = clock.now(), time.monotonic() + _PATIENCE
+        arm.stop()
+        rest, last = np.inf, arm.read().time
+        while clock.now() - began < _RESTING and time.monotonic() < end:
+            clock.wait(clock.now() + self._safety.dt / 5)
+            reading = arm.read()
+            if reading.time > last and np.abs(reading.velocity).max() < _REST:
+                rest = clock.now() - began
                 break
+            last = reading.time
         return Ending(reason, True, advice, rest)
 
     def _tick(
@@ -205,7 +207,6 @@ class Deployment:
                 return Ending("ended by the operator")
             return self.stop("stopped by the operator", "start deploy again when you are ready")
         action = np.asarray(actor.act(sensed.observation), np.float64)
-        now = self._station.clock.now()
         reading = Reading(
             q=sensed.arm.q,
             force=sensed.arm.wrench[:3],
@@ -213,7 +214,7 @@ class Deployment:
             touch=np.zeros(2),
             observation_age=sensed.age,
             action_age=actor.overdue,
-            state_age=now - sensed.arm.stamp if self._execute else 0.0,
+            state_age=self._station.clock.age(sensed.arm.stamp) if self._execute else 0.0,
         )
         before, self.state = self.state, self._safety.advance(self.state, action[:-1], reading)
         self.width = self._safety.width(self.state, float(action[-1]), self.width)

@@ -47,10 +47,10 @@ class Senses:
         arm, gripper = station.arm.read(), station.gripper.read()
         frames = {key: camera.read() for key, camera in station.cameras.items()}
         load = station.load_cell.read() if station.load_cell else None
-        now = station.clock.now()
-        ages = {key: now - frame.stamp for key, frame in frames.items()}
-        if load and now - load.stamp > _LOAD_AGE:
-            ages["load cell"] = now - load.stamp
+        age = station.clock.age
+        ages = {key: age(frame.stamp) for key, frame in frames.items()}
+        if load and age(load.stamp) > _LOAD_AGE:
+            ages["load cell"] = age(load.stamp)
         oldest = max(ages, key=ages.__getitem__) if ages else ""
         fault = f"arm: {arm.fault}" if arm.fault else ""
         fault = fault or (f"gripper: {gripper.fault}" if gripper.fault else "")

@@ -45,6 +45,10 @@ class SimulatedClock:
         """Simulated s."""
         return self._cell.time
 
+    def age(self, stamp: float) -> float:
+        """See Clock."""
+        return self._cell.time - stamp
+
     def wait(self, until: float) -> None:
         """Let the cell go on until then."""
         begin = self._cell.time
@@ -75,6 +79,7 @@ class SimulatedArm:
             torque=cell.tau_ext.copy(),
             fault=self._refusal,
             stamp=cell.time,
+            time=cell.time,
         )
 
     def command(self, q: Joints) -> None:
@@ -154,9 +159,9 @@ class SimulatedCamera:
     def read(self) -> Frame:
         """See Camera."""
         now, last = self._cell.time, self._frame
-        if last is None or now - last.stamp > 1 / self._rate - DT:
-            last = Frame(self._take(), 0 if last is None else last.sequence + 1, now)
-            self._frame = last
+        number = int((now + DT / 2) * self._rate)
+        if last is None or number > last.sequence:
+            last = self._frame = Frame(self._take(), number, now)
         return last
 
     def close(self) -> None:
