@@ -106,7 +106,7 @@ class SafetyRig:
     Attributes:
         flange_lower, flange_upper, fingertips_lower, fingertips_upper: corners of the boxes, m.
         velocity_share: of the maker's speed that a policy may use.
-        force, torque, touch: ceilings, N, Nm and N.
+        force, torque, touch: ceilings: N, Nm and m that a fingertip's gel is pressed in.
         observation_age, state_age: s at which the arm holds; five times that stops it.
         silence: s without news of the controller after which it is lost; none: the driver's own.
     """

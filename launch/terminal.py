@@ -49,7 +49,7 @@ class Terminal:
         mode = state.mode if state.mode is not Mode.MOVE or not acted else f"{state.mode} ({acted})"
         force = float(np.linalg.norm(sensed.arm.wrench[:3]))
         line = (
-            f"{view.seconds:6.1f} s  {mode:<24}  {force:5.1f} N  gripper {1e3 * view.width:3.0f} mm"
+            f"{view.seconds:6.1f} s  {mode:<24}  {force:5.1f} N  gel {1e3 * sensed.touch.max():3.1f} mm  gripper {1e3 * view.width:3.0f} mm"
             f"  pictures {1e3 * sensed.age:4.0f} ms  late {1e3 * view.late:4.1f} ms  {self.cost}"
         )
         print(f"\r{line[:118]:<118}", end="", flush=True)

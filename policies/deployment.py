@@ -31,7 +31,7 @@ ADVICE = {
     Limit.STALE_STATE: "the arm's state is late: check the network to the controller",
     Limit.FORCE: "something pressed on the hand: clear it, then start again",
     Limit.TORQUE: "something pressed on the arm: clear it, then start again",
-    Limit.TOUCH: "a fingertip was pressed too hard: look at its gel, lower the gripper's force",
+    Limit.TOUCH: "a gel was pressed too deep, the hand let go: look at it, lower gripper.force",
     Limit.TRACKING: "the arm does not follow: look for what blocks it",
 }
 
@@ -211,7 +211,7 @@ class Deployment:
             q=sensed.arm.q,
             force=sensed.arm.wrench[:3],
             torque=sensed.arm.torque,
-            touch=np.zeros(2),
+            touch=sensed.touch,
             observation_age=sensed.age,
             action_age=actor.overdue,
             state_age=self._station.clock.age(sensed.arm.stamp) if self._execute else 0.0,
@@ -236,6 +236,9 @@ class Deployment:
         reason = str(fault)
         if fault.limit == Limit.STALE_OBSERVATION:
             reason += f" s ({sensed.oldest}; {self.senses.trouble() or 'it is slow'})"
+        if fault.limit == Limit.TOUCH and self._execute:  # open by as much as both gels give way
+            width = sensed.gripper.width + 2 * self._safety.limits.touch
+            self._station.gripper.command(min(width, self._safety.limits.stroke[1]))
         return self.stop(reason, ADVICE.get(fault.limit, "look at what it names"))
 
     def _imagined(self, sensed: Sensed) -> Sensed:

@@ -108,7 +108,7 @@ def _limits(safety: Safety) -> str:
     limits, dogs = safety.limits, safety.watchdogs
     return (
         f"{safety.joints.velocity.max():.2f} rad/s, {limits.force:g} N, {limits.torque:g} Nm, "
-        f"pictures {1e3 * dogs.observation.hold:.0f} ms, state {1e3 * dogs.state.hold:.0f} ms"
+        f"gel {1e3 * limits.touch:g} mm, pictures {1e3 * dogs.observation.hold:.0f} ms, state {1e3 * dogs.state.hold:.0f} ms"
     )
 
 

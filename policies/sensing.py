@@ -8,8 +8,16 @@ from jaxtyping import Float, UInt8
 
 from touchgoal.control import vocabulary as v
 from touchgoal.control.kinematics import GELSIGHT_TCP, Kinematics, rotation_vector
-from touchgoal.control.protocols import ArmReading, DriverError, GripperReading, LoadReading
+from touchgoal.control.protocols import (
+    ArmReading,
+    DriverError,
+    Frame,
+    GripperReading,
+    LoadReading,
+    TactileSensor,
+)
 from touchgoal.control.station import Station
+from touchgoal.control.touch.indentation import IndentationMeter
 
 _LOAD_AGE = 0.5  # s without a good line after which a load cell counts as silent
 
@@ -22,6 +30,7 @@ class Sensed:
         observation: by the keys of `control/vocabulary.py`.
         age: s since the oldest picture was taken.
         oldest: whose picture that was.
+        touch: m that the left and the right gel are pressed in; 0 without fingertips.
         fault: what a device says is wrong with it; empty if nothing.
     """
 
@@ -31,15 +40,25 @@ class Sensed:
     load: LoadReading | None
     age: float
     oldest: str
+    touch: Float[np.ndarray, "2"]
     fault: str
 
 
 class Senses:
-    """Reads a station. It never waits: drivers keep the newest reading of everything."""
+    """Reads a station whose fingertips are untouched at first.
+
+    It never waits: drivers keep the newest reading of everything.
+    """
 
     def __init__(self, station: Station) -> None:
         self._station = station
         self._kinematics = Kinematics(station.robot.arm, GELSIGHT_TCP)
+        self._meters = {
+            key: IndentationMeter(camera.model, camera.read().image)
+            for key, camera in station.cameras.items()
+            if isinstance(camera, TactileSensor)
+        }
+        self._felt: dict[str, tuple[int, float]] = {}  # sequence of the last frame, indentation
 
     def look(self) -> Sensed:
         """The newest of everything; DriverError if something broke for good."""
@@ -58,7 +77,16 @@ class Senses:
         for key, frame in frames.items():
             tactile = key in v.TACTILE
             observation[key] = frame.image if tactile else framed(frame.image, v.CAMERA_SHAPE[:2])
-        return Sensed(observation, arm, gripper, load, ages.get(oldest, 0.0), oldest, fault)
+        touch = self._touch(frames)
+        return Sensed(observation, arm, gripper, load, ages.get(oldest, 0.0), oldest, touch, fault)
+
+    def _touch(self, frames: dict[str, Frame]) -> Float[np.ndarray, "2"]:
+        """Every picture is measured once: between two of them there is no news."""
+        for key, meter in self._meters.items():
+            frame = frames[key]
+            if key not in self._felt or self._felt[key][0] != frame.sequence:
+                self._felt[key] = frame.sequence, meter.measure(frame.image)
+        return np.array([self._felt[key][1] if key in self._felt else 0.0 for key in v.TACTILE])
 
     def trouble(self) -> str:
         """What the cameras say is wrong with them, for a report."""

@@ -116,7 +116,7 @@ def test_the_joint_margin_is_reached_and_named() -> None:
 FAULTS = [
     ("force", np.array([0, 0, -16.0]), Limit.FORCE),
     ("torque", np.full(7, -11.0), Limit.TORQUE),
-    ("touch", np.array([0.0, 20.0]), Limit.TOUCH),
+    ("touch", np.array([0.0, 2e-3]), Limit.TOUCH),
     ("force", np.full(3, np.nan), Limit.FORCE),
     ("q", np.full(7, np.nan), Limit.TRACKING),
     ("observation_age", 0.6, Limit.STALE_OBSERVATION),
