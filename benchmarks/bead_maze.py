@@ -5,8 +5,10 @@ wires and the same starts. Open loop: see `policies/compounding.py`, along exper
 test wires that nothing disturbs.
 """
 
+import os
+import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +16,20 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import Actor, collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint, compounding
 from touchgoal.policies.acting import SHIPPED, ActorMaker, Observation, Planner, PolicyActor
 from touchgoal.policies.compounding import Compounded, Plan, compound
+from touchgoal.policies.diffusion import RegressionConfig
 from touchgoal.policies.follower import WireFollower
 from touchgoal.policies.maze_trials import MazeTrial, evaluate, trials_of
 from touchgoal.policies.policy import Condition, Policy
 from touchgoal.policies.success import SuccessRate
 from touchgoal.policies.touch import load_touch
-from touchgoal.policies.windows import Windows, read
+from touchgoal.policies.windows import Windows, embeddings, read
 from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
 from touchgoal.sim_envs.maze_expert import BeadMazeExpert
 from touchgoal.sim_envs.wires import HELD_OUT, choose
@@ -49,7 +53,7 @@ class Config:
     """Test wires on which open-loop errors are measured."""
     latencies: tuple[int, ...] = (1, 2)
     """Ticks by which plans come late, tried besides 0 on the first policy."""
-    workers: int = 2
+    workers: int = os.cpu_count() or 1
     """Processes that simulate."""
 
 
@@ -78,24 +82,26 @@ class MisledPlanner(Planner):
 
 
 @dataclass(frozen=True)
-class Misled(ActorMaker):
-    """Makes a policy whose touch was shuffled: it feels other episodes, drawn by `seed`.
+class Misled:
+    """Makes a policy whose touch was shuffled: it feels another episode, drawn by the trial's seed.
 
     Attributes:
-        bank: folder of embedded episodes, as `windows.read` caches them.
+        policy: makes it, undisturbed.
+        episodes: embedded, see `windows.read`.
     """
 
-    bank: Path = Path()
+    policy: ActorMaker
+    episodes: EpisodeSet
 
     def __call__(self, env: BeadMaze) -> Actor:
         """For one episode."""
         torch.set_num_threads(1)
-        policy = checkpoint.load(self.directory)
-        planner = MisledPlanner(policy, load_touch(self.directory / checkpoint.TOUCH), self.seed)
-        episodes = sorted(self.bank.glob("*.npy"))
-        chosen = int(env.np_random.integers(len(episodes)))
-        planner.felt = np.load(episodes[chosen]).astype(np.float32)
-        return PolicyActor(planner, self.latency)
+        loaded = checkpoint.load(self.policy.directory)
+        touch = load_touch(self.policy.directory / checkpoint.TOUCH)
+        planner = MisledPlanner(loaded, touch)
+        chosen = int(env.np_random.integers(len(self.episodes)))
+        planner.felt = embeddings(self.episodes, chosen, touch).astype(np.float32)
+        return PolicyActor(planner, self.policy.latency)
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -104,16 +110,19 @@ def run(config: Config) -> dict[str, Any]:
     Returns:
         `table`, and the numbers behind it.
     """
+    if config.demonstrations < 2:
+        raise UserError("the baselines need at least 2 demonstrations")
     if not config.policies:
         raise UserError("name at least one policy folder with --policies")
     arms = _arms(config.policies)
-    recorded = _record(config)
-    opened = {name: _open_loop(arm, recorded) for name, arm in arms.items()}
-    closed = _closed_loop(config, arms, recorded.root.parent / "embeddings")
+    with tempfile.TemporaryDirectory() as folder:
+        recorded = _record(config, Path(folder) / "episodes")
+        opened = {name: _open_loop(arm, recorded, config.workers) for name, arm in arms.items()}
+        closed = _closed_loop(config, arms, recorded)
     table = "\n\n".join([_closed_table(closed), _open_table(opened)])
     return {
         "table": table,
-        "closed_loop": {name: [t.__dict__ for t in trials] for name, trials in closed.items()},
+        "closed_loop": {name: [asdict(t) for t in trials] for name, trials in closed.items()},
         "open_loop": opened,
     }
 
@@ -122,10 +131,15 @@ def _arms(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
     arms: dict[str, list[Path]] = {}
     for directory in policies:
         config = checkpoint.load(directory).config
-        touch = "frozen touch" if config.touch_dim else "state only"
-        episodes = checkpoint.read_provenance(directory)["episodes"]
-        head = "" if hasattr(config.head, "unet") else ", regression"
-        arms.setdefault(f"{touch}, {episodes} demos{head}", []).append(directory)
+        senses = ["frozen touch"] * (config.touch_dim > 0)
+        if config.eye:
+            felt = set(config.eye.keys) <= set(v.TACTILE)
+            senses.append("end-to-end touch" if felt else "cameras")
+        episodes = checkpoint.POLICY.provenance(directory)["episodes"]
+        name = f"{' and '.join(senses) or 'state only'}, {episodes} demos"
+        if isinstance(config.head, RegressionConfig):
+            name += ", regression"
+        arms.setdefault(name, []).append(directory)
     return arms
 
 
@@ -133,7 +147,7 @@ def _arms(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
 
 
 def _closed_loop(
-    config: Config, arms: dict[str, list[Path]], bank: Path
+    config: Config, arms: dict[str, list[Path]], recorded: EpisodeSet
 ) -> dict[str, list[MazeTrial]]:
     maze = BeadMazeConfig(split="test")
     blind = replace(maze, tactile=False)
@@ -152,9 +166,9 @@ def _closed_loop(
         makers = [ActorMaker(d) for d in directories]
         env = makers[0].observing(maze)
         try_(name, env, makers, jobs)
-        if env.tactile:
-            try_(f"{name}, {HELD_OUT}", env, makers, other)
-            misled = [Misled(d, bank=_bank(bank, d)) for d in directories]
+        try_(f"{name}, {HELD_OUT}", env, makers, other)
+        if checkpoint.load(directories[0]).config.touch_dim:
+            misled = [Misled(maker, recorded) for maker in makers]
             try_(f"{name}, shuffled", blind, misled, jobs)
     first = config.policies[0]
     for latency in config.latencies:
@@ -199,46 +213,39 @@ def bootstrap(values: list[tuple[str, float]], draws: int = 5000) -> tuple[float
 # ---- open loop
 
 
-def _record(config: Config) -> EpisodeSet:
-    """Undisturbed expert demonstrations on test wires; recorded once for all runs."""
-    root = Path("runs") / "bead_maze_test" / "episodes"
-    if root.exists() and len(EpisodeSet(root)) == config.demonstrations:
-        return EpisodeSet(root)
-    if root.exists():
-        raise UserError(f"{root} holds another number of demonstrations: delete {root.parent}")
+def _record(config: Config, root: Path) -> EpisodeSet:
+    """Undisturbed expert demonstrations on test wires."""
     wires = choose("test", config.demonstrations)
     collect(root, BeadMazeConfig(split="test"), trials_of(wires, FIRST_SEED), config.workers)
     return EpisodeSet(root)
 
 
-def _bank(bank: Path, directory: Path) -> Path:
-    return bank / load_touch(directory / checkpoint.TOUCH).name.replace("/", "_")
-
-
-def _open_loop(directories: list[Path], episodes: EpisodeSet) -> dict[str, dict[str, Any]]:
+def _open_loop(
+    directories: list[Path], episodes: EpisodeSet, workers: int
+) -> dict[str, dict[str, Any]]:
     """Errors of an arm and of the trivial baselines, each over demonstrations and seeds."""
     rows: dict[str, list[Compounded]] = {}
+    count = len(episodes)
     for seed, directory in enumerate(directories):
         policy = checkpoint.load(directory)
-        touch = load_touch(directory / checkpoint.TOUCH) if policy.config.touch_dim else None
-        bank = _bank(episodes.root.parent / "embeddings", directory) if touch else Path()
-        read(episodes, range(len(episodes)), policy.config, touch, bank)  # embeds, all at once
-        for i in range(len(episodes)):
-            windows = Windows(read(episodes, [i], policy.config, touch, bank), policy.config)
+        config, horizon = policy.config, policy.config.prediction_horizon
+        touch = load_touch(directory / checkpoint.TOUCH) if config.touch_dim else None
+        if touch:
+            read(episodes, range(count), config, touch, workers)  # embeds, all at once
+        recorded = [read(episodes, [i], config, touch) for i in range(count)]
+        for i in range(count):
             plans = {"policy": _sampled(policy)}
             if touch:
-                other = (i + 1) % len(episodes)
-                felt = read(episodes, [other], policy.config, touch, bank).touch
-                plans["policy, shuffled touch"] = _misled(policy, felt)
+                plans["policy, shuffled touch"] = _misled(policy, recorded[(i + 1) % count].touch)
             if seed == 0:
-                mean = windows.recorded.actions.mean(0)
+                others = [r.actions.mean(0) for k, r in enumerate(recorded) if k != i]
                 plans |= {
-                    "zero motion": compounding.zero_motion,
-                    "repeat last": compounding.repeat_last(policy.config.control_hz),
-                    "mean action": compounding.always(mean),
+                    "zero motion": compounding.zero_motion(horizon),
+                    "repeat last": compounding.repeat_last(config.control_hz, horizon),
+                    "mean action": compounding.always(torch.stack(others).mean(0), horizon),
                 }
             for name, plan in plans.items():
-                errors = compound(plan, windows, policy.config.control_hz)
+                errors = compound(plan, Windows(recorded[i], config), config.control_hz)
                 rows.setdefault(name, []).append(errors)
     return {name: _summary(errors) for name, errors in rows.items()}
 
@@ -254,7 +261,7 @@ def _misled(policy: Policy, felt: torch.Tensor) -> Plan:
     def misled(condition: Condition) -> torch.Tensor:
         rows = torch.arange(len(condition.touch)) % len(felt)
         touch = felt[rows].float()[:, None].expand_as(condition.touch)
-        return plan(Condition(touch, condition.state))
+        return plan(Condition(touch, condition.state, condition.pictures))
 
     return misled
 

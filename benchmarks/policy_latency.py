@@ -6,7 +6,7 @@ weights here: they are timed, not used.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import SHIPPED, ActorMaker
 from touchgoal.policies.diffusion import Diffusion, DiffusionConfig
 from touchgoal.policies.eyes import shrink
+from touchgoal.policies.policy import PolicyConfig
 from touchgoal.policies.samplers import SamplerConfig
 from touchgoal.policies.unet import PRESETS
 
@@ -69,7 +70,7 @@ def run(config: Config) -> dict[str, Any]:
     lines = [f"{'one core, ms':<58}{'median':>9}{'p95':>9}{'slowest':>9}"]
     lines += [f"{s.what:<58}{s.median:>9.1f}{s.p95:>9.1f}{s.slowest:>9.1f}" for s in stages]
     lines.append(f"a tick at {config.control_hz} Hz has {period:.0f} ms")
-    return {"table": "\n".join(lines), "stages": [s.__dict__ for s in stages]}
+    return {"table": "\n".join(lines), "stages": [asdict(s) for s in stages]}
 
 
 def _stages(config: Config) -> list[Stage]:
@@ -100,11 +101,11 @@ def _stages(config: Config) -> list[Stage]:
     stages.append(
         _time("denoising", config.repeats, lambda: policy.head.plan(condition, generator))
     )
-    turn = iter(range(10**9))
+    turn, seen = iter(range(10**9)), planner.config.observation_horizon
 
     def tick() -> None:
         i = next(turn)
-        planner.plan([ticks[i % 8], ticks[(i + 1) % 8]])  # one new observation, as on the arm
+        planner.plan([ticks[(i + k) % 8] for k in range(seen)])  # one is new, as on the arm
 
     stages.append(_time("a whole plan, observation to actions", config.repeats, tick))
     return stages
@@ -127,7 +128,7 @@ def _published(config: Config) -> list[Stage]:
     return stages
 
 
-def _observations(config: Any) -> list[dict[str, np.ndarray]]:
+def _observations(config: PolicyConfig) -> list[dict[str, np.ndarray]]:
     rng = np.random.default_rng(0)
     keys = [*config.proprioception, *v.TACTILE, *v.CAMERAS]
     return [{key: _random(v.FEATURES[key], rng) for key in keys} for _ in range(8)]

@@ -2,8 +2,6 @@
 
 import copy
 import json
-import math
-import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
-from touchgoal.encoders import pretrained
+from touchgoal.encoders import pretrained, resumable
 from touchgoal.encoders.infonce import info_nce, loss_floor, symmetric_info_nce
 from touchgoal.encoders.retrieval import evaluate
 from touchgoal.encoders.touch_data import Augmentation, TouchData, prepare
@@ -24,7 +22,7 @@ from touchgoal.encoders.vit import PRESETS as VIT_PRESETS
 from touchgoal.encoders.vit import random_patches
 from touchgoal.episodes.touches import Touches
 
-_CHECKPOINT, _METRICS, _ENCODER = "checkpoint.pt", "metrics.jsonl", "encoder"
+_ENCODER = "encoder"
 
 
 @dataclass(frozen=True)
@@ -144,11 +142,13 @@ def align(
     Raises:
         UserError: Unfit data, no such device, or a directory that does not fit `resume`.
     """
-    _check(config, out_dir, resume)
+    resumable.check(out_dir, resume, config.device)
+    if config.epochs < 1 or config.batch_size < 2:
+        raise UserError("training needs at least 1 epoch and batches of at least 2 touches")
     data, val_data = (prepare(t, towers, config.sensor, config.idle_texts) for t in (train, val))
     run = _Run(config, towers, data)
     if resume:
-        run.restore(out_dir / _CHECKPOINT)
+        run.restore(out_dir)
     out_dir.mkdir(parents=True, exist_ok=True)
     for epoch in range(len(run.history), config.epochs):
         metrics = run.train_epoch(epoch) | evaluate(run.encoder, val_data)
@@ -164,18 +164,6 @@ def align(
     }
     pretrained.save(run.encoder, out_dir / _ENCODER, provenance)
     return pretrained.load(out_dir / _ENCODER)
-
-
-def _check(config: AlignConfig, out_dir: Path, resume: bool) -> None:
-    exists = (out_dir / _CHECKPOINT).is_file()
-    if resume and not exists:
-        raise UserError(f"nothing to resume in {out_dir}: start without resuming")
-    if exists and not resume:
-        raise UserError(f"{out_dir} holds a run already: resume it, or choose another directory")
-    if config.device.startswith("cuda") and not torch.cuda.is_available():
-        raise UserError("no CUDA device here: choose the device cpu")
-    if config.epochs < 1 or config.batch_size < 2:
-        raise UserError("training needs at least 1 epoch and batches of at least 2 touches")
 
 
 class _Run:
@@ -196,23 +184,23 @@ class _Run:
         self.steps = len(data) // self.batch_size
 
     def train_epoch(self, epoch: int) -> dict[str, float]:
-        """One pass; its randomness depends on seed and epoch only, so a resumed run repeats it."""
-        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + epoch)
+        """One pass: the mean of each loss, and the floors."""
+        config = self.config
+        count, size = len(self.data), self.batch_size
+        generator, batches = resumable.shuffle(count, size, config.seed, epoch)
         self.encoder.train()
-        order = torch.randperm(len(self.data), generator=generator)
-        batches = order[: self.steps * self.batch_size].split(self.batch_size)
         sums: dict[str, float] = {}
         floors: dict[str, float] = {}
-        progress = tqdm(batches, desc=f"epoch {epoch + 1}/{self.config.epochs}", leave=False)
+        progress = tqdm(batches, desc=f"epoch {epoch + 1}/{config.epochs}", leave=False)
         for step, rows in enumerate(progress):
             for group in self.optimiser.param_groups:
-                group["lr"] = _rate(self.config, epoch * self.steps + step, self.steps)
-            batch = _embed(self.encoder, self.data, rows, self.config, generator)
-            losses = batch_losses(batch, self.encoder.config.pretrained_together, self.config)
+                group["lr"] = _rate(config, epoch * self.steps + step, self.steps)
+            batch = _embed(self.encoder, self.data, rows, config, generator)
+            losses = batch_losses(batch, self.encoder.config.pretrained_together, config)
             self.optimiser.zero_grad()
             losses["loss"].backward()
             self.optimiser.step()
-            floors = floors or _floors(batch, self.config)
+            floors = floors or _floors(batch, config)
             for name, loss in losses.items():
                 sums[name] = sums.get(name, 0.0) + loss.item()
             progress.set_postfix(loss=f"{losses['loss'].item():.3f}")
@@ -225,27 +213,17 @@ class _Run:
         self.history.append(metrics)
 
     def checkpoint(self, out_dir: Path) -> None:
-        """Writes everything needed to go on; a kill leaves the old or the new checkpoint."""
+        """Writes everything needed to go on."""
         state = {
-            "setting": self._setting(),
             "encoder": self.encoder.state_dict(),
             "best": self.best,
             "optimiser": self.optimiser.state_dict(),
-            "history": self.history,
         }
-        temporary = out_dir / f"{_CHECKPOINT}.tmp"
-        torch.save(state, temporary)
-        os.replace(temporary, out_dir / _CHECKPOINT)
-        lines = "".join(json.dumps(epoch) + "\n" for epoch in self.history)
-        (out_dir / _METRICS).write_text(lines)
+        resumable.save(out_dir, self._setting(), state, self.history)
 
-    def restore(self, path: Path) -> None:
+    def restore(self, out_dir: Path) -> None:
         """Reads a checkpoint; UserError if it is of another training."""
-        state = torch.load(path, self.config.device, weights_only=True)
-        if state["setting"] != self._setting():
-            raise UserError(
-                f"{path} is of another data set, encoder or config: resume with its own"
-            )
+        state = resumable.restore(out_dir, self._setting(), self.config.device)
         self.encoder.load_state_dict(state["encoder"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.best, self.history = state["best"], state["history"]
@@ -267,13 +245,8 @@ def _optimiser(encoder: TouchEncoder, config: AlignConfig) -> torch.optim.Optimi
 
 
 def _rate(config: AlignConfig, step: int, steps_per_epoch: int) -> float:
-    """Linear warm-up, then a cosine from `lr` to `final_lr * lr`."""
-    total = config.epochs * steps_per_epoch
-    warmup = config.warmup * total
-    if step < warmup:
-        return config.lr * (step + 1) / (warmup + 1)
-    cosine = (1 + math.cos(math.pi * (step - warmup) / max(total - warmup, 1))) / 2
-    return config.lr * (config.final_lr + (1 - config.final_lr) * cosine)
+    steps = config.epochs * steps_per_epoch
+    return config.lr * resumable.warmed_cosine(step, steps, config.warmup * steps, config.final_lr)
 
 
 @dataclass(frozen=True, eq=False)

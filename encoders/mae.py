@@ -1,8 +1,6 @@
 """Masked autoencoding of touch (He et al. 2022; Sparsh, Higuera et al. 2024): no labels needed."""
 
 import json
-import math
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -13,14 +11,14 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
-from touchgoal.encoders import pretrained
+from touchgoal.encoders import pretrained, resumable
 from touchgoal.encoders.probe import ridge_r2
 from touchgoal.encoders.touch_frames import TouchFrames
 from touchgoal.encoders.trunk import BATCH, TouchTrunk, TouchTrunkConfig
 from touchgoal.encoders.vit import PRESETS as VIT_PRESETS
 from touchgoal.encoders.vit import Block, ViTConfig, random_patches, sinusoidal_positions
 
-_CHECKPOINT, _METRICS, _ENCODER = "checkpoint.pt", "metrics.jsonl", "encoder"
+_ENCODER = "encoder"
 
 
 @dataclass(frozen=True)
@@ -31,11 +29,9 @@ class MaeConfig:
         sensor: Name of the fingertip sensor.
         vit: Size of the trunk.
         visible: Share of the patches that the trunk sees.
-        decoder: What the decoder draws from. "tokens": what the trunk says of the patches it saw, as
-            published. "mean": the mean of these tokens, which is the embedding, so that it holds
-            all that is needed. "partner": the mean, and another touch of the same fingertip (as in
-            SiamMAE, Gupta et al. 2023), so that the mean holds what is felt and need not hold what
-            makes this sensor unlike others, such as where its markers were printed.
+        bottleneck: The decoder sees the mean of the trunk's tokens and nothing else, so that this
+            mean, which is the embedding, holds all that is needed to draw the picture. Otherwise it
+            sees the tokens, as published.
         decoder_width: Size of the decoder's tokens.
         decoder_depth: Its blocks.
         epochs: Passes over the touches.
@@ -50,7 +46,7 @@ class MaeConfig:
     sensor: str = "gelsight_mini_markers"
     vit: Literal["tiny", "compact", "small"] = "compact"
     visible: float = 0.5
-    decoder: Literal["tokens", "mean", "partner"] = "mean"
+    bottleneck: bool = True
     decoder_width: int = 96
     decoder_depth: int = 2
     epochs: int = 30
@@ -72,7 +68,6 @@ class MaskedAutoencoder(nn.Module):
         self.trunk = TouchTrunk(TouchTrunkConfig.for_sensor(vit, config.sensor))
         width = config.decoder_width
         self.enter = nn.Linear(vit.width, width)
-        self.recall = nn.Linear(vit.channels * vit.patch_size**2, width)
         self.unseen = nn.Parameter(torch.zeros(width))
         self.blocks = nn.ModuleList(Block(width, 4, 4.0) for _ in range(config.decoder_depth))
         self.norm = nn.LayerNorm(width)
@@ -81,7 +76,6 @@ class MaskedAutoencoder(nn.Module):
     def loss(
         self,
         touch: Float[Tensor, "b 3 h w"],
-        partner: Float[Tensor, "b 3 h w"],
         keep: Int[Tensor, "b k"],
     ) -> Float[Tensor, ""]:
         """Mean squared error of the drawn patches, in the preprocessor's units.
@@ -89,8 +83,8 @@ class MaskedAutoencoder(nn.Module):
         All patches count with a bottleneck, else the unseen ones. Patches are not brought to
         variance 1, as He et al. do: most of a touch is untouched, and would be noise at full size.
         """
-        error = (self.draw(touch, partner, keep) - patches(touch, self.trunk.config.vit)) ** 2
-        if self.config.decoder != "tokens":
+        error = (self.draw(touch, keep) - patches(touch, self.trunk.config.vit)) ** 2
+        if self.config.bottleneck:
             return error.mean()
         unseen = torch.ones(error.shape[:2], device=error.device).scatter(1, keep, 0.0)
         return (error.mean(2) * unseen).sum() / unseen.sum()
@@ -98,17 +92,14 @@ class MaskedAutoencoder(nn.Module):
     def draw(
         self,
         touch: Float[Tensor, "b 3 h w"],
-        partner: Float[Tensor, "b 3 h w"],
         keep: Int[Tensor, "b k"],
     ) -> Float[Tensor, "b n p"]:
-        """All patches of touches, of which the trunk sees those in `keep`; see `MaeConfig`."""
+        """All patches of touches, of which the trunk sees those in `keep`."""
         tokens = self.enter(self.trunk.vit(touch, keep))
         rows, columns = _grid(self.trunk.config.vit)
         b, d = len(tokens), tokens.shape[2]
-        if self.config.decoder == "mean":
+        if self.config.bottleneck:
             x = tokens.mean(1, keepdim=True).expand(b, rows * columns, d)
-        elif self.config.decoder == "partner":
-            x = tokens.mean(1, keepdim=True) + self.recall(patches(partner, self.trunk.config.vit))
         else:
             x = self.unseen.expand(b, rows * columns, d)
             x = x.scatter(1, keep[:, :, None].expand(-1, -1, d), tokens)
@@ -153,18 +144,12 @@ def train_mae(
     Raises:
         UserError: No such device, or a directory that does not fit `resume`.
     """
-    exists = (out_dir / _CHECKPOINT).is_file()
-    if resume != exists:
-        raise UserError(
-            f"nothing to resume in {out_dir}: start without resuming"
-            if resume
-            else f"{out_dir} holds a run already: resume it, or choose another directory"
-        )
-    if config.device.startswith("cuda") and not torch.cuda.is_available():
-        raise UserError("no CUDA device here: choose the device cpu")
+    resumable.check(out_dir, resume, config.device)
+    if config.epochs < 1 or config.batch_size < 1 or not 0 < config.visible <= 1:
+        raise UserError("training needs epochs and batch_size of at least 1, visible in (0, 1]")
     run = _Run(config, train)
     if resume:
-        run.restore(out_dir / _CHECKPOINT)
+        run.restore(out_dir)
     out_dir.mkdir(parents=True, exist_ok=True)
     for epoch in range(len(run.history), config.epochs):
         loss = {"epoch": epoch + 1, "loss": run.train_epoch(epoch)}
@@ -192,11 +177,10 @@ def validate(model: MaskedAutoencoder, train: TouchFrames, val: TouchFrames) -> 
     vit, device = model.trunk.config.vit, model.unseen.device
     generator = torch.Generator().manual_seed(0)
     total, power = 0.0, 0.0
-    for rows in torch.arange(len(val)).split(BATCH):
-        touch = val.touch[rows].to(device).float()
-        partner = val.touch[val.draw_partners(rows, generator)].to(device).float()
+    for batch in val.touch.split(BATCH):
+        touch = batch.to(device).float()
         keep = random_patches(vit, len(touch), model.config.visible, generator).to(device)
-        total += model.loss(touch, partner, keep).item() * len(touch)
+        total += model.loss(touch, keep).item() * len(touch)
         power += patches(touch, vit).square().mean().item() * len(touch)
     metrics = {"validation_loss": total / len(val), "validation_power": power / len(val)}
     if train.wrench is None or val.wrench is None:
@@ -237,23 +221,19 @@ class _Run:
         self.steps = len(data) // self.batch_size
 
     def train_epoch(self, epoch: int) -> float:
-        """One pass, its mean loss; random by seed and epoch only, so a resumed run repeats it."""
+        """One pass, its mean loss."""
         config = self.config
-        generator = torch.Generator().manual_seed(config.seed * 1_000_003 + epoch)
+        count, size = len(self.data), self.batch_size
+        generator, batches = resumable.shuffle(count, size, config.seed, epoch)
         vit = self.model.trunk.config.vit
         self.model.train()
-        order = torch.randperm(len(self.data), generator=generator)
-        batches = order[: self.steps * self.batch_size].split(self.batch_size)
         total = 0.0
         for i, rows in enumerate(tqdm(batches, desc=f"epoch {epoch + 1}", leave=False)):
             for group in self.optimiser.param_groups:
-                group["lr"] = _rate(config, epoch * self.steps + i, config.epochs * self.steps)
+                group["lr"] = config.lr * self._warmed(epoch * self.steps + i)
             keep = random_patches(vit, len(rows), config.visible, generator)
-            partners = self.data.draw_partners(rows, generator)
-            touch, partner = (
-                self.data.touch[r].to(config.device).float() for r in (rows, partners)
-            )
-            loss = self.model.loss(touch, partner, keep.to(config.device))
+            touch = self.data.touch[rows].to(config.device).float()
+            loss = self.model.loss(touch, keep.to(config.device))
             self.optimiser.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
@@ -262,27 +242,20 @@ class _Run:
         return total / self.steps
 
     def checkpoint(self, out_dir: Path) -> None:
-        """Writes everything needed to go on; a kill leaves the old or the new checkpoint."""
-        state = {
-            "setting": self._setting(),
-            "model": self.model.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-            "history": self.history,
-        }
-        temporary = out_dir / f"{_CHECKPOINT}.tmp"
-        torch.save(state, temporary)
-        os.replace(temporary, out_dir / _CHECKPOINT)
-        lines = "".join(json.dumps(epoch) + "\n" for epoch in self.history)
-        (out_dir / _METRICS).write_text(lines)
+        """Writes everything needed to go on."""
+        state = {"model": self.model.state_dict(), "optimiser": self.optimiser.state_dict()}
+        resumable.save(out_dir, self._setting(), state, self.history)
 
-    def restore(self, path: Path) -> None:
+    def restore(self, out_dir: Path) -> None:
         """Reads a checkpoint; UserError if it is of another training."""
-        state = torch.load(path, self.config.device, weights_only=True)
-        if state["setting"] != self._setting():
-            raise UserError(f"{path} is of other episodes or another config: resume with its own")
+        state = resumable.restore(out_dir, self._setting(), self.config.device)
         self.model.load_state_dict(state["model"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.history = state["history"]
+
+    def _warmed(self, step: int) -> float:
+        steps = self.config.epochs * self.steps
+        return resumable.warmed_cosine(step, steps, steps // 10)
 
     def _setting(self) -> str:
         return json.dumps((asdict(self.config), len(self.data)))
@@ -291,13 +264,6 @@ class _Run:
 def _grid(vit: ViTConfig) -> tuple[int, int]:
     rows, columns = (-(-side // vit.patch_size) for side in vit.image_size)
     return rows, columns
-
-
-def _rate(config: MaeConfig, step: int, steps: int) -> float:
-    warmup = steps // 10
-    if step < warmup:
-        return config.lr * (step + 1) / (warmup + 1)
-    return config.lr * (1 + math.cos(math.pi * (step - warmup) / max(steps - warmup, 1))) / 2
 
 
 def _line(metrics: dict[str, float], epochs: int) -> str:

@@ -1,32 +1,21 @@
-"""Encoders on disk: weights as safetensors, and a JSON that says what they are.
+"""Touch encoders on disk, of either kind, checked against the sensor, the preprocessor and the towers."""
 
-Loading is strict. A wrong encoder gives numbers that look like any others, so whatever does not fit
-(sensor, preprocessor version, towers, a tensor's name or shape) is an error.
-"""
-
-import json
-import os
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 
 from touchgoal.control.errors import UserError
 from touchgoal.encoders.preprocess import preprocessor_for
+from touchgoal.encoders.stored import Stored
 from touchgoal.encoders.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.towers import same_towers
 from touchgoal.encoders.trunk import TouchTrunk, TouchTrunkConfig
 from touchgoal.encoders.vit import ViTConfig
 
-FORMAT = 1
 SHIPPED = Path(__file__).parent / "weights" / "gelsight_mini_offline"
-Encoder = TypeVar("Encoder", TouchEncoder, TouchTrunk)
-Config = TypeVar("Config", TouchEncoderConfig, TouchTrunkConfig)
-_JSON, _WEIGHTS = "encoder.json", "encoder.safetensors"
-_TRAIN = "train one with: touchgoal train-encoder"
+ENCODER = Stored("encoder", "touch encoder", "train one with: touchgoal train-encoder")
 
 
 def save(
@@ -43,17 +32,9 @@ def save(
         provenance: JSON-able: data, command, seed, metrics of the training.
         half: Store weights as float16, which turns embeddings by a cosine distance below 1e-3.
     """
-    directory.mkdir(parents=True, exist_ok=True)
     dtype = torch.float16 if half else torch.float32
-    weights = {
-        name: weight.detach().cpu().to(dtype).contiguous()
-        for name, weight in encoder.state_dict().items()
-    }
-    description = {"format": FORMAT, "config": asdict(encoder.config), "provenance": provenance}
-    save_file(weights, directory / f"{_WEIGHTS}.tmp")
-    (directory / f"{_JSON}.tmp").write_text(json.dumps(description, indent=2) + "\n")
-    for name in (_WEIGHTS, _JSON):
-        os.replace(directory / f"{name}.tmp", directory / name)
+    weights = {name: w.detach().cpu().to(dtype) for name, w in encoder.state_dict().items()}
+    ENCODER.save(directory, weights, asdict(encoder.config), provenance)
 
 
 def load(directory: Path, sensor: str | None = None, towers: str | None = None) -> TouchEncoder:
@@ -68,32 +49,31 @@ def load(directory: Path, sensor: str | None = None, towers: str | None = None) 
         UserError: Nothing there, damaged, or not made for this sensor, these towers or this
             version of the preprocessor.
     """
-    config = _read_config(directory, TouchEncoderConfig)
+    config = ENCODER.read_config(directory, _aligned_config)
     if towers is not None and not same_towers(towers, config.towers):
         raise UserError(
             f"the encoder in {directory} was trained with the towers {config.towers}, not {towers}: "
             "load those towers, or train an encoder with these"
         )
     _check_sensor(config, directory, sensor)
-    return _filled(TouchEncoder(config), directory)
+    encoder = TouchEncoder(config)
+    ENCODER.fill(encoder, directory)
+    return encoder
 
 
 def load_trunk(directory: Path, sensor: str | None = None) -> TouchTrunk:
     """Reads a self-supervised trunk for inference, as float32 on the CPU; UserError as `load`."""
-    config = _read_config(directory, TouchTrunkConfig)
+    config = ENCODER.read_config(directory, _trunk_config)
     _check_sensor(config, directory, sensor)
-    return _filled(TouchTrunk(config), directory)
+    encoder = TouchTrunk(config)
+    ENCODER.fill(encoder, directory)
+    return encoder
 
 
 def load_any(directory: Path) -> TouchEncoder | TouchTrunk:
     """Reads an encoder of either kind for inference; UserError as `load`."""
-    aligned = "towers" in _read_description(directory).get("config", {})
+    aligned = "towers" in ENCODER.describe(directory).get("config", {})
     return load(directory) if aligned else load_trunk(directory)
-
-
-def weights_path(directory: Path) -> Path:
-    """The weights' file in an encoder's folder."""
-    return directory / _WEIGHTS
 
 
 def _check_sensor(
@@ -101,64 +81,23 @@ def _check_sensor(
 ) -> None:
     if sensor is not None and sensor != config.sensor:
         raise UserError(
-            f"the encoder in {directory} is for {config.sensor}, not {sensor}: {_TRAIN}"
+            f"the encoder in {directory} is for {config.sensor}, not {sensor}: {ENCODER.remedy}"
         )
     current = preprocessor_for(config.sensor).id
     if config.preprocessor != current:
         raise UserError(
             f"the encoder in {directory} needs the preprocessor {config.preprocessor}, this is "
-            f"{current}: {_TRAIN}"
+            f"{current}: {ENCODER.remedy}"
         )
 
 
-def _filled(encoder: Encoder, directory: Path) -> Encoder:
-    encoder.load_state_dict(_read_weights(directory / _WEIGHTS, encoder))
-    return encoder.eval().requires_grad_(False)
+def _aligned_config(fields: dict[str, Any]) -> TouchEncoderConfig:
+    return TouchEncoderConfig(**fields | {"vit": _vit(fields["vit"])})
 
 
-def read_provenance(directory: Path) -> dict[str, Any]:
-    """What `save` was told about the training; UserError as for `load`."""
-    return _read_description(directory)["provenance"]
+def _trunk_config(fields: dict[str, Any]) -> TouchTrunkConfig:
+    return TouchTrunkConfig(**fields | {"vit": _vit(fields["vit"])})
 
 
-def _read_description(directory: Path) -> dict[str, Any]:
-    path = directory / _JSON
-    if not path.is_file():
-        raise UserError(f"no touch encoder in {directory}: {_TRAIN}")
-    try:
-        description = json.loads(path.read_text())
-        version = description["format"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path} is damaged: {_TRAIN}") from error
-    if version != FORMAT:
-        raise UserError(f"{path} has format {version}, this touchgoal reads {FORMAT}: {_TRAIN}")
-    return description
-
-
-def _read_config(directory: Path, kind: type[Config]) -> Config:
-    try:
-        fields = dict(_read_description(directory)["config"])
-        vit = fields.pop("vit")
-        vit["image_size"] = tuple(vit["image_size"])
-        return kind(vit=ViTConfig(**vit), **fields)
-    except (KeyError, TypeError) as error:
-        raise UserError(f"{directory / _JSON} is damaged ({error}): {_TRAIN}") from error
-
-
-def _read_weights(path: Path, encoder: TouchEncoder | TouchTrunk) -> dict[str, torch.Tensor]:
-    if not path.is_file():
-        raise UserError(f"{path} is missing: {_TRAIN}")
-    try:
-        weights = load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise UserError(f"{path} is damaged: {_TRAIN}") from error
-    expected = {name: tuple(weight.shape) for name, weight in encoder.state_dict().items()}
-    found = {name: tuple(weight.shape) for name, weight in weights.items()}
-    wrong = [name for name in expected | found if expected.get(name) != found.get(name)]
-    if wrong:
-        name = wrong[0]
-        raise UserError(
-            f"{path} does not fit its {_JSON}: {name} is {found.get(name)}, not "
-            f"{expected.get(name)} ({len(wrong)} tensors differ): {_TRAIN}"
-        )
-    return {name: weight.float() for name, weight in weights.items()}
+def _vit(fields: dict[str, Any]) -> ViTConfig:
+    return ViTConfig(**fields | {"image_size": tuple(fields["image_size"])})

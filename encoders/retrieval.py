@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from touchgoal.encoders.touch_data import IDLE, TouchData
-from touchgoal.encoders.touch_encoder import BATCH, TouchEncoder
+from touchgoal.encoders.touch_encoder import TouchEncoder
+from touchgoal.encoders.trunk import BATCH
 
 
 @torch.no_grad()

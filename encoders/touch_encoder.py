@@ -9,11 +9,10 @@ from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor, nn
 
 from touchgoal.control.errors import UserError
-from touchgoal.encoders.preprocess import TactilePreprocessor, preprocessor_for
+from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.towers import Towers, same_towers
+from touchgoal.encoders.trunk import TouchEmbedding
 from touchgoal.encoders.vit import ViT, ViTConfig
-
-BATCH = 64
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ class TouchEncoderConfig:
         )
 
 
-class TouchEncoder(nn.Module):
+class TouchEncoder(TouchEmbedding):
     """Touch, images and texts as unit vectors of one space.
 
     As in ImageBind, the touch head is a LayerNorm (the trunk's last layer), pooling and a bias-free
@@ -77,9 +76,8 @@ class TouchEncoder(nn.Module):
 
     def __init__(self, config: TouchEncoderConfig) -> None:
         """Builds a randomly initialised encoder; UserError for an unknown sensor."""
-        super().__init__()
+        super().__init__(config.sensor, config.embedding_dim)
         self.config = config
-        self.preprocess: TactilePreprocessor = preprocessor_for(config.sensor)
         self.trunk = ViT(config.vit)
         d = config.embedding_dim
         self.touch_head = nn.Linear(config.vit.width, d, bias=False)
@@ -90,7 +88,7 @@ class TouchEncoder(nn.Module):
     def embed_touch(
         self, touch: Float[Tensor, "n 3 h w"], keep: Int[Tensor, "n k"] | None = None
     ) -> Float[Tensor, "n d"]:
-        """Embeds preprocessed frames, of which only the patches in `keep` are seen if given."""
+        """See TouchEmbedding."""
         return F.normalize(self.touch_head(self.trunk.features(touch, keep)), dim=1)
 
     def project_image(self, embeddings: Float[Tensor, "n k"]) -> Float[Tensor, "n d"]:
@@ -106,21 +104,6 @@ class TouchEncoder(nn.Module):
         return F.normalize(embeddings, dim=1)
 
     @torch.no_grad()
-    def embed_frames(
-        self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
-    ) -> Float32[np.ndarray, "n d"]:
-        """Embeds raw frames of one sensor, given the same sensor untouched.
-
-        Raises:
-            UserError: The frames are not of this encoder's sensor.
-        """
-        rows = np.empty((len(frames), self.config.embedding_dim), np.float32)
-        for i in range(0, len(frames), BATCH):
-            touch = torch.from_numpy(self.preprocess(frames[i : i + BATCH], background))
-            rows[i : i + BATCH] = self.embed_touch(touch.to(self._device)).cpu().numpy()
-        return rows
-
-    @torch.no_grad()
     def embed_text_goal(self, texts: list[str], towers: Towers) -> Float32[np.ndarray, "n d"]:
         """Sentences in the shared space, to be compared with `embed_frames`.
 
@@ -128,7 +111,7 @@ class TouchEncoder(nn.Module):
             UserError: The encoder was trained with other towers.
         """
         self.check_towers(towers)
-        return self.project_text(towers.embed_texts(texts).to(self._device)).cpu().numpy()
+        return self.project_text(towers.embed_texts(texts).to(self.device)).cpu().numpy()
 
     @torch.no_grad()
     def embed_image_goal(
@@ -140,7 +123,7 @@ class TouchEncoder(nn.Module):
             UserError: The encoder was trained with other towers.
         """
         self.check_towers(towers)
-        return self.project_image(towers.embed_images(images).to(self._device)).cpu().numpy()
+        return self.project_image(towers.embed_images(images).to(self.device)).cpu().numpy()
 
     def check_towers(self, towers: Towers) -> None:
         """Raises UserError unless these are the towers the encoder was trained with."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16, Int
+from jaxtyping import Float, Float16
 from torch import Tensor
 from tqdm import tqdm
 
@@ -20,28 +20,16 @@ class TouchFrames:
 
     Attributes:
         touch: Preprocessed frames; half precision, for they fill the memory.
-        of: Which fingertip of which episode each was felt with; equal numbers, equal sensor.
         wrench: What the simulator says acts on each pad (N, Nm, pad frame), for probes only;
             None if the episodes do not say.
     """
 
     touch: Float16[Tensor, "n 3 h w"]
-    of: Int[Tensor, " n"]
     wrench: Float[Tensor, "n 6"] | None
 
     def __len__(self) -> int:
         """Number of touches."""
         return len(self.touch)
-
-    def draw_partners(
-        self, rows: Int[Tensor, " b"], generator: torch.Generator
-    ) -> Int[Tensor, " b"]:
-        """For each of these touches a random one of the same fingertip and episode."""
-        _, counts = torch.unique_consecutive(self.of, return_counts=True)
-        first = counts.cumsum(0) - counts
-        group = torch.repeat_interleave(torch.arange(len(counts)), counts)[rows]
-        share = torch.rand(len(rows), generator=generator)
-        return first[group] + (share * counts[group]).long()
 
 
 def draw(episodes: EpisodeSet, sensor: str, per_episode: int, seed: int) -> TouchFrames:
@@ -62,7 +50,7 @@ def draw(episodes: EpisodeSet, sensor: str, per_episode: int, seed: int) -> Touc
         raise UserError(f"{episodes.root} has no {', '.join(sorted(missing))}: record touch")
     preprocess = preprocessor_for(sensor)
     truth = [TRUTH_PAD_WRENCH] if TRUTH_PAD_WRENCH in episodes.features else []
-    touch, of, wrench = [], [], []
+    touch, wrench = [], []
     for i in tqdm(range(len(episodes)), desc="touches", unit="episode"):
         check_sensor(episodes, i, sensor)
         rng = np.random.default_rng([seed, i])
@@ -72,10 +60,9 @@ def draw(episodes: EpisodeSet, sensor: str, per_episode: int, seed: int) -> Touc
         for side, key in enumerate(TACTILE):
             rows = preprocess(frames[key], first[key][0])
             touch.append(torch.from_numpy(rows).half())
-            of.append(torch.full((len(rows),), len(TACTILE) * i + side))
             for name in truth:
                 wrench.append(torch.from_numpy(frames[name][:, 6 * side : 6 * side + 6]))
-    return TouchFrames(torch.cat(touch), torch.cat(of), torch.cat(wrench) if truth else None)
+    return TouchFrames(torch.cat(touch), torch.cat(wrench) if truth else None)
 
 
 def check_sensor(episodes: EpisodeSet, i: int, sensor: str) -> None:

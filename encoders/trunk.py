@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from touchgoal.encoders.preprocess import TactilePreprocessor, preprocessor_for
 from touchgoal.encoders.vit import ViT, ViTConfig
 
-BATCH = 64
+BATCH = 64  # frames at once
 
 
 @dataclass(frozen=True)
@@ -38,21 +38,25 @@ class TouchTrunkConfig:
         return self.vit.width
 
 
-class TouchTrunk(nn.Module):
-    """Touch as the mean of a ViT's tokens."""
+class TouchEmbedding(nn.Module):
+    """What embeds touch, of any kind: subclasses say how preprocessed frames become embeddings."""
 
-    def __init__(self, config: TouchTrunkConfig) -> None:
-        """Builds a randomly initialised trunk; UserError for an unknown sensor."""
+    def __init__(self, sensor: str, embedding_dim: int) -> None:
+        """For a sensor; UserError for an unknown one."""
         super().__init__()
-        self.config = config
-        self.preprocess: TactilePreprocessor = preprocessor_for(config.sensor)
-        self.vit = ViT(config.vit)
+        self.preprocess: TactilePreprocessor = preprocessor_for(sensor)
+        self._width = embedding_dim
 
     def embed_touch(
         self, touch: Float[Tensor, "n 3 h w"], keep: Int[Tensor, "n k"] | None = None
     ) -> Float[Tensor, "n d"]:
         """Embeds preprocessed frames, of which only the patches in `keep` are seen if given."""
-        return self.vit.features(touch, keep)
+        raise NotImplementedError
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return next(self.parameters()).device
 
     @torch.no_grad()
     def embed_frames(
@@ -61,11 +65,26 @@ class TouchTrunk(nn.Module):
         """Embeds raw frames of one sensor, given the same sensor untouched.
 
         Raises:
-            UserError: The frames are not of this trunk's sensor.
+            UserError: The frames are not of this encoder's sensor.
         """
-        rows = np.empty((len(frames), self.config.embedding_dim), np.float32)
-        device = next(self.parameters()).device
+        rows = np.empty((len(frames), self._width), np.float32)
         for i in range(0, len(frames), BATCH):
             touch = torch.from_numpy(self.preprocess(frames[i : i + BATCH], background))
-            rows[i : i + BATCH] = self.embed_touch(touch.to(device)).cpu().numpy()
+            rows[i : i + BATCH] = self.embed_touch(touch.to(self.device)).cpu().numpy()
         return rows
+
+
+class TouchTrunk(TouchEmbedding):
+    """Touch as the mean of a ViT's tokens."""
+
+    def __init__(self, config: TouchTrunkConfig) -> None:
+        """Builds a randomly initialised trunk; UserError for an unknown sensor."""
+        super().__init__(config.sensor, config.embedding_dim)
+        self.config = config
+        self.vit = ViT(config.vit)
+
+    def embed_touch(
+        self, touch: Float[Tensor, "n 3 h w"], keep: Int[Tensor, "n k"] | None = None
+    ) -> Float[Tensor, "n d"]:
+        """See TouchEmbedding."""
+        return self.vit.features(touch, keep)

@@ -13,6 +13,7 @@ COMMANDS = {
     "collect-demos": "record expert episodes of a task, or failures to order",
     "train-encoder": "train a touch encoder",
     "train-policy": "train a policy on recorded episodes",
+    "train-policy-paper": "the same with the published network, sampler and actions",
     "run-policy": "run a policy in a task: success rate, video",
     "reward-curves": "dense cost and reward curves for episodes or plain videos",
     "calibrate": "fit a sensor's light and gel to ball presses",
@@ -25,7 +26,7 @@ COMMANDS = {
 
 def usage() -> str:
     """What `touchgoal --help` prints."""
-    lines = [f"  {name:<15}{meaning}" for name, meaning in COMMANDS.items()]
+    lines = [f"  {name:<20}{meaning}" for name, meaning in COMMANDS.items()]
     return "usage: touchgoal COMMAND [options]\n\ncommands:\n" + "\n".join(lines)
 
 

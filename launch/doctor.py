@@ -79,7 +79,7 @@ def towers() -> Finding:
 
 def weights() -> Finding:
     """The shipped touch encoder and the scale of its costs."""
-    from touchgoal.encoders.pretrained import SHIPPED, load, read_provenance
+    from touchgoal.encoders.pretrained import ENCODER, SHIPPED, load
     from touchgoal.rewards.curves import Scale
 
     try:
@@ -88,7 +88,7 @@ def weights() -> Finding:
     except UserError as error:
         return Finding("touch encoder", False, SHIPPED.name, str(error))
     count = sum(p.numel() for p in encoder.parameters()) / 1e6
-    trained = read_provenance(SHIPPED).get("episodes", "?")
+    trained = ENCODER.provenance(SHIPPED).get("episodes", "?")
     return Finding("touch encoder", True, f"{SHIPPED.name}, {count:.1f} M, {trained} episodes")
 
 

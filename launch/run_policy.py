@@ -53,7 +53,7 @@ class Config:
     workers: int = os.cpu_count() or 1
     """Processes that simulate."""
     video: bool = True
-    """Film the worst episode."""
+    """Film the worst, the median and the best episode."""
     env: PickPlaceConfig = field(default_factory=PickPlaceConfig)
     """Options of pick-place; what the policy does not look at is not rendered."""
     maze: BeadMazeConfig = field(default_factory=lambda: BeadMazeConfig(split="validation"))
@@ -61,7 +61,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Run the episodes, print the table, film the worst one."""
+    """Run the episodes, print the table, film three of them."""
     if config.episodes < 1:
         raise UserError("nothing to run: ask for at least one episode")
     if config.task == "bead-maze":
@@ -79,10 +79,10 @@ def _run_pick_place(config: Config) -> None:
     env = _observe(config.env, policy)
     out = open_run(config.out, "run-policy", config)
     trials = rollout.evaluate(env, policy, jobs, config.workers)
-    worst = min(range(len(trials)), key=lambda i: (trials[i].progress, -trials[i].error))
+    ranked = sorted(range(len(trials)), key=lambda i: (trials[i].progress, -trials[i].error))
     _report(out, trials, table(trials))
     if config.video:
-        _film(out, env, jobs[worst], policy)
+        _film(out, env, [jobs[i] for i in ranked], policy)
 
 
 def _run_maze(config: Config) -> None:
@@ -93,10 +93,10 @@ def _run_maze(config: Config) -> None:
     env = _observe(config.maze, policy)
     out = open_run(config.out, "run-policy", config)
     trials = maze_trials.evaluate(env, policy, jobs, config.workers)
-    worst = min(range(len(trials)), key=lambda i: (trials[i].progress, -trials[i].peak_force))
+    ranked = sorted(range(len(trials)), key=lambda i: (trials[i].progress, -trials[i].peak_force))
     _report(out, trials, maze_table(trials))
     if config.video:
-        _film(out, env, jobs[worst], policy)
+        _film(out, env, [jobs[i] for i in ranked], policy)
 
 
 def _follower(env: BeadMaze) -> WireFollower:
@@ -126,12 +126,18 @@ def _report(out: Path, trials: list[Trial] | list[MazeTrial], printed: str) -> N
     print(f"{printed}\nall trials: {out / 'metrics.json'}")
 
 
-def _film(out: Path, task: TaskConfig, job: Demonstration, policy: Callable[[Any], Actor]) -> None:
+def _film(
+    out: Path, task: TaskConfig, ranked: list[Demonstration], policy: Callable[[Any], Actor]
+) -> None:
+    """Films the worst episode, the median and the best; `ranked` has the worst first."""
+    places = {"worst": 0, "median": len(ranked) // 2, "best": len(ranked) - 1}
     env = make_env(replace(task, tactile=True))
-    _, frames = demonstrate_on_film(env, job, policy)
+    for name in list(places)[: len(ranked)]:
+        job = ranked[places[name]]
+        _, frames = demonstrate_on_film(env, job, policy)
+        write_video(out / f"{name}.mp4", frames, task.control_hz)
+        print(f"{name} episode (seed {job.seed}): {out / f'{name}.mp4'}")
     env.close()
-    write_video(out / "worst.mp4", frames, task.control_hz)
-    print(f"worst episode (seed {job.seed}): {out / 'worst.mp4'}")
 
 
 def summary(trials: list[Trial] | list[MazeTrial]) -> dict:

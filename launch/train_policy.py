@@ -18,11 +18,11 @@ from touchgoal.policies.acting import ActorMaker
 from touchgoal.policies.actions import Representation
 from touchgoal.policies.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.eyes import EyeConfig
-from touchgoal.policies.policy import PolicyConfig
+from touchgoal.policies.policy import PolicyConfig, TouchReading
 from touchgoal.policies.samplers import SamplerConfig
-from touchgoal.policies.selection import Score, select
+from touchgoal.policies.selection import Score, add_touch, select
 from touchgoal.policies.touch import TouchEmbedder, load_touch
-from touchgoal.policies.train import TrainConfig, train
+from touchgoal.policies.train import POLICY, TrainConfig, train
 from touchgoal.policies.unet import PRESETS
 from touchgoal.policies.windows import Windows, read
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
@@ -30,6 +30,7 @@ from touchgoal.sim_envs.objects import CATALOGUE
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.wires import choose
 
+Head = Literal["small", "published", "tiny", "regression"]
 _TRIALS = 2_000_000  # seed of the first trial
 
 
@@ -53,14 +54,16 @@ class Config:
     """Folder of the run; the policy goes to its `policy/`."""
     share: float = 1.0
     """Of the episodes to learn from, the first so many."""
-    head: Literal["small", "published", "tiny", "regression"] = "small"
+    head: Head = "small"
     """Size of the diffusion's U-Net, or regression instead."""
     sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig(plan_steps=4))
     """How the diffusion is trained and sampled."""
     representation: Representation = "chunk"
     """Of the actions while learning."""
+    touch_reading: TouchReading = "wrench"
+    """What the policy makes of a frozen embedding: the wrench on the pads, or anything ("free")."""
     touch_width: int = 64
-    """Numbers to which a frozen embedding is projected, see `PolicyConfig`."""
+    """Numbers to which a frozen embedding is projected, if freely, see `PolicyConfig`."""
     touch_noise: float = 0.5
     """Of frozen embeddings while learning, see `PolicyConfig`."""
     place_noise: float = 0.3
@@ -98,7 +101,7 @@ def main(config: Config) -> None:
     chosen = [_successful(s) for s in sets]
     chosen[0] = chosen[0][: max(1, round(config.share * len(chosen[0])))]
     windows, validation = (
-        Windows(read(s, rows, policy, touch, _cache(s, touch), config.workers), policy)
+        Windows(read(s, rows, policy, touch, config.workers), policy)
         for s, rows in zip(sets, chosen, strict=True)
     )
     print(f"{len(windows)} windows of {len(chosen[0])} episodes; {len(validation)} for validation")
@@ -108,9 +111,11 @@ def main(config: Config) -> None:
         "episodes": len(chosen[0]),
     }
     train(policy, windows, validation, config.train, out, recipe, config.resume)
-    scores = select(out, config.touch, lambda directory: _try(config, directory))
-    write_json(out / "metrics.json", {"snapshots": scores})
-    print(f"policy: {out / 'policy'}")
+    add_touch(out / POLICY, config.touch)
+    if config.trials:
+        scores = select(out, config.touch, lambda directory: _try(config, directory))
+        write_json(out / "metrics.json", {"snapshots": scores})
+    print(f"policy: {out / POLICY}")
 
 
 def _policy_config(
@@ -122,6 +127,7 @@ def _policy_config(
     return PolicyConfig(
         touch_dim=touch.dim if touch else 0,
         touch=touch.name if touch else "",
+        touch_reading=config.touch_reading,
         touch_width=config.touch_width,
         touch_noise=config.touch_noise,
         place_noise=config.place_noise,
@@ -146,15 +152,7 @@ def _successful(episodes: EpisodeSet) -> list[int]:
     return [i for i in range(len(episodes)) if episodes.meta(i).get("success", True)]
 
 
-def _cache(episodes: EpisodeSet, touch: TouchEmbedder | None) -> Path:
-    """Beside the episodes, so that every training on them shares it."""
-    name = touch.name.replace("/", "_") if touch else "none"
-    return episodes.root.parent / "embeddings" / name
-
-
 def _try(config: Config, directory: Path) -> Score:
-    if config.trials == 0:
-        return 0.0, 0.0
     maker = ActorMaker(directory)
     if config.task == "bead-maze":
         wires = choose(config.maze.split, config.trials, config.maze.families)

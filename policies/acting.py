@@ -21,7 +21,7 @@ from touchgoal.sim_envs.base import EnvConfig
 
 _WEIGHTS = Path(__file__).parent / "weights"
 Task = TypeVar("Task", bound=EnvConfig)
-SHIPPED = {"bead-maze": _WEIGHTS / "bead_maze", "pick-place": _WEIGHTS / "pick_place"}
+SHIPPED = {"bead-maze": _WEIGHTS / "bead_maze"}
 
 
 Observation = Mapping[str, np.ndarray]
@@ -144,12 +144,10 @@ class ActorMaker:
 
     Attributes:
         directory: of the policy, with its touch encoder in `touch/`.
-        seed: of the plans' noise.
         latency: see `PolicyActor`.
     """
 
     directory: Path
-    seed: int = 0
     latency: int = 0
 
     def __call__(self, env: object = None) -> PolicyActor:
@@ -160,7 +158,7 @@ class ActorMaker:
     def planner(self) -> Planner:
         """What makes its plans in one episode."""
         policy = checkpoint.load(self.directory)
-        return Planner(policy, self._touch(policy.config), self.seed)
+        return Planner(policy, self._touch(policy.config))
 
     def checked(self, task: EnvConfig) -> "ActorMaker":
         """Itself; UserError if the policy cannot act in the task."""

@@ -13,6 +13,7 @@ demonstration on an unseen maze, and leaves open how. Three readings, in mm at t
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -71,16 +72,21 @@ def _free(plan: Plan, condition: Condition, control_hz: int) -> Float[np.ndarray
     """Joints after each tick, where each plan sees the joints compounded so far."""
     kinematics = Fr3Kinematics()
     joints = condition.joints[0].numpy().astype(np.float64)
-    states, velocity, course = [], np.zeros(7), []
+    states, velocity, course = [], condition.state[0, -1, 7:14].numpy(), []
+    quaternion = np.zeros(4)
     horizon = condition.state.shape[1]
-    for touch, state in zip(condition.touch, condition.state, strict=True):
+    rows = zip(condition.touch, condition.state, strict=True)
+    for i, (touch, state) in enumerate(rows):
         position, R = kinematics.forward(joints)
         now = state[-1].clone()
         now[:7], now[7:14] = torch.from_numpy(joints), torch.from_numpy(velocity)
         now[15:18] = torch.from_numpy(position)
-        now[18:22] = torch.from_numpy(_quaternion(R))
+        mujoco.mju_mat2Quat(quaternion, R.ravel())  # as the environment's observation
+        now[18:22] = torch.from_numpy(quaternion)
         states = [*(states or [now] * horizon)[1:], now]
-        action = plan(Condition(touch[None], torch.stack(states)[None]))[0, 0, :7].numpy()
+        pictures = None if condition.pictures is None else condition.pictures[i : i + 1]
+        seen = Condition(touch[None], torch.stack(states)[None], pictures)
+        action = plan(seen)[0, 0, :7].numpy()
         velocity = action * control_hz
         joints = joints + action
         course.append(joints)
@@ -99,34 +105,21 @@ def _positions(joints: Float[np.ndarray, "... 7"]) -> Float[np.ndarray, "... 3"]
     return np.array(rows).reshape(*joints.shape[:-1], 3)
 
 
-def _quaternion(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
-    """Unit quaternion wxyz of a rotation (Bar-Itzhack 2000: the largest eigenvector)."""
-    K = np.array(
-        [
-            [R[0, 0] + R[1, 1] + R[2, 2], 0, 0, 0],
-            [R[2, 1] - R[1, 2], R[0, 0] - R[1, 1] - R[2, 2], 0, 0],
-            [R[0, 2] - R[2, 0], R[0, 1] + R[1, 0], R[1, 1] - R[0, 0] - R[2, 2], 0],
-            [R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], R[2, 2] - R[0, 0] - R[1, 1]],
-        ]
-    )
-    return np.linalg.eigh(K)[1][:, -1]  # of the lower triangle
+def zero_motion(horizon: int) -> Plan:
+    """The baseline that stands still."""
+    return lambda condition: torch.zeros(len(condition.state), horizon, 8)
 
 
-def zero_motion(condition: Condition) -> Float[Tensor, "b h 8"]:
-    """The baseline that stands still; 8 ticks."""
-    return torch.zeros(len(condition.state), 8, 8)
-
-
-def repeat_last(control_hz: int) -> Plan:
+def repeat_last(control_hz: int, horizon: int) -> Plan:
     """The baseline that goes on at the measured joint velocity."""
 
     def plan(condition: Condition) -> Float[Tensor, "b h 8"]:
         change = condition.state[:, -1, 7:14] / control_hz
-        return torch.cat([change, change[:, :1] * 0], 1)[:, None].expand(-1, 8, -1)
+        return torch.cat([change, change[:, :1] * 0], 1)[:, None].expand(-1, horizon, -1)
 
     return plan
 
 
-def always(mean: Float[Tensor, "8"]) -> Plan:
-    """The baseline that does the training's mean action, whatever it feels."""
-    return lambda condition: mean.expand(len(condition.state), 8, 8)
+def always(action: Float[Tensor, "8"], horizon: int) -> Plan:
+    """The baseline that does the same action for ever, such as the mean of demonstrations."""
+    return lambda condition: action.expand(len(condition.state), horizon, 8)

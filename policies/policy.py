@@ -1,8 +1,10 @@
 """The policy: from what both fingertips and the arm have felt to the actions of the next ticks."""
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
@@ -12,6 +14,8 @@ from touchgoal.policies.actions import ACTION_DIM, Representation, Scale, repres
 from touchgoal.policies.diffusion import Diffusion, DiffusionConfig, Regression, RegressionConfig
 from touchgoal.policies.eyes import Eye, EyeConfig
 
+TouchReading = Literal["wrench", "free"]
+WRENCH_DIM = v.FEATURES[v.TRUTH_PAD_WRENCH].shape[0]
 _FAR = 5.0  # standard deviations beyond which an input is as surprising as it gets
 
 
@@ -23,7 +27,11 @@ class PolicyConfig:
         touch_dim: of the frozen embedding of both fingertips together; 0 for a policy without
             touch.
         touch: names what made the embeddings: encoder, sensor, background.
-        touch_width: to which an embedding is projected.
+        touch_reading: how embeddings reach the head. "wrench": a small network reads the wrenches on
+            both pads out of them, which learns from what the simulator says acted there and from
+            nothing else (TacBench's force estimation, T1), and the head sees the 12 numbers.
+            "free": a projection that learns from the actions alone, for episodes without that truth.
+        touch_width: to which an embedding is projected, if freely.
         touch_noise: standard deviation of noise added to the touch while learning, of embeddings
             scaled to variance 1. Without it a network knows each recorded episode again by its
             sensors, and learns its wire by heart.
@@ -43,6 +51,7 @@ class PolicyConfig:
 
     touch_dim: int
     touch: str
+    touch_reading: TouchReading = "wrench"
     touch_width: int = 64
     touch_noise: float = 0.5
     place_noise: float = 0.3
@@ -71,6 +80,11 @@ class PolicyConfig:
                     f"prediction_horizon {self.prediction_horizon} must be a multiple of {factor} "
                     "for this U-Net"
                 )
+
+    @property
+    def reads_wrench(self) -> bool:
+        """Whether its training needs `truth.pad_wrench`."""
+        return self.touch_dim > 0 and self.touch_reading == "wrench"
 
     @property
     def state_dim(self) -> int:
@@ -112,11 +126,21 @@ class Policy(nn.Module):
         self.config = config
         ticks = config.prediction_horizon
         self.touch_scale = Scale((config.touch_dim,))
+        self.wrench_scale = Scale((WRENCH_DIM,))
         self.state_scale = Scale((config.seen_dim,))
         self.action_scale = Scale((ticks, ACTION_DIM))
-        width = config.touch_width if config.touch_dim else 0
-        # projected before the U-Net, whose FiLM would multiply the embedding's width
-        self.project = nn.Linear(config.touch_dim, width) if width else None
+        # narrowed before the U-Net, whose FiLM would multiply the embedding's width
+        self.read, width = None, 0
+        if config.reads_wrench:
+            width, hidden = WRENCH_DIM, 256
+            self.read = nn.Sequential(
+                nn.Linear(config.touch_dim, hidden), nn.Mish(),
+                nn.Linear(hidden, hidden), nn.Mish(),
+                nn.Linear(hidden, width),
+            )  # fmt: skip
+        elif config.touch_dim:
+            width = config.touch_width
+            self.read = nn.Linear(config.touch_dim, width)
         condition = config.observation_horizon * (width + config.seen_dim)
         self.eye = None
         if config.eye:
@@ -134,24 +158,44 @@ class Policy(nn.Module):
         state: Float[Tensor, "n s"],
         joints: Float[Tensor, "m 7"],
         actions: Float[Tensor, "m h 8"],
+        wrench: Float[Tensor, "n 12"] | None = None,
     ) -> None:
         """Fits the scales to training data: n ticks, and the chunks of m windows.
 
         Inputs get variance 1, actions the range -1 to 1, for each tick of the chunk by itself: the
         first of a chunk-relative plan moves an eighth of what the last does.
         """
-        if self.project is not None:
+        if self.config.touch_dim:
             self.touch_scale.fit_spread(touch)
+        if wrench is not None:
+            self.wrench_scale.fit_spread(wrench)
         self.state_scale.fit_spread(unroll(state, self.config.proprioception))
         self.action_scale.fit_range(represent(actions, joints, self.config.representation))
 
     def loss(
-        self, condition: Condition, actions: Float[Tensor, "b h 8"], generator: torch.Generator
+        self,
+        condition: Condition,
+        actions: Float[Tensor, "b h 8"],
+        generator: torch.Generator,
+        wrench: Float[Tensor, "b o 12"] | None = None,
     ) -> Float[Tensor, ""]:
-        """Training loss on windows; the generator is the CPU's."""
+        """Training loss on windows.
+
+        Args:
+            condition: what was seen.
+            actions: what was done.
+            generator: the CPU's.
+            wrench: what acted on both pads, where touch is read as that.
+        """
         chunk = represent(actions, condition.joints, self.config.representation)
-        encoded = self._encode(condition, generator)
-        return self.head.loss(self.action_scale(chunk), encoded, generator)
+        felt = self._feel(condition, generator)
+        learnt = torch.zeros((), device=felt.device)
+        if self.config.reads_wrench:
+            assert wrench is not None, "this policy learns to read wrenches"
+            learnt = F.mse_loss(felt, self.wrench_scale(wrench))
+            felt = felt.detach()
+        encoded = self._encode(condition, felt, generator)
+        return self.head.loss(self.action_scale(chunk), encoded, generator) + learnt
 
     @torch.inference_mode()
     def plan(self, condition: Condition, generator: torch.Generator) -> Float[Tensor, "b h 8"]:
@@ -159,11 +203,27 @@ class Policy(nn.Module):
 
         The same generator state (on the CPU) gives the same plan.
         """
-        chunk = self.action_scale.inverse(self.head.plan(self._encode(condition), generator))
+        encoded = self._encode(condition, self._feel(condition))
+        chunk = self.action_scale.inverse(self.head.plan(encoded, generator))
         return to_actions(chunk, condition.joints, self.config.representation)
 
-    def _encode(
+    def _feel(
         self, condition: Condition, noise: torch.Generator | None = None
+    ) -> Float[Tensor, "b o w"]:
+        """What touch tells the head, with the training's noise if there is a generator for it."""
+        if self.read is None:
+            return condition.state[..., :0]
+        touch = self.touch_scale(condition.touch).clamp(-_FAR, _FAR)
+        if noise is not None:
+            grain = torch.randn(touch.shape, generator=noise).to(touch)
+            touch = touch + self.config.touch_noise * grain
+        return self.read(touch)
+
+    def _encode(
+        self,
+        condition: Condition,
+        felt: Float[Tensor, "b o w"],
+        noise: torch.Generator | None = None,
     ) -> Float[Tensor, "b c"]:
         """What the head sees, with the training's noise if there is a generator for it."""
         config = self.config
@@ -172,12 +232,7 @@ class Policy(nn.Module):
         if noise is not None:
             shift = torch.randn(len(seen), 1, seen.shape[2], generator=noise).to(seen)
             seen = seen + config.place_noise * shift * self._places.to(seen)
-        if self.project is not None:
-            touch = self.touch_scale(condition.touch).clamp(-_FAR, _FAR)
-            if noise is not None:
-                grain = torch.randn(touch.shape, generator=noise).to(touch)
-                touch = touch + config.touch_noise * grain
-            seen = torch.cat([self.project(touch), seen], -1)
+        seen = torch.cat([felt, seen], -1)
         if self.eye is None:
             return seen.flatten(1)
         assert condition.pictures is not None, "this policy looks at pictures"

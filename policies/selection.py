@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+from touchgoal.policies import checkpoint
 from touchgoal.policies.train import POLICY, SNAPSHOTS
 
 Score = tuple[float, float]
@@ -38,4 +39,4 @@ def select(run: Path, touch: Path | None, trial: Callable[[Path], Score]) -> dic
 def add_touch(policy: Path, touch: Path | None) -> None:
     """Puts the touch encoder beside a policy's weights."""
     if touch:
-        shutil.copytree(touch, policy / "touch", dirs_exist_ok=True)
+        shutil.copytree(touch, policy / checkpoint.TOUCH, dirs_exist_ok=True)

@@ -54,5 +54,7 @@ def load_touch(directory: Path) -> TouchEmbedder:
     Embeddings are named after the weights, not after the folder, which may move.
     """
     encoder = pretrained.load_any(directory)
-    digest = hashlib.sha256(pretrained.weights_path(directory).read_bytes()).hexdigest()[:12]
+    digest = hashlib.sha256(pretrained.ENCODER.weights_path(directory).read_bytes()).hexdigest()[
+        :12
+    ]
     return TouchEmbedder(encoder, f"{encoder.config.preprocessor}/{digest}")

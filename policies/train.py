@@ -2,8 +2,6 @@
 
 import copy
 import json
-import math
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,11 +10,12 @@ import torch
 from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
+from touchgoal.encoders import resumable
 from touchgoal.policies import checkpoint, ema
 from touchgoal.policies.policy import Condition, Policy, PolicyConfig
 from touchgoal.policies.windows import Windows
 
-_CHECKPOINT, _METRICS, POLICY, SNAPSHOTS = "checkpoint.pt", "metrics.jsonl", "policy", "snapshots"
+POLICY, SNAPSHOTS = "policy", "snapshots"
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class TrainConfig:
         betas: of AdamW.
         weight_decay: of AdamW.
         warmup: steps in which the rate rises; a tenth of the training if that is shorter.
-        snapshot_epochs: a policy is kept for trial every so many epochs.
+        snapshot_epochs: a policy is kept for trial every so many epochs, and the last one.
         validation_windows: on which losses are measured, evenly spaced.
         device: of the training.
         seed: of everything random.
@@ -60,8 +59,8 @@ def train(
     """Trains a policy; its weights' average is what is kept.
 
     Writes `metrics.jsonl` (a line an epoch), `checkpoint.pt` (after every epoch), a policy to
-    `snapshots/epoch-<n>/` every so often, and the last one to `policy/`. Which snapshot acts best,
-    only closed-loop trials can tell. Killed and resumed, it ends with the same weights as
+    `snapshots/epoch-<n>/` every so often and at the end, and the last one to `policy/`. Which
+    snapshot acts best, only closed-loop trials can tell. Killed and resumed, it ends with the same weights as
     uninterrupted.
 
     Args:
@@ -79,10 +78,12 @@ def train(
     Raises:
         UserError: no such device, or a directory that does not fit `resume`.
     """
-    _check(config, out_dir, resume)
+    resumable.check(out_dir, resume, config.device)
+    if config.epochs < 1 or config.batch_size < 1 or config.snapshot_epochs < 1:
+        raise UserError("training needs epochs, batch_size and snapshot_epochs of at least 1")
     run = _Run(policy, windows, config)
     if resume:
-        run.restore(out_dir / _CHECKPOINT)
+        run.restore(out_dir)
     out_dir.mkdir(parents=True, exist_ok=True)
     for epoch in range(len(run.history), config.epochs):
         losses = {"epoch": epoch + 1, "loss": run.train_epoch(epoch)}
@@ -93,25 +94,13 @@ def train(
             "windows": len(windows),
             "metrics": run.history[-1],
         }
-        if (epoch + 1) % config.snapshot_epochs == 0:
+        if (epoch + 1) % config.snapshot_epochs == 0 or epoch + 1 == config.epochs:
             checkpoint.save(run.average, out_dir / SNAPSHOTS / f"epoch-{epoch + 1:04d}", provenance)
         if epoch + 1 == config.epochs:
             checkpoint.save(run.average, out_dir / POLICY, provenance)
         run.checkpoint(out_dir)
         tqdm.write(_line(run.history[-1], config.epochs))
     return checkpoint.load(out_dir / POLICY)
-
-
-def _check(config: TrainConfig, out_dir: Path, resume: bool) -> None:
-    exists = (out_dir / _CHECKPOINT).is_file()
-    if resume and not exists:
-        raise UserError(f"nothing to resume in {out_dir}: start without resuming")
-    if exists and not resume:
-        raise UserError(f"{out_dir} holds a run already: resume it, or choose another directory")
-    if config.device.startswith("cuda") and not torch.cuda.is_available():
-        raise UserError("no CUDA device here: choose the device cpu")
-    if config.epochs < 1 or config.batch_size < 1 or config.snapshot_epochs < 1:
-        raise UserError("training needs epochs, batch_size and snapshot_epochs of at least 1")
 
 
 class _Run:
@@ -123,7 +112,8 @@ class _Run:
             torch.manual_seed(config.seed)
             self.policy = Policy(policy)
         touch, state = windows.recorded.touch.float(), windows.recorded.state
-        self.policy.fit_scales(touch, state, windows.joints, windows.actions)
+        wrench = windows.recorded.wrench
+        self.policy.fit_scales(touch, state, windows.joints, windows.actions, wrench)
         self.policy.to(config.device)
         self.average = copy.deepcopy(self.policy).eval().requires_grad_(False)
         self.optimiser = torch.optim.AdamW(
@@ -134,18 +124,17 @@ class _Run:
         self.steps = len(windows) // self.batch_size
 
     def train_epoch(self, epoch: int) -> float:
-        """One pass, its mean loss; random by seed and epoch only, so a resumed run repeats it."""
-        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + epoch)
+        """One pass, its mean loss."""
+        count, size = len(self.windows), self.batch_size
+        generator, batches = resumable.shuffle(count, size, self.config.seed, epoch)
         self.policy.train()
-        order = torch.randperm(len(self.windows), generator=generator)
-        batches = order[: self.steps * self.batch_size].split(self.batch_size)
         total = 0.0
         progress = tqdm(batches, desc=f"epoch {epoch + 1}/{self.config.epochs}", leave=False)
         for i, rows in enumerate(progress):
             step = epoch * self.steps + i
             for group in self.optimiser.param_groups:
                 group["lr"] = _rate(self.config, step, self.config.epochs * self.steps)
-            loss = self.policy.loss(*self._take(self.windows, rows), generator)
+            loss = self._loss(self.policy, self.windows, rows, generator)
             self.optimiser.zero_grad()
             loss.backward()
             self.optimiser.step()
@@ -163,33 +152,32 @@ class _Run:
         generator = torch.Generator().manual_seed(self.config.seed)
         planned = self.average.plan(condition, generator)
         error = (planned - actions)[..., :7].sum(1).norm(dim=1).mean()
-        loss = self.average.loss(condition, actions, generator)
+        loss = self._loss(self.average, windows, rows, generator)
         return {"validation_loss": loss.item(), "validation_error": error.item()}
 
     def checkpoint(self, out_dir: Path) -> None:
-        """Writes everything needed to go on; a kill leaves the old or the new checkpoint."""
+        """Writes everything needed to go on."""
         state = {
-            "setting": self._setting(),
             "policy": self.policy.state_dict(),
             "average": self.average.state_dict(),
             "optimiser": self.optimiser.state_dict(),
-            "history": self.history,
         }
-        temporary = out_dir / f"{_CHECKPOINT}.tmp"
-        torch.save(state, temporary)
-        os.replace(temporary, out_dir / _CHECKPOINT)
-        lines = "".join(json.dumps(epoch) + "\n" for epoch in self.history)
-        (out_dir / _METRICS).write_text(lines)
+        resumable.save(out_dir, self._setting(), state, self.history)
 
-    def restore(self, path: Path) -> None:
+    def restore(self, out_dir: Path) -> None:
         """Reads a checkpoint; UserError if it is of another training."""
-        state = torch.load(path, self.config.device, weights_only=True)
-        if state["setting"] != self._setting():
-            raise UserError(f"{path} is of other episodes or another config: resume with its own")
+        state = resumable.restore(out_dir, self._setting(), self.config.device)
         self.policy.load_state_dict(state["policy"])
         self.average.load_state_dict(state["average"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.history = state["history"]
+
+    def _loss(
+        self, policy: Policy, windows: Windows, rows: torch.Tensor, generator: torch.Generator
+    ) -> torch.Tensor:
+        wrench = windows.wrench(rows)
+        wrench = None if wrench is None else wrench.to(self.config.device)
+        return policy.loss(*self._take(windows, rows), generator, wrench)
 
     def _take(self, windows: Windows, rows: torch.Tensor) -> tuple[Condition, torch.Tensor]:
         condition, actions = windows.take(rows)
@@ -205,9 +193,7 @@ class _Run:
 
 def _rate(config: TrainConfig, step: int, steps: int) -> float:
     warmup = min(config.warmup, steps // 10)
-    if step < warmup:
-        return config.lr * (step + 1) / (warmup + 1)
-    return config.lr * (1 + math.cos(math.pi * (step - warmup) / max(steps - warmup, 1))) / 2
+    return config.lr * resumable.warmed_cosine(step, steps, warmup)
 
 
 def _line(metrics: dict[str, float], epochs: int) -> str:

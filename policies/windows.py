@@ -3,7 +3,6 @@
 Touch is embedded once, by a frozen encoder, and kept on disk beside what it was made from.
 """
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,8 +23,6 @@ from touchgoal.policies.eyes import EyeConfig, shrink
 from touchgoal.policies.policy import Condition, PolicyConfig
 from touchgoal.policies.touch import TouchEmbedder
 
-_IDENTITY = "cache.json"
-
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
@@ -37,6 +34,7 @@ class Recorded:
         actions: `vocabulary.ACTION`.
         lengths: ticks of each episode.
         pictures: for the policy's eye; None without.
+        wrench: what acted on both pads (N, Nm, pad frames); None unless the policy reads it.
     """
 
     touch: Float16[Tensor, "n e"]
@@ -44,6 +42,7 @@ class Recorded:
     actions: Float32[Tensor, "n 8"]
     lengths: tuple[int, ...]
     pictures: UInt8[Tensor, "n k h w 3"] | None = None
+    wrench: Float32[Tensor, "n 12"] | None = None
 
 
 def read(
@@ -51,35 +50,34 @@ def read(
     chosen: Sequence[int],
     config: PolicyConfig,
     embedder: TouchEmbedder | None,
-    cache: Path,
     workers: int = 1,
 ) -> Recorded:
-    """Reads episodes, embedding those that the cache has not; a kill loses those in progress.
+    """Reads episodes, embedding those that are not yet; a kill loses those in progress.
 
     Args:
         episodes: the set.
         chosen: which of them, e.g. the successful ones.
         config: says which columns are read.
         embedder: of touch; None for a policy without.
-        cache: folder for the embeddings of this set by this embedder.
         workers: processes that embed.
 
     Raises:
         UserError: nothing chosen, a missing column, another rate or embedder than the config's, or
-            a cache of another set or embedder.
+            embeddings of other episodes.
     """
     _check(episodes, chosen, config, embedder)
     if embedder:
-        _open_cache(cache, episodes, embedder)
-        _fill_cache(cache, episodes, chosen, embedder, workers)
-    keys = [*config.proprioception, v.ACTION]
-    touch, state, actions, pictures = [], [], [], []
+        _fill_cache(episodes, chosen, embedder, workers)
+    keys = [*config.proprioception, v.ACTION, *[v.TRUTH_PAD_WRENCH] * config.reads_wrench]
+    touch, state, actions, pictures, wrench = [], [], [], [], []
     for i in tqdm(chosen, desc="episodes", unit="episode"):
         frames = episodes.read(i, keys).frames
         state.append(np.concatenate([frames[key] for key in config.proprioception], 1))
         actions.append(frames[v.ACTION])
+        if config.reads_wrench:
+            wrench.append(frames[v.TRUTH_PAD_WRENCH])
         if embedder:
-            touch.append(_load(episodes, i, embedder, _path(cache, i)))
+            touch.append(embeddings(episodes, i, embedder))
         else:
             touch.append(np.empty((len(actions[-1]), 0), np.float16))
         if config.eye:
@@ -89,6 +87,7 @@ def read(
         *parts,
         lengths=tuple(len(rows) for rows in actions),
         pictures=torch.from_numpy(np.concatenate(pictures)) if config.eye else None,
+        wrench=torch.from_numpy(np.concatenate(wrench)) if wrench else None,
     )
 
 
@@ -116,6 +115,11 @@ def _check(
             f"{episodes.root} is of an arm with another number of joints: policies are for the "
             f"{v.N_JOINTS} of an FR3"
         )
+    if config.reads_wrench and v.TRUTH_PAD_WRENCH not in episodes.features:
+        raise UserError(
+            f"{episodes.root} has no {v.TRUTH_PAD_WRENCH}, which only simulated episodes have: "
+            'choose touch_reading "free"'
+        )
     made = (embedder.name, embedder.dim) if embedder else ("", 0)
     if made != (config.touch, config.touch_dim):
         raise UserError(
@@ -124,31 +128,29 @@ def _check(
         )
 
 
-def _open_cache(cache: Path, episodes: EpisodeSet, embedder: TouchEmbedder) -> None:
-    identity = {"touch": embedder.name, "episodes": str(episodes.root.resolve())}
-    path = cache / _IDENTITY
-    if not path.exists():
-        cache.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(identity) + "\n")
-    if json.loads(path.read_text()) != identity:
-        raise UserError(f"{cache} caches other episodes or another encoder: choose another folder")
+def embeddings(episodes: EpisodeSet, i: int, embedder: TouchEmbedder) -> Float16[np.ndarray, "t e"]:
+    """The embeddings that `read` kept of an episode; UserError if they are another episode's."""
+    path = _path(episodes, embedder, i)
+    rows = np.load(path)
+    if rows.shape != (episodes.lengths[i], embedder.dim):
+        raise UserError(f"{path} does not fit episode {i} of {episodes.root}: delete {path.parent}")
+    return rows
 
 
-def _path(cache: Path, i: int) -> Path:
-    return cache / f"{i:06d}.npy"
+def _path(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> Path:
+    """Beside the episodes, so that every training on them shares it."""
+    folder = episodes.root.parent / "embeddings" / embedder.name.replace("/", "_")
+    return folder / f"{i:06d}.npy"
 
 
 def _fill_cache(
-    cache: Path,
-    episodes: EpisodeSet,
-    chosen: Sequence[int],
-    embedder: TouchEmbedder,
-    workers: int,
+    episodes: EpisodeSet, chosen: Sequence[int], embedder: TouchEmbedder, workers: int
 ) -> None:
-    missing = [i for i in chosen if not _path(cache, i).exists()]
+    missing = [i for i in chosen if not _path(episodes, embedder, i).exists()]
     if not missing:
         return
-    embed = partial(_embed, episodes, embedder, cache)
+    _path(episodes, embedder, 0).parent.mkdir(parents=True, exist_ok=True)
+    embed = partial(_embed, episodes, embedder)
     progress = partial(tqdm, total=len(missing), desc="embed", unit="episode")
     if workers == 1:
         list(progress(map(embed, missing)))
@@ -157,21 +159,12 @@ def _fill_cache(
         list(progress(pool.map(embed, missing)))
 
 
-def _embed(episodes: EpisodeSet, embedder: TouchEmbedder, cache: Path, i: int) -> None:
+def _embed(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> None:
     torch.set_num_threads(1)
-    rows = embedder.embed(episodes, i).astype(np.float16)
-    with open(temporary := _path(cache, i).with_suffix(".tmp"), "wb") as file:
+    rows, path = embedder.embed(episodes, i).astype(np.float16), _path(episodes, embedder, i)
+    with open(temporary := path.with_suffix(".tmp"), "wb") as file:
         np.save(file, rows)
-    os.replace(temporary, _path(cache, i))
-
-
-def _load(
-    episodes: EpisodeSet, i: int, embedder: TouchEmbedder, path: Path
-) -> Float16[np.ndarray, "t e"]:
-    rows = np.load(path)
-    if rows.shape != (episodes.lengths[i], embedder.dim):
-        raise UserError(f"{path} does not fit episode {i} of {episodes.root}: delete {path.parent}")
-    return rows
+    os.replace(temporary, path)
 
 
 class Windows:
@@ -213,3 +206,8 @@ class Windows:
         pictures = None if recorded.pictures is None else recorded.pictures[rows]
         condition = Condition(recorded.touch[seen].float(), recorded.state[seen], pictures)
         return condition, recorded.actions[self._done[rows]]
+
+    def wrench(self, rows: Int[Tensor, " b"]) -> Float[Tensor, "b o 12"] | None:
+        """What acted on both pads when some windows were seen, if it was read."""
+        wrench = self.recorded.wrench
+        return None if wrench is None else wrench[self._seen[rows]]

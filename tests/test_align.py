@@ -216,7 +216,7 @@ def test_what_is_returned_is_what_is_saved(tmp_path: Path) -> None:
     encoder = align(TRAIN, VAL, FakeTowers(), replace(CONFIG, epochs=1), tmp_path, {"data": "toy"})
     saved = pretrained.load(tmp_path / "encoder", sensor="gelsight_mini", towers="fake")
     assert torch.equal(weights(saved), weights(encoder))
-    provenance = pretrained.read_provenance(tmp_path / "encoder")
+    provenance = pretrained.ENCODER.provenance(tmp_path / "encoder")
     assert (
         provenance["data"] == "toy"
         and provenance["align"]["seed"] == 0

@@ -13,6 +13,7 @@ from touchgoal.encoders import pretrained
 from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.__main__ import COMMANDS, main, usage
+from touchgoal.policies import checkpoint
 
 
 def run(*arguments: object) -> None:
@@ -93,7 +94,7 @@ def test_train_encoder_then_use_it(episodes: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     run("train-encoder", "align", "--episodes", episodes, "--validation", episodes, "--out", out,
         "--align.vit", "tiny", "--align.epochs", 12, "--align.batch-size", 32)  # fmt: skip
-    kept = pretrained.read_provenance(out / "encoder")
+    kept = pretrained.ENCODER.provenance(out / "encoder")
     assert kept["episodes"] == 2 and kept["command"].startswith("touchgoal")
     run("reward-curves", episodes, "--encoder", out / "encoder", "--out", tmp_path / "curves")
     report = json.loads((tmp_path / "curves" / "episode_001.json").read_text())
@@ -159,6 +160,11 @@ def test_learning_the_bead_maze(
     run("benchmark", "policy-latency", "--policy", "policy/policy", "--repeats", 3,
         "--large-repeats", 0)  # fmt: skip
     assert "denoising" in capsys.readouterr().out
+    run("train-policy-paper", *both, *one, "--head", "tiny", "--sampler.plan-steps", 2, "--trials", 0,
+        "--touch", "mae/encoder", "--train.epochs", 1, "--out", "paper")  # fmt: skip
+    paper = checkpoint.load(Path("paper/policy")).config
+    assert paper.representation == "delta" and paper.touch_reading == "free"
+    assert Path("paper/policy/touch/encoder.json").is_file()
     missing = refused(capsys, "run-policy", "--task", "bead-maze", "--policy", "nowhere")
     assert "no policy in nowhere" in missing
     other = refused(capsys, "run-policy", "--task", "bead-maze", "--policy", "policy/policy",

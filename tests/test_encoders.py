@@ -246,7 +246,7 @@ def test_saved_encoder_is_the_same(tmp_path: Path) -> None:
     full = pretrained.load(tmp_path / "full", sensor="gelsight_mini", towers="fake")
     assert torch.equal(full.embed_touch(touch), encoder.embed_touch(touch))
     assert full.config == encoder.config and not full.training
-    assert pretrained.read_provenance(tmp_path / "full") == {"seed": 3}
+    assert pretrained.ENCODER.provenance(tmp_path / "full") == {"seed": 3}
 
     pretrained.save(encoder, tmp_path / "half", {})
     half = pretrained.load(tmp_path / "half")

@@ -1,0 +1,111 @@
+"""Weights on disk: a safetensors file, and a JSON beside it that says what they are.
+
+Loading is strict: whatever does not fit (format, a tensor's name or shape) is an error, for wrong
+weights give numbers that look like any others.
+"""
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from touchgoal.control.errors import UserError
+
+FORMAT = 1
+Config = TypeVar("Config")
+
+
+@dataclass(frozen=True)
+class Stored:
+    """One kind of weights, each in a folder of its own.
+
+    Attributes:
+        stem: of the two files' names.
+        what: it is called to people.
+        remedy: what to do if there is none.
+    """
+
+    stem: str
+    what: str
+    remedy: str
+
+    def weights_path(self, directory: Path) -> Path:
+        """The file of the weights."""
+        return directory / f"{self.stem}.safetensors"
+
+    def save(
+        self,
+        directory: Path,
+        weights: dict[str, Tensor],
+        config: dict[str, Any],
+        provenance: dict[str, Any],
+    ) -> None:
+        """Writes both files; older ones in the directory, made if needed, are replaced."""
+        directory.mkdir(parents=True, exist_ok=True)
+        paths = self.weights_path(directory), self._json(directory)
+        partial = [path.with_suffix(f"{path.suffix}.tmp") for path in paths]
+        description = {"format": FORMAT, "config": config, "provenance": provenance}
+        save_file({name: weight.contiguous() for name, weight in weights.items()}, partial[0])
+        partial[1].write_text(json.dumps(description, indent=2) + "\n")
+        for temporary, path in zip(partial, paths, strict=True):
+            os.replace(temporary, path)
+
+    def describe(self, directory: Path) -> dict[str, Any]:
+        """The JSON; UserError if there is none, or it is damaged or of another format."""
+        path = self._json(directory)
+        if not path.is_file():
+            raise UserError(f"no {self.what} in {directory}: {self.remedy}")
+        try:
+            description = json.loads(path.read_text())
+            version = description["format"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise UserError(f"{path} is damaged: {self.remedy}") from error
+        if version != FORMAT:
+            raise UserError(
+                f"{path} has format {version}, this touchgoal reads {FORMAT}: {self.remedy}"
+            )
+        return description
+
+    def provenance(self, directory: Path) -> dict[str, Any]:
+        """What `save` was told about the training; UserError as for `describe`."""
+        return self.describe(directory)["provenance"]
+
+    def read_config(self, directory: Path, build: Callable[[dict[str, Any]], Config]) -> Config:
+        """The config, built from its JSON; UserError if that cannot be done."""
+        try:
+            return build(dict(self.describe(directory)["config"]))
+        except (KeyError, TypeError) as error:
+            raise UserError(
+                f"{self._json(directory)} is damaged ({error}): {self.remedy}"
+            ) from error
+
+    def fill(self, module: nn.Module, directory: Path) -> None:
+        """Loads the weights, as float32, for inference; UserError if they do not fit."""
+        path = self.weights_path(directory)
+        if not path.is_file():
+            raise UserError(f"{path} is missing: {self.remedy}")
+        try:
+            weights = load_file(path)
+        except (SafetensorError, OSError) as error:
+            raise UserError(f"{path} is damaged: {self.remedy}") from error
+        expected = {name: tuple(weight.shape) for name, weight in module.state_dict().items()}
+        found = {name: tuple(weight.shape) for name, weight in weights.items()}
+        wrong = [name for name in expected | found if expected.get(name) != found.get(name)]
+        if wrong:
+            name = wrong[0]
+            raise UserError(
+                f"{path} does not fit its {self.stem}.json: {name} is {found.get(name)}, not "
+                f"{expected.get(name)} ({len(wrong)} tensors differ): {self.remedy}"
+            )
+        module.load_state_dict({name: weight.to(torch.float32) for name, weight in weights.items()})
+        module.eval().requires_grad_(False)
+
+    def _json(self, directory: Path) -> Path:
+        return directory / f"{self.stem}.json"

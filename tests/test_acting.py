@@ -1,0 +1,88 @@
+"""Acting by plans: in order, on time, with a planner that is slow or fails."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from toy_policies import TOY, feeling, policy_for, rng, toy_ticks, toy_windows
+
+from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
+from touchgoal.policies.acting import Planner, PolicyActor
+from touchgoal.policies.policy import Condition, Policy
+from touchgoal.policies.realtime import RealTimeActor
+from touchgoal.policies.touch import TouchEmbedder
+
+
+@pytest.mark.parametrize("latency", [0, 1, 3])
+def test_an_actor_does_its_plans_in_order_and_on_time(latency: int) -> None:
+    touch = feeling()
+    config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
+    policy, ticks = policy_for(config, toy_windows(config)).eval(), toy_ticks(8)
+    actor = PolicyActor(Planner(policy, touch, seed=5), latency)
+    done = [actor.act(dict(tick)) for tick in ticks]  # nobody else keeps them
+    rows = np.stack([touch.embed_tick(tick, ticks[0]) for tick in ticks])
+    states = np.stack([np.concatenate([tick[v.STATE], tick[v.TCP_POSE]]) for tick in ticks])
+    generator, expected = rng(5), []
+    for asked in range(0, 8, 3):  # ticks on whose observation a plan is made
+        asked = max(asked - latency, 0)
+        seen = [max(asked - 1, 0), asked]
+        condition = Condition(
+            torch.from_numpy(rows[seen])[None], torch.from_numpy(states[seen])[None]
+        )
+        plan = policy.plan(condition, generator)[0].numpy()
+        first = latency if expected else 0
+        expected += list(plan[first : first + 3])
+    np.testing.assert_allclose(done, expected[:8], rtol=1e-5)
+
+
+def test_an_actor_refuses_what_it_cannot_do() -> None:
+    touch = feeling()
+    policy = Policy(replace(TOY, touch_dim=touch.dim))
+    with pytest.raises(UserError, match="load the touch encoder"):
+        Planner(policy, None)
+    with pytest.raises(UserError, match="feels through 'toy', not 'another'"):
+        Planner(policy, TouchEmbedder(touch.encoder, "another"))
+    with pytest.raises(UserError, match="5 ticks late"):
+        PolicyActor(Planner(policy, touch), latency=5)
+
+
+class SlowPlanner(Planner):
+    """Takes its time; remembers its plans."""
+
+    def __init__(self, policy: Policy, pause: float) -> None:
+        super().__init__(policy, None)
+        self.pause, self.plans = pause, []
+
+    def plan(self, seen):
+        time.sleep(self.pause if self.plans else 0.0)
+        actions = super().plan(seen)
+        self.plans.append((int(seen[-1][v.STATE][0]), actions))
+        return actions
+
+
+def test_a_late_plan_is_joined_where_it_should_be_by_now() -> None:
+    """Every action is one that a plan meant for this very tick; none waits for a plan."""
+    config = replace(TOY, touch_dim=0, touch="", execution_horizon=3)
+    planner = SlowPlanner(policy_for(config, toy_windows(config)).eval(), pause=0.05)
+    actor, done = RealTimeActor(planner), []
+    for i, tick in enumerate(toy_ticks(40)):
+        tick[v.STATE][0] = i
+        done.append(actor.act(tick))
+        time.sleep(0.02)
+    actor.close()
+    for i, action in enumerate(done):
+        meant = [p[i - tick] for tick, p in planner.plans if 0 <= i - tick < 8]
+        assert any(np.array_equal(action, m) for m in meant) or not action[:7].any()
+    assert len(planner.plans) > 4 and sum(not a[:7].any() for a in done) == actor.starved
+    assert len(actor.latencies) == len(planner.plans) - 1
+
+
+def test_a_failing_planner_stops_the_actor() -> None:
+    config = replace(TOY, touch_dim=0, touch="")
+    actor = RealTimeActor(Planner(policy_for(config, toy_windows(config)).eval(), None))
+    with pytest.raises(KeyError):
+        actor.act({})
+    actor.close()

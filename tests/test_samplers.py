@@ -1,0 +1,125 @@
+"""Samplers against closed forms and against diffusers; the U-Net against the published one."""
+
+import pytest
+import torch
+from toy_policies import rng
+
+from touchgoal.control.errors import UserError
+from touchgoal.policies.samplers import (
+    FLOW_STEPS,
+    SamplerConfig,
+    mend,
+    signal_power,
+    spoil,
+    visited,
+)
+from touchgoal.policies.unet import PRESETS, ShortConv1d, UNet
+
+MEAN, DEVIATION = 0.4, 0.3  # of the Gaussian that the exact denoisers know
+
+
+def test_unet_is_the_published_one() -> None:
+    """Parameters of diffusion_policy's network for 7 actions and 1550 conditions: 87.4 M."""
+    with torch.device("meta"):
+        published = UNet(PRESETS["published"], 7, 1550)
+    assert sum(p.numel() for p in published.parameters()) == 87_439_623
+    small = UNet(PRESETS["tiny"], 7, 5)
+    chunk, step, condition = torch.randn(3, 8, 7), torch.tensor([0.0, 50.0, 99.0]), torch.ones(3, 5)
+    out = small(chunk, step, condition)
+    assert out.shape == chunk.shape
+    assert not torch.allclose(small(chunk, step + 1, condition), out, atol=1e-5)
+    assert not torch.allclose(small(chunk, step, condition + 1), out, atol=1e-5)
+
+
+@pytest.mark.parametrize("ticks", [1, 2, 8])
+def test_short_convolution_is_a_convolution(ticks: int) -> None:
+    x, conv = torch.randn(3, 4, ticks, generator=rng()), ShortConv1d(4, 6, 5)
+    expected = torch.nn.functional.conv1d(x, conv.weight, conv.bias, padding=2)
+    torch.testing.assert_close(conv(x), expected)
+
+
+def exact(config: SamplerConfig):
+    """What a perfect network answers for samples of one Gaussian."""
+
+    def network(x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+        if config.kind == "flow":
+            t = step[0] / FLOW_STEPS
+            gain = (t * DEVIATION**2 - (1 - t)) / (t**2 * DEVIATION**2 + (1 - t) ** 2)
+            velocity = MEAN + gain * (x - t * MEAN)
+            return velocity if config.predict == "velocity" else x + (1 - t) * velocity
+        power = signal_power(config.train_steps)[int(step[0])].float()
+        gain = DEVIATION**2 * power.sqrt() / (DEVIATION**2 * power + 1 - power)
+        clean = MEAN + gain * (x - power.sqrt() * MEAN)
+        if config.predict == "sample":
+            return clean
+        return (x - power.sqrt() * clean) / (1 - power).sqrt()
+
+    return network
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        SamplerConfig("ddim", "sample", 1000, 200, clip=9),
+        SamplerConfig("ddim", "epsilon", 1000, 200, clip=9),
+        SamplerConfig("ddpm", "sample", 1000, 1000, clip=9),
+        SamplerConfig("flow", "velocity", plan_steps=200, clip=9),
+        SamplerConfig("flow", "sample", plan_steps=200, clip=9),
+    ],
+    ids=lambda c: f"{c.kind}-{c.predict}",
+)
+def test_exact_denoiser_gives_the_gaussian_back(config: SamplerConfig) -> None:
+    noise = torch.randn(4000, 4, 1, generator=rng())
+    samples = mend(config, exact(config), noise, rng(1))
+    assert samples.mean().item() == pytest.approx(MEAN, abs=0.01)
+    assert samples.std().item() == pytest.approx(DEVIATION, rel=0.03)
+
+
+@pytest.mark.parametrize("predict", ["epsilon", "sample"])
+def test_forward_process_has_the_schedules_statistics(predict: str) -> None:
+    config = SamplerConfig(predict=predict, train_steps=10)  # pyright: ignore[reportArgumentType]
+    clean = torch.full((20_000, 2, 1), 0.7)
+    noisy, step, wanted = spoil(config, clean, rng())
+    for t, power in enumerate(signal_power(10).tolist()):
+        at = noisy[step == t]
+        assert at.mean().item() == pytest.approx(0.7 * power**0.5, abs=0.05)
+        assert at.std().item() == pytest.approx((1 - power) ** 0.5, rel=0.05)
+    power = signal_power(10)[step.long()].float().view(-1, 1, 1)
+    noise = wanted if predict == "epsilon" else (noisy - power.sqrt() * wanted) / (1 - power).sqrt()
+    assert noise.std().item() == pytest.approx(1, abs=0.02)
+
+
+def test_flow_goes_straight() -> None:
+    clean = torch.randn(50, 4, 2, generator=rng())
+    noisy, step, velocity = spoil(SamplerConfig("flow", "velocity"), clean, rng(1))
+    left = 1 - step.view(-1, 1, 1) / FLOW_STEPS
+    torch.testing.assert_close(noisy + left * velocity, clean)
+
+
+def test_plans_start_from_noise_alone() -> None:
+    assert visited(SamplerConfig(plan_steps=4)).tolist() == [99, 74, 49, 24]
+    assert signal_power(100)[-1] < 1e-4
+    with pytest.raises(UserError, match="ask for fewer"):
+        SamplerConfig(plan_steps=101)
+    with pytest.raises(UserError, match="cannot predict velocity"):
+        SamplerConfig("ddim", "velocity")
+
+
+@pytest.mark.parametrize("kind", ["ddpm", "ddim"])
+def test_samplers_equal_diffusers(kind: str) -> None:
+    diffusers = pytest.importorskip("diffusers")
+    options = {
+        "num_train_timesteps": 100,
+        "beta_schedule": "squaredcos_cap_v2",
+        "timestep_spacing": "trailing",
+    }
+    theirs = (diffusers.DDPMScheduler if kind == "ddpm" else diffusers.DDIMScheduler)(**options)
+    steps = 100 if kind == "ddpm" else 10
+    theirs.set_timesteps(steps)
+    config = SamplerConfig(kind, "epsilon", plan_steps=steps)  # pyright: ignore[reportArgumentType]
+    x = noise = torch.randn(3, 8, 2, generator=rng())
+    generator, more = rng(1), {"use_clipped_model_output": True} if kind == "ddim" else {}
+    for t in theirs.timesteps:
+        x = theirs.step(x.tanh(), t, x, generator=generator, **more).prev_sample
+    ours = mend(config, lambda x, t: x.tanh(), noise, rng(1))
+    torch.testing.assert_close(ours, x, atol=1e-3, rtol=1e-3)
