@@ -64,7 +64,7 @@ class Config:
     """What the policy makes of a frozen embedding: the wrench on the pads, or anything ("free")."""
     touch_width: int = 64
     """Numbers to which a frozen embedding is projected, if freely, see `PolicyConfig`."""
-    touch_noise: float = 0.5
+    touch_noise: float = 0.1
     """Of frozen embeddings while learning, see `PolicyConfig`."""
     place_noise: float = 0.3
     """Of joint and TCP positions while learning, see `PolicyConfig`."""

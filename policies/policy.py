@@ -53,7 +53,7 @@ class PolicyConfig:
     touch: str
     touch_reading: TouchReading = "wrench"
     touch_width: int = 64
-    touch_noise: float = 0.5
+    touch_noise: float = 0.1
     place_noise: float = 0.3
     eye: EyeConfig | None = None
     proprioception: tuple[str, ...] = (v.STATE, v.TCP_POSE)

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from touchgoal.control.load_cell import seal
+from touchgoal.control.modbus import crc
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH
 from touchgoal.sim_envs.twin.cell import DT, Cell
 
@@ -74,10 +76,10 @@ class SerialPort:
 
 
 class LoadCell:
-    """A load cell under the table: lines `milliseconds,counts*XOR`, 80 a second.
+    """A load cell under the table: lines `milliseconds,counts*CRC`, 80 a second.
 
-    Force in N is `NEWTONS_PER_COUNT * (counts - ZERO)`; XOR is of all bytes before the star, as two
-    hexadecimal digits.
+    Force in N is `NEWTONS_PER_COUNT * (counts - ZERO)`; CRC is Modbus' CRC-16 of all bytes before
+    the star, as four hexadecimal digits.
     """
 
     def __init__(self, cell: Cell, path: Path) -> None:
@@ -97,7 +99,7 @@ class LoadCell:
         counts = ZERO + self.cell.env.table_load() / NEWTONS_PER_COUNT
         counts += self._rng.normal(0.0, _LOAD_NOISE)
         line = f"{self._milliseconds},{round(counts)}".encode()
-        self.port.write(line + b"*%02X\r\n" % int(np.bitwise_xor.reduce(bytearray(line))))
+        self.port.write(seal(line, "crc16") + b"\r\n")
 
     def close(self) -> None:
         """Pull the plug."""
@@ -190,16 +192,6 @@ class Robotiq:
         share = min(max(1 - self._width / GRIPPER_MAX_WIDTH, 0.0), 1.0)
         position = round(opened + share * (closed - opened))
         return bytes([first, 0, 0, self._orders[3], position, 0])
-
-
-def crc(frame: bytes) -> bytes:
-    """Modbus' CRC-16, low byte first."""
-    value = 0xFFFF
-    for byte in frame:
-        value ^= byte
-        for _ in range(8):
-            value = value >> 1 ^ (0xA001 if value & 1 else 0)
-    return struct.pack("<H", value)
 
 
 def _request_length(unread: bytes) -> int:
