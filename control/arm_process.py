@@ -165,7 +165,7 @@ class ArmProcess:
     """The Arm protocol over an ArmClient in a child process."""
 
     def __init__(
-        self, client: type[ArmClient], config: ArmConfig, connect_timeout: float = 10.0
+        self, client: type[ArmClient], config: ArmConfig, connect_timeout: float = 30.0
     ) -> None:
         self._make = lambda recover: Child(client, config, recover, connect_timeout=connect_timeout)
         self._child = self._make(False)

@@ -223,8 +223,9 @@ def _of_twin(rig: dict[str, Any]) -> dict[str, Any]:
             **rig["options"],
         },
     }
-    if rig["lock_step"]:
-        table["safety"] = {"silence": 2.0}
+    table["safety"] = {"silence": 2.0} if rig["lock_step"] else {}
+    if not pick_place:
+        table["safety"]["force"] = 25.0  # a wire pushes back; the controller's reflex is at 30
     if sides:
         table["fingertips"] = {"sensor": rig["sensor"], **sides, **slow}
     return table

@@ -10,7 +10,7 @@ from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.control.rig import Rig
 from touchgoal.control.safety import Safety
-from touchgoal.policies.acting import SHIPPED, ActorMaker
+from touchgoal.policies.acting import SHIPPED, ActorMaker, Planner
 from touchgoal.policies.deployment import DeployedActor
 from touchgoal.policies.follower import WireFollower
 from touchgoal.policies.realtime import RealTimeActor
@@ -18,6 +18,7 @@ from touchgoal.policies.scripted import Place, pick_and_place
 from touchgoal.sim_envs.base import EnvConfig, Observation
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
+from touchgoal.sim_envs.scene import SERVO_DAMPING
 
 
 class Follower:
@@ -37,9 +38,27 @@ class Follower:
 
 
 class Learned(RealTimeActor):
-    """A policy's plans in the loop; it never ends by itself."""
+    """A policy's plans in the loop; it never ends by itself.
+
+    It has learned on an arm whose servo follows with a lag. One that follows at once answers its
+    corrections too soon, and in contact the two then shake each other: so the lag is put back.
+    """
 
     done = False
+
+    def __init__(self, planner: Planner) -> None:
+        """See RealTimeActor."""
+        super().__init__(planner)
+        self._share = 1 - float(np.exp(-1 / (planner.config.control_hz * SERVO_DAMPING)))
+        self._left = np.zeros(v.N_JOINTS)  # rad, wanted and not yet passed on
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """See DeployedActor."""
+        action = super().act(observation)
+        self._left = self._left + action[:-1]
+        step = self._share * self._left
+        self._left = self._left - step
+        return np.append(step, action[-1])
 
 
 def learned(rig: Rig) -> ActorMaker | None:

@@ -18,6 +18,7 @@ from touchgoal.control.safety import Safety
 from touchgoal.control.sensors import find_sensor
 from touchgoal.control.station import Station
 from touchgoal.control.touch.contact import contact_strength
+from touchgoal.control.touch.markers import find_markers, without_markers
 from touchgoal.control.touch.photometry import load
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.policies.deployed import learned
@@ -131,8 +132,11 @@ def _camera(camera: Camera, rate: float, nominal: float) -> str:
         raise UserError(camera.trouble)
     untouched = ""
     if isinstance(camera, TactileSensor):
-        frame = camera.read().image
-        background = load(camera.model.sensor_file).background
+        frame, model = camera.read().image, camera.model
+        if model.markers is not None:  # every unit's dots lie elsewhere
+            dots = find_markers(frame, model.markers, model.pixel_pitch).positions
+            frame = without_markers(frame, dots, model.markers.diameter / model.pixel_pitch / 2)
+        background = load(model.sensor_file).background
         # A unit differs from the sensor file's; a contact is told by far more than that.
         strength = float(contact_strength(frame[None], background)[0])
         if strength > _TOUCHED:

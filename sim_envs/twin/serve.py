@@ -137,6 +137,7 @@ class Twin:
             ports["gripper"] = robotiq.port
             widths = [GRIPPER_MAX_WIDTH, 0.0]
             gripper = {"kind": "robotiq", "port": str(robotiq.port.path), "widths": widths}
+        gripper["force"] = cell.env.grasp_force  # with which the episode's object is to be held
         services.append(streams := Streams(cell, host, config.port))
         control = config.port + 1 if config.port else 0
         services.append(faults := Faults(cell, arm, streams.streams, ports, host, control))
