@@ -68,7 +68,7 @@ CASES = (
     Case("server killed in motion", "kill"),
     Case("link frozen 0.1 s", "freeze 0.1"),
     Case("link frozen 0.5 s", "freeze 0.5"),
-    Case("link frozen 2 s", "freeze 4"),
+    Case("link frozen 2 s", "freeze 2"),
     Case("camera stalled", "stall front 60"),
     Case("camera frozen on a frame", "repeat front 60"),
     Case("fingertip unplugged", "lose tactile_left 60"),

@@ -82,7 +82,8 @@ class TaskRig:
         goal: for the expert, where on the table it is to go: x, y (m).
         twin: control port of a twin, which is asked for both, and for success.
         seed, object, wire: of a simulated arm's episode.
-        rewards: goals of the cost shown on line, as of reward-curves.
+        rewards: goals of the cost that is shown and recorded live, as those of reward-curves:
+            episode:ROOT#K, image:PATH, text:SENTENCE.
     """
 
     name: Literal["pick-place", "bead-maze"]

@@ -15,6 +15,7 @@ WRIST = "observation.images.wrist"
 TACTILE_LEFT = "observation.images.tactile_left"
 TACTILE_RIGHT = "observation.images.tactile_right"
 ACTION = "action"
+COST = "cost"  # of deployed episodes whose rig names a goal
 
 TACTILE = (TACTILE_LEFT, TACTILE_RIGHT)
 CAMERAS = (FRONT, WRIST)
@@ -81,6 +82,12 @@ FEATURES: dict[str, Feature] = {
     TACTILE_LEFT: Feature("uint8", TACTILE_SHAPE, _IMAGE_NAMES, "left fingertip sensor, RGB"),
     TACTILE_RIGHT: Feature("uint8", TACTILE_SHAPE, _IMAGE_NAMES, "right fingertip sensor, RGB"),
     ACTION: _of_joints(N_JOINTS)[ACTION],
+    COST: Feature(
+        "float32",
+        (1,),
+        ("cost",),
+        "distance to the goal as measured in the run: 1 at the usual start, 0 at the usual end",
+    ),
     TRUTH_PAD_WRENCH: Feature(
         "float32",
         (12,),

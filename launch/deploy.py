@@ -22,11 +22,16 @@ from touchgoal.control.protocols import DriverError
 from touchgoal.control.rig import Rig, read_rig, simulated
 from touchgoal.control.safety import Safety
 from touchgoal.control.station import Station, open_station, watchdogs_of
+from touchgoal.encoders import pretrained
+from touchgoal.encoders.towers import load_towers
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.launch.terminal import HELP, Terminal
 from touchgoal.policies.deployed import learned, make_actor
 from touchgoal.policies.preflight import preflight
 from touchgoal.policies.session import Result, Session
+from touchgoal.rewards.curves import Scale
+from touchgoal.rewards.goals import parse_goal
+from touchgoal.rewards.live import LiveCost
 from touchgoal.sim_envs.simulated import simulate
 from touchgoal.sim_envs.twin.faults import ask
 
@@ -73,7 +78,7 @@ def _deploy(config: Config, rig: Rig, station: Station, out: Path) -> Result:
     require(findings)
     if config.execute and not config.yes:
         _confirm(rig)
-    maker, terminal = learned(rig), Terminal()
+    maker, terminal, cost = learned(rig), Terminal(), _cost(rig)
     truth = station.truth or (partial(ask, rig.task.twin, "truth") if rig.task.twin else None)
     # Scripts end by themselves; of others only a simulator knows when the task is done.
     endless = rig.task.policy != "expert"
@@ -90,12 +95,25 @@ def _deploy(config: Config, rig: Rig, station: Station, out: Path) -> Result:
             wanted=terminal.wanted if judge is None else lambda: terminal.wanted() or judge.read(),
             show=terminal.show,
             truth=truth,
+            cost=cost.look if cost else None,
         )
         try:
             return session.run()
         finally:
+            if cost is not None:
+                cost.close()
             if judge is not None:
                 judge.close()
+
+
+def _cost(rig: Rig) -> LiveCost | None:
+    """What measures the distance to the rig's goals, on the shipped encoder."""
+    if not rig.task.rewards:
+        return None
+    encoder = pretrained.load(pretrained.SHIPPED, sensor=rig.sensor)
+    scale = Scale.load(pretrained.SHIPPED / "scale.json")
+    goals = [parse_goal(text) for text in rig.task.rewards]
+    return LiveCost(load_towers(encoder.config.towers), encoder, scale, goals)
 
 
 def _done(truth: Callable[[], dict[str, Any]]) -> str:

@@ -20,14 +20,9 @@ _REFRESH = 4  # ticks between lines
 
 
 class Terminal:
-    """Asked every tick what the operator wants; shows every few ticks what happens.
-
-    Attributes:
-        cost: distance to the goal, if it is measured.
-    """
+    """Asked every tick what the operator wants; shows every few ticks what happens."""
 
     def __init__(self) -> None:
-        self.cost = ""
         self._asked, self._count = "", 0
         self._keys = sys.stdin.isatty()
 
@@ -48,9 +43,10 @@ class Terminal:
         acted = ", ".join(state.acted)
         mode = state.mode if state.mode is not Mode.MOVE or not acted else f"{state.mode} ({acted})"
         force = float(np.linalg.norm(sensed.arm.wrench[:3]))
+        cost = "" if view.cost is None else f"cost {view.cost:5.2f}"
         line = (
             f"{view.seconds:6.1f} s  {mode:<24}  {force:5.1f} N  gel {1e3 * sensed.touch.max():3.1f} mm  gripper {1e3 * view.width:3.0f} mm"
-            f"  pictures {1e3 * sensed.age:4.0f} ms  late {1e3 * view.late:4.1f} ms  {self.cost}"
+            f"  pictures {1e3 * sensed.age:4.0f} ms  late {1e3 * view.late:4.1f} ms  {cost}"
         )
         print(f"\r{line[:118]:<118}", end="", flush=True)
 

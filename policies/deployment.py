@@ -102,13 +102,14 @@ class Ticks:
 
 @dataclass(frozen=True)
 class View:
-    """A tick, for whoever watches."""
+    """A tick, for whoever watches; no cost without a goal."""
 
     seconds: float
     state: SafetyState
     sensed: Sensed
     width: float
     late: float
+    cost: float | None
 
 
 class Deployment:
@@ -126,6 +127,7 @@ class Deployment:
         execute: bool,
         wanted: Callable[[], str],
         show: Callable[[View], None],
+        cost: Callable[[Observation], float] | None = None,
     ) -> None:
         """The arm is at rest.
 
@@ -135,12 +137,13 @@ class Deployment:
             execute: False: a dry run.
             wanted: asked every tick: "stop" (a person wants that), "done" (likewise), or "".
             show: told of every tick; must not wait.
+            cost: measures how far from its goal a tick is, for the view and the record.
 
         Raises:
             UserError: the arm rests where it may not be.
         """
         self._station, self._safety, self._execute = station, safety, execute
-        self._wanted, self._show = wanted, show
+        self._wanted, self._show, self._cost = wanted, show, cost
         self.senses = Senses(station)
         self.state = safety.start(station.arm.read().q)
         self.width = station.gripper.read().width
@@ -220,14 +223,18 @@ class Deployment:
         self.width = self._safety.width(self.state, float(action[-1]), self.width)
         for limit in self.state.acted:
             ticks.acted[limit] = ticks.acted.get(limit, 0) + 1
-        self._show(View(seconds, self.state, sensed, self.width, late))
+        cost = self._cost(sensed.observation) if self._cost else None
+        self._show(View(seconds, self.state, sensed, self.width, late, cost))
         if self.state.fault is not None:
             return self._at_fault(sensed)
         if self._execute:
             self._station.arm.command(self.state.q)
             self._station.gripper.command(self.width)
         done = np.append(self.state.q - before.q, self.width).astype(np.float32)
-        ticks.rows.append({**sensed.observation, v.ACTION: done})
+        row = {**sensed.observation, v.ACTION: done}
+        if cost is not None:
+            row[v.COST] = np.array([cost], np.float32)
+        ticks.rows.append(row)
         return None
 
     def _at_fault(self, sensed: Sensed) -> Ending:

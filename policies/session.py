@@ -16,6 +16,7 @@ from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.policies.deployment import DeployedActor, Deployment, Ending, Ticks, View
 from touchgoal.policies.scripted import start_move
+from touchgoal.sim_envs.base import Observation
 
 _AT_START = 0.02  # rad from the start pose after the start move
 _NEAR = 0.1  # rad; nearer than that no start move is made
@@ -49,7 +50,7 @@ class Session:
     Attributes:
         execute: False: a dry run, which records nothing.
         make: the actor, when the arm is at its start.
-        wanted, show: see Deployment.
+        wanted, show, cost: see Deployment.
         truth: what a simulator knows.
     """
 
@@ -62,6 +63,7 @@ class Session:
     wanted: Callable[[], str]
     show: Callable[[View], None]
     truth: Callable[[], dict[str, Any]] | None
+    cost: Callable[[Observation], float] | None = None
 
     def run(self) -> Result:
         """Start move, task, recording; the arm is at rest or holds its last command at the end.
@@ -69,7 +71,9 @@ class Session:
         Raises:
             UserError, DriverError: it cannot even begin; nothing has moved.
         """
-        deployment = Deployment(self.station, self.safety, self.execute, self.wanted, self.show)
+        deployment = Deployment(
+            self.station, self.safety, self.execute, self.wanted, self.show, self.cost
+        )
         ticks = Ticks()
         ending = self._to_start(deployment)
         if ending is None:
