@@ -37,6 +37,7 @@ from touchgoal.sim_envs.twin.faults import ask
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 
 _PATIENCE = 60.0  # s for anything to happen
+_UNLIMITED = resource.RLIM_INFINITY
 _SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -90,8 +91,8 @@ class Row:
 
     Attributes:
         seen: what the operator is told.
-        rest: s (simulated) from the fault, or from the stop if it has no moment, until the arm is
-            at rest; not a number if the twin could not say.
+        rest: s (simulated) from the fault until the arm is at rest; not a number if the fault stops
+            no arm, or takes the controller, and so the twin, away.
         excess: rad beyond the maker's joint range; speed: share of the maker's joint speed.
         kept: finished episodes that were there before and are still whole.
         late: ms by which 99 % of the ticks were late at most.
@@ -124,12 +125,13 @@ def _run(case: Case, folder: Path, lock_step: bool, number: int) -> Row:
     folder.mkdir()
     pid = os.getpid()
     host = f"127.{60 + number}.{pid // 250 % 250}.{1 + pid % 250}"
+    broke = folder / "broke"
     twin = _spawn(_serve, host, folder, lock_step)
     _until(lambda: (folder / "rig.json").exists() or not twin.is_alive())
     rig = read_rig(folder / "rig.json")
     rig = replace(rig, task=replace(rig.task, start=None))
     episodes, said = folder / "episodes", folder / "said"
-    deploy = _spawn(_deploy, rig, case, episodes, said)
+    deploy = _spawn(_deploy, rig, case, episodes, said, broke)
     try:
         before, after = _inject(case, rig, deploy, said)
         deploy.join(_PATIENCE)
@@ -144,9 +146,12 @@ def _run(case: Case, folder: Path, lock_step: bool, number: int) -> Row:
     elif not hung:
         seen = "its process is gone; the driver's child brings the arm to rest"
     worst = after["worst"] if after else {"excess": float("nan"), "speed": float("nan")}
-    rest = after["time"] - after["rest"] - before if after else float("nan")
+    if broke.exists():
+        before = float(broke.read_text())
+    stops = case.kills or case.line or broke.exists()
+    rest = after["time"] - after["rest"] - before if after and stops else float("nan")
     kept = len(EpisodeSet(episodes)) >= 1 and not _damaged(episodes)
-    return Row(case.name, seen, max(rest, 0.0), worst["excess"], worst["speed"], kept, float(late))
+    return Row(case.name, seen, rest, worst["excess"], worst["speed"], kept, float(late))
 
 
 def _inject(
@@ -167,10 +172,7 @@ def _inject(
             ask(port, case.line)
         except UserError:  # the twin is gone, as asked
             return moment, None
-    if case.name in ("none", "link frozen 0.1 s", "disk full"):
-        deploy.join(_PATIENCE)
-    else:
-        _until(lambda: said.exists() or case.kills or not deploy.is_alive())
+    _until(lambda: said.exists() or case.kills or not deploy.is_alive())
     _until(lambda: truth()["rest"] > 0.2)
     return moment, truth()
 
@@ -184,7 +186,7 @@ def _serve(host: str, folder: Path, lock_step: bool) -> None:
     twin.run()
 
 
-def _deploy(rig: Rig, case: Case, episodes: Path, said: Path) -> None:
+def _deploy(rig: Rig, case: Case, episodes: Path, said: Path, broke: Path) -> None:
     """The deployment's process; a first, short episode is there before the fault comes."""
     station = open_station(rig, v.CONTROL_HZ)
     safety = Safety(station.robot, v.CONTROL_HZ, watchdogs_of(rig))
@@ -199,19 +201,25 @@ def _deploy(rig: Rig, case: Case, episodes: Path, said: Path) -> None:
     def expert(deployment: Deployment) -> DeployedActor:
         return make_actor(rig, None, safety, truth, deployment.commanded)
 
-    session(lambda d: Broken("still", d), 0.5).run()
+    def breaks() -> None:
+        broke.write_text(str(truth()["time"]))
+
+    session(lambda d: Broken("still", d, breaks), 0.5).run()
     if case.full:  # a file that may not grow fails as on a full disk, in the middle of a write
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, _UNLIMITED))
     makers: dict[str, Callable[[Deployment], DeployedActor]] = {
         "expert": expert,
-        "hangs": lambda d: Learned(Hanging(d.width)),
+        "hangs": lambda d: Learned(Hanging(d.width, breaks)),
     }
-    make = makers.get(case.policy, lambda d: Broken(case.policy, d))
+    make = makers.get(case.policy, lambda d: Broken(case.policy, d, breaks))
     result = session(make, 15.0 if case.policy == "outwards" else 40.0).run()
     late = 1e3 * np.percentile(result.ticks.late or [np.nan], 99)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
-    said.write_text(f"{late}\n{result.trouble or result.ending.reason}")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (_UNLIMITED, _UNLIMITED))
+    seen = result.trouble or result.ending.reason
+    if case.policy == "outwards":
+        seen += "; clamped: " + ", ".join(f"{name} {n}" for name, n in result.ticks.acted.items())
+    said.write_text(f"{late}\n{seen}")
     station.close()
 
 
@@ -220,8 +228,8 @@ class Broken:
 
     done, overdue = False, 0.0
 
-    def __init__(self, how: str, deployment: Deployment) -> None:
-        self._how, self._deployment, self._ticks = how, deployment, 0
+    def __init__(self, how: str, deployment: Deployment, breaks: Callable[[], None]) -> None:
+        self._how, self._deployment, self._breaks, self._ticks = how, deployment, breaks, 0
 
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """See DeployedActor."""
@@ -229,9 +237,10 @@ class Broken:
         n, width = self._deployment.commanded().size, self._deployment.width
         step = np.zeros(n)
         step[0] = 0.0 if self._how == "still" else 0.02
-        broken = self._ticks > v.CONTROL_HZ
-        if broken and self._how == "nan":
+        if self._how == "nan" and self._ticks > v.CONTROL_HZ:
             step[0] = np.nan
+            if self._ticks == v.CONTROL_HZ + 1:
+                self._breaks()
         return np.append(step, width)
 
     def close(self) -> None:
@@ -253,13 +262,14 @@ class Hanging:
 
     config = Horizons()
 
-    def __init__(self, width: float) -> None:
-        self._width, self._plans = width, 0
+    def __init__(self, width: float, breaks: Callable[[], None]) -> None:
+        self._width, self._breaks, self._plans = width, breaks, 0
 
     def plan(self, seen: Sequence[Observation]) -> np.ndarray:
         """Three plans, then none."""
         self._plans += 1
         if self._plans > 3:
+            self._breaks()
             threading.Event().wait()
         plan = np.zeros((self.config.prediction_horizon, v.N_JOINTS + 1), np.float32)
         plan[:, 0], plan[:, -1] = 0.02, self._width
@@ -285,15 +295,17 @@ def _damaged(episodes: Path) -> bool:
 
 def _line(row: Row) -> str:
     kept = "whole" if row.kept else "LOST"
-    return (
-        f"{row.name:<25}{row.rest:>7.2f}{row.excess:>9.3f}{row.speed:>7.0%}{row.late:>8.1f}  "
-        f"{kept:<7}{row.seen[:90]}"
-    )
+    rest = "-" if np.isnan(row.rest) else f"{row.rest:.2f}"
+    limits = f"{'-':>9}{'-':>7}"
+    if not np.isnan(row.excess):
+        limits = f"{row.excess:>9.3f}{row.speed:>7.0%}"
+    late = "-" if np.isnan(row.late) else f"{row.late:.1f}"
+    return f"{row.name:<25}{rest:>7}{limits}{late:>8}  {kept:<7}{row.seen[:100]}"
 
 
 def _table(rows: list[Row]) -> str:
     head = (
-        f"{'fault':<25}{'rest s':>7}{'beyond':>9}{'speed':>7}{'p99 ms':>8}  {'kept':<7}"
+        f"{'fault':<25}{'rest s':>7}{'beyond':>9}{'speed':>7}{'late ms':>8}  {'kept':<7}"
         "what the operator sees"
     )
     return "\n".join([head, *(_line(row) for row in rows)])
