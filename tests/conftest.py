@@ -1,11 +1,34 @@
-"""Shared by all tests: one thread, no network, small episodes recorded once."""
+"""Shared by all tests: one thread, no network; the twins that several files talk to."""
 
 import os
+from collections.abc import Iterator
 
 os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["LP_NUM_THREADS"] = "0"
 
+import pytest  # noqa: E402
 import torch  # noqa: E402
+from running_twin import RunningTwin  # noqa: E402
 
 torch.set_num_threads(1)
+
+_CELL = ["--object", "wooden_block", "--seed", "3"]
+
+
+@pytest.fixture(scope="module")
+def fr3(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningTwin]:
+    """An FR3 that waits for its client, so that runs repeat."""
+    arguments = ["--arm", "fr3", "--lock-step", *_CELL]
+    twin = RunningTwin(arguments, tmp_path_factory.mktemp("fr3"), 0)
+    yield twin
+    twin.close()
+
+
+@pytest.fixture(scope="module")
+def ur5e(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningTwin]:
+    """A UR5e in real time; touch is left out, for it takes time."""
+    arguments = ["--arm", "ur5e", *_CELL, "--env.cameras", "front", "--env.no-tactile"]
+    twin = RunningTwin(arguments, tmp_path_factory.mktemp("ur5e"), 1)
+    yield twin
+    twin.close()

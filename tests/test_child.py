@@ -14,6 +14,8 @@ from touchgoal.control.child import Child
 from touchgoal.control.errors import UserError
 from touchgoal.control.protocols import DriverError
 
+pytestmark = pytest.mark.realtime  # time-outs of children, which must get a core
+
 # A child imports its driver by name, so it stands in a module.
 ODD_DRIVER = """
 import ctypes, os, time

@@ -97,7 +97,7 @@ class Twin:
         return Robotiq(RobotiqConfig(gripper["port"], activate=True, widths=widths))
 
 
-def until(holds: Callable[[], bool], seconds: float = 20.0) -> None:
+def until(holds: Callable[[], bool], seconds: float = 60.0) -> None:
     end = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < end, "it does not happen"

@@ -205,9 +205,9 @@ def add_primitive(
         position, rotation: of the primitive in the sensor frame.
         size: as MuJoCo takes it, m.
     """
-    pose = (np.asarray(a, np.float32) for a in (position, rotation, size))
+    p, R, s = (np.asarray(a, np.float32) for a in (position, rotation, size))
     bound = np.float32(_bounding_radius(kind, size))
-    _add_primitive(height, np.float32(pitch), kind, *pose, bound)
+    _add_primitive(height, np.float32(pitch), kind, p, R, s, bound)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")

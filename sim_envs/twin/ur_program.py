@@ -191,7 +191,7 @@ class UrProgram:
     def _inverse(self, pose: Pose, near: np.ndarray) -> Float[np.ndarray, "6"]:
         """Joint positions, by the nearest way; without a solution a UR stops its program."""
         position, R = self._target(pose)
-        solution = self._kinematics.inverse(position, R, near, margin=0.0, posture=0.0)
+        solution = self._kinematics.inverse(position, R, near, posture=0.0)
         if not solution.reached:
             print("the twin's UR found no inverse kinematics; protective stop")
             self._protective_stop()

@@ -1,0 +1,91 @@
+"""A twin in a process of its own, and clients in processes of theirs.
+
+franky waits for ever for a slot that is taken, and ur-rtde crashes when it reconnects by itself, so
+every client has a time-out.
+"""
+
+import inspect
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from touchgoal.sim_envs.twin import faults
+
+
+class RunningTwin:
+    """A twin at the n-th address of this process.
+
+    Attributes:
+        rig: what its rig.json says.
+    """
+
+    def __init__(self, arguments: list[str], out: Path, n: int) -> None:
+        host = f"127.{10 + n}.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
+        command = [sys.executable, "-m", "touchgoal.launch", "twin", "--port", "0"]
+        self._process = subprocess.Popen(
+            [*command, "--host", host, "--out", str(out), *arguments],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        deadline = time.monotonic() + 120
+        while not (out / "rig.json").exists():
+            alive = self._process.poll() is None and time.monotonic() < deadline
+            assert alive, self._process.communicate()[1]
+            time.sleep(0.05)
+        self.rig: dict[str, Any] = json.loads((out / "rig.json").read_text())
+
+    def ask(self, line: str) -> dict[str, Any]:
+        """What the twin answers to an order or a question."""
+        return faults.ask(self.rig["faults"], line)
+
+    def at_rest(self) -> dict[str, Any]:
+        """The truth once the arm is at rest."""
+        deadline = time.monotonic() + 10
+        while (truth := self.ask("truth"))["rest"] < 0.1:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        return truth
+
+    def begin(self, line: str) -> None:
+        """Reset the cell once the arm is at rest."""
+        self.at_rest()
+        self.ask(line)
+
+    def close(self) -> None:
+        """Ctrl-C, which it ends well after."""
+        self._process.send_signal(signal.SIGINT)
+        assert self._process.wait(20) == 0, self._process.communicate()[1]
+
+
+def client(function: Callable, *arguments: object, using: Callable | None = None) -> dict[str, Any]:
+    """What a function, and one that it is `using`, returns in a process of its own."""
+    source = "\n".join(inspect.getsource(part) for part in (using, function) if part)
+    program = (
+        f"import json, sys, time\nimport numpy as np\n{source}\n"
+        f"print(json.dumps({function.__name__}(*json.loads(sys.argv[1]))), flush=True)\n"
+        "import os; os._exit(0)"  # ur-rtde's threads may outlive the interpreter
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, json.dumps(arguments)],
+        capture_output=True,
+        text=True,
+        timeout=150,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def yaw_of(pose: list[float]) -> float:
+    """Hand yaw that closes across a box, within an eighth of a turn."""
+    w, x, y, z = pose[3:]
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return float((yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4)

@@ -1,0 +1,206 @@
+"""The twin's Franka control interface, through libfranka."""
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+from running_twin import RunningTwin, client, yaw_of
+
+pytestmark = pytest.mark.realtime
+
+HOME = [0.0, -0.3, 0.0, -2.2, 0.0, 1.9, 0.785]
+
+
+def connect(address: str):
+    """franky, with the FR3's limits in place of the Panda's; the speed is safe in any position."""
+    import franky
+
+    robot = franky.Robot(address, realtime_config=franky.RealtimeConfig.Ignore)
+    robot.joint_velocity_limit.set([2, 1, 1.5, 1.25, 2.1, 1.5, 2.1])
+    robot.joint_acceleration_limit.set([9.9, 7.5, 9.9, 9.9, 9.9, 9.9, 9.9])
+    robot.joint_jerk_limit.set([4900, 3700, 4900, 4900, 4900, 4900, 4900])
+    robot.recover_from_errors()
+    return robot
+
+
+def through_franky(function: Any, fr3: RunningTwin, *arguments: object) -> dict[str, Any]:
+    return client(function, fr3.rig["address"], HOME, *arguments, using=connect)
+
+
+def moves(address: str, home: list[float]) -> dict:
+    """Full-speed moves; what the arm says to the limits of another arm, and to going too far."""
+    import franky
+
+    robot = connect(address)
+
+    def refused(target: np.ndarray) -> str:
+        try:
+            robot.move(franky.JointMotion(target.tolist()))
+        except franky.ControlException as error:
+            robot.recover_from_errors()
+            return str(error)
+        return ""
+
+    robot.joint_acceleration_limit.set([15.0, 7.5, 10, 12.5, 15, 20, 20])  # the Panda's
+    panda = refused(np.array(home) + 0.4)
+    robot.joint_acceleration_limit.set([9.9, 7.5, 9.9, 9.9, 9.9, 9.9, 9.9])
+    errors, rng = [], np.random.default_rng(0)
+    for i in range(4):
+        target = np.array(home) + (rng.uniform(-0.5, 0.5, 7) if i % 2 else 0)
+        robot.move(franky.JointMotion(target.tolist()))
+        time.sleep(0.2)
+        errors.append(float(np.abs(np.array(robot.state.q) - target).max()))
+    robot.move(franky.JointMotion(home))
+    time.sleep(0.2)
+    pose = np.array(robot.state.O_T_EE.translation)
+    down = franky.Affine([0, 0, 0.03])
+    robot.move(franky.CartesianMotion(down, franky.ReferenceType.Relative))
+    time.sleep(0.2)
+    fell = pose - np.array(robot.state.O_T_EE.translation)
+    robot.move(franky.JointMotion(home))
+    before = np.array(robot.state.q)
+    robot.move(franky.JointVelocityMotion([0.2, 0, 0, 0, 0, 0, 0], franky.Duration(300)))
+    turned = np.array(robot.state.q) - before
+    held = np.inf
+    stiffness = np.array([600, 600, 600, 600, 250, 150, 50.0])
+    with franky.JointImpedanceTracker(robot, stiffness=stiffness) as tracker:
+        tracker.set_target(np.array(home), np.zeros(7))
+        time.sleep(0.5)
+        held = float(np.abs(np.array(robot.state.q) - home).max())
+    far = refused(np.array([2.9, *home[1:]]))
+    return {
+        "panda": panda,
+        "far": far,
+        "errors": errors,
+        "fell": fell.tolist(),
+        "turned": turned.tolist(),
+        "held": held,
+    }
+
+
+def test_franka_holds_clients_to_its_limits(fr3: RunningTwin) -> None:
+    fr3.begin("reset 3")
+    said = through_franky(moves, fr3)
+    assert "joint_motion_generator" in said["panda"] and "discontinuity" in said["panda"]
+    assert "joint_motion_generator_" in said["far"] and "limits_violation" in said["far"]
+    assert max(said["errors"]) < 2e-3
+    np.testing.assert_allclose(said["fell"], [0, 0, 0.03], atol=2e-3)
+    assert 0.05 < said["turned"][0] < 0.07 and np.abs(said["turned"][1:]).max() < 3e-3
+    assert said["held"] < 0.02
+    worst = fr3.ask("truth")["worst"]
+    assert worst["excess"] <= 0 and worst["speed"] < 1
+
+
+def picks(address: str, home: list[float], position: list[float], yaw: float) -> dict:
+    """Closes on air, then on the object, and lifts it."""
+    import franky
+
+    robot, gripper = connect(address), franky.Gripper(address)
+    robot.relative_dynamics_factor = 0.6
+    robot.move(franky.JointMotion(home))
+    air = gripper.grasp(0.03, 0.1, 20.0)
+    opened = gripper.open(0.1)
+    half = [np.cos(yaw / 2), np.sin(yaw / 2), 0.0, 0.0]  # x, y, z, w: about x, then yaw
+    for height in (0.12, 0.0):
+        at = franky.Affine([position[0], position[1], position[2] + height], half)
+        robot.move(franky.CartesianMotion(at))
+    start = time.monotonic()
+    grasped = gripper.grasp(0.04, 0.04, 20.0, 0.04, 0.04)
+    took = time.monotonic() - start
+    up = franky.Affine([0, 0, -0.12])
+    robot.move(franky.CartesianMotion(up, franky.ReferenceType.Relative))
+    time.sleep(0.5)
+    return {
+        "air": air,
+        "opened": opened,
+        "grasped": grasped and gripper.is_grasped,
+        "took": took,
+        "width": gripper.width,
+        "force": list(robot.state.O_F_ext_hat_K),
+    }
+
+
+def test_franka_grasps_what_is_there(fr3: RunningTwin) -> None:
+    fr3.begin('reset 3 {"object": "wooden_block", "mass": 0.1}')
+    pose = fr3.ask("truth")["layout"]["object"]
+    position = [*pose[:2], max(pose[2], 0.0185)]
+    said = through_franky(picks, fr3, position, yaw_of(pose))
+    assert not said["air"] and said["opened"] and said["grasped"]
+    truth = fr3.ask("truth")
+    assert truth["layout"]["object"][2] > 0.1
+    np.testing.assert_allclose(truth["pad_forces"], 20.0, rtol=0.05)
+    assert abs(truth["width"] - said["width"]) < 1e-4
+    assert abs(said["force"][2] + 0.1 * 9.81) < 0.1
+    assert said["took"] > 0.5 * (0.08 - said["width"]) / 0.04  # it keeps to the speed asked for
+
+
+def suffers(address: str, home: list[float]) -> dict:
+    """Moves slowly until something happens; says what, and whether the arm goes on afterwards."""
+    import franky
+
+    robot = connect(address)
+    robot.set_collision_behavior([20.0] * 7, [20.0] * 6)
+    said, speed = "", [0.05, 0, 0, 0, 0, 0, 0]
+    try:
+        robot.move(franky.JointVelocityMotion(speed, franky.Duration(20_000)))
+    except franky.ControlException as error:
+        said = str(error)
+    mode = robot.state.robot_mode.name
+    try:
+        robot.move(franky.JointVelocityMotion(speed, franky.Duration(100)))
+        rejected = ""
+    except (franky.CommandException, franky.ControlException) as error:
+        rejected = str(error)
+    try:
+        recovered = robot.recover_from_errors()
+    except franky.CommandException:
+        recovered = False
+    if recovered:
+        robot.relative_dynamics_factor = 0.5
+        robot.move(franky.JointMotion(home))
+    return {"said": said, "mode": mode, "rejected": rejected, "recovered": recovered}
+
+
+@pytest.mark.parametrize(
+    ("fault", "error", "mode", "recovers"),
+    [
+        ("nudge 0 60 0 0.3", "cartesian_reflex", "Reflex", True),
+        ("error joint_reflex", "joint_reflex", "Reflex", True),
+        ("freeze 0.3", "communication_constraints_violation", "Reflex", True),
+        ("stop-button on", "safety function", "UserStopped", False),
+    ],
+)
+def test_franka_stops_for_a_fault(
+    fr3: RunningTwin, fault: str, error: str, mode: str, recovers: bool
+) -> None:
+    fr3.begin("reset 3")
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(through_franky, suffers, fr3)
+        while fr3.ask("truth")["rest"] > 0 and not running.done():
+            time.sleep(0.02)
+        fr3.ask(fault)
+        said = running.result()
+    fr3.ask("stop-button off")
+    assert error in said["said"] and said["mode"] == mode
+    assert "rejected" in said["rejected"] and said["recovered"] == recovers
+    assert fr3.at_rest()["worst"]["excess"] <= 0
+
+
+def two_moves(address: str, home: list[float]) -> dict:
+    import franky
+
+    robot = connect(address)
+    robot.move(franky.JointMotion(home))
+    robot.move(franky.JointMotion((np.array(home) + 0.2).tolist()))
+    return {}
+
+
+def test_lock_step_repeats(fr3: RunningTwin) -> None:
+    ends = []
+    for _ in range(2):
+        fr3.begin("reset 5")
+        through_franky(two_moves, fr3)
+        ends.append(fr3.ask("truth")["q"])
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-4)

@@ -1,0 +1,102 @@
+"""The twin's cell without a wire; its pictures, its serial devices, and what it says to mistakes."""
+
+import cv2
+import numpy as np
+import pytest
+import serial
+from running_twin import RunningTwin
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.load_cell import LoadCellConfig, parse
+from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
+from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.scene import SceneConfig
+from touchgoal.sim_envs.twin import faults
+from touchgoal.sim_envs.twin.cell import Cell
+
+pytestmark = pytest.mark.realtime
+
+
+@pytest.mark.parametrize("arm", ["fr3", "ur5e"])
+def test_arm_follows_without_lag(arm: str) -> None:
+    scene = SceneConfig(arm=arm)  # type: ignore[arg-type]
+    cell = Cell(PickPlace(PickPlaceConfig(cameras=(), tactile=False, scene=scene)), 3, {})
+    start, error = cell.q_d.copy(), 0.0
+    for _ in range(1500):
+        phase = 4 * (cell.time + 1e-3)  # 0.8 rad/s and 3.2 rad/s^2 at most
+        cell.follow(start + 0.2 * (1 - np.cos(phase)), np.full(len(start), 0.8 * np.sin(phase)))
+        cell.step()
+        error = max(error, float(np.abs(cell.q - cell.q_d).max()))
+    assert error < 5e-3  # 0.08 rad without feed-forward
+    cell.brake(np.full(len(start), 10.0))
+    for _ in range(300):
+        cell.step()
+    assert not cell.moving and cell.worst.excess <= 0
+
+
+def test_fixture_waits_for_the_first_grasp() -> None:
+    maze = BeadMazeConfig(split="validation", n_wires=20, tactile=False)
+    cell = Cell(BeadMaze(maze), 3, {})
+    for _ in range(2000):
+        cell.step()
+    fixture = cell.env.model.equality("fixture").id
+    assert cell.env.data.eq_active[fixture]
+    cell.grasp(0.0, 0.1, 10.0)
+    for _ in range(1000):
+        cell.step()
+    assert not cell.env.data.eq_active[fixture] and not cell.failures
+    np.testing.assert_allclose(cell.truth()["pad_forces"], 10.0, rtol=0.05)
+
+
+def test_pictures_come_freeze_and_stop(fr3: RunningTwin) -> None:
+    name = "tactile_left"
+    url = fr3.rig["images"][f"observation.images.{name}"]
+    capture = cv2.VideoCapture(url)
+    frames = [capture.read()[1] for _ in range(3)]
+    assert frames[0].shape == (240, 320, 3) and not np.array_equal(frames[1], frames[2])
+    fr3.ask(f"repeat {name} 60")
+    frames = [capture.read()[1] for _ in range(4)]
+    np.testing.assert_array_equal(frames[2], frames[3])
+    fr3.ask(f"repeat {name} 0")
+    fr3.ask(f"lose {name} 60")
+    while capture.read()[0]:
+        pass
+    assert not cv2.VideoCapture(url).isOpened()
+    fr3.ask(f"lose {name} 0")
+    assert cv2.VideoCapture(url).read()[0]
+    front = cv2.VideoCapture(fr3.rig["images"]["observation.images.front"]).read()[1]
+    assert front.shape == (128, 128, 3) and front.std() > 10
+
+
+def test_load_cell_weighs_is_garbled_and_unplugged(fr3: RunningTwin) -> None:
+    fr3.begin('reset 3 {"object": "wooden_block", "mass": 0.1}')
+    config = LoadCellConfig(**fr3.rig["load_cell"], highest=100.0)
+
+    def readings(n: int) -> list[float | None]:
+        device.reset_input_buffer()
+        device.readline()
+        samples = [parse(device.readline().strip(), config) for _ in range(n)]
+        return [sample.force if sample else None for sample in samples]
+
+    with serial.Serial(config.port, 115200, timeout=2) as device:
+        weights = [reading for reading in readings(20) if reading is not None]
+        assert len(weights) == 20 and abs(np.median(weights) - 0.981) < 0.02
+        fr3.ask("garble load_cell 0.5")
+        assert 3 < readings(20).count(None) < 18
+        fr3.ask("garble load_cell 0")
+        fr3.ask("unplug load_cell")
+        with pytest.raises(serial.SerialException):
+            for _ in range(100):
+                device.readline()
+    fr3.ask("plug load_cell")
+    with serial.Serial(config.port, 115200, timeout=2) as device:
+        assert None not in readings(5)
+
+
+def test_mistakes_say_what_to_do(fr3: RunningTwin) -> None:
+    with pytest.raises(UserError, match="unknown command 'frieze'; there are: truth"):
+        fr3.ask("frieze 1")
+    with pytest.raises(UserError, match="unknown object 'teapot'"):
+        fr3.ask('reset 0 {"object": "teapot"}')
+    with pytest.raises(UserError, match="no twin answers at 127.0.0.1:9"):
+        faults.ask("127.0.0.1:9", "truth")

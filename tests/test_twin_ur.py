@@ -1,0 +1,215 @@
+"""The twin's UR controller, through ur-rtde."""
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from running_twin import RunningTwin, client, yaw_of
+
+pytestmark = pytest.mark.realtime
+
+
+def drives(address: str) -> dict:
+    """Moves, stops, servoes at three rates, and falls silent."""
+    from rtde_control import RTDEControlInterface
+    from rtde_receive import RTDEReceiveInterface
+
+    receive, control = RTDEReceiveInterface(address), RTDEControlInterface(address)
+
+    def at() -> np.ndarray:
+        return np.array(receive.getActualQ())
+
+    start = at()
+    said: dict[str, Any] = {}
+    control.moveJ((start + 0.2).tolist(), 1.0, 2.0)
+    said["move"] = float(np.abs(at() - start - 0.2).max())
+    control.moveJ((start - 0.4).tolist(), 0.5, 2.0, True)
+    time.sleep(0.4)
+    control.stopJ(5.0)
+    stopped = at()
+    time.sleep(0.2)
+    said["stop"] = float(np.abs(at() - stopped).max())
+    said["short"] = float(np.abs(at() - start + 0.4).max())
+    control.moveJ(start.tolist(), 1.0, 2.0)
+    said["servo"] = []
+    for rate in (20, 125, 500):
+        began, worst, taken = time.monotonic(), 0.0, True
+        while (now := time.monotonic() - began) < 0.8:
+            goal = start.copy()
+            goal[0] += 0.1 * np.sin(2 * now)
+            taken &= control.servoJ(goal.tolist(), 0, 0, 1 / rate, 0.1, 300)
+            worst = max(worst, abs(at()[0] - goal[0]))
+            time.sleep(max(0.0, 1 / rate - (time.monotonic() - began - now)))
+        control.servoStop()
+        said["servo"].append([taken, worst])
+    control.moveJ(start.tolist(), 1.0, 2.0)
+    control.speedJ([0.3, 0, 0, 0, 0, 0], 2.0, 0.5)
+    time.sleep(0.5)
+    control.speedStop()
+    said["speed"] = (at() - start).tolist()
+    above, pose = at(), receive.getActualTCPPose()
+    control.moveL([*pose[:2], pose[2] - 0.05, *pose[3:]], 0.2, 0.5)
+    said["line"] = (np.array(receive.getActualTCPPose())[:3] - pose[:3]).tolist()
+    control.moveJ_IK(pose, 1.0, 2.0)
+    said["back"] = float(np.abs(at() - above).max())
+    inverse = control.getInverseKinematics(pose, start.tolist())
+    said["inverse"] = float(np.abs(np.array(inverse) - above).max())
+    forward = control.getForwardKinematics(at().tolist(), control.getTCPOffset())
+    said["forward"] = float(np.abs(np.array(forward) - receive.getActualTCPPose())[:3].max())
+    said["inside"] = [
+        control.isJointsWithinSafetyLimits(q) for q in ([0.0] * 6, [0, 0, 4, 0, 0, 0])
+    ]
+    control.setWatchdog(10)
+    for _ in range(10):
+        control.kickWatchdog()
+        time.sleep(0.03)
+    said["kicked"] = control.isProgramRunning()
+    time.sleep(1.0)
+    said["silent"] = control.isProgramRunning()
+    return said
+
+
+def test_ur_moves_servoes_and_watches(ur5e: RunningTwin) -> None:
+    said = client(drives, ur5e.rig["address"])
+    assert said["move"] < 2e-3 and said["stop"] < 2e-3 and said["short"] > 0.1
+    for taken, worst in said["servo"]:
+        assert taken and worst < 0.1  # rad behind a goal at 0.2 rad/s, on a loaded machine
+    assert said["speed"][0] > 0.05 and np.abs(said["speed"][1:]).max() < 2e-3
+    np.testing.assert_allclose(said["line"], [0, 0, -0.05], atol=2e-3)
+    assert said["back"] < 2e-3 and said["inverse"] < 2e-3
+    assert said["forward"] < 1e-3 and said["inside"] == [True, False]
+    assert said["kicked"] and not said["silent"]
+    assert ur5e.ask("truth")["worst"]["excess"] <= 0
+
+
+def protected(address: str, reset: str) -> dict:
+    """Servoes into a protective stop, unlocks it after 5 s, and goes on; then connects anew."""
+    import socket
+
+    from dashboard_client import DashboardClient
+    from rtde_control import RTDEControlInterface
+    from rtde_receive import RTDEReceiveInterface
+
+    receive, control = RTDEReceiveInterface(address), RTDEControlInterface(address)
+    q = receive.getActualQ()
+
+    def order(line: str) -> None:
+        host, _, port = reset.rpartition(":")
+        with socket.create_connection((host, int(port))) as faults:
+            faults.sendall(line.encode() + b"\n")
+            faults.recv(1000)
+
+    order("error protective_stop")
+    deadline = time.monotonic() + 5
+    while control.servoJ(q, 0, 0, 0.008, 0.1, 300) and time.monotonic() < deadline:
+        time.sleep(0.008)
+    said: dict[str, Any] = {"refused": time.monotonic() < deadline}
+    while not receive.isProtectiveStopped() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    said["noticed"] = receive.isProtectiveStopped()
+    dashboard = DashboardClient(address)
+    dashboard.connect()
+    try:
+        dashboard.unlockProtectiveStop()
+        said["early"] = ""
+    except RuntimeError as error:
+        said["early"] = str(error)
+    deadline = time.monotonic() + 20
+    while receive.isProtectiveStopped() and time.monotonic() < deadline:
+        time.sleep(0.5)
+        try:
+            dashboard.unlockProtectiveStop()
+        except RuntimeError:
+            pass
+        time.sleep(0.1)
+    said["unlocked"] = not receive.isProtectiveStopped()
+    order("stop-button on")
+    time.sleep(0.3)
+    said["emergency"] = [receive.isEmergencyStopped(), dashboard.safetystatus()]
+    order("stop-button off")
+    dashboard.powerOn()
+    dashboard.brakeRelease()
+    dashboard.disconnect()
+    control.disconnect()
+    receive.disconnect()
+    receive, control = RTDEReceiveInterface(address), RTDEControlInterface(address)
+    goal = (np.array(receive.getActualQ()) + 0.05).tolist()
+    control.moveJ(goal, 1.0, 1.0)
+    said["anew"] = float(np.abs(np.array(receive.getActualQ()) - goal).max())
+    return said
+
+
+def test_ur_protective_stop_and_reconnection(ur5e: RunningTwin) -> None:
+    said = client(protected, ur5e.rig["address"], ur5e.rig["faults"])
+    assert said["refused"] and said["noticed"] and "5s" in said["early"] and said["unlocked"]
+    assert said["emergency"] == [True, "Safetystatus: ROBOT_EMERGENCY_STOP"]
+    assert said["anew"] < 2e-3
+
+
+def places(address: str, port: str, pick: list[float], place: list[float], yaw: float) -> dict:
+    """Picks and places through ur-rtde, with the gripper's Modbus frames written by hand."""
+    import struct
+
+    import serial
+    from rtde_control import RTDEControlInterface
+
+    control = RTDEControlInterface(address)
+    gripper = serial.Serial(port, 115200, timeout=0.5)
+
+    def check(frame: bytes) -> bytes:
+        value = 0xFFFF
+        for byte in frame:
+            value ^= byte
+            for _ in range(8):
+                value = value >> 1 ^ (0xA001 if value & 1 else 0)
+        return frame + struct.pack("<H", value)
+
+    def grip(position: int) -> int:
+        orders = struct.pack(">BBHHB", 9, 16, 1000, 3, 6) + bytes([9, 0, 0, position, 255, 20])
+        gripper.write(check(orders))
+        assert gripper.read(8) == check(orders[:6])
+        deadline = time.monotonic() + 10
+        while time.monotonic() < deadline:
+            gripper.write(check(struct.pack(">BBHH", 9, 4, 2000, 3)))
+            answer = gripper.read(11)
+            assert answer == check(answer[:-2])
+            if answer[3] >> 6:  # no longer moving
+                return answer[3] >> 6
+            time.sleep(0.05)
+        return 0
+
+    # Pointing down, turned by yaw: half a turn about an axis in the table's plane.
+    down = [np.pi * np.cos(yaw / 2), np.pi * np.sin(yaw / 2), 0.0]
+
+    def go(position: list[float], height: float, speed: float) -> None:
+        pose = [position[0], position[1], position[2] + height, *down]
+        control.moveL(pose, speed, 1.0)
+
+    said = {"air": grip(3)}
+    go(pick, 0.12, 0.5)
+    go(pick, 0.0, 0.2)
+    said["object"] = grip(230)
+    go(pick, 0.12, 0.3)
+    go(place, 0.12, 0.3)
+    go(place, 0.0, 0.1)
+    time.sleep(1.0)
+    return said
+
+
+def test_ur_picks_and_places(ur5e: RunningTwin) -> None:
+    ur5e.begin('reset 7 {"object": "wooden_block", "mass": 0.1}')
+    layout = ur5e.ask("truth")["layout"]
+    height = max(layout["object"][2], 0.0185)
+    pick, place = [*layout["object"][:2], height], [*layout["goal"], height]
+    said = client(
+        places,
+        ur5e.rig["address"],
+        ur5e.rig["gripper"]["port"],
+        pick,
+        place,
+        yaw_of(layout["object"]),
+    )
+    assert said == {"air": 3, "object": 2}
+    truth = ur5e.ask("truth")
+    assert truth["success"] and truth["progress"] == 1
