@@ -11,6 +11,7 @@ COMMANDS = {
     "demo": "the main job, end to end, on the shipped weights",
     "doctor": "what this machine can do, and how to mend what is missing",
     "collect-demos": "record expert episodes of a task, or failures to order",
+    "teleop": "lead the bead along a wire with keys, and record it",
     "train-encoder": "train a touch encoder",
     "train-policy": "train a policy on recorded episodes",
     "train-policy-paper": "the same with the published network, sampler and actions",

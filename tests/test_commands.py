@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -130,6 +131,17 @@ def test_bead_maze(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert "1/1 [0.21, 1.00]" in capsys.readouterr().out
     message = refused(capsys, "run-policy", "--policy", "follower", "--out", tmp_path / "c")
     assert "add: --task bead-maze" in message and not (tmp_path / "c").exists()
+
+
+def test_teleop_needs_a_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it does at one: test_teleop.py."""
+    out = tmp_path / "out"
+    monkeypatch.setattr("sys.stdin", open(os.devnull))
+    assert "in a terminal" in refused(capsys, "teleop", "--out", out)
+    assert "unknown wire" in refused(capsys, "teleop", "--wires", "knot-1", "--out", out)
+    assert not out.exists()
 
 
 @pytest.mark.slow

@@ -1,0 +1,115 @@
+"""Lead the bead along the wire with keys, and record it as an episode like any other demonstration.
+
+The arm is compliant: a key pushes the hand, and the wire guides it. Ctrl-C ends; what was finished is
+on disk.
+"""
+
+import shutil
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
+from touchgoal.control.keyboard import Keyboard
+from touchgoal.episodes.recording import Demonstration, run, to_episode
+from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.store import EpisodeWriter
+from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
+from touchgoal.sim_envs.teleoperator import HELP, Teleoperator, TeleoperatorConfig
+from touchgoal.sim_envs.wires import choose, find
+
+_GIVE_UP = "q"
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of teleop."""
+
+    task: Literal["bead-maze"] = "bead-maze"
+    """What is demonstrated."""
+    out: Path | None = None
+    """Folder of the run; the episodes go to its `episodes/`, after those already there."""
+    episodes: int = 1
+    """How many times to lead the bead; those given up count."""
+    wires: tuple[str, ...] = ()
+    """Names such as helix-2000003, taken in turn; default: those of `maze`. The straightest of the
+    first ones is arc-2000009."""
+    seed: int = 0
+    """Of the first episode; each further one adds one."""
+    hand: TeleoperatorConfig = field(default_factory=TeleoperatorConfig)
+    """How hand and keys respond."""
+    maze: BeadMazeConfig = field(
+        default_factory=lambda: BeadMazeConfig(max_seconds=300.0, stall_seconds=60.0)
+    )
+    """Options of bead-maze; a person is given time to think."""
+
+
+def main(config: Config) -> None:
+    """Offer the wires one by one, keep what is finished, say what came of it."""
+    if config.episodes < 1:
+        raise UserError("nothing to lead: ask for at least one episode")
+    maze, names = config.maze, [find(name).name for name in config.wires]
+    names = names or [w.name for w in choose(maze.split, maze.n_wires, maze.families)]
+    with Keyboard(sys.stdin) as keyboard:
+        out = open_run(config.out, "teleop", config)
+        writer, metas = EpisodeWriter(out / "episodes", fps=maze.control_hz), []
+        env = BeadMaze(maze)
+        try:
+            for i in range(config.episodes):
+                wire = names[i % len(names)]
+                print(f"{wire}, {i + 1} of {config.episodes}: {HELP}  q give up  Ctrl-C end")
+                job = Demonstration(config.seed + i, options={"wire": wire})
+                episode = lead(env, job, keyboard, config.hand)
+                if episode is None:
+                    print("\ngiven up: not kept")
+                    continue
+                failed = ", ".join(env.troubles()) or "out of time"
+                ending = "arrived" if episode.meta["success"] else failed
+                print(f"\n{ending}: saving")
+                writer.append(episode)
+                metas.append(episode.meta)
+        finally:
+            env.close()
+            write_json(out / "metrics.json", {"episodes": metas})
+            done = sum(bool(meta["success"]) for meta in metas)
+            kept = f"{len(metas)} of {config.episodes} episodes kept, {done} to the wire's end"
+            print(f"\n{kept}: {out / 'episodes'}")
+
+
+def lead(
+    env: BeadMaze, job: Demonstration, keyboard: Keyboard, config: TeleoperatorConfig
+) -> Episode | None:
+    """The episode that a person leads to its end, good or bad; None if they give it up.
+
+    Raises:
+        KeyboardInterrupt: they typed Ctrl-C.
+    """
+    observation, info = env.reset(seed=job.seed, options=job.options)
+    keyboard.typed()  # what was meant for the last wire
+    hand, ticks, due = Teleoperator(env, config), [], time.monotonic()
+    for tick in run(env, hand, observation, info):
+        ticks.append(tick)
+        keys = keyboard.typed()
+        if _GIVE_UP in keys:
+            return None
+        hand.press(keys)
+        _show(tick, hand.held)
+        now = time.monotonic()
+        due = max(due + 1 / env.config.control_hz, now)  # what was late is not made up for
+        time.sleep(due - now)
+    return to_episode(env, ticks, job)
+
+
+def _show(tick: dict[str, np.ndarray], held: str) -> None:
+    """One line that is written over."""
+    if sys.stdout.isatty():
+        progress, force = tick[v.TRUTH_PROGRESS][0], np.linalg.norm(tick[v.WRENCH][:3])
+        line = f"{progress:4.0%} of the way  {force:4.1f} N on the hand  {held or 'still':<6}{HELP}"
+        width = shutil.get_terminal_size().columns - 1
+        print(f"\r{line[:width]:<{width}}", end="", flush=True)
