@@ -1,20 +1,20 @@
 """The operator's terminal during a deployment: keys, signals, and one line that is written over."""
 
-import select
 import signal
 import sys
-import termios
-import tty
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
 
+from touchgoal.control.errors import UserError
+from touchgoal.control.keyboard import Keyboard
 from touchgoal.control.safety import Mode
 from touchgoal.policies.deployment import View
 
 HELP = "space or Ctrl-C stops the arm, Enter ends the task; neither is an emergency stop"
+_WISHES = {"\n": "done", "\r": "done", " ": "stop", "q": "stop"}
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _REFRESH = 4  # ticks between lines
 
@@ -24,14 +24,16 @@ class Terminal:
 
     def __init__(self) -> None:
         self._asked, self._count = "", 0
-        self._keys = sys.stdin.isatty()
+        self._keyboard = Keyboard(sys.stdin) if sys.stdin.isatty() else None
 
     def wanted(self) -> str:
-        """See Deployment."""
-        while not self._asked and self._keys and select.select([sys.stdin], [], [], 0)[0]:
-            self._asked = {"\n": "done", "\r": "done", " ": "stop", "q": "stop"}.get(
-                sys.stdin.read(1), ""
-            )
+        """See Deployment. A stop outweighs what was typed before it."""
+        if self._keyboard is not None and self._asked != "stop":
+            try:
+                wishes = {_WISHES.get(key, "") for key in self._keyboard.typed()}
+            except (KeyboardInterrupt, UserError):  # Ctrl-C, or the terminal has gone
+                wishes = {"stop"}
+            self._asked = "stop" if "stop" in wishes else max(wishes, default="") or self._asked
         return self._asked
 
     def show(self, view: View) -> None:
@@ -54,14 +56,10 @@ class Terminal:
     def watching(self) -> Iterator[None]:
         """Keys and signals are taken as wishes while this lasts, and then as before."""
         before = {number: signal.signal(number, self._signalled) for number in _SIGNALS}
-        settings = termios.tcgetattr(sys.stdin) if self._keys else None
-        if self._keys:
-            tty.setcbreak(sys.stdin)
         try:
-            yield
+            with self._keyboard or nullcontext():
+                yield
         finally:
-            if settings is not None:
-                termios.tcsetattr(sys.stdin, termios.TCSADRAIN, settings)
             for number, handler in before.items():
                 signal.signal(number, handler)
             if sys.stdout.isatty():

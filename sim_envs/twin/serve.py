@@ -9,6 +9,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
+from touchgoal.sim_envs.tactile.rig import warm_up
 from touchgoal.sim_envs.tasks import TaskConfig, make_env
 from touchgoal.sim_envs.twin import serial_ports
 from touchgoal.sim_envs.twin.cell import DT, Cell
@@ -78,6 +79,11 @@ class Twin:
         self.cell = Cell(
             make_env(replace(config.task, scene=scene)), config.seed, dict(config.options)
         )
+        env = self.cell.env
+        if (
+            env.config.tactile
+        ):  # a client would lose the arm while code is loaded at the first touch
+            warm_up(env.bodies, env.sensor)
         self._lock_step, self._due = config.lock_step, time.monotonic()
         self.stopped = False
         self._services: list[Service] = []
