@@ -152,7 +152,7 @@ def _run(case: Case, folder: Path, lock_step: bool, number: int) -> Row:
     worst = after["worst"] if after else dict.fromkeys(("excess", "speed", "force"), float("nan"))
     if broke.exists():
         before = float(broke.read_text())
-    stops = case.kills or case.line or broke.exists()
+    stops = seen != "done" and (case.kills or case.line or broke.exists())
     rest = after["time"] - after["rest"] - before if after and stops else float("nan")
     finished = 1 if case.kills or case.full else 2
     kept = len(EpisodeSet(episodes)) == finished and not _damaged(episodes)
@@ -241,7 +241,8 @@ class Broken:
         self._ticks += 1
         n, width = self._deployment.commanded().size, self._deployment.width
         step = np.zeros(n)
-        step[0] = 0.0 if self._how == "still" else 0.02
+        joint = -1 if self._how == "outwards" else 0  # the wrist's end comes before the workspace's
+        step[joint] = 0.0 if self._how == "still" else 0.02
         if self._how == "nan" and self._ticks > v.CONTROL_HZ:
             step[0] = np.nan
             if self._ticks == v.CONTROL_HZ + 1:
