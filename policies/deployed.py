@@ -10,12 +10,12 @@ from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.control.rig import Rig
 from touchgoal.control.safety import Safety
-from touchgoal.policies.acting import SHIPPED, ActorMaker, Planner
+from touchgoal.policies.acting import SHIPPED, ActorMaker, Observation
 from touchgoal.policies.deployment import DeployedActor
 from touchgoal.policies.follower import WireFollower
-from touchgoal.policies.realtime import RealTimeActor
+from touchgoal.policies.realtime import Plans, RealTimeActor
 from touchgoal.policies.scripted import Place, pick_and_place
-from touchgoal.sim_envs.base import EnvConfig, Observation
+from touchgoal.sim_envs.base import EnvConfig
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.scene import SERVO_DAMPING
@@ -29,7 +29,7 @@ class Follower:
     def __init__(self, hz: int) -> None:
         self._follower = WireFollower(hz)
 
-    def act(self, observation: Observation) -> np.ndarray:
+    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """See DeployedActor."""
         return self._follower.act(observation)
 
@@ -46,7 +46,7 @@ class Learned(RealTimeActor):
 
     done = False
 
-    def __init__(self, planner: Planner) -> None:
+    def __init__(self, planner: Plans) -> None:
         """See RealTimeActor."""
         super().__init__(planner)
         self._share = 1 - float(np.exp(-1 / (planner.config.control_hz * SERVO_DAMPING)))

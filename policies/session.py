@@ -12,7 +12,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.rig import Rig
 from touchgoal.control.safety import Safety
 from touchgoal.control.station import Station
-from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.policies.deployment import DeployedActor, Deployment, Ending, Ticks, View
 from touchgoal.policies.scripted import start_move
@@ -125,7 +125,7 @@ class Session:
     def _record(self, ticks: Ticks, ending: Ending, success: bool | None) -> int:
         rig = self.rig
         outcome = {True: "success", False: "failure", None: "unknown"}[success]
-        meta = {
+        meta: dict[str, MetaValue] = {
             "sensor": rig.sensor,
             "arm": rig.arm,
             "policy": rig.task.policy,
