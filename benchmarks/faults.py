@@ -29,9 +29,9 @@ from touchgoal.control.station import open_station, watchdogs_of
 from touchgoal.episodes.metadata import write_file
 from touchgoal.episodes.store import EpisodeSet, validate
 from touchgoal.policies.acting import Observation
-from touchgoal.policies.deployed import Learned, make_actor
-from touchgoal.policies.deployment import DeployedActor, Deployment
-from touchgoal.policies.session import Session
+from touchgoal.policies.deploy.deployed import Learned, make_actor
+from touchgoal.policies.deploy.deployment import DeployedActor, Deployment
+from touchgoal.policies.deploy.session import Session
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.twin.faults import ask
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig

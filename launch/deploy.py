@@ -26,9 +26,9 @@ from touchgoal.encoders import pretrained
 from touchgoal.encoders.towers import load_towers
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.launch.terminal import HELP, Terminal
-from touchgoal.policies.deployed import learned, make_actor
-from touchgoal.policies.preflight import preflight
-from touchgoal.policies.session import Result, Session
+from touchgoal.policies.deploy.deployed import learned, make_actor
+from touchgoal.policies.deploy.preflight import preflight
+from touchgoal.policies.deploy.session import Result, Session
 from touchgoal.rewards.curves import Scale
 from touchgoal.rewards.goals import parse_goal
 from touchgoal.rewards.live import LiveCost

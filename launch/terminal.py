@@ -11,7 +11,7 @@ import numpy as np
 from touchgoal.control.errors import UserError
 from touchgoal.control.keyboard import Keyboard
 from touchgoal.control.safety import Mode
-from touchgoal.policies.deployment import View
+from touchgoal.policies.deploy.deployment import View
 
 HELP = "space or Ctrl-C stops the arm, Enter ends the task; neither is an emergency stop"
 _WISHES = {"\n": "done", "\r": "done", " ": "stop", "q": "stop"}

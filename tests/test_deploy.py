@@ -18,7 +18,7 @@ from touchgoal.control.safety import Safety
 from touchgoal.control.station import watchdogs_of
 from touchgoal.episodes.store import EpisodeSet, validate
 from touchgoal.launch.__main__ import main
-from touchgoal.policies.deployment import Deployment, Ticks, View
+from touchgoal.policies.deploy.deployment import Deployment, Ticks, View
 from touchgoal.sim_envs.simulated import simulate
 
 _PATIENCE = 300  # s for a deployment, on a machine however loaded

@@ -11,10 +11,10 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.rig import Rig
 from touchgoal.control.safety import Safety
 from touchgoal.policies.acting import SHIPPED, ActorMaker, Observation
-from touchgoal.policies.deployment import DeployedActor
+from touchgoal.policies.deploy.deployment import DeployedActor
+from touchgoal.policies.deploy.realtime import Plans, RealTimeActor
+from touchgoal.policies.deploy.scripted import Place, pick_and_place
 from touchgoal.policies.follower import WireFollower
-from touchgoal.policies.realtime import Plans, RealTimeActor
-from touchgoal.policies.scripted import Place, pick_and_place
 from touchgoal.sim_envs.base import EnvConfig
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.pick_place import PickPlaceConfig

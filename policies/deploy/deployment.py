@@ -17,7 +17,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.protocols import DriverError
 from touchgoal.control.safety import Limit, Reading, Safety, SafetyState
 from touchgoal.control.station import Station
-from touchgoal.policies.sensing import Sensed, Senses
+from touchgoal.policies.deploy.sensing import Sensed, Senses
 from touchgoal.sim_envs.base import Observation
 
 _REST = 0.01  # rad/s

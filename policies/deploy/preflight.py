@@ -21,7 +21,7 @@ from touchgoal.control.touch.contact import contact_strength
 from touchgoal.control.touch.markers import find_markers, without_markers
 from touchgoal.control.touch.photometry import load
 from touchgoal.episodes.store import EpisodeWriter
-from touchgoal.policies.deployed import learned
+from touchgoal.policies.deploy.deployed import learned
 
 _LEAST_RATE = 0.8  # of what the rig says of a camera
 # Counts by which a fingertip may differ from its sensor file's. Simulated units differ by 1 to 2, a

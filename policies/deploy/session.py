@@ -14,8 +14,8 @@ from touchgoal.control.safety import Safety
 from touchgoal.control.station import Station
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeWriter
-from touchgoal.policies.deployment import DeployedActor, Deployment, Ending, Ticks, View
-from touchgoal.policies.scripted import start_move
+from touchgoal.policies.deploy.deployment import DeployedActor, Deployment, Ending, Ticks, View
+from touchgoal.policies.deploy.scripted import start_move
 from touchgoal.sim_envs.base import Observation
 
 _AT_START = 0.02  # rad from the start pose after the start move
