@@ -61,7 +61,7 @@ class ArmClient(ABC):
         self._clock, self._stamp = -1.0, time.monotonic()
         self._reading = self._measure()
         self._refusal = self._reading.fault
-        self._ticked = time.monotonic()
+        self._ticked, self._streamed = time.monotonic(), 0.0
 
     @abstractmethod
     def _connect(self, recover: bool) -> JointLimits:
@@ -96,6 +96,7 @@ class ArmClient(ABC):
             raise UserError(f"the target {np.round(q, 3).tolist()} rad is beyond a joint's range")
         if self._state is None:
             self._state = self._tracker.start(self._commanded)
+            self._streamed = self._reading.time
         self._state = self._tracker.aim(self._state, q)
 
     def stop(self) -> None:
@@ -103,9 +104,11 @@ class ArmClient(ABC):
         self._latch("stopped on request; recover the arm to go on")
 
     def tick(self) -> None:
-        """Read the state and stream the next command."""
+        """Read the state and stream the next command.
+
+        The stream goes by the controller's clock: a simulator may be slower than the one on the wall.
+        """
         now = time.monotonic()
-        periods = min(max(round((now - self._ticked) / self.period), 1), _LATE)
         punctual = now - self._ticked < self.config.silence / 2
         self._ticked = now
         self._reading = self._measure()
@@ -117,7 +120,11 @@ class ArmClient(ABC):
             self._latch(self._reading.fault)
         if self._state is None:
             return
-        before = self._state.q
+        time_, before = self._reading.time, self._state.q
+        periods = min(round((time_ - self._streamed) / self.period), _LATE)
+        if periods < 1:
+            return
+        self._streamed = max(self._streamed + periods * self.period, time_ - self.period)
         for _ in range(periods):
             self._state = self._tracker.step(self._state)
         self._send(self._state.q, (self._state.q - before) / (periods * self.period))
@@ -158,7 +165,7 @@ class ArmProcess:
     """The Arm protocol over an ArmClient in a child process."""
 
     def __init__(
-        self, client: type[ArmClient], config: ArmConfig, connect_timeout: float = 10.0
+        self, client: type[ArmClient], config: ArmConfig, connect_timeout: float = 30.0
     ) -> None:
         self._make = lambda recover: Child(client, config, recover, connect_timeout=connect_timeout)
         self._child = self._make(False)

@@ -55,7 +55,7 @@ class Child:
     """
 
     def __init__(
-        self, driver: Callable[..., ChildDriver], *args: Any, connect_timeout: float = 10.0
+        self, driver: Callable[..., ChildDriver], *args: Any, connect_timeout: float = 30.0
     ) -> None:
         self._name, self._lock = driver.__qualname__, threading.Lock()
         self.end = ""

@@ -78,7 +78,8 @@ class FrankaClient(ArmClient):
             wrench=moved_wrench(state.O_F_ext_hat_K, contact, tcp),
             torque=state.tau_ext_hat_filtered,
             fault=self._fault(state),
-            stamp=self._stamped(state.time.to_msec()),
+            stamp=self._stamped(state.time.to_sec()),
+            time=state.time.to_sec(),
         )
 
     def _fault(self, state: "franky.RobotState") -> str:

@@ -97,7 +97,7 @@ class RobotLimits:
         flange, fingertips: where the flange and the fingers' outer lower edges may be.
         finger_edges: those edges in the hand frame (m).
         force, torque: N and Nm from outside at the TCP and in a joint, below the reflex.
-        touch: N, normal force on one fingertip.
+        touch: m that anything may press into a gel, as seen (`control.touch.indentation`).
         stroke: m, least and largest width that a gripper is asked for.
     """
 
@@ -112,7 +112,7 @@ class RobotLimits:
     tracking: float = 0.2
     force: float = 15.0
     torque: float = 10.0
-    touch: float = 15.0
+    touch: float = 1.5e-3
     stroke: tuple[float, float] = (0.0, 0.08)  # of the Franka Hand
 
     # Franka Hand fully open (80 mm) with GelSight Minis: outer faces 28.3 mm behind the gels, lower
@@ -135,8 +135,9 @@ class RobotLimits:
 
 # Shares, margin, step, forces: proposals of shared/research/drivers.md 6, after what DROID (0.1 rad
 # margin, 20 N) and LeRobot (0.05 per step) do; Franka's reflex is set at 20 N and above. Half the
-# acceleration, not 30 %, because it also brakes. Touch and tracking: our choice, without a source;
-# compare the former with your sensor's sheet.
+# acceleration, not 30 %, because it also brakes. Tracking: our choice, without a source. Touch: twice
+# what FEATS pressed into a Mini (0.86 mm); simulated, a golf ball at 30 N, the least that a Franka
+# Hand grasps with, goes in by 1.2 mm, a pebble's edge by 2 mm. Compare it with your sensor's sheet.
 
 FR3 = RobotLimits(
     arm=kinematics.FR3,

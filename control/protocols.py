@@ -32,6 +32,7 @@ class ArmReading:
         torque: external torque in each joint, Nm.
         fault: why the arm refuses commands until a person recovers it; empty if it does not.
         stamp: s; the controller's clock advanced then.
+        time: s, that clock, from an origin of its own.
     """
 
     q: Joints
@@ -40,6 +41,7 @@ class ArmReading:
     torque: Joints
     fault: str
     stamp: float
+    time: float
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ class Limit(StrEnum):
     STALE_STATE = "robot state age"
     FORCE = "external force"
     TORQUE = "external torque"
-    TOUCH = "touch force"
+    TOUCH = "gel indentation"
     TRACKING = "distance of joints from command"
 
 
@@ -87,7 +87,7 @@ class Reading:
         q: measured joint positions, rad.
         force: N on the TCP from outside.
         torque: Nm in each joint from outside.
-        touch: N, normal force on each fingertip.
+        touch: m that each fingertip's gel is pressed in.
         observation_age, action_age, state_age: s since the oldest of each was taken.
     """
 

@@ -73,6 +73,7 @@ class UrClient(ArmClient):
             torque=self._kinematics.jacobian(q).T @ wrench,  # the arm does not measure it
             fault=self._fault(),
             stamp=self._stamped(clock),
+            time=clock,
         )
         if self._state is None and not reading.fault:
             self._control.kickWatchdog()

@@ -19,9 +19,10 @@ from touchgoal.control.protocols import Frame
 
 # A lost stream is told in `trouble`; what the libraries print about it would tear a live view apart.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_FATAL)
 
 _READ_TIMEOUT = 1000  # ms without a frame after which OpenCV gives up on a stream
+_OPEN_TIMEOUT = 5000  # ms to open it the first time: the first frame may take longer to come
 _REOPEN = 0.5  # s between attempts
 _RATE_WINDOW = 2.0  # s that the rate is measured over
 _LATE = 3.0  # periods without a frame that mean trouble
@@ -66,7 +67,7 @@ class VideoCamera:
 
     def __init__(self, config: VideoConfig) -> None:
         self.config = config
-        self._capture = _open(config)
+        self._capture = _open(config, _OPEN_TIMEOUT)
         self._sequence, self._times = 0, deque[float]()
         self._image: np.ndarray | None = None
         self._changed = self._due = time.monotonic()
@@ -135,21 +136,22 @@ class VideoCamera:
         self._capture.release()
         time.sleep(_REOPEN)
         try:
-            self._capture = _open(self.config)
+            self._capture = _open(self.config, _READ_TIMEOUT)
         except UserError:
             pass  # not back yet
 
 
-def _open(config: VideoConfig) -> cv2.VideoCapture:
+def _open(config: VideoConfig, patience: int) -> cv2.VideoCapture:
+    """Within `patience` ms if it is a stream."""
     source = int(config.source) if config.source.isdigit() else config.source
     if config.is_camera:
         capture = cv2.VideoCapture(source, cv2.CAP_V4L2)
     elif config.is_file:
         capture = cv2.VideoCapture(source)
     else:
-        timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC]
-        pairs = [value for name in timeouts for value in (name, _READ_TIMEOUT)]
-        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, pairs)
+        opening = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, patience]
+        reading = [cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_TIMEOUT]
+        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, opening + reading)
     if not capture.isOpened():
         raise UserError(f"cannot open {config.source}: check cable, address and permission (video)")
     if config.is_camera:

@@ -15,6 +15,7 @@ WRIST = "observation.images.wrist"
 TACTILE_LEFT = "observation.images.tactile_left"
 TACTILE_RIGHT = "observation.images.tactile_right"
 ACTION = "action"
+COST = "cost"  # of deployed episodes whose rig names a goal
 
 TACTILE = (TACTILE_LEFT, TACTILE_RIGHT)
 CAMERAS = (FRONT, WRIST)
@@ -29,12 +30,11 @@ TRUTH_PROGRESS = "truth.progress"
 TRUTH_SUCCESS = "truth.success"
 TRUTH_FAILURE = "truth.failure"  # of tasks that can fail before their time is up
 
-N_JOINTS = 7
+N_JOINTS = 7  # of an FR3, for which policies are; see `features_of` for other arms
 CONTROL_HZ = 20
 TACTILE_SHAPE = (240, 320, 3)
 CAMERA_SHAPE = (128, 128, 3)
 
-_JOINTS = tuple(f"joint_{i}" for i in range(1, N_JOINTS + 1))
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 
@@ -51,13 +51,28 @@ class Feature:
 
 _IMAGE_NAMES = ("height", "width", "channels")
 
+
+def _of_joints(joints: int) -> dict[str, Feature]:
+    """The two columns that differ between arms."""
+    names = [f"joint_{i}" for i in range(1, joints + 1)]
+    return {
+        STATE: Feature(
+            "float32",
+            (2 * joints + 1,),
+            (*(f"{j}.pos" for j in names), *(f"{j}.vel" for j in names), "gripper.pos"),
+            "joint positions (rad), joint velocities (rad/s), gripper width (m)",
+        ),
+        ACTION: Feature(
+            "float32",
+            (joints + 1,),
+            (*(f"{j}.delta" for j in names), "gripper.target"),
+            "joint change for this control tick (rad), gripper width target (m)",
+        ),
+    }
+
+
 FEATURES: dict[str, Feature] = {
-    STATE: Feature(
-        "float32",
-        (15,),
-        tuple(f"{j}.pos" for j in _JOINTS) + tuple(f"{j}.vel" for j in _JOINTS) + ("gripper.pos",),
-        "joint positions (rad), joint velocities (rad/s), gripper width (m)",
-    ),
+    STATE: _of_joints(N_JOINTS)[STATE],
     TCP_POSE: Feature("float32", (7,), _POSE, "tool centre point in the base frame: m, wxyz"),
     WRENCH: Feature(
         "float32", (6,), _WRENCH, "external force (N) and torque (Nm) at the TCP, base frame"
@@ -66,11 +81,12 @@ FEATURES: dict[str, Feature] = {
     WRIST: Feature("uint8", CAMERA_SHAPE, _IMAGE_NAMES, "camera on the hand, RGB"),
     TACTILE_LEFT: Feature("uint8", TACTILE_SHAPE, _IMAGE_NAMES, "left fingertip sensor, RGB"),
     TACTILE_RIGHT: Feature("uint8", TACTILE_SHAPE, _IMAGE_NAMES, "right fingertip sensor, RGB"),
-    ACTION: Feature(
+    ACTION: _of_joints(N_JOINTS)[ACTION],
+    COST: Feature(
         "float32",
-        (8,),
-        tuple(f"{j}.delta" for j in _JOINTS) + ("gripper.target",),
-        "joint change for this control tick (rad), gripper width target (m)",
+        (1,),
+        ("cost",),
+        "distance to the goal as measured in the run: 1 at the usual start, 0 at the usual end",
     ),
     TRUTH_PAD_WRENCH: Feature(
         "float32",
@@ -87,3 +103,8 @@ FEATURES: dict[str, Feature] = {
         "bool", (3,), ("drop", "jam", "over_force"), "object lost, stuck, pressed too hard"
     ),
 }
+
+
+def features_of(joints: int) -> dict[str, Feature]:
+    """`FEATURES` of an arm with so many joints: 7 of an FR3, 6 of a UR5e."""
+    return FEATURES | _of_joints(joints)

@@ -223,16 +223,17 @@ def read_columns(
         where = np.flatnonzero(group_of == group)
         rows = frames[where] - (ends[group] - sizes[group])
         for key in features:
-            out[key][where] = _from_arrow(key, table[key].combine_chunks(), rows)
+            shape = features[key]["shape"]
+            out[key][where] = _from_arrow(key, shape, table[key].combine_chunks(), rows)
     return out
 
 
 def _from_arrow(
-    key: str, column: pa.Array, rows: Sequence[int] | Int[np.ndarray, " n"]
+    key: str, shape: list[int], column: pa.Array, rows: Sequence[int] | Int[np.ndarray, " n"]
 ) -> Shaped[np.ndarray, "n ..."]:
     if is_image(key):
         png = column.field("bytes")
         return np.stack([decode_png(png[int(row)].as_py()) for row in rows])
     if not pa.types.is_primitive(column.type):
         column = column.flatten()
-    return column.to_numpy(zero_copy_only=False).reshape(-1, *FEATURES[key].shape)[rows]
+    return column.to_numpy(zero_copy_only=False).reshape(-1, *shape)[rows]

@@ -7,7 +7,15 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.vocabulary import FEATURES, IMAGE_PREFIX
+from touchgoal.control.vocabulary import (
+    ACTION,
+    FEATURES,
+    IMAGE_PREFIX,
+    N_JOINTS,
+    STATE,
+    Feature,
+    features_of,
+)
 
 MetaValue = str | int | float | bool | list[str]
 
@@ -38,7 +46,7 @@ class Episode:
     Attributes:
         frames: key of `FEATURES` -> array (T, *shape) in the key's dtype, rows in step at the
             set's frame rate. Pictures are uint8 RGB (T, h, w, 3); h and w may differ from
-            `FEATURES` but not within a set of episodes.
+            `FEATURES` but not within a set of episodes, nor may the arm's number of joints.
         task: the instruction, in words.
         meta: facts about the whole episode, such as the object, the seed and the outcome. All
             episodes of a set have the same keys with the same types.
@@ -52,14 +60,23 @@ class Episode:
         """Number of frames, T."""
         return next((len(values) for values in self.frames.values()), 0)
 
+    @property
+    def features(self) -> dict[str, Feature]:
+        """The vocabulary for this episode's arm, which its state, else its action, tells."""
+        for key, joints in ((STATE, lambda n: (n - 1) // 2), (ACTION, lambda n: n - 1)):
+            if key in self.frames and self.frames[key].ndim == 2:
+                return features_of(joints(self.frames[key].shape[1]))
+        return features_of(N_JOINTS)
+
     def check(self) -> None:
         """Raises UserError, naming the key, if anything here could not be stored faithfully."""
         if not self.task.strip():
             raise UserError("an episode needs a task in words: its task is empty")
         if len(self) == 0:
             raise UserError("an episode needs at least one key and one frame: this one is empty")
+        features = self.features
         for key, values in self.frames.items():
-            _check_key(key, values)
+            _check_key(features, key, values)
             if len(values) != len(self):
                 first = next(iter(self.frames))
                 raise UserError(
@@ -70,10 +87,10 @@ class Episode:
             _check_meta(key, value)
 
 
-def _check_key(key: str, values: np.ndarray) -> None:
-    if key not in FEATURES:
+def _check_key(features: dict[str, Feature], key: str, values: np.ndarray) -> None:
+    if key not in features:
         raise UserError(f"{key!r} is no key of touchgoal; known keys: {', '.join(FEATURES)}")
-    feature = FEATURES[key]
+    feature = features[key]
     if values.dtype != feature.dtype:
         raise UserError(f"{key} has dtype {values.dtype}: convert it to {feature.dtype}")
     if is_image(key):
@@ -111,7 +128,7 @@ def _check_meta(key: str, value: Any) -> None:
 def describe_features(episode: Episode, fps: int) -> dict[str, dict[str, Any]]:
     """The `features` of LeRobot's meta/info.json for an episode, index columns included."""
     described = {}
-    for key, feature in FEATURES.items():
+    for key, feature in episode.features.items():
         if key not in episode.frames:
             continue
         shape = list(episode.frames[key].shape[1:])

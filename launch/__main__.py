@@ -18,6 +18,7 @@ COMMANDS = {
     "run-policy": "run a policy in a task: success rate, video",
     "reward-curves": "dense cost and reward curves for episodes or plain videos",
     "calibrate": "fit a sensor's light and gel to ball presses",
+    "deploy": "run a policy on an arm or on the twin, with safety and recording",
     "twin": "serve the simulated cell over the wire protocols of real ones",
     "repair": "check a set of episodes and mend what an interruption left",
     "benchmark": "print one table of measured figures",

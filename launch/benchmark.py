@@ -9,6 +9,7 @@ import tyro
 from touchgoal.benchmarks import (
     bead_maze,
     env_speed,
+    faults,
     policy_latency,
     reward_quality,
     tactile_realism,
@@ -21,6 +22,7 @@ BENCHMARKS: dict[type, Any] = {
     for module in (
         bead_maze,
         env_speed,
+        faults,
         policy_latency,
         reward_quality,
         tactile_realism,
@@ -30,6 +32,7 @@ BENCHMARKS: dict[type, Any] = {
 Config = (
     Annotated[bead_maze.Config, tyro.conf.subcommand("bead-maze")]
     | Annotated[env_speed.Config, tyro.conf.subcommand("env-speed")]
+    | Annotated[faults.Config, tyro.conf.subcommand("faults")]
     | Annotated[policy_latency.Config, tyro.conf.subcommand("policy-latency")]
     | Annotated[reward_quality.Config, tyro.conf.subcommand("reward-quality")]
     | Annotated[tactile_realism.Config, tyro.conf.subcommand("tactile-realism")]

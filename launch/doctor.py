@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from touchgoal.control.errors import UserError
+from touchgoal.control.finding import Finding, require
 from touchgoal.sim_envs.rendering import OPENGL_PACKAGES
 
 _GL_PROBE = "import touchgoal, mujoco; c = mujoco.GLContext(64, 64); c.make_current(); c.free()"
@@ -23,31 +24,13 @@ class Config:
     """Print only what is missing."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """One line of the report.
-
-    Attributes:
-        ok: whether it works; None for something optional that is not there.
-        mend: what to do if it does not.
-    """
-
-    what: str
-    ok: bool | None
-    says: str
-    mend: str = ""
-
-
 def main(config: Config) -> None:
     """Print the report; UserError, so exit code 1, if something required is missing."""
     findings = [check() for check in CHECKS]
     for f in findings:
         if not config.quiet or f.ok is False:
-            mark = {True: "ok", False: "MISSING", None: "-"}[f.ok]
-            print(f"{mark:<9}{f.what:<18}{f.says}" + (f"  ->  {f.mend}" if f.mend else ""))
-    broken = [f for f in findings if f.ok is False]
-    if broken:
-        raise UserError("; ".join(f"{f.what}: {f.mend}" for f in broken))
+            print(f)
+    require(findings)
 
 
 def python() -> Finding:

@@ -110,6 +110,11 @@ def _check(
             f"{episodes.root} runs at {episodes.fps} Hz, the policy at {config.control_hz}: set "
             "control_hz to the episodes' rate"
         )
+    if tuple(episodes.features[v.STATE]["shape"]) != v.FEATURES[v.STATE].shape:
+        raise UserError(
+            f"{episodes.root} is of an arm with another number of joints: policies are for the "
+            f"{v.N_JOINTS} of an FR3"
+        )
     if config.reads_wrench and v.TRUTH_PAD_WRENCH not in episodes.features:
         raise UserError(
             f"{episodes.root} has no {v.TRUTH_PAD_WRENCH}, which only simulated episodes have: "

@@ -33,12 +33,12 @@ class Contact:
 
     Attributes:
         frame: first frame in contact, None if there is none.
-        known_from: "truth" (the simulator's), "detected" (from the tactile images) or "no touch"
-            (the source has no tactile images).
+        known_from: "truth" (the simulator's), "detected" (from the tactile images), "no touch" (the
+            source has no tactile images) or "not looked for" (a single tick).
     """
 
     frame: int | None
-    known_from: Literal["truth", "detected", "no touch"]
+    known_from: Literal["truth", "detected", "no touch", "not looked for"]
 
 
 @dataclass(frozen=True)

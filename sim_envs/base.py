@@ -347,13 +347,11 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         return keys + (list(v.TACTILE) if self.config.tactile else [])
 
     def _shape(self, key: str) -> tuple[int, ...]:
-        if key == v.STATE:
-            return (2 * self.n_joints + 1,)
         if key in v.CAMERAS:
             return (*self.config.camera_size, 3)
         if key in v.TACTILE:
             return (*self.sensor.image_shape, 3)
-        return v.FEATURES[key].shape
+        return v.features_of(self.n_joints)[key].shape
 
     def _action_space(self) -> gym.spaces.Box:
         step = self.robot.hardware.velocity / self.config.control_hz

@@ -63,7 +63,7 @@ class PickPlaceExpert:
     def _run(self) -> Iterator[np.ndarray]:
         env = self._env
         position, _ = env.kinematics.forward(env.command)
-        yaw, target_yaw = self._yaw_now(), self._grasp_yaw()
+        yaw, target_yaw = self._yaw_now(), self._env.grasp_yaw(self._picked)
         stop = self._freeze_tick()
         tick, width = 0, GRIPPER_MAX_WIDTH
         for segment in self._plan():
@@ -132,18 +132,6 @@ class PickPlaceExpert:
     def _yaw_now(self) -> float:
         _, R = self._env.kinematics.forward(self._env.command)
         return float(np.arctan2(R[1, 0], R[0, 0]))
-
-    def _grasp_yaw(self) -> float:
-        """Hand yaw that closes across the object, within a quarter turn of the comfortable one."""
-        env = self._env
-        body = next(b for b in env.bodies if b.name == self._picked)
-        if body.kind.shape in ("sphere", "cylinder", "mesh"):
-            return 0.0
-        w, x, y, z = env.object_pose(self._picked)[3:]
-        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        if body.kind.shape == "box" and body.size[0] < body.size[1]:
-            yaw += np.pi / 2  # close along the narrower side
-        return float((yaw + np.pi / 2) % np.pi - np.pi / 2)
 
     def _towards(self, position: np.ndarray, yaw: float, width: float) -> np.ndarray:
         env = self._env

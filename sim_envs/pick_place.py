@@ -67,8 +67,20 @@ class PickPlace(FrankaTactileEnv):
         return f"pick up the {self.bodies[0].kind.name.replace('_', ' ')} and place it on the disc"
 
     def layout(self) -> dict[str, list[float]]:
-        """The object's pose, and where on the table it is to go (m)."""
-        return super().layout() | {"goal": self.goal.tolist()}
+        """The object's pose; where to close the hand (m, and yaw in rad); where it is to go (m)."""
+        grasp = [*self.object_pose()[:3].tolist(), self.grasp_yaw("object")]
+        return super().layout() | {"grasp": grasp, "goal": self.goal.tolist()}
+
+    def grasp_yaw(self, name: str) -> float:
+        """Hand yaw that closes across an object, within a quarter turn of the comfortable one."""
+        body = next(b for b in self.bodies if b.name == name)
+        if body.kind.shape in ("sphere", "cylinder", "mesh"):
+            return 0.0
+        w, x, y, z = self.object_pose(name)[3:]
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        if body.kind.shape == "box" and body.size[0] < body.size[1]:
+            yaw += np.pi / 2  # close along the narrower side
+        return float((yaw + np.pi / 2) % np.pi - np.pi / 2)
 
     def _sample(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
         config = self.config

@@ -11,8 +11,8 @@ from toy_policies import TOY, feeling, policy_for, rng, toy_ticks, toy_windows
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.policies.acting import Planner, PolicyActor
+from touchgoal.policies.deploy.realtime import RealTimeActor
 from touchgoal.policies.policy import Condition, Policy
-from touchgoal.policies.realtime import RealTimeActor
 from touchgoal.policies.touch import TouchEmbedder
 
 

@@ -46,11 +46,14 @@ class DepthEstimator:
 
     Args:
         photometry: the sensor file.
+        finest: side of the smallest cells, px. 8 takes a third of the time of 2 and finds the
+            deepest point of most contacts as well.
     """
 
-    def __init__(self, photometry: Photometry) -> None:
+    def __init__(self, photometry: Photometry, finest: int = 2) -> None:
         self._photometry = photometry
-        self._levels = [_Level(photometry, cell) for cell, *_ in _SCHEDULE]
+        self._schedule = [step for step in _SCHEDULE if step[0] >= finest]
+        self._levels = [_Level(photometry, cell) for cell, *_ in self._schedule]
 
     def estimate(
         self,
@@ -68,7 +71,7 @@ class DepthEstimator:
             background = self._photometry.background.astype(np.float32)
         change = image - background
         surface = np.zeros((1, 1), np.float32)
-        for level, (_, steps, searched, inner) in zip(self._levels, _SCHEDULE, strict=True):
+        for level, (_, steps, searched, inner) in zip(self._levels, self._schedule, strict=True):
             surface = level.refine(surface, change, steps, searched, inner)
         h, w, _ = image.shape
         return cv2.resize(surface, (w, h), interpolation=cv2.INTER_LINEAR)

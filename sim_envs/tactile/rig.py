@@ -9,7 +9,7 @@ from touchgoal.sim_envs.contact import PadContact
 from touchgoal.sim_envs.objects import Body
 from touchgoal.sim_envs.scene import build
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
-from touchgoal.sim_envs.tactile.unit import Unit
+from touchgoal.sim_envs.tactile.unit import Unit, sample_unit
 
 
 class PressRig:
@@ -57,3 +57,17 @@ class PressRig:
         torque = np.array([-y * force, x * force, x * sy - y * sx])
         contact = PadContact(np.array([sx, sy, -force]), torque, 0.0, self._geoms)
         return self._pad.sense(self._data, contact, rng)
+
+
+def warm_up(bodies: list[Body], sensor: SensorModel) -> None:
+    """Press each body once, and it drags: loading the machine code of a touch takes up to a second.
+
+    For a simulator that must keep up with a clock or a client.
+    """
+    rng = np.random.default_rng(0)
+    unit = sample_unit(sensor, rng)
+    for body in bodies:
+        rig = PressRig(body, sensor, unit)
+        rig.place(np.zeros(3))
+        for _ in range(2):  # the second time the gel remembers the first
+            rig.sense(1.0, rng, shear=(0.1, 0.0))

@@ -15,6 +15,9 @@ DT = 1e-3  # s, of the Franka control interface and of the physics
 AT_REST = 0.01  # rad/s
 _FILTER = 0.02  # s, first order: how fast the arm's estimate of external torque follows; our choice
 _YIELD = 0.02  # s, likewise: how fast an arm that was hit gives way; our choice
+# rad/s^2 of a reflex: four times what motions may use. At once, a wrist would be asked for more torque
+# than it has, and chatter between both ends of it for good.
+_REFLEX = 40.0
 
 Joints = Float[np.ndarray, " n"]
 
@@ -105,9 +108,9 @@ class Cell:
         self._braking = acceleration
 
     def yield_(self) -> None:
-        """Stop here, at once, as hard as the joints can, and then give way to what presses."""
+        """Stop here, as hard as a reflex does, and then give way to what presses."""
         self._release(torque=False)
-        self.q_d, self.dq_d, self._yielding = self.q.copy(), np.zeros_like(self.dq), True
+        self.q_d, self.dq_d, self._yielding = self.q.copy(), self.dq.copy(), True
 
     def grasp(self, width: float, speed: float, force: float) -> None:
         """Send the gripper to `width` (m) at `speed` (m/s), pressing with `force` (N) a finger."""
@@ -131,7 +134,8 @@ class Cell:
             self.dq_d = braked(self.dq_d, self._braking, DT)
             self.q_d = self.q_d + DT * self.dq_d
         if self._yielding:
-            self.q_d = self.q_d + (DT / _YIELD) * (self.q - self.q_d)
+            self.dq_d = braked(self.dq_d, np.full_like(self.dq_d, _REFLEX), DT)
+            self.q_d = self.q_d + DT * self.dq_d + (DT / _YIELD) * (self.q - self.q_d)
         pushed = self._push()
         env.grasp_force = self.grip.force
         if self._torque is not None:

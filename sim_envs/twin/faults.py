@@ -2,7 +2,8 @@
 
     truth                         what only a simulator knows, and where the arm is
     reset SEED [OPTIONS]          begin an episode; OPTIONS is a JSON object of the task's
-    freeze SECONDS                nothing passes between the arm (and its hand) and its clients
+    freeze SECONDS                nothing passes between the arm (and its hand) and its clients, for
+                                  so long simulated
     drop                          hang up on the arm's clients
     stop-button on|off            user stop of a Franka, emergency stop of a UR
     error NAME                    stop the arm with an error, such as cartesian_reflex
@@ -25,7 +26,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from touchgoal.control.errors import UserError
-from touchgoal.sim_envs.twin.cell import Cell
+from touchgoal.sim_envs.twin.cell import DT, Cell
 from touchgoal.sim_envs.twin.doors import Door
 from touchgoal.sim_envs.twin.mjpeg import Stream
 from touchgoal.sim_envs.twin.serial_ports import SerialPort
@@ -62,14 +63,15 @@ class Faults:
     ) -> None:
         self._cell, self._arm, self._streams, self._ports = cell, arm, streams, ports
         self._door = Door(host, port)
-        self._thaw = 0.0
+        self._frozen = 0.0  # s left, simulated: a slow machine would end it before a packet is lost
         self.address = f"{host}:{self._door.port}"
 
     def receive(self) -> None:
         """Do what has been asked."""
-        if self._thaw and time.monotonic() > self._thaw:
-            self._thaw = 0.0
-            self._arm.freeze(False)
+        if self._frozen > 0:
+            self._frozen -= DT
+            if self._frozen <= 0:
+                self._arm.freeze(False)
         for client in self._door.poll():
             for line in client.lines():
                 client.send(json.dumps(self._answer(line)).encode() + b"\n")
@@ -113,7 +115,7 @@ class Faults:
 
     def _freeze(self, seconds: float) -> None:
         self._arm.freeze(True)
-        self._thaw = time.monotonic() + seconds
+        self._frozen = seconds
 
     def _nudge(self, x: float, y: float, z: float, seconds: float) -> None:
         self._cell.nudge(np.array([x, y, z]), seconds)

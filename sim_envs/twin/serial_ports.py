@@ -66,7 +66,7 @@ class SerialPort:
     def write(self, message: bytes) -> None:
         """Send; what nobody reads is lost, as on a wire."""
         if self._rng.random() < self.garble:
-            cut = int(self._rng.integers(len(message)))
+            cut = int(self._rng.integers(len(message) - 2))  # a line without its \r is still whole
             message = message[:cut] + message[cut + 1 :]
         try:
             if self._ends:

@@ -8,6 +8,8 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH
+from touchgoal.sim_envs.bead_maze import BeadMazeConfig
+from touchgoal.sim_envs.tactile.rig import warm_up
 from touchgoal.sim_envs.tasks import TaskConfig, make_env
 from touchgoal.sim_envs.twin import serial_ports
 from touchgoal.sim_envs.twin.cell import DT, Cell
@@ -77,6 +79,11 @@ class Twin:
         self.cell = Cell(
             make_env(replace(config.task, scene=scene)), config.seed, dict(config.options)
         )
+        env = self.cell.env
+        if (
+            env.config.tactile
+        ):  # a client would lose the arm while code is loaded at the first touch
+            warm_up(env.bodies, env.sensor)
         self._lock_step, self._due = config.lock_step, time.monotonic()
         self.stopped = False
         self._services: list[Service] = []
@@ -136,6 +143,7 @@ class Twin:
             ports["gripper"] = robotiq.port
             widths = [GRIPPER_MAX_WIDTH, 0.0]
             gripper = {"kind": "robotiq", "port": str(robotiq.port.path), "widths": widths}
+        gripper["force"] = cell.env.grasp_force  # with which the episode's object is to be held
         services.append(streams := Streams(cell, host, config.port))
         control = config.port + 1 if config.port else 0
         services.append(faults := Faults(cell, arm, streams.streams, ports, host, control))
@@ -151,6 +159,9 @@ class Twin:
                 "zero": serial_ports.ZERO,
             },
             "faults": faults.address,
+            "task": "bead-maze" if isinstance(config.task, BeadMazeConfig) else "pick-place",
+            "seed": config.seed,
+            "options": config.options,
             "instruction": cell.env.instruction(),
             "lock_step": config.lock_step,
         }

@@ -2,20 +2,47 @@
 
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Float32
 
 from touchgoal.control import vocabulary as v
-from touchgoal.policies.acting import Observation, Planner
+from touchgoal.control.errors import UserError
+from touchgoal.policies.acting import Observation
+
+_FIRST = 20.0  # s for the first plan; it warms everything up
+_CLOSING = 2.0  # s for a plan under way when the episode ends
 
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
     tick: int  # at which its first action belongs
     actions: Float32[np.ndarray, "h 8"]
+
+
+@runtime_checkable
+class Horizons(Protocol):
+    """What of a policy's config the hand-over needs; see `PolicyConfig`."""
+
+    @property
+    def observation_horizon(self) -> int: ...  # noqa: D102
+    @property
+    def execution_horizon(self) -> int: ...  # noqa: D102
+    @property
+    def control_hz(self) -> int: ...  # noqa: D102
+
+
+@runtime_checkable
+class Plans(Protocol):
+    """Anything that plans: a `Planner`."""
+
+    @property
+    def config(self) -> Horizons: ...  # noqa: D102
+    def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]: ...  # noqa: D102
 
 
 class RealTimeActor:
@@ -28,14 +55,16 @@ class RealTimeActor:
     Attributes:
         latencies: seconds from an observation to its plan, of every plan but the first.
         starved: ticks for which no plan was ready.
+        overdue: s for which that has been so without a break.
         failure: what ended the planning thread, if something did; `act` raises it.
     """
 
-    def __init__(self, planner: Planner) -> None:
+    def __init__(self, planner: Plans) -> None:
         """Starts an episode; `close` ends the thread."""
         self._planner, self._config = planner, planner.config
         self.latencies: list[float] = []
         self.starved = 0
+        self.overdue = 0.0
         self.failure: BaseException | None = None
         self._tick = -1
         self._seen: list[Observation] = []
@@ -57,18 +86,19 @@ class RealTimeActor:
             self._condition.notify_all()
             if first:
                 self._thread.start()
-                self._condition.wait_for(lambda: self._plan is not None or self.failure is not None)
+                if not self._condition.wait_for(self._answered, _FIRST):
+                    raise UserError(f"the policy made no plan in {_FIRST:.0f} s: make it smaller")
             if self.failure is not None:
                 raise self.failure
             return self._action()
 
     def close(self) -> None:
-        """Ends the thread."""
+        """Ends the thread; one that hangs is left behind."""
         with self._condition:
             self._closed = True
             self._condition.notify_all()
         if self._thread.is_alive():
-            self._thread.join()
+            self._thread.join(_CLOSING)
 
     def _action(self) -> np.ndarray:
         assert self._plan is not None
@@ -76,9 +106,14 @@ class RealTimeActor:
         if k < len(self._plan.actions):
             action = self._plan.actions[k]
             self._width = float(action[v.N_JOINTS])
+            self.overdue = 0.0
             return action
         self.starved += 1
+        self.overdue += 1 / self._config.control_hz
         return np.append(np.zeros(v.N_JOINTS), self._width).astype(np.float32)
+
+    def _answered(self) -> bool:
+        return self._plan is not None or self.failure is not None
 
     def _work(self) -> None:
         torch.set_num_threads(1)  # of this thread; two lose badly when the other core is taken

@@ -1,0 +1,161 @@
+"""What moves a deployed arm without learning: the start move, and picking and placing by plan."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.control import vocabulary as v
+from touchgoal.control.kinematics import GELSIGHT_TCP, Kinematics, fingers_down
+from touchgoal.control.safety import Safety
+from touchgoal.control.trajectories import (
+    Trajectory,
+    joint_move,
+    require_inside,
+    straight_line,
+)
+from touchgoal.sim_envs.base import Observation
+
+_SHARE = 0.9  # of what the safety layer lets a policy do: a plan should not be clamped
+_START_SHARE = 0.3  # of that, for the start move: a person watches where it goes
+_BEHIND = 0.02  # rad; the arm was held: the plan waits until it has caught up
+_LAG = 0.12  # rad between command and arm beyond which the plan waits; 0.06 is usual at this speed
+_MOVING = 5e-4  # m a tick that the gripper does when it moves
+_CLEARANCE = 0.12  # m above the object before and after the grasp
+_LOWEST = 0.0185, 0.0172  # m of a grasp, of a placement: the sensors' cases stay above the table
+_FEEL_DOWN = 0.004  # m below the grasp's height to look for the table
+_SUPPORT = 2.5  # N upwards, more than while it was carried, that mean the table carries it
+_CLOSE, _FEEL, _HOLD = 1.0, 3.0, 0.8  # s for closing the hand, feeling for the table, at the end
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where things are in the base frame.
+
+    Attributes:
+        grasp: x, y, z (m) and yaw (rad) of the hand closing on the object.
+        goal: x, y (m) of where it is to go.
+    """
+
+    grasp: tuple[float, float, float, float]
+    goal: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A move (or, without one, a wait) with the gripper going to `width` (m); may end by feeling."""
+
+    path: Trajectory | None
+    width: float
+    seconds: float
+    until_supported: bool = False
+
+
+class Script:
+    """An actor that walks through segments; the plan waits while the arm is held.
+
+    Attributes:
+        done: whether the last segment is over.
+        overdue: always 0: a script is never late.
+    """
+
+    overdue = 0.0
+
+    def __init__(self, segments: list[Segment], commanded: Callable[[], np.ndarray], hz: float):
+        """An actor.
+
+        Args:
+            segments: in their order; each begins where the one before ends.
+            commanded: the joint positions (rad) commanded now.
+            hz: ticks per second.
+        """
+        self._commanded, self._tick = commanded, 1 / hz
+        self._wrench, self._measured = np.zeros(6), commanded()
+        self._width, self._still = np.inf, False
+        self.done = False
+        self._actions = self._run(segments)
+
+    def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
+        """The action for the next tick."""
+        self._wrench = observation[v.WRENCH]
+        self._measured = observation[v.STATE][: self._measured.size].astype(np.float64)
+        width = float(observation[v.STATE][-1])
+        self._still, self._width = abs(width - self._width) < _MOVING, width
+        return next(self._actions)
+
+    def close(self) -> None:
+        """Nothing is left behind."""
+
+    def _run(self, segments: list[Segment]) -> Iterator[np.ndarray]:
+        still, width = np.zeros(self._commanded().size), 0.0
+        for segment in segments:
+            width, t, weight = segment.width, 0.0, self._wrench[2]
+            while t < segment.seconds:
+                if segment.until_supported and self._wrench[2] - weight > _SUPPORT:
+                    # Command what is, not what was asked: the lag would press on the table.
+                    yield np.append(self._measured - self._commanded(), width)
+                    break
+                wanted = still
+                lag = np.abs(self._commanded() - self._measured).max()
+                if segment.path is None:  # seconds in which nothing moves
+                    t = t + self._tick if self._still and lag < _BEHIND else 0.0
+                else:
+                    at = segment.path.at(t)
+                    if np.abs(at - self._commanded()).max() < _BEHIND and lag < _LAG:
+                        t += self._tick
+                        at = segment.path.at(t)
+                    wanted = at - self._commanded()
+                yield np.append(wanted, width)
+        self.done = True
+        while True:
+            yield np.append(still, width)
+
+
+def start_move(
+    goal: np.ndarray, width: float, safety: Safety, commanded: Callable[[], np.ndarray]
+) -> Script:
+    """Slowly to a posture (rad), the gripper staying at `width` (m).
+
+    UserError if the way leaves the workspace.
+    """
+    limits = safety.joints.scaled(_START_SHARE, _START_SHARE)
+    path = joint_move(commanded(), goal, limits)
+    require_inside(path, safety)
+    return Script([Segment(path, width, path.duration)], commanded, 1 / safety.dt)
+
+
+def pick_and_place(place: Place, safety: Safety, commanded: Callable[[], np.ndarray]) -> Script:
+    """Grasp, carry, set down until the table is felt, and keep holding.
+
+    UserError if the arm cannot go there inside its workspace; nothing has moved then.
+    """
+    robot = safety.limits
+    kinematics = Kinematics(robot.arm, GELSIGHT_TCP)
+    limits = safety.joints.scaled(_SHARE, _SHARE)
+    x, y, z, yaw = place.grasp
+    z = max(z, _LOWEST[0])
+    pick, put = np.array([x, y, z]), np.array([*place.goal, z])
+    deepest = np.array([*place.goal, max(z - _FEEL_DOWN, _LOWEST[1])])
+    up, opened = np.array([0, 0, _CLEARANCE]), robot.stroke[1]
+    q = commanded()
+
+    def line(to: np.ndarray, width: float, least: float = 0.0, felt: bool = False) -> Segment:
+        nonlocal q
+        path = straight_line(kinematics, q, to, fingers_down(yaw), limits)
+        require_inside(path, safety)
+        q = path.at(path.duration)
+        path = replace(path, duration=max(path.duration, least))
+        return Segment(path, width, path.duration, felt)
+
+    segments = [
+        line(pick + up, opened),
+        line(pick, opened),
+        Segment(None, 0.0, _CLOSE),
+        line(pick + up, 0.0),
+        line(put + up, 0.0),
+        line(put + [0, 0, 0.004], 0.0),
+        line(deepest, 0.0, _FEEL, felt=True),
+        Segment(None, 0.0, _HOLD),
+    ]
+    return Script(segments, commanded, 1 / safety.dt)
