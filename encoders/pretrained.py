@@ -92,12 +92,14 @@ def _check_sensor(
 
 
 def _aligned_config(fields: dict[str, Any]) -> TouchEncoderConfig:
-    return TouchEncoderConfig(**fields | {"vit": _vit(fields["vit"])})
+    return TouchEncoderConfig(**_with_vit(fields))
 
 
 def _trunk_config(fields: dict[str, Any]) -> TouchTrunkConfig:
-    return TouchTrunkConfig(**fields | {"vit": _vit(fields["vit"])})
+    return TouchTrunkConfig(**_with_vit(fields))
 
 
-def _vit(fields: dict[str, Any]) -> ViTConfig:
-    return ViTConfig(**fields | {"image_size": tuple(fields["image_size"])})
+def _with_vit(fields: dict[str, Any]) -> dict[str, Any]:
+    vit = fields["vit"]
+    size: dict[str, Any] = {"image_size": tuple(vit["image_size"])}
+    return fields | {"vit": ViTConfig(**vit | size)}
