@@ -1,6 +1,7 @@
 """Shared by all tests: one thread, no network; the twins that several files talk to."""
 
 import os
+import signal
 from collections.abc import Iterator
 
 os.environ["OMP_NUM_THREADS"] = "1"
@@ -12,6 +13,8 @@ import torch  # noqa: E402
 from running_twin import RunningTwin  # noqa: E402
 
 torch.set_num_threads(1)
+# A shell that starts the tests in the background ignores Ctrl-C, for them and all their children.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 _CELL = ["--object", "wooden_block", "--seed", "3"]
 

@@ -148,7 +148,7 @@ def parent(log: Path, *words: str) -> subprocess.Popen[bytes]:
 def test_a_killed_parent_leaves_the_device_at_rest(log: Path) -> None:
     process = parent(log)
     process.send_signal(signal.SIGKILL)
-    process.wait()
+    process.wait(20)
     until(lambda: not running(pid(log)))
     assert log.read_text().endswith("at rest\n")
 
@@ -157,13 +157,13 @@ def test_a_killed_parent_with_a_hung_library_leaves_nothing_running(log: Path) -
     process = parent(log, "short")
     time.sleep(0.3)
     process.send_signal(signal.SIGKILL)
-    process.wait()
+    process.wait(20)
     until(lambda: not running(pid(log)))
 
 
 def test_ctrl_c_is_for_the_parent_alone(log: Path) -> None:
     process = parent(log)
     process.send_signal(signal.SIGINT)
-    process.wait()
+    process.wait(20)
     until(lambda: not running(pid(log)))
     assert log.read_text().endswith("at rest\n")
