@@ -20,6 +20,7 @@ from touchgoal.sim_envs.base import Observation
 
 _AT_START = 0.02  # rad from the start pose after the start move
 _NEAR = 0.1  # rad; nearer than that no start move is made
+_SETTLES = 2.0  # s that a simulator may take to see that the task is done
 
 MakeActor = Callable[[Deployment], DeployedActor]
 
@@ -117,10 +118,14 @@ class Session:
     def _judge(self, ending: Ending) -> bool | None:
         if self.truth is None or not self.execute:
             return None
+        clock = self.station.clock
+        end = clock.now() + (0.0 if ending.stopped else _SETTLES)
         try:
-            return bool(self.truth()["success"])
+            while not (success := bool(self.truth()["success"])) and clock.now() < end:
+                clock.wait(clock.now() + self.safety.dt)
         except UserError:  # the twin has ended; the ending says so
             return None
+        return success
 
     def _record(self, ticks: Ticks, ending: Ending, success: bool | None) -> int:
         rig = self.rig

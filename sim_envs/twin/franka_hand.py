@@ -13,6 +13,7 @@ from touchgoal.sim_envs.twin.franka_wire import HandCommand, HandStatus
 _STILL = 1e-3  # m/s of width
 _SETTLED = 0.1  # s without motion after which a move is over
 _SOMETHING = 1e-3  # m: narrower than this the fingers have met
+_KEPT = 2e-3  # m by which the width may change while something is held
 
 
 @dataclass
@@ -42,7 +43,7 @@ class FrankaHand:
         self.cell = cell
         self.link = wire.Link(host, wire.HAND_PORT, wire.HAND_VERSION, wide=False)
         self._job: Job | None = None
-        self._grasped = False
+        self._grasped, self._held = False, 0.0  # m, the width of what is held
         self._state = np.zeros((), wire.HAND_STATE)
         self._state["max_width"], self._state["temperature"] = GRIPPER_MAX_WIDTH, 30
 
@@ -55,7 +56,9 @@ class FrankaHand:
 
     def send(self) -> None:
         """Send the state."""
-        self._state["width"] = max(0.0, self.cell.env.width())
+        width = self.cell.env.width()
+        self._grasped &= abs(width - self._held) < _KEPT
+        self._state["width"] = max(0.0, width)
         self._state["is_grasped"] = self._grasped
         self.link.send(self._state.tobytes())
         self._state["message_id"] += 1
@@ -102,7 +105,7 @@ class FrankaHand:
         status = HandStatus.SUCCESS
         if job.accepted is not None:
             least, most = job.accepted
-            self._grasped = max(least, _SOMETHING) < width < most
+            self._grasped, self._held = max(least, _SOMETHING) < width < most, width
             status = HandStatus.SUCCESS if self._grasped else HandStatus.UNSUCCESSFUL
         elif abs(width - reached) > 2e-3:
             status = HandStatus.UNSUCCESSFUL  # something was in the way
