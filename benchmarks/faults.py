@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from touchgoal.policies.acting import Observation
 from touchgoal.policies.deploy.deployed import Learned, make_actor
 from touchgoal.policies.deploy.deployment import DeployedActor, Deployment
 from touchgoal.policies.deploy.session import Session
+from touchgoal.policies.policy import PolicyConfig
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.twin.faults import ask
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
@@ -195,7 +197,7 @@ def _deploy(rig: Rig, case: Case, episodes: Path, said: Path, broke: Path) -> No
     """The deployment's process; a first, short episode is there before the fault comes."""
     station = open_station(rig, v.CONTROL_HZ)
     safety = Safety(station.robot, v.CONTROL_HZ, watchdogs_of(rig))
-    truth = lambda: ask(rig.task.twin, "truth")  # noqa: E731
+    truth = partial(ask, rig.task.twin, "truth")
 
     def session(make: Callable[[Deployment], DeployedActor], seconds: float) -> Session:
         short = replace(rig, task=replace(rig.task, seconds=seconds))
@@ -253,20 +255,12 @@ class Broken:
         """Nothing is left behind."""
 
 
-@dataclass(frozen=True)
-class Horizons:
-    """What the planning thread asks of a policy's config."""
-
-    observation_horizon: int = 1
-    execution_horizon: int = 8
-    prediction_horizon: int = 16
-    control_hz: int = v.CONTROL_HZ
-
-
 class Hanging:
     """A planner that turns the base and then never answers again, in the real planning thread."""
 
-    config = Horizons()
+    config = PolicyConfig(
+        touch_dim=0, touch="", observation_horizon=1, execution_horizon=8, prediction_horizon=16
+    )
 
     def __init__(self, width: float, breaks: Callable[[], None]) -> None:
         self._width, self._breaks, self._plans = width, breaks, 0

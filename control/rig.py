@@ -2,7 +2,7 @@
 
 import json
 import tomllib
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -274,8 +274,3 @@ def _read_table(kind: Any, table: Any, where: str) -> Any:
 def _require(right: bool, where: str, wanted: str, value: Any) -> None:
     if not right:
         raise UserError(f"{where} is to be {wanted}, not {value!r}")
-
-
-def simulated(rig: Rig) -> Rig:
-    """The same rig with a simulated arm, as `arm = "sim"` in its file."""
-    return replace(rig, arm="sim")

@@ -6,7 +6,7 @@ A dry run unless --execute is given: everything is read, checked and planned, no
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,7 +19,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.finding import require
 from touchgoal.control.newest import Newest
 from touchgoal.control.protocols import DriverError
-from touchgoal.control.rig import Rig, read_rig, simulated
+from touchgoal.control.rig import Rig, read_rig
 from touchgoal.control.safety import Safety
 from touchgoal.control.station import Station, open_station, watchdogs_of
 from touchgoal.encoders import pretrained
@@ -56,7 +56,9 @@ class Config:
 
 def main(config: Config) -> None:
     """Connect, check, ask, run, record, report; UserError, so exit code 1, if it was stopped."""
-    rig = simulated(read_rig(config.rig)) if config.sim else read_rig(config.rig)
+    rig = read_rig(config.rig)
+    if config.sim:
+        rig = replace(rig, arm="sim")
     out = open_run(config.out, "deploy", config)
     try:
         station = (

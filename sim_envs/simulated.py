@@ -200,7 +200,7 @@ def simulate(rig: Rig, hz: float) -> Station:
     """The station of a rig with `arm = "sim"`: its sensors, task and limits, in simulation."""
     task = rig.task
     chosen = {"object": task.object, "wire": task.wire}
-    env = make_env(_task(rig))
+    env = make_env(task_of(rig))
     cell = Cell(env, task.seed, {name: value for name, value in chosen.items() if value})
     env.refresh()
     arm = SimulatedArm(cell, hz)
@@ -222,10 +222,14 @@ def simulate(rig: Rig, hz: float) -> Station:
     )
 
 
-def _task(rig: Rig) -> TaskConfig:
-    """The environment that has the rig's sensors."""
+def task_of(rig: Rig) -> TaskConfig:
+    """The task's own options with the rig's sensors, at the rate of a deployment."""
     task = BeadMazeConfig() if rig.task.name == "bead-maze" else PickPlaceConfig()
     scene = replace(task.scene, sensor=rig.sensor)
     return replace(
-        task, cameras=tuple(rig.cameras), tactile=rig.fingertips is not None, scene=scene
+        task,
+        cameras=tuple(rig.cameras),
+        tactile=rig.fingertips is not None,
+        scene=scene,
+        control_hz=v.CONTROL_HZ,
     )

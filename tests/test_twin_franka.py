@@ -94,10 +94,13 @@ def test_franka_holds_clients_to_its_limits(fr3: RunningTwin) -> None:
 
 
 def picks(address: str, home: list[float], position: list[float], yaw: float) -> dict:
-    """Closes on air, then on the object, and lifts it."""
+    """Closes on air, then on the object, and lifts it; first our driver meets it on a way part in."""
     import franky
 
-    robot, gripper = connect(address), franky.Gripper(address)
+    from touchgoal.control.franka_hand import FrankaHandClient
+
+    robot, driver = connect(address), FrankaHandClient(address, 20.0)
+    gripper = driver._hand  # a hand takes one client
     robot.relative_dynamics_factor = 0.6
     robot.move(franky.JointMotion(home))
     air = gripper.grasp(0.03, 0.1, 20.0)
@@ -106,6 +109,14 @@ def picks(address: str, home: list[float], position: list[float], yaw: float) ->
     for height in (0.12, 0.0):
         at = franky.Affine([position[0], position[1], position[2] + height], half)
         robot.move(franky.CartesianMotion(at))
+    driver.tick()
+    driver.command(0.01)
+    end = time.monotonic() + 20
+    while not driver.read().grasped and time.monotonic() < end:
+        driver.tick()
+        time.sleep(driver.period)
+    met = driver.read()
+    gripper.open(0.1)
     start = time.monotonic()
     grasped = gripper.grasp(0.04, 0.04, 20.0, 0.04, 0.04)
     took = time.monotonic() - start
@@ -113,6 +124,7 @@ def picks(address: str, home: list[float], position: list[float], yaw: float) ->
     robot.move(franky.CartesianMotion(up, franky.ReferenceType.Relative))
     time.sleep(0.5)
     return {
+        "met": [met.grasped, met.width, met.fault],
         "air": air,
         "opened": opened,
         "grasped": grasped and gripper.is_grasped,
@@ -128,6 +140,8 @@ def test_franka_grasps_what_is_there(fr3: RunningTwin) -> None:
     position = [*pose[:2], max(pose[2], 0.0185)]
     said = through_franky(picks, fr3, position, yaw_of(pose))
     assert not said["air"] and said["opened"] and said["grasped"]
+    grasped, width, fault = said["met"]
+    assert grasped and abs(width - said["width"]) < 2e-3 and fault == ""
     truth = fr3.ask("truth")
     assert truth["layout"]["object"][2] > 0.1
     np.testing.assert_allclose(truth["pad_forces"], 20.0, rtol=0.05)

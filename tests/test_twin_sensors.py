@@ -1,5 +1,7 @@
 """The twin's cell without a wire; its pictures, its serial devices, and what it says to mistakes."""
 
+from typing import Literal
+
 import cv2
 import numpy as np
 import pytest
@@ -18,8 +20,8 @@ pytestmark = pytest.mark.realtime
 
 
 @pytest.mark.parametrize("arm", ["fr3", "ur5e"])
-def test_arm_follows_without_lag(arm: str) -> None:
-    scene = SceneConfig(arm=arm)  # type: ignore[arg-type]
+def test_arm_follows_without_lag(arm: Literal["fr3", "ur5e"]) -> None:
+    scene = SceneConfig(arm=arm)
     cell = Cell(PickPlace(PickPlaceConfig(cameras=(), tactile=False, scene=scene)), 3, {})
     start, error = cell.q_d.copy(), 0.0
     for _ in range(1500):

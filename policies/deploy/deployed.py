@@ -15,10 +15,8 @@ from touchgoal.policies.deploy.deployment import DeployedActor
 from touchgoal.policies.deploy.realtime import Plans, RealTimeActor
 from touchgoal.policies.deploy.scripted import Place, pick_and_place
 from touchgoal.policies.follower import WireFollower
-from touchgoal.sim_envs.base import EnvConfig
-from touchgoal.sim_envs.bead_maze import BeadMazeConfig
-from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.scene import SERVO_DAMPING
+from touchgoal.sim_envs.simulated import task_of
 
 
 class Follower:
@@ -67,23 +65,17 @@ def learned(rig: Rig) -> ActorMaker | None:
         return None
     shipped = rig.task.policy == "shipped"
     directory = SHIPPED[rig.task.name] if shipped else Path(rig.task.policy)
-    maker = ActorMaker(directory).checked(env_of(rig))
+    task = task_of(rig)
+    maker = ActorMaker(directory).checked(task)
     if rig.arm == "ur5e":
         raise UserError("the policy commands the seven joints of an FR3, not a UR5e's: use expert")
-    needed = maker.observing(env_of(rig))
+    needed = maker.observing(task)
     if needed.tactile and rig.fingertips is None:
         raise UserError("the policy feels with fingertips, the rig has none: add [fingertips]")
     for camera in needed.cameras:
         if camera not in rig.cameras:
             raise UserError(f"the policy looks at the {camera} camera: add [cameras.{camera}]")
     return maker
-
-
-def env_of(rig: Rig) -> EnvConfig:
-    """The task's own options with the rig's fingertips."""
-    task = BeadMazeConfig() if rig.task.name == "bead-maze" else PickPlaceConfig()
-    scene = type(task.scene)(sensor=rig.sensor)
-    return type(task)(scene=scene, control_hz=v.CONTROL_HZ)
 
 
 def place_of(rig: Rig, truth: Callable[[], dict[str, Any]] | None) -> Place:

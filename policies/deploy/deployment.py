@@ -8,7 +8,7 @@ nothing.
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
@@ -18,7 +18,7 @@ from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.control.protocols import DriverError
 from touchgoal.control.safety import Limit, Reading, Safety, SafetyState
-from touchgoal.control.station import Station
+from touchgoal.control.station import RealClock, Station
 from touchgoal.policies.deploy.sensing import Sensed, Senses
 from touchgoal.sim_envs.base import Observation
 
@@ -171,7 +171,8 @@ class Deployment:
     def run(self, actor: DeployedActor, seconds: float, ticks: Ticks) -> Ending:
         """Let it act until it is done, time is up, someone wants it or something is wrong."""
         try:
-            with _ahead_of_others():
+            real = isinstance(self._station.clock, RealClock)
+            with _ahead_of_others() if real else nullcontext():
                 return self._loop(actor, seconds, ticks)
         except (DriverError, UserError) as error:
             return self.stop(str(error), "check what it names, then start again")
@@ -195,8 +196,8 @@ class Deployment:
             if not first:
                 ticks.late.append(late)
             # What was missed is not made up for, and the first tick warms the policy up.
-            due = max(due + self._safety.dt, clock.now() - self._safety.dt)
-            due = clock.now() + self._safety.dt if first else due
+            dt, now = self._safety.dt, clock.now()
+            due = now + dt if first else max(due + dt, now - dt)
             first = False
             clock.wait(due)
 
