@@ -38,8 +38,9 @@ class PolicyConfig:
         place_noise: likewise of the joint and TCP positions, one draw for all ticks seen: where on
             the table a wire ran shall not tell how it goes on. Velocities and the hand's
             orientation stay as they are.
-        eye: for pictures that no frozen encoder reads; None for a policy without.
-        proprioception: columns of `vocabulary.FEATURES`, the state first.
+        eye: for fingertips that no frozen encoder reads; None for a policy without.
+        proprioception: columns of `vocabulary.FEATURES`, the state first. Where it acts, those that
+            only a simulator knows come from its senses, see `senses.py`.
         observation_horizon: ticks seen, the latest included.
         prediction_horizon: ticks planned. The first is the latest observation's, so that all of
             them can be done; diffusion_policy counts from the oldest observation instead.
@@ -85,6 +86,11 @@ class PolicyConfig:
     def reads_wrench(self) -> bool:
         """Whether its training needs `truth.pad_wrench`."""
         return self.touch_dim > 0 and self.touch_reading == "wrench"
+
+    @property
+    def perceived(self) -> tuple[str, ...]:
+        """Columns that senses must read where there is no simulator to ask."""
+        return tuple(key for key in self.proprioception if not key.startswith("observation."))
 
     @property
     def state_dim(self) -> int:
@@ -145,7 +151,7 @@ class Policy(nn.Module):
         self.eye = None
         if config.eye:
             self.eye = Eye(config.eye)
-            condition += len(config.eye.keys) * config.eye.width
+            condition += len(v.TACTILE) * config.eye.width
         self.condition_dim = condition
         if isinstance(config.head, DiffusionConfig):
             self.head = Diffusion(config.head, ticks, ACTION_DIM, condition)
@@ -252,16 +258,39 @@ class Policy(nn.Module):
 def unroll(
     state: Float[Tensor, "... s"], proprioception: tuple[str, ...]
 ) -> Float[Tensor, "... r"]:
-    """Proprioception with the TCP's quaternion as the first two columns of its rotation matrix.
+    """Proprioception as a network understands it at once.
 
-    A quaternion and its negative are the same turn, and a measured one jumps between the two as
-    the hand turns about the vertical; the matrix does not (Zhou et al. 2019).
+    The TCP's quaternion becomes the first two columns of its rotation matrix. A quaternion and its
+    negative are the same turn, and a measured one jumps between the two as the hand turns about the
+    vertical; the matrix does not (Zhou et al. 2019). What `truth.start` says is seen from the hand,
+    in axes parallel to the base's: a centimetre matters there, not where on the table.
     """
-    parts, start = [], 0
+    parts, start = {}, 0
     for key in proprioception:
-        part = state[..., start : (start := start + v.FEATURES[key].shape[0])]
-        parts += [part[..., :3], _two_columns(part[..., 3:])] if key == v.TCP_POSE else [part]
-    return torch.cat(parts, -1)
+        parts[key] = state[..., start : (start := start + v.FEATURES[key].shape[0])]
+    if v.TCP_POSE in parts:
+        pose = parts[v.TCP_POSE]
+        turned = _two_columns(pose[..., 3:])
+        if v.TRUTH_START in parts:
+            parts[v.TRUTH_START] = _from_hand(parts[v.TRUTH_START], pose[..., :3], turned)
+        parts[v.TCP_POSE] = torch.cat([pose[..., :3], turned], -1)
+    return torch.cat([parts[key] for key in proprioception], -1)
+
+
+def _from_hand(
+    start: Float[Tensor, "... 7"], hand: Float[Tensor, "... 3"], turned: Float[Tensor, "... 6"]
+) -> Float[Tensor, "... 7"]:
+    """`vocabulary.TRUTH_START` relative to the hand's position and yaw."""
+    cos, sin = turned[..., 0], turned[..., 1]
+    cos, sin = cos * cos - sin * sin, 2 * cos * sin  # of twice the hand's yaw
+    yaw = torch.stack(
+        [
+            start[..., 3] * cos + start[..., 4] * sin,
+            start[..., 4] * cos - start[..., 3] * sin,
+        ],
+        -1,
+    )
+    return torch.cat([start[..., :3] - hand, yaw, start[..., 5:] - hand[..., :2]], -1)
 
 
 def _two_columns(quaternion: Float[Tensor, "... 4"]) -> Float[Tensor, "... 6"]:

@@ -92,9 +92,8 @@ def read(
 
 
 def _look(episodes: EpisodeSet, i: int, eye: EyeConfig) -> UInt8[np.ndarray, "t k h w 3"]:
-    frames = episodes.read(i, eye.keys).frames
-    columns = [shrink(frames[key], key, frames[key][0], eye.size) for key in eye.keys]
-    return np.stack(columns, 1)
+    frames = episodes.read(i, v.TACTILE).frames
+    return np.stack([shrink(frames[key], frames[key][0], eye.size) for key in v.TACTILE], 1)
 
 
 def _check(
@@ -110,6 +109,8 @@ def _check(
             f"{episodes.root} runs at {episodes.fps} Hz, the policy at {config.control_hz}: set "
             "control_hz to the episodes' rate"
         )
+    if missing := set(config.proprioception) - set(episodes.features):
+        raise UserError(f"{episodes.root} has no {sorted(missing)[0]}, which the policy acts on")
     if config.reads_wrench and v.TRUTH_PAD_WRENCH not in episodes.features:
         raise UserError(
             f"{episodes.root} has no {v.TRUTH_PAD_WRENCH}, which only simulated episodes have: "

@@ -18,16 +18,21 @@ _CLEARANCE = 0.12  # m above the object before and after the grasp
 _LOWEST_GRASP = 0.0185  # m: the sensor case (32.5 mm) must stay above the table
 _LOWEST_PLACE = 0.0172
 _FEEL_DOWN = 0.010  # m below the grasp's height to look for the table when placing
+_ACCELERATION = 1.5  # m/s^2
+_RETURN = 8.0  # 1/s: greatest speed towards a place per distance to it
+_THERE = 0.003  # m from the place at which a move is over
+_TURN = 1.5  # rad/s
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A straight minimum-jerk move of the TCP, fingers down, while the gripper goes to `width`.
+    """A move of the TCP, fingers down, while the gripper goes to `width`.
 
     Attributes:
         position: of the TCP at the end, m, base frame; None: stay.
         width: gripper target throughout, m.
-        seconds: duration.
+        speed: at most, m/s.
+        seconds: that it lasts, or at most if it is a move.
         until_supported: end early once the table carries the object.
     """
 
@@ -35,6 +40,7 @@ class Segment:
     position: np.ndarray | None
     width: float
     seconds: float
+    speed: float = 0.0
     until_supported: bool = False
 
 
@@ -43,6 +49,8 @@ class PickPlaceExpert:
 
     never_touch closes the hand 8 cm above the object; drop lets go on the way; wrong_object takes
     the first distractor; freeze stops moving somewhere between the start and the goal.
+
+    A move heads for its end from wherever the hand has been led astray.
     """
 
     def __init__(self, env: PickPlace, outcome: Outcome = "success") -> None:
@@ -61,32 +69,38 @@ class PickPlaceExpert:
         return next(self._actions)
 
     def _run(self) -> Iterator[np.ndarray]:
-        env = self._env
-        position, _ = env.kinematics.forward(env.command)
-        yaw, target_yaw = self._yaw_now(), self._grasp_yaw()
-        stop = self._freeze_tick()
+        env, hz = self._env, self._env.config.control_hz
+        yaw, stop = env.grasp_yaw(self._picked), self._freeze_tick()
+        velocity = np.zeros(3)
         tick, width = 0, GRIPPER_MAX_WIDTH
         for segment in self._plan():
-            ticks = round(segment.seconds * env.config.control_hz)
-            start, start_yaw = position, yaw
-            for k in range(1, ticks + 1):
+            for _ in range(round(segment.seconds * hz)):
+                here, R = env.kinematics.forward(env.command)
                 if segment.until_supported and env.object_on_table(self._picked):
-                    # Command what is, not what was asked: the lag would press on the table.
-                    position = env.data.site("tcp").xpos.copy()
                     break
-                s = _minimum_jerk(k / ticks)
-                if segment.position is not None:
-                    position = start + s * (segment.position - start)
-                yaw = start_yaw + s * (target_yaw - start_yaw)
+                target = here if segment.position is None else segment.position
+                if segment.position is not None and _distance(target, here) < _THERE:
+                    break
                 tick += 1
                 if tick > stop:
                     break
-                yield self._towards(position, yaw, segment.width)
+                velocity = self._velocity(target - here, velocity, segment.speed)
+                turn = np.clip(yaw - np.arctan2(R[1, 0], R[0, 0]), -_TURN / hz, _TURN / hz)
+                turned = np.arctan2(R[1, 0], R[0, 0]) + turn
+                yield self._towards(here + velocity / hz, turned, segment.width)
             if tick > stop:
                 break
             width = segment.width
         while True:
             yield np.append(np.zeros(env.n_joints), width)
+
+    def _velocity(self, way: np.ndarray, before: np.ndarray, most: float) -> np.ndarray:
+        """Velocity (m/s) of the next tick on the way (m) to a place, given the last tick's."""
+        distance = float(np.linalg.norm(way))
+        speed = min(most, np.sqrt(2 * _ACCELERATION * distance), _RETURN * distance)
+        change = way / max(distance, 1e-9) * speed - before
+        greatest = _ACCELERATION / self._env.config.control_hz
+        return before + change * min(1.0, greatest / max(float(np.linalg.norm(change)), 1e-9))
 
     def _plan(self) -> list[Segment]:
         env = self._env
@@ -97,25 +111,27 @@ class PickPlaceExpert:
         place = np.array([*env.goal, pick[2]])
         above, over = pick + [0, 0, _CLEARANCE], place + [0, 0, _CLEARANCE]
         deepest = np.array([*env.goal, max(pick[2] - _FEEL_DOWN, _LOWEST_PLACE)])
-        middle = 0.5 * (above + over)
         # Closed on air the pads would touch each other, which is no absence of touch.
         closed = 0.03 if self._outcome == "never_touch" else 0.0
-        carried = GRIPPER_MAX_WIDTH if self._outcome == "drop" else closed
         segments = [
-            Segment("approach", above, GRIPPER_MAX_WIDTH, 1.0),
-            Segment("descend", pick, GRIPPER_MAX_WIDTH, 0.7),
-            Segment("close", None, closed, 0.8),
-            Segment("lift", above, closed, 0.7),
-            Segment("carry", middle, closed, 0.6),
-            Segment("carry", over, carried, 0.6),
-            Segment("lower", place + [0, 0, 0.004], carried, 0.9, until_supported=True),
-            Segment("feel", deepest, carried, 0.8, until_supported=True),
-            Segment("hold", None, carried, 0.8),
+            Segment("approach", above, GRIPPER_MAX_WIDTH, 2.0, speed=0.4),
+            Segment("descend", pick, GRIPPER_MAX_WIDTH, 1.5, speed=0.25),
+            Segment("close", None, closed, 0.7),
+            Segment("lift", above, closed, 1.5, speed=0.25),
+        ]
+        if self._outcome == "drop":
+            segments.append(Segment("carry", 0.5 * (above + over), closed, 1.5, speed=0.4))
+            closed = GRIPPER_MAX_WIDTH
+        segments += [
+            Segment("carry", over, closed, 2.0, speed=0.4),
+            Segment("lower", place + [0, 0, 0.004], closed, 1.5, 0.25, until_supported=True),
+            Segment("feel", deepest, closed, 1.0, 0.02, until_supported=True),
+            Segment("hold", None, closed, 0.8),
         ]
         if env.config.release:
             segments[-1:] = [
                 Segment("release", None, GRIPPER_MAX_WIDTH, 0.5),
-                Segment("retreat", over, GRIPPER_MAX_WIDTH, 0.8),
+                Segment("retreat", over, GRIPPER_MAX_WIDTH, 1.5, speed=0.25),
             ]
         return segments
 
@@ -129,28 +145,11 @@ class PickPlaceExpert:
             return np.inf
         return float(self._env.np_random.integers(15, 85))
 
-    def _yaw_now(self) -> float:
-        _, R = self._env.kinematics.forward(self._env.command)
-        return float(np.arctan2(R[1, 0], R[0, 0]))
-
-    def _grasp_yaw(self) -> float:
-        """Hand yaw that closes across the object, within a quarter turn of the comfortable one."""
-        env = self._env
-        body = next(b for b in env.bodies if b.name == self._picked)
-        if body.kind.shape in ("sphere", "cylinder", "mesh"):
-            return 0.0
-        w, x, y, z = env.object_pose(self._picked)[3:]
-        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        if body.kind.shape == "box" and body.size[0] < body.size[1]:
-            yaw += np.pi / 2  # close along the narrower side
-        return float((yaw + np.pi / 2) % np.pi - np.pi / 2)
-
     def _towards(self, position: np.ndarray, yaw: float, width: float) -> np.ndarray:
         env = self._env
         joints = env.kinematics.reach(position, fingers_down(yaw), env.command)
         return np.append(joints - env.command, width)
 
 
-def _minimum_jerk(s: float) -> float:
-    """Flash and Hogan (1985): position along a rest-to-rest move at a fraction of its time."""
-    return s**3 * (10 - 15 * s + 6 * s * s)
+def _distance(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.linalg.norm(a - b))
