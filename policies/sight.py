@@ -28,10 +28,7 @@ class SightConfig:
         width: of the hidden layer that puts together what they say.
     """
 
-    windows: tuple[tuple[str, Box], ...] = (
-        (v.FRONT, (52, 116, 8, 120)),
-        (v.WRIST, (0, 88, 0, 128)),
-    )
+    windows: tuple[tuple[str, Box], ...] = ((v.FRONT, (52, 116, 8, 120)),)
     channels: int = 32
     glances: int = 16
     detail: int = 32

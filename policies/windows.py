@@ -66,20 +66,16 @@ def read(
             embeddings of other episodes.
     """
     _check(episodes, chosen, config, embedder)
-    if embedder:
-        _fill_cache(episodes, chosen, embedder, workers)
+    felt = embed(episodes, chosen, embedder, workers) if embedder else None
     keys = [*config.proprioception, v.ACTION, *[v.TRUTH_PAD_WRENCH] * config.reads_wrench]
     touch, state, actions, pictures, wrench = [], [], [], [], []
-    for i in tqdm(chosen, desc="episodes", unit="episode"):
+    for n, i in enumerate(tqdm(chosen, desc="episodes", unit="episode")):
         frames = episodes.read(i, keys).frames
         state.append(np.concatenate([frames[key] for key in config.proprioception], 1))
         actions.append(frames[v.ACTION])
         if config.reads_wrench:
             wrench.append(frames[v.TRUTH_PAD_WRENCH])
-        if embedder:
-            touch.append(embeddings(episodes, i, embedder))
-        else:
-            touch.append(np.empty((len(actions[-1]), 0), np.float16))
+        touch.append(felt[n] if felt else np.empty((len(actions[-1]), 0), np.float16))
         if config.eye:
             pictures.append(_look(episodes, i, config.eye))
     parts = (torch.from_numpy(np.concatenate(rows)) for rows in (touch, state, actions))
@@ -124,6 +120,14 @@ def _check(
         )
 
 
+def embed(
+    episodes: EpisodeSet, chosen: Sequence[int], embedder: TouchEmbedder, workers: int = 1
+) -> list[Float16[np.ndarray, "t e"]]:
+    """The embeddings of episodes, made and kept if they are not yet."""
+    _fill_cache(episodes, chosen, embedder, workers)
+    return [embeddings(episodes, i, embedder) for i in chosen]
+
+
 def embeddings(episodes: EpisodeSet, i: int, embedder: TouchEmbedder) -> Float16[np.ndarray, "t e"]:
     """The embeddings that `read` kept of an episode; UserError if they are another episode's."""
     path = _path(episodes, embedder, i)
@@ -146,13 +150,13 @@ def _fill_cache(
     if not missing:
         return
     _path(episodes, embedder, 0).parent.mkdir(parents=True, exist_ok=True)
-    embed = partial(_embed, episodes, embedder)
+    make = partial(_embed, episodes, embedder)
     progress = partial(tqdm, total=len(missing), desc="embed", unit="episode")
     if workers == 1:
-        list(progress(map(embed, missing)))
+        list(progress(map(make, missing)))
         return
     with one_core_workers(workers) as pool:
-        list(progress(pool.map(embed, missing)))
+        list(progress(pool.map(make, missing)))
 
 
 def _embed(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> None:

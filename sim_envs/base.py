@@ -28,7 +28,6 @@ from touchgoal.sim_envs.tactile.unit import Spread, sample_unit
 
 GRIPPER_MAX_WIDTH = 0.08  # m, Franka Hand
 STRAY_SECONDS = 0.5  # for which a disturbance keeps its direction
-STRAY_TURN = 20.0  # rad of disturbance per m of it
 GRIPPER_SPEED = 0.1  # m/s of width, Franka Hand's datasheet maximum
 _SETPOINT_PERIOD = 0.002  # s: set-points coarser than 2 ms shake the wrist (MuJoCo 4.0.0)
 
@@ -46,7 +45,7 @@ class EnvConfig:
         control_hz: control ticks per second.
         max_seconds: after which an episode is truncated.
         disturbance: rms speed (m/s) along each axis at which the hand strays from what is
-            commanded, and, times `STRAY_TURN`, its rms rate of turn (rad/s). An expert then shows
+            commanded, and, times `stray_turn`, its rms rate of turn (rad/s). An expert then shows
             how to come back, and what it is recorded to do is right (DART, Laskey 2017).
         spread: between the units of the sensor; every episode has two of its own.
         scene: robot, sensors, physics.
@@ -71,6 +70,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     holds with `grasp_force` N on each finger, as the Franka Hand's `grasp` does.
     """
 
+    stray_turn = 2.0  # rad of disturbance per m of it
     metadata = {"render_modes": ["rgb_array"], "render_fps": v.CONTROL_HZ}  # noqa: RUF012
 
     def __init__(self, config: EnvConfig, render_mode: str | None = None) -> None:
@@ -282,7 +282,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         tick = 1 / self.config.control_hz
         keep = np.exp(-tick / STRAY_SECONDS)
         self._drift = keep * self._drift + np.sqrt(1 - keep**2) * self.np_random.normal(size=6)
-        twist = self.config.disturbance * np.repeat([1.0, STRAY_TURN], 3) * self._drift
+        twist = self.config.disturbance * np.repeat([1.0, self.stray_turn], 3) * self._drift
         return np.linalg.pinv(self.kinematics.jacobian(self.command)) @ (twist * tick)
 
     def _compile(self, rng: np.random.Generator) -> None:

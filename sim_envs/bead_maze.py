@@ -89,6 +89,7 @@ class BeadMaze(FrankaTactileEnv):
     """
 
     config: BeadMazeConfig
+    stray_turn = 20.0  # rad of disturbance per m of it: the hole turns with the hand
 
     def __init__(self, config: BeadMazeConfig | None = None, render_mode: str | None = None):
         super().__init__(config or BeadMazeConfig(), render_mode)
