@@ -73,9 +73,9 @@ BLIND := --env.no-tactile --env.cameras
 pick-place-policy: $(READY)
 	$(BIN)/touchgoal train-senses --episodes runs/weights/train/episodes \
 		--validation runs/weights/val/episodes --out $(PICK)/senses
-	$(BIN)/touchgoal collect-demos --episodes 20 --seed 120000 $(BLIND) --env.disturbance 0.02 \
+	$(BIN)/touchgoal collect-demos --episodes 20 --seed 120000 $(BLIND) --env.disturbance 0.01 \
 		--out $(PICK)/val
-	$(BIN)/touchgoal collect-demos --episodes 130 --seed 20000 $(BLIND) --env.disturbance 0.02 \
+	$(BIN)/touchgoal collect-demos --episodes 130 --seed 20000 $(BLIND) --env.disturbance 0.01 \
 		--out $(PICK)/train
 	$(BIN)/touchgoal train-policy --task pick-place --episodes $(PICK)/train/episodes \
 		--validation $(PICK)/val/episodes --senses $(PICK)/senses/senses --head regression \

@@ -16,6 +16,7 @@ from touchgoal.policies.eyes import Eye, EyeConfig
 
 TouchReading = Literal["wrench", "free"]
 WRENCH_DIM = v.FEATURES[v.TRUTH_PAD_WRENCH].shape[0]
+_NEAR = 0.02  # m
 _FAR = 5.0  # standard deviations beyond which an input is as surprising as it gets
 
 
@@ -100,7 +101,7 @@ class PolicyConfig:
     @property
     def seen_dim(self) -> int:
         """Width of the proprioception as the network sees it, see `unroll`."""
-        return self.state_dim + (2 if v.TCP_POSE in self.proprioception else 0)
+        return sum(_seen(key) for key in self.proprioception)
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,8 +251,7 @@ class Policy(nn.Module):
         marks = []
         for key in self.config.proprioception:
             places = {v.STATE: v.N_JOINTS, v.TCP_POSE: 3}.get(key, 0)
-            size = v.FEATURES[key].shape[0] + (2 if key == v.TCP_POSE else 0)
-            marks += [1.0] * places + [0.0] * (size - places)
+            marks += [1.0] * places + [0.0] * (_seen(key) - places)
         return torch.tensor(marks)
 
 
@@ -279,7 +279,7 @@ def unroll(
 
 def _from_hand(
     start: Float[Tensor, "... 7"], hand: Float[Tensor, "... 3"], turned: Float[Tensor, "... 6"]
-) -> Float[Tensor, "... 7"]:
+) -> Float[Tensor, "... 12"]:
     """`vocabulary.TRUTH_START` relative to the hand's position and yaw."""
     cos, sin = turned[..., 0], turned[..., 1]
     cos, sin = cos * cos - sin * sin, 2 * cos * sin  # of twice the hand's yaw
@@ -290,7 +290,13 @@ def _from_hand(
         ],
         -1,
     )
-    return torch.cat([start[..., :3] - hand, yaw, start[..., 5:] - hand[..., :2]], -1)
+    way = torch.cat([start[..., :3] - hand, start[..., 5:] - hand[..., :2]], -1)
+    return torch.cat([way, yaw, way / (way.abs() + _NEAR)], -1)
+
+
+def _seen(key: str) -> int:
+    """Width of what `unroll` makes of a column."""
+    return v.FEATURES[key].shape[0] + {v.TCP_POSE: 2, v.TRUTH_START: 5}.get(key, 0)
 
 
 def _two_columns(quaternion: Float[Tensor, "... 4"]) -> Float[Tensor, "... 6"]:

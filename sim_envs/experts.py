@@ -22,6 +22,7 @@ _ACCELERATION = 1.5  # m/s^2
 _RETURN = 8.0  # 1/s: greatest speed towards a place per distance to it
 _THERE = 0.003  # m from the place at which a move is over
 _TURN = 1.5  # rad/s
+_HOLD = 3
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class Segment:
         speed: at most, m/s.
         seconds: that it lasts, or at most if it is a move.
         until_supported: end early once the table carries the object.
+        until_held: end early once both pads have touched something for `_HOLD` ticks.
     """
 
     name: str
@@ -42,6 +44,7 @@ class Segment:
     seconds: float
     speed: float = 0.0
     until_supported: bool = False
+    until_held: bool = False
 
 
 class PickPlaceExpert:
@@ -72,11 +75,14 @@ class PickPlaceExpert:
         env, hz = self._env, self._env.config.control_hz
         yaw, stop = env.grasp_yaw(self._picked), self._freeze_tick()
         velocity = np.zeros(3)
-        tick, width = 0, GRIPPER_MAX_WIDTH
+        tick, held, width = 0, 0, GRIPPER_MAX_WIDTH
         for segment in self._plan():
             for _ in range(round(segment.seconds * hz)):
                 here, R = env.kinematics.forward(env.command)
+                held = held + 1 if all(pad.touching for pad in env.pad_contacts()) else 0
                 if segment.until_supported and env.object_on_table(self._picked):
+                    break
+                if segment.until_held and held >= _HOLD:
                     break
                 target = here if segment.position is None else segment.position
                 if segment.position is not None and _distance(target, here) < _THERE:
@@ -116,7 +122,7 @@ class PickPlaceExpert:
         segments = [
             Segment("approach", above, GRIPPER_MAX_WIDTH, 2.0, speed=0.4),
             Segment("descend", pick, GRIPPER_MAX_WIDTH, 1.5, speed=0.25),
-            Segment("close", None, closed, 0.7),
+            Segment("close", None, closed, 0.7, until_held=True),
             Segment("lift", above, closed, 1.5, speed=0.25),
         ]
         if self._outcome == "drop":
