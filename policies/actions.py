@@ -55,10 +55,9 @@ def to_actions(
 
 def _hand(joints: Float[Tensor, "b 7"]) -> Float[Tensor, "b 7 7"]:
     """From small changes of the joints to the hand's displacement, its turn, the third joint's."""
-    kinematics = _kinematics()
-    rows = [kinematics.jacobian(q) for q in joints.cpu().numpy().astype(np.float64)]
+    rows = _kinematics().jacobians(joints.cpu().numpy().astype(np.float64))
     elbow = torch.eye(N_JOINTS)[2].expand(len(rows), 1, -1)
-    return torch.cat([torch.from_numpy(np.stack(rows)).float(), elbow], 1).to(joints)
+    return torch.cat([torch.from_numpy(rows).float(), elbow], 1).to(joints)
 
 
 @cache

@@ -272,13 +272,17 @@ def unroll(
         pose = parts[v.TCP_POSE]
         turned = _two_columns(pose[..., 3:])
         if v.TRUTH_START in parts:
-            parts[v.TRUTH_START] = _from_hand(parts[v.TRUTH_START], pose[..., :3], turned)
+            held = parts[v.TRUTH_CONTACT].amin(-1, keepdim=True)
+            parts[v.TRUTH_START] = _from_hand(parts[v.TRUTH_START], pose[..., :3], turned, held)
         parts[v.TCP_POSE] = torch.cat([pose[..., :3], turned], -1)
     return torch.cat([parts[key] for key in proprioception], -1)
 
 
 def _from_hand(
-    start: Float[Tensor, "... 7"], hand: Float[Tensor, "... 3"], turned: Float[Tensor, "... 6"]
+    start: Float[Tensor, "... 7"],
+    hand: Float[Tensor, "... 3"],
+    turned: Float[Tensor, "... 6"],
+    held: Float[Tensor, "... 1"],
 ) -> Float[Tensor, "... 12"]:
     """`vocabulary.TRUTH_START` relative to the hand's position and yaw."""
     cos, sin = turned[..., 0], turned[..., 1]
@@ -290,7 +294,9 @@ def _from_hand(
         ],
         -1,
     )
-    way = torch.cat([start[..., :3] - hand, start[..., 5:] - hand[..., :2]], -1)
+    there, height = (start[..., :2] - hand[..., :2]) * (1 - held), start[..., 2:3] - hand[..., 2:]
+    goal, yaw = (start[..., 5:] - hand[..., :2]) * held, yaw * (1 - held)
+    way = torch.cat([there, height, goal], -1)
     return torch.cat([way, yaw, way / (way.abs() + _NEAR)], -1)
 
 
