@@ -22,7 +22,7 @@ from touchgoal.sim_envs.base import EnvConfig
 
 _WEIGHTS = Path(__file__).parent / "weights"
 Task = TypeVar("Task", bound=EnvConfig)
-SHIPPED = {"bead-maze": _WEIGHTS / "bead_maze", "pick-place": _WEIGHTS / "pick_place"}
+SHIPPED = {"bead-maze": _WEIGHTS / "bead_maze"}
 
 
 Observation = Mapping[str, np.ndarray]

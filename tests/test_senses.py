@@ -36,15 +36,18 @@ def toy_senses() -> Senses:
 
 
 def test_the_start_is_seen_from_the_hand() -> None:
-    columns = v.TCP_POSE, v.TRUTH_START
+    columns = v.TCP_POSE, v.TRUTH_CONTACT, v.TRUTH_START
     yaw, hand = 0.4, 0.3
     pose = [0.5, 0.1, 0.2, 0.0, np.cos(hand / 2), np.sin(hand / 2), 0.0]  # fingers down
     start = [0.45, 0.15, 0.03, np.cos(2 * yaw), np.sin(2 * yaw), 0.6, -0.1]
-    seen = unroll(torch.tensor([pose + start]), columns)[0, 9:].numpy()
     left = 2 * (yaw - hand)
-    way = np.array([-0.05, 0.05, -0.17, 0.1, -0.2])
-    expected = [*way, np.cos(left), np.sin(left), *way / (np.abs(way) + 0.02)]
-    np.testing.assert_allclose(seen, expected, atol=1e-6)
+    for contact in ([0.0, 1.0], [1.0, 1.0]):  # the object matters, or the goal
+        held = contact == [1.0, 1.0]
+        seen = unroll(torch.tensor([pose + contact + start]), columns)[0, 11:].numpy()
+        way = np.array([0.0, 0.0, -0.17, 0.1, -0.2] if held else [-0.05, 0.05, -0.17, 0.0, 0.0])
+        twice = [0.0, 0.0] if held else [np.cos(left), np.sin(left)]
+        expected = [*way, *twice, *way / (np.abs(way) + 0.02)]
+        np.testing.assert_allclose(seen, expected, atol=1e-6)
 
 
 def test_contact_is_learnt() -> None:
