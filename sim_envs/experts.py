@@ -149,7 +149,7 @@ class PickPlaceExpert:
         """When to stand still for good: on the way to the object or with it, as the seed says."""
         if self._outcome != "freeze":
             return np.inf
-        return float(self._env.np_random.integers(15, 85))
+        return float(self._env.np_random.integers(15, 60))
 
     def _towards(self, position: np.ndarray, yaw: float, width: float) -> np.ndarray:
         env = self._env

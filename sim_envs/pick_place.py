@@ -160,7 +160,7 @@ class PickPlace(FrankaTactileEnv):
         self._still_ticks, self._lifted, self._put_down = 0, False, False
 
     def _info(self, progress: float, success: bool) -> dict[str, Any]:
-        return super()._info(progress, success) | {v.TRUTH_START: self._start}
+        return super()._info(progress, success) | {v.TRUTH_START: self._start.copy()}
 
     def _stray(self) -> Float[np.ndarray, " n"]:
         return np.zeros(self.n_joints) if self._put_down else super()._stray()

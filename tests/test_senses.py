@@ -55,7 +55,7 @@ def test_contact_is_learnt() -> None:
     contact = torch.stack([touch[:, 0] > 0, touch[:, 3] > 0], 1)  # one number of each fingertip
     network = SensesNetwork(SensesConfig("toy", 6, SMALL))
     learn_contact(network, touch, contact, LearnConfig(contact_steps=300, touch_noise=0.1))
-    assert ((network.contact(touch) > 0) == contact).float().mean() > 0.95
+    assert ((network.contact(touch) > 0) == contact).float().mean() > 0.9
 
 
 def test_a_place_is_learnt() -> None:
