@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 CODE := control sim_envs episodes encoders rewards policies benchmarks launch tests
 
-.PHONY: demo test check format build typings weights maze-policy clean
+.PHONY: demo test check format build typings weights maze-policy pick-place-policy clean
 
 demo: $(READY)
 	$(BIN)/touchgoal doctor --quiet
@@ -64,6 +64,23 @@ maze-policy: $(READY)
 		--trials 24 --out $(MAZE)/policy
 	rm -rf policies/weights/bead_maze && mkdir -p policies/weights
 	cp -r $(MAZE)/policy/policy policies/weights/bead_maze
+
+# A pick-and-place policy, about an hour of a core; not good enough to ship yet. What it reads it learns from
+# the recordings of `make weights` and from pictures of placements; what it does, from demonstrations
+# without pictures.
+PICK := runs/pick_place
+BLIND := --env.no-tactile --env.cameras
+pick-place-policy: $(READY)
+	$(BIN)/touchgoal train-senses --episodes runs/weights/train/episodes \
+		--validation runs/weights/val/episodes --out $(PICK)/senses
+	$(BIN)/touchgoal collect-demos --episodes 20 --seed 120000 $(BLIND) --env.disturbance 0.01 \
+		--out $(PICK)/val
+	$(BIN)/touchgoal collect-demos --episodes 130 --seed 20000 $(BLIND) --env.disturbance 0.01 \
+		--out $(PICK)/train
+	$(BIN)/touchgoal train-policy --task pick-place --episodes $(PICK)/train/episodes \
+		--validation $(PICK)/val/episodes --senses $(PICK)/senses/senses --head regression \
+		--representation hand --place-noise 1 --train.epochs 30 --train.lr 2e-3 --trials 20 \
+		--out $(PICK)/policy
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import Actor, collect
 from touchgoal.episodes.store import EpisodeSet
@@ -132,9 +131,7 @@ def _arms(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
     for directory in policies:
         config = checkpoint.load(directory).config
         senses = ["frozen touch"] * (config.touch_dim > 0)
-        if config.eye:
-            felt = set(config.eye.keys) <= set(v.TACTILE)
-            senses.append("end-to-end touch" if felt else "cameras")
+        senses += ["end-to-end touch"] * (config.eye is not None)
         episodes = checkpoint.POLICY.provenance(directory)["episodes"]
         name = f"{' and '.join(senses) or 'state only'}, {episodes} demos"
         if isinstance(config.head, RegressionConfig):

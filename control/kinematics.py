@@ -193,6 +193,11 @@ class Kinematics:
         """Geometric Jacobian of the TCP, base frame: linear rows (m/rad), then angular."""
         return self._chain(q)[2].full()
 
+    def jacobians(self, q: Float[np.ndarray, "b n"]) -> Float[np.ndarray, "b 6 n"]:
+        """`jacobian` of many joint positions at once."""
+        side_by_side = self._chain.map(len(q))(q.T)[2].full()
+        return side_by_side.reshape(6, *q.shape).transpose(1, 0, 2)
+
     def inverse(
         self,
         position: Vector3,

@@ -26,6 +26,7 @@ TRUTH_PAD_WRENCH = "truth.pad_wrench"
 TRUTH_CONTACT = "truth.contact"
 TRUTH_SLIP = "truth.slip"
 TRUTH_OBJECT_POSE = "truth.object_pose"
+TRUTH_START = "truth.start"  # of pick-and-place
 TRUTH_PROGRESS = "truth.progress"
 TRUTH_SUCCESS = "truth.success"
 TRUTH_FAILURE = "truth.failure"  # of tasks that can fail before their time is up
@@ -97,6 +98,13 @@ FEATURES: dict[str, Feature] = {
     TRUTH_CONTACT: Feature("bool", (2,), ("left", "right"), "pad touches something"),
     TRUTH_SLIP: Feature("bool", (2,), ("left", "right"), "pad contact slides"),
     TRUTH_OBJECT_POSE: Feature("float32", (7,), _POSE, "object in the base frame: m, wxyz"),
+    TRUTH_START: Feature(
+        "float32",
+        (7,),
+        ("x", "y", "z", "cos_2yaw", "sin_2yaw", "goal.x", "goal.y"),
+        "as the episode begins, base frame: the object (m), the hand's yaw to grasp it, the goal "
+        "(m); twice the yaw, as half a turn changes nothing between two fingers",
+    ),
     TRUTH_PROGRESS: Feature("float32", (1,), ("progress",), "task progress in [0, 1]"),
     TRUTH_SUCCESS: Feature("bool", (1,), ("success",), "task done"),
     TRUTH_FAILURE: Feature(

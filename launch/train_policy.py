@@ -13,14 +13,15 @@ from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.run_folder import open_run, write_json
-from touchgoal.policies import maze_trials, rollout
+from touchgoal.policies import checkpoint, maze_trials, rollout
 from touchgoal.policies.acting import ActorMaker
 from touchgoal.policies.actions import Representation
 from touchgoal.policies.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.eyes import EyeConfig
 from touchgoal.policies.policy import PolicyConfig, TouchReading
 from touchgoal.policies.samplers import SamplerConfig
-from touchgoal.policies.selection import Score, add_touch, select
+from touchgoal.policies.selection import Score, add_parts, select
+from touchgoal.policies.senses import READ, load_senses
 from touchgoal.policies.touch import TouchEmbedder, load_touch
 from touchgoal.policies.train import POLICY, TrainConfig, train
 from touchgoal.policies.unet import PRESETS
@@ -31,6 +32,7 @@ from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.wires import choose
 
 Head = Literal["small", "published", "tiny", "regression"]
+_COLUMNS = v.STATE, v.TCP_POSE
 _TRIALS = 2_000_000  # seed of the first trial
 
 
@@ -48,8 +50,9 @@ class Config:
     """Folder of a frozen touch encoder (train-encoder); without one the policy does not feel."""
     end_to_end: bool = False
     """Feel through a touch ViT that is trained along, instead of a frozen encoder."""
-    cameras: tuple[str, ...] = ()
-    """Cameras to look at, front or wrist, through networks that are trained along."""
+    senses: Path | None = None
+    """Folder of senses (train-senses): the policy acts on what they read of contact and of the
+    scene at the start, and learns on the truth, so that its episodes need no pictures."""
     out: Path | None = None
     """Folder of the run; the policy goes to its `policy/`."""
     share: float = 1.0
@@ -92,8 +95,15 @@ def main(config: Config) -> None:
         raise UserError("to resume a run, name its folder with --out")
     if not 0 < config.share <= 1:
         raise UserError("share must be above 0 and at most 1")
-    if config.end_to_end and (config.touch or config.cameras):
-        raise UserError("end-to-end touch takes no frozen encoder and no cameras: leave them out")
+    if config.end_to_end and config.touch:
+        raise UserError("end-to-end touch takes no frozen encoder: leave it out")
+    parts = {
+        name: folder
+        for name, folder in ((checkpoint.TOUCH, config.touch), (checkpoint.SENSES, config.senses))
+        if folder
+    }
+    if config.senses:
+        load_senses(config.senses)
     touch = load_touch(config.touch) if config.touch else None
     sets = EpisodeSet(config.episodes), EpisodeSet(config.validation)
     policy = _policy_config(config, sets[0], touch)
@@ -111,9 +121,9 @@ def main(config: Config) -> None:
         "episodes": len(chosen[0]),
     }
     train(policy, windows, validation, config.train, out, recipe, config.resume)
-    add_touch(out / POLICY, config.touch)
+    add_parts(out / POLICY, parts)
     if config.trials:
-        scores = select(out, config.touch, lambda directory: _try(config, directory))
+        scores = select(out, parts, lambda directory: _try(config, directory))
         write_json(out / "metrics.json", {"snapshots": scores})
     print(f"policy: {out / POLICY}")
 
@@ -131,22 +141,14 @@ def _policy_config(
         touch_width=config.touch_width,
         touch_noise=config.touch_noise,
         place_noise=config.place_noise,
-        eye=_eye(config),
+        eye=EyeConfig() if config.end_to_end else None,
+        proprioception=_COLUMNS + (v.WRENCH, *READ) if config.senses else _COLUMNS,
         representation=config.representation,
         observation_horizon=config.observation_horizon,
         execution_horizon=config.execution_horizon,
         control_hz=episodes.fps,
         head=head,
     )
-
-
-def _eye(config: Config) -> EyeConfig | None:
-    if config.end_to_end:
-        # 120 x 160 learn nine times slower, which is hours for a tenth of the data on a core
-        return EyeConfig(v.TACTILE, size=(60, 80), network="vit")
-    if config.cameras:
-        return EyeConfig(tuple(v.IMAGE_PREFIX + name for name in config.cameras))
-    return None
 
 
 def _successful(episodes: EpisodeSet) -> list[int]:

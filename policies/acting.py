@@ -16,6 +16,7 @@ from touchgoal.control.sensors import find_sensor
 from touchgoal.policies import checkpoint
 from touchgoal.policies.eyes import shrink
 from touchgoal.policies.policy import Condition, Policy, PolicyConfig
+from touchgoal.policies.senses import Senses, load_senses
 from touchgoal.policies.touch import TouchEmbedder, load_touch
 from touchgoal.sim_envs.base import EnvConfig
 
@@ -33,16 +34,23 @@ class Planner:
     The same seed and observations give the same plans.
     """
 
-    def __init__(self, policy: Policy, touch: TouchEmbedder | None, seed: int = 0) -> None:
+    def __init__(
+        self,
+        policy: Policy,
+        touch: TouchEmbedder | None,
+        senses: Senses | None = None,
+        seed: int = 0,
+    ) -> None:
         """For one episode.
 
         Args:
             policy: for inference.
             touch: embedder of the training; None for a policy without touch.
+            senses: that read the columns which only a simulator knows; None if there are none.
             seed: of the plans' noise.
 
         Raises:
-            UserError: the embedder is not the training's.
+            UserError: the embedder is not the training's, or senses are missing.
         """
         self.config = config = policy.config
         if (touch.name if touch else "") != config.touch:
@@ -50,10 +58,12 @@ class Planner:
                 f"the policy feels through {config.touch!r}, not {touch.name if touch else ''!r}: "
                 "load the touch encoder that it was trained with"
             )
-        self._policy, self.touch = policy, touch
+        if config.perceived and senses is None:
+            raise UserError(f"the policy acts on {config.perceived[0]}: give it senses to read it")
+        self._policy, self._touch, self._senses = policy, touch, senses
         self._generator = torch.Generator().manual_seed(seed)
         self._first: Observation = {}
-        self._felt: list[tuple[Observation, np.ndarray]] = []
+        self._known: list[tuple[Observation, np.ndarray, np.ndarray]] = []
 
     def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]:
         """Actions from the latest observation on.
@@ -63,28 +73,33 @@ class Planner:
                 first call is the episode's first, untouched one.
         """
         self._first = self._first or seen[0]
-        rows = [self._feel(observation) for observation in seen]
-        self._felt = list(zip(seen, rows, strict=True))
-        state = [np.concatenate([o[key] for key in self.config.proprioception]) for o in seen]
-        touch, state = (torch.from_numpy(np.stack(x)).float()[None] for x in (rows, state))
+        self._known = [(observation, *self._sense(observation)) for observation in seen]
+        _, touch, state = zip(*self._known, strict=True)
+        touch, state = (torch.from_numpy(np.stack(x)).float()[None] for x in (touch, state))
         condition = Condition(touch, state, self._look(seen[-1]))
         return self._policy.plan(condition, self._generator)[0].numpy()
 
-    def _feel(self, observation: Observation) -> Float32[np.ndarray, " e"]:
-        if self.touch is None:
-            return np.empty(0, np.float32)
-        for before, row in self._felt:
+    def _sense(self, observation: Observation) -> tuple[np.ndarray, np.ndarray]:
+        """The embedding (e,) and the proprioception (s,) of one tick."""
+        for before, touch, state in self._known:
             if before is observation:
-                return row
-        return self.touch.embed_tick(observation, self._first)
+                return touch, state
+        known = dict(observation)
+        if self._senses:
+            known |= self._senses.read(observation, self._first)
+        state = np.concatenate([known[key] for key in self.config.proprioception])
+        return self._feel(observation), state
+
+    def _feel(self, observation: Observation) -> Float32[np.ndarray, " e"]:
+        if self._touch is None:
+            return np.empty(0, np.float32)
+        return self._touch.embed_tick(observation, self._first)
 
     def _look(self, observation: Observation) -> UInt8[Tensor, "1 k h w 3"] | None:
         eye = self.config.eye
         if eye is None:
             return None
-        pictures = [
-            shrink(observation[key][None], key, self._first[key], eye.size) for key in eye.keys
-        ]
+        pictures = [shrink(observation[k][None], self._first[k], eye.size) for k in v.TACTILE]
         return torch.from_numpy(np.stack(pictures, 1))
 
 
@@ -143,7 +158,7 @@ class ActorMaker:
     """Makes actors of a policy on disk, in any process.
 
     Attributes:
-        directory: of the policy, with its touch encoder in `touch/`.
+        directory: of the policy, with its touch encoder in `touch/`, its senses in `senses/`.
         latency: see `PolicyActor`.
     """
 
@@ -158,28 +173,33 @@ class ActorMaker:
     def planner(self) -> Planner:
         """What makes its plans in one episode."""
         policy = checkpoint.load(self.directory)
-        return Planner(policy, self._touch(policy.config))
+        return Planner(policy, self._touch(policy.config), self._senses(policy.config))
 
     def checked(self, task: EnvConfig) -> "ActorMaker":
         """Itself; UserError if the policy cannot act in the task."""
         policy = checkpoint.load(self.directory, control_hz=task.control_hz)
-        touch = self._touch(policy.config)
+        touch, senses = self._touch(policy.config), self._senses(policy.config)
         sensor = find_sensor(task.scene.sensor).name
-        if touch and touch.sensor != sensor:
-            raise UserError(
-                f"the policy in {self.directory} feels with {touch.sensor}, the task has {sensor}: "
-                "choose that sensor for the scene"
-            )
-        PolicyActor(Planner(policy, touch), self.latency)
+        for embedder in (touch, senses and senses.touch):
+            if embedder and embedder.sensor != sensor:
+                raise UserError(
+                    f"the policy in {self.directory} feels with {embedder.sensor}, the task has "
+                    f"{sensor}: choose that sensor for the scene"
+                )
+        PolicyActor(Planner(policy, touch, senses), self.latency)
         return self
 
     def observing(self, task: Task) -> Task:
         """The task with the pictures that the policy looks at, and no others."""
         config = checkpoint.load(self.directory).config
-        keys = config.eye.keys if config.eye else ()
-        cameras = tuple(k.removeprefix(v.IMAGE_PREFIX) for k in keys if k in v.CAMERAS)
-        tactile = config.touch_dim > 0 or any(key in v.TACTILE for key in keys)
-        return replace(task, tactile=tactile, cameras=cameras)
+        senses = self._senses(config)
+        keys = senses.cameras if senses else ()
+        felt = config.touch_dim > 0 or config.eye is not None or senses is not None
+        cameras = tuple(key.removeprefix(v.IMAGE_PREFIX) for key in keys)
+        return replace(task, tactile=felt, cameras=cameras)
 
     def _touch(self, config: PolicyConfig) -> TouchEmbedder | None:
         return load_touch(self.directory / checkpoint.TOUCH) if config.touch_dim else None
+
+    def _senses(self, config: PolicyConfig) -> Senses | None:
+        return load_senses(self.directory / checkpoint.SENSES) if config.perceived else None

@@ -4,18 +4,23 @@ An action (8,) is the joint change (7) of one tick, rad, and the gripper width t
 (`vocabulary.ACTION`). A chunk is the actions of h ticks from the latest observation on.
 """
 
+from functools import cache
 from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from touchgoal.control.kinematics import Fr3Kinematics
 from touchgoal.control.vocabulary import N_JOINTS
 
 ACTION_DIM = N_JOINTS + 1
-Representation = Literal["delta", "chunk", "absolute"]
+Representation = Literal["delta", "chunk", "absolute", "hand"]
 """Of the joints: each tick's change; the change since the chunk's start; the joint positions that
-these changes lead to from the measured ones. The gripper's width is a target in all three."""
+these changes lead to from the measured ones; the hand's displacement and turn since the chunk's start
+(m, rad, base frame, to first order) with the third joint's change for the elbow, which is nearly the
+same wherever on the table the hand does the same. The gripper's width is a target in all four."""
 
 _CONSTANT = 1e-6  # in SI units: smaller than anything that a policy should learn to vary
 
@@ -27,6 +32,8 @@ def represent(
     if kind == "delta":
         return actions
     targets = actions[..., :N_JOINTS].cumsum(1)
+    if kind == "hand":
+        targets = targets @ _hand(joints).mT
     if kind == "absolute":
         targets = joints[:, None] + targets
     return torch.cat([targets, actions[..., N_JOINTS:]], -1)
@@ -39,9 +46,23 @@ def to_actions(
     if kind == "delta":
         return represented
     targets = represented[..., :N_JOINTS]
+    if kind == "hand":
+        targets = torch.linalg.solve(_hand(joints), targets.mT).mT
     start = joints if kind == "absolute" else torch.zeros_like(joints)
     changes = torch.cat([targets[:, :1] - start[:, None], targets.diff(dim=1)], 1)
     return torch.cat([changes, represented[..., N_JOINTS:]], -1)
+
+
+def _hand(joints: Float[Tensor, "b 7"]) -> Float[Tensor, "b 7 7"]:
+    """From small changes of the joints to the hand's displacement, its turn, the third joint's."""
+    rows = _kinematics().jacobians(joints.cpu().numpy().astype(np.float64))
+    elbow = torch.eye(N_JOINTS)[2].expand(len(rows), 1, -1)
+    return torch.cat([torch.from_numpy(rows).float(), elbow], 1).to(joints)
+
+
+@cache
+def _kinematics() -> Fr3Kinematics:
+    return Fr3Kinematics()
 
 
 class Scale(nn.Module):

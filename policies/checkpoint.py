@@ -12,7 +12,7 @@ from touchgoal.policies.policy import Policy, PolicyConfig
 from touchgoal.policies.samplers import SamplerConfig
 from touchgoal.policies.unet import UNetConfig
 
-TOUCH = "touch"  # folder of the touch encoder beside the weights
+TOUCH, SENSES = "touch", "senses"  # folders beside the weights: of the touch encoder, of senses
 POLICY = Stored("policy", "policy", "train one with: touchgoal train-policy")
 
 
@@ -57,7 +57,7 @@ def load(directory: Path, control_hz: int | None = None) -> Policy:
 def _config(fields: dict[str, Any]) -> PolicyConfig:
     head = fields.pop("head")
     if eye := fields.pop("eye", None):
-        fields["eye"] = EyeConfig(**eye | {k: tuple(eye[k]) for k in ("keys", "size")})
+        fields["eye"] = EyeConfig(**eye | {"size": tuple(eye["size"])})
     fields["proprioception"] = tuple(fields["proprioception"])
     return PolicyConfig(**fields, head=_read_head(head))
 

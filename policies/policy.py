@@ -16,6 +16,7 @@ from touchgoal.policies.eyes import Eye, EyeConfig
 
 TouchReading = Literal["wrench", "free"]
 WRENCH_DIM = v.FEATURES[v.TRUTH_PAD_WRENCH].shape[0]
+_NEAR = 0.02  # m
 _FAR = 5.0  # standard deviations beyond which an input is as surprising as it gets
 
 
@@ -38,8 +39,9 @@ class PolicyConfig:
         place_noise: likewise of the joint and TCP positions, one draw for all ticks seen: where on
             the table a wire ran shall not tell how it goes on. Velocities and the hand's
             orientation stay as they are.
-        eye: for pictures that no frozen encoder reads; None for a policy without.
-        proprioception: columns of `vocabulary.FEATURES`, the state first.
+        eye: for fingertips that no frozen encoder reads; None for a policy without.
+        proprioception: columns of `vocabulary.FEATURES`, the state first. Where it acts, those that
+            only a simulator knows come from its senses, see `senses.py`.
         observation_horizon: ticks seen, the latest included.
         prediction_horizon: ticks planned. The first is the latest observation's, so that all of
             them can be done; diffusion_policy counts from the oldest observation instead.
@@ -87,6 +89,11 @@ class PolicyConfig:
         return self.touch_dim > 0 and self.touch_reading == "wrench"
 
     @property
+    def perceived(self) -> tuple[str, ...]:
+        """Columns that senses must read where there is no simulator to ask."""
+        return tuple(key for key in self.proprioception if not key.startswith("observation."))
+
+    @property
     def state_dim(self) -> int:
         """Width of the proprioception of one tick."""
         return sum(v.FEATURES[key].shape[0] for key in self.proprioception)
@@ -94,7 +101,7 @@ class PolicyConfig:
     @property
     def seen_dim(self) -> int:
         """Width of the proprioception as the network sees it, see `unroll`."""
-        return self.state_dim + (2 if v.TCP_POSE in self.proprioception else 0)
+        return sum(_seen(key) for key in self.proprioception)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +152,7 @@ class Policy(nn.Module):
         self.eye = None
         if config.eye:
             self.eye = Eye(config.eye)
-            condition += len(config.eye.keys) * config.eye.width
+            condition += len(v.TACTILE) * config.eye.width
         self.condition_dim = condition
         if isinstance(config.head, DiffusionConfig):
             self.head = Diffusion(config.head, ticks, ACTION_DIM, condition)
@@ -244,24 +251,58 @@ class Policy(nn.Module):
         marks = []
         for key in self.config.proprioception:
             places = {v.STATE: v.N_JOINTS, v.TCP_POSE: 3}.get(key, 0)
-            size = v.FEATURES[key].shape[0] + (2 if key == v.TCP_POSE else 0)
-            marks += [1.0] * places + [0.0] * (size - places)
+            marks += [1.0] * places + [0.0] * (_seen(key) - places)
         return torch.tensor(marks)
 
 
 def unroll(
     state: Float[Tensor, "... s"], proprioception: tuple[str, ...]
 ) -> Float[Tensor, "... r"]:
-    """Proprioception with the TCP's quaternion as the first two columns of its rotation matrix.
+    """Proprioception as a network understands it at once.
 
-    A quaternion and its negative are the same turn, and a measured one jumps between the two as
-    the hand turns about the vertical; the matrix does not (Zhou et al. 2019).
+    The TCP's quaternion becomes the first two columns of its rotation matrix. A quaternion and its
+    negative are the same turn, and a measured one jumps between the two as the hand turns about the
+    vertical; the matrix does not (Zhou et al. 2019). What `truth.start` says is seen from the hand,
+    in axes parallel to the base's: a centimetre matters there, not where on the table.
     """
-    parts, start = [], 0
+    parts, start = {}, 0
     for key in proprioception:
-        part = state[..., start : (start := start + v.FEATURES[key].shape[0])]
-        parts += [part[..., :3], _two_columns(part[..., 3:])] if key == v.TCP_POSE else [part]
-    return torch.cat(parts, -1)
+        parts[key] = state[..., start : (start := start + v.FEATURES[key].shape[0])]
+    if v.TCP_POSE in parts:
+        pose = parts[v.TCP_POSE]
+        turned = _two_columns(pose[..., 3:])
+        if v.TRUTH_START in parts:
+            held = parts[v.TRUTH_CONTACT].amin(-1, keepdim=True)
+            parts[v.TRUTH_START] = _from_hand(parts[v.TRUTH_START], pose[..., :3], turned, held)
+        parts[v.TCP_POSE] = torch.cat([pose[..., :3], turned], -1)
+    return torch.cat([parts[key] for key in proprioception], -1)
+
+
+def _from_hand(
+    start: Float[Tensor, "... 7"],
+    hand: Float[Tensor, "... 3"],
+    turned: Float[Tensor, "... 6"],
+    held: Float[Tensor, "... 1"],
+) -> Float[Tensor, "... 12"]:
+    """`vocabulary.TRUTH_START` relative to the hand's position and yaw."""
+    cos, sin = turned[..., 0], turned[..., 1]
+    cos, sin = cos * cos - sin * sin, 2 * cos * sin  # of twice the hand's yaw
+    yaw = torch.stack(
+        [
+            start[..., 3] * cos + start[..., 4] * sin,
+            start[..., 4] * cos - start[..., 3] * sin,
+        ],
+        -1,
+    )
+    there, height = (start[..., :2] - hand[..., :2]) * (1 - held), start[..., 2:3] - hand[..., 2:]
+    goal, yaw = (start[..., 5:] - hand[..., :2]) * held, yaw * (1 - held)
+    way = torch.cat([there, height, goal], -1)
+    return torch.cat([way, yaw, way / (way.abs() + _NEAR)], -1)
+
+
+def _seen(key: str) -> int:
+    """Width of what `unroll` makes of a column."""
+    return v.FEATURES[key].shape[0] + {v.TCP_POSE: 2, v.TRUTH_START: 5}.get(key, 0)
 
 
 def _two_columns(quaternion: Float[Tensor, "... 4"]) -> Float[Tensor, "... 6"]:

@@ -1,22 +1,23 @@
 """Which snapshot of a training acts best: only trials can tell, a loss cannot."""
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from touchgoal.policies import checkpoint
 from touchgoal.policies.train import POLICY, SNAPSHOTS
 
 Score = tuple[float, float]
 """Success rate, then mean progress; both in [0, 1]."""
 
 
-def select(run: Path, touch: Path | None, trial: Callable[[Path], Score]) -> dict[str, Score]:
+def select(
+    run: Path, parts: Mapping[str, Path], trial: Callable[[Path], Score]
+) -> dict[str, Score]:
     """Tries every snapshot of a run and makes the best one its policy.
 
     Args:
         run: directory of a finished training.
-        touch: folder of the touch encoder, which is put beside every policy.
+        parts: what goes beside every policy, see `add_parts`.
         trial: scores a policy's directory, on validation tasks.
 
     Returns:
@@ -24,7 +25,7 @@ def select(run: Path, touch: Path | None, trial: Callable[[Path], Score]) -> dic
     """
     scores: dict[str, Score] = {}
     for snapshot in sorted((run / SNAPSHOTS).iterdir()):
-        add_touch(snapshot, touch)
+        add_parts(snapshot, parts)
         scores[snapshot.name] = trial(snapshot)
         print(
             f"{snapshot.name}: success {scores[snapshot.name][0]:.0%}, "
@@ -36,7 +37,7 @@ def select(run: Path, touch: Path | None, trial: Callable[[Path], Score]) -> dic
     return scores
 
 
-def add_touch(policy: Path, touch: Path | None) -> None:
-    """Puts the touch encoder beside a policy's weights."""
-    if touch:
-        shutil.copytree(touch, policy / checkpoint.TOUCH, dirs_exist_ok=True)
+def add_parts(policy: Path, parts: Mapping[str, Path]) -> None:
+    """Copies folders beside a policy's weights: its touch encoder, its senses, by their names."""
+    for name, folder in parts.items():
+        shutil.copytree(folder, policy / name, dirs_exist_ok=True)

@@ -66,20 +66,16 @@ def read(
             embeddings of other episodes.
     """
     _check(episodes, chosen, config, embedder)
-    if embedder:
-        _fill_cache(episodes, chosen, embedder, workers)
+    felt = embed(episodes, chosen, embedder, workers) if embedder else None
     keys = [*config.proprioception, v.ACTION, *[v.TRUTH_PAD_WRENCH] * config.reads_wrench]
     touch, state, actions, pictures, wrench = [], [], [], [], []
-    for i in tqdm(chosen, desc="episodes", unit="episode"):
+    for n, i in enumerate(tqdm(chosen, desc="episodes", unit="episode")):
         frames = episodes.read(i, keys).frames
         state.append(np.concatenate([frames[key] for key in config.proprioception], 1))
         actions.append(frames[v.ACTION])
         if config.reads_wrench:
             wrench.append(frames[v.TRUTH_PAD_WRENCH])
-        if embedder:
-            touch.append(embeddings(episodes, i, embedder))
-        else:
-            touch.append(np.empty((len(actions[-1]), 0), np.float16))
+        touch.append(felt[n] if felt else np.empty((len(actions[-1]), 0), np.float16))
         if config.eye:
             pictures.append(_look(episodes, i, config.eye))
     parts = (torch.from_numpy(np.concatenate(rows)) for rows in (touch, state, actions))
@@ -92,9 +88,8 @@ def read(
 
 
 def _look(episodes: EpisodeSet, i: int, eye: EyeConfig) -> UInt8[np.ndarray, "t k h w 3"]:
-    frames = episodes.read(i, eye.keys).frames
-    columns = [shrink(frames[key], key, frames[key][0], eye.size) for key in eye.keys]
-    return np.stack(columns, 1)
+    frames = episodes.read(i, v.TACTILE).frames
+    return np.stack([shrink(frames[key], frames[key][0], eye.size) for key in v.TACTILE], 1)
 
 
 def _check(
@@ -115,6 +110,8 @@ def _check(
             f"{episodes.root} is of an arm with another number of joints: policies are for the "
             f"{v.N_JOINTS} of an FR3"
         )
+    if missing := set(config.proprioception) - set(episodes.features):
+        raise UserError(f"{episodes.root} has no {sorted(missing)[0]}, which the policy acts on")
     if config.reads_wrench and v.TRUTH_PAD_WRENCH not in episodes.features:
         raise UserError(
             f"{episodes.root} has no {v.TRUTH_PAD_WRENCH}, which only simulated episodes have: "
@@ -126,6 +123,14 @@ def _check(
             f"the policy wants touch {config.touch!r} of width {config.touch_dim}, this is "
             f"{made[0]!r} of width {made[1]}: make its config for this embedder"
         )
+
+
+def embed(
+    episodes: EpisodeSet, chosen: Sequence[int], embedder: TouchEmbedder, workers: int = 1
+) -> list[Float16[np.ndarray, "t e"]]:
+    """The embeddings of episodes, made and kept if they are not yet."""
+    _fill_cache(episodes, chosen, embedder, workers)
+    return [embeddings(episodes, i, embedder) for i in chosen]
 
 
 def embeddings(episodes: EpisodeSet, i: int, embedder: TouchEmbedder) -> Float16[np.ndarray, "t e"]:
@@ -150,13 +155,13 @@ def _fill_cache(
     if not missing:
         return
     _path(episodes, embedder, 0).parent.mkdir(parents=True, exist_ok=True)
-    embed = partial(_embed, episodes, embedder)
+    make = partial(_embed, episodes, embedder)
     progress = partial(tqdm, total=len(missing), desc="embed", unit="episode")
     if workers == 1:
-        list(progress(map(embed, missing)))
+        list(progress(map(make, missing)))
         return
     with one_core_workers(workers) as pool:
-        list(progress(pool.map(embed, missing)))
+        list(progress(pool.map(make, missing)))
 
 
 def _embed(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> None:

@@ -27,6 +27,7 @@ from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
 from touchgoal.sim_envs.tactile.unit import Spread, sample_unit
 
 GRIPPER_MAX_WIDTH = 0.08  # m, Franka Hand
+STRAY_SECONDS = 0.5  # for which a disturbance keeps its direction
 GRIPPER_SPEED = 0.1  # m/s of width, Franka Hand's datasheet maximum
 _SETPOINT_PERIOD = 0.002  # s: set-points coarser than 2 ms shake the wrist (MuJoCo 4.0.0)
 
@@ -43,6 +44,9 @@ class EnvConfig:
         tactile: whether the two fingertip images are observed.
         control_hz: control ticks per second.
         max_seconds: after which an episode is truncated.
+        disturbance: rms speed (m/s) along each axis at which the hand strays from what is
+            commanded, and, times `stray_turn`, its rms rate of turn (rad/s). An expert then shows
+            how to come back, and what it is recorded to do is right (DART, Laskey 2017).
         spread: between the units of the sensor; every episode has two of its own.
         scene: robot, sensors, physics.
     """
@@ -52,6 +56,7 @@ class EnvConfig:
     tactile: bool = True
     control_hz: int = v.CONTROL_HZ
     max_seconds: float = 8.0
+    disturbance: float = 0.0
     spread: Spread = Spread()
     scene: SceneConfig = SceneConfig()
 
@@ -65,6 +70,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     holds with `grasp_force` N on each finger, as the Franka Hand's `grasp` does.
     """
 
+    stray_turn = 2.0  # rad of disturbance per m of it
     metadata = {"render_modes": ["rgb_array"], "render_fps": v.CONTROL_HZ}  # noqa: RUF012
 
     def __init__(self, config: EnvConfig, render_mode: str | None = None) -> None:
@@ -117,6 +123,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self._compile(rng)
         self._place(rng)
         self.command = self.start_joints(rng)
+        self._drift = np.zeros(6)
         self._opening = GRIPPER_MAX_WIDTH / 2
         self.data.qpos[self.arm_positions] = self.command
         self.data.qpos[self._fingers] = self._opening
@@ -131,6 +138,8 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         if action.shape != self.action_space.shape or not np.isfinite(action).all():
             size = self.n_joints + 1
             raise ValueError(f"an action is {size} finite numbers, not {action}")
+        if self.config.disturbance > 0:
+            action = action + np.append(self._stray(), 0.0)
         low, high = self._limits.low, self._limits.high
         action = np.clip(action, low, high)
         before = self._progress
@@ -267,6 +276,14 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     def _settle(self) -> None:
         """Physics before the first observation: objects come to rest, the hand is open."""
         self._advance(np.zeros(self.n_joints), GRIPPER_MAX_WIDTH, seconds=0.3)
+
+    def _stray(self) -> Float[np.ndarray, " n"]:
+        """Joint change (rad) that nobody commanded: a random walk of the hand's velocity."""
+        tick = 1 / self.config.control_hz
+        keep = np.exp(-tick / STRAY_SECONDS)
+        self._drift = keep * self._drift + np.sqrt(1 - keep**2) * self.np_random.normal(size=6)
+        twist = self.config.disturbance * np.repeat([1.0, self.stray_turn], 3) * self._drift
+        return np.linalg.pinv(self.kinematics.jacobian(self.command)) @ (twist * tick)
 
     def _compile(self, rng: np.random.Generator) -> None:
         self.close()

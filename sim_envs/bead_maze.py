@@ -25,8 +25,6 @@ START, END = 0.03, LENGTH - 0.03  # m of arc: where the bead starts and where it
 BEAD_RADIUS, BEAD_LENGTH, BEAD_MASS = 0.010, 0.016, 0.010  # m, m, kg
 HOLE_RADIUS, WIRE_RADIUS = 0.0024, 0.00175  # m
 GRASP_SECONDS = 0.5  # for which a fixture holds the bead while the hand closes on it
-STRAY_SECONDS = 0.5  # for which a disturbance keeps its direction
-STRAY_TURN = 20.0  # rad of disturbance per m of it
 _SAG = 6e-5  # m between the wire and its straight pieces, a tenth of the hole's clearance
 _WOOD = Material(Texture.SMOOTH, 0.0, 1e-3, HARD, 0.8, (0.78, 0.16, 0.12, 1.0))
 BEADS = {
@@ -58,9 +56,6 @@ class BeadMazeConfig(EnvConfig):
         bead: a cylinder feels the wire's direction as a torque, a sphere much less.
         grasp_force: range of the force of each finger, N.
         wire_friction: range of the friction coefficient between bead and wire.
-        disturbance: rms speed (m/s) along each axis at which the hand strays from what is
-            commanded, and, times `STRAY_TURN`, its rms rate of turn (rad/s). An expert then shows
-            how to come back, and what it is recorded to do is right (DART, Laskey 2017).
         stall_seconds: without 2 mm of progress after which the bead counts as jammed.
         max_force: external force on the hand that counts as too much, N.
     """
@@ -74,7 +69,6 @@ class BeadMazeConfig(EnvConfig):
     bead: Literal["sphere", "cylinder"] = "sphere"
     grasp_force: tuple[float, float] = (8.0, 12.0)
     wire_friction: tuple[float, float] = (0.15, 0.25)
-    disturbance: float = 0.0
     stall_seconds: float = 5.0
     max_force: float = 30.0
 
@@ -95,16 +89,13 @@ class BeadMaze(FrankaTactileEnv):
     """
 
     config: BeadMazeConfig
+    stray_turn = 20.0  # rad of disturbance per m of it: the hole turns with the hand
 
     def __init__(self, config: BeadMazeConfig | None = None, render_mode: str | None = None):
         super().__init__(config or BeadMazeConfig(), render_mode)
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control tick; the reward is the tick's gain in progress."""
-        action = np.asarray(action, dtype=np.float64)
-        known = action.shape == self.action_space.shape
-        if self.config.disturbance > 0 and known and not self.grasping:
-            action = action + np.append(self._stray(), 0.0)
         observation, reward, success, truncated, info = super().step(action)
         return observation, reward, success or bool(self.failure.any()), truncated, info
 
@@ -161,7 +152,6 @@ class BeadMaze(FrankaTactileEnv):
         self.s = START
         self.failure = np.zeros(3, bool)
         self._furthest, self._stalled_ticks = START, 0
-        self._drift = np.zeros(6)
 
     def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
         """Joint positions with the bead between the fingers, not quite in their middle."""
@@ -181,12 +171,7 @@ class BeadMaze(FrankaTactileEnv):
         self._advance(np.zeros(self.n_joints), 2 * self._opening, seconds=0.1)
 
     def _stray(self) -> Float[np.ndarray, " n"]:
-        """Joint change (rad) that nobody commanded: a random walk of the hand's velocity."""
-        tick = 1 / self.config.control_hz
-        keep = np.exp(-tick / STRAY_SECONDS)
-        self._drift = keep * self._drift + np.sqrt(1 - keep**2) * self.np_random.normal(size=6)
-        twist = self.config.disturbance * np.repeat([1.0, STRAY_TURN], 3) * self._drift
-        return np.linalg.pinv(self.kinematics.jacobian(self.command)) @ (twist * tick)
+        return np.zeros(self.n_joints) if self.grasping else super()._stray()
 
     def _judge(self) -> tuple[float, bool]:
         bead = self.object_pose()[:3]

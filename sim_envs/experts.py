@@ -14,10 +14,10 @@ from touchgoal.sim_envs.pick_place import PickPlace
 Outcome = Literal["success", "never_touch", "drop", "wrong_object", "freeze"]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 
-_CLEARANCE = 0.12  # m above the object before and after the grasp
-_LOWEST_GRASP = 0.0185  # m: the sensor case (32.5 mm) must stay above the table
-_LOWEST_PLACE = 0.0172
-_FEEL_DOWN = 0.010  # m below the grasp's height to look for the table when placing
+CLEARANCE = 0.12  # m above the object before and after the grasp
+LOWEST_GRASP = 0.0185  # m: the sensor case (32.5 mm) must stay above the table
+LOWEST_PLACE = 0.0172
+FEEL_DOWN = 0.010  # m below the grasp's height to look for the table when placing
 
 
 @dataclass(frozen=True)
@@ -91,12 +91,12 @@ class PickPlaceExpert:
     def _plan(self) -> list[Segment]:
         env = self._env
         pick = env.object_pose(self._picked)[:3]
-        pick[2] = max(pick[2], _LOWEST_GRASP)
+        pick[2] = max(pick[2], LOWEST_GRASP)
         if self._outcome == "never_touch":
             pick[2] += 0.08
         place = np.array([*env.goal, pick[2]])
-        above, over = pick + [0, 0, _CLEARANCE], place + [0, 0, _CLEARANCE]
-        deepest = np.array([*env.goal, max(pick[2] - _FEEL_DOWN, _LOWEST_PLACE)])
+        above, over = pick + [0, 0, CLEARANCE], place + [0, 0, CLEARANCE]
+        deepest = np.array([*env.goal, max(pick[2] - FEEL_DOWN, LOWEST_PLACE)])
         middle = 0.5 * (above + over)
         # Closed on air the pads would touch each other, which is no absence of touch.
         closed = 0.03 if self._outcome == "never_touch" else 0.0

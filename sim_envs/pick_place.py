@@ -9,9 +9,11 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
+from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
-from touchgoal.sim_envs.base import EnvConfig, FrankaTactileEnv
+from touchgoal.sim_envs.base import EnvConfig, FrankaTactileEnv, Observation
 from touchgoal.sim_envs.objects import CATALOGUE, find, sample_body
 from touchgoal.sim_envs.scene import VISUAL_GROUP
 
@@ -68,10 +70,10 @@ class PickPlace(FrankaTactileEnv):
 
     def layout(self) -> dict[str, list[float]]:
         """The object's pose; where to close the hand (m, and yaw in rad); where it is to go (m)."""
-        grasp = [*self.object_pose()[:3].tolist(), self.grasp_yaw("object")]
+        grasp = [*self.object_pose()[:3].tolist(), self.grasp_yaw()]
         return super().layout() | {"grasp": grasp, "goal": self.goal.tolist()}
 
-    def grasp_yaw(self, name: str) -> float:
+    def grasp_yaw(self, name: str = "object") -> float:
         """Hand yaw that closes across an object, within a quarter turn of the comfortable one."""
         body = next(b for b in self.bodies if b.name == name)
         if body.kind.shape in ("sphere", "cylinder", "mesh"):
@@ -81,6 +83,28 @@ class PickPlace(FrankaTactileEnv):
         if body.kind.shape == "box" and body.size[0] < body.size[1]:
             yaw += np.pi / 2  # close along the narrower side
         return float((yaw + np.pi / 2) % np.pi - np.pi / 2)
+
+    def rearrange(self) -> tuple[Observation, dict[str, Any]]:
+        """Another beginning with the same things, without the cost of a reset.
+
+        All things are moved over the table as they lie, to where they, the goal and the hand could
+        be after a reset, at rest.
+        """
+        rng, data = self.np_random, self.data
+        *positions, self.goal = _spread(rng, len(self.bodies) + 1)
+        self.model.geom("goal").pos[:2] = self.goal
+        for body, position in zip(self.bodies, positions, strict=True):
+            pose, turn = data.joint(body.name).qpos, rng.uniform(-np.pi, np.pi)
+            pose[:2] = position
+            mujoco.mju_mulQuat(
+                pose[3:], np.array([np.cos(turn / 2), 0, 0, np.sin(turn / 2)]), pose[3:].copy()
+            )
+        self.command = self.start_joints(rng)
+        data.qpos[self.arm_positions] = self.command
+        data.qvel[:] = 0
+        self.refresh()
+        self._begin()
+        return self._observe(), self._info(0.0, False)
 
     def _sample(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
         config = self.config
@@ -101,8 +125,7 @@ class PickPlace(FrankaTactileEnv):
             self.bodies.append(
                 sample_body(other, rng, rng.uniform(*config.mass), f"distractor_{i + 1}")
             )
-        self._positions = _spread(rng, len(self.bodies) + 1)
-        self.goal = self._positions[-1]
+        *self._positions, self.goal = _spread(rng, len(self.bodies) + 1)
 
     def _extend(self, spec: mujoco.MjSpec) -> None:
         spec.worldbody.add_geom(
@@ -117,30 +140,41 @@ class PickPlace(FrankaTactileEnv):
         )
 
     def _place(self, rng: np.random.Generator) -> None:
-        for body, position in zip(self.bodies, self._positions, strict=False):
+        for body, position in zip(self.bodies, self._positions, strict=True):
             yaw = rng.uniform(-np.pi, np.pi)
             joint = self.data.joint(body.name)
             joint.qpos[:3] = *position, body.rest_height + 0.001
             joint.qpos[3:] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
-        self._still_ticks = 0
-        self._lifted = False
-        self._rest_height: float | None = None
+
+    def _settle(self) -> None:
+        super()._settle()
+        self._begin()
+
+    def _begin(self) -> None:
+        """Take note of how an episode begins."""
+        position, twice = self.object_pose()[:3], 2 * self.grasp_yaw()
+        self._start = np.array([*position, np.cos(twice), np.sin(twice), *self.goal], np.float32)
+        self._reach = max(self._tcp_distance(position), 1e-3)
+        self._still_ticks, self._lifted, self._put_down = 0, False, False
+
+    def _info(self, progress: float, success: bool) -> dict[str, Any]:
+        return super()._info(progress, success) | {v.TRUTH_START: self._start.copy()}
+
+    def _stray(self) -> Float[np.ndarray, " n"]:
+        return np.zeros(self.n_joints) if self._put_down else super()._stray()
 
     def _judge(self) -> tuple[float, bool]:
         position = self.object_pose()[:3]
-        if self._rest_height is None:  # the first call, when the object has settled
-            self._rest_height = float(position[2])
-            self._start = position[:2].copy()
-            self._reach = max(self._tcp_distance(position), 1e-3)
-        height = float(position[2]) - self._rest_height
+        height = float(position[2] - self._start[2])
         self._lifted |= height > _LIFTED
         away = float(np.linalg.norm(position[:2] - self.goal))
         held = all(pad.touching for pad in self.pad_contacts())
         let_go = not any(pad.touching for pad in self.pad_contacts())
         speed = float(np.abs(self.data.joint("object").qvel).max())
         # Held and only grazing the table, the contact comes and goes; a millimetre is down, too.
-        resting = (self.object_on_table() or height < 1e-3) and speed < 0.05
-        there = self._lifted and away < self.config.tolerance and resting
+        down = self.object_on_table() or height < 1e-3
+        self._put_down = self._lifted and down
+        there = self._put_down and away < self.config.tolerance and speed < 0.05
         placed = there and (let_go or not self.config.release)
         self._still_ticks = self._still_ticks + 1 if placed else 0
         success = self._still_ticks >= self.config.control_hz // 2
@@ -161,7 +195,7 @@ class PickPlace(FrankaTactileEnv):
             return 0.95
         if not held:
             return 0.25 * float(np.clip(1 - self._tcp_distance(position) / self._reach, 0, 1))
-        travelled = 1 - away / float(np.linalg.norm(self._start - self.goal))
+        travelled = 1 - away / float(np.linalg.norm(self._start[:2] - self.goal))
         carried = 0.35 + 0.5 * float(np.clip(travelled, 0, 1))
         if away < self.config.tolerance:
             carried += 0.1 * float(np.clip(1 - height / 0.1, 0, 1))

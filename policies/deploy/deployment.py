@@ -54,7 +54,7 @@ def _ahead_of_others() -> Iterator[None]:
 
 @runtime_checkable
 class DeployedActor(Protocol):
-    """What acts in the loop, and never waits.
+    """What acts in the loop, and never waits for as long as a tick.
 
     Attributes:
         done: whether it is through.
@@ -104,11 +104,13 @@ class Ticks:
     Attributes:
         rows: of each tick: observation and what was commanded, by key.
         late: s by which each tick began too late.
+        answered: s after which the actor had answered, each time.
         acted: how often each limit changed a command.
     """
 
     rows: list[dict[str, np.ndarray]] = field(default_factory=list)
     late: list[float] = field(default_factory=list)
+    answered: list[float] = field(default_factory=list)
     acted: dict[str, int] = field(default_factory=dict)
 
     def frames(self) -> dict[str, np.ndarray]:
@@ -230,7 +232,9 @@ class Deployment:
             if wanted == "done":
                 return Ending("ended by the operator")
             return self.stop("stopped by the operator", "start deploy again when you are ready")
+        asked = time.perf_counter()
         action = np.asarray(actor.act(sensed.observation), np.float64)
+        ticks.answered.append(time.perf_counter() - asked)
         reading = Reading(
             q=sensed.arm.q,
             force=sensed.arm.wrench[:3],

@@ -15,6 +15,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.policies.acting import Observation
 
 _FIRST = 20.0  # s for the first plan; it warms everything up
+_PATIENCE = 0.5  # of a tick, for a plan that is due
 _CLOSING = 2.0  # s for a plan under way when the episode ends
 
 
@@ -46,11 +47,13 @@ class Plans(Protocol):
 
 
 class RealTimeActor:
-    """Answers at once, from the newest plan that is ready; the next one is made in a thread.
+    """Answers within half a tick, from the newest plan; the next one is made in a thread.
 
-    A plan's action k belongs to the tick k after its observation, so what has gone by while it was
-    made is left out: a late plan makes no jump. If plans run out the arm is told to stand still,
-    and that is counted. The first plan, which warms everything up, is waited for and not counted.
+    A plan that is due is waited for so long. While plans take longer they are asked for a tick
+    early, and no answer waits. A plan's action k belongs to the tick k after its observation, so
+    what has gone by while it was made is left out: a late plan makes no jump. If plans run out the
+    arm is told to stand still, and that is counted. The first plan, which warms everything up, is
+    waited for and not counted.
 
     Attributes:
         latencies: seconds from an observation to its plan, of every plan but the first.
@@ -66,6 +69,7 @@ class RealTimeActor:
         self.starved = 0
         self.overdue = 0.0
         self.failure: BaseException | None = None
+        self._patience = _PATIENCE / planner.config.control_hz  # s
         self._tick = -1
         self._seen: list[Observation] = []
         self._asked = 0.0  # when the newest observation came, monotonic s
@@ -88,6 +92,8 @@ class RealTimeActor:
                 self._thread.start()
                 if not self._condition.wait_for(self._answered, _FIRST):
                     raise UserError(f"the policy made no plan in {_FIRST:.0f} s: make it smaller")
+            elif not self._slow and self._due():
+                self._condition.wait_for(lambda: self._closed or not self._due(), self._patience)
             if self.failure is not None:
                 raise self.failure
             return self._action()
@@ -137,7 +143,12 @@ class RealTimeActor:
             self._condition.wait_for(self._due)
             return None if self._closed else (self._tick, list(self._seen), self._asked)
 
+    @property
+    def _slow(self) -> bool:
+        return bool(self.latencies) and self.latencies[-1] > self._patience
+
     def _due(self) -> bool:
+        """Whether it is time for another plan, or for the end."""
         if self._closed or self._plan is None:
             return self._closed or self._tick >= 0
-        return self._tick - self._plan.tick >= self._config.execution_horizon - 1
+        return self._tick - self._plan.tick >= self._config.execution_horizon - self._slow

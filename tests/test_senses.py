@@ -1,0 +1,115 @@
+"""Senses: what they say fits what a policy learns on, and a policy with them acts."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from toy_policies import TOY, feeling, policy_for, rng, toy_ticks, toy_windows
+
+from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
+from touchgoal.policies.acting import SHIPPED, ActorMaker, Planner
+from touchgoal.policies.learn_senses import LearnConfig, judge_sight, learn_contact, learn_sight
+from touchgoal.policies.placements import Placements
+from touchgoal.policies.policy import unroll
+from touchgoal.policies.senses import (
+    READ,
+    Senses,
+    SensesConfig,
+    SensesNetwork,
+    load_senses,
+    save_senses,
+)
+from touchgoal.policies.sight import SightConfig
+from touchgoal.sim_envs.bead_maze import BeadMazeConfig
+from touchgoal.sim_envs.pick_place import WORKSPACE, PickPlace, PickPlaceConfig
+
+SMALL = SightConfig(windows=((v.FRONT, (0, 16, 0, 16)),), channels=8, glances=4, detail=4, width=16)
+
+
+def toy_senses() -> Senses:
+    torch.manual_seed(0)
+    touch = feeling()
+    return Senses(SensesNetwork(SensesConfig(touch.name, touch.dim, SMALL)).eval(), touch)
+
+
+def test_the_start_is_seen_from_the_hand() -> None:
+    columns = v.TCP_POSE, v.TRUTH_CONTACT, v.TRUTH_START
+    yaw, hand = 0.4, 0.3
+    pose = [0.5, 0.1, 0.2, 0.0, np.cos(hand / 2), np.sin(hand / 2), 0.0]  # fingers down
+    start = [0.45, 0.15, 0.03, np.cos(2 * yaw), np.sin(2 * yaw), 0.6, -0.1]
+    left = 2 * (yaw - hand)
+    for contact in ([0.0, 1.0], [1.0, 1.0]):  # the object matters, or the goal
+        held = contact == [1.0, 1.0]
+        seen = unroll(torch.tensor([pose + contact + start]), columns)[0, 11:].numpy()
+        way = np.array([0.0, 0.0, -0.17, 0.1, -0.2] if held else [-0.05, 0.05, -0.17, 0.0, 0.0])
+        twice = [0.0, 0.0] if held else [np.cos(left), np.sin(left)]
+        expected = [*way, *twice, *way / (np.abs(way) + 0.02)]
+        np.testing.assert_allclose(seen, expected, atol=1e-6)
+
+
+def test_contact_is_learnt() -> None:
+    touch = torch.randn(400, 6, generator=rng())
+    contact = torch.stack([touch[:, 0] > 0, touch[:, 3] > 0], 1)  # one number of each fingertip
+    network = SensesNetwork(SensesConfig("toy", 6, SMALL))
+    learn_contact(network, touch, contact, LearnConfig(contact_steps=300, touch_noise=0.1))
+    assert ((network.contact(touch) > 0) == contact).float().mean() > 0.9
+
+
+def test_a_place_is_learnt() -> None:
+    """A bright spot on grey, where it is to be found again."""
+    torch.manual_seed(0)
+    spots = torch.randint(0, 14, (256, 2), generator=rng())
+    pictures = torch.full((256, 16, 16, 3), 128, dtype=torch.uint8)
+    for picture, (row, column) in zip(pictures, spots, strict=True):
+        picture[row : row + 2, column : column + 2] = 255
+    start = torch.zeros(256, 7)
+    start[:, 3] = 1.0
+    start[:, :2] = spots / 100
+    placements = Placements({v.FRONT: pictures}, torch.randn(256, 7, generator=rng()), start)
+    sight = SensesNetwork(SensesConfig("toy", 6, SMALL)).sight
+    learn_sight(sight, placements, LearnConfig(steps=300, lr=1e-2))
+    assert judge_sight(sight, placements)["object_mm"][0] < 15  # 60 by chance
+
+
+def test_senses_survive_the_disk(tmp_path: Path) -> None:
+    senses = toy_senses()
+    save_senses(senses.network, tmp_path, {})
+    with pytest.raises(UserError, match="feel through 'toy'"):
+        load_senses(tmp_path)  # finds the shipped touch encoder
+
+
+def test_a_policy_acts_on_its_senses() -> None:
+    config = replace(
+        TOY, touch_dim=0, touch="", proprioception=(v.STATE, v.TCP_POSE, *READ), place_noise=0.0
+    )
+    policy, ticks = policy_for(config, toy_windows(config)).eval(), toy_ticks(3)
+    for tick in ticks:
+        tick[v.FRONT] = np.zeros(v.CAMERA_SHAPE, np.uint8)
+    with pytest.raises(UserError, match=r"truth\.contact"):
+        Planner(policy, None)
+    planner = Planner(policy, None, toy_senses())
+    plans = [planner.plan(ticks[i : i + 2]) for i in range(2)]
+    assert plans[0].shape == (config.prediction_horizon, 8) and np.isfinite(plans).all()
+
+
+def test_a_rearrangement_is_a_beginning() -> None:
+    env = PickPlace(PickPlaceConfig(cameras=(), tactile=False))
+    _, first = env.reset(seed=3, options={"object": "wooden_block"})
+    observation, info = env.rearrange()
+    start, (low, high) = info[v.TRUTH_START], np.array(WORKSPACE).T
+    assert not np.allclose(start, first[v.TRUTH_START])
+    np.testing.assert_allclose(start[:3], info[v.TRUTH_OBJECT_POSE][:3], atol=1e-6)
+    for place in (start[:2], start[5:]):
+        assert (low - 0.01 < place).all() and (place < high + 0.01).all()
+    assert abs(env.grasp_yaw()) <= np.pi / 4  # a box has two pairs of sides
+    assert np.linalg.norm(observation[v.TCP_POSE][:3] - [0.45, 0, 0.26]) < 0.06
+
+
+@pytest.mark.parametrize("task", SHIPPED)
+def test_what_ships_fits_its_task(task: str) -> None:
+    config = BeadMazeConfig() if task == "bead-maze" else PickPlaceConfig()
+    maker = ActorMaker(SHIPPED[task]).checked(config)
+    assert maker.observing(config).tactile
