@@ -92,7 +92,7 @@ def _stages(config: Config) -> list[Stage]:
             _time("touch encoder, both", config.repeats, lambda: encoder.embed_touch(touch)),
         ]
     if (eye := policy.config.eye) is not None and policy.eye is not None:
-        pictures = [shrink(ticks[1][k][None], k, ticks[0][k], eye.size) for k in eye.keys]
+        pictures = [shrink(ticks[1][k][None], ticks[0][k], eye.size) for k in v.TACTILE]
         seen = torch.from_numpy(np.stack(pictures, 1))
         look = policy.eye
         stages.append(_time("pictures through the eye", config.repeats, lambda: look(seen)))

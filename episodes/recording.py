@@ -4,7 +4,8 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -42,8 +43,24 @@ class Demonstration:
     options: dict[str, Any] = field(default_factory=dict)
 
 
+CORRECTED = "corrected"  # outcome of an episode in which a learner acted and an expert answered
+Cast = Callable[[Any, Demonstration], tuple[Actor, Actor]]
+"""Who acts in an environment after its reset, and whose answers to all that is seen are recorded:
+one and the same expert, or a learner and the expert that corrects it."""
+
+
+def scripted(env: FrankaTactileEnv, demonstration: Demonstration) -> tuple[Actor, Actor]:
+    """The task's expert, succeeding or failing as the demonstration asks; see Cast."""
+    expert = make_expert(env, demonstration.outcome)
+    return expert, expert
+
+
 def run(
-    env: FrankaTactileEnv, actor: Actor, observation: Observation, info: dict[str, Any]
+    env: FrankaTactileEnv,
+    actor: Actor,
+    observation: Observation,
+    info: dict[str, Any],
+    expert: Actor | None = None,
 ) -> Iterator[dict[str, np.ndarray]]:
     """Act until the episode ends; yields what was seen, done and true at each tick.
 
@@ -51,22 +68,30 @@ def run(
         env: after its reset.
         actor: chooses the actions.
         observation, info: what the reset returned.
+        expert: if given, what it would have done stands for what was done.
     """
     while True:
         action = np.asarray(actor.act(observation), np.float32)
-        yield {**observation, v.ACTION: action, **info}
+        answer = np.asarray(expert.act(observation), np.float32) if expert else action
+        yield {**observation, v.ACTION: answer, **info}
         observation, _, terminated, truncated, info = env.step(action)
         if terminated or truncated:
             break
-    still = np.append(np.zeros(v.N_JOINTS), action[-1]).astype(np.float32)
+    still = np.append(np.zeros(v.N_JOINTS), answer[-1]).astype(np.float32)
     yield {**observation, v.ACTION: still, **info}
 
 
-def demonstrate(env: FrankaTactileEnv, demonstration: Demonstration) -> Episode:
-    """Record the expert, succeeding or failing as the demonstration asks."""
+def demonstrate(
+    env: FrankaTactileEnv, demonstration: Demonstration, cast: Cast = scripted
+) -> Episode:
+    """Record an expert's answers."""
     observation, info = env.reset(seed=demonstration.seed, options=demonstration.options)
-    expert = make_expert(env, demonstration.outcome)
-    return to_episode(env, list(run(env, expert, observation, info)), demonstration)
+    actor, expert = cast(env, demonstration)
+    if expert is actor:
+        return to_episode(env, list(run(env, actor, observation, info)), demonstration)
+    ticks = list(run(env, actor, observation, info, expert))
+    episode = to_episode(env, ticks, demonstration)
+    return replace(episode, meta={**episode.meta, "outcome": CORRECTED})
 
 
 def demonstrate_on_film(
@@ -105,12 +130,16 @@ def to_episode(
 
 
 def collect(
-    root: Path, config: TaskConfig, demonstrations: Sequence[Demonstration], workers: int
+    root: Path,
+    config: TaskConfig,
+    demonstrations: Sequence[Demonstration],
+    workers: int,
+    cast: Cast = scripted,
 ) -> list[dict[str, MetaValue]]:
     """Append demonstrations to the episode set in `root`, in their order.
 
     Workers simulate and encode; this process alone writes, so that an interruption loses at most
-    the episodes in progress.
+    the episodes in progress. The cast must pickle.
 
     Returns:
         The `meta` of each episode, outcome and success included.
@@ -120,7 +149,7 @@ def collect(
     writer = EpisodeWriter(root, fps=config.control_hz)
     metas = []
     with one_core_workers(workers) as pool:
-        encoded = pool.map(_record, [config] * len(demonstrations), demonstrations)
+        encoded = pool.map(partial(_record, config, cast), demonstrations)
         for episode in tqdm(encoded, total=len(demonstrations), desc="record", unit="episode"):
             writer.append(episode)
             metas.append(episode.description.meta)
@@ -140,9 +169,9 @@ def _use_one_core() -> None:
     os.environ["LP_NUM_THREADS"] = "1"
 
 
-def _record(config: TaskConfig, demonstration: Demonstration) -> EncodedEpisode:
+def _record(config: TaskConfig, cast: Cast, demonstration: Demonstration) -> EncodedEpisode:
     env = make_env(config)
     try:
-        return encode(demonstrate(env, demonstration), config.control_hz)
+        return encode(demonstrate(env, demonstration, cast), config.control_hz)
     finally:
         env.close()

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Int, UInt8
 from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.touch.contact import detect_contact
+from touchgoal.control.touch.contact import detect_contact, threshold_for
 from touchgoal.control.vocabulary import TACTILE, TRUTH_CONTACT, WRIST
 from touchgoal.episodes.store import EpisodeSet
 
@@ -74,7 +74,7 @@ def collect(
     drawn, backgrounds, views, filled = [], [], [], 0
     for i in tqdm(range(len(episodes)), desc="touches", unit="episode"):
         background = [_background(episodes, i, side) for side in sides]
-        contact = _contact(episodes, i, sides, background)
+        contact = _contact(episodes, i, sides)
         rng = np.random.default_rng([seed, i])
         picks = np.concatenate(
             [
@@ -123,6 +123,12 @@ def touch_background(frames: UInt8[np.ndarray, "n h w 3"]) -> UInt8[np.ndarray, 
     return np.median(frames[:_BACKGROUND_FRAMES], axis=0).astype(np.uint8)
 
 
+def felt_contact(frames: UInt8[np.ndarray, "t h w 3"]) -> Bool[np.ndarray, " t"]:
+    """Whether a fingertip touches something, frame by frame; in the first 5 it must not."""
+    untouched, background = frames[:_BACKGROUND_FRAMES], touch_background(frames)
+    return detect_contact(frames, background, threshold_for(untouched, background))
+
+
 def _background(episodes: EpisodeSet, i: int, side: int) -> UInt8[np.ndarray, "h w 3"]:
     key = TACTILE[side]
     first = range(min(_BACKGROUND_FRAMES, episodes.lengths[i]))
@@ -130,15 +136,13 @@ def _background(episodes: EpisodeSet, i: int, side: int) -> UInt8[np.ndarray, "h
 
 
 def _contact(
-    episodes: EpisodeSet, i: int, sides: list[int], background: list[np.ndarray]
+    episodes: EpisodeSet, i: int, sides: list[int]
 ) -> Bool[np.ndarray, "t s"]:
     if TRUTH_CONTACT in episodes.features:
         return episodes.read(i, [TRUTH_CONTACT]).frames[TRUTH_CONTACT][:, sides]
-    columns = []
-    for side, untouched in zip(sides, background, strict=True):
-        frames = episodes.read(i, [TACTILE[side]]).frames[TACTILE[side]]
-        columns.append(detect_contact(frames, untouched))
-    return np.stack(columns, axis=1)
+    keys = [TACTILE[side] for side in sides]
+    frames = episodes.read(i, keys).frames
+    return np.stack([felt_contact(frames[key]) for key in keys], axis=1)
 
 
 def _draw(

@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from touchgoal.episodes.recording import Demonstration, collect
+from touchgoal.control.errors import UserError
+from touchgoal.episodes.recording import Cast, Demonstration, collect, scripted
 from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.policies.corrections import Corrected
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.experts import Outcome
 from touchgoal.sim_envs.objects import CATALOGUE, find
@@ -30,6 +32,12 @@ class Config:
     """What the expert shall do: succeed, or (pick-place) fail in one of four ways."""
     objects: tuple[str, ...] = ()
     """pick-place: catalogue names, taken in turn; default: all."""
+    feedback: bool = False
+    """pick-place: show it by a law of the present state, from which a policy learns better than from
+    planned paths."""
+    learner: Path | None = None
+    """pick-place: a policy that acts in that expert's place; what the expert would have done is
+    recorded (DAgger)."""
     seed: int = 0
     """Of the first episode; each further one adds one."""
     workers: int = os.cpu_count() or 1
@@ -48,7 +56,7 @@ def main(config: Config) -> None:
         for i, outcome in enumerate(config.outcomes * config.episodes)
     ]
     out = open_run(config.out, "collect-demos", config)
-    metas = collect(out / "episodes", task, demonstrations, config.workers)
+    metas = collect(out / "episodes", task, demonstrations, config.workers, _cast(config))
     outcomes = Counter(str(meta["outcome"]) for meta in metas)
     write_json(out / "metrics.json", {"outcomes": outcomes, "episodes": metas})
     print(f"{len(metas)} episodes in {out / 'episodes'}")
@@ -63,3 +71,11 @@ def _choose(config: Config) -> tuple[TaskConfig, list[dict[str, Any]]]:
         return maze, [{"wire": w.name} for w in choose(maze.split, maze.n_wires, maze.families)]
     names = [find(name).name for name in config.objects] or list(CATALOGUE)
     return config.env, [{"object": name} for name in names]
+
+
+def _cast(config: Config) -> Cast:
+    if not config.feedback and config.learner is None:
+        return scripted
+    if config.task != "pick-place" or config.outcomes != ("success",) or config.env.release:
+        raise UserError("feedback is for pick-place that succeeds and does not let go")
+    return Corrected(config.learner)

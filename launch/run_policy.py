@@ -36,10 +36,10 @@ class Config:
 
     task: Literal["pick-place", "bead-maze"] = "pick-place"
     """Where to run it."""
-    policy: str = "expert"
-    """Which policy: expert, which sees the simulator's state; a folder that train-policy made;
-    (bead-maze) shipped, trained by `make maze-policy`; or (bead-maze) follower, the classical one,
-    which feels the force on the hand."""
+    policy: str = "shipped"
+    """Which policy: shipped, trained by `make maze-policy` or `make pick-place-policy`; a folder that
+    train-policy made; expert, which sees the simulator's state; or (bead-maze) follower, the
+    classical one, which feels the force on the hand."""
     latency: int = 0
     """Ticks that a learned policy's plans come late, as on the arm."""
     out: Path | None = None
@@ -106,10 +106,6 @@ def _follower(env: BeadMaze) -> WireFollower:
 def _learned(config: Config) -> ActorMaker:
     """A policy on disk; UserError if it does not fit the task, before anything is simulated."""
     task = config.maze if config.task == "bead-maze" else config.env
-    if config.policy == "shipped" and config.task not in SHIPPED:
-        raise UserError(
-            f"no policy ships for {config.task}: choose expert, or train-policy's folder"
-        )
     directory = SHIPPED[config.task] if config.policy == "shipped" else Path(config.policy)
     return ActorMaker(directory, latency=config.latency).checked(task)
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
+from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies import checkpoint, maze_trials, rollout
@@ -21,7 +22,7 @@ from touchgoal.policies.eyes import EyeConfig
 from touchgoal.policies.policy import PolicyConfig, TouchReading
 from touchgoal.policies.samplers import SamplerConfig
 from touchgoal.policies.selection import Score, add_parts, select
-from touchgoal.policies.senses import READ, load_senses
+from touchgoal.policies.senses.reading import READ, load_senses
 from touchgoal.policies.touch import TouchEmbedder, load_touch
 from touchgoal.policies.train import POLICY, TrainConfig, train
 from touchgoal.policies.unet import PRESETS
@@ -41,7 +42,7 @@ class Config:
     """Options of train-policy."""
 
     episodes: Path
-    """Set of episodes to learn from; the successful ones are."""
+    """Set of episodes to learn from: successful ones, and those in which a learner was corrected."""
     validation: Path
     """Set of other episodes, on which losses are measured."""
     task: Literal["pick-place", "bead-maze"] = "bead-maze"
@@ -108,7 +109,7 @@ def main(config: Config) -> None:
     sets = EpisodeSet(config.episodes), EpisodeSet(config.validation)
     policy = _policy_config(config, sets[0], touch)
     out = open_run(config.out, "train-policy", config)
-    chosen = [_successful(s) for s in sets]
+    chosen = [_instructive(s) for s in sets]
     chosen[0] = chosen[0][: max(1, round(config.share * len(chosen[0])))]
     windows, validation = (
         Windows(read(s, rows, policy, touch, config.workers), policy)
@@ -151,8 +152,11 @@ def _policy_config(
     )
 
 
-def _successful(episodes: EpisodeSet) -> list[int]:
-    return [i for i in range(len(episodes)) if episodes.meta(i).get("success", True)]
+def _instructive(episodes: EpisodeSet) -> list[int]:
+    metas = [episodes.meta(i) for i in range(len(episodes))]
+    return [
+        i for i, m in enumerate(metas) if m.get("success", True) or m.get("outcome") == CORRECTED
+    ]
 
 
 def _try(config: Config, directory: Path) -> Score:

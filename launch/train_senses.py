@@ -12,7 +12,7 @@ from touchgoal.control import vocabulary as v
 from touchgoal.encoders import pretrained
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.run_folder import open_run, write_json
-from touchgoal.policies.learn_senses import (
+from touchgoal.policies.senses.learning import (
     LearnConfig,
     felt,
     judge_contact,
@@ -20,9 +20,9 @@ from touchgoal.policies.learn_senses import (
     learn_contact,
     learn_sight,
 )
-from touchgoal.policies.placements import place
-from touchgoal.policies.senses import SensesConfig, SensesNetwork, save_senses
-from touchgoal.policies.sight import SightConfig
+from touchgoal.policies.senses.placements import place
+from touchgoal.policies.senses.reading import SensesConfig, SensesNetwork, save_senses
+from touchgoal.policies.senses.sight import SightConfig
 from touchgoal.policies.touch import load_touch
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -16,16 +16,27 @@ from touchgoal.control.sensors import find_sensor
 from touchgoal.policies import checkpoint
 from touchgoal.policies.eyes import shrink
 from touchgoal.policies.policy import Condition, Policy, PolicyConfig
-from touchgoal.policies.senses import Senses, load_senses
+from touchgoal.policies.senses.reading import Senses, load_senses
 from touchgoal.policies.touch import TouchEmbedder, load_touch
 from touchgoal.sim_envs.base import EnvConfig
 
 _WEIGHTS = Path(__file__).parent / "weights"
 Task = TypeVar("Task", bound=EnvConfig)
-SHIPPED = {"bead-maze": _WEIGHTS / "bead_maze"}
+SHIPPED = {"bead-maze": _WEIGHTS / "bead_maze", "pick-place": _WEIGHTS / "pick_place"}
 
 
 Observation = Mapping[str, np.ndarray]
+
+
+@runtime_checkable
+class Reads(Protocol):
+    """Senses, or what stands for them."""
+
+    def read(
+        self, observation: Observation, first: Observation
+    ) -> dict[str, Float32[np.ndarray, " n"]]:
+        """See Senses."""
+        ...
 
 
 class Planner:
@@ -38,7 +49,7 @@ class Planner:
         self,
         policy: Policy,
         touch: TouchEmbedder | None,
-        senses: Senses | None = None,
+        senses: Reads | None = None,
         seed: int = 0,
     ) -> None:
         """For one episode.
@@ -60,7 +71,7 @@ class Planner:
             )
         if config.perceived and senses is None:
             raise UserError(f"the policy acts on {config.perceived[0]}: give it senses to read it")
-        self._policy, self._touch, self._senses = policy, touch, senses
+        self._policy, self.touch, self._senses = policy, touch, senses
         self._generator = torch.Generator().manual_seed(seed)
         self._first: Observation = {}
         self._known: list[tuple[Observation, np.ndarray, np.ndarray]] = []
@@ -91,9 +102,9 @@ class Planner:
         return self._feel(observation), state
 
     def _feel(self, observation: Observation) -> Float32[np.ndarray, " e"]:
-        if self._touch is None:
+        if self.touch is None:
             return np.empty(0, np.float32)
-        return self._touch.embed_tick(observation, self._first)
+        return self.touch.embed_tick(observation, self._first)
 
     def _look(self, observation: Observation) -> UInt8[Tensor, "1 k h w 3"] | None:
         eye = self.config.eye

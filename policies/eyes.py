@@ -18,11 +18,12 @@ class EyeConfig:
     """An eye for both fingertips at the latest tick: a ViT, which reads textures.
 
     Attributes:
-        size: rows and columns of the pictures looked at.
+        size: rows and columns of the pictures looked at; twice as many of either learn nine times
+            slower.
         width: of what the eye says of one picture.
     """
 
-    size: tuple[int, int] = (120, 160)
+    size: tuple[int, int] = (60, 80)
     width: int = 64
 
 

@@ -15,11 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.touch.contact import detect_contact
 from touchgoal.control.vocabulary import TACTILE, TRUTH_CONTACT
 from touchgoal.episodes.metadata import write_file
 from touchgoal.episodes.schema import Episode
-from touchgoal.episodes.touches import touch_background
+from touchgoal.episodes.touches import felt_contact
 from touchgoal.rewards.metrics import CurveMetrics, measure_curve
 
 FUSED = {"image+tactile": ("image", "tactile"), "image+text": ("image", "text")}
@@ -191,14 +190,14 @@ def reward(d: Float[np.ndarray, " n"], form: RewardForm) -> Float[np.ndarray, " 
 def first_contact(episode: Episode) -> Contact:
     """First frame in which a fingertip touches: the simulator's truth, else from the images.
 
-    Detection compares with `touch_background`, so the first frames must be free of contact.
+    Detection compares with the first frames, which must be free of contact.
     """
     if TRUTH_CONTACT in episode.frames:
         return Contact(_first(episode.frames[TRUTH_CONTACT]), "truth")
     sides = [episode.frames[key] for key in TACTILE if key in episode.frames]
     if not sides:
         return Contact(None, "no touch")
-    touching = [detect_contact(side, touch_background(side)) for side in sides]
+    touching = [felt_contact(side) for side in sides]
     return Contact(_first(np.stack(touching, axis=1)), "detected")
 
 

@@ -13,10 +13,10 @@ _NEAR, _GRIPPING = 0.006, 0.015  # m beside the object: for fingers to begin to 
 _OVER, _PLACED = 0.008, 0.014  # m beside the goal: for the object to go down, to stay there
 _BEGUN = GRIPPER_MAX_WIDTH - 0.006  # m of width below which the fingers have begun to close
 _STILL = 0.006  # m/s of width: fingers that something stops
-_SPEED, _CLIMB, _FEEL = 0.4, 0.25, 0.02  # m/s: at most over the table, up and down, near it
+_SPEED, _CLIMB, _FEEL = 0.3, 0.2, 0.02  # m/s: at most over the table, up and down, near it
 _ACCELERATION = 4.0  # m/s^2
 _RETURN = 5.0  # 1/s: speed towards a place per distance to it
-_TURN = 1.5  # rad/s
+_TURN = 1.0  # rad/s
 
 
 class FeedbackExpert:

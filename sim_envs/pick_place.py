@@ -153,19 +153,19 @@ class PickPlace(FrankaTactileEnv):
     def _begin(self) -> None:
         """Take note of how an episode begins."""
         position, twice = self.object_pose()[:3], 2 * self.grasp_yaw()
-        self._start = np.array([*position, np.cos(twice), np.sin(twice), *self.goal], np.float32)
+        self.start = np.array([*position, np.cos(twice), np.sin(twice), *self.goal], np.float32)
         self._reach = max(self._tcp_distance(position), 1e-3)
         self._still_ticks, self._lifted, self._put_down = 0, False, False
 
     def _info(self, progress: float, success: bool) -> dict[str, Any]:
-        return super()._info(progress, success) | {v.TRUTH_START: self._start.copy()}
+        return super()._info(progress, success) | {v.TRUTH_START: self.start.copy()}
 
     def _stray(self) -> Float[np.ndarray, " n"]:
         return np.zeros(self.n_joints) if self._put_down else super()._stray()
 
     def _judge(self) -> tuple[float, bool]:
         position = self.object_pose()[:3]
-        height = float(position[2] - self._start[2])
+        height = float(position[2] - self.start[2])
         self._lifted |= height > _LIFTED
         away = float(np.linalg.norm(position[:2] - self.goal))
         held = all(pad.touching for pad in self.pad_contacts())
@@ -195,7 +195,7 @@ class PickPlace(FrankaTactileEnv):
             return 0.95
         if not held:
             return 0.25 * float(np.clip(1 - self._tcp_distance(position) / self._reach, 0, 1))
-        travelled = 1 - away / float(np.linalg.norm(self._start[:2] - self.goal))
+        travelled = 1 - away / float(np.linalg.norm(self.start[:2] - self.goal))
         carried = 0.35 + 0.5 * float(np.clip(travelled, 0, 1))
         if away < self.config.tolerance:
             carried += 0.1 * float(np.clip(1 - height / 0.1, 0, 1))

@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 
@@ -7,6 +8,7 @@ from touchgoal.control.touch.contact import (
     ContactDetector,
     contact_strength,
     detect_contact,
+    threshold_for,
 )
 
 HEIGHT, WIDTH = 240, 320
@@ -25,6 +27,11 @@ def sensed(light: np.ndarray, bump: np.ndarray, seed: int = 0) -> np.ndarray:
         shifted = np.roll(noise, rng.integers(0, (HEIGHT, WIDTH)), axis=(0, 1))
         frames[i] = GEL * gain + height * shape * np.array([1, -0.5, 0.3]) + shifted + 0.5
     return frames
+
+
+def through_jpeg(frame: np.ndarray) -> np.ndarray:
+    """As a sensor sends it, with noise of a size that its blocks make coarse."""
+    return cv2.imdecode(cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 60])[1], 1)
 
 
 def background_of(frames: np.ndarray) -> np.ndarray:
@@ -71,3 +78,13 @@ def test_what_a_long_contact_leaves_behind_is_no_contact() -> None:
 def test_any_picture_size(size: tuple[int, int]) -> None:
     frames = np.full((2, *size, 3), 80, np.uint8)
     assert not detect_contact(frames, frames[0]).any()
+
+
+def test_a_jpeg_streams_noise_is_no_contact() -> None:
+    height = np.zeros(40)
+    height[20:] = 20
+    frames = np.stack([through_jpeg(f) for f in sensed(np.ones(40), height)])
+    untouched, background = frames[:5], background_of(frames)
+    assert contact_strength(frames[:20], background).max() > THRESHOLD
+    felt = detect_contact(frames, background, threshold_for(untouched, background))
+    np.testing.assert_array_equal(felt, height > 0)

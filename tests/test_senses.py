@@ -11,10 +11,10 @@ from toy_policies import TOY, feeling, policy_for, rng, toy_ticks, toy_windows
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.policies.acting import SHIPPED, ActorMaker, Planner
-from touchgoal.policies.learn_senses import LearnConfig, judge_sight, learn_contact, learn_sight
-from touchgoal.policies.placements import Placements
 from touchgoal.policies.policy import unroll
-from touchgoal.policies.senses import (
+from touchgoal.policies.senses.learning import LearnConfig, judge_sight, learn_contact, learn_sight
+from touchgoal.policies.senses.placements import Placements
+from touchgoal.policies.senses.reading import (
     READ,
     Senses,
     SensesConfig,
@@ -22,7 +22,7 @@ from touchgoal.policies.senses import (
     load_senses,
     save_senses,
 )
-from touchgoal.policies.sight import SightConfig
+from touchgoal.policies.senses.sight import SightConfig
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.pick_place import WORKSPACE, PickPlace, PickPlaceConfig
 
@@ -54,7 +54,7 @@ def test_contact_is_learnt() -> None:
     touch = torch.randn(400, 6, generator=rng())
     contact = torch.stack([touch[:, 0] > 0, touch[:, 3] > 0], 1)  # one number of each fingertip
     network = SensesNetwork(SensesConfig("toy", 6, SMALL))
-    learn_contact(network, touch, contact, LearnConfig(contact_steps=300, touch_noise=0.1))
+    learn_contact(network, touch, contact, LearnConfig(contact_steps=1500, touch_noise=0.1))
     assert ((network.contact(touch) > 0) == contact).float().mean() > 0.9
 
 
@@ -104,7 +104,9 @@ def test_a_rearrangement_is_a_beginning() -> None:
     np.testing.assert_allclose(start[:3], info[v.TRUTH_OBJECT_POSE][:3], atol=1e-6)
     for place in (start[:2], start[5:]):
         assert (low - 0.01 < place).all() and (place < high + 0.01).all()
-    assert abs(env.grasp_yaw()) <= np.pi / 4  # a box has two pairs of sides
+    np.testing.assert_allclose(
+        start[3:5], [np.cos(2 * env.grasp_yaw()), np.sin(2 * env.grasp_yaw())], atol=1e-6
+    )
     assert np.linalg.norm(observation[v.TCP_POSE][:3] - [0.45, 0, 0.26]) < 0.06
 
 

@@ -6,6 +6,7 @@ from jaxtyping import Bool, Float32, UInt8
 from touchgoal.control.touch.background import Background, local_change
 
 THRESHOLD = 1.2  # counts; noise of 1 count has a strength of 0.3, at most 0.45
+_SPARE = 2.0  # threshold of a noisy sensor per strength of its untouched frames
 _RELEASE = 0.1  # of a contact's peak strength
 
 
@@ -54,6 +55,16 @@ def contact_strength(
         background: the same sensor untouched.
     """
     return np.array([local_change(frame, background).max() for frame in frames], np.float32)
+
+
+def threshold_for(
+    untouched: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
+) -> float:
+    """Threshold (counts) for a sensor with the noise of these frames.
+
+    That of a JPEG stream has a strength of about 1; see `THRESHOLD`, the least.
+    """
+    return max(THRESHOLD, _SPARE * float(contact_strength(untouched, background).max()))
 
 
 def detect_contact(

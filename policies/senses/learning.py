@@ -12,9 +12,9 @@ from tqdm import tqdm
 from touchgoal.control import vocabulary as v
 from touchgoal.encoders import resumable
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.policies.placements import Placements
-from touchgoal.policies.senses import SensesNetwork
-from touchgoal.policies.sight import Sight
+from touchgoal.policies.senses.placements import Placements
+from touchgoal.policies.senses.reading import SensesNetwork
+from touchgoal.policies.senses.sight import Sight
 from touchgoal.policies.touch import TouchEmbedder
 from touchgoal.policies.windows import embed
 

@@ -19,7 +19,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.stored import Stored
 from touchgoal.policies.actions import Scale
-from touchgoal.policies.sight import Sight, SightConfig
+from touchgoal.policies.senses.sight import Sight, SightConfig
 from touchgoal.policies.touch import TouchEmbedder, load_touch
 
 SENSES = Stored("senses", "senses", "train them with: touchgoal train-senses")

@@ -1,0 +1,54 @@
+"""Pick and place shown by a law of the present state, to a learner too that acts by itself."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
+from touchgoal.episodes.recording import Actor, Demonstration
+from touchgoal.policies import checkpoint
+from touchgoal.policies.acting import Planner, PolicyActor
+from touchgoal.sim_envs.feedback import FeedbackExpert
+from touchgoal.sim_envs.pick_place import PickPlace
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """A cast (see `episodes/recording.py`) of the feedback expert and whom it teaches.
+
+    Attributes:
+        learner: directory of a policy that acts, on the simulator's truth in its senses' place,
+            while the expert says what it should have done (DAgger, Ross et al. 2011); None: the
+            expert itself acts.
+    """
+
+    learner: Path | None = None
+
+    def __call__(self, env: PickPlace, demonstration: Demonstration) -> tuple[Actor, Actor]:
+        """Who acts, and whose answers are recorded."""
+        expert = FeedbackExpert(env)
+        if self.learner is None:
+            return expert, expert
+        policy = checkpoint.load(self.learner, control_hz=env.config.control_hz)
+        if policy.config.touch_dim or policy.config.eye:
+            raise UserError(
+                f"{self.learner} feels or looks: only a policy with senses is corrected"
+            )
+        return PolicyActor(Planner(policy, None, _Knowing(env))), expert
+
+
+class _Knowing:
+    """Senses that ask the simulator."""
+
+    def __init__(self, env: PickPlace) -> None:
+        self._env = env
+
+    def read(
+        self, observation: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """See Senses."""
+        contact = np.array([pad.touching for pad in self._env.pad_contacts()], np.float32)
+        return {v.TRUTH_CONTACT: contact, v.TRUTH_START: self._env.start}

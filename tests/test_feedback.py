@@ -1,0 +1,68 @@
+"""Pick and place as a law of the present state, and learners that it corrects."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy_policies import TOY, policy_for, toy_windows
+
+from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
+from touchgoal.episodes.recording import CORRECTED, Demonstration, demonstrate
+from touchgoal.policies import checkpoint
+from touchgoal.policies.corrections import Corrected
+from touchgoal.policies.senses.reading import READ
+from touchgoal.sim_envs.feedback import FeedbackExpert
+from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+
+BLIND = PickPlaceConfig(cameras=(), tactile=False)
+JOB = Demonstration(1, options={"object": "wooden_block"})
+
+
+@pytest.mark.parametrize("disturbance", [0.0, 0.01])
+def test_it_picks_and_places_though_it_is_led_astray(disturbance: float) -> None:
+    episode = demonstrate(PickPlace(replace(BLIND, disturbance=disturbance)), JOB, Corrected())
+    assert episode.meta["success"]
+    moved = np.abs(episode.frames[v.ACTION][:, :7])
+    assert moved.max() < 0.1  # rad a tick, 2 rad/s: an FR3 may turn its slowest joint as fast
+
+
+def test_it_comes_back_from_where_it_never_went() -> None:
+    env = PickPlace(BLIND)
+    observation, _ = env.reset(seed=JOB.seed, options=JOB.options)
+    expert, success = FeedbackExpert(env), False
+    for tick in range(160):
+        action = expert.act(observation)
+        if 8 <= tick < 18:  # somebody else has the arm
+            action = np.append(0.02 * np.array([1, -1, 0, 1, 0, 0, 0]), action[-1])
+        observation, _, success, _, _ = env.step(action)
+        if success:
+            break
+    assert success
+
+
+def test_a_learner_acts_and_is_corrected(tmp_path: Path) -> None:
+    config = replace(
+        TOY, touch_dim=0, touch="", proprioception=(v.STATE, v.TCP_POSE, *READ), place_noise=0.0
+    )
+    checkpoint.save(policy_for(config, toy_windows(config)), tmp_path / "learner", {})
+    cast, env = Corrected(tmp_path / "learner"), PickPlace(replace(BLIND, max_seconds=1.0))
+    episode = demonstrate(env, JOB, cast)
+    assert episode.meta["outcome"] == CORRECTED
+    observation, _ = env.reset(seed=JOB.seed, options=JOB.options)
+    learner, expert = cast(env, JOB)
+    for tick in range(20):
+        answer, action = expert.act(observation), learner.act(observation)
+        np.testing.assert_array_equal(episode.frames[v.STATE][tick], observation[v.STATE])
+        np.testing.assert_allclose(episode.frames[v.ACTION][tick], answer, atol=1e-6)
+        assert not np.allclose(action, answer)
+        observation, *_ = env.step(action)
+
+
+def test_only_a_policy_with_senses_is_corrected(tmp_path: Path) -> None:
+    checkpoint.save(policy_for(TOY, toy_windows(TOY)), tmp_path, {})
+    env = PickPlace(BLIND)
+    env.reset(seed=0)
+    with pytest.raises(UserError, match="feels or looks"):
+        Corrected(tmp_path)(env, JOB)
