@@ -36,8 +36,7 @@ class Config:
     """pick-place: show it by a law of the present state, from which a policy learns better than from
     planned paths."""
     learner: Path | None = None
-    """pick-place: a policy that acts in that expert's place; what the expert would have done is
-    recorded (DAgger)."""
+    """A policy that acts in the expert's place; what the expert would have done is recorded (DAgger)."""
     seed: int = 0
     """Of the first episode; each further one adds one."""
     workers: int = os.cpu_count() or 1
@@ -76,6 +75,6 @@ def _choose(config: Config) -> tuple[TaskConfig, list[dict[str, Any]]]:
 def _cast(config: Config) -> Cast:
     if not config.feedback and config.learner is None:
         return scripted
-    if config.task != "pick-place" or config.outcomes != ("success",) or config.env.release:
-        raise UserError("feedback is for pick-place that succeeds and does not let go")
+    if config.outcomes != ("success",) or config.env.release:
+        raise UserError("no expert to be asked in any state fails, or lets go: leave these options")
     return Corrected(config.learner)

@@ -42,7 +42,7 @@ class Config:
     touch: Path = pretrained.SHIPPED
     """Folder of a frozen touch encoder (train-encoder). It is not copied: the shipped one is found
     again, another one is to be put into the senses' `touch/`."""
-    things: int = 400
+    things: int = 600
     """Objects to look at, of random kind and size."""
     places: int = 20
     """On the table, for each of them."""
@@ -67,7 +67,8 @@ def main(config: Config) -> None:
     learn_contact(network, *rows, config.learn)
     errors: dict = {"contact": judge_contact(network, *validation)}
     cameras = tuple(key.removeprefix(v.IMAGE_PREFIX) for key, _ in config.sight.windows)
-    env = replace(config.env, tactile=False, cameras=cameras)
+    size = config.sight.size
+    env = replace(config.env, tactile=False, cameras=cameras, camera_size=size)
     learn_sight(
         network.sight,
         place(env, config.things, config.places, _SEED, config.workers),

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.sim_envs.base import STREAMED
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
@@ -37,11 +38,11 @@ class Config:
     """bead-maze: which wire, such as helix-17; default: drawn."""
     out: Path | None = None
     """Folder of the run: rig.json, serial devices."""
-    env: PickPlaceConfig = field(default_factory=PickPlaceConfig)
+    env: PickPlaceConfig = field(default_factory=lambda: PickPlaceConfig(camera_size=STREAMED))
     """Options of pick-place."""
     maze: BeadMazeConfig = field(
         default_factory=lambda: BeadMazeConfig(
-            cameras=("front", "wrist"), split="validation", n_wires=20
+            cameras=("front", "wrist"), camera_size=STREAMED, split="validation", n_wires=20
         )
     )
     """Options of bead-maze."""

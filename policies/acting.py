@@ -207,7 +207,8 @@ class ActorMaker:
         keys = senses.cameras if senses else ()
         felt = config.touch_dim > 0 or config.eye is not None or senses is not None
         cameras = tuple(key.removeprefix(v.IMAGE_PREFIX) for key in keys)
-        return replace(task, tactile=felt, cameras=cameras)
+        task = replace(task, tactile=felt, cameras=cameras)
+        return replace(task, camera_size=senses.camera_size) if senses else task
 
     def _touch(self, config: PolicyConfig) -> TouchEmbedder | None:
         return load_touch(self.directory / checkpoint.TOUCH) if config.touch_dim else None

@@ -1,4 +1,4 @@
-"""Pick and place shown by a law of the present state, to a learner too that acts by itself."""
+"""Demonstrations by laws of the present state, to a learner too that acts by itself."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,37 +7,36 @@ from pathlib import Path
 import numpy as np
 
 from touchgoal.control import vocabulary as v
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import Actor, Demonstration
 from touchgoal.policies import checkpoint
-from touchgoal.policies.acting import Planner, PolicyActor
+from touchgoal.policies.acting import ActorMaker, Planner, PolicyActor
+from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import PickPlace
+from touchgoal.sim_envs.tasks import make_expert
 
 
 @dataclass(frozen=True)
 class Corrected:
-    """A cast (see `episodes/recording.py`) of the feedback expert and whom it teaches.
+    """A cast (see `episodes/recording.py`) of an expert to be asked in any state, and its learner.
 
     Attributes:
-        learner: directory of a policy that acts, on the simulator's truth in its senses' place,
-            while the expert says what it should have done (DAgger, Ross et al. 2011); None: the
-            expert itself acts.
+        learner: directory of a policy that acts while the expert says what it should have done
+            (DAgger, Ross et al. 2011), on the simulator's truth in place of its senses, if it has
+            some; None: the expert itself acts.
     """
 
     learner: Path | None = None
 
-    def __call__(self, env: PickPlace, demonstration: Demonstration) -> tuple[Actor, Actor]:
+    def __call__(self, env: FrankaTactileEnv, demonstration: Demonstration) -> tuple[Actor, Actor]:
         """Who acts, and whose answers are recorded."""
-        expert = FeedbackExpert(env)
+        expert = FeedbackExpert(env) if isinstance(env, PickPlace) else make_expert(env)
         if self.learner is None:
             return expert, expert
         policy = checkpoint.load(self.learner, control_hz=env.config.control_hz)
-        if policy.config.touch_dim or policy.config.eye:
-            raise UserError(
-                f"{self.learner} feels or looks: only a policy with senses is corrected"
-            )
-        return PolicyActor(Planner(policy, None, _Knowing(env))), expert
+        if policy.config.perceived and isinstance(env, PickPlace):
+            return PolicyActor(Planner(policy, None, _Knowing(env))), expert
+        return ActorMaker(self.learner).checked(env.config)(), expert
 
 
 class _Knowing:

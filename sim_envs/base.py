@@ -28,6 +28,7 @@ from touchgoal.sim_envs.tactile.unit import Spread, sample_unit
 
 GRIPPER_MAX_WIDTH = 0.08  # m, Franka Hand
 STRAY_SECONDS = 0.5  # for which a disturbance keeps its direction
+STREAMED = (256, 256)  # rows, columns of what a twin's cameras send, more than is recorded
 GRIPPER_SPEED = 0.1  # m/s of width, Franka Hand's datasheet maximum
 _SETPOINT_PERIOD = 0.002  # s: set-points coarser than 2 ms shake the wrist (MuJoCo 4.0.0)
 

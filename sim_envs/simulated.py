@@ -25,7 +25,7 @@ from touchgoal.control.rig import Rig
 from touchgoal.control.sensors import SensorModel, find_sensor
 from touchgoal.control.station import Station, limits_of
 from touchgoal.control.tracker import Tracker, TrackerState
-from touchgoal.sim_envs.base import GRIPPER_SPEED
+from touchgoal.sim_envs.base import GRIPPER_SPEED, STREAMED
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.tasks import TaskConfig, make_env
@@ -229,6 +229,7 @@ def task_of(rig: Rig) -> TaskConfig:
     return replace(
         task,
         cameras=tuple(rig.cameras),
+        camera_size=STREAMED,
         tactile=rig.fingertips is not None,
         scene=scene,
         control_hz=v.CONTROL_HZ,

@@ -8,7 +8,6 @@ import pytest
 from toy_policies import TOY, policy_for, toy_windows
 
 from touchgoal.control import vocabulary as v
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import CORRECTED, Demonstration, demonstrate
 from touchgoal.policies import checkpoint
 from touchgoal.policies.corrections import Corrected
@@ -58,11 +57,3 @@ def test_a_learner_acts_and_is_corrected(tmp_path: Path) -> None:
         np.testing.assert_allclose(episode.frames[v.ACTION][tick], answer, atol=1e-6)
         assert not np.allclose(action, answer)
         observation, *_ = env.step(action)
-
-
-def test_only_a_policy_with_senses_is_corrected(tmp_path: Path) -> None:
-    checkpoint.save(policy_for(TOY, toy_windows(TOY)), tmp_path, {})
-    env = PickPlace(BLIND)
-    env.reset(seed=0)
-    with pytest.raises(UserError, match="feels or looks"):
-        Corrected(tmp_path)(env, JOB)

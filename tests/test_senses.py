@@ -26,7 +26,7 @@ from touchgoal.policies.senses.sight import SightConfig
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.pick_place import WORKSPACE, PickPlace, PickPlaceConfig
 
-SMALL = SightConfig(windows=((v.FRONT, (0, 16, 0, 16)),), channels=8, glances=4, detail=4, width=16)
+SMALL = SightConfig((16, 16), windows=((v.FRONT, (0, 16, 0, 16)),), channels=8, glances=4, detail=4, width=16)
 
 
 def toy_senses() -> Senses:
@@ -87,7 +87,7 @@ def test_a_policy_acts_on_its_senses() -> None:
     )
     policy, ticks = policy_for(config, toy_windows(config)).eval(), toy_ticks(3)
     for tick in ticks:
-        tick[v.FRONT] = np.zeros(v.CAMERA_SHAPE, np.uint8)
+        tick[v.FRONT] = np.zeros((16, 16, 3), np.uint8)
     with pytest.raises(UserError, match=r"truth\.contact"):
         Planner(policy, None)
     planner = Planner(policy, None, toy_senses())

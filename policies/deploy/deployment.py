@@ -19,7 +19,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.protocols import DriverError
 from touchgoal.control.safety import Limit, Reading, Safety, SafetyState
 from touchgoal.control.station import RealClock, Station
-from touchgoal.policies.deploy.sensing import Sensed, Senses
+from touchgoal.policies.deploy.sensing import Sensed, StationReader
 from touchgoal.sim_envs.base import Observation
 
 _REST = 0.01  # rad/s
@@ -146,6 +146,7 @@ class Deployment:
         wanted: Callable[[], str],
         show: Callable[[View], None],
         cost: Callable[[Observation], float] | None = None,
+        camera_size: tuple[int, int] = v.CAMERA_SHAPE[:2],
     ) -> None:
         """The arm is at rest.
 
@@ -156,13 +157,14 @@ class Deployment:
             wanted: asked every tick: "stop" (a person wants that), "done" (likewise), or "".
             show: told of every tick; must not wait.
             cost: measures how far from its goal a tick is, for the view and the record.
+            camera_size: rows and columns of cameras' pictures, as observed and recorded.
 
         Raises:
-            UserError: the arm rests where it may not be.
+            UserError: the arm rests where it may not be, or a camera's pictures are too small.
         """
         self._station, self._safety, self._execute = station, safety, execute
         self._wanted, self._show, self._cost = wanted, show, cost
-        self.senses = Senses(station)
+        self.reader = StationReader(station, camera_size)
         self.state = safety.start(station.arm.read().q)
         self.width = station.gripper.read().width
 
@@ -223,7 +225,7 @@ class Deployment:
     def _tick(
         self, actor: DeployedActor, ticks: Ticks, seconds: float, late: float
     ) -> Ending | None:
-        sensed = self.senses.look()
+        sensed = self.reader.look()
         if not self._execute:
             sensed = self._imagined(sensed)
         if sensed.fault:
@@ -267,7 +269,7 @@ class Deployment:
         assert fault is not None
         reason = str(fault)
         if fault.limit == Limit.STALE_OBSERVATION:
-            reason += f" s ({sensed.oldest}; {self.senses.trouble() or 'it is slow'})"
+            reason += f" s ({sensed.oldest}; {self.reader.trouble() or 'it is slow'})"
         if fault.limit == Limit.TOUCH and self._execute:  # open by as much as both gels give way
             width = sensed.gripper.width + 2 * self._safety.limits.touch
             self._station.gripper.command(min(width, self._safety.limits.stroke[1]))

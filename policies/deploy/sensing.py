@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from touchgoal.control import vocabulary as v
+from touchgoal.control.errors import UserError
 from touchgoal.control.kinematics import GELSIGHT_TCP, Kinematics, rotation_vector
 from touchgoal.control.protocols import (
     ArmReading,
@@ -44,14 +45,24 @@ class Sensed:
     fault: str
 
 
-class Senses:
+class StationReader:
     """Reads a station whose fingertips are untouched at first.
 
     It never waits: drivers keep the newest reading of everything.
     """
 
-    def __init__(self, station: Station) -> None:
-        self._station = station
+    def __init__(
+        self, station: Station, camera_size: tuple[int, int] = v.CAMERA_SHAPE[:2]
+    ) -> None:
+        """Gives cameras' pictures that size; UserError if one takes smaller ones."""
+        self._station, self._size = station, camera_size
+        for key, camera in station.cameras.items():
+            taken = camera.read().image.shape[:2]
+            if key not in v.TACTILE and min(np.subtract(taken, camera_size)) < 0:
+                raise UserError(
+                    f"{key} takes pictures of {taken[0]} x {taken[1]}, {camera_size[0]} x "
+                    f"{camera_size[1]} are needed: make them larger where the camera is set"
+                )
         self._kinematics = Kinematics(station.robot.arm, GELSIGHT_TCP)
         self._meters = {
             key: IndentationMeter(camera.model, camera.read().image)
@@ -76,7 +87,7 @@ class Senses:
         observation = self._proprioception(arm, gripper)
         for key, frame in frames.items():
             tactile = key in v.TACTILE
-            observation[key] = frame.image if tactile else framed(frame.image, v.CAMERA_SHAPE[:2])
+            observation[key] = frame.image if tactile else framed(frame.image, self._size)
         touch = self._touch(frames)
         return Sensed(observation, arm, gripper, load, ages.get(oldest, 0.0), oldest, touch, fault)
 

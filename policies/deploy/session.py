@@ -51,7 +51,7 @@ class Session:
     Attributes:
         execute: False: a dry run, which records nothing.
         make: the actor, when the arm is at its start.
-        wanted, show, cost: see Deployment.
+        wanted, show, cost, camera_size: see Deployment.
         truth: what a simulator knows.
     """
 
@@ -65,6 +65,7 @@ class Session:
     show: Callable[[View], None]
     truth: Callable[[], dict[str, Any]] | None
     cost: Callable[[Observation], float] | None = None
+    camera_size: tuple[int, int] = v.CAMERA_SHAPE[:2]
 
     def run(self) -> Result:
         """Start move, task, recording; the arm is at rest or holds its last command at the end.
@@ -73,7 +74,13 @@ class Session:
             UserError, DriverError: it cannot even begin; nothing has moved.
         """
         deployment = Deployment(
-            self.station, self.safety, self.execute, self.wanted, self.show, self.cost
+            self.station,
+            self.safety,
+            self.execute,
+            self.wanted,
+            self.show,
+            self.cost,
+            self.camera_size,
         )
         ticks = Ticks()
         ending = self._to_start(deployment)

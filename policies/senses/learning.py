@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from tqdm import tqdm
 
@@ -29,14 +29,16 @@ class LearnConfig:
         steps: of sight.
         batch_size: placements a step of sight.
         lr: highest learning rate of sight, left by a cosine.
+        picture_noise: counts by which each pixel is changed at most, as a camera's are.
         contact_steps: of contact, 256 ticks each at a rate of 1e-3.
         touch_noise: standard deviation of noise added to embeddings, scaled to variance 1.
         seed: of everything random.
     """
 
-    steps: int = 3000
+    steps: int = 4000
     batch_size: int = 64
     lr: float = 2e-3
+    picture_noise: int = 4
     contact_steps: int = 600
     touch_noise: float = 0.5
     seed: int = 0
@@ -86,7 +88,10 @@ def learn_sight(sight: Sight, placements: Placements, config: LearnConfig) -> No
         for group in optimiser.param_groups:
             group["lr"] = config.lr * rate
         rows = torch.randint(len(placements), (config.batch_size,), generator=generator)
-        pictures = {key: placements.pictures[key][rows] for key, _ in sight.config.windows}
+        pictures = {
+            key: _noisy(placements.pictures[key][rows], config.picture_noise, generator)
+            for key, _ in sight.config.windows
+        }
         said = sight.scaled(pictures, placements.tcp[rows])
         wanted = sight.start_scale(placements.start[rows])
         loss = F.smooth_l1_loss(said, wanted, beta=_LINEAR)
@@ -94,6 +99,15 @@ def learn_sight(sight: Sight, placements: Placements, config: LearnConfig) -> No
         loss.backward()
         optimiser.step()
         progress.set_postfix(loss=f"{loss.item():.4f}")
+
+
+def _noisy(
+    pictures: UInt8[Tensor, "b h w 3"], counts: int, generator: torch.Generator
+) -> UInt8[Tensor, "b h w 3"]:
+    noise = torch.randint(
+        -counts, counts + 1, pictures.shape, dtype=torch.int16, generator=generator
+    )
+    return (pictures + noise).clamp(0, 255).to(torch.uint8)
 
 
 @torch.no_grad()

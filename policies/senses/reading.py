@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor, nn
 
 from touchgoal.control import vocabulary as v
@@ -64,6 +64,7 @@ class Senses:
     Attributes:
         touch: the embedder.
         cameras: columns of pictures looked at.
+        camera_size: rows and columns of these.
     """
 
     def __init__(self, network: SensesNetwork, touch: TouchEmbedder) -> None:
@@ -74,6 +75,7 @@ class Senses:
                 "touch encoder that they were trained with"
             )
         self.network, self.touch = network, touch
+        self.camera_size = network.config.sight.size
         self.cameras = tuple(key for key, _ in network.config.sight.windows)
         self._start: tuple[Mapping[str, np.ndarray] | None, np.ndarray] = None, np.empty(0)
 
@@ -88,12 +90,19 @@ class Senses:
             first: the episode's first, untouched one, with all of the table in view.
         """
         if self._start[0] is not first:
-            pictures = {key: torch.from_numpy(first[key])[None] for key in self.cameras}
+            pictures = {key: self._picture(key, first[key]) for key in self.cameras}
             tcp = torch.from_numpy(first[v.TCP_POSE])[None]
             self._start = first, self.network.sight(pictures, tcp)[0].numpy()
         touch = torch.from_numpy(self.touch.embed_tick(observation, first))[None]
         contact = self.network.contact(touch).sigmoid()[0].numpy()
         return {v.TRUTH_CONTACT: contact, v.TRUTH_START: self._start[1]}
+
+    def _picture(self, key: str, picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[Tensor, "1 h w 3"]:
+        size = self.camera_size
+        if picture.shape[:2] != size:
+            seen, wanted = (f"{rows} x {columns}" for rows, columns in (picture.shape[:2], size))
+            raise UserError(f"{key} is {seen}, the senses learned on {wanted}: set camera_size")
+        return torch.from_numpy(picture)[None]
 
 
 def save_senses(network: SensesNetwork, directory: Path, provenance: dict[str, Any]) -> None:
@@ -121,4 +130,5 @@ def load_senses(directory: Path) -> Senses:
 def _config(fields: dict[str, Any]) -> SensesConfig:
     sight = fields.pop("sight")
     windows = tuple((key, tuple(box)) for key, box in sight.pop("windows"))
-    return SensesConfig(**fields, sight=SightConfig(windows=windows, **sight))
+    size = tuple(sight.pop("size"))
+    return SensesConfig(**fields, sight=SightConfig(size, windows, **sight))

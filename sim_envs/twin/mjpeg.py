@@ -66,6 +66,7 @@ class Streams:
     def __init__(self, cell: Cell, host: str, port: int) -> None:
         self._cell, self._host = cell, host
         self._rng = np.random.default_rng(0)
+        self._noise = np.empty(0)
         env = cell.env
         self.streams = {
             camera: Stream(_CAMERA_RATE, partial(self._picture, camera))
@@ -108,7 +109,10 @@ class Streams:
 
     def _picture(self, camera: str) -> Picture:
         picture = self._cell.env.picture(camera)
-        noise = self._rng.normal(0.0, _CAMERA_NOISE, picture.shape)
+        if self._noise.shape != picture.shape:
+            self._noise = self._rng.normal(0.0, _CAMERA_NOISE, picture.shape)
+        # one field of noise, shifted: drawing anew takes longer than the picture
+        noise = np.roll(self._noise, self._rng.integers(0, picture.shape[:2]), axis=(0, 1))
         return np.clip(picture + noise, 0, 255).astype(np.uint8)
 
     def _feel(self, side: int) -> Picture:
