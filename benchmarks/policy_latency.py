@@ -18,11 +18,11 @@ from touchgoal.control import vocabulary as v
 from touchgoal.encoders.vit import ViT, ViTConfig
 from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import SHIPPED, ActorMaker
-from touchgoal.policies.diffusion import Diffusion, DiffusionConfig
-from touchgoal.policies.eyes import shrink
+from touchgoal.policies.networks.diffusion import Diffusion, DiffusionConfig
+from touchgoal.policies.networks.eyes import shrink
+from touchgoal.policies.networks.samplers import SamplerConfig
+from touchgoal.policies.networks.unet import PRESETS
 from touchgoal.policies.policy import PolicyConfig
-from touchgoal.policies.samplers import SamplerConfig
-from touchgoal.policies.unet import PRESETS
 
 _VITS = {
     "ViT-tiny": ViTConfig((224, 224), width=192, depth=12, heads=3),

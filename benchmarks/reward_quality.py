@@ -19,7 +19,7 @@ from touchgoal.encoders import pretrained
 from touchgoal.encoders.towers import load_towers
 from touchgoal.episodes.recording import Demonstration, collect
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.policies.success import SuccessRate
+from touchgoal.policies.trials.success import SuccessRate
 from touchgoal.rewards.curves import Curves, Scale
 from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EpisodeEmbedder, measure
 from touchgoal.rewards.goals import EpisodeEnd, Goal, LastFrame, Sentence

@@ -135,9 +135,7 @@ def _background(episodes: EpisodeSet, i: int, side: int) -> UInt8[np.ndarray, "h
     return touch_background(episodes.read(i, [key], first).frames[key])
 
 
-def _contact(
-    episodes: EpisodeSet, i: int, sides: list[int]
-) -> Bool[np.ndarray, "t s"]:
+def _contact(episodes: EpisodeSet, i: int, sides: list[int]) -> Bool[np.ndarray, "t s"]:
     if TRUTH_CONTACT in episodes.features:
         return episodes.read(i, [TRUTH_CONTACT]).frames[TRUTH_CONTACT][:, sides]
     keys = [TACTILE[side] for side in sides]

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import Cast, Demonstration, collect, scripted
 from touchgoal.launch.run_folder import open_run, write_json
-from touchgoal.policies.corrections import Corrected
+from touchgoal.policies.training.corrections import Corrected
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.experts import Outcome
 from touchgoal.sim_envs.objects import CATALOGUE, find

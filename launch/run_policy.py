@@ -13,12 +13,12 @@ from touchgoal.control.errors import UserError
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.recording import Actor, Demonstration, demonstrate_on_film
 from touchgoal.launch.run_folder import open_run, write_json
-from touchgoal.policies import maze_trials, rollout
 from touchgoal.policies.acting import SHIPPED, ActorMaker
 from touchgoal.policies.follower import WireFollower
-from touchgoal.policies.maze_trials import MazeTrial
-from touchgoal.policies.rollout import Trial
-from touchgoal.policies.success import SuccessRate
+from touchgoal.policies.trials import maze_trials, rollout
+from touchgoal.policies.trials.maze_trials import MazeTrial
+from touchgoal.policies.trials.rollout import Trial
+from touchgoal.policies.trials.success import SuccessRate
 from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
 from touchgoal.sim_envs.experts import PickPlaceExpert
 from touchgoal.sim_envs.maze_expert import BeadMazeExpert

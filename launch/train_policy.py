@@ -14,19 +14,20 @@ from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.run_folder import open_run, write_json
-from touchgoal.policies import checkpoint, maze_trials, rollout
+from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import ActorMaker
 from touchgoal.policies.actions import Representation
-from touchgoal.policies.diffusion import DiffusionConfig, RegressionConfig
-from touchgoal.policies.eyes import EyeConfig
+from touchgoal.policies.networks.diffusion import DiffusionConfig, RegressionConfig
+from touchgoal.policies.networks.eyes import EyeConfig
+from touchgoal.policies.networks.samplers import SamplerConfig
+from touchgoal.policies.networks.unet import PRESETS
 from touchgoal.policies.policy import PolicyConfig, TouchReading
-from touchgoal.policies.samplers import SamplerConfig
-from touchgoal.policies.selection import Score, add_parts, select
 from touchgoal.policies.senses.reading import READ, load_senses
 from touchgoal.policies.touch import TouchEmbedder, load_touch
-from touchgoal.policies.train import POLICY, TrainConfig, train
-from touchgoal.policies.unet import PRESETS
-from touchgoal.policies.windows import Windows, read
+from touchgoal.policies.training.selection import Score, add_parts, select
+from touchgoal.policies.training.train import POLICY, TrainConfig, train
+from touchgoal.policies.training.windows import Windows, read
+from touchgoal.policies.trials import maze_trials, rollout
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.objects import CATALOGUE
 from touchgoal.sim_envs.pick_place import PickPlaceConfig

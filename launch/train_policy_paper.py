@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 
 from touchgoal.launch import train_policy
 from touchgoal.policies.actions import Representation
+from touchgoal.policies.networks.samplers import SamplerConfig
 from touchgoal.policies.policy import TouchReading
-from touchgoal.policies.samplers import SamplerConfig
-from touchgoal.policies.train import TrainConfig
+from touchgoal.policies.training.train import TrainConfig
 
 
 @dataclass(frozen=True)

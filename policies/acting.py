@@ -14,7 +14,7 @@ from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.control.sensors import find_sensor
 from touchgoal.policies import checkpoint
-from touchgoal.policies.eyes import shrink
+from touchgoal.policies.networks.eyes import shrink
 from touchgoal.policies.policy import Condition, Policy, PolicyConfig
 from touchgoal.policies.senses.reading import Senses, load_senses
 from touchgoal.policies.touch import TouchEmbedder, load_touch

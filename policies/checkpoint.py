@@ -6,11 +6,11 @@ from typing import Any
 
 from touchgoal.control.errors import UserError
 from touchgoal.encoders.stored import Stored
-from touchgoal.policies.diffusion import DiffusionConfig, RegressionConfig
-from touchgoal.policies.eyes import EyeConfig
+from touchgoal.policies.networks.diffusion import DiffusionConfig, RegressionConfig
+from touchgoal.policies.networks.eyes import EyeConfig
+from touchgoal.policies.networks.samplers import SamplerConfig
+from touchgoal.policies.networks.unet import UNetConfig
 from touchgoal.policies.policy import Policy, PolicyConfig
-from touchgoal.policies.samplers import SamplerConfig
-from touchgoal.policies.unet import UNetConfig
 
 TOUCH, SENSES = "touch", "senses"  # folders beside the weights: of the touch encoder, of senses
 POLICY = Stored("policy", "policy", "train one with: touchgoal train-policy")

@@ -11,8 +11,13 @@ from torch import Tensor, nn
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.policies.actions import ACTION_DIM, Representation, Scale, represent, to_actions
-from touchgoal.policies.diffusion import Diffusion, DiffusionConfig, Regression, RegressionConfig
-from touchgoal.policies.eyes import Eye, EyeConfig
+from touchgoal.policies.networks.diffusion import (
+    Diffusion,
+    DiffusionConfig,
+    Regression,
+    RegressionConfig,
+)
+from touchgoal.policies.networks.eyes import Eye, EyeConfig
 
 TouchReading = Literal["wrench", "free"]
 WRENCH_DIM = v.FEATURES[v.TRUTH_PAD_WRENCH].shape[0]

@@ -10,7 +10,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.touch.contact import detect_contact
 from touchgoal.episodes.recording import run
 from touchgoal.policies.follower import WireFollower
-from touchgoal.policies.maze_trials import evaluate, trials_of
+from touchgoal.policies.trials.maze_trials import evaluate, trials_of
 from touchgoal.sim_envs import wires
 from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig, add_wire, thread
 from touchgoal.sim_envs.maze_expert import BeadMazeExpert

@@ -8,9 +8,9 @@ import torch
 from toy_policies import TOY
 
 from touchgoal.control.kinematics import Fr3Kinematics
-from touchgoal.policies.compounding import always, compound, repeat_last, zero_motion
 from touchgoal.policies.policy import Condition
-from touchgoal.policies.windows import Recorded, Windows
+from touchgoal.policies.training.windows import Recorded, Windows
+from touchgoal.policies.trials.compounding import always, compound, repeat_last, zero_motion
 
 import mujoco  # isort: skip - after touchgoal, which chooses the OpenGL platform
 

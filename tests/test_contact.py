@@ -31,7 +31,9 @@ def sensed(light: np.ndarray, bump: np.ndarray, seed: int = 0) -> np.ndarray:
 
 def through_jpeg(frame: np.ndarray) -> np.ndarray:
     """As a sensor sends it, with noise of a size that its blocks make coarse."""
-    return cv2.imdecode(cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 60])[1], 1)
+    decoded = cv2.imdecode(cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 60])[1], 1)
+    assert decoded is not None
+    return decoded
 
 
 def background_of(frames: np.ndarray) -> np.ndarray:

@@ -10,8 +10,8 @@ from toy_policies import TOY, policy_for, toy_windows
 from touchgoal.control import vocabulary as v
 from touchgoal.episodes.recording import CORRECTED, Demonstration, demonstrate
 from touchgoal.policies import checkpoint
-from touchgoal.policies.corrections import Corrected
 from touchgoal.policies.senses.reading import READ
+from touchgoal.policies.training.corrections import Corrected
 from touchgoal.sim_envs.feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
 

@@ -3,8 +3,8 @@
 import pytest
 
 from touchgoal.episodes.recording import Demonstration
-from touchgoal.policies.rollout import evaluate
-from touchgoal.policies.success import SuccessRate
+from touchgoal.policies.trials.rollout import evaluate
+from touchgoal.policies.trials.success import SuccessRate
 from touchgoal.sim_envs.experts import PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 

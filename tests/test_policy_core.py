@@ -15,13 +15,14 @@ from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.policies import checkpoint, ema
-from touchgoal.policies import train as train_module
+from touchgoal.policies import checkpoint
 from touchgoal.policies.actions import Representation, Scale, represent, to_actions
-from touchgoal.policies.diffusion import DiffusionConfig, RegressionConfig
+from touchgoal.policies.networks import ema
+from touchgoal.policies.networks.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.policy import Condition, Policy, PolicyConfig, unroll
-from touchgoal.policies.train import TrainConfig, train
-from touchgoal.policies.windows import read
+from touchgoal.policies.training import train as train_module
+from touchgoal.policies.training.train import TrainConfig, train
+from touchgoal.policies.training.windows import read
 
 
 @pytest.mark.parametrize("kind", ["delta", "chunk", "absolute", "hand"])

@@ -26,7 +26,9 @@ from touchgoal.policies.senses.sight import SightConfig
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.pick_place import WORKSPACE, PickPlace, PickPlaceConfig
 
-SMALL = SightConfig((16, 16), windows=((v.FRONT, (0, 16, 0, 16)),), channels=8, glances=4, detail=4, width=16)
+SMALL = SightConfig(
+    (16, 16), windows=((v.FRONT, (0, 16, 0, 16)),), channels=8, glances=4, detail=4, width=16
+)
 
 
 def toy_senses() -> Senses:

@@ -6,12 +6,12 @@ import torch
 from touchgoal.control import vocabulary as v
 from touchgoal.encoders.trunk import TouchTrunk, TouchTrunkConfig
 from touchgoal.encoders.vit import PRESETS as VITS
-from touchgoal.policies.diffusion import DiffusionConfig
+from touchgoal.policies.networks.diffusion import DiffusionConfig
+from touchgoal.policies.networks.samplers import SamplerConfig
+from touchgoal.policies.networks.unet import PRESETS
 from touchgoal.policies.policy import WRENCH_DIM, Policy, PolicyConfig
-from touchgoal.policies.samplers import SamplerConfig
 from touchgoal.policies.touch import TouchEmbedder
-from touchgoal.policies.unet import PRESETS
-from touchgoal.policies.windows import Recorded, Windows
+from touchgoal.policies.training.windows import Recorded, Windows
 
 DIFFUSION = DiffusionConfig(PRESETS["tiny"], SamplerConfig(plan_steps=5))
 FLOW = DiffusionConfig(PRESETS["tiny"], SamplerConfig("flow", plan_steps=5))

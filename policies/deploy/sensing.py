@@ -51,9 +51,7 @@ class StationReader:
     It never waits: drivers keep the newest reading of everything.
     """
 
-    def __init__(
-        self, station: Station, camera_size: tuple[int, int] = v.CAMERA_SHAPE[:2]
-    ) -> None:
+    def __init__(self, station: Station, camera_size: tuple[int, int] = v.CAMERA_SHAPE[:2]) -> None:
         """Gives cameras' pictures that size; UserError if one takes smaller ones."""
         self._station, self._size = station, camera_size
         for key, camera in station.cameras.items():

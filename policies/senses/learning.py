@@ -16,7 +16,7 @@ from touchgoal.policies.senses.placements import Placements
 from touchgoal.policies.senses.reading import SensesNetwork
 from touchgoal.policies.senses.sight import Sight
 from touchgoal.policies.touch import TouchEmbedder
-from touchgoal.policies.windows import embed
+from touchgoal.policies.training.windows import embed
 
 _LINEAR = 0.3  # standard deviations beyond which an error of sight counts linearly
 

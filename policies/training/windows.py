@@ -19,7 +19,7 @@ from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.policies.eyes import EyeConfig, shrink
+from touchgoal.policies.networks.eyes import EyeConfig, shrink
 from touchgoal.policies.policy import Condition, PolicyConfig
 from touchgoal.policies.touch import TouchEmbedder
 

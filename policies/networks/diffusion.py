@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from touchgoal.policies.samplers import SamplerConfig, mend, spoil
-from touchgoal.policies.unet import PRESETS, UNet, UNetConfig
+from touchgoal.policies.networks.samplers import SamplerConfig, mend, spoil
+from touchgoal.policies.networks.unet import PRESETS, UNet, UNetConfig
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,10 @@ from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
 from touchgoal.encoders import resumable
-from touchgoal.policies import checkpoint, ema
+from touchgoal.policies import checkpoint
+from touchgoal.policies.networks import ema
 from touchgoal.policies.policy import Condition, Policy, PolicyConfig
-from touchgoal.policies.windows import Windows
+from touchgoal.policies.training.windows import Windows
 
 POLICY, SNAPSHOTS = "policy", "snapshots"
 

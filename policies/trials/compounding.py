@@ -21,7 +21,7 @@ from torch import Tensor
 
 from touchgoal.control.kinematics import Fr3Kinematics
 from touchgoal.policies.policy import Condition
-from touchgoal.policies.windows import Windows
+from touchgoal.policies.training.windows import Windows
 
 Plan = Callable[[Condition], Float[Tensor, "b h 8"]]
 

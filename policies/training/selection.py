@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from touchgoal.policies.train import POLICY, SNAPSHOTS
+from touchgoal.policies.training.train import POLICY, SNAPSHOTS
 
 Score = tuple[float, float]
 """Success rate, then mean progress; both in [0, 1]."""
