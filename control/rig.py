@@ -2,7 +2,7 @@
 
 import json
 import tomllib
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -150,8 +150,12 @@ class Rig:
         return self.fingertips.sensor if self.fingertips else "gelsight_mini"
 
 
-def read_rig(path: Path) -> Rig:
+def read_rig(path: Path, policy: str = "") -> Rig:
     """Read a rig file (TOML), or the `rig.json` that a twin has written.
+
+    Args:
+        path: of the file.
+        policy: in place of the file's, if given.
 
     Raises:
         UserError: no such file, bad syntax, an unknown key, or a value that is missing or wrong.
@@ -169,6 +173,8 @@ def read_rig(path: Path) -> Rig:
         ) from error
     try:
         rig = _read(Rig, table, "")
+        if policy:
+            rig = replace(rig, task=replace(rig.task, policy=policy))
         _check(rig)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error

@@ -45,6 +45,8 @@ class Config:
 
     rig: Annotated[Path, tyro.conf.Positional]
     """The rig file: one like those in launch/rigs/, or the rig.json of a twin."""
+    policy: str = ""
+    """In place of the rig's: expert, follower, shipped, or a folder that train-policy made."""
     execute: bool = False
     """Move the arm. Without it this is a dry run."""
     yes: bool = False
@@ -57,7 +59,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Connect, check, ask, run, record, report; UserError, so exit code 1, if it was stopped."""
-    rig = read_rig(config.rig)
+    rig = read_rig(config.rig, config.policy)
     if config.sim:
         rig = replace(rig, arm="sim")
     out = open_run(config.out, "deploy", config)
