@@ -14,7 +14,8 @@ from touchgoal.encoders.towers import same_towers
 from touchgoal.encoders.trunk import TouchTrunk, TouchTrunkConfig
 from touchgoal.encoders.vit import ViTConfig
 
-SHIPPED = Path(__file__).parent / "weights" / "gelsight_mini_offline"
+_WEIGHTS = Path(__file__).parent / "weights"
+SHIPPED = _WEIGHTS / "gelsight_mini_offline"
 ENCODER = Stored("encoder", "touch encoder", "train one with: touchgoal train-encoder")
 
 
@@ -35,6 +36,18 @@ def save(
     dtype = torch.float16 if half else torch.float32
     weights = {name: w.detach().cpu().to(dtype) for name, w in encoder.state_dict().items()}
     ENCODER.save(directory, weights, asdict(encoder.config), provenance)
+
+
+def shipped_for(sensor: str | None) -> Path:
+    """The encoder that ships for a sensor, on the offline towers; `SHIPPED` if it is unknown.
+
+    Raises:
+        UserError: none ships.
+    """
+    directory = _WEIGHTS / f"{sensor}_offline" if sensor else SHIPPED
+    if not directory.is_dir():
+        raise UserError(f"no touch encoder ships for {sensor}: {ENCODER.remedy}")
+    return directory
 
 
 def load(directory: Path, sensor: str | None = None, towers: str | None = None) -> TouchEncoder:

@@ -42,8 +42,10 @@ class Config:
 def main(config: Config) -> None:
     """Load the weights first, so that a missing one costs no simulation; then record and judge."""
     find(config.object)
-    encoder = pretrained.load(pretrained.SHIPPED, sensor=find_sensor(config.env.scene.sensor).name)
-    scale = Scale.load(pretrained.SHIPPED / "scale.json")
+    sensor = find_sensor(config.env.scene.sensor).name
+    directory = pretrained.shipped_for(sensor)
+    encoder = pretrained.load(directory, sensor=sensor)
+    scale = Scale.load(directory / "scale.json")
     embedder = EpisodeEmbedder(load_towers(encoder.config.towers), encoder)
     out = open_run(config.out, "demo", config)
 
@@ -58,7 +60,7 @@ def main(config: Config) -> None:
     specs = [parse_goal("last"), parse_goal(f"text:{config.words}")]
     goal = embedder.embed_goal(choose_goal(specs, embedded.modalities), embedded)
     curves = measure(embedded, goal, scale)
-    write_report(curves, out, "curves", {"encoder": pretrained.SHIPPED.name, **embedder.space})
+    write_report(curves, out, "curves", {"encoder": directory.name, **embedder.space})
     print(f"\n{episode.task}: {episode.meta['outcome']} in {len(episode) - 1} ticks")
     summarise([curves], out)
     print(f"video: {out / 'episode.mp4'}\ncurves: {out / 'curves.png'}")

@@ -116,8 +116,9 @@ def _cost(rig: Rig) -> LiveCost | None:
     """What measures the distance to the rig's goals, on the shipped encoder."""
     if not rig.task.rewards:
         return None
-    encoder = pretrained.load(pretrained.SHIPPED, sensor=rig.sensor)
-    scale = Scale.load(pretrained.SHIPPED / "scale.json")
+    directory = pretrained.shipped_for(rig.sensor)
+    encoder = pretrained.load(directory, sensor=rig.sensor)
+    scale = Scale.load(directory / "scale.json")
     goals = [parse_goal(text) for text in rig.task.rewards]
     return LiveCost(load_towers(encoder.config.towers), encoder, scale, goals)
 

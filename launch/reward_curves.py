@@ -36,8 +36,8 @@ class Config:
     """What to be near; may be given several times. Default: last."""
     episodes: tuple[int, ...] = ()
     """Which episodes of the set; default: all."""
-    encoder: Path = pretrained.SHIPPED
-    """Folder of the touch encoder."""
+    encoder: Path | None = None
+    """Folder of the touch encoder; default: the one that ships for the episodes' sensor."""
     camera: str = FRONT
     """Which camera's pictures are measured."""
     out: Path | None = None
@@ -48,8 +48,9 @@ def main(config: Config) -> None:
     """Embed, measure, and write a plot, a CSV and a JSON for each episode."""
     specs = [parse_goal(text) for text in config.goal or ("last",)]
     sources = _open(config)
-    encoder = pretrained.load(config.encoder, sensor=sources.sensor)
-    scale = Scale.load(config.encoder / "scale.json")
+    directory = config.encoder or pretrained.shipped_for(sources.sensor)
+    encoder = pretrained.load(directory, sensor=sources.sensor)
+    scale = Scale.load(directory / "scale.json")
     embedder = EpisodeEmbedder(load_towers(encoder.config.towers), encoder, config.camera)
     out, curves = None, []
     for name, index in tqdm(sources.items, desc="curves", unit="episode"):
@@ -57,7 +58,7 @@ def main(config: Config) -> None:
         goal = embedder.embed_goal(choose_goal(specs, embedded.modalities), embedded)
         measured = measure(embedded, goal, scale)
         out = out or open_run(config.out, "reward-curves", config)
-        write_report(measured, out, name, {"encoder": str(config.encoder), **embedder.space})
+        write_report(measured, out, name, {"encoder": str(directory), **embedder.space})
         curves.append(measured)
     assert out is not None  # a source has at least one item
     summarise(curves, out)

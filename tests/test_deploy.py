@@ -76,6 +76,21 @@ def test_picks_and_places_on_the_twin_and_the_episode_has_reward_curves(
 
 
 @pytest.mark.realtime
+def test_the_shipped_policy_leads_a_bead_on_the_twin(tmp_path: Path) -> None:
+    pytest.importorskip("franky", reason="pip install 'touchgoal[franka]'")
+    cell = ["--lock-step", "--task", "bead-maze", "--wire", "helix-3", "--maze.cameras"]
+    twin = RunningTwin(cell, tmp_path, 3)
+    _, complaint = deploying(twin, tmp_path).communicate(timeout=_PATIENCE)
+    worst = twin.ask("truth")["worst"]
+    twin.close()
+    assert complaint == "" and worst["excess"] == 0 and worst["speed"] < 1
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["success"]
+    run("reward-curves", tmp_path / "run" / "episodes", "--out", tmp_path / "curves")
+    report = json.loads((tmp_path / "curves" / "episode_000.json").read_text())
+    assert report["metrics"]["tactile"]["end"] < report["metrics"]["tactile"]["start"]
+
+
+@pytest.mark.realtime
 def test_a_stalled_camera_stops_the_arm_and_the_episode_is_kept(
     twin: RunningTwin, tmp_path: Path
 ) -> None:
