@@ -72,7 +72,7 @@ PICK := runs/pick_place
 BLIND := --env.no-tactile --env.cameras
 LEARN := --task pick-place --episodes $(PICK)/train/episodes --validation $(PICK)/val/episodes \
 	--senses $(PICK)/senses/senses --head regression --representation hand --place-noise 0 \
-	--execution-horizon 2 --train.lr 1e-3
+	--execution-horizon 2 --train.lr 1e-3 --train.epochs 16 --train.snapshot-epochs 16
 pick-place-policy: $(READY)
 	$(BIN)/touchgoal train-senses --episodes runs/weights/train/episodes \
 		--validation runs/weights/val/episodes --out $(PICK)/senses
@@ -82,12 +82,12 @@ pick-place-policy: $(READY)
 	$(BIN)/touchgoal collect-demos --feedback --episodes 120 --seed 20120 $(BLIND) \
 		--env.disturbance 0.02 --out $(PICK)/train
 	for round in 1 2 3 4 5 6; do \
-		$(BIN)/touchgoal train-policy $(LEARN) --train.epochs 16 --trials 0 \
+		$(BIN)/touchgoal train-policy $(LEARN) --trials 0 \
 			--out $(PICK)/round-$$round && \
 		$(BIN)/touchgoal collect-demos --learner $(PICK)/round-$$round/policy --episodes 120 \
 			--seed 3$${round}000 $(BLIND) --out $(PICK)/train || exit 1; \
 	done
-	$(BIN)/touchgoal train-policy $(LEARN) --train.epochs 30 --trials 40 --out $(PICK)/policy
+	$(BIN)/touchgoal train-policy $(LEARN) --trials 40 --out $(PICK)/policy
 	rm -rf policies/weights/pick_place && cp -r $(PICK)/policy/policy policies/weights/pick_place
 
 $(READY): pyproject.toml constraints.txt

@@ -3,6 +3,7 @@
 import pytest
 
 from touchgoal.episodes.recording import Demonstration
+from touchgoal.policies.acting import SHIPPED, ActorMaker
 from touchgoal.policies.trials.rollout import evaluate
 from touchgoal.policies.trials.success import SuccessRate
 from touchgoal.sim_envs.experts import PickPlaceExpert
@@ -25,3 +26,11 @@ def test_trials_depend_on_their_seed_alone() -> None:
         *evaluate(config, PickPlaceExpert, jobs[:1], workers=1),
         *evaluate(config, PickPlaceExpert, jobs[1:], workers=1),
     ]
+
+
+def test_what_ships_picks_and_places() -> None:
+    maker = ActorMaker(SHIPPED["pick-place"])
+    config = maker.observing(PickPlaceConfig())
+    assert config.cameras == ("front",) and config.tactile
+    (trial,) = evaluate(config, maker, [Demonstration(2_000_000)], workers=1)
+    assert trial.success
