@@ -265,6 +265,9 @@ class Hanging:
     def __init__(self, width: float, breaks: Callable[[], None]) -> None:
         self._width, self._breaks, self._plans = width, breaks, 0
 
+    def sense(self, seen: Sequence[Observation]) -> None:
+        """It has no senses."""
+
     def plan(self, seen: Sequence[Observation]) -> np.ndarray:
         """Three plans, then none."""
         self._plans += 1

@@ -83,12 +83,16 @@ class Planner:
             seen: the last `observation_horizon` observations, oldest first. The oldest one of the
                 first call is the episode's first, untouched one.
         """
-        self._first = self._first or seen[0]
-        self._known = [(observation, *self._sense(observation)) for observation in seen]
+        self.sense(seen)
         _, touch, state = zip(*self._known, strict=True)
         touch, state = (torch.from_numpy(np.stack(x)).float()[None] for x in (touch, state))
         condition = Condition(touch, state, self._look(seen[-1]))
         return self._policy.plan(condition, self._generator)[0].numpy()
+
+    def sense(self, seen: Sequence[Observation]) -> None:
+        """Embed these ahead of a `plan` that begins with some of them: most of the work."""
+        self._first = self._first or seen[0]
+        self._known = [(observation, *self._sense(observation)) for observation in seen]
 
     def _sense(self, observation: Observation) -> tuple[np.ndarray, np.ndarray]:
         """The embedding (e,) and the proprioception (s,) of one tick."""

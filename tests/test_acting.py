@@ -82,9 +82,10 @@ def test_a_late_plan_is_joined_where_it_should_be_by_now() -> None:
 
 def test_a_quick_plan_is_done_from_the_tick_it_was_made_on() -> None:
     """So an arm does what was judged in simulation, where plans take no time."""
-    config = replace(TOY, touch_dim=0, touch="", execution_horizon=3, control_hz=2)
+    touch = feeling()
+    config = replace(TOY, touch_dim=touch.dim, execution_horizon=3, control_hz=2)
     policy = policy_for(config, toy_windows(config)).eval()
-    threaded, plain = RealTimeActor(Planner(policy, None)), PolicyActor(Planner(policy, None))
+    threaded, plain = RealTimeActor(Planner(policy, touch)), PolicyActor(Planner(policy, touch))
     for tick in toy_ticks(10):
         np.testing.assert_array_equal(threaded.act(tick), plain.act(tick))
     threaded.close()

@@ -18,6 +18,8 @@ from touchgoal.policies.follower import WireFollower
 from touchgoal.sim_envs.scene import SERVO_DAMPING
 from touchgoal.sim_envs.simulated import task_of
 
+_STANDS_STILL = 20.0  # s
+
 
 class Follower:
     """The wire follower in the loop; it never ends by itself."""
@@ -44,9 +46,9 @@ class Learned(RealTimeActor):
 
     done = False
 
-    def __init__(self, planner: Plans) -> None:
+    def __init__(self, planner: Plans, patience: float | None) -> None:
         """See RealTimeActor."""
-        super().__init__(planner)
+        super().__init__(planner, patience)
         self._share = 1 - float(np.exp(-1 / (planner.config.control_hz * SERVO_DAMPING)))
         self._left = np.zeros(v.N_JOINTS)  # rad, wanted and not yet passed on
 
@@ -98,7 +100,8 @@ def make_actor(
 ) -> DeployedActor:
     """The actor for one run, from where the arm is now."""
     if maker is not None:
-        return Learned(maker.planner())
+        # The time of a simulated arm stands still meanwhile: so a run repeats on any machine.
+        return Learned(maker.planner(), _STANDS_STILL if rig.arm == "sim" else None)
     if rig.task.policy == "follower":
         return Follower(v.CONTROL_HZ)
     return pick_and_place(place_of(rig, truth), safety, commanded)

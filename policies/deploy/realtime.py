@@ -15,7 +15,6 @@ from touchgoal.control.errors import UserError
 from touchgoal.policies.acting import Observation
 
 _FIRST = 20.0  # s for the first plan; it warms everything up
-_PATIENCE = 0.5  # of a tick, for a plan that is due
 _CLOSING = 2.0  # s for a plan under way when the episode ends
 
 
@@ -43,6 +42,7 @@ class Plans(Protocol):
 
     @property
     def config(self) -> Horizons: ...  # noqa: D102
+    def sense(self, seen: Sequence[Observation]) -> None: ...  # noqa: D102
     def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]: ...  # noqa: D102
 
 
@@ -62,14 +62,21 @@ class RealTimeActor:
         failure: what ended the planning thread, if something did; `act` raises it.
     """
 
-    def __init__(self, planner: Plans) -> None:
-        """Starts an episode; `close` ends the thread."""
+    def __init__(self, planner: Plans, patience: float | None = None) -> None:
+        """Starts an episode; `close` ends the thread.
+
+        Args:
+            planner: of this episode.
+            patience: s for which a plan that is due is waited for; None: half a tick.
+        """
         self._planner, self._config = planner, planner.config
         self.latencies: list[float] = []
         self.starved = 0
         self.overdue = 0.0
         self.failure: BaseException | None = None
-        self._patience = _PATIENCE / planner.config.control_hz  # s
+        self._sensed = -1  # tick of the newest observation that the thread has taken
+        half = 0.5 / planner.config.control_hz
+        self._patience = half if patience is None else patience
         self._tick = -1
         self._seen: list[Observation] = []
         self._asked = 0.0  # when the newest observation came, monotonic s
@@ -125,7 +132,10 @@ class RealTimeActor:
         torch.set_num_threads(1)  # of this thread; two lose badly when the other core is taken
         try:
             while (task := self._wait()) is not None:
-                tick, seen, asked = task
+                tick, seen, asked, due = task
+                if not due:
+                    self._planner.sense(seen)
+                    continue
                 actions = self._planner.plan(seen)
                 with self._condition:
                     if self._plan is not None:
@@ -137,18 +147,22 @@ class RealTimeActor:
                 self.failure = error
                 self._condition.notify_all()
 
-    def _wait(self) -> tuple[int, list[Observation], float] | None:
-        """What to plan from: the newest observation, once enough of the present plan is done."""
+    def _wait(self) -> tuple[int, list[Observation], float, bool] | None:
+        """What to plan from, if a plan is due, or to sense, if the next plan sees it, too."""
         with self._condition:
-            self._condition.wait_for(self._due)
-            return None if self._closed else (self._tick, list(self._seen), self._asked)
+            seen = self._config.observation_horizon - 1
+            self._condition.wait_for(
+                lambda: self._due() or (self._sensed < self._tick and self._due(seen))
+            )
+            self._sensed = self._tick
+            return None if self._closed else (self._tick, [*self._seen], self._asked, self._due())
 
     @property
     def _slow(self) -> bool:
         return bool(self.latencies) and self.latencies[-1] > self._patience
 
-    def _due(self) -> bool:
-        """Whether it is time for another plan, or for the end."""
+    def _due(self, ahead: int = 0) -> bool:
+        """Whether it is time for another plan, or will be in some ticks; or for the end."""
         if self._closed or self._plan is None:
             return self._closed or self._tick >= 0
-        return self._tick - self._plan.tick >= self._config.execution_horizon - self._slow
+        return self._tick + ahead - self._plan.tick >= self._config.execution_horizon - self._slow

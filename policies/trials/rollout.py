@@ -19,6 +19,7 @@ class Trial:
         progress: the greatest reached, in [0, 1].
         error: distance of the object to the goal at the end, m.
         peak_force: the greatest normal force on a pad, N.
+        peak_load: the greatest external force on the hand, N.
     """
 
     seed: int
@@ -30,6 +31,7 @@ class Trial:
     progress: float
     error: float
     peak_force: float
+    peak_load: float
     ticks: int
 
 
@@ -73,5 +75,6 @@ def _try(
         progress=max(float(tick[v.TRUTH_PROGRESS][0]) for tick in ticks),
         error=float(error),
         peak_force=float(np.abs(normal).max()),
+        peak_load=max(float(np.linalg.norm(tick[v.WRENCH][:3])) for tick in ticks),
         ticks=len(ticks) - 1,
     )
