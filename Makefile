@@ -13,7 +13,7 @@ demo: $(READY)
 
 # What runs in real time needs a core to itself, so it comes after the rest.
 test: $(READY)
-	$(BIN)/python -m pytest -n auto -m "not realtime" --durations 20
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not realtime" --durations 20
 	$(BIN)/python -m pytest -m realtime --durations 10
 
 # The quick loop before every commit.

@@ -23,6 +23,7 @@ from touchgoal.policies.networks.eyes import shrink
 from touchgoal.policies.networks.samplers import SamplerConfig
 from touchgoal.policies.networks.unet import PRESETS
 from touchgoal.policies.policy import PolicyConfig
+from touchgoal.sim_envs.base import EnvConfig
 
 _VITS = {
     "ViT-tiny": ViTConfig((224, 224), width=192, depth=12, heads=3),
@@ -76,7 +77,8 @@ def run(config: Config) -> dict[str, Any]:
 def _stages(config: Config) -> list[Stage]:
     maker = ActorMaker(config.policy)
     planner = maker.planner()
-    policy, ticks = checkpoint.load(config.policy), _observations(planner.config)
+    policy = checkpoint.load(config.policy)
+    ticks = _observations(policy.config, maker.observing(EnvConfig()).camera_size)
     stages = []
     if planner.touch is not None:
         encoder = planner.touch.encoder
@@ -128,16 +130,17 @@ def _published(config: Config) -> list[Stage]:
     return stages
 
 
-def _observations(config: PolicyConfig) -> list[dict[str, np.ndarray]]:
+def _observations(config: PolicyConfig, camera: tuple[int, int]) -> list[dict[str, np.ndarray]]:
     rng = np.random.default_rng(0)
-    keys = [*config.proprioception, *v.TACTILE, *v.CAMERAS]
-    return [{key: _random(v.FEATURES[key], rng) for key in keys} for _ in range(8)]
-
-
-def _random(feature: v.Feature, rng: np.random.Generator) -> np.ndarray:
-    if feature.dtype == "uint8":
-        return rng.integers(90, 110, feature.shape, np.uint8)
-    return rng.normal(size=feature.shape).astype(np.float32)
+    seen = [key for key in config.proprioception if key not in config.perceived]
+    pictures = dict.fromkeys(v.CAMERAS, (*camera, 3)) | {
+        key: v.FEATURES[key].shape for key in v.TACTILE
+    }
+    return [
+        {key: rng.normal(size=v.FEATURES[key].shape).astype(np.float32) for key in seen}
+        | {key: rng.integers(90, 110, shape, np.uint8) for key, shape in pictures.items()}
+        for _ in range(8)
+    ]
 
 
 def _time(what: str, repeats: int, work: Callable[[], object]) -> Stage:

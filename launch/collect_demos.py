@@ -10,6 +10,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import Cast, Demonstration, collect, scripted
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies.training.corrections import Corrected
+from touchgoal.policies.trials.success import SuccessRate
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.experts import Outcome
 from touchgoal.sim_envs.objects import CATALOGUE, find
@@ -61,6 +62,9 @@ def main(config: Config) -> None:
     print(f"{len(metas)} episodes in {out / 'episodes'}")
     for outcome, count in outcomes.items():
         print(f"  {outcome:<14}{count}")
+    if config.learner:
+        rate = SuccessRate(sum(bool(meta["success"]) for meta in metas), len(metas))
+        print(f"the learner succeeded in {rate}")
 
 
 def _choose(config: Config) -> tuple[TaskConfig, list[dict[str, Any]]]:

@@ -157,9 +157,11 @@ def table(trials: list[Trial]) -> str:
             error = 1e3 * sum(t.error for t in some) / len(some)
             lines.append(f"{shape:<10}{rate!s:<26}{error:>17.1f}")
     masses, forces = [t.mass for t in trials], [t.grasp_force for t in trials]
+    loads = [t.peak_load for t in trials if t.success] or [0.0]
     lines.append(
         f"masses {1e3 * min(masses):.0f} to {1e3 * max(masses):.0f} g, "
-        f"grasp forces {min(forces):.1f} to {max(forces):.1f} N"
+        f"grasp forces {min(forces):.1f} to {max(forces):.1f} N; "
+        f"successes loaded the hand with at most {np.median(loads):.1f} N (median), {max(loads):.1f} N"
     )
     return "\n".join(lines)
 

@@ -49,7 +49,7 @@ class RunningTwin:
 
     def at_rest(self) -> dict[str, Any]:
         """The truth once the arm is at rest."""
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + 60
         while (truth := self.ask("truth"))["rest"] < 0.1:
             assert time.monotonic() < deadline
             time.sleep(0.05)

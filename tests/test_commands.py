@@ -184,6 +184,28 @@ def test_learning_the_bead_maze(
     assert "feels with gelsight_mini_markers" in other
 
 
+@pytest.mark.slow
+def test_learning_to_pick_and_place(
+    episodes: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From placements and demonstrations to a policy that is corrected; too little of everything."""
+    monkeypatch.chdir(tmp_path)
+    one, blind = ("--workers", 1), ("--env.no-tactile", "--env.cameras", "--out", "demos")
+    run("train-senses", "--episodes", episodes, "--validation", episodes, *one, "--things", 2,
+        "--places", 2, "--learn.steps", 2, "--learn.contact-steps", 2, "--out", "senses")  # fmt: skip
+    run("collect-demos", "--feedback", "--episodes", 1, *one, *blind)
+    both = ("--episodes", "demos/episodes", "--validation", "demos/episodes")
+    run("train-policy", "--task", "pick-place", *both, *one, "--senses", "senses/senses", "--head",
+        "regression", "--representation", "hand", "--train.epochs", 1, "--trials", 1,
+        "--env.max-seconds", 0.5, "--out", "policy")  # fmt: skip
+    capsys.readouterr()
+    run("collect-demos", "--learner", "policy/policy", "--episodes", 1, *one, *blind,
+        "--env.max-seconds", 0.5)  # fmt: skip
+    assert "the learner succeeded in 0/1" in capsys.readouterr().out
+    found = EpisodeSet(Path("demos/episodes"))
+    assert [found.meta(i)["outcome"] for i in range(2)] == ["success", "corrected"]
+
+
 def test_doctor_and_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     run("doctor")
     run(*"benchmark env-speed --repeats 1 --physics-steps 100 --env-steps 1".split(), "--out",

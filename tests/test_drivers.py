@@ -1,18 +1,15 @@
 """One contract for all drivers, against the twin: vendors' client libraries over the wire."""
 
-import json
-import os
-import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from running_twin import RunningTwin
 
 from touchgoal.control import franka, ur
 from touchgoal.control.arm_process import ArmConfig, ArmProcess, moved_wrench
@@ -31,7 +28,6 @@ from touchgoal.control.protocols import (
 from touchgoal.control.robotiq import Robotiq, RobotiqConfig
 from touchgoal.control.video import VideoCamera, VideoConfig
 from touchgoal.control.vocabulary import FRONT
-from touchgoal.sim_envs.twin import faults
 
 pytestmark = pytest.mark.realtime
 
@@ -59,35 +55,23 @@ while True:
 """
 
 
-class Twin:
+class Twin(RunningTwin):
     """A twin in real time, and its driver's parts."""
 
     def __init__(self, name: str, out: Path) -> None:
-        number, self.name = os.getpid(), name
-        host = f"127.{('fr3', 'ur5e').index(name) + 30}.{number // 250 % 250}.{number % 250 + 1}"
-        options = ["--arm", name, "--host", host, "--port", "0", "--out", str(out)]
-        options += ["--env.cameras", "front", "--env.no-tactile"]  # a processor's time
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "touchgoal.launch", "twin", "--seed", "3", *options],
-            stdout=subprocess.DEVNULL,
-        )
-        rig = out / "rig.json"
-        until(lambda: rig.exists() or self.process.poll() is not None, 60)
-        self.rig: dict[str, Any] = json.loads(rig.read_text())
+        arms = ("fr3", "ur5e")
+        blind = ["--env.cameras", "front", "--env.no-tactile"]  # a processor's time
+        super().__init__(["--arm", name, "--seed", "3", *blind], out, 20 + arms.index(name))
+        self.name = name
         self.client, rate, robot = {
             "fr3": (franka.FrankaClient, franka.RATE, FR3),
             "ur5e": (ur.UrClient, ur.RATE, UR5E),
         }[name]
-        self.config = ArmConfig(host, robot, GELSIGHT_TCP, HZ, rate, silence=0.5)
-
-    def ask(self, line: str) -> dict[str, Any]:
-        return faults.ask(self.rig["faults"], line)
+        address = self.rig["address"]
+        self.config = ArmConfig(address, robot, GELSIGHT_TCP, HZ, rate, silence=0.5)
 
     def connect(self) -> ArmProcess:
         return ArmProcess(self.client, self.config)
-
-    def at_rest(self) -> bool:
-        return self.ask("truth")["rest"] > 0.1
 
     def gripper(self) -> Gripper:
         gripper = self.rig["gripper"]
@@ -110,13 +94,12 @@ def twin(
 ) -> Iterator[Twin]:
     twin = Twin(request.param, tmp_path_factory.mktemp(request.param))
     yield twin
-    twin.process.send_signal(signal.SIGINT)
-    twin.process.wait(20)
+    twin.close()
 
 
 @pytest.fixture
 def arm(twin: Twin) -> Iterator[ArmProcess]:
-    until(twin.at_rest)
+    twin.at_rest()
     arm = twin.connect()
     yield arm
     arm.close()
@@ -143,7 +126,7 @@ def test_an_arm_reads_fresh_follows_and_rests_at_the_last_target(twin: Twin, arm
     until(lambda: arm.read().stamp > first.stamp)
     target = swing(arm)
     arrives(arm, target)
-    until(twin.at_rest)
+    twin.at_rest()
     np.testing.assert_allclose(twin.ask("truth")["q"], target, atol=5e-3)
     assert arm.read().stamp > first.stamp + 0.4 and arm.read().fault == ""
 
@@ -151,7 +134,7 @@ def test_an_arm_reads_fresh_follows_and_rests_at_the_last_target(twin: Twin, arm
 def test_a_stopped_arm_rests_and_refuses_until_recovered(twin: Twin, arm: Arm) -> None:
     swing(arm)
     arm.stop()
-    until(twin.at_rest)
+    twin.at_rest()
     assert "stopped" in arm.read().fault
     with pytest.raises(DriverError, match="stopped"):
         arm.command(arm.read().q)
@@ -173,7 +156,7 @@ def test_an_error_of_the_controller_is_said_and_kept_until_recovered(twin: Twin,
     twin.ask(f"error {error}")
     words = error.replace("_", " ") if twin.name == "ur5e" else error
     until(lambda: words in arm.read().fault)
-    until(twin.at_rest)
+    twin.at_rest()
     with pytest.raises(DriverError, match=words):
         arm.command(arm.read().q)
     until(lambda: recovered(arm))  # a UR lets nobody unlock it for 5 s
@@ -197,7 +180,7 @@ def test_a_frozen_link_stops_the_arm_and_is_said(twin: Twin, arm: Arm) -> None:
         arm.command(lost.q)
     arm.stop()
     assert arm.read().stamp == lost.stamp
-    until(twin.at_rest)
+    twin.at_rest()
     until(lambda: recovered(arm))
     arrives(arm, swing(arm, change=-0.01))
 
@@ -209,7 +192,7 @@ def test_a_pressed_stop_is_not_recovered_by_software(twin: Twin, arm: Arm) -> No
     with pytest.raises(DriverError, match="stop"):
         arm.recover()
     assert "stop" in arm.read().fault
-    until(twin.at_rest)
+    twin.at_rest()
     twin.ask("stop-button off")
     if twin.name == "ur5e":  # it took the power off; a person switches it on at the pendant
         with socket.create_connection((twin.config.address, 29999), timeout=10) as pendant:
@@ -228,7 +211,7 @@ def test_a_killed_program_leaves_the_arm_at_rest(twin: Twin) -> None:
     assert parent.stdout and parent.stdout.readline() == b"moves\n"
     parent.kill()
     parent.wait()
-    until(twin.at_rest)
+    twin.at_rest()
 
 
 def rests_at(gripper: Gripper, width: float) -> bool:
