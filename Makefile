@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 CODE := control sim_envs episodes encoders rewards policies benchmarks launch tests
 
-.PHONY: demo test check format build typings weights maze-policy pick-place-policy clean
+.PHONY: demo test check format build typings weights weights-markers maze-policy pick-place-policy clean
 
 demo: $(READY)
 	$(BIN)/touchgoal doctor --quiet
@@ -47,6 +47,15 @@ weights: $(READY)
 	$(BIN)/touchgoal train-encoder align --episodes runs/weights/train/episodes \
 		--validation runs/weights/val/episodes --scale-episodes 60 --out runs/weights/run
 	cp runs/weights/run/encoder/* encoders/weights/gelsight_mini_offline/
+
+# The same for the Mini with markers.
+MARKERS := --env.scene.sensor gelsight_mini_markers
+weights-markers: $(READY)
+	$(BIN)/touchgoal collect-demos $(MARKERS) --episodes 40 --seed 100000 --out runs/markers/val
+	$(BIN)/touchgoal collect-demos $(MARKERS) --episodes 240 --seed 0 --out runs/markers/train
+	$(BIN)/touchgoal train-encoder align --episodes runs/markers/train/episodes \
+		--validation runs/markers/val/episodes --scale-episodes 60 --out runs/markers/run
+	cp runs/markers/run/encoder/* encoders/weights/gelsight_mini_markers_offline/
 
 # How the shipped bead-maze policy and its touch encoder were made: hours on 2 cores, most of them
 # for the recordings; the policy itself takes 4 minutes and its trials 10.

@@ -3,7 +3,6 @@
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control import vocabulary as v
 from touchgoal.control.kinematics import fingers_down
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH, Observation
 from touchgoal.sim_envs.experts import CLEARANCE, FEEL_DOWN, LOWEST_GRASP, LOWEST_PLACE
@@ -14,11 +13,9 @@ _NEAR, _GRIPPING = 0.006, 0.015  # m beside the object: for fingers to begin to 
 _OVER, _PLACED = 0.008, 0.014  # m beside the goal: for the object to go down, to stay there
 _BEGUN = GRIPPER_MAX_WIDTH - 0.006  # m of width below which the fingers have begun to close
 _STILL = 0.006  # m/s of width: fingers that something stops
-_SPEED, _CLIMB, _FEEL = 0.3, 0.2, 0.01  # m/s: at most over the table, up and down, near it
-_CLOSE = 0.006  # m above its place at which the object is lowered no faster than that
-_PRESS, _YIELD = 3.0, 0.004  # N on the table that are enough, m/s per N beyond them
+_SPEED, _CLIMB, _FEEL = 0.3, 0.2, 0.02  # m/s: at most over the table, up and down, near it
 _ACCELERATION = 4.0  # m/s^2
-_RETURN, _LOWER = 5.0, 3.0  # 1/s: speed towards a place per distance to it; down, with the object
+_RETURN = 5.0  # 1/s: speed towards a place per distance to it
 _TURN = 1.0  # rad/s
 
 
@@ -43,8 +40,7 @@ class FeedbackExpert:
     def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
         """The action for the next tick; to be asked at every tick, whoever acts.
 
-        Of the observation only the force on the hand is looked at: the expert sees the simulator's
-        state.
+        The observation is not looked at: the expert sees the simulator's state.
         """
         env, hz = self._env, self._env.config.control_hz
         (here, R), width = env.kinematics.forward(env.command), env.width()
@@ -54,17 +50,18 @@ class FeedbackExpert:
         yaw = float(np.arctan2(R[1, 0], R[0, 0]))
         turn, grip = 0.0, 0.0
         if still and all(pad.touching for pad in env.pad_contacts()):
-            velocity = self._carry(here, float(observation[v.WRENCH][2]))
+            velocity = self._carry(here)
         else:
             turn = float((self._yaw - yaw + np.pi / 2) % np.pi - np.pi / 2)
             velocity, turn, grip = self._fetch(here, turn, width)
         change = velocity - pace
         change *= min(1.0, _ACCELERATION / hz / max(float(np.linalg.norm(change)), 1e-9))
         turn = float(np.clip(_RETURN * turn, -_TURN, _TURN)) / hz
-        joints = env.kinematics.reach(
+        # A learner may have led the arm to where nothing is in reach: the nearest place will do.
+        solution = env.kinematics.inverse(
             here + (pace + change) / hz, fingers_down(yaw + turn), env.command
         )
-        return np.append(joints - env.command, grip)
+        return np.append(solution.q - env.command, grip)
 
     def _fetch(
         self, here: np.ndarray, turn: float, width: float
@@ -77,22 +74,22 @@ class FeedbackExpert:
             return np.zeros(3), 0.0, 0.0
         return _funnel(off, beside - _NEAR), turn, GRIPPER_MAX_WIDTH
 
-    def _carry(self, here: np.ndarray, press: float) -> np.ndarray:
-        """Velocity (m/s) of a hand that holds the object, with so much force (N) on it from below."""
+    def _carry(self, here: np.ndarray) -> np.ndarray:
+        """Velocity (m/s) of a hand that holds the object."""
         off = self._goal - here
         beside = float(np.linalg.norm(off[:2]))
         if beside < _PLACED and self._env.object_on_table():
-            return np.array([0, 0, np.clip(_YIELD * (press - _PRESS), 0, 2 * _FEEL)])
-        if beside < _OVER and off[2] > -_CLOSE:
+            return np.zeros(3)
+        if beside < _OVER and off[2] > -0.004:
             deepest = max(self._goal[2] - FEEL_DOWN, LOWEST_PLACE)
             return np.array([0, 0, -_FEEL if here[2] > deepest else 0.0])
-        return _funnel(off, beside - _OVER, _LOWER)
+        return _funnel(off, beside - _OVER)
 
 
-def _funnel(off: np.ndarray, beside: float, lower: float = _RETURN) -> np.ndarray:
+def _funnel(off: np.ndarray, beside: float) -> np.ndarray:
     """Velocity (m/s) towards a place `off` (m), from above it."""
     rise = off[2] + min(CLEARANCE, _STEEP * max(0.0, beside))
     distance = float(np.linalg.norm(off[:2]))
     high = np.clip(1 - rise / 0.04, 0, 1)  # over the table only where it is high enough
-    climb = np.clip((_RETURN if rise > 0 else lower) * rise, -_CLIMB, _CLIMB)
+    climb = np.clip(_RETURN * rise, -_CLIMB, _CLIMB)
     return np.array([*(off[:2] * high * min(_RETURN, _SPEED / max(distance, 1e-9))), climb])

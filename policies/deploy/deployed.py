@@ -46,7 +46,7 @@ class Learned(RealTimeActor):
 
     done = False
 
-    def __init__(self, planner: Plans, patience: float | None) -> None:
+    def __init__(self, planner: Plans, patience: float | None = None) -> None:
         """See RealTimeActor."""
         super().__init__(planner, patience)
         self._share = 1 - float(np.exp(-1 / (planner.config.control_hz * SERVO_DAMPING)))
