@@ -54,7 +54,8 @@ weights-markers: $(READY)
 	$(BIN)/touchgoal collect-demos $(MARKERS) --episodes 40 --seed 100000 --out runs/markers/val
 	$(BIN)/touchgoal collect-demos $(MARKERS) --episodes 240 --seed 0 --out runs/markers/train
 	$(BIN)/touchgoal train-encoder align --episodes runs/markers/train/episodes \
-		--validation runs/markers/val/episodes --scale-episodes 60 --out runs/markers/run
+		--validation runs/markers/val/episodes --scale-episodes 60 \
+		--align.sensor gelsight_mini_markers --out runs/markers/run
 	cp runs/markers/run/encoder/* encoders/weights/gelsight_mini_markers_offline/
 
 # How the shipped bead-maze policy and its touch encoder were made: hours on 2 cores, most of them

@@ -108,6 +108,9 @@ def _recipe(episodes: EpisodeSet, validation: EpisodeSet) -> dict[str, Any]:
 def _align(config: Align) -> None:
     """Cut touches from the episodes, train, fit the scale of the costs."""
     episodes, validation = EpisodeSet(config.episodes), EpisodeSet(config.validation)
+    for s in (episodes, validation):
+        for i in range(len(s)):
+            touch_frames.check_sensor(s, i, config.align.sensor)
     towers = load_towers(config.towers)
     out = open_run(config.out, "train-encoder", config)
     train, val = (

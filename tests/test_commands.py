@@ -253,6 +253,15 @@ def test_wrong_encoder_for_the_sensor(
     assert "is for digit, not gelsight_mini" in message and not out.exists()
 
 
+def test_wrong_sensor_for_the_encoder(
+    episodes: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    both = ("--episodes", episodes, "--validation", episodes)
+    out, sensor = tmp_path / "out", ("--align.sensor", "gelsight_mini_markers")
+    message = refused(capsys, "train-encoder", "align", *both, *sensor, "--out", out)
+    assert "was felt with gelsight_mini, not" in message and not out.exists()
+
+
 def test_corrupt_episode_is_named(
     episodes: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

@@ -51,7 +51,8 @@ def test_gymnasium_contract(name: str) -> None:
     for key, value in observation.items():
         assert value.shape == v.FEATURES[key].shape and value.dtype == v.FEATURES[key].dtype
     truth = {key for key in v.FEATURES if key.startswith("truth.")}
-    assert truth - {v.TRUTH_FAILURE} <= info.keys() <= truth
+    of_some_tasks = {v.TRUTH_FAILURE, v.TRUTH_START}
+    assert truth - of_some_tasks <= info.keys() <= truth
     for key in info:
         assert info[key].shape == v.FEATURES[key].shape and info[key].dtype == v.FEATURES[key].dtype
     env.close()

@@ -67,7 +67,7 @@ def test_pictures_come_freeze_and_stop(fr3: RunningTwin) -> None:
     fr3.ask(f"lose {name} 0")
     assert cv2.VideoCapture(url).read()[0]
     front = cv2.VideoCapture(fr3.rig["images"]["observation.images.front"]).read()[1]
-    assert front.shape == (128, 128, 3) and front.std() > 10
+    assert front.shape == (256, 256, 3) and front.std() > 10
 
 
 def test_load_cell_weighs_is_garbled_and_unplugged(fr3: RunningTwin) -> None:
