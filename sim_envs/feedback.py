@@ -13,9 +13,10 @@ _NEAR, _GRIPPING = 0.006, 0.015  # m beside the object: for fingers to begin to 
 _OVER, _PLACED = 0.008, 0.014  # m beside the goal: for the object to go down, to stay there
 _BEGUN = GRIPPER_MAX_WIDTH - 0.006  # m of width below which the fingers have begun to close
 _STILL = 0.006  # m/s of width: fingers that something stops
-_SPEED, _CLIMB, _FEEL = 0.3, 0.2, 0.02  # m/s: at most over the table, up and down, near it
+_SPEED, _CLIMB, _FEEL = 0.3, 0.2, 0.01  # m/s: at most over the table, up and down, near it
+_CLOSE = 0.006  # m above its place at which the object is lowered no faster than that
 _ACCELERATION = 4.0  # m/s^2
-_RETURN = 5.0  # 1/s: speed towards a place per distance to it
+_RETURN, _LOWER = 5.0, 3.0  # 1/s: speed towards a place per distance to it; down, with the object
 _TURN = 1.0  # rad/s
 
 
@@ -80,16 +81,16 @@ class FeedbackExpert:
         beside = float(np.linalg.norm(off[:2]))
         if beside < _PLACED and self._env.object_on_table():
             return np.zeros(3)
-        if beside < _OVER and off[2] > -0.004:
+        if beside < _OVER and off[2] > -_CLOSE:
             deepest = max(self._goal[2] - FEEL_DOWN, LOWEST_PLACE)
             return np.array([0, 0, -_FEEL if here[2] > deepest else 0.0])
-        return _funnel(off, beside - _OVER)
+        return _funnel(off, beside - _OVER, _LOWER)
 
 
-def _funnel(off: np.ndarray, beside: float) -> np.ndarray:
+def _funnel(off: np.ndarray, beside: float, lower: float = _RETURN) -> np.ndarray:
     """Velocity (m/s) towards a place `off` (m), from above it."""
     rise = off[2] + min(CLEARANCE, _STEEP * max(0.0, beside))
     distance = float(np.linalg.norm(off[:2]))
     high = np.clip(1 - rise / 0.04, 0, 1)  # over the table only where it is high enough
-    climb = np.clip(_RETURN * rise, -_CLIMB, _CLIMB)
+    climb = np.clip((_RETURN if rise > 0 else lower) * rise, -_CLIMB, _CLIMB)
     return np.array([*(off[:2] * high * min(_RETURN, _SPEED / max(distance, 1e-9))), climb])
