@@ -33,7 +33,7 @@ from touchgoal.rewards.curves import Scale
 from touchgoal.rewards.goals import parse_goal
 from touchgoal.rewards.live import LiveCost
 from touchgoal.sim_envs.base import EnvConfig
-from touchgoal.sim_envs.simulated import simulate, task_of
+from touchgoal.sim_envs.simulated import simulate
 from touchgoal.sim_envs.twin.faults import ask
 
 _ASKING = 0.2  # s between questions to a twin
@@ -101,7 +101,7 @@ def _deploy(config: Config, rig: Rig, station: Station, out: Path) -> Result:
             show=terminal.show,
             truth=truth,
             cost=cost.look if cost else None,
-            camera_size=(maker.observing(task_of(rig)) if maker else EnvConfig()).camera_size,
+            camera_size=(maker.observing(EnvConfig()) if maker else EnvConfig()).camera_size,
         )
         try:
             return session.run()
