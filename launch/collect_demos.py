@@ -9,6 +9,7 @@ from typing import Any, Literal
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import Cast, Demonstration, collect, scripted
 from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.policies import checkpoint
 from touchgoal.policies.training.corrections import Corrected
 from touchgoal.policies.trials.success import SuccessRate
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
@@ -55,8 +56,9 @@ def main(config: Config) -> None:
         Demonstration(config.seed + i, outcome, options[i % len(options)])
         for i, outcome in enumerate(config.outcomes * config.episodes)
     ]
+    cast = _cast(config)
     out = open_run(config.out, "collect-demos", config)
-    metas = collect(out / "episodes", task, demonstrations, config.workers, _cast(config))
+    metas = collect(out / "episodes", task, demonstrations, config.workers, cast)
     outcomes = Counter(str(meta["outcome"]) for meta in metas)
     write_json(out / "metrics.json", {"outcomes": outcomes, "episodes": metas})
     print(f"{len(metas)} episodes in {out / 'episodes'}")
@@ -81,4 +83,6 @@ def _cast(config: Config) -> Cast:
         return scripted
     if config.outcomes != ("success",) or config.env.release:
         raise UserError("no expert to be asked in any state fails, or lets go: leave these options")
+    if config.learner:
+        checkpoint.load(config.learner)  # what is wrong with it is said before anything is written
     return Corrected(config.learner)

@@ -160,7 +160,8 @@ def _report(result: Result, out: Path) -> None:
     write_json(out / "metrics.json", numbers)
     clamped = ", ".join(f"{name} {n}" for name, n in ticks.acted.items()) or "never"
     print(f"{len(ticks.rows)} ticks, late by {numbers['late_p99_ms']:.1f} ms at most in 99 %, "
-          f"answered in {numbers['answered_p95_ms']:.1f} ms at most in 95 %; clamped: {clamped}; force up to {numbers['force_max_newtons']:.1f} N")  # fmt: skip
+          f"answered in {numbers['answered_p95_ms']:.1f} ms at most in 95 %; "
+          f"clamped: {clamped}; force up to {numbers['force_max_newtons']:.1f} N")  # fmt: skip
     if result.success is not None:
         print(f"task (as the simulator judges): {'done' if result.success else 'not done'}")
     if result.episode is not None:

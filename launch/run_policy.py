@@ -41,7 +41,7 @@ class Config:
     train-policy made; expert, which sees the simulator's state; or (bead-maze) follower, the
     classical one, which feels the force on the hand."""
     latency: int = 0
-    """Ticks that a learned policy's plans come late, as on the arm."""
+    """Ticks that a learned policy's plans come late, as where they take longer than half a tick."""
     out: Path | None = None
     """Folder of the run."""
     episodes: int = 20

@@ -97,3 +97,13 @@ def test_a_failing_planner_stops_the_actor() -> None:
     with pytest.raises(KeyError):
         actor.act({})
     actor.close()
+
+
+def test_a_planner_that_fails_later_is_not_waited_for() -> None:
+    config = replace(TOY, touch_dim=0, touch="", execution_horizon=1)
+    planner = Planner(policy_for(config, toy_windows(config)).eval(), None)
+    actor = RealTimeActor(planner, patience=3600)
+    actor.act(toy_ticks(1)[0])
+    with pytest.raises(KeyError):
+        actor.act({})
+    actor.close()

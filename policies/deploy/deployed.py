@@ -18,7 +18,7 @@ from touchgoal.policies.follower import WireFollower
 from touchgoal.sim_envs.scene import SERVO_DAMPING
 from touchgoal.sim_envs.simulated import task_of
 
-_STANDS_STILL = 20.0  # s
+_STANDS_STILL = 20.0  # s for which a simulated arm's time stands still for a plan
 
 
 class Follower:
@@ -100,7 +100,7 @@ def make_actor(
 ) -> DeployedActor:
     """The actor for one run, from where the arm is now."""
     if maker is not None:
-        # The time of a simulated arm stands still meanwhile: so a run repeats on any machine.
+        # So a run on a simulated arm repeats on any machine.
         return Learned(maker.planner(), _STANDS_STILL if rig.arm == "sim" else None)
     if rig.task.policy == "follower":
         return Follower(v.CONTROL_HZ)

@@ -100,7 +100,7 @@ class RealTimeActor:
                 if not self._condition.wait_for(self._answered, _FIRST):
                     raise UserError(f"the policy made no plan in {_FIRST:.0f} s: make it smaller")
             elif not self._slow and self._due():
-                self._condition.wait_for(lambda: self._closed or not self._due(), self._patience)
+                self._condition.wait_for(self._settled, self._patience)
             if self.failure is not None:
                 raise self.failure
             return self._action()
@@ -124,6 +124,9 @@ class RealTimeActor:
         self.starved += 1
         self.overdue += 1 / self._config.control_hz
         return np.append(np.zeros(v.N_JOINTS), self._width).astype(np.float32)
+
+    def _settled(self) -> bool:
+        return self._closed or self.failure is not None or not self._due()
 
     def _answered(self) -> bool:
         return self._plan is not None or self.failure is not None
