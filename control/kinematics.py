@@ -193,10 +193,12 @@ class Kinematics:
         """Geometric Jacobian of the TCP, base frame: linear rows (m/rad), then angular."""
         return self._chain(q)[2].full()
 
-    def jacobians(self, q: Float[np.ndarray, "b n"]) -> Float[np.ndarray, "b 6 n"]:
-        """`jacobian` of many joint positions at once."""
-        side_by_side = self._chain.map(len(q))(q.T)[2].full()
-        return side_by_side.reshape(6, *q.shape).transpose(1, 0, 2)
+    def jacobians(
+        self, q: Float[np.ndarray, "b n"]
+    ) -> tuple[Float[np.ndarray, "b 6 n"], Float[np.ndarray, "b 3 3"]]:
+        """`jacobian` of many joint positions at once, and the TCP's rotations there."""
+        _, R, J = (side_by_side.full() for side_by_side in self._chain.map(len(q))(q.T))
+        return J.reshape(6, *q.shape).transpose(1, 0, 2), R.reshape(3, len(q), 3).transpose(1, 0, 2)
 
     def inverse(
         self,

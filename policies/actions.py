@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -16,12 +17,14 @@ from touchgoal.control.kinematics import Fr3Kinematics
 from touchgoal.control.vocabulary import N_JOINTS
 
 ACTION_DIM = N_JOINTS + 1
-Representation = Literal["delta", "chunk", "absolute", "hand"]
+Representation = Literal["delta", "chunk", "absolute", "hand", "tool"]
 """Of the joints: each tick's change; the change since the chunk's start; the joint positions that
 these changes lead to from the measured ones; the hand's displacement and turn since the chunk's start
 (m, rad, base frame, to first order) with the third joint's change for the elbow, which is nearly the
-same wherever on the table the hand does the same. The gripper's width is a target in all four."""
+same wherever on the table the hand does the same; the hand's displacement and turn along its own axes,
+the elbow going where the joints move least. The gripper's width is a target in all five."""
 
+_DAMPING = 1e-6  # m^2, as in inverse kinematics
 _CONSTANT = 1e-6  # in SI units: smaller than anything that a policy should learn to vary
 
 
@@ -34,6 +37,8 @@ def represent(
     targets = actions[..., :N_JOINTS].cumsum(1)
     if kind == "hand":
         targets = targets @ _hand(joints).mT
+    if kind == "tool":
+        targets = F.pad(targets @ along_the_hand(joints).mT, (0, 1))
     if kind == "absolute":
         targets = joints[:, None] + targets
     return torch.cat([targets, actions[..., N_JOINTS:]], -1)
@@ -48,6 +53,8 @@ def to_actions(
     targets = represented[..., :N_JOINTS]
     if kind == "hand":
         targets = torch.linalg.solve(_hand(joints), targets.mT).mT
+    if kind == "tool":
+        targets = targets[..., :6] @ _least_motion(along_the_hand(joints)).mT
     start = joints if kind == "absolute" else torch.zeros_like(joints)
     changes = torch.cat([targets[:, :1] - start[:, None], targets.diff(dim=1)], 1)
     return torch.cat([changes, represented[..., N_JOINTS:]], -1)
@@ -55,9 +62,21 @@ def to_actions(
 
 def _hand(joints: Float[Tensor, "b 7"]) -> Float[Tensor, "b 7 7"]:
     """From small changes of the joints to the hand's displacement, its turn, the third joint's."""
-    rows = _kinematics().jacobians(joints.cpu().numpy().astype(np.float64))
+    rows, _ = _kinematics().jacobians(joints.cpu().numpy().astype(np.float64))
     elbow = torch.eye(N_JOINTS)[2].expand(len(rows), 1, -1)
     return torch.cat([torch.from_numpy(rows).float(), elbow], 1).to(joints)
+
+
+def along_the_hand(joints: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 6 7"]:
+    """From small changes of the joints to the TCP's displacement and turn along the TCP's axes."""
+    J, R = _kinematics().jacobians(joints.reshape(-1, N_JOINTS).cpu().numpy().astype(np.float64))
+    own = R.mT[:, None] @ J.reshape(-1, 2, 3, N_JOINTS)
+    return torch.from_numpy(own).float().to(joints).reshape(*joints.shape[:-1], 6, N_JOINTS)
+
+
+def _least_motion(J: Float[Tensor, "b 6 7"]) -> Float[Tensor, "b 7 6"]:
+    """From a displacement and turn to the least change of the joints, damped where none will do."""
+    return J.mT @ torch.linalg.inv(J @ J.mT + _DAMPING * torch.eye(6).to(J))
 
 
 @cache

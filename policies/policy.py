@@ -18,10 +18,10 @@ from touchgoal.policies.networks.diffusion import (
     RegressionConfig,
 )
 from touchgoal.policies.networks.eyes import Eye, EyeConfig
+from touchgoal.policies.proprioception import places, unroll, widths
 
 TouchReading = Literal["wrench", "free"]
 WRENCH_DIM = v.FEATURES[v.TRUTH_PAD_WRENCH].shape[0]
-_NEAR = 0.02  # m
 _FAR = 5.0  # standard deviations beyond which an input is as surprising as it gets
 
 
@@ -43,7 +43,7 @@ class PolicyConfig:
             sensors, and learns its wire by heart.
         place_noise: likewise of the joint and TCP positions, one draw for all ticks seen: where on
             the table a wire ran shall not tell how it goes on. Velocities and the hand's
-            orientation stay as they are.
+            orientation stay as they are. "tool" sees no positions.
         eye: for fingertips that no frozen encoder reads; None for a policy without.
         proprioception: columns of `vocabulary.FEATURES`, the state first. Where it acts, those that
             only a simulator knows come from its senses, see `senses.py`.
@@ -51,7 +51,8 @@ class PolicyConfig:
         prediction_horizon: ticks planned. The first is the latest observation's, so that all of
             them can be done; diffusion_policy counts from the oldest observation instead.
         execution_horizon: ticks of a plan that are done before the next one.
-        representation: of the actions while learning.
+        representation: of the actions while learning; "tool" also sees along the hand's own axes,
+            see `proprioception.py`.
         control_hz: ticks per second.
         head: what draws the chunk.
     """
@@ -75,6 +76,8 @@ class PolicyConfig:
         """Raises UserError for what makes no policy."""
         if self.proprioception[:1] != (v.STATE,) or not set(self.proprioception) <= set(v.FEATURES):
             raise UserError(f"proprioception must be known columns, {v.STATE} first")
+        if self.representation == "tool" and self.proprioception != (v.STATE, v.TCP_POSE):
+            raise UserError(f'"tool" sees {v.STATE} and {v.TCP_POSE}, no other columns')
         if not 1 <= self.execution_horizon <= self.prediction_horizon:
             raise UserError(
                 f"execution_horizon {self.execution_horizon} must be between 1 and the "
@@ -105,8 +108,8 @@ class PolicyConfig:
 
     @property
     def seen_dim(self) -> int:
-        """Width of the proprioception as the network sees it, see `unroll`."""
-        return sum(_seen(key) for key in self.proprioception)
+        """Width of the proprioception as the network sees it, see `proprioception.unroll`."""
+        return sum(widths(self.proprioception, self.representation))
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,8 +184,9 @@ class Policy(nn.Module):
             self.touch_scale.fit_spread(touch)
         if wrench is not None:
             self.wrench_scale.fit_spread(wrench)
-        self.state_scale.fit_spread(unroll(state, self.config.proprioception))
-        self.action_scale.fit_range(represent(actions, joints, self.config.representation))
+        columns, kind = self.config.proprioception, self.config.representation
+        self.state_scale.fit_spread(unroll(state, columns, kind))
+        self.action_scale.fit_range(represent(actions, joints, kind))
 
     def loss(
         self,
@@ -238,82 +242,14 @@ class Policy(nn.Module):
         noise: torch.Generator | None = None,
     ) -> Float[Tensor, "b c"]:
         """What the head sees, with the training's noise if there is a generator for it."""
-        config = self.config
-        state = unroll(condition.state, config.proprioception)
+        columns, kind = self.config.proprioception, self.config.representation
+        state = unroll(condition.state, columns, kind)
         seen = self.state_scale(state).clamp(-_FAR, _FAR)
         if noise is not None:
             shift = torch.randn(len(seen), 1, seen.shape[2], generator=noise).to(seen)
-            seen = seen + config.place_noise * shift * self._places.to(seen)
+            seen = seen + self.config.place_noise * shift * places(columns, kind).to(seen)
         seen = torch.cat([felt, seen], -1)
         if self.eye is None:
             return seen.flatten(1)
         assert condition.pictures is not None, "this policy looks at pictures"
         return torch.cat([seen.flatten(1), self.eye(condition.pictures)], 1)
-
-    @property
-    def _places(self) -> Float[Tensor, " r"]:
-        """1 for joint and TCP positions, 0 for all else that `unroll` gives."""
-        marks = []
-        for key in self.config.proprioception:
-            places = {v.STATE: v.N_JOINTS, v.TCP_POSE: 3}.get(key, 0)
-            marks += [1.0] * places + [0.0] * (_seen(key) - places)
-        return torch.tensor(marks)
-
-
-def unroll(
-    state: Float[Tensor, "... s"], proprioception: tuple[str, ...]
-) -> Float[Tensor, "... r"]:
-    """Proprioception as a network understands it at once.
-
-    The TCP's quaternion becomes the first two columns of its rotation matrix. A quaternion and its
-    negative are the same turn, and a measured one jumps between the two as the hand turns about the
-    vertical; the matrix does not (Zhou et al. 2019). What `truth.start` says is seen from the hand,
-    in axes parallel to the base's: a centimetre matters there, not where on the table.
-    """
-    parts, start = {}, 0
-    for key in proprioception:
-        parts[key] = state[..., start : (start := start + v.FEATURES[key].shape[0])]
-    if v.TCP_POSE in parts:
-        pose = parts[v.TCP_POSE]
-        turned = _two_columns(pose[..., 3:])
-        if v.TRUTH_START in parts:
-            held = parts[v.TRUTH_CONTACT].amin(-1, keepdim=True)
-            parts[v.TRUTH_START] = _from_hand(parts[v.TRUTH_START], pose[..., :3], turned, held)
-        parts[v.TCP_POSE] = torch.cat([pose[..., :3], turned], -1)
-    return torch.cat([parts[key] for key in proprioception], -1)
-
-
-def _from_hand(
-    start: Float[Tensor, "... 7"],
-    hand: Float[Tensor, "... 3"],
-    turned: Float[Tensor, "... 6"],
-    held: Float[Tensor, "... 1"],
-) -> Float[Tensor, "... 12"]:
-    """`vocabulary.TRUTH_START` relative to the hand's position and yaw."""
-    cos, sin = turned[..., 0], turned[..., 1]
-    cos, sin = cos * cos - sin * sin, 2 * cos * sin  # of twice the hand's yaw
-    yaw = torch.stack(
-        [
-            start[..., 3] * cos + start[..., 4] * sin,
-            start[..., 4] * cos - start[..., 3] * sin,
-        ],
-        -1,
-    )
-    there, height = (start[..., :2] - hand[..., :2]) * (1 - held), start[..., 2:3] - hand[..., 2:]
-    goal, yaw = (start[..., 5:] - hand[..., :2]) * held, yaw * (1 - held)
-    way = torch.cat([there, height, goal], -1)
-    return torch.cat([way, yaw, way / (way.abs() + _NEAR)], -1)
-
-
-def _seen(key: str) -> int:
-    """Width of what `unroll` makes of a column."""
-    return v.FEATURES[key].shape[0] + {v.TCP_POSE: 2, v.TRUTH_START: 5}.get(key, 0)
-
-
-def _two_columns(quaternion: Float[Tensor, "... 4"]) -> Float[Tensor, "... 6"]:
-    w, x, y, z = quaternion.unbind(-1)
-    columns = [
-        1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y),
-        2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
-    ]  # fmt: skip
-    return torch.stack(columns, -1)

@@ -7,6 +7,7 @@ from touchgoal.sim_envs.base import Observation
 from touchgoal.sim_envs.bead_maze import BeadMaze
 
 _RETURN = 5.8  # 1/s: rate at which a distance to the course is taken back, a quarter at 20 Hz
+_FASTEST = 0.02  # m/s (or, times _LEVER, rad/s) at which it comes back from far away
 _LEAD = 0.006  # m that the commanded bead may be ahead of the real one: more is a jam
 _SLOW = 0.004  # m (or, times _LEVER, rad) off the course at which there is no going on
 _LEVER = 0.02  # m by which a turn counts as a displacement: the size of the bead
@@ -37,7 +38,7 @@ class BeadMazeExpert:
         turned = rotation_vector(fingers_across(tangent).T @ R)
         astray = max(float(np.linalg.norm(off)), _LEVER * float(np.linalg.norm(turned)))
         ahead = self._speed * tick * max(0.0, 1 - astray / _SLOW)
-        left = np.exp(-_RETURN * tick)
+        left = max(np.exp(-_RETURN * tick), 1 - _FASTEST * tick / max(astray, 1e-9))
         point, tangent = env.wire.at(min(s + ahead, env.s + _LEAD))
         R = fingers_across(tangent) @ _rotation(left * turned)
         target = point + left * off - R @ grip

@@ -5,6 +5,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -13,13 +14,15 @@ from toy_policies import DIFFUSION, FLOW, TOY, feeling, policy_for, rng, toy_tic
 
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
+from touchgoal.control.kinematics import FR3_HOME, Fr3Kinematics
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies import checkpoint
 from touchgoal.policies.actions import Representation, Scale, represent, to_actions
 from touchgoal.policies.networks import ema
 from touchgoal.policies.networks.diffusion import DiffusionConfig, RegressionConfig
-from touchgoal.policies.policy import Condition, Policy, PolicyConfig, unroll
+from touchgoal.policies.policy import Condition, Policy, PolicyConfig
+from touchgoal.policies.proprioception import unroll
 from touchgoal.policies.training import train as train_module
 from touchgoal.policies.training.train import TrainConfig, train
 from touchgoal.policies.training.windows import read
@@ -32,6 +35,33 @@ def test_representations_round_trip(kind: Representation) -> None:
     torch.testing.assert_close(to_actions(represented, joints, kind), actions, rtol=1e-4, atol=1e-4)
     if kind == "absolute":
         torch.testing.assert_close(represented[:, -1, :7], joints + actions[..., :7].sum(1))
+
+
+def test_along_the_hand_every_way_the_arm_faces_is_the_same() -> None:
+    """Turned about its first, vertical joint, the arm sees and does the same."""
+    kinematics, columns = Fr3Kinematics(), (v.STATE, v.TCP_POSE)
+    q = FR3_HOME + np.random.default_rng(0).normal(0, 0.2, (2, 7))
+    q[1, 1:] = q[0, 1:]
+    velocity = 0.1 * torch.randn(1, 7, generator=rng()).expand(2, -1)
+    poses = []
+    for position, R in map(kinematics.forward, q):
+        mujoco.mju_mat2Quat(quaternion := np.zeros(4), R.ravel())
+        poses.append(torch.from_numpy(np.concatenate([position, quaternion])).float())
+    joints = torch.from_numpy(q).float()
+    state = torch.cat([joints, velocity, torch.full((2, 1), 0.03), torch.stack(poses)], 1)
+    seen = unroll(state, columns, "tool")
+    torch.testing.assert_close(seen[0], seen[1], atol=1e-6, rtol=1e-5)
+    np.testing.assert_allclose(seen[0, 7:], kinematics.forward(q[0])[1][2], atol=1e-6)
+    J, R = kinematics.jacobian(q[0]), kinematics.forward(q[0])[1]
+    np.testing.assert_allclose(seen[0, :3], R.T @ J[:3] @ velocity[0].numpy(), atol=1e-6)
+    changes = 0.01 * torch.randn(2, 8, 8, generator=rng(1))
+    done = represent(changes, joints, "tool")
+    least = to_actions(done, joints, "tool")  # the same but for the elbow, which moves less
+    torch.testing.assert_close(represent(least, joints, "tool"), done, atol=1e-5, rtol=1e-3)
+    assert (least[..., :7].norm(dim=-1) <= changes[..., :7].norm(dim=-1)).all()
+    assert torch.equal(to_actions(done[:1], joints[:1], "tool")[..., 7], changes[:1, :, 7])
+    same = to_actions(done[:1].expand(2, -1, -1), joints, "tool")
+    torch.testing.assert_close(same[0], same[1], atol=1e-6, rtol=1e-4)
 
 
 def test_scales_round_trip_and_keep_constants() -> None:
@@ -147,11 +177,12 @@ def test_a_turn_looks_the_same_by_either_quaternion() -> None:
     state = torch.randn(5, 22)
     state[:, 18:] /= state[:, 18:].norm(dim=1, keepdim=True)
     other = torch.cat([state[:, :18], -state[:, 18:]], 1)
-    seen = unroll(state, (v.STATE, v.TCP_POSE))
-    torch.testing.assert_close(seen, unroll(other, (v.STATE, v.TCP_POSE)))
+    columns = v.STATE, v.TCP_POSE
+    seen = unroll(state, columns, "chunk")
+    torch.testing.assert_close(seen, unroll(other, columns, "chunk"))
+    turned = unroll(state, columns, "tool")
+    torch.testing.assert_close(turned, unroll(other, columns, "tool"))
     matrix = np.zeros(9)
-    import mujoco  # after touchgoal, which chooses the OpenGL platform
-
     mujoco.mju_quat2Mat(matrix, state[0, 18:].double().numpy())
     np.testing.assert_allclose(seen[0, 18:].reshape(2, 3).T, matrix.reshape(3, 3)[:, :2], atol=1e-6)
 

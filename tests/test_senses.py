@@ -11,7 +11,7 @@ from toy_policies import TOY, feeling, policy_for, rng, toy_ticks, toy_windows
 from touchgoal.control import vocabulary as v
 from touchgoal.control.errors import UserError
 from touchgoal.policies.acting import SHIPPED, ActorMaker, Planner
-from touchgoal.policies.policy import unroll
+from touchgoal.policies.proprioception import unroll
 from touchgoal.policies.senses.learning import LearnConfig, judge_sight, learn_contact, learn_sight
 from touchgoal.policies.senses.placements import Placements
 from touchgoal.policies.senses.reading import (
@@ -45,7 +45,7 @@ def test_the_start_is_seen_from_the_hand() -> None:
     left = 2 * (yaw - hand)
     for contact in ([0.0, 1.0], [1.0, 1.0]):  # the object matters, or the goal
         held = contact == [1.0, 1.0]
-        seen = unroll(torch.tensor([pose + contact + start]), columns)[0, 11:].numpy()
+        seen = unroll(torch.tensor([pose + contact + start]), columns, "hand")[0, 11:].numpy()
         way = np.array([0.0, 0.0, -0.17, 0.1, -0.2] if held else [-0.05, 0.05, -0.17, 0.0, 0.0])
         twice = [0.0, 0.0] if held else [np.cos(left), np.sin(left)]
         expected = [*way, *twice, *way / (np.abs(way) + 0.02)]
