@@ -5,7 +5,6 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 import torch
@@ -26,6 +25,8 @@ from touchgoal.policies.proprioception import unroll
 from touchgoal.policies.training import train as train_module
 from touchgoal.policies.training.train import TrainConfig, train
 from touchgoal.policies.training.windows import read
+
+import mujoco  # isort: skip - after touchgoal, which chooses the OpenGL platform
 
 
 @pytest.mark.parametrize("kind", ["delta", "chunk", "absolute", "hand"])
