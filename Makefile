@@ -59,8 +59,11 @@ weights-markers: $(READY)
 	cp runs/markers/run/encoder/* encoders/weights/gelsight_mini_markers_offline/
 
 # How the shipped bead-maze policy and its touch encoder were made: hours on 2 cores, most of them
-# for the recordings; the policy itself takes 4 minutes and its trials 10.
+# for the recordings. It learns from demonstrations, and from what the expert would have done where
+# the policy has got to by itself.
 MAZE := runs/maze
+FEEL := --episodes $(MAZE)/train/episodes --validation $(MAZE)/val/episodes \
+	--touch $(MAZE)/mae/encoder --head regression --representation tool --train.lr 1e-3
 maze-policy: $(READY)
 	$(BIN)/touchgoal collect-demos --task bead-maze --episodes 16 --seed 20000 \
 		--maze.split validation --maze.n-wires 16 --out $(MAZE)/val
@@ -68,10 +71,14 @@ maze-policy: $(READY)
 		--out $(MAZE)/train
 	$(BIN)/touchgoal train-encoder mae --episodes $(MAZE)/train/episodes \
 		--validation $(MAZE)/val/episodes --frames 30 --mae.epochs 12 --out $(MAZE)/mae
-	$(BIN)/touchgoal train-policy --episodes $(MAZE)/train/episodes \
-		--validation $(MAZE)/val/episodes --touch $(MAZE)/mae/encoder \
-		--head regression --train.epochs 12 --train.snapshot-epochs 6 --train.lr 1e-3 \
-		--trials 24 --out $(MAZE)/policy
+	for round in 0 1; do \
+		$(BIN)/touchgoal train-policy $(FEEL) --train.epochs $$((6 + 2 * round)) --trials 0 \
+			--out $(MAZE)/round-$$round && \
+		$(BIN)/touchgoal collect-demos --task bead-maze --learner $(MAZE)/round-$$round/policy \
+			--episodes 120 --seed 5$${round}000 --maze.n-wires 260 --out $(MAZE)/train || exit 1; \
+	done
+	$(BIN)/touchgoal train-policy $(FEEL) --train.epochs 8 --train.snapshot-epochs 4 \
+		--trials 48 --maze.disturbance 0.003 --out $(MAZE)/policy
 	rm -rf policies/weights/bead_maze && mkdir -p policies/weights
 	cp -r $(MAZE)/policy/policy policies/weights/bead_maze
 

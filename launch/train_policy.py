@@ -63,8 +63,9 @@ class Config:
     """Size of the diffusion's U-Net, or regression instead."""
     sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig(plan_steps=4))
     """How the diffusion is trained and sampled."""
-    representation: Representation = "chunk"
-    """Of the actions while learning."""
+    representation: Representation = "tool"
+    """Of the actions while learning; "tool" also sees along the hand's own axes, which with senses
+    must be "hand"."""
     touch_reading: TouchReading = "wrench"
     """What the policy makes of a frozen embedding: the wrench on the pads, or anything ("free")."""
     touch_width: int = 64
@@ -72,7 +73,7 @@ class Config:
     touch_noise: float = 0.1
     """Of frozen embeddings while learning, see `PolicyConfig`."""
     place_noise: float = 0.3
-    """Of joint and TCP positions while learning, see `PolicyConfig`."""
+    """Of joint and TCP positions while learning, if they are seen, see `PolicyConfig`."""
     observation_horizon: int = 2
     """Ticks seen."""
     execution_horizon: int = 4

@@ -77,7 +77,9 @@ class PolicyConfig:
         if self.proprioception[:1] != (v.STATE,) or not set(self.proprioception) <= set(v.FEATURES):
             raise UserError(f"proprioception must be known columns, {v.STATE} first")
         if self.representation == "tool" and self.proprioception != (v.STATE, v.TCP_POSE):
-            raise UserError(f'"tool" sees {v.STATE} and {v.TCP_POSE}, no other columns')
+            raise UserError(
+                f'representation "tool" sees {v.STATE} and {v.TCP_POSE} alone: choose "hand"'
+            )
         if not 1 <= self.execution_horizon <= self.prediction_horizon:
             raise UserError(
                 f"execution_horizon {self.execution_horizon} must be between 1 and the "
