@@ -2,13 +2,13 @@
 
 Every policy of the same recipe counts as one arm, its seeds as repeats. All arms meet the same
 wires and the same starts. Open loop: see `policies/trials/compounding.py`, along expert demonstrations on
-test wires that nothing disturbs.
+test wires that nothing disturbs unless asked.
 """
 
 import os
 import tempfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,8 @@ class Config:
     """Test wires on which open-loop errors are measured."""
     latencies: tuple[int, ...] = (1, 2)
     """Ticks by which plans come late, tried besides 0 on the first policy."""
+    maze: BeadMazeConfig = field(default_factory=lambda: BeadMazeConfig(split="test"))
+    """Options of the maze, e.g. a disturbance; demonstrations are recorded with the same."""
     workers: int = os.cpu_count() or 1
     """Processes that simulate."""
 
@@ -147,10 +149,10 @@ def _arms(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
 def _closed_loop(
     config: Config, arms: dict[str, list[Path]], recorded: EpisodeSet
 ) -> dict[str, list[MazeTrial]]:
-    maze = BeadMazeConfig(split="test")
+    maze = config.maze
     blind = replace(maze, tactile=False)
-    jobs = trials_of(choose("test", config.wires, maze.families), FIRST_SEED)
-    other = trials_of(choose("test", config.held_out, (HELD_OUT,)), FIRST_SEED + 10_000)
+    jobs = trials_of(choose(maze.split, config.wires, maze.families), FIRST_SEED)
+    other = trials_of(choose(maze.split, config.held_out, (HELD_OUT,)), FIRST_SEED + 10_000)
     results: dict[str, list[MazeTrial]] = {}
 
     def try_(name: str, env: BeadMazeConfig, makers: list[Callable], trials: list) -> None:
@@ -214,9 +216,10 @@ def bootstrap(values: list[tuple[str, float]], draws: int = 5000) -> tuple[float
 
 
 def _record(config: Config, root: Path) -> EpisodeSet:
-    """Undisturbed expert demonstrations on test wires."""
-    wires = choose("test", config.demonstrations)
-    collect(root, BeadMazeConfig(split="test"), trials_of(wires, FIRST_SEED), config.workers)
+    """Expert demonstrations, on test wires and undisturbed unless other options are chosen."""
+    maze = config.maze
+    wires = choose(maze.split, config.demonstrations, maze.families)
+    collect(root, maze, trials_of(wires, FIRST_SEED), config.workers)
     return EpisodeSet(root)
 
 

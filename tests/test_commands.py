@@ -166,7 +166,7 @@ def test_learning_the_bead_maze(
         "--latency", 2, "--no-video", "--maze.max-seconds", 1)  # fmt: skip
     assert "0/1" in capsys.readouterr().out
     run("benchmark", "bead-maze", "--policies", "policy/policy", "--wires", 1, "--held-out", 0,
-        "--demonstrations", 2, "--latencies", *one)  # fmt: skip
+        "--demonstrations", 2, "--latencies", "--maze.max-seconds", 3, *one)  # fmt: skip
     printed = capsys.readouterr().out
     assert "frozen touch, 1 demos, shuffled" in printed and "zero motion" in printed
     run("benchmark", "policy-latency", "--policy", "policy/policy", "--repeats", 3,
