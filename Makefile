@@ -63,7 +63,7 @@ weights-markers: $(READY)
 # the policy has got to by itself.
 MAZE := runs/maze
 FEEL := --episodes $(MAZE)/train/episodes --validation $(MAZE)/val/episodes \
-	--touch $(MAZE)/mae/encoder --head regression --representation tool --train.lr 1e-3
+	--touch $(MAZE)/mae/encoder --head regression --representation tool --execution-horizon 2 --train.lr 1e-3
 maze-policy: $(READY)
 	$(BIN)/touchgoal collect-demos --task bead-maze --episodes 16 --seed 20000 \
 		--maze.split validation --maze.n-wires 16 --out $(MAZE)/val
