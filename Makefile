@@ -60,7 +60,7 @@ weights-markers: $(READY)
 
 # How the shipped bead-maze policy and its touch encoder were made: hours on 2 cores, most of them
 # for the recordings. It learns from demonstrations, and from what the expert would have done where
-# the policy has got to by itself.
+# the policy has got to by itself. (The learners of what ships planned every fourth tick.)
 MAZE := runs/maze
 FEEL := --episodes $(MAZE)/train/episodes --validation $(MAZE)/val/episodes \
 	--touch $(MAZE)/mae/encoder --head regression --representation tool --execution-horizon 2 --train.lr 1e-3

@@ -64,8 +64,8 @@ class Config:
     sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig(plan_steps=4))
     """How the diffusion is trained and sampled."""
     representation: Representation = "tool"
-    """Of the actions while learning; "tool" also sees along the hand's own axes, which with senses
-    must be "hand"."""
+    """Of the actions while learning; "tool" also sees along the hand's own axes, and does not go
+    with senses: choose "hand" there."""
     touch_reading: TouchReading = "wrench"
     """What the policy makes of a frozen embedding: the wrench on the pads, or anything ("free")."""
     touch_width: int = 64
