@@ -63,7 +63,7 @@ weights-markers: $(READY)
 # the policy has got to by itself. (The learners of what ships planned every fourth tick.)
 MAZE := runs/maze
 FEEL := --episodes $(MAZE)/train/episodes --validation $(MAZE)/val/episodes \
-	--touch $(MAZE)/mae/encoder --head regression --representation tool --execution-horizon 2 --train.lr 1e-3
+	--touch $(MAZE)/mae/encoder --head regression --representation tool --train.lr 1e-3
 maze-policy: $(READY)
 	$(BIN)/touchgoal collect-demos --task bead-maze --episodes 16 --seed 20000 \
 		--maze.split validation --maze.n-wires 16 --out $(MAZE)/val
@@ -89,7 +89,7 @@ PICK := runs/pick_place
 BLIND := --env.no-tactile --env.cameras
 LEARN := --task pick-place --episodes $(PICK)/train/episodes --validation $(PICK)/val/episodes \
 	--senses $(PICK)/senses/senses --head regression --representation hand --place-noise 0 \
-	--execution-horizon 2 --train.lr 1e-3 --train.epochs 16 --train.snapshot-epochs 16
+	--train.lr 1e-3 --train.epochs 16 --train.snapshot-epochs 16
 pick-place-policy: $(READY)
 	$(BIN)/touchgoal train-senses --episodes runs/weights/train/episodes \
 		--validation runs/weights/val/episodes --out $(PICK)/senses

@@ -76,7 +76,7 @@ class Config:
     """Of joint and TCP positions while learning, if they are seen, see `PolicyConfig`."""
     observation_horizon: int = 2
     """Ticks seen."""
-    execution_horizon: int = 4
+    execution_horizon: int = 2
     """Ticks of a plan that are done before the next one."""
     train: TrainConfig = TrainConfig()
     """The training."""

@@ -67,7 +67,7 @@ class PolicyConfig:
     proprioception: tuple[str, ...] = (v.STATE, v.TCP_POSE)
     observation_horizon: int = 2
     prediction_horizon: int = 8
-    execution_horizon: int = 4
+    execution_horizon: int = 2
     representation: Representation = "chunk"
     control_hz: int = v.CONTROL_HZ
     head: DiffusionConfig | RegressionConfig = field(default_factory=DiffusionConfig)
