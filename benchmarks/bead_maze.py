@@ -199,7 +199,7 @@ def _closed_table(results: dict[str, list[MazeTrial]]) -> str:
 
 
 def bootstrap(values: list[tuple[str, float]], draws: int = 5000) -> tuple[float, float]:
-    """95 % interval of the mean: wires are drawn, then, within each, the training seeds."""
+    """95 % interval of the mean: wires (or recordings) are drawn, then, in each, training seeds."""
     rng = np.random.default_rng(0)
     groups: dict[str, list[float]] = {}
     for name, value in values:
@@ -227,7 +227,7 @@ def _open_loop(
     directories: list[Path], episodes: EpisodeSet, workers: int
 ) -> dict[str, dict[str, Any]]:
     """Errors of an arm and of the trivial baselines, each over demonstrations and seeds."""
-    rows: dict[str, list[Compounded]] = {}
+    rows: dict[str, list[tuple[str, Compounded]]] = {}
     count = len(episodes)
     for seed, directory in enumerate(directories):
         policy = checkpoint.load(directory)
@@ -249,7 +249,7 @@ def _open_loop(
                 }
             for name, plan in plans.items():
                 errors = compound(plan, Windows(recorded[i], config), config.control_hz)
-                rows.setdefault(name, []).append(errors)
+                rows.setdefault(name, []).append((str(i), errors))
     return {name: _summary(errors) for name, errors in rows.items()}
 
 
@@ -269,10 +269,12 @@ def _misled(policy: Policy, felt: torch.Tensor) -> Plan:
     return misled
 
 
-def _summary(errors: list[Compounded]) -> dict[str, Any]:
+def _summary(rows: list[tuple[str, Compounded]]) -> dict[str, Any]:
+    errors = [e for _, e in rows]
     return {
         "chunk_mm": np.mean([e.chunk for e in errors], 0).tolist(),
         "forced_mm": [float(e.forced.mean()) for e in errors],
+        "forced_interval_mm": bootstrap([(name, float(e.forced.mean())) for name, e in rows]),
         "forced_final_mm": [float(e.forced[-1]) for e in errors],
         "free_mm": [float(e.free.mean()) for e in errors],
         "path_mm": float(np.mean([e.path for e in errors])),
@@ -285,12 +287,17 @@ def _open_table(arms: dict[str, dict[str, dict[str, Any]]]) -> str:
         path = next(iter(rows.values()))["path_mm"]
         lines.append(
             f"{'open loop, mm: ' + arm:<44}{'(A) tick 1':>11}{'(A) tick 8':>11}"
-            f"{'(B) mean':>10}{'(B) final':>10}{'(C) mean':>10}   way {path:.0f} mm"
+            f"{'(B) mean [95 %]':>21}{'(B) final':>10}{'(C) mean':>10}   way {path:.0f} mm"
         )
         lines += [
             f"{'  ' + name:<44}{r['chunk_mm'][0]:>11.2f}{r['chunk_mm'][-1]:>11.2f}"
-            f"{np.mean(r['forced_mm']):>10.2f}{np.mean(r['forced_final_mm']):>10.2f}"
+            f"{_forced(r):>21}{np.mean(r['forced_final_mm']):>10.2f}"
             f"{np.mean(r['free_mm']):>10.2f}"
             for name, r in rows.items()
         ]
     return "\n".join(lines)
+
+
+def _forced(row: dict[str, Any]) -> str:
+    low, high = row["forced_interval_mm"]
+    return f"{np.mean(row['forced_mm']):.2f} [{low:.1f}, {high:.1f}]"
