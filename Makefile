@@ -61,7 +61,8 @@ weights-markers: $(READY)
 # How the shipped bead-maze policy and its touch encoder were made: hours on 2 cores, most of them
 # for the recordings. It learns from demonstrations, and from what the expert would have done where
 # the policy has got to by itself: a regression learns that fast, and the diffusion policy learns from
-# all of it. (The learners of what ships planned every fourth tick.)
+# all of it. (The learners of what ships planned every fourth tick, and it was taught without trials and
+# with four DDIM steps, see docs/next_steps.md.)
 MAZE := runs/maze
 FEEL := --episodes $(MAZE)/train/episodes --validation $(MAZE)/val/episodes \
 	--touch $(MAZE)/mae/encoder --representation tool --train.lr 1e-3
