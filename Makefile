@@ -79,7 +79,7 @@ maze-policy: $(READY)
 		$(BIN)/touchgoal collect-demos --task bead-maze --learner $(MAZE)/round-$$round/policy \
 			--episodes 120 --seed 5$${round}000 --maze.n-wires 260 --out $(MAZE)/train || exit 1; \
 	done
-	$(BIN)/touchgoal train-policy $(FEEL) --sampler.plan-steps 2 --train.epochs 10 \
+	$(BIN)/touchgoal train-policy $(FEEL) --train.epochs 10 \
 		--train.snapshot-epochs 5 --trials 48 --maze.disturbance 0.003 --out $(MAZE)/policy
 	rm -rf policies/weights/bead_maze && mkdir -p policies/weights
 	cp -r $(MAZE)/policy/policy policies/weights/bead_maze

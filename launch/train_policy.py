@@ -61,7 +61,7 @@ class Config:
     """Of the episodes to learn from, the first so many."""
     head: Head = "small"
     """Size of the diffusion's U-Net, or regression instead."""
-    sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig(plan_steps=4))
+    sampler: SamplerConfig = field(default_factory=SamplerConfig)
     """How the diffusion is trained and sampled."""
     representation: Representation = "tool"
     """Of the actions while learning; "tool" also sees along the hand's own axes, and does not go

@@ -19,7 +19,7 @@ class DiffusionConfig:
     """A network and how it is trained and sampled."""
 
     unet: UNetConfig = field(default_factory=lambda: PRESETS["small"])
-    sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig(plan_steps=4))
+    sampler: SamplerConfig = field(default_factory=SamplerConfig)
 
 
 class Diffusion(nn.Module):

@@ -31,14 +31,15 @@ class SamplerConfig:
             published, or the clean sample. The last needs fewer steps and less training where
             samples vary little (3D diffusion policy, Ze et al. 2024, which takes it as well).
         train_steps: of the squared-cosine schedule (Nichol and Dhariwal 2021).
-        plan_steps: network calls for one sample.
+        plan_steps: network calls for one sample. Two led the bead as well as four and answer
+            within half a tick of 20 Hz on one core (docs/next_steps.md).
         clip: clean samples lie in [-clip, clip].
     """
 
     kind: Literal["ddpm", "ddim", "flow"] = "ddim"
     predict: Literal["epsilon", "velocity", "sample"] = "sample"
     train_steps: int = 100
-    plan_steps: int = 8
+    plan_steps: int = 2
     clip: float = 1.0
 
     def __post_init__(self) -> None:
