@@ -180,8 +180,9 @@ def _closed_loop(
 
 
 def _closed_table(results: dict[str, list[MazeTrial]]) -> str:
+    width = max(len(name) for name in results) + 2
     lines = [
-        f"{'closed loop, test wires':<44}{'success [95 % Wilson]':<24}"
+        f"{'closed loop, test wires':<{width}}{'success [95 % Wilson]':<24}"
         f"{'completed [95 %]':<22}{'drop':>5}{'jam':>5}{'force':>6}{'peak N':>8}"
     ]
     for name, trials in results.items():
@@ -192,7 +193,7 @@ def _closed_table(results: dict[str, list[MazeTrial]]) -> str:
         low, high = bootstrap([(t.wire, t.progress) for t in trials])
         done = f"{np.mean([t.progress for t in trials]):.0%} [{low:.0%}, {high:.0%}]"
         lines.append(
-            f"{name:<44}{rate!s:<24}{done:<22}{failures[0]:>5}{failures[1]:>5}{failures[2]:>6}"
+            f"{name:<{width}}{rate!s:<24}{done:<22}{failures[0]:>5}{failures[1]:>5}{failures[2]:>6}"
             f"{np.median([t.peak_force for t in trials]):>8.1f}"
         )
     return "\n".join(lines)
@@ -282,16 +283,17 @@ def _summary(rows: list[tuple[str, Compounded]]) -> dict[str, Any]:
 
 
 def _open_table(arms: dict[str, dict[str, dict[str, Any]]]) -> str:
+    width = max(len(f"open loop, mm: {arm}") for arm in arms) + 2
     lines = []
     for arm, rows in arms.items():
         path = next(iter(rows.values()))["path_mm"]
         lines.append(
-            f"{'open loop, mm: ' + arm:<44}{'(A) tick 1':>11}{'(A) tick 8':>11}"
-            f"{'(B) mean [95 %]':>21}{'(B) final':>10}{'(C) mean':>10}   way {path:.0f} mm"
+            f"{'open loop, mm: ' + arm:<{width}}{'(A) tick 1':>11}{'(A) tick 8':>11}"
+            f"{'(B) mean [95 %]':>24}{'(B) final':>10}{'(C) mean':>10}   way {path:.0f} mm"
         )
         lines += [
-            f"{'  ' + name:<44}{r['chunk_mm'][0]:>11.2f}{r['chunk_mm'][-1]:>11.2f}"
-            f"{_forced(r):>21}{np.mean(r['forced_final_mm']):>10.2f}"
+            f"{'  ' + name:<{width}}{r['chunk_mm'][0]:>11.2f}{r['chunk_mm'][-1]:>11.2f}"
+            f"{_forced(r):>24}{np.mean(r['forced_final_mm']):>10.2f}"
             f"{np.mean(r['free_mm']):>10.2f}"
             for name, r in rows.items()
         ]
