@@ -92,6 +92,7 @@ def test_the_shipped_policy_leads_a_bead_on_the_twin(tmp_path: Path) -> None:
     twin.close()
     assert complaint == "" and worst["excess"] == 0 and worst["speed"] < 1
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["success"]
+    assert touch_comes_nearer(tmp_path)
 
 
 @pytest.mark.realtime

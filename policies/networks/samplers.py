@@ -31,8 +31,8 @@ class SamplerConfig:
             published, or the clean sample. The last needs fewer steps and less training where
             samples vary little (3D diffusion policy, Ze et al. 2024, which takes it as well).
         train_steps: of the squared-cosine schedule (Nichol and Dhariwal 2021).
-        plan_steps: network calls for one sample. Two led the bead as well as four and answer
-            within half a tick of 20 Hz on one core (docs/next_steps.md).
+        plan_steps: network calls for one sample. Two of "ddim" with "sample" led the bead as well as
+            four (docs/next_steps.md); "ddpm" and "epsilon" want more.
         clip: clean samples lie in [-clip, clip].
     """
 
