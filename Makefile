@@ -93,7 +93,7 @@ LEARN := --task pick-place --episodes $(PICK)/train/episodes --validation $(PICK
 	--senses $(PICK)/senses/senses --head regression --representation hand --place-noise 0 \
 	--train.lr 1e-3 --train.epochs 16 --train.snapshot-epochs 16
 pick-place-policy: $(READY)
-	$(BIN)/touchgoal train-senses --episodes runs/weights/train/episodes \
+	$(BIN)/touchgoal train-estimators --episodes runs/weights/train/episodes \
 		--validation runs/weights/val/episodes --out $(PICK)/senses
 	$(BIN)/touchgoal collect-demos --feedback --episodes 20 --seed 120000 $(BLIND) --out $(PICK)/val
 	$(BIN)/touchgoal collect-demos --feedback --episodes 120 --seed 20000 $(BLIND) \

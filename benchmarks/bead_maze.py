@@ -1,7 +1,7 @@
 """Does touch lead a bead along a wire never seen (TacBench T5, Sparsh Table 10), closed loop too?
 
 Every policy of the same recipe counts as one arm, its seeds as repeats. All arms meet the same
-wires and the same starts. Open loop: see `policies/trials/compounding.py`, along expert demonstrations on
+wires and the same starts. Open loop: see `policies/evaluation/open_loop.py`, along expert demonstrations on
 test wires that nothing disturbs unless asked.
 """
 
@@ -21,18 +21,18 @@ from touchgoal.episodes.recording import Actor, collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import SHIPPED, ActorMaker, Observation, Planner, PolicyActor
+from touchgoal.policies.evaluation import open_loop as compounding
+from touchgoal.policies.evaluation.bead_maze import MazeTrial, evaluate, trials_of
+from touchgoal.policies.evaluation.open_loop import Compounded, Plan, compound
+from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.follower import WireFollower
-from touchgoal.policies.networks.diffusion import RegressionConfig
+from touchgoal.policies.heads.diffusion import RegressionConfig
+from touchgoal.policies.perception.frozen_touch import load_touch
 from touchgoal.policies.policy import Condition, Policy
-from touchgoal.policies.touch import load_touch
-from touchgoal.policies.training.windows import Windows, embeddings, read
-from touchgoal.policies.trials import compounding
-from touchgoal.policies.trials.compounding import Compounded, Plan, compound
-from touchgoal.policies.trials.maze_trials import MazeTrial, evaluate, trials_of
-from touchgoal.policies.trials.success import SuccessRate
+from touchgoal.policies.training.sequence_dataset import Windows, embeddings, read
 from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
-from touchgoal.sim_envs.maze_expert import BeadMazeExpert
-from touchgoal.sim_envs.wires import HELD_OUT, choose
+from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
+from touchgoal.sim_envs.scene.wires import HELD_OUT, choose
 
 FIRST_SEED = 4_000_000
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from touchgoal.benchmarks.speed import Row, measure, one_core, table
 from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
-from touchgoal.sim_envs.experts import PickPlaceExpert
+from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
-from touchgoal.sim_envs.scene import robot_model
+from touchgoal.sim_envs.scene.build import robot_model
 
 STILL = np.zeros(8)
 HOLDING = 70  # ticks after which the expert holds the object in the air

@@ -22,16 +22,16 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
+from touchgoal.control.cell.config import Rig, read_rig
+from touchgoal.control.cell.connection import open_station, watchdogs_of
 from touchgoal.control.errors import UserError
-from touchgoal.control.rig import Rig, read_rig
-from touchgoal.control.safety import Safety
-from touchgoal.control.station import open_station, watchdogs_of
+from touchgoal.control.safety.action_filter import Safety
 from touchgoal.episodes.metadata import write_file
 from touchgoal.episodes.store import EpisodeSet, validate
 from touchgoal.policies.acting import Observation
-from touchgoal.policies.deploy.deployed import Learned, make_actor
-from touchgoal.policies.deploy.deployment import DeployedActor, Deployment
+from touchgoal.policies.deploy.actors import Learned, make_actor
+from touchgoal.policies.deploy.control_loop import DeployedActor, Deployment
 from touchgoal.policies.deploy.session import Session
 from touchgoal.policies.policy import PolicyConfig
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
@@ -195,8 +195,8 @@ def _serve(host: str, folder: Path, lock_step: bool) -> None:
 
 def _deploy(rig: Rig, case: Case, episodes: Path, said: Path, broke: Path) -> None:
     """The deployment's process; a first, short episode is there before the fault comes."""
-    station = open_station(rig, v.CONTROL_HZ)
-    safety = Safety(station.robot, v.CONTROL_HZ, watchdogs_of(rig))
+    station = open_station(rig, ft.CONTROL_HZ)
+    safety = Safety(station.robot, ft.CONTROL_HZ, watchdogs_of(rig))
     truth = partial(ask, rig.task.twin, "truth")
 
     def session(make: Callable[[Deployment], DeployedActor], seconds: float) -> Session:
@@ -245,9 +245,9 @@ class Broken:
         step = np.zeros(n)
         joint = -1 if self._how == "outwards" else 0  # the wrist's end comes before the workspace's
         step[joint] = 0.0 if self._how == "still" else 0.02
-        if self._how == "nan" and self._ticks > v.CONTROL_HZ:
+        if self._how == "nan" and self._ticks > ft.CONTROL_HZ:
             step[0] = np.nan
-            if self._ticks == v.CONTROL_HZ + 1:
+            if self._ticks == ft.CONTROL_HZ + 1:
                 self._breaks()
         return np.append(step, width)
 
@@ -274,7 +274,7 @@ class Hanging:
         if self._plans > 3:
             self._breaks()
             threading.Event().wait()
-        plan = np.zeros((self.config.prediction_horizon, v.N_JOINTS + 1), np.float32)
+        plan = np.zeros((self.config.prediction_horizon, ft.N_JOINTS + 1), np.float32)
         plan[:, 0], plan[:, -1] = 0.02, self._width
         return plan
 

@@ -14,14 +14,14 @@ import numpy as np
 import torch
 
 from touchgoal.benchmarks.speed import one_core
-from touchgoal.control import vocabulary as v
-from touchgoal.encoders.vit import ViT, ViTConfig
+from touchgoal.control import features as ft
+from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import SHIPPED, ActorMaker
-from touchgoal.policies.networks.diffusion import Diffusion, DiffusionConfig
-from touchgoal.policies.networks.eyes import shrink
-from touchgoal.policies.networks.samplers import SamplerConfig
-from touchgoal.policies.networks.unet import PRESETS
+from touchgoal.policies.heads.diffusion import Diffusion, DiffusionConfig
+from touchgoal.policies.heads.samplers import SamplerConfig
+from touchgoal.policies.heads.unet import PRESETS
+from touchgoal.policies.perception.end_to_end import shrink
 from touchgoal.policies.policy import PolicyConfig
 from touchgoal.sim_envs.base import EnvConfig
 
@@ -44,7 +44,7 @@ class Config:
     """Plans timed."""
     large_repeats: int = 5
     """Runs of each network of a published size; 0 leaves them out."""
-    control_hz: int = v.CONTROL_HZ
+    control_hz: int = ft.CONTROL_HZ
     """Ticks per second that the plan has to fit."""
 
 
@@ -82,19 +82,19 @@ def _stages(config: Config) -> list[Stage]:
     stages = []
     if planner.touch is not None:
         encoder = planner.touch.encoder
-        frame = ticks[0][v.TACTILE_LEFT]
+        frame = ticks[0][ft.TACTILE_LEFT]
         both = np.concatenate([encoder.preprocess(frame[None], frame)] * 2)
         touch = torch.from_numpy(both)
         stages += [
             _time(
                 "preprocess both fingertips",
                 config.repeats,
-                lambda: [encoder.preprocess(ticks[1][k][None], ticks[0][k]) for k in v.TACTILE],
+                lambda: [encoder.preprocess(ticks[1][k][None], ticks[0][k]) for k in ft.TACTILE],
             ),
             _time("touch encoder, both", config.repeats, lambda: encoder.embed_touch(touch)),
         ]
     if (eye := policy.config.eye) is not None and policy.eye is not None:
-        pictures = [shrink(ticks[1][k][None], ticks[0][k], eye.size) for k in v.TACTILE]
+        pictures = [shrink(ticks[1][k][None], ticks[0][k], eye.size) for k in ft.TACTILE]
         seen = torch.from_numpy(np.stack(pictures, 1))
         look = policy.eye
         stages.append(_time("pictures through the eye", config.repeats, lambda: look(seen)))
@@ -133,11 +133,11 @@ def _published(config: Config) -> list[Stage]:
 def _observations(config: PolicyConfig, camera: tuple[int, int]) -> list[dict[str, np.ndarray]]:
     rng = np.random.default_rng(0)
     seen = [key for key in config.proprioception if key not in config.perceived]
-    pictures = dict.fromkeys(v.CAMERAS, (*camera, 3)) | {
-        key: v.FEATURES[key].shape for key in v.TACTILE
+    pictures = dict.fromkeys(ft.CAMERAS, (*camera, 3)) | {
+        key: ft.FEATURES[key].shape for key in ft.TACTILE
     }
     return [
-        {key: rng.normal(size=v.FEATURES[key].shape).astype(np.float32) for key in seen}
+        {key: rng.normal(size=ft.FEATURES[key].shape).astype(np.float32) for key in seen}
         | {key: rng.integers(90, 110, shape, np.uint8) for key, shape in pictures.items()}
         for _ in range(8)
     ]

@@ -16,18 +16,18 @@ import numpy as np
 from tqdm import tqdm
 
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.towers import load_towers
+from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.recording import Demonstration, collect
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.policies.trials.success import SuccessRate
+from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.rewards.curves import Curves, Scale
 from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EpisodeEmbedder, measure
 from touchgoal.rewards.goals import EpisodeEnd, Goal, LastFrame, Sentence
 from touchgoal.rewards.metrics import CurveMetrics, measure_curve
-from touchgoal.rewards.overview import overview
-from touchgoal.sim_envs.experts import OUTCOMES, Outcome
-from touchgoal.sim_envs.objects import CATALOGUE
+from touchgoal.rewards.report.summary import overview
+from touchgoal.sim_envs.experts.pick_place import OUTCOMES, Outcome
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
+from touchgoal.sim_envs.scene.objects import CATALOGUE
 
 # New wordings: none of these sentences was trained on.
 SENTENCES = {

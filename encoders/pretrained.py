@@ -7,12 +7,12 @@ from typing import Any
 import torch
 
 from touchgoal.control.errors import UserError
+from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
+from touchgoal.encoders.backbones.touch_backbone import TouchTrunk, TouchTrunkConfig
+from touchgoal.encoders.backbones.vit import ViTConfig
 from touchgoal.encoders.preprocess import preprocessor_for
-from touchgoal.encoders.stored import Stored
-from touchgoal.encoders.touch_encoder import TouchEncoder, TouchEncoderConfig
-from touchgoal.encoders.towers import same_towers
-from touchgoal.encoders.trunk import TouchTrunk, TouchTrunkConfig
-from touchgoal.encoders.vit import ViTConfig
+from touchgoal.encoders.towers.towers import same_towers
+from touchgoal.encoders.training.weights import Stored
 
 _WEIGHTS = Path(__file__).parent / "weights"
 SHIPPED = _WEIGHTS / "gelsight_mini_offline"

@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Int, Shaped, UInt8
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.vocabulary import FEATURES
+from touchgoal.control.features import FEATURES
 from touchgoal.episodes import statistics
 from touchgoal.episodes.media import encode_video
 from touchgoal.episodes.schema import (

@@ -14,14 +14,14 @@ import numpy as np
 from jaxtyping import UInt8
 from tqdm import tqdm
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.encoding import EncodedEpisode, encode
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
-from touchgoal.sim_envs.experts import Outcome
-from touchgoal.sim_envs.filming import Film
+from touchgoal.sim_envs.experts.pick_place import Outcome
+from touchgoal.sim_envs.scene.filming import Film
 from touchgoal.sim_envs.tasks import TaskConfig, make_env, make_expert
 
 
@@ -73,12 +73,12 @@ def run(
     while True:
         action = np.asarray(actor.act(observation), np.float32)
         answer = np.asarray(expert.act(observation), np.float32) if expert else action
-        yield {**observation, v.ACTION: answer, **info}
+        yield {**observation, ft.ACTION: answer, **info}
         observation, _, terminated, truncated, info = env.step(action)
         if terminated or truncated:
             break
-    still = np.append(np.zeros(v.N_JOINTS), answer[-1]).astype(np.float32)
-    yield {**observation, v.ACTION: still, **info}
+    still = np.append(np.zeros(ft.N_JOINTS), answer[-1]).astype(np.float32)
+    yield {**observation, ft.ACTION: still, **info}
 
 
 def demonstrate(
@@ -115,7 +115,7 @@ def to_episode(
     env: FrankaTactileEnv, ticks: list[dict[str, np.ndarray]], demonstration: Demonstration
 ) -> Episode:
     """The episode of the ticks that were run in an environment."""
-    success = bool(ticks[-1][v.TRUTH_SUCCESS][0])
+    success = bool(ticks[-1][ft.TRUTH_SUCCESS][0])
     asked_to_fail = demonstration.outcome != "success"
     return Episode(
         frames={key: np.stack([tick[key] for tick in ticks]) for key in ticks[0]},

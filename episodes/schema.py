@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.vocabulary import (
+from touchgoal.control.features import (
     ACTION,
     FEATURES,
     IMAGE_PREFIX,

@@ -20,7 +20,7 @@ from jaxtyping import UInt8
 from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.vocabulary import FEATURES
+from touchgoal.control.features import FEATURES
 from touchgoal.episodes import metadata
 from touchgoal.episodes.encoding import (
     Description,

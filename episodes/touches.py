@@ -7,8 +7,8 @@ from jaxtyping import Bool, Int, UInt8
 from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.touch.contact import detect_contact, threshold_for
-from touchgoal.control.vocabulary import TACTILE, TRUTH_CONTACT, WRIST
+from touchgoal.control.features import TACTILE, TRUTH_CONTACT, WRIST
+from touchgoal.control.tactile.contact import detect_contact, threshold_for
 from touchgoal.episodes.store import EpisodeSet
 
 _BACKGROUND_FRAMES = 5

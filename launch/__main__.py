@@ -13,7 +13,7 @@ COMMANDS = {
     "collect-demos": "record expert episodes of a task, or failures to order",
     "teleop": "lead the bead along a wire with keys, and record it",
     "train-encoder": "train a touch encoder",
-    "train-senses": "train what reads contact in touch and a scene in pictures",
+    "train-estimators": "train what reads contact in touch and a scene in pictures",
     "train-policy": "train a policy on recorded episodes",
     "train-policy-paper": "the same with the published network, sampler and actions",
     "run-policy": "run a policy in a task: success rate, video",

@@ -25,8 +25,8 @@ from touchgoal.control.calibration.picture_errors import (
 from touchgoal.control.calibration.pictures import light_compass, side_by_side
 from touchgoal.control.calibration.press_set import PressSet, read_presses, split
 from touchgoal.control.errors import UserError
-from touchgoal.control.sensors import SENSORS
-from touchgoal.control.touch.photometry import save
+from touchgoal.control.tactile.sensor_calibration import save
+from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.launch.run_folder import open_run, write_json
 
 _SHOWN = 6  # held-out presses in the picture

@@ -10,14 +10,14 @@ from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import Cast, Demonstration, collect, scripted
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies import checkpoint
-from touchgoal.policies.training.corrections import Corrected
-from touchgoal.policies.trials.success import SuccessRate
+from touchgoal.policies.evaluation.success_rate import SuccessRate
+from touchgoal.policies.training.dagger import Corrected
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
-from touchgoal.sim_envs.experts import Outcome
-from touchgoal.sim_envs.objects import CATALOGUE, find
+from touchgoal.sim_envs.experts.pick_place import Outcome
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
+from touchgoal.sim_envs.scene.objects import CATALOGUE, find
+from touchgoal.sim_envs.scene.wires import choose
 from touchgoal.sim_envs.tasks import TaskConfig
-from touchgoal.sim_envs.wires import choose
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ becomes dense cost curves against its goal in image, touch, image+touch, and wor
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from touchgoal.control.sensors import find_sensor
+from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.towers import load_towers
+from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.recording import Demonstration, demonstrate_on_film
 from touchgoal.episodes.store import EpisodeWriter
@@ -18,9 +18,9 @@ from touchgoal.launch.run_folder import open_run
 from touchgoal.rewards.curves import Scale
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder, measure
 from touchgoal.rewards.goals import choose_goal, parse_goal
-from touchgoal.rewards.report import write_report
-from touchgoal.sim_envs.objects import find
+from touchgoal.rewards.report.report import write_report
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.scene.objects import find
 
 
 @dataclass(frozen=True)

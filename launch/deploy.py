@@ -14,27 +14,27 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
+from touchgoal.control.cell.config import Rig, read_rig
+from touchgoal.control.cell.connection import Station, open_station, watchdogs_of
+from touchgoal.control.checks import require
 from touchgoal.control.errors import UserError
-from touchgoal.control.finding import require
-from touchgoal.control.newest import Newest
-from touchgoal.control.protocols import DriverError
-from touchgoal.control.rig import Rig, read_rig
-from touchgoal.control.safety import Safety
-from touchgoal.control.station import Station, open_station, watchdogs_of
+from touchgoal.control.interfaces import DriverError
+from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.sensors.latest_value import Newest
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.towers import load_towers
+from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.launch.terminal import HELP, Terminal
-from touchgoal.policies.deploy.deployed import learned, make_actor
+from touchgoal.policies.deploy.actors import learned, make_actor
 from touchgoal.policies.deploy.preflight import preflight
 from touchgoal.policies.deploy.session import Result, Session
 from touchgoal.rewards.curves import Scale
 from touchgoal.rewards.goals import parse_goal
-from touchgoal.rewards.live import LiveCost
+from touchgoal.rewards.online import LiveCost
 from touchgoal.sim_envs.base import EnvConfig
-from touchgoal.sim_envs.simulated import simulate
 from touchgoal.sim_envs.twin.faults import ask
+from touchgoal.sim_envs.twin.in_process import simulate
 
 _ASKING = 0.2  # s between questions to a twin
 
@@ -44,7 +44,7 @@ class Config:
     """Options of deploy."""
 
     rig: Annotated[Path, tyro.conf.Positional]
-    """The rig file: one like those in launch/rigs/, or the rig.json of a twin."""
+    """The rig file: one like those in launch/cells/, or the rig.json of a twin."""
     policy: str = ""
     """In place of the rig's: expert, follower, shipped, or a folder that train-policy made."""
     execute: bool = False
@@ -65,7 +65,7 @@ def main(config: Config) -> None:
     out = open_run(config.out, "deploy", config)
     try:
         station = (
-            simulate(rig, v.CONTROL_HZ) if rig.arm == "sim" else open_station(rig, v.CONTROL_HZ)
+            simulate(rig, ft.CONTROL_HZ) if rig.arm == "sim" else open_station(rig, ft.CONTROL_HZ)
         )
     except DriverError as error:
         raise UserError(str(error)) from error
@@ -77,7 +77,7 @@ def main(config: Config) -> None:
 
 
 def _deploy(config: Config, rig: Rig, station: Station, out: Path) -> Result:
-    safety = Safety(station.robot, v.CONTROL_HZ, watchdogs_of(rig))
+    safety = Safety(station.robot, ft.CONTROL_HZ, watchdogs_of(rig))
     findings = preflight(rig, station, safety, out / "episodes")
     print("\n".join(str(f) for f in findings), flush=True)
     require(findings)
@@ -142,7 +142,7 @@ def _confirm(rig: Rig) -> None:
 def _report(result: Result, out: Path) -> None:
     ending, ticks = result.ending, result.ticks
     late = np.array(ticks.late) if ticks.late else np.zeros(1)
-    forces = [np.linalg.norm(row[v.WRENCH][:3]) for row in ticks.rows]
+    forces = [np.linalg.norm(row[ft.WRENCH][:3]) for row in ticks.rows]
     numbers = {
         "reason": ending.reason,
         "stopped": ending.stopped,

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from touchgoal.control.checks import Finding, require
 from touchgoal.control.errors import UserError
-from touchgoal.control.finding import Finding, require
-from touchgoal.sim_envs.rendering import OPENGL_PACKAGES
+from touchgoal.sim_envs.scene.rendering import OPENGL_PACKAGES
 
 _GL_PROBE = "import touchgoal, mujoco; c = mujoco.GLContext(64, 64); c.make_current(); c.free()"
 _PACKAGES = ("mujoco", "torch", "opencv-contrib-python-headless", "casadi", "pyarrow", "av")

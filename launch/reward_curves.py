@@ -12,9 +12,9 @@ import tyro
 from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.vocabulary import CONTROL_HZ, FRONT
+from touchgoal.control.features import CONTROL_HZ, FRONT
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.towers import load_towers
+from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.metadata import INFO
 from touchgoal.episodes.store import EpisodeSet
@@ -22,8 +22,8 @@ from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.rewards.curves import Curves, Scale
 from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EpisodeEmbedder, measure
 from touchgoal.rewards.goals import choose_goal, parse_goal
-from touchgoal.rewards.overview import overview
-from touchgoal.rewards.report import write_report
+from touchgoal.rewards.report.report import write_report
+from touchgoal.rewards.report.summary import overview
 
 
 @dataclass(frozen=True)

@@ -14,18 +14,19 @@ from touchgoal.episodes.media import write_video
 from touchgoal.episodes.recording import Actor, Demonstration, demonstrate_on_film
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies.acting import SHIPPED, ActorMaker
+from touchgoal.policies.evaluation import bead_maze as maze_trials
+from touchgoal.policies.evaluation import pick_place as rollout
+from touchgoal.policies.evaluation.bead_maze import MazeTrial
+from touchgoal.policies.evaluation.pick_place import Trial
+from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.follower import WireFollower
-from touchgoal.policies.trials import maze_trials, rollout
-from touchgoal.policies.trials.maze_trials import MazeTrial
-from touchgoal.policies.trials.rollout import Trial
-from touchgoal.policies.trials.success import SuccessRate
 from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
-from touchgoal.sim_envs.experts import PickPlaceExpert
-from touchgoal.sim_envs.maze_expert import BeadMazeExpert
-from touchgoal.sim_envs.objects import CATALOGUE, SHAPES, find
+from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
+from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
+from touchgoal.sim_envs.scene.objects import CATALOGUE, SHAPES, find
+from touchgoal.sim_envs.scene.wires import FAMILIES, choose
 from touchgoal.sim_envs.tasks import TaskConfig, make_env
-from touchgoal.sim_envs.wires import FAMILIES, choose
 
 Task = TypeVar("Task", PickPlaceConfig, BeadMazeConfig)
 

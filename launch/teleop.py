@@ -13,16 +13,16 @@ from typing import Literal
 
 import numpy as np
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.control.keyboard import Keyboard
+from touchgoal.control.sensors.keyboard import Keyboard
 from touchgoal.episodes.recording import Demonstration, run, to_episode
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
-from touchgoal.sim_envs.teleoperator import HELP, Teleoperator, TeleoperatorConfig
-from touchgoal.sim_envs.wires import choose, find
+from touchgoal.sim_envs.experts.teleoperator import HELP, Teleoperator, TeleoperatorConfig
+from touchgoal.sim_envs.scene.wires import choose, find
 
 _GIVE_UP = "q"
 
@@ -109,7 +109,7 @@ def lead(
 def _show(tick: dict[str, np.ndarray], held: str) -> None:
     """One line that is written over."""
     if sys.stdout.isatty():
-        progress, force = tick[v.TRUTH_PROGRESS][0], np.linalg.norm(tick[v.WRENCH][:3])
+        progress, force = tick[ft.TRUTH_PROGRESS][0], np.linalg.norm(tick[ft.WRENCH][:3])
         line = f"{progress:4.0%} of the way  {force:4.1f} N on the hand  {held or 'still':<6}{HELP}"
         width = shutil.get_terminal_size().columns - 1
         print(f"\r{line[:width]:<{width}}", end="", flush=True)

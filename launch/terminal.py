@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.keyboard import Keyboard
-from touchgoal.control.safety import Mode
-from touchgoal.policies.deploy.deployment import View
+from touchgoal.control.safety.action_filter import Mode
+from touchgoal.control.sensors.keyboard import Keyboard
+from touchgoal.policies.deploy.control_loop import View
 
 HELP = "space or Ctrl-C stops the arm, Enter ends the task; neither is an emergency stop"
 _WISHES = {"\n": "done", "\r": "done", " ": "stop", "q": "stop"}

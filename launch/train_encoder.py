@@ -10,10 +10,10 @@ import tyro
 from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
-from touchgoal.encoders import touch_frames
-from touchgoal.encoders.align import PRESETS, AlignConfig, align
-from touchgoal.encoders.mae import MaeConfig, train_mae
-from touchgoal.encoders.towers import load_towers
+from touchgoal.encoders.alignment.align import PRESETS, AlignConfig, align
+from touchgoal.encoders.ssl import frames as touch_frames
+from touchgoal.encoders.ssl.mae import MaeConfig, train_mae
+from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import collect
 from touchgoal.launch.run_folder import open_run

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.store import EpisodeSet
@@ -17,24 +17,25 @@ from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import ActorMaker
 from touchgoal.policies.actions import Representation
-from touchgoal.policies.networks.diffusion import DiffusionConfig, RegressionConfig
-from touchgoal.policies.networks.eyes import EyeConfig
-from touchgoal.policies.networks.samplers import SamplerConfig
-from touchgoal.policies.networks.unet import PRESETS
+from touchgoal.policies.evaluation import bead_maze as maze_trials
+from touchgoal.policies.evaluation import pick_place as rollout
+from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
+from touchgoal.policies.heads.samplers import SamplerConfig
+from touchgoal.policies.heads.unet import PRESETS
+from touchgoal.policies.perception.end_to_end import EyeConfig
+from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
+from touchgoal.policies.perception.state_estimation import READ, load_senses
 from touchgoal.policies.policy import PolicyConfig, TouchReading
-from touchgoal.policies.senses.reading import READ, load_senses
-from touchgoal.policies.touch import TouchEmbedder, load_touch
-from touchgoal.policies.training.selection import Score, add_parts, select
+from touchgoal.policies.training.model_selection import Score, add_parts, select
+from touchgoal.policies.training.sequence_dataset import Windows, read
 from touchgoal.policies.training.train import POLICY, TrainConfig, train
-from touchgoal.policies.training.windows import Windows, read
-from touchgoal.policies.trials import maze_trials, rollout
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
-from touchgoal.sim_envs.objects import CATALOGUE
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
-from touchgoal.sim_envs.wires import choose
+from touchgoal.sim_envs.scene.objects import CATALOGUE
+from touchgoal.sim_envs.scene.wires import choose
 
 Head = Literal["small", "published", "tiny", "regression"]
-_COLUMNS = v.STATE, v.TCP_POSE
+_COLUMNS = ft.STATE, ft.TCP_POSE
 _TRIALS = 2_000_000  # seed of the first trial
 
 
@@ -53,7 +54,7 @@ class Config:
     end_to_end: bool = False
     """Feel through a touch ViT that is trained along, instead of a frozen encoder."""
     senses: Path | None = None
-    """Folder of senses (train-senses): the policy acts on what they read of contact and of the
+    """Folder of senses (train-estimators): the policy acts on what they read of contact and of the
     scene at the start, and learns on the truth, so that its episodes need no pictures."""
     out: Path | None = None
     """Folder of the run; the policy goes to its `policy/`."""
@@ -145,7 +146,7 @@ def _policy_config(
         touch_noise=config.touch_noise,
         place_noise=config.place_noise,
         eye=EyeConfig() if config.end_to_end else None,
-        proprioception=_COLUMNS + (v.WRENCH, *READ) if config.senses else _COLUMNS,
+        proprioception=_COLUMNS + (ft.WRENCH, *READ) if config.senses else _COLUMNS,
         representation=config.representation,
         observation_horizon=config.observation_horizon,
         execution_horizon=config.execution_horizon,

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from touchgoal.launch import train_policy
 from touchgoal.policies.actions import Representation
-from touchgoal.policies.networks.samplers import SamplerConfig
+from touchgoal.policies.heads.samplers import SamplerConfig
 from touchgoal.policies.policy import TouchReading
 from touchgoal.policies.training.train import TrainConfig
 

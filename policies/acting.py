@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Float32, UInt8
 from torch import Tensor
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.control.sensors import find_sensor
+from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.policies import checkpoint
-from touchgoal.policies.networks.eyes import shrink
+from touchgoal.policies.perception.end_to_end import shrink
+from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
+from touchgoal.policies.perception.state_estimation import Senses, load_senses
 from touchgoal.policies.policy import Condition, Policy, PolicyConfig
-from touchgoal.policies.senses.reading import Senses, load_senses
-from touchgoal.policies.touch import TouchEmbedder, load_touch
 from touchgoal.sim_envs.base import EnvConfig
 
 _WEIGHTS = Path(__file__).parent / "weights"
@@ -114,7 +114,7 @@ class Planner:
         eye = self.config.eye
         if eye is None:
             return None
-        pictures = [shrink(observation[k][None], self._first[k], eye.size) for k in v.TACTILE]
+        pictures = [shrink(observation[k][None], self._first[k], eye.size) for k in ft.TACTILE]
         return torch.from_numpy(np.stack(pictures, 1))
 
 
@@ -210,7 +210,7 @@ class ActorMaker:
         senses = self._senses(config)
         keys = senses.cameras if senses else ()
         felt = config.touch_dim > 0 or config.eye is not None or senses is not None
-        cameras = tuple(key.removeprefix(v.IMAGE_PREFIX) for key in keys)
+        cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key in keys)
         task = replace(task, tactile=felt, cameras=cameras)
         return replace(task, camera_size=senses.camera_size) if senses else task
 

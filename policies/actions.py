@@ -13,8 +13,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from touchgoal.control.kinematics import Fr3Kinematics
-from touchgoal.control.vocabulary import N_JOINTS
+from touchgoal.control.features import N_JOINTS
+from touchgoal.control.motion.kinematics import Fr3Kinematics
 
 ACTION_DIM = N_JOINTS + 1
 Representation = Literal["delta", "chunk", "absolute", "hand", "tool"]

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from touchgoal.control.errors import UserError
-from touchgoal.encoders.stored import Stored
-from touchgoal.policies.networks.diffusion import DiffusionConfig, RegressionConfig
-from touchgoal.policies.networks.eyes import EyeConfig
-from touchgoal.policies.networks.samplers import SamplerConfig
-from touchgoal.policies.networks.unet import UNetConfig
+from touchgoal.encoders.training.weights import Stored
+from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
+from touchgoal.policies.heads.samplers import SamplerConfig
+from touchgoal.policies.heads.unet import UNetConfig
+from touchgoal.policies.perception.end_to_end import EyeConfig
 from touchgoal.policies.policy import Policy, PolicyConfig
 
 TOUCH, SENSES = "touch", "senses"  # folders beside the weights: of the touch encoder, of senses

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from touchgoal.control import vocabulary as v
-from touchgoal.control.kinematics import Fr3Kinematics, fingers_across
+from touchgoal.control import features as ft
+from touchgoal.control.motion.kinematics import Fr3Kinematics, fingers_across
 from touchgoal.sim_envs.bead_maze import GRASP_SECONDS
 
 
@@ -34,7 +34,7 @@ class WireFollower:
     wire. Compliance across a constraint and motion along it are Mason's (1981).
     """
 
-    def __init__(self, control_hz: int = v.CONTROL_HZ, config: FollowerConfig | None = None):
+    def __init__(self, control_hz: int = ft.CONTROL_HZ, config: FollowerConfig | None = None):
         self._tick = 1 / control_hz
         self._config = config or FollowerConfig()
         self._kinematics = Fr3Kinematics()
@@ -47,7 +47,7 @@ class WireFollower:
             self._grasping -= 1
             return np.zeros(8)
         config, tick = self._config, self._tick
-        joints = observation[v.STATE][:7].astype(np.float64)
+        joints = observation[ft.STATE][:7].astype(np.float64)
         position, R = self._kinematics.forward(joints)
         if self._command is None:
             self._command, self._target, self._before = joints, position, position
@@ -56,7 +56,7 @@ class WireFollower:
         self._velocity += share * ((position - self._before) / tick - self._velocity)
         self._before = position
         heading = self._velocity / np.linalg.norm(self._velocity)
-        force = observation[v.WRENCH][:3]
+        force = observation[ft.WRENCH][:3]
         across = force - heading * (heading @ force)
         self._target = self._target + tick * (config.speed * heading + config.compliance * across)
         lag = self._target - position

@@ -8,20 +8,20 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.policies.actions import ACTION_DIM, Representation, Scale, represent, to_actions
-from touchgoal.policies.networks.diffusion import (
+from touchgoal.policies.heads.diffusion import (
     Diffusion,
     DiffusionConfig,
     Regression,
     RegressionConfig,
 )
-from touchgoal.policies.networks.eyes import Eye, EyeConfig
-from touchgoal.policies.proprioception import places, unroll, widths
+from touchgoal.policies.perception.end_to_end import Eye, EyeConfig
+from touchgoal.policies.perception.proprioception import places, unroll, widths
 
 TouchReading = Literal["wrench", "free"]
-WRENCH_DIM = v.FEATURES[v.TRUTH_PAD_WRENCH].shape[0]
+WRENCH_DIM = ft.FEATURES[ft.TRUTH_PAD_WRENCH].shape[0]
 _FAR = 5.0  # standard deviations beyond which an input is as surprising as it gets
 
 
@@ -64,21 +64,23 @@ class PolicyConfig:
     touch_noise: float = 0.1
     place_noise: float = 0.3
     eye: EyeConfig | None = None
-    proprioception: tuple[str, ...] = (v.STATE, v.TCP_POSE)
+    proprioception: tuple[str, ...] = (ft.STATE, ft.TCP_POSE)
     observation_horizon: int = 2
     prediction_horizon: int = 8
     execution_horizon: int = 2
     representation: Representation = "chunk"
-    control_hz: int = v.CONTROL_HZ
+    control_hz: int = ft.CONTROL_HZ
     head: DiffusionConfig | RegressionConfig = field(default_factory=DiffusionConfig)
 
     def __post_init__(self) -> None:
         """Raises UserError for what makes no policy."""
-        if self.proprioception[:1] != (v.STATE,) or not set(self.proprioception) <= set(v.FEATURES):
-            raise UserError(f"proprioception must be known columns, {v.STATE} first")
-        if self.representation == "tool" and self.proprioception != (v.STATE, v.TCP_POSE):
+        if self.proprioception[:1] != (ft.STATE,) or not set(self.proprioception) <= set(
+            ft.FEATURES
+        ):
+            raise UserError(f"proprioception must be known columns, {ft.STATE} first")
+        if self.representation == "tool" and self.proprioception != (ft.STATE, ft.TCP_POSE):
             raise UserError(
-                f'representation "tool" sees {v.STATE} and {v.TCP_POSE} alone: choose "hand"'
+                f'representation "tool" sees {ft.STATE} and {ft.TCP_POSE} alone: choose "hand"'
             )
         if not 1 <= self.execution_horizon <= self.prediction_horizon:
             raise UserError(
@@ -106,7 +108,7 @@ class PolicyConfig:
     @property
     def state_dim(self) -> int:
         """Width of the proprioception of one tick."""
-        return sum(v.FEATURES[key].shape[0] for key in self.proprioception)
+        return sum(ft.FEATURES[key].shape[0] for key in self.proprioception)
 
     @property
     def seen_dim(self) -> int:
@@ -131,7 +133,7 @@ class Condition:
     @property
     def joints(self) -> Float[Tensor, "b 7"]:
         """Joint positions at the latest tick, rad."""
-        return self.state[:, -1, : v.N_JOINTS]
+        return self.state[:, -1, : ft.N_JOINTS]
 
 
 class Policy(nn.Module):
@@ -162,7 +164,7 @@ class Policy(nn.Module):
         self.eye = None
         if config.eye:
             self.eye = Eye(config.eye)
-            condition += len(v.TACTILE) * config.eye.width
+            condition += len(ft.TACTILE) * config.eye.width
         self.condition_dim = condition
         if isinstance(config.head, DiffusionConfig):
             self.head = Diffusion(config.head, ticks, ACTION_DIM, condition)

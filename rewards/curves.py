@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.vocabulary import TACTILE, TRUTH_CONTACT
+from touchgoal.control.features import TACTILE, TRUTH_CONTACT
 from touchgoal.episodes.metadata import write_file
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.touches import felt_contact

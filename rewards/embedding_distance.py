@@ -21,9 +21,9 @@ import torch
 from jaxtyping import Float, Float32, UInt8
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.vocabulary import FRONT, TACTILE, TRUTH_CONTACT
-from touchgoal.encoders.touch_encoder import TouchEncoder
-from touchgoal.encoders.towers import Towers
+from touchgoal.control.features import FRONT, TACTILE, TRUTH_CONTACT
+from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
+from touchgoal.encoders.towers.towers import Towers
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import (

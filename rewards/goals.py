@@ -31,7 +31,7 @@ from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.vocabulary import TRUTH_CONTACT
+from touchgoal.control.features import TRUTH_CONTACT
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.rewards.metrics import START_FRAMES

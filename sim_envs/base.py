@@ -9,22 +9,22 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.control.kinematics import GELSIGHT_TCP, Kinematics, fingers_down
-from touchgoal.control.sensors import find_sensor
-from touchgoal.sim_envs.contact import SLIP_SPEED, ContactReader, PadContact
-from touchgoal.sim_envs.objects import Body
-from touchgoal.sim_envs.rendering import open_renderer
-from touchgoal.sim_envs.scene import (
+from touchgoal.control.motion.kinematics import GELSIGHT_TCP, Kinematics, fingers_down
+from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.sim_envs.scene.build import (
     ROBOTS,
     SIDES,
     SceneConfig,
     arm_joints,
     build,
 )
+from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, ContactReader, PadContact
+from touchgoal.sim_envs.scene.objects import Body
+from touchgoal.sim_envs.scene.rendering import open_renderer
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
-from touchgoal.sim_envs.tactile.unit import Spread, sample_unit
+from touchgoal.sim_envs.tactile.sensor_instance import Spread, sample_unit
 
 GRIPPER_MAX_WIDTH = 0.08  # m, Franka Hand
 STRAY_SECONDS = 0.5  # for which a disturbance keeps its direction
@@ -53,9 +53,9 @@ class EnvConfig:
     """
 
     cameras: tuple[str, ...] = ("front", "wrist")
-    camera_size: tuple[int, int] = v.CAMERA_SHAPE[:2]
+    camera_size: tuple[int, int] = ft.CAMERA_SHAPE[:2]
     tactile: bool = True
-    control_hz: int = v.CONTROL_HZ
+    control_hz: int = ft.CONTROL_HZ
     max_seconds: float = 8.0
     disturbance: float = 0.0
     spread: Spread = Spread()
@@ -65,14 +65,14 @@ class EnvConfig:
 class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     """An FR3 with two fingertip sensors at a table; a task adds objects, progress and success.
 
-    Observations are a flat dict with the keys of `control/vocabulary.py`; truth (`truth.*`) is in
+    Observations are a flat dict with the keys of `control/features.py`; truth (`truth.*`) is in
     `info`. The action is the joint change (rad) for this tick, added to the commanded joint
     positions, and the gripper width target (m). The gripper closes at its own speed and then
     holds with `grasp_force` N on each finger, as the Franka Hand's `grasp` does.
     """
 
     stray_turn = 2.0  # rad of disturbance per m of it
-    metadata = {"render_modes": ["rgb_array"], "render_fps": v.CONTROL_HZ}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"], "render_fps": ft.CONTROL_HZ}  # noqa: RUF012
 
     def __init__(self, config: EnvConfig, render_mode: str | None = None) -> None:
         self.config, self.render_mode = config, render_mode
@@ -82,7 +82,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.kinematics = Kinematics(self.robot.arm, GELSIGHT_TCP)
         self.action_space = self._limits = self._action_space()
         self.observation_space = gym.spaces.Dict(
-            {key: _space(v.FEATURES[key], self._shape(key)) for key in self._observed()}
+            {key: _space(ft.FEATURES[key], self._shape(key)) for key in self._observed()}
         )
         self.grasp_force = 15.0
         self.bodies: list[Body] = []
@@ -323,16 +323,16 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, data.site_xmat[self._tcp])
         values = {
-            v.STATE: np.concatenate([*self.joints(), [self.width()]]),
-            v.TCP_POSE: np.concatenate([data.site_xpos[self._tcp], quat]),
-            v.WRENCH: self._external,
+            ft.STATE: np.concatenate([*self.joints(), [self.width()]]),
+            ft.TCP_POSE: np.concatenate([data.site_xpos[self._tcp], quat]),
+            ft.WRENCH: self._external,
         }
         observation = {key: value.astype(np.float32) for key, value in values.items()}
         for camera in self.config.cameras:
-            observation[v.IMAGE_PREFIX + camera] = self.picture(camera)
+            observation[ft.IMAGE_PREFIX + camera] = self.picture(camera)
         if self._pads:
             self._frames = [self.feel(side) for side in range(2)]
-            for key, frame in zip(v.TACTILE, self._frames, strict=True):
+            for key, frame in zip(ft.TACTILE, self._frames, strict=True):
                 observation[key] = frame.image
         return observation
 
@@ -341,12 +341,12 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         pads = self._contacts
         wrench = np.concatenate([w for pad in pads for w in (pad.force, pad.torque)])
         return {
-            v.TRUTH_PAD_WRENCH: wrench.astype(np.float32),
-            v.TRUTH_CONTACT: np.array([pad.touching for pad in pads]),
-            v.TRUTH_SLIP: np.array([pad.slip_speed > SLIP_SPEED for pad in pads]),
-            v.TRUTH_OBJECT_POSE: self.object_pose().astype(np.float32),
-            v.TRUTH_PROGRESS: np.array([progress], np.float32),
-            v.TRUTH_SUCCESS: np.array([success]),
+            ft.TRUTH_PAD_WRENCH: wrench.astype(np.float32),
+            ft.TRUTH_CONTACT: np.array([pad.touching for pad in pads]),
+            ft.TRUTH_SLIP: np.array([pad.slip_speed > SLIP_SPEED for pad in pads]),
+            ft.TRUTH_OBJECT_POSE: self.object_pose().astype(np.float32),
+            ft.TRUTH_PROGRESS: np.array([progress], np.float32),
+            ft.TRUTH_SUCCESS: np.array([success]),
         }
 
     def object_pose(self, name: str = "object") -> Float[np.ndarray, "7"]:
@@ -354,22 +354,22 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         return self.data.joint(name).qpos.copy()
 
     def _observed(self) -> list[str]:
-        keys = [v.STATE, v.TCP_POSE, v.WRENCH]
-        known = {key.removeprefix(v.IMAGE_PREFIX) for key in v.CAMERAS}
+        keys = [ft.STATE, ft.TCP_POSE, ft.WRENCH]
+        known = {key.removeprefix(ft.IMAGE_PREFIX) for key in ft.CAMERAS}
         for camera in self.config.cameras:
             if camera not in known:
                 raise UserError(
                     f"unknown camera {camera!r}; choose from: {', '.join(sorted(known))}"
                 )
-            keys.append(v.IMAGE_PREFIX + camera)
-        return keys + (list(v.TACTILE) if self.config.tactile else [])
+            keys.append(ft.IMAGE_PREFIX + camera)
+        return keys + (list(ft.TACTILE) if self.config.tactile else [])
 
     def _shape(self, key: str) -> tuple[int, ...]:
-        if key in v.CAMERAS:
+        if key in ft.CAMERAS:
             return (*self.config.camera_size, 3)
-        if key in v.TACTILE:
+        if key in ft.TACTILE:
             return (*self.sensor.image_shape, 3)
-        return v.features_of(self.n_joints)[key].shape
+        return ft.features_of(self.n_joints)[key].shape
 
     def _action_space(self) -> gym.spaces.Box:
         step = self.robot.hardware.velocity / self.config.control_hz
@@ -380,7 +380,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         )
 
 
-def _space(feature: v.Feature, shape: tuple[int, ...]) -> gym.spaces.Box:
+def _space(feature: ft.Feature, shape: tuple[int, ...]) -> gym.spaces.Box:
     if feature.dtype == "uint8":
         return gym.spaces.Box(0, 255, shape, np.uint8)
     return gym.spaces.Box(-np.inf, np.inf, shape, np.float32)

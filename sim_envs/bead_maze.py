@@ -11,14 +11,14 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.control.kinematics import fingers_across
-from touchgoal.sim_envs import wires
+from touchgoal.control.motion.kinematics import fingers_across
 from touchgoal.sim_envs.base import EnvConfig, FrankaTactileEnv, Observation
-from touchgoal.sim_envs.objects import HARD, Body, Material, ObjectKind, Texture
-from touchgoal.sim_envs.scene import VISUAL_GROUP, SceneConfig
-from touchgoal.sim_envs.wires import LENGTH, Wire
+from touchgoal.sim_envs.scene import wires
+from touchgoal.sim_envs.scene.build import VISUAL_GROUP, SceneConfig
+from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Texture
+from touchgoal.sim_envs.scene.wires import LENGTH, Wire
 
 START, END = 0.03, LENGTH - 0.03  # m of arc: where the bead starts and where it has arrived
 
@@ -110,7 +110,7 @@ class BeadMaze(FrankaTactileEnv):
 
     def troubles(self) -> list[str]:
         """Of drop, jam and over_force, what is so after the last tick."""
-        names = v.FEATURES[v.TRUTH_FAILURE].names
+        names = ft.FEATURES[ft.TRUTH_FAILURE].names
         return [name for name, true in zip(names, self.failure, strict=True) if true]
 
     def instruction(self) -> str:
@@ -200,7 +200,7 @@ class BeadMaze(FrankaTactileEnv):
         return bool(np.linalg.norm(self._external[:3]) > self.config.max_force)
 
     def _info(self, progress: float, success: bool) -> dict[str, Any]:
-        return super()._info(progress, success) | {v.TRUTH_FAILURE: self.failure}
+        return super()._info(progress, success) | {ft.TRUTH_FAILURE: self.failure}
 
 
 def add_wire(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:

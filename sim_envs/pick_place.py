@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import EnvConfig, FrankaTactileEnv, Observation
-from touchgoal.sim_envs.objects import CATALOGUE, find, sample_body
-from touchgoal.sim_envs.scene import VISUAL_GROUP
+from touchgoal.sim_envs.scene.build import VISUAL_GROUP
+from touchgoal.sim_envs.scene.objects import CATALOGUE, find, sample_body
 
 WORKSPACE = ((0.40, 0.60), (-0.20, 0.20))  # m, where objects start and goals lie, base frame
 _LIFTED = 0.03  # m above rest that counts as picked up
@@ -158,7 +158,7 @@ class PickPlace(FrankaTactileEnv):
         self._still_ticks, self._lifted, self._put_down = 0, False, False
 
     def _info(self, progress: float, success: bool) -> dict[str, Any]:
-        return super()._info(progress, success) | {v.TRUTH_START: self.start.copy()}
+        return super()._info(progress, success) | {ft.TRUTH_START: self.start.copy()}
 
     def _stray(self) -> Float[np.ndarray, " n"]:
         return np.zeros(self.n_joints) if self._put_down else super()._stray()

@@ -3,8 +3,8 @@
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
-from touchgoal.sim_envs.experts import Outcome, PickPlaceExpert
-from touchgoal.sim_envs.maze_expert import BeadMazeExpert
+from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
+from touchgoal.sim_envs.experts.pick_place import Outcome, PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
 
 TaskConfig = PickPlaceConfig | BeadMazeConfig

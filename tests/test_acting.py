@@ -8,12 +8,12 @@ import pytest
 import torch
 from toy_policies import TOY, feeling, policy_for, rng, toy_ticks, toy_windows
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.policies.acting import Planner, PolicyActor
 from touchgoal.policies.deploy.realtime import RealTimeActor
+from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.policy import Condition, Policy
-from touchgoal.policies.touch import TouchEmbedder
 
 
 @pytest.mark.parametrize("latency", [0, 1, 3])
@@ -24,7 +24,7 @@ def test_an_actor_does_its_plans_in_order_and_on_time(latency: int) -> None:
     actor = PolicyActor(Planner(policy, touch, seed=5), latency)
     done = [actor.act(dict(tick)) for tick in ticks]  # nobody else keeps them
     rows = np.stack([touch.embed_tick(tick, ticks[0]) for tick in ticks])
-    states = np.stack([np.concatenate([tick[v.STATE], tick[v.TCP_POSE]]) for tick in ticks])
+    states = np.stack([np.concatenate([tick[ft.STATE], tick[ft.TCP_POSE]]) for tick in ticks])
     generator, expected = rng(5), []
     for asked in range(0, 8, 3):  # ticks on whose observation a plan is made
         asked = max(asked - latency, 0)
@@ -59,7 +59,7 @@ class SlowPlanner(Planner):
     def plan(self, seen):
         time.sleep(self.pause if self.plans else 0.0)
         actions = super().plan(seen)
-        self.plans.append((int(seen[-1][v.STATE][0]), actions))
+        self.plans.append((int(seen[-1][ft.STATE][0]), actions))
         return actions
 
 
@@ -69,7 +69,7 @@ def test_a_late_plan_is_joined_where_it_should_be_by_now() -> None:
     planner = SlowPlanner(policy_for(config, toy_windows(config)).eval(), pause=0.05)
     actor, done = RealTimeActor(planner), []
     for i, tick in enumerate(toy_ticks(40)):
-        tick[v.STATE][0] = i
+        tick[ft.STATE][0] = i
         done.append(actor.act(tick))
         time.sleep(0.02)
     actor.close()

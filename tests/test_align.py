@@ -11,12 +11,18 @@ import torch
 import torch.nn.functional as F
 
 from touchgoal.control.errors import UserError
-from touchgoal.encoders import align as align_module
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.align import PRESETS, AlignConfig, AlignedBatch, align, batch_losses
-from touchgoal.encoders.retrieval import mean_average_precision, top1
-from touchgoal.encoders.touch_data import Augmentation, TouchData, prepare
-from touchgoal.encoders.touch_encoder import TouchEncoder
+from touchgoal.encoders.alignment import align as align_module
+from touchgoal.encoders.alignment.align import (
+    PRESETS,
+    AlignConfig,
+    AlignedBatch,
+    align,
+    batch_losses,
+)
+from touchgoal.encoders.alignment.data import Augmentation, TouchData, prepare
+from touchgoal.encoders.alignment.retrieval import mean_average_precision, top1
+from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
 from touchgoal.episodes.touches import Touches
 
 DESCRIPTIONS = {

@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.control.touch.contact import detect_contact
+from touchgoal.control.tactile.contact import detect_contact
 from touchgoal.episodes.recording import run
+from touchgoal.policies.evaluation.bead_maze import evaluate, trials_of
 from touchgoal.policies.follower import WireFollower
-from touchgoal.policies.trials.maze_trials import evaluate, trials_of
-from touchgoal.sim_envs import wires
 from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig, add_wire, thread
-from touchgoal.sim_envs.maze_expert import BeadMazeExpert
-from touchgoal.sim_envs.wires import FAMILIES, LENGTH, MIN_RADIUS, Wire, choose, find
+from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
+from touchgoal.sim_envs.scene import wires
+from touchgoal.sim_envs.scene.wires import FAMILIES, LENGTH, MIN_RADIUS, Wire, choose, find
 
 BLIND = BeadMazeConfig(tactile=False)
 STILL = np.zeros(8)
@@ -44,7 +44,7 @@ class FeelsSomethingElse:
         self.follower, self.forces = WireFollower(), iter(forces)
 
     def act(self, observation):
-        return self.follower.act({**observation, v.WRENCH: next(self.forces, np.zeros(6))})
+        return self.follower.act({**observation, ft.WRENCH: next(self.forces, np.zeros(6))})
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -113,43 +113,43 @@ def test_bead_slides_as_coulomb_says(degrees: float, slides: bool) -> None:
 @pytest.mark.parametrize("family", FAMILIES)
 def test_expert_leads_the_bead_to_the_end(maze: BeadMaze, family) -> None:
     ticks = lead(maze, BeadMazeExpert, choose("validation", 3, (family,))[2])
-    assert ticks[-1][v.TRUTH_SUCCESS] and ticks[-1][v.TRUTH_PROGRESS] == 1
-    force = np.linalg.norm([tick[v.WRENCH][:3] for tick in ticks], axis=1)
+    assert ticks[-1][ft.TRUTH_SUCCESS] and ticks[-1][ft.TRUTH_PROGRESS] == 1
+    force = np.linalg.norm([tick[ft.WRENCH][:3] for tick in ticks], axis=1)
     assert force.max() < 3 and len(ticks) < 330
-    assert not any(tick[v.TRUTH_FAILURE].any() for tick in ticks)
+    assert not any(tick[ft.TRUTH_FAILURE].any() for tick in ticks)
 
 
 @pytest.mark.parametrize("bead", ["sphere", "cylinder"])
 def test_expert_comes_back_when_led_astray(bead) -> None:
     env = BeadMaze(replace(BLIND, disturbance=0.004, bead=bead))
     ticks = lead(env, BeadMazeExpert, find("roller-3"))
-    force = np.linalg.norm([tick[v.WRENCH][:3] for tick in ticks], axis=1)
-    assert ticks[-1][v.TRUTH_SUCCESS] and 5 < force.max() < env.config.max_force
+    force = np.linalg.norm([tick[ft.WRENCH][:3] for tick in ticks], axis=1)
+    assert ticks[-1][ft.TRUTH_SUCCESS] and 5 < force.max() < env.config.max_force
 
 
 def test_it_takes_touch(maze: BeadMaze) -> None:
     """The follower finishes, of the held-out family too; blind or misled, it does not."""
     other = lead(maze, follower, find("helix-6"), seed=1)
-    wrenches = [tick[v.WRENCH] for tick in other]
+    wrenches = [tick[ft.WRENCH] for tick in other]
     for name in ("fourier-3", "serpentine-5"):
-        assert lead(maze, follower, find(name))[-1][v.TRUTH_SUCCESS]
+        assert lead(maze, follower, find(name))[-1][ft.TRUTH_SUCCESS]
         for felt in ([], wrenches):
             ticks = lead(maze, lambda env, felt=felt: FeelsSomethingElse(felt), find(name))
-            assert ticks[-1][v.TRUTH_FAILURE].any()
-            assert max(tick[v.TRUTH_PROGRESS] for tick in ticks) < 0.6
+            assert ticks[-1][ft.TRUTH_FAILURE].any()
+            assert max(tick[ft.TRUTH_PROGRESS] for tick in ticks) < 0.6
 
 
 def test_the_hand_closes_while_a_fixture_holds_the_bead(maze: BeadMaze) -> None:
     env = BeadMaze(BeadMazeConfig(max_seconds=2.0, disturbance=0.004))
     observation, info = env.reset(seed=3, options={"wire": "roller-3"})
     untouched = observation
-    assert not info[v.TRUTH_CONTACT].any()
+    assert not info[ft.TRUTH_CONTACT].any()
     ticks = list(run(env, BeadMazeExpert(env), observation, info))
-    for key in v.TACTILE:
+    for key in ft.TACTILE:
         assert not detect_contact(ticks[0][key][None], untouched[key]).any()
         assert detect_contact(np.stack([ticks[12][key]]), untouched[key]).all()
-    np.testing.assert_array_equal(ticks[0][v.STATE][:7].round(3), ticks[9][v.STATE][:7].round(3))
-    assert ticks[30][v.TRUTH_PROGRESS] > 0 and not ticks[30][v.TRUTH_FAILURE].any()
+    np.testing.assert_array_equal(ticks[0][ft.STATE][:7].round(3), ticks[9][ft.STATE][:7].round(3))
+    assert ticks[30][ft.TRUTH_PROGRESS] > 0 and not ticks[30][ft.TRUTH_FAILURE].any()
 
 
 def test_drop_and_jam(maze: BeadMaze) -> None:
@@ -157,11 +157,11 @@ def test_drop_and_jam(maze: BeadMaze) -> None:
     terminated, info = False, {}
     while not terminated:
         *_, terminated, _, info = maze.step(np.append(np.zeros(7), 0.08))
-    assert info[v.TRUTH_FAILURE].tolist() == [True, False, False] and not info[v.TRUTH_SUCCESS]
+    assert info[ft.TRUTH_FAILURE].tolist() == [True, False, False] and not info[ft.TRUTH_SUCCESS]
     env = BeadMaze(replace(BLIND, stall_seconds=0.5))
     env.reset(seed=0)
     *_, info = [env.step(STILL) for _ in range(22)][-1]
-    assert info[v.TRUTH_FAILURE].tolist() == [False, True, False]
+    assert info[ft.TRUTH_FAILURE].tolist() == [False, True, False]
 
 
 def test_bead_stays_on_the_wire_whatever_the_hand_does(maze: BeadMaze) -> None:
@@ -172,7 +172,7 @@ def test_bead_stays_on_the_wire_whatever_the_hand_does(maze: BeadMaze) -> None:
         action = maze.action_space.sample()
         action[7] = 0.0
         *_, info = maze.step(action)
-        pressed |= info[v.TRUTH_FAILURE][2]
+        pressed |= info[ft.TRUTH_FAILURE][2]
         point, _ = maze.wire.at(maze.wire.project(maze.object_pose()[:3], maze.s))
         assert np.linalg.norm(maze.object_pose()[:3] - point) < 2e-3
     assert pressed

@@ -13,9 +13,10 @@ from touchgoal.control.calibration.ball import ball_overlap, press_surface
 from touchgoal.control.calibration.calibrate import fit
 from touchgoal.control.calibration.press_set import PressSet, read_presses, split, write_presses
 from touchgoal.control.errors import UserError
-from touchgoal.control.sensors import SENSORS
-from touchgoal.control.touch import gel, photometry
-from touchgoal.control.touch.photometry import Photometry
+from touchgoal.control.tactile import gel
+from touchgoal.control.tactile import sensor_calibration as photometry
+from touchgoal.control.tactile.sensor_calibration import Photometry
+from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.launch.__main__ import main
 
 SHAPE, PITCH, BALL, NOISE = (120, 160), 0.118e-3, 3e-3, 1.0

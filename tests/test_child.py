@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from touchgoal.control.child import Child
+from touchgoal.control.arms.driver_process import Child
 from touchgoal.control.errors import UserError
-from touchgoal.control.protocols import DriverError
+from touchgoal.control.interfaces import DriverError
 
 pytestmark = pytest.mark.realtime  # time-outs of children, which must get a core
 
@@ -56,7 +56,7 @@ class Odd:
 PARENT = """
 import sys
 from odd_driver import Odd
-from touchgoal.control.child import Child
+from touchgoal.control.arms.driver_process import Child
 child = Child(Odd, sys.argv[1])
 print("ready", flush=True)
 if sys.argv[2:]:

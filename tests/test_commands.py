@@ -191,7 +191,7 @@ def test_learning_to_pick_and_place(
     """From placements and demonstrations to a policy that is corrected; too little of everything."""
     monkeypatch.chdir(tmp_path)
     one, blind = ("--workers", 1), ("--env.no-tactile", "--env.cameras", "--out", "demos")
-    run("train-senses", "--episodes", episodes, "--validation", episodes, *one, "--things", 2,
+    run("train-estimators", "--episodes", episodes, "--validation", episodes, *one, "--things", 2,
         "--places", 2, "--learn.steps", 2, "--learn.contact-steps", 2, "--out", "senses")  # fmt: skip
     run("collect-demos", "--feedback", "--episodes", 1, *one, *blind)
     both = ("--episodes", "demos/episodes", "--validation", "demos/episodes")

@@ -7,10 +7,10 @@ import pytest
 import torch
 from toy_policies import TOY
 
-from touchgoal.control.kinematics import Fr3Kinematics
+from touchgoal.control.motion.kinematics import Fr3Kinematics
+from touchgoal.policies.evaluation.open_loop import always, compound, repeat_last, zero_motion
 from touchgoal.policies.policy import Condition
-from touchgoal.policies.training.windows import Recorded, Windows
-from touchgoal.policies.trials.compounding import always, compound, repeat_last, zero_motion
+from touchgoal.policies.training.sequence_dataset import Recorded, Windows
 
 import mujoco  # isort: skip - after touchgoal, which chooses the OpenGL platform
 

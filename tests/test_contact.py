@@ -2,8 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from touchgoal.control.touch.background import Background
-from touchgoal.control.touch.contact import (
+from touchgoal.control.tactile.background import Background
+from touchgoal.control.tactile.contact import (
     THRESHOLD,
     ContactDetector,
     contact_strength,

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from running_twin import RunningTwin
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
+from touchgoal.control.cell.config import Rig, read_rig
+from touchgoal.control.cell.connection import watchdogs_of
 from touchgoal.control.errors import UserError
-from touchgoal.control.rig import Rig, read_rig
-from touchgoal.control.safety import Safety
-from touchgoal.control.station import watchdogs_of
+from touchgoal.control.safety.action_filter import Safety
 from touchgoal.episodes.store import EpisodeSet, validate
 from touchgoal.launch.__main__ import main
-from touchgoal.policies.deploy.deployment import Deployment, Ticks, View
-from touchgoal.sim_envs.simulated import simulate
+from touchgoal.policies.deploy.control_loop import Deployment, Ticks, View
+from touchgoal.sim_envs.twin.in_process import simulate
 
 _PATIENCE = 300  # s for a deployment, on a machine however loaded
-RIGS = Path(__file__).parents[1] / "launch" / "rigs"
+RIGS = Path(__file__).parents[1] / "launch" / "cells"
 SIM = """
 arm = "sim"
 gripper = { kind = "franka_hand" }
@@ -144,7 +144,7 @@ class Acts:
 
 def deployed(rig: Rig, actor: Acts, stop_after: int = 10_000) -> tuple[str, bool, float]:
     """How it ends, whether it was stopped, and the farthest that the first joint got (rad)."""
-    station, count = simulate(rig, v.CONTROL_HZ), 0
+    station, count = simulate(rig, ft.CONTROL_HZ), 0
 
     def wanted() -> str:
         nonlocal count
@@ -156,7 +156,7 @@ def deployed(rig: Rig, actor: Acts, stop_after: int = 10_000) -> tuple[str, bool
     def show(view: View) -> None:
         far[0] = max(far[0], float(view.sensed.arm.q[0]))
 
-    safety = Safety(station.robot, v.CONTROL_HZ, watchdogs_of(rig))
+    safety = Safety(station.robot, ft.CONTROL_HZ, watchdogs_of(rig))
     deployment = Deployment(station, safety, True, wanted, show)
     ending = deployment.run(actor, 20.0, Ticks())
     assert np.abs(station.arm.read().velocity).max() < 0.01

@@ -11,23 +11,23 @@ import numpy as np
 import pytest
 from running_twin import RunningTwin
 
-from touchgoal.control import franka, ur
-from touchgoal.control.arm_process import ArmConfig, ArmProcess, moved_wrench
+from touchgoal.control.arms import franka, ur
+from touchgoal.control.arms.streaming import ArmConfig, ArmProcess, moved_wrench
 from touchgoal.control.errors import UserError
-from touchgoal.control.franka_hand import FrankaHand
-from touchgoal.control.kinematics import GELSIGHT_TCP
-from touchgoal.control.limits import FR3, UR5E
-from touchgoal.control.load_cell import LoadCellConfig, SerialLoadCell
-from touchgoal.control.protocols import (
+from touchgoal.control.features import FRONT
+from touchgoal.control.grippers.franka_hand import FrankaHand
+from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
+from touchgoal.control.interfaces import (
     Arm,
     Camera,
     DriverError,
     Gripper,
     LoadCell,
 )
-from touchgoal.control.robotiq import Robotiq, RobotiqConfig
-from touchgoal.control.video import VideoCamera, VideoConfig
-from touchgoal.control.vocabulary import FRONT
+from touchgoal.control.motion.kinematics import GELSIGHT_TCP
+from touchgoal.control.safety.limits import FR3, UR5E
+from touchgoal.control.sensors.load_cell import LoadCellConfig, SerialLoadCell
+from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 
 pytestmark = pytest.mark.realtime
 
@@ -37,9 +37,10 @@ HZ = 20.0
 DRIVING = """
 import sys, time
 import numpy as np
-from touchgoal.control import franka, ur
-from touchgoal.control.arm_process import ArmConfig, ArmProcess
-from touchgoal.control.limits import FR3, UR5E
+from touchgoal.control.arms import franka
+from touchgoal.control.arms import ur
+from touchgoal.control.arms.streaming import ArmConfig, ArmProcess
+from touchgoal.control.safety.limits import FR3, UR5E
 name, address = sys.argv[1:]
 client, rate, robot = {
     "fr3": (franka.FrankaClient, franka.RATE, FR3), "ur5e": (ur.UrClient, ur.RATE, UR5E)

@@ -13,12 +13,12 @@ import torch.nn.functional as F
 from safetensors.torch import load_file, save_file
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.sensors import GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
+from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.infonce import info_nce, loss_floor, symmetric_info_nce
+from touchgoal.encoders.alignment.infonce import info_nce, loss_floor, symmetric_info_nce
+from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
+from touchgoal.encoders.backbones.vit import PRESETS, ViT, ViTConfig, random_patches
 from touchgoal.encoders.preprocess import PREPROCESSORS
-from touchgoal.encoders.touch_encoder import TouchEncoder, TouchEncoderConfig
-from touchgoal.encoders.vit import PRESETS, ViT, ViTConfig, random_patches
 
 MINI = PREPROCESSORS["gelsight_mini"]
 

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.sim_envs.experts import OUTCOMES, PickPlaceExpert
-from touchgoal.sim_envs.objects import CATALOGUE, SHAPES
+from touchgoal.sim_envs.experts.pick_place import OUTCOMES, PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.scene.objects import CATALOGUE, SHAPES
 
 ENVS = [
     "touchgoal.sim_envs.pick_place:touchgoal/PickPlace-v0",
@@ -49,12 +49,14 @@ def test_gymnasium_contract(name: str) -> None:
     check_env(env.unwrapped, skip_render_check=True)
     observation, info = env.reset(seed=0)
     for key, value in observation.items():
-        assert value.shape == v.FEATURES[key].shape and value.dtype == v.FEATURES[key].dtype
-    truth = {key for key in v.FEATURES if key.startswith("truth.")}
-    of_some_tasks = {v.TRUTH_FAILURE, v.TRUTH_START}
+        assert value.shape == ft.FEATURES[key].shape and value.dtype == ft.FEATURES[key].dtype
+    truth = {key for key in ft.FEATURES if key.startswith("truth.")}
+    of_some_tasks = {ft.TRUTH_FAILURE, ft.TRUTH_START}
     assert truth - of_some_tasks <= info.keys() <= truth
     for key in info:
-        assert info[key].shape == v.FEATURES[key].shape and info[key].dtype == v.FEATURES[key].dtype
+        assert (
+            info[key].shape == ft.FEATURES[key].shape and info[key].dtype == ft.FEATURES[key].dtype
+        )
     env.close()
 
 
@@ -69,7 +71,7 @@ def test_same_seed_same_episode(name: str) -> None:
         env.close()
     for key in runs[0]:
         np.testing.assert_array_equal(runs[0][key], runs[1][key])
-    assert not np.array_equal(runs[0][v.TACTILE_LEFT], runs[2][v.TACTILE_LEFT])
+    assert not np.array_equal(runs[0][ft.TACTILE_LEFT], runs[2][ft.TACTILE_LEFT])
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -77,16 +79,16 @@ def test_expert_places_every_shape(blind: PickPlace, shape: str) -> None:
     name = next(k.name for k in CATALOGUE.values() if k.shape == shape)
     blind.reset(seed=1, options={"object": name})
     _, success, info = rollout(blind, PickPlaceExpert(blind))
-    assert success and info[v.TRUTH_PROGRESS] == 1
-    distance = np.linalg.norm(info[v.TRUTH_OBJECT_POSE][:2] - blind.goal)
-    assert distance < blind.config.tolerance and info[v.TRUTH_CONTACT].all()
+    assert success and info[ft.TRUTH_PROGRESS] == 1
+    distance = np.linalg.norm(info[ft.TRUTH_OBJECT_POSE][:2] - blind.goal)
+    assert distance < blind.config.tolerance and info[ft.TRUTH_CONTACT].all()
 
 
 def test_expert_lets_go_when_asked() -> None:
     env = PickPlace(PickPlaceConfig(cameras=(), tactile=False, release=True))
     env.reset(seed=1)
     _, success, info = rollout(env, PickPlaceExpert(env))
-    assert success and not info[v.TRUTH_CONTACT].any()
+    assert success and not info[ft.TRUTH_CONTACT].any()
 
 
 @pytest.mark.parametrize("outcome", [o for o in OUTCOMES if o != "success"])
@@ -98,7 +100,7 @@ def test_failures_to_order(outcome: str) -> None:
     success = truncated = False
     while not (success or truncated):
         _, _, success, truncated, info = env.step(expert.act({}))
-        touched.append(info[v.TRUTH_CONTACT].any())
+        touched.append(info[ft.TRUTH_CONTACT].any())
         lifted.append(env.object_pose()[2] > 0.08)
     assert not success
     assert any(touched) == (outcome in ("drop", "wrong_object")) or outcome == "freeze"
@@ -139,7 +141,7 @@ def test_weak_grasp_loses_a_heavy_object(blind: PickPlace) -> None:
 def test_external_wrench_is_the_weight(blind: PickPlace) -> None:
     lift(blind, object="toy_brick", grasp_force=20.0, mass=0.15)
     observation, *_ = blind.step(STILL)
-    np.testing.assert_allclose(observation[v.WRENCH][:3], [0, 0, -0.15 * 9.81], atol=0.03)
+    np.testing.assert_allclose(observation[ft.WRENCH][:3], [0, 0, -0.15 * 9.81], atol=0.03)
 
 
 def test_bad_requests_say_what_to_do(blind: PickPlace) -> None:

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.episodes import metadata, statistics
 from touchgoal.episodes.encoding import encode
@@ -24,7 +24,7 @@ from touchgoal.episodes.store import EpisodeSet, EpisodeWriter, repair, validate
 
 FPS = 20
 PNG_START = b"\x89PNG"
-NUMERIC = (v.STATE, v.ACTION, v.TRUTH_CONTACT, v.TRUTH_PROGRESS, v.TRUTH_SUCCESS)
+NUMERIC = (ft.STATE, ft.ACTION, ft.TRUTH_CONTACT, ft.TRUTH_PROGRESS, ft.TRUTH_SUCCESS)
 
 
 def moving_blob(n: int, height: int, width: int, seed: int) -> np.ndarray:
@@ -40,14 +40,14 @@ def make_episode(seed: int, n: int = 7) -> Episode:
     rng = np.random.default_rng(seed)
     touch = rng.integers(0, 256, (2, n, 24, 32, 3), dtype=np.uint8)
     frames = {
-        v.STATE: rng.standard_normal((n, 15)).astype(np.float32),
-        v.WRIST: moving_blob(n, 32, 48, seed),
-        v.TACTILE_LEFT: touch[0],
-        v.TACTILE_RIGHT: touch[1],
-        v.ACTION: rng.standard_normal((n, 8)).astype(np.float32),
-        v.TRUTH_CONTACT: rng.random((n, 2)) < 0.5,
-        v.TRUTH_PROGRESS: np.linspace(0, 1, n, dtype=np.float32)[:, None],
-        v.TRUTH_SUCCESS: np.arange(n)[:, None] == n - 1,
+        ft.STATE: rng.standard_normal((n, 15)).astype(np.float32),
+        ft.WRIST: moving_blob(n, 32, 48, seed),
+        ft.TACTILE_LEFT: touch[0],
+        ft.TACTILE_RIGHT: touch[1],
+        ft.ACTION: rng.standard_normal((n, 8)).astype(np.float32),
+        ft.TRUTH_CONTACT: rng.random((n, 2)) < 0.5,
+        ft.TRUTH_PROGRESS: np.linspace(0, 1, n, dtype=np.float32)[:, None],
+        ft.TRUTH_SUCCESS: np.arange(n)[:, None] == n - 1,
     }
     meta = {"object": f"cube_{seed % 2}", "descriptions": ["hard", "smooth"][: seed % 3]}
     return Episode(
@@ -71,10 +71,10 @@ def assert_holds(root: Path, seeds: list[int], n: int = 7) -> None:
 def assert_same(read: Episode, original: Episode) -> None:
     assert (read.task, read.meta) == (original.task, original.meta)
     assert set(read.frames) == set(original.frames)
-    for key in (*NUMERIC, *v.TACTILE):
+    for key in (*NUMERIC, *ft.TACTILE):
         np.testing.assert_array_equal(read.frames[key], original.frames[key], err_msg=key)
         assert read.frames[key].dtype == original.frames[key].dtype
-    assert psnr(read.frames[v.WRIST], original.frames[v.WRIST]) > 35
+    assert psnr(read.frames[ft.WRIST], original.frames[ft.WRIST]) > 35
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
@@ -122,36 +122,36 @@ def test_only_what_is_asked_for_is_decoded(small: Path) -> None:
         path.write_bytes(b"not a video")
     data = small / metadata.data_path(0)
     damage(data, data.read_bytes().index(PNG_START) + 100)
-    episode = EpisodeSet(small).read(0, [v.STATE])
-    np.testing.assert_array_equal(episode.frames[v.STATE], make_episode(0).frames[v.STATE])
+    episode = EpisodeSet(small).read(0, [ft.STATE])
+    np.testing.assert_array_equal(episode.frames[ft.STATE], make_episode(0).frames[ft.STATE])
 
 
 def test_files_are_what_lerobot_reads(recorded: Path) -> None:
     info = json.loads((recorded / metadata.INFO).read_text())
     assert info["codebase_version"] == "v3.0" and info["total_frames"] == 210
     dtypes = {key: feature["dtype"] for key, feature in info["features"].items()}
-    assert (dtypes[v.WRIST], dtypes[v.TACTILE_LEFT]) == ("video", "image")
-    assert (dtypes[v.TRUTH_CONTACT], dtypes[v.STATE]) == ("bool", "float32")
+    assert (dtypes[ft.WRIST], dtypes[ft.TACTILE_LEFT]) == ("video", "image")
+    assert (dtypes[ft.TRUTH_CONTACT], dtypes[ft.STATE]) == ("bool", "float32")
     pandas = pq.read_table(recorded / metadata.TASKS).schema.pandas_metadata
     assert pandas["index_columns"] == ["task"]
     rows = pq.read_table(recorded / metadata.EPISODES).to_pylist()
     assert [row["dataset_from_index"] for row in rows] == [0, 70, 140]
-    assert rows[2][f"videos/{v.WRIST}/to_timestamp"] == 3.5
+    assert rows[2][f"videos/{ft.WRIST}/to_timestamp"] == 3.5
     table = pq.read_table(recorded / metadata.data_path(2))
     assert set(table.column_names) == {key for key, dtype in dtypes.items() if dtype != "video"}
     assert table["index"].to_pylist() == list(range(140, 210))
     assert table["task_index"].to_pylist() == [0] * 70
     assert table["timestamp"].to_numpy() == pytest.approx(np.arange(70) / FPS, abs=1e-6)
-    assert isinstance(table[v.TRUTH_PROGRESS][0].as_py(), float), "shape (1,) is a scalar column"
-    png = table[v.TACTILE_LEFT].to_pylist()[3]["bytes"]
+    assert isinstance(table[ft.TRUTH_PROGRESS][0].as_py(), float), "shape (1,) is a scalar column"
+    png = table[ft.TACTILE_LEFT].to_pylist()[3]["bytes"]
     pixels = np.asarray(Image.open(io.BytesIO(png)))
-    np.testing.assert_array_equal(pixels, make_episode(2, 70).frames[v.TACTILE_LEFT][3])
+    np.testing.assert_array_equal(pixels, make_episode(2, 70).frames[ft.TACTILE_LEFT][3])
 
 
 def test_statistics_of_the_set_are_of_all_frames(recorded: Path) -> None:
     stats = json.loads((recorded / metadata.STATS).read_text())
     episodes = [make_episode(seed, 70) for seed in range(3)]
-    for key, axes, scale in ((v.ACTION, 0, 1), (v.TACTILE_LEFT, (0, 1, 2), 255)):
+    for key, axes, scale in ((ft.ACTION, 0, 1), (ft.TACTILE_LEFT, (0, 1, 2), 255)):
         values = np.concatenate([episode.frames[key] for episode in episodes]).astype(float) / scale
         shape = (3, 1, 1) if scale == 255 else (8,)
         assert stats[key]["count"] == [210]
@@ -196,14 +196,14 @@ def with_meta(**meta: object) -> Episode:
 
 
 UNFIT = {
-    "state differ": without(make_episode(9), v.STATE),
-    "wrist differ": with_frames(v.WRIST, np.zeros((7, 32, 64, 3), np.uint8)),
-    "even height": with_frames(v.WRIST, np.zeros((7, 32, 47, 3), np.uint8)),
-    "convert it to uint8": with_frames(v.WRIST, np.zeros((7, 32, 48, 3), np.float32)),
+    "state differ": without(make_episode(9), ft.STATE),
+    "wrist differ": with_frames(ft.WRIST, np.zeros((7, 32, 64, 3), np.uint8)),
+    "even height": with_frames(ft.WRIST, np.zeros((7, 32, 47, 3), np.uint8)),
+    "convert it to uint8": with_frames(ft.WRIST, np.zeros((7, 32, 48, 3), np.float32)),
     "no key of touchgoal": with_frames("observation.smell", np.zeros((7, 1), np.float32)),
-    "has 6 frames": with_frames(v.ACTION, np.zeros((6, 8), np.float32)),
+    "has 6 frames": with_frames(ft.ACTION, np.zeros((6, 8), np.float32)),
     "not finite at frame 2": with_frames(
-        v.ACTION, np.where(np.arange(7)[:, None] == 2, np.nan, np.zeros((7, 8))).astype(np.float32)
+        ft.ACTION, np.where(np.arange(7)[:, None] == 2, np.nan, np.zeros((7, 8))).astype(np.float32)
     ),
     "meta differs from the set's in light": with_meta(light=1.0),
     "meta differs from the set's in seed": with_meta(seed="nine"),
@@ -228,7 +228,7 @@ def test_refusals_say_what_to_do(small: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="frames 0 to 6, not -1"):
         episodes.read(0, frames=[0, -1])
     with pytest.raises(UserError, match="has no observation.images.front"):
-        episodes.read(0, [v.FRONT])
+        episodes.read(0, [ft.FRONT])
     with pytest.raises(UserError, match="not a set of episodes"):
         EpisodeSet(tmp_path)
     with pytest.raises(UserError, match="20 frames per second, not 30"):
@@ -265,10 +265,10 @@ DAMAGE = {
         lambda path: damage(path, path.read_bytes().index(PNG_START) + 100),
     ),
     "half a data file": (metadata.data_path(1), cut),
-    "flipped byte in a video": (metadata.video_path(v.WRIST, 1), lambda path: damage(path, 400)),
-    "half a video": (metadata.video_path(v.WRIST, 1), cut),
+    "flipped byte in a video": (metadata.video_path(ft.WRIST, 1), lambda path: damage(path, 400)),
+    "half a video": (metadata.video_path(ft.WRIST, 1), cut),
     "no data file": (metadata.data_path(1), Path.unlink),
-    "no video": (metadata.video_path(v.WRIST, 1), Path.unlink),
+    "no video": (metadata.video_path(ft.WRIST, 1), Path.unlink),
 }
 
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from toy_policies import TOY, policy_for, toy_windows
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.episodes.recording import CORRECTED, Demonstration, demonstrate
 from touchgoal.policies import checkpoint
-from touchgoal.policies.senses.reading import READ
-from touchgoal.policies.training.corrections import Corrected
-from touchgoal.sim_envs.feedback import FeedbackExpert
+from touchgoal.policies.perception.state_estimation import READ
+from touchgoal.policies.training.dagger import Corrected
+from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
 
 BLIND = PickPlaceConfig(cameras=(), tactile=False)
@@ -23,7 +23,7 @@ JOB = Demonstration(1, options={"object": "wooden_block"})
 def test_it_picks_and_places_though_it_is_led_astray(disturbance: float) -> None:
     episode = demonstrate(PickPlace(replace(BLIND, disturbance=disturbance)), JOB, Corrected())
     assert episode.meta["success"]
-    moved = np.abs(episode.frames[v.ACTION][:, :7])
+    moved = np.abs(episode.frames[ft.ACTION][:, :7])
     assert moved.max() < 0.1  # rad a tick, 2 rad/s: an FR3 may turn its slowest joint as fast
 
 
@@ -43,7 +43,7 @@ def test_it_comes_back_from_where_it_never_went() -> None:
 
 def test_a_learner_acts_and_is_corrected(tmp_path: Path) -> None:
     config = replace(
-        TOY, touch_dim=0, touch="", proprioception=(v.STATE, v.TCP_POSE, *READ), place_noise=0.0
+        TOY, touch_dim=0, touch="", proprioception=(ft.STATE, ft.TCP_POSE, *READ), place_noise=0.0
     )
     checkpoint.save(policy_for(config, toy_windows(config)), tmp_path / "learner", {})
     cast, env = Corrected(tmp_path / "learner"), PickPlace(replace(BLIND, max_seconds=1.0))
@@ -53,7 +53,7 @@ def test_a_learner_acts_and_is_corrected(tmp_path: Path) -> None:
     learner, expert = cast(env, JOB)
     for tick in range(20):
         answer, action = expert.act(observation), learner.act(observation)
-        np.testing.assert_array_equal(episode.frames[v.STATE][tick], observation[v.STATE])
-        np.testing.assert_allclose(episode.frames[v.ACTION][tick], answer, atol=1e-6)
+        np.testing.assert_array_equal(episode.frames[ft.STATE][tick], observation[ft.STATE])
+        np.testing.assert_allclose(episode.frames[ft.ACTION][tick], answer, atol=1e-6)
         assert not np.allclose(action, answer)
         observation, *_ = env.step(action)

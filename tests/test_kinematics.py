@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.kinematics import (
+from touchgoal.control.motion.kinematics import (
     FR3_HOME,
     FR3_LOWER,
     FR3_UPPER,
@@ -17,7 +17,7 @@ from touchgoal.control.kinematics import (
     rotation_matrix,
     rotation_vector,
 )
-from touchgoal.sim_envs.scene import build
+from touchgoal.sim_envs.scene.build import build
 
 if TYPE_CHECKING:
     import mujoco

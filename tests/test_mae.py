@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from touchgoal.control.errors import UserError
-from touchgoal.encoders import mae as mae_module
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.mae import MaeConfig, MaskedAutoencoder, patches, train_mae
-from touchgoal.encoders.probe import ridge_r2
-from touchgoal.encoders.touch_frames import TouchFrames
-from touchgoal.encoders.vit import random_patches
+from touchgoal.encoders.backbones.vit import random_patches
+from touchgoal.encoders.probes.ridge import ridge_r2
+from touchgoal.encoders.ssl import mae as mae_module
+from touchgoal.encoders.ssl.frames import TouchFrames
+from touchgoal.encoders.ssl.mae import MaeConfig, MaskedAutoencoder, patches, train_mae
 
 TOY = MaeConfig(vit="tiny", decoder_width=16, decoder_depth=1, epochs=3, batch_size=16, lr=3e-3)
 

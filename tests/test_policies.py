@@ -4,9 +4,9 @@ import pytest
 
 from touchgoal.episodes.recording import Demonstration
 from touchgoal.policies.acting import SHIPPED, ActorMaker
-from touchgoal.policies.trials.rollout import evaluate
-from touchgoal.policies.trials.success import SuccessRate
-from touchgoal.sim_envs.experts import PickPlaceExpert
+from touchgoal.policies.evaluation.pick_place import evaluate
+from touchgoal.policies.evaluation.success_rate import SuccessRate
+from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 
 

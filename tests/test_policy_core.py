@@ -11,20 +11,20 @@ import torch
 from safetensors.torch import load_file, save_file
 from toy_policies import DIFFUSION, FLOW, TOY, feeling, policy_for, rng, toy_ticks, toy_windows
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.control.kinematics import FR3_HOME, Fr3Kinematics
+from touchgoal.control.motion.kinematics import FR3_HOME, Fr3Kinematics
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies import checkpoint
 from touchgoal.policies.actions import Representation, Scale, represent, to_actions
-from touchgoal.policies.networks import ema
-from touchgoal.policies.networks.diffusion import DiffusionConfig, RegressionConfig
+from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
+from touchgoal.policies.perception.proprioception import unroll
 from touchgoal.policies.policy import Condition, Policy, PolicyConfig
-from touchgoal.policies.proprioception import unroll
+from touchgoal.policies.training import ema
 from touchgoal.policies.training import train as train_module
+from touchgoal.policies.training.sequence_dataset import read
 from touchgoal.policies.training.train import TrainConfig, train
-from touchgoal.policies.training.windows import read
 
 import mujoco  # isort: skip - after touchgoal, which chooses the OpenGL platform
 
@@ -40,7 +40,7 @@ def test_representations_round_trip(kind: Representation) -> None:
 
 def test_along_the_hand_every_way_the_arm_faces_is_the_same() -> None:
     """Turned about its first, vertical joint, the arm sees and does the same."""
-    kinematics, columns = Fr3Kinematics(), (v.STATE, v.TCP_POSE)
+    kinematics, columns = Fr3Kinematics(), (ft.STATE, ft.TCP_POSE)
     q = FR3_HOME + np.random.default_rng(0).normal(0, 0.2, (2, 7))
     q[1, 1:] = q[0, 1:]
     velocity = 0.1 * torch.randn(1, 7, generator=rng()).expand(2, -1)
@@ -178,7 +178,7 @@ def test_a_turn_looks_the_same_by_either_quaternion() -> None:
     state = torch.randn(5, 22)
     state[:, 18:] /= state[:, 18:].norm(dim=1, keepdim=True)
     other = torch.cat([state[:, :18], -state[:, 18:]], 1)
-    columns = v.STATE, v.TCP_POSE
+    columns = ft.STATE, ft.TCP_POSE
     seen = unroll(state, columns, "chunk")
     torch.testing.assert_close(seen, unroll(other, columns, "chunk"))
     turned = unroll(state, columns, "tool")
@@ -212,7 +212,7 @@ def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     writer, embedder = EpisodeWriter(tmp_path / "set/episodes"), feeling()
     config = replace(TOY, touch_dim=embedder.dim, touch_reading="free")
     for n in (4, 6):
-        ticks = [{**tick, v.ACTION: tick[v.STATE][:8]} for tick in toy_ticks(n)]
+        ticks = [{**tick, ft.ACTION: tick[ft.STATE][:8]} for tick in toy_ticks(n)]
         writer.append(Episode({k: np.stack([t[k] for t in ticks]) for k in ticks[0]}, "feel"))
     episodes = EpisodeSet(tmp_path / "set/episodes")
     first = read(episodes, [0, 1], config, embedder)

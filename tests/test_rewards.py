@@ -16,9 +16,9 @@ from PIL import Image
 from torch import Tensor
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.vocabulary import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT
-from touchgoal.encoders.touch_encoder import TouchEncoder, TouchEncoderConfig
-from touchgoal.encoders.vit import PRESETS
+from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT
+from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
+from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.rewards.curves import Contact, Curves, Scale, first_contact, reward, with_fused
@@ -40,7 +40,7 @@ from touchgoal.rewards.goals import (
     choose_goal,
     parse_goal,
 )
-from touchgoal.rewards.report import write_report
+from touchgoal.rewards.report.report import write_report
 
 N, CONTACT = 40, 20
 ALL: tuple[Modality, ...] = ("image", "tactile", "text")
@@ -391,5 +391,5 @@ def test_report_holds_the_curves(tmp_path: Path) -> None:
 
 
 def test_reports_need_no_torch() -> None:
-    code = "import sys, touchgoal.rewards.report; sys.exit('torch' in sys.modules)"
+    code = "import sys, touchgoal.rewards.report.report; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -13,10 +13,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from touchgoal.control import limits as robots
 from touchgoal.control.errors import UserError
-from touchgoal.control.limits import RobotLimits
-from touchgoal.control.safety import Limit, Mode, Reading, Safety, SafetyState
+from touchgoal.control.safety import limits as robots
+from touchgoal.control.safety.action_filter import Limit, Mode, Reading, Safety, SafetyState
+from touchgoal.control.safety.limits import RobotLimits
 
 HZ = 20
 TICKS = int(os.environ.get("TOUCHGOAL_SAFETY_TICKS", "400"))

@@ -5,7 +5,7 @@ import torch
 from toy_policies import rng
 
 from touchgoal.control.errors import UserError
-from touchgoal.policies.networks.samplers import (
+from touchgoal.policies.heads.samplers import (
     FLOW_STEPS,
     SamplerConfig,
     mend,
@@ -13,7 +13,7 @@ from touchgoal.policies.networks.samplers import (
     spoil,
     visited,
 )
-from touchgoal.policies.networks.unet import PRESETS, ShortConv1d, UNet
+from touchgoal.policies.heads.unet import PRESETS, ShortConv1d, UNet
 
 MEAN, DEVIATION = 0.4, 0.3  # of the Gaussian that the exact denoisers know
 

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from touchgoal.control import limits as robots
 from touchgoal.control.errors import UserError
-from touchgoal.control.kinematics import FR3, Fr3Kinematics, Kinematics, fingers_down
-from touchgoal.control.self_distance import (
+from touchgoal.control.motion.kinematics import FR3, Fr3Kinematics, Kinematics, fingers_down
+from touchgoal.control.motion.self_collision import (
     SelfDistance,
     require_apart,
     segment_distance,
 )
-from touchgoal.control.trajectories import joint_move
-from touchgoal.sim_envs.scene import build
+from touchgoal.control.motion.trajectories import joint_move
+from touchgoal.control.safety import limits as robots
+from touchgoal.sim_envs.scene.build import build
 
 
 def test_the_capsules_cover_the_arms_meshes() -> None:

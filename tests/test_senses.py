@@ -8,13 +8,13 @@ import pytest
 import torch
 from toy_policies import TOY, feeling, policy_for, rng, toy_ticks, toy_windows
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.policies.acting import SHIPPED, ActorMaker, Planner
-from touchgoal.policies.proprioception import unroll
-from touchgoal.policies.senses.learning import LearnConfig, judge_sight, learn_contact, learn_sight
-from touchgoal.policies.senses.placements import Placements
-from touchgoal.policies.senses.reading import (
+from touchgoal.policies.perception.placements import Placements
+from touchgoal.policies.perception.pose_estimator import SightConfig
+from touchgoal.policies.perception.proprioception import unroll
+from touchgoal.policies.perception.state_estimation import (
     READ,
     Senses,
     SensesConfig,
@@ -22,12 +22,17 @@ from touchgoal.policies.senses.reading import (
     load_senses,
     save_senses,
 )
-from touchgoal.policies.senses.sight import SightConfig
+from touchgoal.policies.perception.training import (
+    LearnConfig,
+    judge_sight,
+    learn_contact,
+    learn_sight,
+)
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.pick_place import WORKSPACE, PickPlace, PickPlaceConfig
 
 SMALL = SightConfig(
-    (16, 16), windows=((v.FRONT, (0, 16, 0, 16)),), channels=8, glances=4, detail=4, width=16
+    (16, 16), windows=((ft.FRONT, (0, 16, 0, 16)),), channels=8, glances=4, detail=4, width=16
 )
 
 
@@ -38,7 +43,7 @@ def toy_senses() -> Senses:
 
 
 def test_the_start_is_seen_from_the_hand() -> None:
-    columns = v.TCP_POSE, v.TRUTH_CONTACT, v.TRUTH_START
+    columns = ft.TCP_POSE, ft.TRUTH_CONTACT, ft.TRUTH_START
     yaw, hand = 0.4, 0.3
     pose = [0.5, 0.1, 0.2, 0.0, np.cos(hand / 2), np.sin(hand / 2), 0.0]  # fingers down
     start = [0.45, 0.15, 0.03, np.cos(2 * yaw), np.sin(2 * yaw), 0.6, -0.1]
@@ -70,7 +75,7 @@ def test_a_place_is_learnt() -> None:
     start = torch.zeros(256, 7)
     start[:, 3] = 1.0
     start[:, :2] = spots / 100
-    placements = Placements({v.FRONT: pictures}, torch.randn(256, 7, generator=rng()), start)
+    placements = Placements({ft.FRONT: pictures}, torch.randn(256, 7, generator=rng()), start)
     sight = SensesNetwork(SensesConfig("toy", 6, SMALL)).sight
     learn_sight(sight, placements, LearnConfig(steps=300, lr=1e-2))
     assert judge_sight(sight, placements)["object_mm"][0] < 15  # 60 by chance
@@ -85,11 +90,11 @@ def test_senses_survive_the_disk(tmp_path: Path) -> None:
 
 def test_a_policy_acts_on_its_senses() -> None:
     config = replace(
-        TOY, touch_dim=0, touch="", proprioception=(v.STATE, v.TCP_POSE, *READ), place_noise=0.0
+        TOY, touch_dim=0, touch="", proprioception=(ft.STATE, ft.TCP_POSE, *READ), place_noise=0.0
     )
     policy, ticks = policy_for(config, toy_windows(config)).eval(), toy_ticks(3)
     for tick in ticks:
-        tick[v.FRONT] = np.zeros((16, 16, 3), np.uint8)
+        tick[ft.FRONT] = np.zeros((16, 16, 3), np.uint8)
     with pytest.raises(UserError, match=r"truth\.contact"):
         Planner(policy, None)
     planner = Planner(policy, None, toy_senses())
@@ -101,15 +106,15 @@ def test_a_rearrangement_is_a_beginning() -> None:
     env = PickPlace(PickPlaceConfig(cameras=(), tactile=False))
     _, first = env.reset(seed=3, options={"object": "wooden_block"})
     observation, info = env.rearrange()
-    start, (low, high) = info[v.TRUTH_START], np.array(WORKSPACE).T
-    assert not np.allclose(start, first[v.TRUTH_START])
-    np.testing.assert_allclose(start[:3], info[v.TRUTH_OBJECT_POSE][:3], atol=1e-6)
+    start, (low, high) = info[ft.TRUTH_START], np.array(WORKSPACE).T
+    assert not np.allclose(start, first[ft.TRUTH_START])
+    np.testing.assert_allclose(start[:3], info[ft.TRUTH_OBJECT_POSE][:3], atol=1e-6)
     for place in (start[:2], start[5:]):
         assert (low - 0.01 < place).all() and (place < high + 0.01).all()
     np.testing.assert_allclose(
         start[3:5], [np.cos(2 * env.grasp_yaw()), np.sin(2 * env.grasp_yaw())], atol=1e-6
     )
-    assert np.linalg.norm(observation[v.TCP_POSE][:3] - [0.45, 0, 0.26]) < 0.06
+    assert np.linalg.norm(observation[ft.TCP_POSE][:3] - [0.45, 0, 0.26]) < 0.06
 
 
 @pytest.mark.parametrize("task", SHIPPED)

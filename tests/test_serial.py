@@ -12,7 +12,10 @@ import numpy as np
 import pytest
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.load_cell import (
+from touchgoal.control.grippers.modbus import crc
+from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
+from touchgoal.control.interfaces import DriverError
+from touchgoal.control.sensors.load_cell import (
     Checksum,
     LoadCellConfig,
     Sample,
@@ -20,9 +23,6 @@ from touchgoal.control.load_cell import (
     parse,
     seal,
 )
-from touchgoal.control.modbus import crc
-from touchgoal.control.protocols import DriverError
-from touchgoal.control.robotiq import Robotiq, RobotiqConfig
 
 
 @pytest.fixture

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from touchgoal.control.sensors import DIGIT, SensorModel
-from touchgoal.control.sensors import GELSIGHT_MINI as MINI
-from touchgoal.control.touch.photometry import shade
-from touchgoal.sim_envs.experts import PickPlaceExpert
-from touchgoal.sim_envs.objects import CATALOGUE, Body
+from touchgoal.control.tactile.sensor_calibration import shade
+from touchgoal.control.tactile.sensor_models import DIGIT, SensorModel
+from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI as MINI
+from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.scene.objects import CATALOGUE, Body
 from touchgoal.sim_envs.tactile import batched
 from touchgoal.sim_envs.tactile.geometry import (
     BOX,
@@ -25,8 +25,8 @@ from touchgoal.sim_envs.tactile.geometry import (
 )
 from touchgoal.sim_envs.tactile.optics import render
 from touchgoal.sim_envs.tactile.pad import TactileFrame
-from touchgoal.sim_envs.tactile.rig import PressRig
-from touchgoal.sim_envs.tactile.unit import NOMINAL, Spread, sample_unit
+from touchgoal.sim_envs.tactile.press_bench import PressRig
+from touchgoal.sim_envs.tactile.sensor_instance import NOMINAL, Spread, sample_unit
 
 UNIT = sample_unit(MINI, np.random.default_rng(0), NOMINAL)
 

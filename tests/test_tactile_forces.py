@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from touchgoal.control.sensors import GELSIGHT_MINI_MARKERS as MINI
-from touchgoal.sim_envs import scene
-from touchgoal.sim_envs.contact import ContactReader, PadContact
+from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS as MINI
+from touchgoal.sim_envs.scene import build as scene
+from touchgoal.sim_envs.scene.contacts import ContactReader, PadContact
 from touchgoal.sim_envs.tactile.forces import ForceField, force_field
 from touchgoal.sim_envs.tactile.geometry import NO_SURFACE, Grid
 from touchgoal.sim_envs.tactile.markers import (

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.control.keyboard import Keyboard
+from touchgoal.control.sensors.keyboard import Keyboard
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
-from touchgoal.sim_envs.teleoperator import Teleoperator, TeleoperatorConfig
+from touchgoal.sim_envs.experts.teleoperator import Teleoperator, TeleoperatorConfig
 
 STRAIGHT = "arc-2000009"  # nearly: it turns by 7 degrees
 UP, TICK = np.array([0.0, 0.0, 1.0]), 0.05
@@ -37,7 +37,7 @@ def moved(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """How far an action takes the hand (m), and its rotation before and after."""
     before, R = maze.kinematics.forward(maze.command)
-    action = hand.act({v.WRENCH: np.array(wrench, np.float32)})
+    action = hand.act({ft.WRENCH: np.array(wrench, np.float32)})
     assert action[-1] == 0  # the gripper stays closed
     after, turned = maze.kinematics.forward(maze.command + action[:-1])
     return after - before, R, turned
@@ -121,10 +121,10 @@ def test_a_person_leads_the_bead(tmp_path: Path) -> None:
     episode = found.read(0)
     assert len(found) == 1 and found.lengths == [61] and found.meta(0)["wire"] == STRAIGHT
     assert found.meta(0)["outcome"] == "failure"  # time was up
-    progress = episode.frames[v.TRUTH_PROGRESS][:, 0]
-    assert progress[-1] > 0.2 and not episode.frames[v.TRUTH_FAILURE].any()
-    assert np.abs(episode.frames[v.ACTION][20:-1, :7]).max() > 1e-3
-    assert episode.frames[v.TACTILE_LEFT].shape == (61, 240, 320, 3)
+    progress = episode.frames[ft.TRUTH_PROGRESS][:, 0]
+    assert progress[-1] > 0.2 and not episode.frames[ft.TRUTH_FAILURE].any()
+    assert np.abs(episode.frames[ft.ACTION][20:-1, :7]).max() > 1e-3
+    assert episode.frames[ft.TACTILE_LEFT].shape == (61, 240, 320, 3)
     assert json.loads((tmp_path / "metrics.json").read_text())["episodes"][0]["seed"] == 0
 
 

@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.sensors import DIGIT, GELSIGHT, GELSIGHT_MINI, SensorModel
-from touchgoal.control.sensors import GELSIGHT_MINI_MARKERS as DOTTED
-from touchgoal.control.touch.background import Background
-from touchgoal.control.touch.contact import ContactDetector
-from touchgoal.control.touch.depth import DepthEstimator
-from touchgoal.control.touch.force import estimate_force
-from touchgoal.control.touch.markers import MarkerTracker, find_markers, without_markers
-from touchgoal.sim_envs.objects import CATALOGUE, Body, ObjectKind
+from touchgoal.control.tactile.background import Background
+from touchgoal.control.tactile.contact import ContactDetector
+from touchgoal.control.tactile.depth import DepthEstimator
+from touchgoal.control.tactile.force import estimate_force
+from touchgoal.control.tactile.markers import MarkerTracker, find_markers, without_markers
+from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT, GELSIGHT_MINI, SensorModel
+from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS as DOTTED
+from touchgoal.sim_envs.scene.objects import CATALOGUE, Body, ObjectKind
 from touchgoal.sim_envs.tactile.markers import draw
 from touchgoal.sim_envs.tactile.optics import render, render_untouched
 from touchgoal.sim_envs.tactile.pad import TactileFrame
-from touchgoal.sim_envs.tactile.rig import PressRig
-from touchgoal.sim_envs.tactile.unit import NOMINAL, STEP, Unit, sample_unit
+from touchgoal.sim_envs.tactile.press_bench import PressRig
+from touchgoal.sim_envs.tactile.sensor_instance import NOMINAL, STEP, Unit, sample_unit
 
 HEIGHT, WIDTH = GELSIGHT_MINI.image_shape
 MINI = sample_unit(GELSIGHT_MINI, np.random.default_rng(0), NOMINAL)

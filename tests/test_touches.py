@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
@@ -17,12 +17,12 @@ def touch_episode(seed: int, truth: bool) -> Episode:
     bump = np.exp(-((x - 60) ** 2 + (y - 50) ** 2) / 200)[..., None] * [30, -20, 10]
     contact = np.arange(n)[:, None] >= [20, 25] if seed != 2 else np.zeros((n, 2), bool)
     frames: dict[str, np.ndarray] = {}
-    frames[v.WRIST] = np.tile(np.arange(n, dtype=np.uint8)[:, None, None, None] * 6, (16, 16, 3))
-    for side, key in enumerate(v.TACTILE):
+    frames[ft.WRIST] = np.tile(np.arange(n, dtype=np.uint8)[:, None, None, None] * 6, (16, 16, 3))
+    for side, key in enumerate(ft.TACTILE):
         gel = 100 + 20 * seed + 5 * side + rng.normal(0, 1, (n, 96, 128, 3))
         frames[key] = (gel + contact[:, side, None, None, None] * bump).astype(np.uint8)
     if truth:
-        frames[v.TRUTH_CONTACT] = contact
+        frames[ft.TRUTH_CONTACT] = contact
     descriptions = [f"feels like {seed}", "hard"]
     return Episode(frames, "touch", {"object": f"thing_{seed}", "descriptions": descriptions})
 

@@ -12,8 +12,8 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 
 from touchgoal.control.errors import UserError
-from touchgoal.encoders import efficientnet, towers
-from touchgoal.encoders.towers import (
+from touchgoal.encoders.towers import efficientnet, towers
+from touchgoal.encoders.towers.towers import (
     ClipTowers,
     OfflineTowers,
     clip_pixels,

@@ -4,9 +4,9 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from touchgoal.control.limits import FR3, UR5E, JointLimits
-from touchgoal.control.safety import Reading, Safety
-from touchgoal.control.tracker import Tracker
+from touchgoal.control.motion.tracker import Tracker
+from touchgoal.control.safety.action_filter import Reading, Safety
+from touchgoal.control.safety.limits import FR3, UR5E, JointLimits
 
 DT = 1e-3
 

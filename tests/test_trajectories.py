@@ -3,17 +3,22 @@
 import numpy as np
 import pytest
 
-from touchgoal.control import limits as robots
 from touchgoal.control.errors import UserError
-from touchgoal.control.kinematics import Fr3Kinematics, Kinematics, Ur5eKinematics, fingers_down
-from touchgoal.control.limits import JointLimits, RobotLimits
-from touchgoal.control.safety import Safety
-from touchgoal.control.trajectories import (
+from touchgoal.control.motion.kinematics import (
+    Fr3Kinematics,
+    Kinematics,
+    Ur5eKinematics,
+    fingers_down,
+)
+from touchgoal.control.motion.trajectories import (
     Trajectory,
     joint_move,
     require_inside,
     straight_line,
 )
+from touchgoal.control.safety import limits as robots
+from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.safety.limits import JointLimits, RobotLimits
 
 ROBOTS = [(robots.FR3, Fr3Kinematics()), (robots.UR5E, Ur5eKinematics())]
 

@@ -97,7 +97,7 @@ def picks(address: str, home: list[float], position: list[float], yaw: float) ->
     """Closes on air, then on the object, and lifts it; first our driver meets it on a way part in."""
     import franky
 
-    from touchgoal.control.franka_hand import FrankaHandClient
+    from touchgoal.control.grippers.franka_hand import FrankaHandClient
 
     robot, driver = connect(address), FrankaHandClient(address, 20.0)
     gripper = driver._hand  # a hand takes one client

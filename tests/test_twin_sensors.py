@@ -9,10 +9,10 @@ import serial
 from running_twin import RunningTwin
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.load_cell import LoadCellConfig, parse
+from touchgoal.control.sensors.load_cell import LoadCellConfig, parse
 from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
-from touchgoal.sim_envs.scene import SceneConfig
+from touchgoal.sim_envs.scene.build import SceneConfig
 from touchgoal.sim_envs.twin import faults
 from touchgoal.sim_envs.twin.cell import Cell
 

@@ -11,11 +11,17 @@ import numpy as np
 import pytest
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.gelsight import DIGIT_VIEW, GELSIGHT_MINI_VIEW, UNCHANGED, Fingertip, cut
-from touchgoal.control.protocols import DriverError, TactileSensor
-from touchgoal.control.sensors import DIGIT, GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
-from touchgoal.control.usb_cameras import find_sensor_camera, list_cameras
-from touchgoal.control.video import VideoCamera, VideoConfig
+from touchgoal.control.interfaces import DriverError, TactileSensor
+from touchgoal.control.sensors.tactile_camera import (
+    DIGIT_VIEW,
+    GELSIGHT_MINI_VIEW,
+    UNCHANGED,
+    Fingertip,
+    cut,
+)
+from touchgoal.control.sensors.usb_cameras import find_sensor_camera, list_cameras
+from touchgoal.control.sensors.video import VideoCamera, VideoConfig
+from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
 
 BITS = 12
 

@@ -3,15 +3,15 @@
 import numpy as np
 import torch
 
-from touchgoal.control import vocabulary as v
-from touchgoal.encoders.trunk import TouchTrunk, TouchTrunkConfig
-from touchgoal.encoders.vit import PRESETS as VITS
-from touchgoal.policies.networks.diffusion import DiffusionConfig
-from touchgoal.policies.networks.samplers import SamplerConfig
-from touchgoal.policies.networks.unet import PRESETS
+from touchgoal.control import features as ft
+from touchgoal.encoders.backbones.touch_backbone import TouchTrunk, TouchTrunkConfig
+from touchgoal.encoders.backbones.vit import PRESETS as VITS
+from touchgoal.policies.heads.diffusion import DiffusionConfig
+from touchgoal.policies.heads.samplers import SamplerConfig
+from touchgoal.policies.heads.unet import PRESETS
+from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.policy import WRENCH_DIM, Policy, PolicyConfig
-from touchgoal.policies.touch import TouchEmbedder
-from touchgoal.policies.training.windows import Recorded, Windows
+from touchgoal.policies.training.sequence_dataset import Recorded, Windows
 
 DIFFUSION = DiffusionConfig(PRESETS["tiny"], SamplerConfig(plan_steps=5))
 FLOW = DiffusionConfig(PRESETS["tiny"], SamplerConfig("flow", plan_steps=5))
@@ -53,9 +53,9 @@ def toy_ticks(n: int) -> list[dict[str, np.ndarray]]:
     generator = np.random.default_rng(1)
     return [
         {
-            v.STATE: generator.normal(size=15).astype(np.float32),
-            v.TCP_POSE: generator.normal(size=7).astype(np.float32),
-            **{k: generator.integers(0, 255, (6, 8, 3), np.uint8) for k in v.TACTILE},
+            ft.STATE: generator.normal(size=15).astype(np.float32),
+            ft.TCP_POSE: generator.normal(size=7).astype(np.float32),
+            **{k: generator.integers(0, 255, (6, 8, 3), np.uint8) for k in ft.TACTILE},
         }
         for _ in range(n)
     ]

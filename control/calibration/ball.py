@@ -5,8 +5,8 @@ import math
 import numpy as np
 from jaxtyping import Float, Float32
 
-from touchgoal.control.touch import gel
-from touchgoal.control.touch.photometry import Photometry
+from touchgoal.control.tactile import gel
+from touchgoal.control.tactile.sensor_calibration import Photometry
 
 Circle = Float[np.ndarray, " 3"]
 """Centre x (column), centre y (row) and radius of a contact, px; (0, 0) is the first pixel."""

@@ -17,7 +17,7 @@ from touchgoal.control.calibration.press_fit import (
     PressFit,
 )
 from touchgoal.control.calibration.press_set import PressSet
-from touchgoal.control.touch.photometry import N_FEATURES, Photometry, features, shade
+from touchgoal.control.tactile.sensor_calibration import N_FEATURES, Photometry, features, shade
 
 STEPS = 7
 """How often `fit` reports progress."""

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from touchgoal.control.touch.photometry import Photometry
+from touchgoal.control.tactile.sensor_calibration import Photometry
 
 CONTRAST = 4  # of the difference column
 _LIGHTS = {"R": (213, 94, 0), "G": (0, 158, 115), "B": (0, 114, 178)}  # Okabe and Ito

@@ -15,7 +15,13 @@ from jaxtyping import Float32, Float64, Int, UInt8
 
 from touchgoal.control.calibration.ball import Circle, press_surface
 from touchgoal.control.calibration.press_set import PressSet
-from touchgoal.control.touch.photometry import N_FEATURES, Photometry, columns, gain, weights
+from touchgoal.control.tactile.sensor_calibration import (
+    N_FEATURES,
+    Photometry,
+    columns,
+    gain,
+    weights,
+)
 
 REGION = 3.0
 """Radius of the region that is fitted and judged around a press, in labelled contact radii."""

@@ -9,19 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
+from touchgoal.control.cell.config import Rig
+from touchgoal.control.cell.connection import Station
+from touchgoal.control.checks import Finding
 from touchgoal.control.errors import UserError
-from touchgoal.control.finding import Finding
-from touchgoal.control.protocols import Camera, DriverError, TactileSensor
-from touchgoal.control.rig import Rig
-from touchgoal.control.safety import Safety
-from touchgoal.control.sensors import find_sensor
-from touchgoal.control.station import Station
-from touchgoal.control.touch.contact import contact_strength
-from touchgoal.control.touch.markers import find_markers, without_markers
-from touchgoal.control.touch.photometry import load
+from touchgoal.control.interfaces import Camera, DriverError, TactileSensor
+from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.tactile.contact import contact_strength
+from touchgoal.control.tactile.markers import find_markers, without_markers
+from touchgoal.control.tactile.sensor_calibration import load
+from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.store import EpisodeWriter
-from touchgoal.policies.deploy.deployed import learned
+from touchgoal.policies.deploy.actors import learned
 
 _LEAST_RATE = 0.8  # of what the rig says of a camera
 # Counts by which a fingertip may differ from its sensor file's. Simulated units differ by 1 to 2, a
@@ -44,7 +44,7 @@ def preflight(rig: Rig, station: Station, safety: Safety, episodes: Path) -> lis
     for key, camera in station.cameras.items():
         nominal = _nominal(rig, key)
         check = partial(_camera, camera, rates[key], nominal)
-        checks.append((key.removeprefix(v.IMAGE_PREFIX), check))
+        checks.append((key.removeprefix(ft.IMAGE_PREFIX), check))
     if station.load_cell:
         checks.append(("load cell", lambda: _load_cell(station)))
     checks += [
@@ -121,10 +121,10 @@ def _gripper(station: Station) -> str:
 
 
 def _nominal(rig: Rig, key: str) -> float:
-    if key in v.TACTILE:
+    if key in ft.TACTILE:
         assert rig.fingertips is not None
         return rig.fingertips.rate or find_sensor(rig.sensor).frame_rate
-    return rig.cameras[key.removeprefix(v.IMAGE_PREFIX)].rate
+    return rig.cameras[key.removeprefix(ft.IMAGE_PREFIX)].rate
 
 
 def _camera(camera: Camera, rate: float, nominal: float) -> str:
@@ -158,7 +158,7 @@ def _load_cell(station: Station) -> str:
 
 def _policy(rig: Rig) -> str:
     learned(rig)
-    return f"{rig.task.policy}, at {v.CONTROL_HZ} Hz"
+    return f"{rig.task.policy}, at {ft.CONTROL_HZ} Hz"
 
 
 def _disk(episodes: Path) -> str:
@@ -170,4 +170,4 @@ def _disk(episodes: Path) -> str:
 
 
 def _episodes(episodes: Path) -> str:
-    return f"{len(EpisodeWriter(episodes, fps=v.CONTROL_HZ))} recorded in {episodes}"
+    return f"{len(EpisodeWriter(episodes, fps=ft.CONTROL_HZ))} recorded in {episodes}"

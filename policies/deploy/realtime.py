@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.policies.acting import Observation
 
@@ -118,12 +118,12 @@ class RealTimeActor:
         k = self._tick - self._plan.tick
         if k < len(self._plan.actions):
             action = self._plan.actions[k]
-            self._width = float(action[v.N_JOINTS])
+            self._width = float(action[ft.N_JOINTS])
             self.overdue = 0.0
             return action
         self.starved += 1
         self.overdue += 1 / self._config.control_hz
-        return np.append(np.zeros(v.N_JOINTS), self._width).astype(np.float32)
+        return np.append(np.zeros(ft.N_JOINTS), self._width).astype(np.float32)
 
     def _settled(self) -> bool:
         return self._closed or self.failure is not None or not self._due()

@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control import vocabulary as v
-from touchgoal.control.kinematics import GELSIGHT_TCP, Kinematics, fingers_down
-from touchgoal.control.safety import Safety
-from touchgoal.control.trajectories import (
+from touchgoal.control import features as ft
+from touchgoal.control.motion.kinematics import GELSIGHT_TCP, Kinematics, fingers_down
+from touchgoal.control.motion.trajectories import (
     Trajectory,
     joint_move,
     require_inside,
     straight_line,
 )
+from touchgoal.control.safety.action_filter import Safety
 from touchgoal.sim_envs.base import Observation
 
 _SHARE = 0.9  # of what the safety layer lets a policy do: a plan should not be clamped
@@ -78,9 +78,9 @@ class Script:
 
     def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
         """The action for the next tick."""
-        self._wrench = observation[v.WRENCH]
-        self._measured = observation[v.STATE][: self._measured.size].astype(np.float64)
-        width = float(observation[v.STATE][-1])
+        self._wrench = observation[ft.WRENCH]
+        self._measured = observation[ft.STATE][: self._measured.size].astype(np.float64)
+        width = float(observation[ft.STATE][-1])
         self._still, self._width = abs(width - self._width) < _MOVING, width
         return next(self._actions)
 

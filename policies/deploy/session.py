@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
+from touchgoal.control.cell.config import Rig
+from touchgoal.control.cell.connection import Station
 from touchgoal.control.errors import UserError
-from touchgoal.control.rig import Rig
-from touchgoal.control.safety import Safety
-from touchgoal.control.station import Station
+from touchgoal.control.safety.action_filter import Safety
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeWriter
-from touchgoal.policies.deploy.deployment import DeployedActor, Deployment, Ending, Ticks, View
+from touchgoal.policies.deploy.control_loop import DeployedActor, Deployment, Ending, Ticks, View
 from touchgoal.policies.deploy.scripted import start_move
 from touchgoal.sim_envs.base import Observation
 
@@ -65,7 +65,7 @@ class Session:
     show: Callable[[View], None]
     truth: Callable[[], dict[str, Any]] | None
     cost: Callable[[Observation], float] | None = None
-    camera_size: tuple[int, int] = v.CAMERA_SHAPE[:2]
+    camera_size: tuple[int, int] = ft.CAMERA_SHAPE[:2]
 
     def run(self) -> Result:
         """Start move, task, recording; the arm is at rest or holds its last command at the end.
@@ -146,4 +146,4 @@ class Session:
         }
         task = rig.task.instruction or rig.task.name
         episode = Episode(frames=ticks.frames(), task=task, meta=meta)
-        return EpisodeWriter(self.episodes, fps=v.CONTROL_HZ).append(episode)
+        return EpisodeWriter(self.episodes, fps=ft.CONTROL_HZ).append(episode)

@@ -10,11 +10,11 @@ import torch
 from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
-from touchgoal.encoders import resumable
+from touchgoal.encoders.training import checkpoint as resumable
 from touchgoal.policies import checkpoint
-from touchgoal.policies.networks import ema
 from touchgoal.policies.policy import Condition, Policy, PolicyConfig
-from touchgoal.policies.training.windows import Windows
+from touchgoal.policies.training import ema
+from touchgoal.policies.training.sequence_dataset import Windows
 
 POLICY, SNAPSHOTS = "policy", "snapshots"
 

@@ -11,9 +11,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from touchgoal.control.touch.gel import CONTACT_SHARE, NEARBY_CELLS, SHADOW_CELLS, cells
-from touchgoal.control.touch.photometry import Photometry
-from touchgoal.sim_envs.tactile.unit import STEP, Unit
+from touchgoal.control.tactile.gel import CONTACT_SHARE, NEARBY_CELLS, SHADOW_CELLS, cells
+from touchgoal.control.tactile.sensor_calibration import Photometry
+from touchgoal.sim_envs.tactile.sensor_instance import STEP, Unit
 
 Fields = Float[Tensor, "b h w"]
 

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numba import njit
 
-from touchgoal.control.sensors import SensorModel
-from touchgoal.sim_envs.contact import PadContact
+from touchgoal.control.tactile.sensor_models import SensorModel
+from touchgoal.sim_envs.scene.contacts import PadContact
 from touchgoal.sim_envs.tactile.press import Press, solve3
 
 INCIPIENT = 0.25  # share of the normal force whose cells slip

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from numba import njit
 
-from touchgoal.control.sensors import MarkerGrid, SensorModel
+from touchgoal.control.tactile.sensor_models import MarkerGrid, SensorModel
 from touchgoal.sim_envs.tactile.forces import ForceField
 from touchgoal.sim_envs.tactile.geometry import Grid
 

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numba import njit
 
-from touchgoal.control.touch.photometry import shadows
-from touchgoal.sim_envs.tactile.unit import NOISE_MARGIN, STEP, Unit
+from touchgoal.control.tactile.sensor_calibration import shadows
+from touchgoal.sim_envs.tactile.sensor_instance import NOISE_MARGIN, STEP, Unit
 
 HeightField = Float32[np.ndarray, "h w"]
 

@@ -8,11 +8,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
-from touchgoal.control.sensors import SensorModel
-from touchgoal.control.touch.gel import deform
-from touchgoal.sim_envs.contact import PadContact
-from touchgoal.sim_envs.objects import Body, Material
-from touchgoal.sim_envs.scene import OBJECT_GROUP
+from touchgoal.control.tactile.gel import deform
+from touchgoal.control.tactile.sensor_models import SensorModel
+from touchgoal.sim_envs.scene.build import OBJECT_GROUP
+from touchgoal.sim_envs.scene.contacts import PadContact
+from touchgoal.sim_envs.scene.objects import Body, Material
 from touchgoal.sim_envs.tactile.forces import ForceField, force_field
 from touchgoal.sim_envs.tactile.geometry import (
     BOX,
@@ -28,8 +28,8 @@ from touchgoal.sim_envs.tactile.geometry import (
 from touchgoal.sim_envs.tactile.markers import GelMotion, draw
 from touchgoal.sim_envs.tactile.optics import render, render_untouched
 from touchgoal.sim_envs.tactile.press import Press, settle
+from touchgoal.sim_envs.tactile.sensor_instance import Unit
 from touchgoal.sim_envs.tactile.texture import add_texture
-from touchgoal.sim_envs.tactile.unit import Unit
 
 _PRIMITIVES = {
     int(mujoco.mjtGeom.mjGEOM_BOX): BOX,

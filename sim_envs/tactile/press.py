@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float32
 from numba import njit
 
-from touchgoal.control.sensors import SensorModel
-from touchgoal.sim_envs.contact import PadContact
+from touchgoal.control.tactile.sensor_models import SensorModel
+from touchgoal.sim_envs.scene.contacts import PadContact
 from touchgoal.sim_envs.tactile.geometry import NO_SURFACE, HeightField
 
 MAX_TILT = math.radians(3.0)

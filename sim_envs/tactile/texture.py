@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numba import njit
 
-from touchgoal.sim_envs.objects import Material
+from touchgoal.sim_envs.scene.objects import Material
 
 # Wave vectors of the rough pattern, cycles per wavelength: directions from all around, lengths that
 # share no period.

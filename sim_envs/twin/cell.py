@@ -7,9 +7,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.braking import braked
+from touchgoal.control.safety.braking import braked
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH, GRIPPER_SPEED, FrankaTactileEnv
-from touchgoal.sim_envs.scene import GRIPPER_MAX_FORCE, SERVO_DAMPING
+from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE, SERVO_DAMPING
 
 DT = 1e-3  # s, of the Franka control interface and of the physics
 AT_REST = 0.01  # rad/s

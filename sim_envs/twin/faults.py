@@ -27,9 +27,9 @@ import numpy as np
 
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.twin.cell import DT, Cell
-from touchgoal.sim_envs.twin.doors import Door
 from touchgoal.sim_envs.twin.mjpeg import Stream
-from touchgoal.sim_envs.twin.serial_ports import SerialPort
+from touchgoal.sim_envs.twin.serial.devices import SerialPort
+from touchgoal.sim_envs.twin.tcp_ports import Door
 
 
 @runtime_checkable

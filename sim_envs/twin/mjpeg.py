@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.control import vocabulary as v
+from touchgoal.control import features as ft
 from touchgoal.sim_envs.twin.cell import Cell
 
 _CAMERA_RATE = 30  # Hz, a webcam's
@@ -73,9 +73,9 @@ class Streams:
             for camera in env.config.cameras
         }
         if env.config.tactile:
-            for side, key in enumerate(v.TACTILE):
+            for side, key in enumerate(ft.TACTILE):
                 take = partial(self._feel, side)
-                name = key.removeprefix(v.IMAGE_PREFIX)
+                name = key.removeprefix(ft.IMAGE_PREFIX)
                 self.streams[name] = Stream(round(env.sensor.frame_rate), take)
         handler = type("Handler", (_Handler,), {"streams": self.streams})
         self._server = ThreadingHTTPServer((host, port), handler)
@@ -86,7 +86,7 @@ class Streams:
         """Address of each stream, by its key in the vocabulary."""
         port = self._server.server_address[1]
         return {
-            v.IMAGE_PREFIX + name: f"http://{self._host}:{port}/{name}" for name in self.streams
+            ft.IMAGE_PREFIX + name: f"http://{self._host}:{port}/{name}" for name in self.streams
         }
 
     def receive(self) -> None:

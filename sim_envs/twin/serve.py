@@ -9,15 +9,15 @@ from typing import Any, Literal, Protocol, runtime_checkable
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
-from touchgoal.sim_envs.tactile.rig import warm_up
+from touchgoal.sim_envs.tactile.press_bench import warm_up
 from touchgoal.sim_envs.tasks import TaskConfig, make_env
-from touchgoal.sim_envs.twin import serial_ports
 from touchgoal.sim_envs.twin.cell import DT, Cell
 from touchgoal.sim_envs.twin.faults import Faults
-from touchgoal.sim_envs.twin.franka import FrankaArm
-from touchgoal.sim_envs.twin.franka_hand import FrankaHand
+from touchgoal.sim_envs.twin.franka.controller import FrankaArm
+from touchgoal.sim_envs.twin.franka.hand import FrankaHand
 from touchgoal.sim_envs.twin.mjpeg import Streams
-from touchgoal.sim_envs.twin.rtde import UrController
+from touchgoal.sim_envs.twin.serial import devices as serial_ports
+from touchgoal.sim_envs.twin.ur.controller import UrController
 
 _BACKLOG = 0.1  # s behind real time beyond which the twin stops trying to catch up
 # s to wait for a client that drives the arm. In lock-step for as long as a loaded machine needs; in

@@ -1,0 +1,196 @@
+"""A driver in a process of its own: it may hang, crash or lose its parent, and is ended in time.
+
+Vendors' client libraries hang on a taken robot, ignore Ctrl-C and crash when a link drops. Here they
+run in a fresh interpreter that imports nothing else. Three things end it: a call that is not answered
+in time, a dead parent (the pipe closes), and the kernel's alarm when the library hangs meanwhile; a
+controller stops its arm when its client is gone.
+"""
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection, Pipe
+from typing import Any, Protocol, runtime_checkable
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.interfaces import DriverError
+
+_GRACE = 1.0  # s that the kernel's alarm gives beyond the parent's patience
+_CLOSING = 3.0  # s to bring an arm to rest and disconnect
+_GAVE_UP = 3  # exit code; the reason is the last line of output
+
+
+@runtime_checkable
+class ChildDriver(Protocol):
+    """What runs in the child: `tick` every `period` s, any other method when the parent calls it."""
+
+    period: float
+
+    def tick(self) -> None:
+        """Keep the device going; an exception ends the process at once, without `close`."""
+        ...
+
+    def close(self) -> None:
+        """Bring the device to rest and disconnect."""
+        ...
+
+
+class Child:
+    """Parent's end: makes `driver(*args)` in a child process and calls its methods.
+
+    `driver` is a class at the top of an importable module; arguments and answers are pickled. Calls
+    may come from several threads, not from a signal handler.
+
+    Attributes:
+        end: why there is no process any more; empty while there is.
+
+    Raises:
+        UserError, DriverError: what the driver raised, or it did not connect in time.
+    """
+
+    def __init__(
+        self, driver: Callable[..., ChildDriver], *args: Any, connect_timeout: float = 30.0
+    ) -> None:
+        self._name, self._lock = driver.__qualname__, threading.Lock()
+        self.end = ""
+        self._output = tempfile.TemporaryFile()
+        self._pipe, theirs = Pipe()
+        # Its own session: Ctrl-C is for the parent, which then stops the arm in good order.
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "touchgoal.control.arms.driver_process", str(theirs.fileno())],
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+            stdout=self._output,
+            stderr=self._output,
+            start_new_session=True,
+        )
+        theirs.close()
+        self._exchange((driver, args, connect_timeout), connect_timeout, "connect")
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process.poll() is None
+
+    def call(self, method: str, *args: Any, timeout: float = 1.5) -> Any:
+        """The method's result; DriverError if it fails, or takes too long and is killed."""
+        return self._exchange((method, args, timeout), timeout, method)
+
+    def close(self) -> None:
+        """Let the driver bring its device to rest, then end it, by force if need be."""
+        if self.alive:
+            self._pipe.close()
+            try:
+                self._process.wait(_CLOSING + _GRACE)
+            except subprocess.TimeoutExpired:
+                self._kill()
+        self.end = self.end or f"{self._name} is closed"
+        self._pipe.close()
+        self._output.close()
+
+    def _exchange(self, request: Any, timeout: float, what: str) -> Any:
+        with self._lock:
+            try:
+                self._pipe.send(request)
+                if not self._pipe.poll(timeout):
+                    self._kill()
+                    self.end = (
+                        f"{self._name} did not {what} within {timeout:g} s and was ended: check "
+                        "power, cable and address, and that no other program holds the device"
+                    )
+                    raise DriverError(self.end)
+                failure, result = self._pipe.recv()
+            except (EOFError, OSError) as error:
+                self.end = self.end or self._obituary()
+                raise DriverError(self.end) from error
+        if failure is not None:
+            raise failure
+        return result
+
+    def _kill(self) -> int:
+        self._process.kill()
+        return self._process.wait()
+
+    def _obituary(self) -> str:
+        try:
+            code = self._process.wait(_GRACE)
+        except subprocess.TimeoutExpired:
+            code = self._kill()
+        self._output.seek(0)
+        lines = self._output.read().decode(errors="replace").split("\n")
+        last = next((line.strip()[:200] for line in reversed(lines) if line.strip()), "")
+        if code == _GAVE_UP:
+            return last
+        how = signal.Signals(-code).name if code < 0 else f"code {code}"
+        return f"{self._name} ended by itself ({how}): {last or 'it said nothing'}"
+
+
+def _as_sent(error: Exception) -> Exception:
+    """An exception that the parent can unpickle without the client's library."""
+    if isinstance(error, UserError | DriverError):
+        return error
+    return DriverError(one_line(error))
+
+
+def one_line(error: Exception) -> str:
+    """What a library says, for a person; the project's own errors are for a person already."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, UserError | DriverError) else f"{type(error).__name__}: {text}"
+
+
+def _alarm(seconds: float) -> None:
+    """From now on the kernel ends this process unless it calls again within `seconds`."""
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+
+
+def _answer(driver: ChildDriver, pipe: Connection) -> None:
+    method, args, timeout = pipe.recv()
+    _alarm(timeout + _GRACE)
+    try:
+        reply = None, getattr(driver, method)(*args)
+    except Exception as error:
+        reply = _as_sent(error), None
+    pipe.send(reply)
+
+
+def _serve(driver: ChildDriver, pipe: Connection) -> None:
+    """Ticks and answers until the parent closes the pipe or dies."""
+    due = time.monotonic()
+    while True:
+        _alarm(driver.period + _CLOSING)
+        if pipe.poll(max(due - time.monotonic(), 0)):
+            _answer(driver, pipe)
+        now = time.monotonic()
+        if now >= due:
+            driver.tick()
+            due = max(due + driver.period, now)
+
+
+def _main(pipe: Connection) -> None:
+    make, args, timeout = pickle.loads(pipe.recv_bytes())
+    _alarm(timeout + _GRACE)
+    try:
+        driver = make(*args)
+    except Exception as error:
+        pipe.send((_as_sent(error), None))
+        return
+    pipe.send((None, None))
+    try:
+        _serve(driver, pipe)
+    except (EOFError, BrokenPipeError, ConnectionResetError):  # the parent closed, or is gone
+        _alarm(_CLOSING)
+        driver.close()
+    except Exception as error:
+        print(one_line(error), file=sys.stderr, flush=True)
+        os._exit(_GAVE_UP)
+
+
+if __name__ == "__main__":
+    _main(Connection(int(sys.argv[1])))
+    os._exit(0)  # a client library's threads must not hold the process back

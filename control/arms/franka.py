@@ -1,0 +1,126 @@
+"""Franka FR3 through franky-control, in a child process.
+
+Commands stream as joint velocities that each last 100 ms: if the child dies or stalls, the arm comes
+to rest by itself. franky's own 1 kHz loop shapes them. A pull towards the commanded position keeps
+the sum of the velocities from drifting.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from touchgoal.control.arms.streaming import ArmClient, ArmConfig, ArmProcess, moved_wrench
+from touchgoal.control.interfaces import ArmReading, DriverError, Joints
+from touchgoal.control.motion.kinematics import Kinematics
+from touchgoal.control.safety.limits import JointLimits
+
+if TYPE_CHECKING:
+    import franky
+
+RATE = 200.0  # Hz of velocity commands
+SILENCE = 0.5  # s; libfranka itself gives up after 1 s
+_LASTS_MS = 100  # of each
+_PULL = 10.0  # 1/s towards the commanded position
+_SHARE = 0.9  # of franky's limits that the stream uses; the rest is for the pull
+_TORQUE_REFLEX, _FORCE_REFLEX = 20.0, 30.0  # Nm and N; franky's defaults, beyond RobotLimits.force
+
+
+class FrankaClient(ArmClient):
+    """In the child: one FR3."""
+
+    def _connect(self, recover: bool) -> JointLimits:
+        import franky
+
+        self._franky, self._aborted = franky, ""
+        self._kinematics = Kinematics(self.config.robot.arm, self.config.tcp_offset)
+        # No real-time kernel is asked for: firmware 5.9 and later does without.
+        self._robot: franky.Robot | None = franky.Robot(
+            self.config.address,
+            default_torque_threshold=_TORQUE_REFLEX,
+            default_force_threshold=_FORCE_REFLEX,
+            realtime_config=franky.RealtimeConfig.Ignore,
+        )
+        if recover and self._robot.state.robot_mode == franky.RobotMode.Reflex:
+            self._robot.recover_from_errors()
+        return self._limits(self._robot)
+
+    def _limits(self, robot: "franky.Robot") -> JointLimits:
+        """Sets franky's limits and returns the stream's.
+
+        franky's defaults are the Panda's, in part above the FR3's, and cannot be raised where they
+        are below; 1 and 2 % are for the controller's differences of rounded positions.
+        """
+        hardware, interface = self.config.robot.hardware, self.config.robot.interface
+        wanted = (
+            (robot.joint_velocity_limit, hardware.velocity),
+            (robot.joint_acceleration_limit, 0.99 * hardware.acceleration),
+            (robot.joint_jerk_limit, 0.98 * hardware.jerk),
+        )
+        for limit, value in wanted:
+            limit.set(np.minimum(value, limit.max))
+        self._ceiling = robot.joint_velocity_limit.get()
+        used = (_SHARE * limit.get() for limit, _ in wanted)
+        return JointLimits(interface.lower, interface.upper, *used, taper=interface.taper)
+
+    def _measure(self) -> ArmReading:
+        robot = self._require()
+        try:
+            robot.poll_motion()  # raises what ended a motion
+        except self._franky.ControlException as error:
+            self._aborted = " ".join(str(error).split())
+        state = robot.state
+        self._commanded = state.q_d
+        contact = (state.O_T_EE * state.EE_T_K).translation
+        tcp, _ = self._kinematics.forward(state.q)
+        return ArmReading(
+            q=state.q,
+            velocity=state.dq,
+            wrench=moved_wrench(state.O_F_ext_hat_K, contact, tcp),
+            torque=state.tau_ext_hat_filtered,
+            fault=self._fault(state),
+            stamp=self._stamped(state.time.to_sec()),
+            time=state.time.to_sec(),
+        )
+
+    def _fault(self, state: "franky.RobotState") -> str:
+        mode = self._franky.RobotMode
+        if state.robot_mode == mode.Reflex:
+            return f"reflex ({_errors(state)}): clear the cause, then recover the arm"
+        if state.robot_mode == mode.UserStopped:
+            return "user stop: release the activation device, then recover the arm"
+        if state.robot_mode not in (mode.Idle, mode.Move):
+            return f"the arm is in mode {state.robot_mode.name}: set it to execution in Desk"
+        return f"{self._aborted}; recover the arm" if self._aborted else ""
+
+    def _send(self, q: Joints, velocity: Joints) -> None:
+        wanted = velocity + _PULL * (q - self._commanded)
+        motion = self._franky.JointVelocityMotion(
+            np.clip(wanted, -self._ceiling, self._ceiling), self._franky.Duration(_LASTS_MS)
+        )
+        try:
+            self._require().move(motion, asynchronous=True)
+        except self._franky.ControlException as error:
+            self._aborted = " ".join(str(error).split())  # the next measurement says why
+
+    def _halt(self) -> None:
+        robot = self._require()
+        if robot.is_in_control:
+            robot.move(self._franky.JointVelocityStopMotion(), asynchronous=True)
+
+    def _disconnect(self) -> None:
+        self._robot = None
+
+    def _require(self) -> "franky.Robot":
+        if self._robot is None:
+            raise DriverError("the arm is not connected")
+        return self._robot
+
+
+def _errors(state: "franky.RobotState") -> str:
+    errors = state.current_errors
+    return ", ".join(n for n in dir(errors) if getattr(errors, n) is True) or "unnamed"
+
+
+def franka(config: ArmConfig) -> ArmProcess:
+    """Connects to an FR3 with FCI switched on in Desk."""
+    return ArmProcess(FrankaClient, config)

@@ -1,0 +1,212 @@
+"""What the Franka's and the UR's drivers share: targets become a stream, faults latch.
+
+The policy's targets (10 to 20 Hz) go through the tracker, so whatever comes when, the stream stays
+inside the interface's limits and ends at rest at the last target.
+"""
+
+import time
+from abc import ABC, abstractmethod
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.control.arms.driver_process import Child
+from touchgoal.control.errors import UserError
+from touchgoal.control.interfaces import ArmReading, DriverError, Joints
+from touchgoal.control.motion.tracker import Tracker, TrackerState
+from touchgoal.control.safety.limits import JointLimits, RobotLimits
+
+_LATE = 4  # periods that a late tick makes up for at once
+_BRAKING = 1.5  # s for coming to rest on closing
+_REST, _LOOK = 0.01, 0.05  # rad/s over so many s that count as rest
+
+
+@dataclass(frozen=True)
+class ArmConfig:
+    """Where an arm is and how it is driven.
+
+    Attributes:
+        address: of the controller.
+        robot: its limits and geometry.
+        tcp_offset: m along the hand's z axis from the flange to the tool centre point.
+        hz: of the commands that come.
+        rate: Hz of the stream that goes out.
+        silence: s without news of the controller after which it is lost. Each driver has its own;
+            a simulator on a loaded machine needs more.
+    """
+
+    address: str
+    robot: RobotLimits
+    tcp_offset: float
+    hz: float
+    rate: float
+    silence: float
+
+
+class ArmClient(ABC):
+    """In the child: a vendor's client behind five methods. `config.rate` times a second it ticks.
+
+    When the link is lost, by the controller's silence too, the process ends: no library mends its
+    link while nobody looks, and a controller stops the arm of a dead client.
+    """
+
+    _commanded: Joints  # the controller's own present command, rad; `_measure` sets it
+
+    def __init__(self, config: ArmConfig, recover: bool) -> None:
+        self.config, self.period = config, 1 / config.rate
+        self._state: TrackerState | None = None
+        self._tracker = Tracker(self._connect(recover), 1 / config.hz, self.period)
+        self._clock, self._stamp = -1.0, time.monotonic()
+        self._reading = self._measure()
+        self._refusal = self._reading.fault
+        self._ticked, self._streamed = time.monotonic(), 0.0
+
+    @abstractmethod
+    def _connect(self, recover: bool) -> JointLimits:
+        """Take the arm, clearing its errors if a person asked for that; what the stream may use."""
+
+    @abstractmethod
+    def _measure(self) -> ArmReading:
+        """The newest state, stamped by `_stamped`. It and `_send` raise when the link is lost."""
+
+    @abstractmethod
+    def _send(self, q: Joints, velocity: Joints) -> None:
+        """Stream one command: joint positions (rad) and their velocity (rad/s)."""
+
+    @abstractmethod
+    def _halt(self) -> None:
+        """Brake as the controller does it; an exception changes nothing."""
+
+    @abstractmethod
+    def _disconnect(self) -> None:
+        """Let go of the arm; an exception changes nothing."""
+
+    def read(self) -> ArmReading:
+        """The state as of the last tick."""
+        return replace(self._reading, fault=self._refusal)
+
+    def command(self, q: Joints) -> None:
+        """A new target (rad)."""
+        if self._refusal:
+            raise DriverError(f"no command is taken: {self._refusal}")
+        limits = self.config.robot.interface
+        if not (np.isfinite(q).all() and (q >= limits.lower).all() and (q <= limits.upper).all()):
+            raise UserError(f"the target {np.round(q, 3).tolist()} rad is beyond a joint's range")
+        if self._state is None:
+            self._state = self._tracker.start(self._commanded)
+            self._streamed = self._reading.time
+        self._state = self._tracker.aim(self._state, q)
+
+    def stop(self) -> None:
+        """Brake, and take no command until `recover`."""
+        self._latch("stopped on request; recover the arm to go on")
+
+    def tick(self) -> None:
+        """Read the state and stream the next command.
+
+        The stream goes by the controller's clock: a simulator may be slower than the one on the wall.
+        """
+        now = time.monotonic()
+        punctual = now - self._ticked < self.config.silence / 2
+        self._ticked = now
+        self._reading = self._measure()
+        if punctual and now - self._reading.stamp > self.config.silence:
+            raise DriverError(
+                f"no state for {1e3 * self.config.silence:.0f} ms: check power and cable, then recover"
+            )
+        if self._reading.fault:
+            self._latch(self._reading.fault)
+        if self._state is None:
+            return
+        time_, before = self._reading.time, self._state.q
+        periods = min(round((time_ - self._streamed) / self.period), _LATE)
+        if periods < 1:
+            return
+        self._streamed = max(self._streamed + periods * self.period, time_ - self.period)
+        for _ in range(periods):
+            self._state = self._tracker.step(self._state)
+        self._send(self._state.q, (self._state.q - before) / (periods * self.period))
+
+    def close(self) -> None:
+        """Bring the arm to rest and let go of it."""
+        self._latch("closed")
+        end = time.monotonic() + _BRAKING
+        with suppress(Exception):
+            while time.monotonic() < end:
+                before = self._reading.q
+                time.sleep(_LOOK)
+                self.tick()
+                if np.abs(self._reading.q - before).max() < _REST * _LOOK:
+                    break
+        self._let_go()
+
+    def _latch(self, reason: str) -> None:
+        """Brake; the first reason stays."""
+        self._state = None
+        if not self._refusal:
+            self._refusal = reason
+            with suppress(Exception):
+                self._halt()
+
+    def _let_go(self) -> None:
+        with suppress(Exception):
+            self._disconnect()
+
+    def _stamped(self, clock: float) -> float:
+        """The stamp of a measurement with the controller's time: now if it advanced, else as before."""
+        if clock != self._clock:
+            self._clock, self._stamp = clock, time.monotonic()
+        return self._stamp
+
+
+class ArmProcess:
+    """The Arm protocol over an ArmClient in a child process."""
+
+    def __init__(
+        self, client: type[ArmClient], config: ArmConfig, connect_timeout: float = 30.0
+    ) -> None:
+        self._make = lambda recover: Child(client, config, recover, connect_timeout=connect_timeout)
+        self._child = self._make(False)
+        self._last: ArmReading = self._child.call("read")
+
+    def read(self) -> ArmReading:
+        """See Arm. Of a lost arm it is the last reading, with the reason as its fault."""
+        try:
+            self._last = self._child.call("read")
+        except DriverError as error:
+            self._last = replace(self._last, fault=str(error))
+        return self._last
+
+    def command(self, q: Joints) -> None:
+        """See Arm."""
+        self._child.call("command", q)
+
+    def stop(self) -> None:
+        """See Arm. There is nothing to do for a lost arm: its controller stops it."""
+        if self._child.alive:
+            with suppress(DriverError):
+                self._child.call("stop")
+
+    def recover(self) -> None:
+        """See Arm."""
+        self._child.close()
+        try:
+            self._child = self._make(True)
+        except DriverError as error:
+            self._child.end = f"not recovered: {error}"
+            raise
+        if fault := self.read().fault:
+            raise DriverError(f"not recovered: {fault}")
+
+    def close(self) -> None:
+        """See Arm."""
+        self._child.close()
+
+
+def moved_wrench(
+    wrench: Float[np.ndarray, "6"], origin: Float[np.ndarray, "3"], point: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "6"]:
+    """A wrench (N, Nm) about `origin` as seen about `point` (m), all in one frame."""
+    return np.concatenate([wrench[:3], wrench[3:] + np.cross(origin - point, wrench[:3])])

@@ -1,0 +1,113 @@
+"""Universal Robots e-Series (UR5e) through ur-rtde, in a child process.
+
+ur-rtde says that a command succeeded when the link is long dead, and later connects again by itself
+and crashes (measured). So the controller's clock is watched here, 50 ms of standstill end the
+process, and only a person's `recover` starts a new one. The controller's own watchdog stops the
+arm if this process dies.
+"""
+
+import time
+
+import numpy as np
+
+from touchgoal.control.arms.streaming import ArmClient, ArmConfig, ArmProcess, moved_wrench
+from touchgoal.control.interfaces import ArmReading, DriverError, Joints
+from touchgoal.control.motion.kinematics import Kinematics
+from touchgoal.control.safety.limits import JointLimits
+
+RATE = 125.0  # Hz of servoJ; 20 to 500
+SILENCE = 0.05  # s
+_GAIN = 300.0  # of servoJ, 100 to 2000; URScript's default
+_LOOKAHEAD = 0.03, 0.2  # s, servoJ's range; the arm lags by about this much
+_BRAKING = 10.0  # rad/s^2 of servoStop; ur-rtde's default
+_UNLOCKING = 2.0  # s that clearing a protective stop may take
+_WATCHDOG = 10.0  # Hz; with fewer commands the controller stops its program, and so the arm
+
+
+class UrClient(ArmClient):
+    """In the child: one UR."""
+
+    def _connect(self, recover: bool) -> JointLimits:
+        from rtde_control import RTDEControlInterface
+        from rtde_receive import RTDEReceiveInterface
+
+        self._kinematics = Kinematics(self.config.robot.arm, self.config.tcp_offset)
+        self._refused = False
+        self._receive = RTDEReceiveInterface(self.config.address)
+        if recover and self._receive.isProtectiveStopped():
+            self._unlock()
+        if self._stopped():
+            raise DriverError(self._stopped())
+        self._control = RTDEControlInterface(self.config.address)
+        self._control.setWatchdog(_WATCHDOG)
+        self._lookahead = float(np.clip(2 * self.period, *_LOOKAHEAD))
+        return self.config.robot.interface
+
+    def _unlock(self) -> None:
+        """As a person does it at the pendant; the controller refuses for the first 5 s."""
+        from dashboard_client import DashboardClient
+
+        dashboard = DashboardClient(self.config.address)
+        dashboard.connect(int(1e3 * _UNLOCKING))
+        dashboard.closeSafetyPopup()
+        dashboard.unlockProtectiveStop()
+        end = time.monotonic() + _UNLOCKING
+        while self._receive.isProtectiveStopped() and time.monotonic() < end:
+            time.sleep(0.05)
+        dashboard.disconnect()
+
+    def _measure(self) -> ArmReading:
+        receive = self._receive
+        if not (receive.isConnected() and self._control.isConnected()):
+            raise DriverError("the controller closed the connection")
+        clock, q = receive.getTimestamp(), np.array(receive.getActualQ())
+        self._commanded = np.array(receive.getTargetQ())
+        tcp, _ = self._kinematics.forward(q)
+        # About the controller's own TCP, in its base frame, the tool's weight taken off.
+        wrench = np.array(receive.getActualTCPForce())
+        wrench = moved_wrench(wrench, np.array(receive.getActualTCPPose()[:3]), tcp)
+        reading = ArmReading(
+            q=q,
+            velocity=np.array(receive.getActualQd()),
+            wrench=wrench,
+            torque=self._kinematics.jacobian(q).T @ wrench,  # the arm does not measure it
+            fault=self._fault(),
+            stamp=self._stamped(clock),
+            time=clock,
+        )
+        if self._state is None and not reading.fault:
+            self._control.kickWatchdog()
+        return reading
+
+    def _stopped(self) -> str:
+        if self._receive.isEmergencyStopped():
+            return "emergency stop: release it and restart the arm at the pendant, then recover"
+        if self._receive.isProtectiveStopped():
+            return (
+                "protective stop: clear the cause, wait 5 s, then recover or unlock at the pendant"
+            )
+        return ""
+
+    def _fault(self) -> str:
+        if self._stopped():
+            return self._stopped()
+        if self._refused or not self._control.isProgramRunning():
+            return "the control program ended: look at the pendant's log, then recover the arm"
+        return ""
+
+    def _send(self, q: Joints, velocity: Joints) -> None:
+        taken = self._control.servoJ(q.tolist(), 0.0, 0.0, self.period, self._lookahead, _GAIN)
+        self._refused = not taken  # the next measurement says why
+
+    def _halt(self) -> None:
+        self._control.servoStop(_BRAKING)
+
+    def _disconnect(self) -> None:
+        self._control.stopScript()
+        self._control.disconnect()
+        self._receive.disconnect()
+
+
+def universal_robot(config: ArmConfig) -> ArmProcess:
+    """Connects to a UR in remote control."""
+    return ArmProcess(UrClient, config)

@@ -1,0 +1,122 @@
+"""Franka Hand through franky-control, in a child process.
+
+The hand takes one slow command at a time, while a policy asks for a width every tick. The newest
+width is sent when the last command is done, which is after 0.8 s at most: franky cannot interrupt one
+(measured: its stop waits for the end). A hand's grasp closes until it meets something, whatever width
+it is told, so only closing all the way grasps; any other width is a move, and one that meets something
+on its way in grasps that.
+"""
+
+import time
+
+from touchgoal.control.arms.driver_process import Child
+from touchgoal.control.errors import UserError
+from touchgoal.control.interfaces import DriverError, GripperReading
+
+_STEP = 2e-3  # m between commands that differ, and up to which a width is shut
+_SPEED = 0.1  # m/s; the hand's fastest
+
+
+class FrankaHandClient:
+    """In the child: one hand. Its state comes every 20 to 50 ms."""
+
+    period = 0.05
+
+    def __init__(self, address: str, force: float) -> None:
+        import franky
+
+        self._franky, self._force = franky, force
+        self._hand = franky.Gripper(address)
+        self._max_width = self._hand.state.max_width
+        if self._max_width <= 0:
+            raise UserError("the Franka Hand does not know its stroke: home it in Desk first")
+        self._running: franky.BoolFuture | None = None
+        self._inwards = False  # whether that is a move that closes
+        self._sent = self._target = self._hand.state.width
+        self._fault, self._clock = "", -1
+        self._reading = self._measure()
+
+    def read(self) -> GripperReading:
+        """The state as of the last tick."""
+        return self._reading
+
+    def command(self, width: float) -> None:
+        """A new target (m)."""
+        if self._fault:
+            raise DriverError(f"no command is taken: {self._fault}")
+        self._target = min(max(width, 0.0), self._max_width)
+
+    def stop(self) -> None:
+        """Send nothing more."""
+        self._target = self._sent
+
+    def tick(self) -> None:
+        """Read the state; send the target if it is news."""
+        try:
+            self._reading = self._measure()
+            if not self._fault and self._idle() and abs(self._target - self._sent) > _STEP:
+                self._go(self._target)
+        except Exception as error:
+            self._fault = f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+    def close(self) -> None:
+        """See Gripper."""
+
+    def _measure(self) -> GripperReading:
+        state = self._hand.state
+        clock, stamp = state.time.to_msec(), time.monotonic()
+        if clock == self._clock:
+            stamp = self._reading.stamp
+        self._clock = clock
+        return GripperReading(state.width, state.is_grasped, self._fault, stamp)
+
+    def _idle(self) -> bool:
+        """Whether the last command is done; what it met on its way in is grasped."""
+        if self._running is None:
+            return True
+        if not self._running.wait(0.0):
+            return False
+        arrived, self._running = self._running.get(), None  # raises what went wrong
+        if not arrived and self._inwards:
+            self._grasp(self._sent)
+        return self._running is None
+
+    def _go(self, width: float) -> None:
+        self._sent = width
+        if self._reading.grasped and width < self._reading.width:
+            return  # the grasp goes on: it holds by force
+        if width <= _STEP:
+            self._grasp(width)
+        else:
+            self._inwards = width < self._reading.width
+            self._running = self._hand.move_async(width, _SPEED)
+
+    def _grasp(self, width: float) -> None:
+        # What is met before `width` counts as grasped, whatever its size.
+        self._inwards = False
+        self._running = self._hand.grasp_async(
+            width, _SPEED, self._force, epsilon_inner=width, epsilon_outer=self._max_width
+        )
+
+
+class FrankaHand:
+    """The Gripper protocol over a hand; it closes with `force` (N, 30 to 70)."""
+
+    def __init__(self, address: str, force: float = 30.0) -> None:
+        self._child = Child(FrankaHandClient, address, force)
+
+    def read(self) -> GripperReading:
+        """See Gripper."""
+        return self._child.call("read")
+
+    def command(self, width: float) -> None:
+        """See Gripper."""
+        self._child.call("command", width)
+
+    def stop(self) -> None:
+        """See Gripper."""
+        self._child.call("stop")
+
+    def close(self) -> None:
+        """See Gripper."""
+        self._child.close()

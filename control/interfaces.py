@@ -1,0 +1,174 @@
+"""What deployment asks of an arm, a gripper, a camera, a fingertip and a load cell.
+
+Every reading is a frozen snapshot with `stamp`, the monotonic time (s, `time.monotonic`) at which its
+content was new. A driver that hears nothing more returns the old reading with its old stamp: ages,
+not exceptions, tell that something is stale. `read` and `command` never wait for hardware for longer
+than a time-out; what is broken for good raises DriverError.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from touchgoal.control.tactile.sensor_models import SensorModel
+
+Joints = Float[np.ndarray, "n"]
+
+
+class DriverError(RuntimeError):
+    """A component failed; one line says what happened and what a person can do."""
+
+
+@dataclass(frozen=True)
+class ArmReading:
+    """An arm's state.
+
+    Attributes:
+        q: joint positions, rad.
+        velocity: of the joints, rad/s.
+        wrench: external force (N) and torque (Nm) at the TCP, base frame.
+        torque: external torque in each joint, Nm.
+        fault: why the arm refuses commands until a person recovers it; empty if it does not.
+        stamp: s; the controller's clock advanced then.
+        time: s, that clock, from an origin of its own.
+    """
+
+    q: Joints
+    velocity: Joints
+    wrench: Float[np.ndarray, "6"]
+    torque: Joints
+    fault: str
+    stamp: float
+    time: float
+
+
+@dataclass(frozen=True)
+class GripperReading:
+    """A parallel gripper's state: width between the fingertips (m), whether it holds something."""
+
+    width: float
+    grasped: bool
+    fault: str
+    stamp: float
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A picture.
+
+    Attributes:
+        image: RGB.
+        sequence: counts the frames taken, those that nobody read included.
+        stamp: s, right after the frame was grabbed; of a frozen camera, when its picture last changed.
+    """
+
+    image: UInt8[np.ndarray, "h w 3"]
+    sequence: int
+    stamp: float
+
+
+@dataclass(frozen=True)
+class LoadReading:
+    """A force (N) that a load cell measured; `rejected` counts lines refused so far."""
+
+    force: float
+    rejected: int
+    stamp: float
+
+
+@runtime_checkable
+class Arm(Protocol):
+    """A position-controlled arm.
+
+    `command` takes joint positions (rad) to be reached one control period from now. Without a new
+    one the arm comes to rest at the last. After `stop` or a fault it refuses commands.
+    """
+
+    def read(self) -> ArmReading:
+        """The newest state."""
+        ...
+
+    def command(self, q: Joints) -> None:
+        """Go on to `q` (rad); DriverError if stopped or at fault, UserError if beyond the range."""
+        ...
+
+    def stop(self) -> None:
+        """Brake as fast as the limits allow, and stay; returns at once."""
+        ...
+
+    def recover(self) -> None:
+        """Clear `stop` or a fault. Call it only when a person asked for it."""
+        ...
+
+    def close(self) -> None:
+        """Bring the arm to rest and disconnect."""
+        ...
+
+
+@runtime_checkable
+class Gripper(Protocol):
+    """A parallel gripper; `command` takes the width (m) to go to, or to hold something before it."""
+
+    def read(self) -> GripperReading:
+        """The newest state."""
+        ...
+
+    def command(self, width: float) -> None:
+        """Go on to a width (m), clipped to the stroke; returns at once. DriverError at fault."""
+        ...
+
+    def stop(self) -> None:
+        """Stay as it is; what is held stays held."""
+        ...
+
+    def close(self) -> None:
+        """Disconnect; the fingers stay."""
+        ...
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """A stream of pictures of which only the newest matters."""
+
+    @property
+    def rate(self) -> float:
+        """Measured frames per second."""
+        ...
+
+    @property
+    def trouble(self) -> str:
+        """What a person should know: lost, frozen; empty if all is well."""
+        ...
+
+    def read(self) -> Frame:
+        """The newest frame; it waits for the first, DriverError if none comes."""
+        ...
+
+    def close(self) -> None:
+        """Release the device."""
+        ...
+
+
+@runtime_checkable
+class TactileSensor(Camera, Protocol):
+    """A fingertip camera whose frames have the shape of its sensor model's."""
+
+    @property
+    def model(self) -> SensorModel:
+        """What the sensor is."""
+        ...
+
+
+@runtime_checkable
+class LoadCell(Protocol):
+    """A one-axis force sensor."""
+
+    def read(self) -> LoadReading:
+        """The newest accepted line; it waits for the first, DriverError if none comes."""
+        ...
+
+    def close(self) -> None:
+        """Release the port."""
+        ...

@@ -1,0 +1,275 @@
+"""The safety layer: every commanded joint change is clamped, every fault stops the arm for good.
+
+Pure: a state goes in, a new one comes out. It keeps one invariant: from where the command is,
+braking stops inside every limit. A tick takes the policy's command only as far as that stays true
+of the next one; otherwise it brakes along the path already checked.
+"""
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.motion.kinematics import Kinematics
+from touchgoal.control.safety.braking import braked, highest_speed
+from touchgoal.control.safety.limits import RobotLimits
+
+Joints = Float[np.ndarray, "n"]
+
+
+class Mode(StrEnum):
+    """What the arm does: follows the policy, brakes and waits, or is stopped until a restart."""
+
+    MOVE = "move"
+    HOLD = "hold"
+    STOP = "stop"
+
+
+class Limit(StrEnum):
+    """What changed a command."""
+
+    NOT_A_NUMBER = "not a number"
+    STEP = "step"
+    MARGIN = "joint margin"
+    VELOCITY = "velocity"
+    ACCELERATION = "acceleration"
+    WORKSPACE = "workspace"
+    STALE_OBSERVATION = "observation age"
+    STALE_ACTION = "action age"
+    STALE_STATE = "robot state age"
+    FORCE = "external force"
+    TORQUE = "external torque"
+    TOUCH = "gel indentation"
+    TRACKING = "distance of joints from command"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Why the arm was stopped: the measured value and its ceiling, in SI units."""
+
+    limit: Limit
+    value: float
+    ceiling: float
+
+    def __str__(self) -> str:
+        """For the operator."""
+        return f"{self.limit} {self.value:.3g} above {self.ceiling:.3g}"
+
+
+@dataclass(frozen=True)
+class Deadline:
+    """Ages (s) beyond which something is too old: the arm holds, then stops."""
+
+    hold: float
+    stop: float
+
+
+@dataclass(frozen=True)
+class Watchdogs:
+    """Deadlines of camera and touch frames, of the policy's action, of the arm's state.
+
+    Hold after 100 ms, two ticks at 20 Hz and 50 ms: shared/research/drivers.md 6. Stop: half a
+    second, well below the client libraries' own 1 s.
+    """
+
+    observation: Deadline = Deadline(0.1, 0.5)
+    action: Deadline = Deadline(0.1, 0.5)
+    state: Deadline = Deadline(0.05, 0.25)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What the sensors say in a tick.
+
+    Attributes:
+        q: measured joint positions, rad.
+        force: N on the TCP from outside.
+        torque: Nm in each joint from outside.
+        touch: m that each fingertip's gel is pressed in.
+        observation_age, action_age, state_age: s since the oldest of each was taken.
+    """
+
+    q: Joints
+    force: Float[np.ndarray, "3"]
+    torque: Joints
+    touch: Float[np.ndarray, "2"]
+    observation_age: float
+    action_age: float
+    state_age: float
+
+
+@dataclass(frozen=True)
+class SafetyState:
+    """The safe command of this tick and what it is to be continued from.
+
+    Attributes:
+        q: commanded joint positions, rad.
+        velocity: of the command, rad/s.
+        mode: see Mode.
+        acted: limits that changed the command this tick.
+        fault: the first fault; it stays.
+        bad_actions: ticks since the last action of finite numbers.
+    """
+
+    q: Joints
+    velocity: Joints
+    mode: Mode = Mode.HOLD
+    acted: tuple[Limit, ...] = ()
+    fault: Fault | None = None
+    bad_actions: int = 0
+
+
+# Shares of the way from braking to the wanted command that are tried at the workspace's edge.
+_SHARES = np.array([0.8, 0.6, 0.4, 0.2])
+_ROUNDING = 1e-12  # rad/s; a smaller change is no clamp
+
+
+class Safety:
+    """The limits of one robot at one control rate (Hz)."""
+
+    def __init__(self, limits: RobotLimits, hz: float, watchdogs: Watchdogs | None = None) -> None:
+        self.limits, self.joints, self.dt = limits, limits.policy, 1 / hz
+        self.watchdogs = watchdogs or Watchdogs()
+        edges = np.array(((0.0, 0.0, 0.0), *limits.finger_edges))
+        self._points = Kinematics(limits.arm, 0.0).track(edges)
+        unit = self.joints.acceleration * self.dt
+        self._braking_ticks = int(np.ceil(self.joints.velocity / unit).max()) + 1
+
+    def start(self, q: Joints) -> SafetyState:
+        """The state of an arm at rest; UserError if it rests where a policy may not be."""
+        outside = np.flatnonzero(~((q >= self.joints.lower) & (q <= self.joints.upper)))
+        if outside.size:
+            i = int(outside[0])
+            raise UserError(
+                f"joint {i + 1} is at {q[i]:.3f} rad, outside {self.joints.lower[i]:.3f} to "
+                f"{self.joints.upper[i]:.3f}: move the arm there by hand, then start again"
+            )
+        if not self.inside_workspace(q[None])[0]:
+            raise UserError(
+                "the flange or the fingers are outside the workspace box: move the arm into it by "
+                "hand, or widen the box in the robot's limits"
+            )
+        return SafetyState(np.array(q), np.zeros(q.size))
+
+    def advance(self, state: SafetyState, action: Joints, reading: Reading) -> SafetyState:
+        """One tick: the safe command for a wanted joint change (rad), relative to the last command.
+
+        The arm holds while something is stale or the action is not finite; it stops at the first
+        fault, and only a new `start` ends that. In STOP the driver also stops by its own means.
+        """
+        finite = action.shape == state.q.shape and bool(np.isfinite(action).all())
+        state = replace(state, bad_actions=0 if finite else state.bad_actions + 1)
+        fault = state.fault or self._fault(state, reading)
+        if fault:
+            return self._brake(state, Mode.STOP, (fault.limit,), fault)
+        stale = self._stale(reading) + (() if finite else (Limit.NOT_A_NUMBER,))
+        if stale:
+            return self._brake(state, Mode.HOLD, stale, None)
+        return self._move(state, action)
+
+    def width(self, state: SafetyState, target: float, last: float) -> float:
+        """The gripper width (m) to command in the tick that led to `state`.
+
+        The target inside the stroke; the last command while the arm holds or is stopped, so that
+        nothing is dropped or squeezed then, and for a target that is not finite.
+        """
+        if state.mode is not Mode.MOVE or not np.isfinite(target):
+            return last
+        return float(np.clip(target, *self.limits.stroke))
+
+    def inside_workspace(self, q: Float[np.ndarray, "k n"]) -> Bool[np.ndarray, " k"]:
+        """Whether flange and finger edges lie in their boxes, for each of k postures."""
+        points = self.monitored(q)
+        flange = self.limits.flange.holds(points[:, 0])
+        return flange & self.limits.fingertips.holds(points[:, 1:]).all(axis=1)
+
+    def monitored(self, q: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k 3 3"]:
+        """Flange and the two finger edges in the base frame (m), for each of k postures."""
+        return self._points(q.T).full().T.reshape(len(q), 3, 3)
+
+    def _ages(self, reading: Reading) -> list[tuple[Limit, float, Deadline]]:
+        w = self.watchdogs
+        return [
+            (Limit.STALE_OBSERVATION, reading.observation_age, w.observation),
+            (Limit.STALE_ACTION, reading.action_age, w.action),
+            (Limit.STALE_STATE, reading.state_age, w.state),
+        ]
+
+    def _stale(self, reading: Reading) -> tuple[Limit, ...]:
+        return tuple(name for name, age, dead in self._ages(reading) if not age <= dead.hold)
+
+    def _fault(self, state: SafetyState, reading: Reading) -> Fault | None:
+        """The first ceiling exceeded; a reading that is not a number exceeds its ceiling."""
+        limits = self.limits
+        checks = [(name, age, dead.stop) for name, age, dead in self._ages(reading)]
+        checks += [
+            (Limit.FORCE, np.linalg.norm(reading.force), limits.force),
+            (Limit.TORQUE, np.abs(reading.torque).max(), limits.torque),
+            (Limit.TOUCH, np.abs(reading.touch).max(), limits.touch),
+            (Limit.TRACKING, np.abs(reading.q - state.q).max(), limits.tracking),
+            (Limit.NOT_A_NUMBER, state.bad_actions * self.dt, self.watchdogs.action.stop),
+        ]
+        for name, value, ceiling in checks:
+            if not value <= ceiling:
+                return Fault(name, float(value), ceiling)
+        return None
+
+    def _brake(
+        self, state: SafetyState, mode: Mode, acted: tuple[Limit, ...], fault: Fault | None
+    ) -> SafetyState:
+        velocity = braked(state.velocity, self.joints.acceleration, self.dt)
+        q = state.q + velocity * self.dt
+        return replace(state, q=q, velocity=velocity, mode=mode, acted=acted, fault=fault)
+
+    def _move(self, state: SafetyState, action: Joints) -> SafetyState:
+        j, dt, acted = self.joints, self.dt, []
+
+        def clamp(velocity: Joints, low: Joints, high: Joints, name: Limit) -> Joints:
+            clamped = np.clip(velocity, low, high)
+            if (np.abs(clamped - velocity) > _ROUNDING).any():
+                acted.append(name)
+            return clamped
+
+        step = np.full(action.size, self.limits.max_step)
+        # Clipped before the division: the largest floats would overflow.
+        velocity = clamp(action, -step, step, Limit.STEP) / dt
+        velocity = clamp(velocity, -j.velocity, j.velocity, Limit.VELOCITY)
+        down = -highest_speed(state.q - j.lower, j.acceleration, dt)
+        up = highest_speed(j.upper - state.q, j.acceleration, dt)
+        velocity = clamp(velocity, down, up, Limit.MARGIN)
+        reach = j.acceleration * dt
+        velocity = clamp(
+            velocity, state.velocity - reach, state.velocity + reach, Limit.ACCELERATION
+        )
+        safe = self._into_workspace(state, velocity)
+        if safe is not velocity:
+            acted.append(Limit.WORKSPACE)
+        q = state.q + safe * dt
+        return replace(state, q=q, velocity=safe, mode=Mode.MOVE, acted=tuple(acted))
+
+    def _into_workspace(self, state: SafetyState, wanted: Joints) -> Joints:
+        """The wanted velocity, or as much of it as lets braking end inside the boxes.
+
+        Braking itself is the path checked a tick ago, computed by the same operations in the same
+        order, hence inside to the last bit. Postures between two ticks are not looked at: the joints
+        move by less than 0.03 rad, and a point leaves the chord by less than 0.1 mm.
+        """
+        if self._stops_inside(state.q, wanted[None])[0]:
+            return wanted
+        rest = braked(state.velocity, self.joints.acceleration, self.dt)
+        tries = rest + _SHARES[:, None] * (wanted - rest)
+        good = np.flatnonzero(self._stops_inside(state.q, tries))
+        return tries[good[0]] if good.size else rest
+
+    def _stops_inside(
+        self, q: Joints, velocity: Float[np.ndarray, "c n"]
+    ) -> Bool[np.ndarray, " c"]:
+        """For each candidate velocity: are this tick and the braking after it inside the boxes?"""
+        path = [q + velocity * self.dt]
+        for _ in range(self._braking_ticks):
+            velocity = braked(velocity, self.joints.acceleration, self.dt)
+            path.append(path[-1] + velocity * self.dt)
+        inside = self.inside_workspace(np.concatenate(path))
+        return np.all(inside.reshape(len(path), -1), axis=0)

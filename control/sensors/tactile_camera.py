@@ -1,0 +1,89 @@
+"""A fingertip sensor: a camera whose pictures are cut and scaled to its model's image."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.interfaces import Camera, Frame
+from touchgoal.control.tactile.sensor_models import SensorModel
+
+
+@dataclass(frozen=True)
+class View:
+    """How a sensor's picture lies in its camera's.
+
+    Attributes:
+        border: share cut off at each of the four sides; 0 of a stream that is cut already.
+        quarter_turns: counter-clockwise, before cutting; a DIGIT's camera lies on its side.
+        mirrored: left to right, after turning.
+    """
+
+    border: float = 0.0
+    quarter_turns: int = 0
+    mirrored: bool = False
+
+
+# Of a whole GelSight Mini picture its SDK cuts a seventh off each side, the case's edge, and scales
+# the rest; digit-interface turns the pictures upright.
+GELSIGHT_MINI_VIEW = View(border=1 / 7)
+DIGIT_VIEW = View(quarter_turns=1)
+UNCHANGED = View()
+
+
+class Fingertip:
+    """The TactileSensor protocol over a Camera; it closes the camera with it."""
+
+    def __init__(self, camera: Camera, model: SensorModel, view: View) -> None:
+        self._camera, self._model, self._view = camera, model, view
+        self._last: tuple[Frame, Frame] | None = None
+
+    @property
+    def model(self) -> SensorModel:
+        """See TactileSensor."""
+        return self._model
+
+    @property
+    def rate(self) -> float:
+        """See Camera."""
+        return self._camera.rate
+
+    @property
+    def trouble(self) -> str:
+        """See Camera."""
+        return self._camera.trouble
+
+    def read(self) -> Frame:
+        """See Camera; UserError if the picture's proportions are not the sensor's."""
+        frame = self._camera.read()
+        if self._last is None or self._last[0] is not frame:
+            self._last = frame, replace(frame, image=cut(frame.image, self._model, self._view))
+        return self._last[1]
+
+    def close(self) -> None:
+        """See Camera."""
+        self._camera.close()
+
+
+def cut(
+    image: UInt8[np.ndarray, "h w 3"], model: SensorModel, view: View
+) -> UInt8[np.ndarray, "H W 3"]:
+    """The sensor's picture in its camera's, at the model's shape."""
+    image = np.rot90(image, view.quarter_turns)
+    if view.mirrored:
+        image = image[:, ::-1]
+    height, width = image.shape[:2]
+    top, left = int(view.border * height), int(view.border * width)
+    image = image[top : height - top, left : width - left]
+    rows, columns = model.image_shape
+    ratio = image.shape[1] / image.shape[0] / (columns / rows)
+    if not 0.97 < ratio < 1.03:
+        raise UserError(
+            f"the picture of the {model.name} is {image.shape[1]}x{image.shape[0]}, not "
+            f"{columns}:{rows}: correct `border` or `quarter_turns` of its view"
+        )
+    if image.shape[:2] == (rows, columns):
+        return np.ascontiguousarray(image)
+    return cv2.resize(np.ascontiguousarray(image), (columns, rows), interpolation=cv2.INTER_AREA)

@@ -1,0 +1,83 @@
+"""USB cameras by what they are: the name and serial number in Linux's device tree, not an index.
+
+Indices of `/dev/video*` change from boot to boot, and two fingertips look alike; a serial number does
+not change.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.tactile.sensor_models import (
+    DIGIT,
+    GELSIGHT_MINI,
+    GELSIGHT_MINI_MARKERS,
+    SensorModel,
+)
+
+_ROOT = Path("/sys/class/video4linux")
+# What the USB product names contain: gsrobotics looks for the first, digit-interface for the second.
+_PRODUCTS = {
+    GELSIGHT_MINI.name: "GelSight Mini",
+    GELSIGHT_MINI_MARKERS.name: "GelSight Mini",
+    DIGIT.name: "DIGIT",
+}
+
+
+@dataclass(frozen=True)
+class UsbCamera:
+    """A camera that is plugged in: `device` such as /dev/video2, product name, serial number."""
+
+    device: str
+    product: str
+    serial: str
+
+
+def list_cameras(root: Path = _ROOT) -> list[UsbCamera]:
+    """All USB cameras; of a camera's several nodes the one with pictures (index 0)."""
+    found = []
+    for node in sorted(root.glob("video*"), key=lambda n: (len(n.name), n.name)):
+        if _text(node / "index") != "0":
+            continue
+        usb = _usb_device(node)
+        serial = _text(usb / "serial") if usb else ""
+        product = _text(usb / "product") if usb else ""
+        found.append(UsbCamera(f"/dev/{node.name}", product or _text(node / "name"), serial))
+    return found
+
+
+def find_camera(product: str, serial: str = "", root: Path = _ROOT) -> UsbCamera:
+    """The camera with `product` in its name and, if given, this serial number.
+
+    Raises:
+        UserError: there is none, or several.
+    """
+    cameras = list_cameras(root)
+    found = [c for c in cameras if product in c.product and serial in ("", c.serial)]
+    if len(found) == 1:
+        return found[0]
+    wanted = f"{product} with serial number {serial}" if serial else product
+    if found:
+        choice = ", ".join(c.serial or "none" for c in found)
+        raise UserError(
+            f"{len(found)} cameras are a {wanted}: say which, by serial number: {choice}"
+        )
+    present = ", ".join(f"{c.product} ({c.serial})" for c in cameras) or "none"
+    raise UserError(f"no {wanted} is plugged in; cameras found: {present}")
+
+
+def find_sensor_camera(model: SensorModel, serial: str = "", root: Path = _ROOT) -> UsbCamera:
+    """The fingertip sensor of a kind, as `find_camera`."""
+    if model.name not in _PRODUCTS:
+        raise UserError(f"a {model.name} has no USB name known here: give its device instead")
+    return find_camera(_PRODUCTS[model.name], serial, root)
+
+
+def _usb_device(node: Path) -> Path | None:
+    """The folder of the USB device above a video node: the first that has a product id."""
+    device = (node / "device").resolve()
+    return next((p for p in (device, *device.parents) if (p / "idProduct").exists()), None)
+
+
+def _text(path: Path) -> str:
+    return path.read_text(errors="replace").strip() if path.exists() else ""

@@ -1,0 +1,80 @@
+"""A sensor file from a drawing: colours of a matt gel under a ring of three lamps, not fitted.
+
+For sensors of which nobody has presses at hand. `touchgoal calibrate` gives the real thing.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.control.tactile.sensor_calibration import N_FEATURES, Photometry
+from touchgoal.control.tactile.sensor_models import SensorModel
+
+
+@dataclass(frozen=True)
+class LedRing:
+    """Three lamps, red, green and blue, around the camera's view.
+
+    Attributes:
+        azimuths: of the lamps, degrees from x (right) towards y (down).
+        radius: of the ring, m.
+        distance: of its plane from the gel's surface, m.
+        brightness: mean of the untouched picture, counts.
+        shadowed: share of a lamp's light that is missing in its full shadow; scattered light
+            fills the rest.
+    """
+
+    azimuths: tuple[float, float, float]
+    radius: float
+    distance: float
+    brightness: float = 110.0
+    shadowed: float = 0.5
+
+
+# TACTO's config_digit.yml: lamps at 30, 150 and 270 degrees in the gel's plane (y, z), its camera
+# shows -y to the right and z upwards; 20 mm around (y, z) = (0, 15) mm, 17 mm behind the gel.
+DIGIT_RING = LedRing(azimuths=(-150.0, -30.0, 90.0), radius=20e-3, distance=17e-3)
+
+
+def from_led_ring(sensor: SensorModel, ring: LedRing) -> Photometry:
+    """Colours by Lambert's law with the inverse square of the distance.
+
+    A lamp in direction l lights a surface of normal n by n.l: linear in the normal's part in the
+    image plane, and falling with its square, n_z = sqrt(1 - nx^2 - ny^2). How the direction changes
+    over the image goes into the terms in u and v.
+    """
+    rows, columns = sensor.image_shape
+    u, v = np.meshgrid(np.linspace(-1, 1, columns), np.linspace(-1, 1, rows))
+    x, y = u * (columns - 1) / 2 * sensor.pixel_pitch, v * (rows - 1) / 2 * sensor.pixel_pitch
+    place = np.stack([np.ones_like(u), u, v], -1).reshape(-1, 3)
+    background = np.empty((rows, columns, 3))
+    response = np.zeros((3, N_FEATURES, 3), np.float32)
+    for channel, azimuth in enumerate(np.radians(ring.azimuths)):
+        lx, ly = ring.radius * np.cos(azimuth) - x, ring.radius * np.sin(azimuth) - y
+        light = (lx**2 + ly**2 + ring.distance**2) ** -1.5
+        background[..., channel] = ring.brightness * light / light.mean()
+        slopes = np.stack([lx, ly], -1).reshape(-1, 2) / ring.distance
+        response[channel, :2] = ring.brightness * _fit(place, slopes)
+        response[channel, [2, 4], 0] = -ring.brightness / 2
+    elevation = ring.distance / ring.radius
+    return Photometry(
+        sensor=sensor.name,
+        background=np.clip(background, 0, 255).astype(np.uint8),
+        pixel_pitch=sensor.pixel_pitch,
+        response=response,
+        light_azimuths=ring.azimuths,
+        shadow_slope=elevation,
+        shadow=np.diag(np.full(3, -ring.shadowed * ring.brightness)).astype(np.float32),
+        penumbra=5e-5,
+        # Steeper than this a wall turns away from the lamps.
+        steepest=float(np.sin(np.arctan(elevation))),
+        deepest=1e-3,
+        bulge=(1.05e-3, 0.525e-3, 0.2625e-3, 0.1225e-3),  # as fitted to the Mini's gel
+        noise=0.97,
+    )
+
+
+def _fit(place: Float[np.ndarray, "n 3"], slopes: Float[np.ndarray, "n 2"]) -> np.ndarray:
+    """Coefficients of (1, u, v), one row per slope."""
+    return np.linalg.lstsq(place, slopes, rcond=None)[0].T

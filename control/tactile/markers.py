@@ -1,0 +1,289 @@
+"""Dots printed on a gel: found in a picture, followed through the next ones, and painted out."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int, UInt8
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.tactile.sensor_models import MarkerGrid
+
+_FAINTEST = 0.5  # of the usual darkness: a fainter spot is no dot
+_LEAST_FOUND = 0.7  # of the grid, or it is no marker gel
+_NOISE = 0.02  # darkness of a spot that may be noise
+_RIM = 2.0  # px around a dot's nominal radius that may still be dark
+
+
+@dataclass(frozen=True)
+class Markers:
+    """A grid of dots in one frame.
+
+    Attributes:
+        positions: (x, y) of the centres in px, pixel centres at integers; expected ones where a
+            dot was not found.
+        found: whether each dot was seen.
+    """
+
+    positions: Float32[np.ndarray, "rows columns 2"]
+    found: Bool[np.ndarray, "rows columns"]
+
+
+class MarkerTracker:
+    """Follows the dots of one gel from frame to frame.
+
+    A dot takes the spot nearest to where its last motion would bring it, if it is that spot's
+    nearest dot as well and lies within half the pitch: dots can get lost, which is flagged, but
+    not swapped. A lost dot is expected where its neighbours' displacement would carry it.
+
+    Args:
+        untouched: RGB frame of the untouched gel.
+        grid: what is printed on the gel; sizes may be off by a fifth.
+        pixel_pitch: m per px.
+
+    Attributes:
+        rest: where the dots lie on the untouched gel.
+        now: where they lie in the last frame.
+
+    Raises:
+        UserError: the frame does not show the grid.
+    """
+
+    def __init__(
+        self, untouched: UInt8[np.ndarray, "h w 3"], grid: MarkerGrid, pixel_pitch: float
+    ) -> None:
+        self._size = grid.diameter / pixel_pitch
+        self.rest = self.now = find_markers(untouched, grid, pixel_pitch)
+        _, darkness = _spots(_grey(untouched), self._size)
+        self._faintest = _FAINTEST * _usual(darkness, grid)
+        steps = np.diff(self.rest.positions, axis=1)
+        self._reach = 0.5 * float(np.median(np.linalg.norm(steps, axis=-1)))
+        self._motion = np.zeros_like(self.rest.positions)
+
+    @property
+    def displacement(self) -> Float32[np.ndarray, "rows columns 2"]:
+        """How far each dot lies from its rest, px."""
+        return self.now.positions - self.rest.positions
+
+    def update(self, frame: UInt8[np.ndarray, "h w 3"]) -> Markers:
+        """Find the dots in the next frame."""
+        before = self.now.positions
+        expected = before + self._motion
+        grey = _grey(frame)
+        spots, darkness = _spots(grey, self._size)
+        spots = spots[darkness > self._faintest]
+        for _ in range(2):  # steep shading may throw the first centre off by several pixels
+            spots = _refined(grey, spots, self._size / 2)
+        positions, found = expected.copy(), np.zeros(expected.shape[:2], bool)
+        if len(spots):
+            distance = np.linalg.norm(expected[:, :, None] - spots, axis=-1)
+            spot = distance.argmin(-1)
+            nearest = distance.reshape(-1, len(spots)).argmin(0)[spot]
+            own = np.arange(spot.size).reshape(spot.shape)
+            found = (nearest == own) & (distance.min(-1) < self._reach)
+            positions[found] = spots[spot[found]]
+            moved = _spread(positions - self.rest.positions, found)
+            positions[~found] = (self.rest.positions + moved)[~found]
+        self._motion = positions - before
+        self.now = Markers(positions, found)
+        return self.now
+
+
+def find_markers(
+    image: UInt8[np.ndarray, "h w 3"], grid: MarkerGrid, pixel_pitch: float
+) -> Markers:
+    """The dots of an untouched gel, ordered by rows (downwards) and columns (rightwards).
+
+    The grid may be rotated by up to 30 degrees, shifted, and scaled by a fifth.
+
+    Args:
+        image: RGB frame.
+        grid: what to look for.
+        pixel_pitch: m per px.
+
+    Raises:
+        UserError: less than 70 % of the dots can be seen.
+    """
+    grey, size = _grey(image), grid.diameter / pixel_pitch
+    spots, darkness = _spots(grey, size)
+    spots = _refined(grey, spots[darkness > _FAINTEST * _usual(darkness, grid)], size / 2)
+    cells = _ordered(spots, grid.pitch / pixel_pitch)
+    positions = np.zeros((grid.rows, grid.columns, 2), np.float32)
+    found = np.zeros((grid.rows, grid.columns), bool)
+    if len(cells):
+        cells = cells - _fullest(cells, grid)
+        inside = ((cells >= 0) & (cells < [grid.columns, grid.rows])).all(1)
+        column, row = cells[inside].T
+        positions[row, column] = spots[inside]
+        found[row, column] = True
+    if found.mean() < _LEAST_FOUND:
+        raise UserError(
+            f"only {found.sum()} of {found.size} markers are visible: check that the sensor has a "
+            f"marker gel of {grid.rows} x {grid.columns} dots and that nothing touches it"
+        )
+    if not found.all():
+        row, column = np.mgrid[: grid.rows, : grid.columns]
+        terms = np.stack([np.ones_like(row), column, row], -1).astype(np.float32)
+        plane = np.linalg.lstsq(terms[found], positions[found], rcond=None)[0]
+        positions[~found] = (terms @ plane)[~found]
+    return Markers(positions, found)
+
+
+Image = UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"]
+
+
+def without_markers(image: Image, centres: Float32[np.ndarray, "*n 2"], radius: float) -> Image:
+    """The image with its dots painted over by the membrane stretched between their rims.
+
+    Args:
+        image: RGB frame or background.
+        centres: (x, y) of the dots in px, such as `Markers.positions`.
+        radius: of the dots, px; a rim of 2 px more is replaced too.
+    """
+    h, w, _ = image.shape
+    centres = centres.reshape(-1, 2)
+    near = ((centres > -radius) & (centres < np.array([w, h]) + radius)).all(1)
+    padded, margin = _padded(image, radius)
+    pixels, membrane = _under_dots(padded, centres[near] + margin, radius)
+    padded[pixels] = np.rint(membrane) if image.dtype == np.uint8 else membrane
+    return padded[margin : margin + h, margin : margin + w]
+
+
+def _grey(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 1"]:
+    return cv2.transform(image.astype(np.float32), np.full((1, 3), 1 / 3, np.float32))[..., None]
+
+
+def _usual(darkness: Float32[np.ndarray, " n"], grid: MarkerGrid) -> float:
+    """Median darkness of as many of the darkest spots as the grid has dots."""
+    darkest = np.sort(darkness)[-grid.rows * grid.columns :]
+    return float(np.median(darkest)) if len(darkest) else 0.0
+
+
+def _spots(
+    grey: Float32[np.ndarray, "h w 1"], size: float
+) -> tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, " n"]]:
+    """Dark spots of about `size` px: (x, y) of their centres and their darkness, 0 to 1.
+
+    Darkness is the share of light missing with respect to the spot's surroundings, blurred to the
+    size of a spot; a parabola through its peak gives the centre.
+    """
+    scale = max(int(size / 7), 1)  # dots of 7 px are found as well as larger ones, and faster
+    h, w, _ = grey.shape
+    size /= scale
+    width = 2 * round(0.7 * size) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
+    light = cv2.resize(grey, (w // scale, h // scale), interpolation=cv2.INTER_AREA)
+    light = cv2.GaussianBlur(light, (0, 0), 0.5)
+    around = cv2.morphologyEx(light, cv2.MORPH_CLOSE, kernel)
+    dark = cv2.GaussianBlur((around - light) / np.maximum(around, 1), (0, 0), size / 3)
+    peak = (dark == cv2.dilate(dark, kernel)) & (dark > _NOISE)
+    peak[[0, -1]] = peak[:, [0, -1]] = False
+    y, x = np.nonzero(peak)
+    centre = np.stack([x, y], axis=1).astype(np.float32)
+    for axis, (dy, dx) in enumerate(((0, 1), (1, 0))):
+        low, middle, high = dark[y - dy, x - dx], dark[y, x], dark[y + dy, x + dx]
+        centre[:, axis] += 0.5 * (high - low) / np.maximum(2 * middle - low - high, 1e-6)
+    return centre * scale + np.float32((scale - 1) / 2), dark[y, x]
+
+
+def _refined(
+    grey: Float32[np.ndarray, "h w 1"], spots: Float32[np.ndarray, "n 2"], radius: float
+) -> Float32[np.ndarray, "n 2"]:
+    """Centroids of what is darker than the membrane over each spot: shading does not shift them."""
+    padded, margin = _padded(grey, radius)
+    (y, x), membrane = _under_dots(padded, spots + margin, radius)
+    dark = np.maximum(1 - padded[y, x, 0] / np.maximum(membrane[..., 0], 1), 0)
+    dark /= np.maximum(dark.sum(1, keepdims=True), 1e-6)
+    return np.stack([(dark * x).sum(1), (dark * y).sum(1)], 1).astype(np.float32) - margin
+
+
+def _ordered(spots: Float32[np.ndarray, "n 2"], pitch: float) -> Int[np.ndarray, "n 2"]:
+    """(column, row) of each spot in the lattice that grows from the middlemost one.
+
+    Spots that no chain of steps reaches get a cell far outside.
+    """
+    cells = np.full((len(spots), 2), -(10**6))
+    if not len(spots):
+        return cells
+    apart = spots[None] - spots[:, None]
+    distance = np.linalg.norm(apart, axis=-1)
+    close = np.abs(distance - pitch) < 0.25 * pitch
+    along = np.arctan2(apart[close][:, 1], apart[close][:, 0])
+    # Lattice steps point four ways, a right angle apart: four times their angle is one direction.
+    angle = np.angle(np.exp(4j * along).sum()) / 4
+    step = float(np.median(distance[close])) if close.any() else pitch
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    lattice = apart @ turn.T / step
+    hop = np.rint(lattice).astype(int)
+    near = (np.abs(hop).sum(-1) == 1) & (np.linalg.norm(lattice - hop, axis=-1) < 0.3)
+    start = int(np.linalg.norm(spots - np.median(spots, axis=0), axis=1).argmin())
+    cells[start] = 0
+    reached = [start]
+    for spot in reached:
+        for other in np.flatnonzero(near[spot]):
+            if cells[other, 0] == -(10**6):
+                cells[other] = cells[spot] + hop[spot, other]
+                reached.append(int(other))
+    return cells
+
+
+def _fullest(cells: Int[np.ndarray, "n 2"], grid: MarkerGrid) -> Int[np.ndarray, "2"]:
+    """First (column, row) of the window of the grid's size that holds most cells."""
+    real = cells[cells[:, 0] > -(10**6)]
+    corners = [
+        np.array([column, row])
+        for column in range(real[:, 0].min(), real[:, 0].max() + 1)
+        for row in range(real[:, 1].min(), real[:, 1].max() + 1)
+    ]
+    size = np.array([grid.columns, grid.rows])
+    return max(corners, key=lambda c: int(((real >= c) & (real < c + size)).all(1).sum()))
+
+
+def _spread(
+    field: Float32[np.ndarray, "rows columns 2"], known: Bool[np.ndarray, "rows columns"]
+) -> Float32[np.ndarray, "rows columns 2"]:
+    """The field averaged over known neighbours, those of the next cells counting most."""
+    weight = known.astype(np.float32)
+    total = cv2.GaussianBlur(field * weight[..., None], (0, 0), 1.0, borderType=cv2.BORDER_CONSTANT)
+    share = cv2.GaussianBlur(weight, (0, 0), 1.0, borderType=cv2.BORDER_CONSTANT)
+    return total / np.maximum(share, 1e-6)[..., None]
+
+
+def _padded(image: np.ndarray, radius: float) -> tuple[np.ndarray, int]:
+    """The image with a margin that holds any dot touching it, and the margin's width."""
+    m = int(2 * radius + _RIM) + 3
+    padded = cv2.copyMakeBorder(image, m, m, m, m, cv2.BORDER_REPLICATE)
+    return padded.reshape(*padded.shape[:2], image.shape[2]), m
+
+
+def _under_dots(
+    image: np.ndarray, centres: Float32[np.ndarray, "n 2"], radius: float
+) -> tuple[
+    tuple[Int[np.ndarray, "n inner"], Int[np.ndarray, "n inner"]],
+    Float32[np.ndarray, "n inner channels"],
+]:
+    """(rows, columns) of the pixels that dots may cover, and the membrane from their rims there."""
+    inner, ring, weights = _membrane(radius + _RIM)
+    at = np.rint(centres).astype(int)[:, None]
+    x, y = np.moveaxis(at + inner, -1, 0)
+    rim_x, rim_y = np.moveaxis(at + ring, -1, 0)
+    return (y, x), weights @ image[rim_y, rim_x].astype(np.float32)
+
+
+@cache
+def _membrane(
+    radius: float,
+) -> tuple[
+    Int[np.ndarray, "inner 2"], Int[np.ndarray, "ring 2"], Float32[np.ndarray, "inner ring"]
+]:
+    """Offsets (x, y) of the pixels in a disc, of those around it, and the harmonic weights."""
+    reach = int(radius) + 2
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    disc = (x * x + y * y <= radius * radius).astype(np.uint8)
+    around = cv2.dilate(disc, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))) - disc
+    inner, ring = (np.stack([x[m > 0], y[m > 0]], 1) for m in (disc, around))
+    next_to = (np.abs(inner[:, None] - inner).sum(-1) == 1).astype(np.float64)
+    laplace = 4 * np.eye(len(inner)) - next_to
+    boundary = (np.abs(inner[:, None] - ring).sum(-1) == 1).astype(np.float64)
+    return inner, ring, np.linalg.solve(laplace, boundary).astype(np.float32)

@@ -1,0 +1,269 @@
+"""What the coloured lights inside a sensor make of the shape of its gel: the sensor file.
+
+The model. A gel surface h(x, y), m into the gel (`gel.deform`), has slopes gx = dh/dx, gy = dh/dy
+by central differences and the unit normal's image-plane part (nx, ny) = -(gx, gy) / sqrt(1 + gx^2
++ gy^2). With the ten features f_k of `features`, position p = (1, u, v), u and v from -1 to 1
+across columns and rows, and the shadow depths s_l of `gel.shadow_depth`, channel c shows
+
+    I_c = background_c + noise + gain_c (
+        sum over k, m of response[c,k,m] f_k p_m  +  sum over l of shadow[c,l] s_l / (s_l + penumbra)
+    )
+
+The gain is the blurred background divided by its mean: where little light falls, slopes change the
+picture little. The polynomial holds for what the presses showed and no further: a normal steeper
+than `steepest` is shortened to it, a depth beyond `deepest` counts as `deepest`, for shadows too.
+"""
+
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.tactile import gel
+
+N_FEATURES = 10
+FORMAT = 1
+_JSON, _BACKGROUND = "sensor.json", "background.png"
+_MAKE = "make one with: touchgoal calibrate PRESSES"
+
+
+@dataclass(frozen=True)
+class Photometry:
+    """One sensor's colours, as `touchgoal calibrate` fits them to presses.
+
+    Attributes:
+        sensor: name of the sensor model.
+        background: the untouched sensor, RGB.
+        pixel_pitch: m per pixel.
+        response: counts per channel and feature (`features`); the last axis multiplies (1, u, v),
+            where u and v run from -1 to 1 across columns and rows.
+        light_azimuths: where in the image each light stands, degrees from x (right) towards y
+            (down).
+        shadow_slope: tangent of the lights' height above the gel plane.
+        shadow: counts per channel in the deepest shadow of each light.
+        penumbra: shadow depth (`gel.shadow_depth`) at which half of that is reached, m.
+        steepest, deepest: largest length of (nx, ny), and depth in m, in the presses.
+        bulge: standard deviations of the gel's bulge, coarse to fine, m (`gel.deform`).
+        noise: standard deviation of the camera's noise, counts.
+    """
+
+    sensor: str
+    background: UInt8[np.ndarray, "h w 3"]
+    pixel_pitch: float
+    response: Float32[np.ndarray, "3 10 3"]
+    light_azimuths: tuple[float, ...]
+    shadow_slope: float
+    shadow: Float32[np.ndarray, "3 lights"]
+    penumbra: float
+    steepest: float
+    deepest: float
+    bulge: tuple[float, ...]
+    noise: float
+
+
+def gain(background: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    """How strongly the light falls over the image, per channel relative to its mean."""
+    light = cv2.GaussianBlur(background.astype(np.float32), (0, 0), background.shape[1] / 40)
+    return light / light.mean((0, 1))
+
+
+def features(
+    surface: Float32[np.ndarray, "h w"], pitch: float, steepest: float, deepest: float
+) -> Float32[np.ndarray, "10 h w"]:
+    """What the colours are linear in.
+
+    Args:
+        surface: of the gel, m into the gel.
+        pitch: m per pixel.
+        steepest, deepest: see `Photometry`.
+
+    Returns:
+        nx, ny, nx^2, nx ny, ny^2, nx^3, nx^2 ny, nx ny^2, ny^3 of the unit normal's components in
+        the image plane, and the depth in m.
+    """
+    padded = np.pad(surface, 1, mode="edge")
+    gx = (padded[1:-1, 2:] - padded[1:-1, :-2]) * np.float32(0.5 / pitch)
+    gy = (padded[2:, 1:-1] - padded[:-2, 1:-1]) * np.float32(0.5 / pitch)
+    # |n| = s / sqrt(1 + s^2) for slope s; at most `steepest`
+    square = gx * gx + gy * gy
+    inverse = -1 / np.sqrt(np.maximum(1 + square, square / np.float32(steepest**2)))
+    depth = np.minimum(surface, np.float32(deepest))
+    return np.stack([*monomials(gx * inverse, gy * inverse), depth])
+
+
+def monomials(
+    x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]
+) -> Float[np.ndarray, "9 ..."]:
+    """Of a normal's part in the image plane: x, y, x^2, xy, y^2, x^3, x^2 y, x y^2, y^3."""
+    xx, xy, yy = x * x, x * y, y * y
+    return np.stack([x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y])
+
+
+def shadows(
+    photometry: Photometry, surface: Float32[np.ndarray, "h w"], pitch: float
+) -> Float32[np.ndarray, "lights h w"]:
+    """Share of each light's full shadow, 0 to 1, on a gel surface of any resolution.
+
+    Args:
+        photometry: where the lights stand and how their shadows begin.
+        surface: of the gel, m; a depth beyond `deepest` counts as `deepest`.
+        pitch: of the surface, m per pixel.
+    """
+    known = np.minimum(surface, np.float32(photometry.deepest))
+    depth = gel.shadow_depth(known, pitch, photometry.light_azimuths, photometry.shadow_slope)
+    depth /= depth + np.float32(photometry.penumbra)
+    return depth
+
+
+def columns(
+    photometry: Photometry, surface: Float32[np.ndarray, "h w"], pixels: Int[np.ndarray, " n"]
+) -> Float32[np.ndarray, "terms n"]:
+    """What the change of colour is linear in: the features, times 1, u and v, then the shadows.
+
+    Args:
+        photometry: only its numbers that are not linear are used.
+        surface: of the gel, m.
+        pixels: flat indices of the pixels wanted.
+    """
+    h, w = surface.shape
+    shape = features(surface, photometry.pixel_pitch, photometry.steepest, photometry.deepest)
+    shape = shape.reshape(N_FEATURES, -1)[:, pixels]
+    v, u = np.divmod(pixels, w) * (2 / np.array([[h - 1], [w - 1]], np.float32)) - 1
+    dark = shadows(photometry, surface, photometry.pixel_pitch).reshape(-1, h * w)[:, pixels]
+    terms = np.concatenate([shape, shape * u, shape * v, dark])
+    return terms.astype(np.float32, copy=False)
+
+
+def weights(photometry: Photometry) -> Float32[np.ndarray, "3 terms"]:
+    """What each of `columns` counts for, per channel."""
+    response = photometry.response.transpose(0, 2, 1).reshape(3, -1)
+    return np.concatenate([response, photometry.shadow], 1)
+
+
+def shade(
+    photometry: Photometry, surface: Float32[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w 3"]:
+    """RGB picture of a gel surface without noise, in counts, neither rounded nor clipped.
+
+    The reference: short and slow. The simulator's fused kernels must agree with it.
+    """
+    terms = columns(photometry, surface, np.arange(surface.size))
+    change = (weights(photometry) @ terms).T.reshape(*surface.shape, 3)
+    return photometry.background + gain(photometry.background) * change
+
+
+def save(photometry: Photometry, folder: Path, provenance: dict[str, Any]) -> None:
+    """Write `sensor.json` and `background.png`; an older sensor file there is replaced.
+
+    Args:
+        photometry: what to keep.
+        folder: made if needed.
+        provenance: where it comes from, JSON-able: source, command, presses, held-out errors.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    rows, columns, _ = photometry.background.shape
+    numbers = {name: _plain(getattr(photometry, name)) for name in _NUMBERS}
+    description = {"format": FORMAT, "image_shape": [rows, columns], **numbers}
+    text = json.dumps({**description, "provenance": provenance}, indent=1)
+    cv2.imwrite(str(folder / _BACKGROUND), photometry.background[..., ::-1])
+    (folder / _JSON).write_text(_INNERMOST.sub(lambda m: " ".join(m[0].split()), text) + "\n")
+
+
+def load(folder: Path) -> Photometry:
+    """Read what `save` wrote.
+
+    Raises:
+        UserError: nothing there, damaged, another format, or numbers that do not fit together.
+    """
+    description = _read_description(folder)
+    path = folder / _JSON
+    image = cv2.imread(str(folder / _BACKGROUND), cv2.IMREAD_COLOR)
+    if image is None:
+        raise UserError(f"{folder / _BACKGROUND} is missing or no picture: {_MAKE}")
+    if list(image.shape[:2]) != description.get("image_shape"):
+        raise UserError(
+            f"{folder / _BACKGROUND} has {image.shape[:2]} rows and columns, {path} says "
+            f"{description.get('image_shape')}: they belong to different sensor files; {_MAKE}"
+        )
+    values: dict[str, Any] = {}
+    for name, kind in _NUMBERS.items():
+        try:
+            values[name] = kind(description[name])
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(f"{path} has no usable {name}: {_MAKE}") from error
+    lights = len(values["light_azimuths"])
+    shapes = {"response": (3, N_FEATURES, 3), "shadow": (3, lights)}
+    for name, shape in shapes.items():
+        if values[name].shape != shape:
+            raise UserError(f"{path}: {name} is {values[name].shape}, not {shape}: {_MAKE}")
+    for name in ("pixel_pitch", "shadow_slope", "penumbra", "steepest", "deepest"):
+        if not values[name] > 0:
+            raise UserError(f"{path}: {name} must be positive, not {values[name]}: {_MAKE}")
+    background = np.ascontiguousarray(image[..., ::-1])
+    return Photometry(background=background, **values)
+
+
+def read_provenance(folder: Path) -> dict[str, Any]:
+    """What `save` was told about where the numbers come from; UserError as for `load`."""
+    return _read_description(folder)["provenance"]
+
+
+def _read_description(folder: Path) -> dict[str, Any]:
+    path = folder / _JSON
+    if not path.is_file():
+        raise UserError(f"no sensor file in {folder}: {_MAKE}")
+    try:
+        description = json.loads(path.read_text())
+        version, _ = description["format"], description["provenance"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} is no sensor file: {_MAKE}") from error
+    if version != FORMAT:
+        raise UserError(f"{path} has format {version}, this touchgoal reads {FORMAT}: {_MAKE}")
+    return description
+
+
+def _array(value: Any) -> Float32[np.ndarray, "..."]:
+    array = np.array(value, np.float32)
+    if not np.isfinite(array).all():
+        raise ValueError("not finite")
+    return array
+
+
+def _numbers(value: Any) -> tuple[float, ...]:
+    return tuple(float(v) for v in _array(value))
+
+
+def _number(value: Any) -> float:
+    return float(value) if math.isfinite(value) else math.nan
+
+
+def _plain(value: Any) -> Any:
+    """JSON-able, seven digits."""
+    if isinstance(value, np.ndarray | tuple):
+        return [_plain(v) for v in value]
+    return value if isinstance(value, str) else float(f"{value:.7g}")
+
+
+# What sensor.json holds besides the shape of the background, and how each is read.
+_NUMBERS: dict[str, Callable[[Any], Any]] = {
+    "sensor": str,
+    "pixel_pitch": _number,
+    "response": _array,
+    "light_azimuths": _numbers,
+    "shadow_slope": _number,
+    "shadow": _array,
+    "penumbra": _number,
+    "steepest": _number,
+    "deepest": _number,
+    "bulge": _numbers,
+    "noise": _number,
+}
+_INNERMOST = re.compile(r"\[[^\[\]{}]*\]")  # lists of numbers go on one line

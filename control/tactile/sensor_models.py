@@ -1,0 +1,165 @@
+"""Fingertip sensors as data: what a GelSight or a DIGIT is, in numbers with unit and source."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.tactile.sensor_calibration import load
+
+
+@dataclass(frozen=True)
+class MarkerGrid:
+    """Dots printed on a gel.
+
+    Attributes:
+        rows, columns: of the grid, which is centred on the image.
+        pitch: between neighbours, m.
+        diameter: of a dot, m.
+    """
+
+    rows: int
+    columns: int
+    pitch: float
+    diameter: float
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """A camera-based fingertip sensor.
+
+    The sensor frame sits on the undeformed gel, in the middle of the image: x along the image's
+    columns, y along its rows (downwards), z out of the gel. The gel is taken to be flat.
+
+    Attributes:
+        name: the id under which encoders and preprocessors know the sensor.
+        image_shape: (rows, columns) of a frame.
+        pixel_pitch: m of gel per pixel; square pixels.
+        pitch_range: m of gel per pixel, (least, most) that units and sources differ by.
+        gel_size: (along x, along y) of the gel, m.
+        gel_thickness: m.
+        case_size: (along x, along y, depth) of the housing, m.
+        foundation_modulus: gel pressure per indentation, Pa/m: how the gel's surface gives way
+            under a contact, as the camera sees it.
+        shear_modulus: of the gel's material, Pa.
+        normal_stiffness: of the gel as a whole under a typical curved contact, N/m.
+        shear_stiffness: of the gel as a whole, N/m.
+        frame_rate: Hz.
+        sensor_file: folder with the colours of a typical unit (`control.touch.photometry`).
+        markers: dots printed on the gel, if any.
+    """
+
+    name: str
+    image_shape: tuple[int, int]
+    pixel_pitch: float
+    pitch_range: tuple[float, float]
+    gel_size: tuple[float, float]
+    gel_thickness: float
+    case_size: tuple[float, float, float]
+    foundation_modulus: float
+    shear_modulus: float
+    normal_stiffness: float
+    shear_stiffness: float
+    frame_rate: float
+    sensor_file: Path
+    markers: MarkerGrid | None = None
+
+
+_FILES = Path(__file__).parent / "sensor_files"
+
+# Image: the SDK's 320x240 crop; 0.059 mm/px is Tactile-MNIST's 18.88 x 14.16 mm and Taxim's Mini
+# (the datasheet says 18.6 x 14.3; other sources up to 22.9 x 17.1: calibrate your own).
+# Gel 25.4 x 20.9 x 4.0 mm: FEATS STEP file. Case 32.5 x 28.5 x 28.3 mm: GelSight STEP file.
+# Shear modulus: FEATS' Neo-Hooke fit, 2 C10 = 0.145 MPa.
+# Foundation modulus: a bonded, nearly incompressible 4 mm layer of E = 0.44 MPa (the same fit) is
+# about three times stiffer than E/t; 3e8 Pa/m gives 0.8 mm under a 25 mm ball at 15 N, within
+# FEATS' measured range (up to 0.86 mm).
+# Whole-gel stiffness: the same modulus over the patch of such a ball, and G A / t of the gel.
+GELSIGHT_MINI = SensorModel(
+    name="gelsight_mini",
+    image_shape=(240, 320),
+    pixel_pitch=0.059e-3,
+    pitch_range=(0.058e-3, 0.071e-3),
+    gel_size=(25.4e-3, 20.9e-3),
+    gel_thickness=4.0e-3,
+    case_size=(32.5e-3, 28.5e-3, 28.3e-3),
+    foundation_modulus=3.0e8,
+    shear_modulus=1.45e5,
+    normal_stiffness=2.0e4,
+    shear_stiffness=6.0e3,
+    frame_rate=25.0,
+    sensor_file=_FILES / "gelsight_mini",
+)
+
+# 63 dots found in three real pictures: pitch 31.4-32.5 px, diameter 14-18 px of 320.
+GELSIGHT_MINI_MARKERS = replace(
+    GELSIGHT_MINI,
+    name="gelsight_mini_markers",
+    markers=MarkerGrid(rows=7, columns=9, pitch=1.88e-3, diameter=0.94e-3),
+)
+
+# The bench sensor of the Taxim paper: 0.0295 mm/px at 640x480, here at half of that. Its gel's
+# moduli are not published: the Mini's, whose silicone is the same maker's.
+# Dots 11 x 9, pitch 29 x 26 px of 320x240 at 0.051 mm/px: FOTS' GelSight; mean pitch, diameter
+# by analogy to the Mini's.
+GELSIGHT = replace(
+    GELSIGHT_MINI,
+    name="gelsight",
+    pitch_range=(0.051e-3, 0.063e-3),
+    gel_size=(25.0e-3, 25.0e-3),
+    sensor_file=_FILES / "gelsight",
+)
+GELSIGHT_MARKERS = replace(
+    GELSIGHT,
+    name="gelsight_markers",
+    markers=MarkerGrid(rows=9, columns=11, pitch=1.4e-3, diameter=0.7e-3),
+)
+
+# Image: QVGA at 60 Hz, upright as digit-interface returns it. Scale 0.0511 mm/px: FOTS; sources
+# range from 0.0405 (gs_sdk, at VGA) to 0.0667 (a 16 x 19 mm sensing field). Case 32.3 x 27 x 34 mm:
+# its STL. Gel 20 x 30 mm: TACTO, which also bends it by 5 mm (R 100 mm); flat here.
+# Thickness and moduli are not published: a third thinner than the Mini's, of the same silicone.
+DIGIT = SensorModel(
+    name="digit",
+    image_shape=(320, 240),
+    pixel_pitch=0.0511e-3,
+    pitch_range=(0.0405e-3, 0.0667e-3),
+    gel_size=(20.0e-3, 30.0e-3),
+    gel_thickness=2.7e-3,
+    case_size=(27.0e-3, 32.3e-3, 34.0e-3),
+    foundation_modulus=4.5e8,
+    shear_modulus=1.45e5,
+    normal_stiffness=3.0e4,
+    shear_stiffness=9.0e3,
+    frame_rate=60.0,
+    sensor_file=_FILES / "digit",
+)
+
+SENSORS = {
+    sensor.name: sensor
+    for sensor in (GELSIGHT_MINI, GELSIGHT_MINI_MARKERS, GELSIGHT, GELSIGHT_MARKERS, DIGIT)
+}
+
+
+def find_sensor(name: str) -> SensorModel:
+    """A sensor model by name, or one unit of it by the folder that `touchgoal calibrate` wrote.
+
+    Raises:
+        UserError: it is neither.
+    """
+    if name in SENSORS:
+        return SENSORS[name]
+    folder = Path(name)
+    if not folder.is_dir():
+        known = ", ".join(SENSORS)
+        raise UserError(f"{name} is no sensor and no folder; choose a sensor file or: {known}")
+    unit = load(folder)
+    if unit.sensor not in SENSORS:
+        raise UserError(f"{folder} is of an unknown sensor, {unit.sensor}")
+    pitch, shape = unit.pixel_pitch, unit.background.shape[:2]
+    return replace(
+        SENSORS[unit.sensor],
+        image_shape=shape,
+        pixel_pitch=pitch,
+        pitch_range=(pitch, pitch),
+        sensor_file=folder,
+    )

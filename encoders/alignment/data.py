@@ -1,0 +1,154 @@
+"""What alignment trains on: preprocessed touches beside the cached embeddings of the towers."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Float16, Int
+from torch import Tensor
+from tqdm import tqdm
+
+from touchgoal.control.errors import UserError
+from touchgoal.encoders.preprocess import preprocessor_for
+from touchgoal.encoders.towers.towers import BATCH, Towers
+from touchgoal.episodes.touches import Touches
+
+IDLE = ""
+
+
+@dataclass(frozen=True, eq=False)
+class TouchData:
+    """n touches of `names` (catalogue ids, and "" for no contact), with their partners.
+
+    Attributes:
+        touch: Preprocessed frames; half precision, for they fill the memory.
+        label: Row of `names` that each touch feels.
+        contact: False for idle touches, which have texts but no picture.
+        view_of: Row of `images` of each touch.
+        images: The image tower's embedding of each view, not normalised.
+        texts: The text tower's embedding of each sentence, not normalised.
+        says: Sentence j describes name i.
+        names: Sorted, so "" comes first.
+    """
+
+    touch: Float16[Tensor, "n 3 h w"]
+    label: Int[Tensor, " n"]
+    contact: Bool[Tensor, " n"]
+    view_of: Int[Tensor, " n"]
+    images: Float[Tensor, "e i"]
+    texts: Float[Tensor, "m t"]
+    says: Bool[Tensor, "k m"]
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        """Number of touches."""
+        return len(self.label)
+
+    def draw_sentences(
+        self, rows: Int[Tensor, " b"], generator: torch.Generator
+    ) -> Int[Tensor, " b"]:
+        """One random sentence (row of `texts`) for each of these touches."""
+        return torch.multinomial(self.says[self.label[rows]].float(), 1, generator=generator)[:, 0]
+
+
+def prepare(
+    touches: Touches, towers: Towers, sensor: str, idle_texts: tuple[str, ...]
+) -> TouchData:
+    """Runs preprocessor and towers once over everything.
+
+    Args:
+        touches: Raw frames.
+        towers: Frozen towers.
+        sensor: Name of the fingertip sensor.
+        idle_texts: What is said of touches without contact; without any, those are left out.
+
+    Raises:
+        UserError: Frames of another sensor, an object without descriptions, or no contact.
+    """
+    objects = np.asarray(touches.object)
+    kept = np.flatnonzero((objects != IDLE) | bool(idle_texts))
+    objects = objects[kept]
+    if not (objects != IDLE).any():
+        raise UserError("no touch is in contact: record episodes that touch something")
+    names = tuple(sorted(set(objects.tolist())))
+    sentences, says = _sentences(names, touches.descriptions | {IDLE: list(idle_texts)})
+    return TouchData(
+        touch=_preprocess(touches, kept, sensor),
+        label=torch.from_numpy(np.searchsorted(names, objects)),
+        contact=torch.from_numpy(objects != IDLE),
+        view_of=torch.from_numpy(touches.view_of[kept].astype(np.int64)),
+        images=_embed_views(touches.view, towers),
+        texts=towers.embed_texts(sentences),
+        says=says,
+        names=names,
+    )
+
+
+def _sentences(
+    names: tuple[str, ...], descriptions: dict[str, list[str]]
+) -> tuple[list[str], Bool[Tensor, "k m"]]:
+    for name in names:
+        if not descriptions.get(name):
+            raise UserError(f"the object '{name}' has no descriptions: say how it feels")
+    sentences = sorted({sentence for name in names for sentence in descriptions[name]})
+    says = torch.tensor([[s in descriptions[name] for s in sentences] for name in names])
+    return sentences, says
+
+
+def _preprocess(touches: Touches, rows: np.ndarray, sensor: str) -> Float16[Tensor, "n 3 h w"]:
+    preprocess = preprocessor_for(sensor)
+    out = torch.empty(len(rows), 3, *preprocess.size, dtype=torch.float16)
+    for i, row in enumerate(tqdm(rows, desc="preprocess", unit="touch", leave=False)):
+        background = touches.background[touches.background_of[row]]
+        out[i] = torch.from_numpy(preprocess(touches.frames[row : row + 1], background)[0])
+    return out
+
+
+def _embed_views(views: np.ndarray, towers: Towers) -> Float[Tensor, "e i"]:
+    starts = tqdm(range(0, len(views), BATCH), desc="embed views", unit="batch", leave=False)
+    return torch.cat([towers.embed_images(views[i : i + BATCH]) for i in starts])
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """Random changes of a preprocessed touch that leave alone what is felt.
+
+    No flips and no rotations: every colour of the LEDs comes from its own side, so a mirrored
+    GelSight image shows a relief (a dent for a bump) that no contact makes.
+
+    Attributes:
+        shift: Largest displacement in pixels, up, down and sideways; zeros come in.
+        gain: Largest relative change of the contrast, per colour.
+        offset: Largest change of the brightness, per colour, in the preprocessor's units.
+        noise: Standard deviation of the noise of a pixel, in the preprocessor's units.
+    """
+
+    shift: int = 0
+    gain: float = 0.0
+    offset: float = 0.0
+    noise: float = 0.0
+
+    def __call__(
+        self, touch: Float[Tensor, "b 3 h w"], generator: torch.Generator
+    ) -> Float[Tensor, "b 3 h w"]:
+        """A changed copy."""
+        touch = self._shifted(touch, generator) if self.shift else touch
+        gain = 1 + self.gain * _uniform((len(touch), 3, 1, 1), generator)
+        offset = self.offset * _uniform((len(touch), 3, 1, 1), generator)
+        touch = touch * gain + offset
+        if self.noise:
+            touch = touch + self.noise * torch.randn(touch.shape, generator=generator)
+        return touch
+
+    def _shifted(self, touch: Tensor, generator: torch.Generator) -> Tensor:
+        s, (h, w) = self.shift, touch.shape[2:]
+        moves = torch.randint(0, 2 * s + 1, (len(touch), 2), generator=generator).tolist()
+        padded = F.pad(touch, (s, s, s, s))
+        return torch.stack(
+            [image[:, y : y + h, x : x + w] for image, (y, x) in zip(padded, moves, strict=True)]
+        )
+
+
+def _uniform(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+    return 2 * torch.rand(shape, generator=generator) - 1

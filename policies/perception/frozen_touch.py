@@ -1,0 +1,60 @@
+"""What a policy feels: both fingertips through a frozen touch encoder."""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from touchgoal.control import features as ft
+from touchgoal.encoders import pretrained
+from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
+from touchgoal.encoders.backbones.touch_backbone import TouchTrunk
+from touchgoal.encoders.ssl.frames import check_sensor
+from touchgoal.episodes.store import EpisodeSet
+
+
+class TouchEmbedder:
+    """Both fingertips as one row: the left embedding, then the right one.
+
+    The background of each is its first frame: episodes start untouched.
+
+    Attributes:
+        name: changes whenever the embeddings would; becomes `PolicyConfig.touch`.
+        dim: of a row.
+        sensor: name of the fingertip sensor.
+    """
+
+    def __init__(self, encoder: TouchEncoder | TouchTrunk, name: str) -> None:
+        self.encoder, self.name = encoder, name
+        self.dim = len(ft.TACTILE) * encoder.config.embedding_dim
+        self.sensor = encoder.config.sensor
+
+    def embed(self, episodes: EpisodeSet, i: int) -> Float32[np.ndarray, "t e"]:
+        """All ticks of an episode; UserError if it was felt with another sensor."""
+        check_sensor(episodes, i, self.sensor)
+        frames = episodes.read(i, ft.TACTILE).frames
+        sides = [self.encoder.embed_frames(frames[k], frames[k][0]) for k in ft.TACTILE]
+        return np.concatenate(sides, 1)
+
+    @torch.no_grad()
+    def embed_tick(
+        self, observation: Mapping[str, np.ndarray], untouched: Mapping[str, np.ndarray]
+    ) -> Float32[np.ndarray, " e"]:
+        """One tick, given an observation without touch."""
+        sides = [self.encoder.preprocess(observation[k][None], untouched[k]) for k in ft.TACTILE]
+        return self.encoder.embed_touch(torch.from_numpy(np.concatenate(sides))).numpy().ravel()
+
+
+def load_touch(directory: Path) -> TouchEmbedder:
+    """The embedder of an encoder on disk, aligned or self-supervised; UserError if there is none.
+
+    Embeddings are named after the weights, not after the folder, which may move.
+    """
+    encoder = pretrained.load_any(directory)
+    digest = hashlib.sha256(pretrained.ENCODER.weights_path(directory).read_bytes()).hexdigest()[
+        :12
+    ]
+    return TouchEmbedder(encoder, f"{encoder.config.preprocessor}/{digest}")

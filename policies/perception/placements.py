@@ -1,0 +1,66 @@
+"""How pick-and-place begins, seen many times over: what a sense of sight learns from."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float32, UInt8
+from torch import Tensor
+from tqdm import tqdm
+
+from touchgoal.control import features as ft
+from touchgoal.episodes.recording import one_core_workers
+from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+
+
+@dataclass(frozen=True, eq=False)
+class Placements:
+    """n beginnings of episodes.
+
+    Attributes:
+        pictures: of every camera by its column, as it takes them.
+        tcp: pose of the hand, `vocabulary.TCP_POSE`.
+        start: what there is to see, `vocabulary.TRUTH_START`.
+    """
+
+    pictures: dict[str, UInt8[Tensor, "n h w 3"]]
+    tcp: Float32[Tensor, "n 7"]
+    start: Float32[Tensor, "n 7"]
+
+    def __len__(self) -> int:
+        """Number of beginnings."""
+        return len(self.start)
+
+
+def place(config: PickPlaceConfig, things: int, times: int, seed: int, workers: int) -> Placements:
+    """Lays so many things on the table, each so many times.
+
+    Args:
+        config: of the task; cameras are those to look through.
+        things: objects of random kind and size, one for every seed from `seed` on.
+        times: places of each.
+        seed: of the first thing.
+        workers: processes that render.
+    """
+    seeds = range(seed, seed + things)
+    with one_core_workers(workers) as pool:
+        laid = pool.map(_lay, [config] * things, [times] * things, seeds)
+        rows = [row for some in tqdm(laid, total=things, desc="things") for row in some]
+    keys = [key for key in ft.CAMERAS if key in rows[0]]
+    columns = {
+        key: torch.from_numpy(np.stack([row[key] for row in rows]))
+        for key in (*keys, ft.TCP_POSE, ft.TRUTH_START)
+    }
+    tcp, start = columns.pop(ft.TCP_POSE), columns.pop(ft.TRUTH_START)
+    return Placements(columns, tcp, start)
+
+
+def _lay(config: PickPlaceConfig, times: int, seed: int) -> list[dict[str, np.ndarray]]:
+    env = PickPlace(config)
+    observation, info = env.reset(seed=seed)
+    rows = [observation | info]
+    for _ in range(times - 1):
+        observation, info = env.rearrange()
+        rows.append(observation | info)
+    env.close()
+    return rows

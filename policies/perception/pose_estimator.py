@@ -1,0 +1,99 @@
+"""Sight: a network that reads in the first pictures of an episode what lies where."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+
+from touchgoal.control import features as ft
+from touchgoal.policies.actions import Scale
+
+Box = tuple[int, int, int, int]
+_START = ft.FEATURES[ft.TRUTH_START].shape[0]
+_TCP = ft.FEATURES[ft.TCP_POSE].shape[0]
+
+
+@dataclass(frozen=True)
+class SightConfig:
+    """Where to look, and the networks that look.
+
+    Attributes:
+        size: rows and columns of the cameras' pictures. With half as many the table is seen at 5 mm a
+            pixel, and an object's place is told no better than to 3 mm.
+        windows: of each camera's pictures, by its column, the rows and columns (from, to; from, to)
+            in which the table is seen.
+        channels: of the maps of a picture, one cell for 4 x 4 pixels.
+        glances: places looked at in each picture.
+        detail: numbers that describe what is at such a place.
+        width: of the hidden layer that puts together what they say.
+    """
+
+    size: tuple[int, int] = (256, 256)
+    windows: tuple[tuple[str, Box], ...] = ((ft.FRONT, (104, 232, 16, 240)),)
+    channels: int = 32
+    glances: int = 16
+    detail: int = 32
+    width: int = 256
+
+
+class Sight(nn.Module):
+    """Pictures of the start to `vocabulary.TRUTH_START`."""
+
+    def __init__(self, config: SightConfig) -> None:
+        """Randomly initialised; `fit_scales` comes before training."""
+        super().__init__()
+        self.config = config
+        self.networks = nn.ModuleList(_Glances(config) for _ in config.windows)
+        seen = _TCP + config.glances * (2 + config.detail) * len(config.windows)
+        self.tcp_scale, self.start_scale = Scale((_TCP,)), Scale((_START,))
+        self.read = nn.Sequential(
+            nn.Linear(seen, config.width), nn.Mish(),
+            nn.Linear(config.width, config.width), nn.Mish(),
+            nn.Linear(config.width, _START),
+        )  # fmt: skip
+
+    def forward(
+        self, pictures: dict[str, UInt8[Tensor, "b h w 3"]], tcp: Float[Tensor, "b 7"]
+    ) -> Float[Tensor, "b 7"]:
+        """What was read: m, base frame.
+
+        Args:
+            pictures: by column, as the cameras take them.
+            tcp: pose of the hand, which carries a camera.
+        """
+        return self.start_scale.inverse(self.scaled(pictures, tcp))
+
+    def scaled(
+        self, pictures: dict[str, UInt8[Tensor, "b h w 3"]], tcp: Float[Tensor, "b 7"]
+    ) -> Float[Tensor, "b 7"]:
+        """The same, scaled to variance 1."""
+        said = [self.tcp_scale(tcp)]
+        for (key, (top, bottom, left, right)), network in zip(
+            self.config.windows, self.networks, strict=True
+        ):
+            window = pictures[key][:, top:bottom, left:right].permute(0, 3, 1, 2)
+            said.append(network(window.float() / 64 - 2))
+        return self.read(torch.cat(said, 1))
+
+
+class _Glances(nn.Module):
+    """Looks at several places of a picture: where each is, in [-1, 1], and what is there."""
+
+    def __init__(self, config: SightConfig) -> None:
+        super().__init__()
+        width, self.glances = config.channels, config.glances
+        self.patches = nn.Conv2d(3, width, 8, 4, 2)
+        self.join = nn.Conv2d(width, width, 3, 1, 1)
+        self.where = nn.Conv2d(width, config.glances, 1)
+        self.what = nn.Conv2d(width, config.detail, 1)
+
+    def forward(self, pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b p"]:
+        maps = F.relu(self.join(F.relu(self.patches(pictures))))
+        share = self.where(maps).flatten(2).softmax(2)
+        h, w = maps.shape[2:]
+        y, x = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
+        place = torch.stack([x, y]).flatten(1).expand(len(maps), -1, -1)
+        there = torch.cat([place, self.what(maps).flatten(2)], 1)
+        return (share @ there.mT).flatten(1)

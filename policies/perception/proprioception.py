@@ -1,0 +1,105 @@
+"""Proprioception as a network understands it at once.
+
+Two views of the same columns. From the base: joints and hand as they are. Along the hand's own axes
+("tool"): how the hand moves and which way is up, and nothing of where on the table it is or which way
+it faces, so that what was learnt on one wire holds for every wire that bends as much.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from touchgoal.control import features as ft
+from touchgoal.policies.actions import Representation, along_the_hand
+
+_NEAR = 0.02  # m
+_SEEN_ALONG_THE_HAND = {ft.STATE: 7, ft.TCP_POSE: 3}  # columns there are, and their widths
+
+
+def widths(columns: tuple[str, ...], kind: Representation) -> list[int]:
+    """Of what `unroll` makes of each column; KeyError for one that "tool" does not know."""
+    if kind == "tool":
+        return [_SEEN_ALONG_THE_HAND[key] for key in columns]
+    more = {ft.TCP_POSE: 2, ft.TRUTH_START: 5}
+    return [ft.FEATURES[key].shape[0] + more.get(key, 0) for key in columns]
+
+
+def places(columns: tuple[str, ...], kind: Representation) -> Float[Tensor, " r"]:
+    """1 for joint and TCP positions, 0 for all else that `unroll` gives."""
+    marks = []
+    for key, width in zip(columns, widths(columns, kind), strict=True):
+        count = 0 if kind == "tool" else {ft.STATE: ft.N_JOINTS, ft.TCP_POSE: 3}.get(key, 0)
+        marks += [1.0] * count + [0.0] * (width - count)
+    return torch.tensor(marks)
+
+
+def unroll(
+    state: Float[Tensor, "... s"], columns: tuple[str, ...], kind: Representation
+) -> Float[Tensor, "... r"]:
+    """What a network sees of columns of `vocabulary.FEATURES`, side by side.
+
+    From the base: the TCP's quaternion becomes the first two columns of its rotation matrix. A
+    quaternion and its negative are the same turn, and a measured one jumps between the two as the hand
+    turns about the vertical; the matrix does not (Zhou et al. 2019). What `truth.start` says is seen
+    from the hand, in axes parallel to the base's: a centimetre matters there, not where on the table.
+
+    Along the hand's axes: the TCP's linear and angular velocity (m/s, rad/s) and the gripper's width
+    for the state, the vertical for the TCP's pose.
+    """
+    parts, start = {}, 0
+    for key in columns:
+        parts[key] = state[..., start : (start := start + ft.FEATURES[key].shape[0])]
+    if kind == "tool":
+        parts[ft.STATE] = _motion(parts[ft.STATE])
+        if ft.TCP_POSE in parts:
+            parts[ft.TCP_POSE] = _vertical(parts[ft.TCP_POSE][..., 3:])
+    elif ft.TCP_POSE in parts:
+        pose = parts[ft.TCP_POSE]
+        turned = _two_columns(pose[..., 3:])
+        if ft.TRUTH_START in parts:
+            held = parts[ft.TRUTH_CONTACT].amin(-1, keepdim=True)
+            parts[ft.TRUTH_START] = _from_hand(parts[ft.TRUTH_START], pose[..., :3], turned, held)
+        parts[ft.TCP_POSE] = torch.cat([pose[..., :3], turned], -1)
+    return torch.cat([parts[key] for key in columns], -1)
+
+
+def _motion(state: Float[Tensor, "... 15"]) -> Float[Tensor, "... 7"]:
+    joints, velocity, width = state.split([ft.N_JOINTS, ft.N_JOINTS, 1], -1)
+    return torch.cat([(along_the_hand(joints) @ velocity[..., None])[..., 0], width], -1)
+
+
+def _vertical(quaternion: Float[Tensor, "... 4"]) -> Float[Tensor, "... 3"]:
+    """The base's z axis in the frame that the quaternion turns."""
+    w, x, y, z = quaternion.unbind(-1)
+    return torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1)
+
+
+def _from_hand(
+    start: Float[Tensor, "... 7"],
+    hand: Float[Tensor, "... 3"],
+    turned: Float[Tensor, "... 6"],
+    held: Float[Tensor, "... 1"],
+) -> Float[Tensor, "... 12"]:
+    """`vocabulary.TRUTH_START` relative to the hand's position and yaw."""
+    cos, sin = turned[..., 0], turned[..., 1]
+    cos, sin = cos * cos - sin * sin, 2 * cos * sin  # of twice the hand's yaw
+    yaw = torch.stack(
+        [
+            start[..., 3] * cos + start[..., 4] * sin,
+            start[..., 4] * cos - start[..., 3] * sin,
+        ],
+        -1,
+    )
+    there, height = (start[..., :2] - hand[..., :2]) * (1 - held), start[..., 2:3] - hand[..., 2:]
+    goal, yaw = (start[..., 5:] - hand[..., :2]) * held, yaw * (1 - held)
+    way = torch.cat([there, height, goal], -1)
+    return torch.cat([way, yaw, way / (way.abs() + _NEAR)], -1)
+
+
+def _two_columns(quaternion: Float[Tensor, "... 4"]) -> Float[Tensor, "... 6"]:
+    w, x, y, z = quaternion.unbind(-1)
+    columns = [
+        1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y),
+        2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
+    ]  # fmt: skip
+    return torch.stack(columns, -1)

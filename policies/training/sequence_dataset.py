@@ -1,0 +1,218 @@
+"""Training windows over episodes: what was seen on the last ticks, and what was done on the next.
+
+Touch is embedded once, by a frozen encoder, and kept on disk beside what it was made from.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float16, Float32, Int, UInt8
+from torch import Tensor
+from tqdm import tqdm
+
+from touchgoal.control import features as ft
+from touchgoal.control.errors import UserError
+from touchgoal.episodes.recording import one_core_workers
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.policies.perception.end_to_end import EyeConfig, shrink
+from touchgoal.policies.perception.frozen_touch import TouchEmbedder
+from touchgoal.policies.policy import Condition, PolicyConfig
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """n ticks of several episodes, one after the other.
+
+    Attributes:
+        touch: embeddings of both fingertips; float16, as they are many.
+        state: proprioception.
+        actions: `vocabulary.ACTION`.
+        lengths: ticks of each episode.
+        pictures: for the policy's eye; None without.
+        wrench: what acted on both pads (N, Nm, pad frames); None unless the policy reads it.
+    """
+
+    touch: Float16[Tensor, "n e"]
+    state: Float32[Tensor, "n s"]
+    actions: Float32[Tensor, "n 8"]
+    lengths: tuple[int, ...]
+    pictures: UInt8[Tensor, "n k h w 3"] | None = None
+    wrench: Float32[Tensor, "n 12"] | None = None
+
+
+def read(
+    episodes: EpisodeSet,
+    chosen: Sequence[int],
+    config: PolicyConfig,
+    embedder: TouchEmbedder | None,
+    workers: int = 1,
+) -> Recorded:
+    """Reads episodes, embedding those that are not yet; a kill loses those in progress.
+
+    Args:
+        episodes: the set.
+        chosen: which of them, e.g. the successful ones.
+        config: says which columns are read.
+        embedder: of touch; None for a policy without.
+        workers: processes that embed.
+
+    Raises:
+        UserError: nothing chosen, a missing column, another rate or embedder than the config's, or
+            embeddings of other episodes.
+    """
+    _check(episodes, chosen, config, embedder)
+    felt = embed(episodes, chosen, embedder, workers) if embedder else None
+    keys = [*config.proprioception, ft.ACTION, *[ft.TRUTH_PAD_WRENCH] * config.reads_wrench]
+    touch, state, actions, pictures, wrench = [], [], [], [], []
+    for n, i in enumerate(tqdm(chosen, desc="episodes", unit="episode")):
+        frames = episodes.read(i, keys).frames
+        state.append(np.concatenate([frames[key] for key in config.proprioception], 1))
+        actions.append(frames[ft.ACTION])
+        if config.reads_wrench:
+            wrench.append(frames[ft.TRUTH_PAD_WRENCH])
+        touch.append(felt[n] if felt else np.empty((len(actions[-1]), 0), np.float16))
+        if config.eye:
+            pictures.append(_look(episodes, i, config.eye))
+    parts = (torch.from_numpy(np.concatenate(rows)) for rows in (touch, state, actions))
+    return Recorded(
+        *parts,
+        lengths=tuple(len(rows) for rows in actions),
+        pictures=torch.from_numpy(np.concatenate(pictures)) if config.eye else None,
+        wrench=torch.from_numpy(np.concatenate(wrench)) if wrench else None,
+    )
+
+
+def _look(episodes: EpisodeSet, i: int, eye: EyeConfig) -> UInt8[np.ndarray, "t k h w 3"]:
+    frames = episodes.read(i, ft.TACTILE).frames
+    return np.stack([shrink(frames[key], frames[key][0], eye.size) for key in ft.TACTILE], 1)
+
+
+def _check(
+    episodes: EpisodeSet,
+    chosen: Sequence[int],
+    config: PolicyConfig,
+    embedder: TouchEmbedder | None,
+) -> None:
+    if not chosen:
+        raise UserError(f"no episode of {episodes.root} to learn from: record successful ones")
+    if episodes.fps != config.control_hz:
+        raise UserError(
+            f"{episodes.root} runs at {episodes.fps} Hz, the policy at {config.control_hz}: set "
+            "control_hz to the episodes' rate"
+        )
+    if tuple(episodes.features[ft.STATE]["shape"]) != ft.FEATURES[ft.STATE].shape:
+        raise UserError(
+            f"{episodes.root} is of an arm with another number of joints: policies are for the "
+            f"{ft.N_JOINTS} of an FR3"
+        )
+    if missing := set(config.proprioception) - set(episodes.features):
+        raise UserError(f"{episodes.root} has no {sorted(missing)[0]}, which the policy acts on")
+    if config.reads_wrench and ft.TRUTH_PAD_WRENCH not in episodes.features:
+        raise UserError(
+            f"{episodes.root} has no {ft.TRUTH_PAD_WRENCH}, which only simulated episodes have: "
+            'choose touch_reading "free"'
+        )
+    made = (embedder.name, embedder.dim) if embedder else ("", 0)
+    if made != (config.touch, config.touch_dim):
+        raise UserError(
+            f"the policy wants touch {config.touch!r} of width {config.touch_dim}, this is "
+            f"{made[0]!r} of width {made[1]}: make its config for this embedder"
+        )
+
+
+def embed(
+    episodes: EpisodeSet, chosen: Sequence[int], embedder: TouchEmbedder, workers: int = 1
+) -> list[Float16[np.ndarray, "t e"]]:
+    """The embeddings of episodes, made and kept if they are not yet."""
+    _fill_cache(episodes, chosen, embedder, workers)
+    return [embeddings(episodes, i, embedder) for i in chosen]
+
+
+def embeddings(episodes: EpisodeSet, i: int, embedder: TouchEmbedder) -> Float16[np.ndarray, "t e"]:
+    """The embeddings that `read` kept of an episode; UserError if they are another episode's."""
+    path = _path(episodes, embedder, i)
+    rows = np.load(path)
+    if rows.shape != (episodes.lengths[i], embedder.dim):
+        raise UserError(f"{path} does not fit episode {i} of {episodes.root}: delete {path.parent}")
+    return rows
+
+
+def _path(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> Path:
+    """Beside the episodes, so that every training on them shares it."""
+    folder = episodes.root.parent / "embeddings" / embedder.name.replace("/", "_")
+    return folder / f"{i:06d}.npy"
+
+
+def _fill_cache(
+    episodes: EpisodeSet, chosen: Sequence[int], embedder: TouchEmbedder, workers: int
+) -> None:
+    missing = [i for i in chosen if not _path(episodes, embedder, i).exists()]
+    if not missing:
+        return
+    _path(episodes, embedder, 0).parent.mkdir(parents=True, exist_ok=True)
+    make = partial(_embed, episodes, embedder)
+    progress = partial(tqdm, total=len(missing), desc="embed", unit="episode")
+    if workers == 1:
+        list(progress(map(make, missing)))
+        return
+    with one_core_workers(workers) as pool:
+        list(progress(pool.map(make, missing)))
+
+
+def _embed(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> None:
+    torch.set_num_threads(1)
+    rows, path = embedder.embed(episodes, i).astype(np.float16), _path(episodes, embedder, i)
+    with open(temporary := path.with_suffix(".tmp"), "wb") as file:
+        np.save(file, rows)
+    os.replace(temporary, path)
+
+
+class Windows:
+    """One window for every recorded tick.
+
+    Before an episode's start its first observation is repeated, and after its end its last action,
+    which is to stay: as in diffusion_policy.
+    """
+
+    def __init__(self, recorded: Recorded, config: PolicyConfig) -> None:
+        """Windows of the config's horizons."""
+        self.recorded = recorded
+        ends = np.cumsum(recorded.lengths)
+        first = np.repeat(ends - recorded.lengths, recorded.lengths)[:, None]
+        last = np.repeat(ends - 1, recorded.lengths)[:, None]
+        tick = np.arange(ends[-1])[:, None]
+        seen = tick + np.arange(1 - config.observation_horizon, 1)
+        done = tick + np.arange(config.prediction_horizon)
+        self._seen = torch.from_numpy(np.maximum(seen, first))
+        self._done = torch.from_numpy(np.minimum(done, last))
+
+    def __len__(self) -> int:
+        """Number of windows."""
+        return len(self._seen)
+
+    @property
+    def joints(self) -> Float[Tensor, "n 7"]:
+        """Joint positions at the latest tick of every window, rad."""
+        return self.recorded.state[:, : ft.N_JOINTS]
+
+    @property
+    def actions(self) -> Float[Tensor, "n h 8"]:
+        """What was done in every window."""
+        return self.recorded.actions[self._done]
+
+    def take(self, rows: Int[Tensor, " b"]) -> tuple[Condition, Float[Tensor, "b h 8"]]:
+        """Some windows: what was seen, what was done."""
+        seen, recorded = self._seen[rows], self.recorded
+        pictures = None if recorded.pictures is None else recorded.pictures[rows]
+        condition = Condition(recorded.touch[seen].float(), recorded.state[seen], pictures)
+        return condition, recorded.actions[self._done[rows]]
+
+    def wrench(self, rows: Int[Tensor, " b"]) -> Float[Tensor, "b o 12"] | None:
+        """What acted on both pads when some windows were seen, if it was read."""
+        wrench = self.recorded.wrench
+        return None if wrench is None else wrench[self._seen[rows]]

@@ -1,0 +1,98 @@
+"""The cost of a trajectory while it happens: what `reward-curves` would say of the newest tick."""
+
+import time
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.features import CONTROL_HZ, FRONT, TACTILE
+from touchgoal.control.sensors.latest_value import Newest
+from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
+from touchgoal.encoders.towers.towers import Towers
+from touchgoal.rewards.curves import Contact, Scale
+from touchgoal.rewards.embedding_distance import (
+    EmbeddedEpisode,
+    EmbeddedGoal,
+    EpisodeEmbedder,
+    measure,
+)
+from touchgoal.rewards.goals import GoalSpec, choose_goal
+
+_FIRST = 30.0  # s for the first cost, which warms everything up
+_IDLE = 0.005  # s between looks for a new tick
+
+Observation = Mapping[str, np.ndarray]
+
+
+class LiveCost:
+    """Measures ticks in a thread: the newest one whenever it is through with the last.
+
+    The fingertips' background is the first tick's: they are untouched then.
+    """
+
+    def __init__(
+        self, towers: Towers, encoder: TouchEncoder, scale: Scale, goals: Sequence[GoalSpec]
+    ) -> None:
+        """Starts the thread; `close` ends it.
+
+        Args:
+            towers: frozen image and text towers.
+            encoder: touch encoder trained with them.
+            scale: of these encoders.
+            goals: each modality takes the first that speaks for it; what none speaks for is left
+                out. Frames of the episode itself are not known yet and cannot be goals.
+        """
+        self._towers, self._encoder, self._scale, self._goals = towers, encoder, scale, goals
+        self._embedder = EpisodeEmbedder(towers, encoder)
+        self._first: Observation = {}
+        self._goal: EmbeddedGoal | None = None
+        self._tick: Observation | None = None
+        self._newest = Newest("cost", self._take, _FIRST)
+
+    def look(self, observation: Observation) -> float:
+        """Hand a tick over; the newest cost there is, 1 at the usual start and 0 at the usual end.
+
+        The mean over the modalities that have a goal. It waits for the first one alone. DriverError,
+        with the reason, if nothing can be measured.
+        """
+        self._tick = observation
+        return self._newest.read()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._newest.close()
+
+    def _take(self) -> float | None:
+        observation, self._tick = self._tick, None
+        if observation is None:
+            time.sleep(_IDLE)
+            return None
+        torch.set_num_threads(1)  # of this thread: the control loop needs the other core
+        self._first = self._first or observation
+        episode = self._embed(observation)
+        if self._goal is None:
+            goal = choose_goal(self._goals, episode.modalities)
+            if goal.own:
+                raise UserError("task.rewards: last and frame:K are not known before the end")
+            self._goal = self._embedder.embed_goal(goal, episode)
+        curves = measure(episode, self._goal, self._scale)
+        return float(np.mean([curves.normalised[name][0] for name in curves.raw]))
+
+    def _embed(self, observation: Observation) -> EmbeddedEpisode:
+        """One tick as an episode."""
+        if FRONT not in observation:
+            raise UserError("task.rewards: the cost looks through the front camera: add it")
+        image = self._towers.embed_images(observation[FRONT][None]).float()
+        sides = tuple(key for key in TACTILE if key in observation)
+        touch = [self._encoder.embed_frames(observation[k][None], self._first[k]) for k in sides]
+        return EmbeddedEpisode(
+            source="this run",
+            fps=CONTROL_HZ,
+            contact=Contact(None, "not looked for"),
+            space=self._embedder.space,
+            image=torch.nn.functional.normalize(image, dim=1).cpu().numpy(),
+            sides=sides,
+            touch=np.stack(touch) if touch else None,
+        )

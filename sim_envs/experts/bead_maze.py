@@ -1,0 +1,65 @@
+"""The bead maze's demonstrator: it sees the wire, and comes back to it when it is led astray."""
+
+import numpy as np
+
+from touchgoal.control.motion.kinematics import fingers_across, rotation_vector
+from touchgoal.sim_envs.base import Observation
+from touchgoal.sim_envs.bead_maze import BeadMaze
+
+_RETURN = 5.8  # 1/s: rate at which a distance to the course is taken back, a quarter at 20 Hz
+_FASTEST = 0.02  # m/s (or, times _LEVER, rad/s) at which it comes back from far away
+_LEAD = 0.006  # m that the commanded bead may be ahead of the real one: more is a jam
+_SLOW = 0.004  # m (or, times _LEVER, rad) off the course at which there is no going on
+_LEVER = 0.02  # m by which a turn counts as a displacement: the size of the bead
+
+
+class BeadMazeExpert:
+    """Leads the bead along the wire at `speed` m/s, the hand turned with the wire.
+
+    It acts on the commanded pose, of which it makes a point on the course, a step ahead, so that
+    the arm's compliance does not add up. Where the bead sits in the hand is measured at each tick
+    without the gels' deflection: a bead that slipped is led from where it is.
+    """
+
+    def __init__(self, env: BeadMaze, speed: float = 0.025) -> None:
+        self._env, self._speed = env, speed
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """The action for the next tick; the observation is not looked at."""
+        env = self._env
+        if env.grasping:
+            return np.zeros(8)
+        tick, grip = 1 / env.config.control_hz, self._grip()
+        position, R = env.kinematics.forward(env.command)
+        bead = position + R @ grip
+        s = env.wire.project(bead, env.s)
+        point, tangent = env.wire.at(s)
+        off = bead - point
+        turned = rotation_vector(fingers_across(tangent).T @ R)
+        astray = max(float(np.linalg.norm(off)), _LEVER * float(np.linalg.norm(turned)))
+        ahead = self._speed * tick * max(0.0, 1 - astray / _SLOW)
+        left = max(np.exp(-_RETURN * tick), 1 - _FASTEST * tick / max(astray, 1e-9))
+        point, tangent = env.wire.at(min(s + ahead, env.s + _LEAD))
+        R = fingers_across(tangent) @ _rotation(left * turned)
+        target = point + left * off - R @ grip
+        joints = env.kinematics.inverse(target, R, env.command).q
+        return np.append(joints - env.command, 0.0)
+
+    def _grip(self) -> np.ndarray:
+        """Where the bead would sit in the TCP frame if the gels were not deflected, m."""
+        data = self._env.data
+        sides = ("left", "right")
+        gels = [data.body(f"{s}_gel").xpos - data.site(f"{s}_sensor").xpos for s in sides]
+        tcp = data.site("tcp")
+        offset = self._env.object_pose()[:3] - tcp.xpos - 0.5 * (gels[0] + gels[1])
+        return tcp.xmat.reshape(3, 3).T @ offset
+
+
+def _rotation(vector: np.ndarray) -> np.ndarray:
+    """Rotation matrix of an axis times angle (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-9:
+        return np.eye(3)
+    x, y, z = vector / angle
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)

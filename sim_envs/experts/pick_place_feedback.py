@@ -1,0 +1,96 @@
+"""Pick and place as a law of the present state: what to do from wherever a learner has got to."""
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.control.motion.kinematics import fingers_down
+from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH, Observation
+from touchgoal.sim_envs.experts.pick_place import CLEARANCE, FEEL_DOWN, LOWEST_GRASP, LOWEST_PLACE
+from touchgoal.sim_envs.pick_place import PickPlace
+
+_STEEP = 3.0  # m of height per m that the hand is beside its place
+_NEAR, _GRIPPING = 0.006, 0.015  # m beside the object: for fingers to begin to close, to go on
+_OVER, _PLACED = 0.008, 0.014  # m beside the goal: for the object to go down, to stay there
+_BEGUN = GRIPPER_MAX_WIDTH - 0.006  # m of width below which the fingers have begun to close
+_STILL = 0.006  # m/s of width: fingers that something stops
+_SPEED, _CLIMB, _FEEL = 0.3, 0.2, 0.01  # m/s: at most over the table, up and down, near it
+_CLOSE = 0.006  # m above its place at which the object is lowered no faster than that
+_ACCELERATION = 4.0  # m/s^2
+_RETURN, _LOWER = 5.0, 3.0  # 1/s: speed towards a place per distance to it; down, with the object
+_TURN = 1.0  # rad/s
+
+
+class FeedbackExpert:
+    """Picks and places, to be asked in any state, whoever led the arm there.
+
+    It follows a funnel over the object, and once it holds it, over the goal: the farther beside, the
+    higher. What it does depends on nothing but how the episode began and what can be sensed of the
+    present tick and the one before, so a learner that sees as much can do the same. An object
+    that is pushed away it does not follow, and it never lets go.
+    """
+
+    def __init__(self, env: PickPlace) -> None:
+        """For one episode, at its beginning."""
+        self._env = env
+        self._object, self._yaw = env.object_pose()[:3].copy(), env.grasp_yaw()
+        self._object[2] = max(self._object[2], LOWEST_GRASP)
+        self._goal = np.array([*env.goal, self._object[2]])
+        self._before, _ = env.kinematics.forward(env.command)
+        self._width = env.width()
+
+    def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
+        """The action for the next tick; to be asked at every tick, whoever acts.
+
+        The observation is not looked at: the expert sees the simulator's state.
+        """
+        env, hz = self._env, self._env.config.control_hz
+        (here, R), width = env.kinematics.forward(env.command), env.width()
+        pace = (here - self._before) * hz
+        still = abs(width - self._width) * hz < _STILL
+        self._before, self._width = here, width
+        yaw = float(np.arctan2(R[1, 0], R[0, 0]))
+        turn, grip = 0.0, 0.0
+        if still and all(pad.touching for pad in env.pad_contacts()):
+            velocity = self._carry(here)
+        else:
+            turn = float((self._yaw - yaw + np.pi / 2) % np.pi - np.pi / 2)
+            velocity, turn, grip = self._fetch(here, turn, width)
+        change = velocity - pace
+        change *= min(1.0, _ACCELERATION / hz / max(float(np.linalg.norm(change)), 1e-9))
+        turn = float(np.clip(_RETURN * turn, -_TURN, _TURN)) / hz
+        # A learner may have led the arm to where nothing is in reach: the nearest place will do.
+        solution = env.kinematics.inverse(
+            here + (pace + change) / hz, fingers_down(yaw + turn), env.command
+        )
+        return np.append(solution.q - env.command, grip)
+
+    def _fetch(
+        self, here: np.ndarray, turn: float, width: float
+    ) -> tuple[np.ndarray, float, float]:
+        """Velocity (m/s), turn still to make (rad) and width (m) of a hand that holds nothing."""
+        off = self._object - here
+        beside = float(np.linalg.norm(off[:2])) + 0.05 * abs(turn)
+        reach = _GRIPPING if width < _BEGUN else _NEAR
+        if beside < reach and abs(off[2]) < reach:
+            return np.zeros(3), 0.0, 0.0
+        return _funnel(off, beside - _NEAR), turn, GRIPPER_MAX_WIDTH
+
+    def _carry(self, here: np.ndarray) -> np.ndarray:
+        """Velocity (m/s) of a hand that holds the object."""
+        off = self._goal - here
+        beside = float(np.linalg.norm(off[:2]))
+        if beside < _PLACED and self._env.object_on_table():
+            return np.zeros(3)
+        if beside < _OVER and off[2] > -_CLOSE:
+            deepest = max(self._goal[2] - FEEL_DOWN, LOWEST_PLACE)
+            return np.array([0, 0, -_FEEL if here[2] > deepest else 0.0])
+        return _funnel(off, beside - _OVER, _LOWER)
+
+
+def _funnel(off: np.ndarray, beside: float, lower: float = _RETURN) -> np.ndarray:
+    """Velocity (m/s) towards a place `off` (m), from above it."""
+    rise = off[2] + min(CLEARANCE, _STEEP * max(0.0, beside))
+    distance = float(np.linalg.norm(off[:2]))
+    high = np.clip(1 - rise / 0.04, 0, 1)  # over the table only where it is high enough
+    climb = np.clip((_RETURN if rise > 0 else lower) * rise, -_CLIMB, _CLIMB)
+    return np.array([*(off[:2] * high * min(_RETURN, _SPEED / max(distance, 1e-9))), climb])

@@ -1,0 +1,86 @@
+"""A person who leads the bead with keys, as one who leads a compliant arm by the hand does.
+
+A key pushes the hand; the arm gives way to what the wire does to the bead. So the person says where
+to, and the wire where exactly.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from touchgoal.control import features as ft
+from touchgoal.control.motion.kinematics import rotation_matrix
+from touchgoal.sim_envs.base import Observation
+from touchgoal.sim_envs.bead_maze import BeadMaze
+
+STOP = " "
+HELP = "w/s on/back  a/d left/right  r/f up/down  j/l yaw  i/k pitch  u/o roll  space stop"
+
+# Of each axis of the hand (x along the wire, y to the right, z down): the key that pushes it or turns
+# it about the axis, and the one that does the opposite.
+_PAIRS = ("ws", "da", "fr", "ou", "ik", "lj")
+_PUSHES = {
+    key: sign * axis
+    for pair, axis in zip(_PAIRS, np.eye(6), strict=True)
+    for key, sign in zip(pair, (1, -1), strict=True)
+}
+
+
+@dataclass(frozen=True)
+class TeleoperatorConfig:
+    """How hand and keys respond.
+
+    Attributes:
+        speed, turn: m/s and rad/s at which a key moves and turns the free hand.
+        give: m/s by which the hand gives way to a force, per N.
+        give_turn: rad/s by which it gives way to a torque, per N m.
+        hold: s for which a key counts as held after it was typed. A terminal tells of no releases; it
+            repeats a held key after some 0.4 s, and only the last one. Two keys typed in turn push
+            together.
+    """
+
+    speed: float = 0.025
+    turn: float = 0.5
+    give: float = 2e-3
+    give_turn: float = 2.0
+    hold: float = 0.5
+
+
+class Teleoperator:
+    """Acts on the commanded pose, as `press` says and the wire lets it."""
+
+    def __init__(self, env: BeadMaze, config: TeleoperatorConfig) -> None:
+        self._env, self._config = env, config
+        self._held: dict[str, int] = {}  # ticks left
+
+    @property
+    def held(self) -> str:
+        """The keys that count as held."""
+        return "".join(sorted(self._held))
+
+    def press(self, keys: str) -> None:
+        """Keys were typed, in this order; those without a meaning have no effect."""
+        for key in keys:
+            if key == STOP:
+                self._held.clear()
+            elif key in _PUSHES:
+                (pair,) = (pair for pair in _PAIRS if key in pair)
+                self._held.pop(pair.replace(key, ""), None)
+                self._held[key] = round(self._config.hold * self._env.config.control_hz)
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """The action for the next tick; none while the hand closes on the bead."""
+        env, c = self._env, self._config
+        push = sum((_PUSHES[key] for key in self._held), np.zeros(6)).reshape(2, 3)
+        self._held = {key: ticks - 1 for key, ticks in self._held.items() if ticks > 1}
+        if env.grasping:
+            return np.zeros(8)
+        position, R = env.kinematics.forward(env.command)
+        wrench = observation[ft.WRENCH].astype(np.float64).reshape(2, 3)
+        moved, turned = np.array([[c.speed], [c.turn]]) * (push @ R.T)
+        yielded, swung = np.array([[c.give], [c.give_turn]]) * wrench
+        tick = 1 / env.config.control_hz
+        target = position + tick * (moved + yielded)
+        R = rotation_matrix(tick * (turned + swung)) @ R
+        joints = env.kinematics.inverse(target, R, env.command).q
+        return np.append(joints - env.command, 0.0)

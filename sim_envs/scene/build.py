@@ -1,0 +1,345 @@
+"""The MuJoCo scene: an FR3 or UR5e with a fingertip sensor on each finger, a table, cameras, objects.
+
+Solver settings and their measured effects (creep of a held object, speed) are explained where they
+are set. World frame = the robot's base frame, table top at z = 0.
+"""
+
+import importlib.util
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.motion.kinematics import GELSIGHT_TCP
+from touchgoal.control.safety import limits
+from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
+from touchgoal.sim_envs.scene.objects import FIRM, Body
+from touchgoal.sim_envs.scene.ur5e import with_ur5e
+
+SIDES = ("left", "right")
+OBJECT_GROUP, VISUAL_GROUP, HIDDEN_GROUP = 1, 2, 3
+GRIPPER_MAX_FORCE = 80.0  # N, both fingers; opening never needs a limit below it
+
+ROBOTS = {"fr3": limits.FR3, "ur5e": limits.UR5E}
+# N m/rad. Franka's default joint impedance: fr3.xml. Stiff enough for the UR5e, too: our choice.
+_STIFFNESS = {
+    "fr3": (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0),
+    "ur5e": (4500.0, 4500.0, 4500.0, 2000.0, 2000.0, 2000.0),
+}
+SERVO_DAMPING = 0.1  # s: N m s/rad for each N m/rad of stiffness, fr3.xml
+_SENSOR_DEPTH_IN_FINGER = GELSIGHT_TCP - 0.0584  # finger frame to sensor centre, along z
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """What the scene is made of.
+
+    Attributes:
+        arm: whose flange carries the hand.
+        sensor: on both fingers: a name in `control.sensors.SENSORS`, or the folder of a sensor file
+            that `touchgoal calibrate` wrote.
+        meshes: "fast" draws the collision meshes (2.5k triangles, 1 ms a frame in software GL),
+            "full" the visual ones (242k triangles, 30 ms).
+        timestep: of the physics, s.
+    """
+
+    arm: Literal["fr3", "ur5e"] = "fr3"
+    sensor: str = "gelsight_mini"
+    meshes: Literal["fast", "full"] = "fast"
+    timestep: float = 1e-3
+
+
+def robot_model() -> Path:
+    """The FR3's MJCF inside the franky-sim wheel (not imported: it would pull pinocchio in)."""
+    found = importlib.util.find_spec("franky_sim")
+    if found is None or found.origin is None:
+        raise UserError("the FR3 model is missing; run: pip install franky-sim")
+    return Path(found.origin).parent / "assets" / "fr3.xml"
+
+
+def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpec:
+    """The scene's spec; tasks add to it before they compile it."""
+    config = config or SceneConfig()
+    if config.arm == "ur5e":
+        spec = mujoco.MjSpec.from_string(with_ur5e(robot_model()))
+    else:
+        spec = mujoco.MjSpec.from_file(str(robot_model()))
+        # No posture brings these together (none of 20,000 random ones did), but they lie so near
+        # that each pair would be looked at closely in every step.
+        for i, k in ((0, 2), (2, 4), (3, 5)):
+            spec.add_exclude(bodyname1=f"fr3_link{i}", bodyname2=f"fr3_link{k}")
+    spec.meshdir = str(robot_model().parent / "meshes")
+    _set_options(spec, config)
+    _strip(spec, config)
+    _compensate_gravity(spec.body("base"))
+    for side in SIDES:
+        _add_fingertip(spec, side, find_sensor(config.sensor))
+    _add_actuators(spec, config.arm)
+    _add_cameras_and_table(spec)
+    for body in bodies:
+        _add_body(spec, body)
+    return spec
+
+
+def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
+    option = spec.option
+    option.timestep = config.timestep
+    # `discrete` keeps implicit damping when an actuator saturates; with `implicitfast` MuJoCo
+    # 4.0.0 shakes a grasped object several mm out of the hand at each set-point step.
+    option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    # Elliptic cones at impratio 1000: a held object creeps 0.001 mm/s instead of 1.
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = 1000
+    # 4.0.0's sparse Newton factorisation is wrong (fixed in 4.0.1); at our size dense is as fast.
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    # One small island: looking for more costs 10 % of a step. Creep is the same at both tolerances.
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
+    option.tolerance = 1e-6
+    spec.stat.extent = 1.0
+    spec.stat.center = np.array([0.5, 0.0, 0.2])
+    visual = spec.visual
+    visual.map.znear, visual.map.zfar = 0.01, 10.0  # m: the wrist camera is near the fingers
+    visual.global_.offwidth, visual.global_.offheight = 1280, 960
+    visual.headlight.active = 1
+    visual.headlight.ambient, visual.headlight.diffuse = (
+        np.full(3, 0.3, np.float32),
+        np.full(3, 0.3, np.float32),
+    )
+    visual.headlight.specular = np.zeros(3, np.float32)
+    visual.quality.shadowsize = 0 if config.meshes == "fast" else 2048
+    visual.quality.offsamples = 0 if config.meshes == "fast" else 4
+    visual.quality.numslices = 24
+
+
+def _strip(spec: mujoco.MjSpec, config: SceneConfig) -> None:
+    """Drop what the wheel's model brings and we replace: keyframes, servos, finger shapes."""
+    for item in [*spec.keys, *spec.actuators]:
+        spec.delete(item)
+    for side in SIDES:
+        for geom in list(spec.body(f"{side}_finger").geoms):
+            spec.delete(geom)
+    # Finger joints at their stops would otherwise be as soft as a contact.
+    for joint in ("finger_joint1", "finger_joint2"):
+        spec.joint(joint).solref_limit = np.array([0.004, 1])
+    for body in spec.bodies:
+        for geom in list(body.geoms):
+            is_visual = geom.meshname != "" and not geom.meshname.endswith("_coll")
+            if is_visual and config.meshes == "fast":
+                spec.delete(geom)
+            elif not is_visual and config.meshes == "fast":
+                geom.group = VISUAL_GROUP
+                geom.rgba = [0.92, 0.92, 0.94, 1]
+    used = {geom.meshname for body in spec.bodies for geom in body.geoms}
+    for mesh in [m for m in spec.meshes if m.name not in used]:
+        spec.delete(mesh)
+
+
+def _compensate_gravity(body: mujoco.MjsBody) -> None:
+    """As libfranka does: the arm and its tool do not feel their own weight."""
+    body.gravcomp = 1
+    for child in body.bodies:
+        _compensate_gravity(child)
+
+
+def _add_fingertip(spec: mujoco.MjSpec, side: str, sensor: SensorModel) -> None:
+    """Carriage, adapter, sensor case and gel of one finger.
+
+    The gel is one rigid plate on three springs (normal, two shear): the pad's force then is exact,
+    and its displacement is what shear does to the image. The plate's collision box reaches 12 mm
+    into the case, because a thin box flips its contact normals when squeezed.
+    """
+    finger = spec.body(f"{side}_finger")
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    z = _SENSOR_DEPTH_IN_FINGER
+    length, width, depth = sensor.case_size
+    protrusion = sensor.gel_thickness + 0.0005  # the case must never take the load
+    grey, black = [0.3, 0.3, 0.32, 1], [0.12, 0.12, 0.13, 1]
+    visual = {"contype": 0, "conaffinity": 0, "mass": 0.0, "group": VISUAL_GROUP, "rgba": grey}
+    # Adapter (GelSight's STEP file): mount block 21 x 25 mm on the carriage, arm 30 x 12 mm.
+    finger.add_geom(type=box, size=[0.0105, 0.0125, 0.010], pos=[0, 0.014, 0.010], **visual)
+    arm = (z - length / 2 - 0.018) / 2
+    finger.add_geom(type=box, size=[0.015, 0.006, arm], pos=[0, 0.024, 0.018 + arm], **visual)
+    finger.add_geom(
+        name=f"{side}_case",
+        type=box,
+        size=[width / 2, (depth - protrusion) / 2, length / 2],
+        pos=[0, (depth + protrusion) / 2, z],
+        mass=0.0,
+        friction=[0.5, 0.005, 0.0001],
+        group=VISUAL_GROUP,
+        rgba=black,
+    )
+    # Sensor frame: x down the finger, z out of the gel (towards the other finger), y = z x x.
+    x, y, out = np.array([0.0, 0, 1]), np.array([-1.0, 0, 0]), np.array([0, -1.0, 0])
+    finger.add_site(
+        name=f"{side}_sensor", pos=[0, 0, z], quat=_quaternion(x, y, out), group=HIDDEN_GROUP
+    )
+    _add_gel(spec, finger, side, sensor, z)
+
+
+def _add_gel(
+    spec: mujoco.MjSpec, finger: mujoco.MjsBody, side: str, sensor: SensorModel, z: float
+) -> None:
+    mass, damping_ratio = 0.005, 0.7  # kg of gel; critically enough damped to not ring
+    gel = finger.add_body(name=f"{side}_gel", pos=[0, 0, z], gravcomp=1)
+    gel.explicitinertial = True
+    gel.mass, gel.inertia = mass, np.full(3, 1e-6)
+    gel.ipos, gel.iquat = np.zeros(3), np.array([1.0, 0, 0, 0])
+    springs = (
+        ("normal", [0, 1, 0], sensor.normal_stiffness),
+        ("shear_x", [0, 0, 1], sensor.shear_stiffness),
+        ("shear_y", [-1, 0, 0], sensor.shear_stiffness),
+    )
+    for name, axis, stiffness in springs:
+        gel.add_joint(
+            name=f"{side}_gel_{name}",
+            type=mujoco.mjtJoint.mjJNT_SLIDE,
+            axis=axis,
+            stiffness=[stiffness, 0, 0],
+            damping=[2 * damping_ratio * np.sqrt(stiffness * mass), 0, 0],
+            armature=0.0,
+            frictionloss=0.0,
+        )
+    gel.add_geom(
+        name=f"{side}_pad",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[sensor.gel_size[1] / 2, 0.006, sensor.gel_size[0] / 2],
+        pos=[0, 0.006, 0],
+        mass=0.0,
+        group=VISUAL_GROUP,
+        rgba=[0.75, 0.75, 0.78, 1],
+    )
+    other = "right" if side == "left" else "left"
+    for body in (f"{side}_finger", f"{other}_finger", "hand"):
+        spec.add_exclude(bodyname1=f"{side}_gel", bodyname2=body)
+    if side == "left":
+        spec.add_exclude(bodyname1="left_finger", bodyname2="right_finger")
+    spec.add_exclude(bodyname1="hand", bodyname2=f"{side}_finger")
+
+
+def arm_joints(arm: str) -> list[str]:
+    """Names of an arm's joints, from the base outwards."""
+    return [f"{arm}_joint{i}" for i in range(1, ROBOTS[arm].arm.home.size + 1)]
+
+
+def _add_actuators(spec: mujoco.MjSpec, arm: str) -> None:
+    affine = {
+        "gaintype": mujoco.mjtGain.mjGAIN_FIXED,
+        "biastype": mujoco.mjtBias.mjBIAS_AFFINE,
+    }
+    for i, (name, stiffness) in enumerate(zip(arm_joints(arm), _STIFFNESS[arm], strict=True), 1):
+        joint = spec.joint(name)
+        spec.add_actuator(
+            name=f"joint_{i}",
+            target=joint.name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            gainprm=[stiffness] + [0] * 9,
+            biasprm=[0, -stiffness, -SERVO_DAMPING * stiffness] + [0] * 7,
+            ctrlrange=joint.range.tolist(),
+            ctrllimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+            **affine,
+        )
+    # One servo on the mean finger opening, stiff enough that the force clamp, set at run time to
+    # the grasp force, is what it delivers; the wheel's own hand is a 100 N/m spring.
+    stiffness, damping = 2.0e4, 200.0
+    spec.add_actuator(
+        name="gripper",
+        target="split",
+        trntype=mujoco.mjtTrn.mjTRN_TENDON,
+        gainprm=[stiffness] + [0] * 9,
+        biasprm=[0, -stiffness, -damping] + [0] * 7,
+        forcerange=[-GRIPPER_MAX_FORCE, GRIPPER_MAX_FORCE],
+        forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        **affine,
+    )
+
+
+def _add_cameras_and_table(spec: mujoco.MjSpec) -> None:
+    world = spec.worldbody
+    hand = spec.body("hand")
+    hand.add_site(name="tcp", pos=[0, 0, GELSIGHT_TCP], group=HIDDEN_GROUP)
+    eye = [0.075, 0.0, 0.02]
+    hand.add_camera(name="wrist", pos=eye, quat=_look(eye, [0.012, 0, 0.17], [1, 0, 0]), fovy=62)
+    for name, eye, target, fovy in (
+        ("front", [1.15, 0.0, 0.55], [0.46, 0.0, 0.10], 40),
+        ("side", [0.62, -0.95, 0.42], [0.45, 0.0, 0.17], 40),
+    ):
+        world.add_camera(name=name, pos=eye, quat=_look(eye, target, [0, 0, 1]), fovy=fovy)
+    world.add_light(pos=[0.6, -0.6, 1.6], dir=[-0.1, 0.4, -1], castshadow=True, diffuse=[0.5] * 3)
+    world.add_light(pos=[0.9, 0.8, 1.5], dir=[-0.3, -0.5, -1], castshadow=False, diffuse=[0.3] * 3)
+    world.add_geom(
+        name="table",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[0.4, 0.5, 0.02],
+        pos=[0.55, 0, -0.02],
+        rgba=[0.62, 0.6, 0.57, 1],
+        group=VISUAL_GROUP,
+    )
+    world.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[3, 3, 0.1],
+        pos=[0, 0, -0.4],
+        rgba=[0.35, 0.38, 0.42, 1],
+        contype=0,
+        conaffinity=0,
+        group=VISUAL_GROUP,
+    )
+
+
+_GEOM_TYPES = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "mesh": mujoco.mjtGeom.mjGEOM_MESH,
+}
+
+
+def _add_body(spec: mujoco.MjSpec, body: Body) -> None:
+    kind = body.kind
+    item = spec.worldbody.add_body(name=body.name)
+    item.add_freejoint(name=body.name)
+    shape: dict = {"size": [*body.size, 0, 0][:3]}
+    if kind.shape == "capsule":
+        shape["quat"] = [np.sqrt(0.5), 0, np.sqrt(0.5), 0]  # lies along the body's x axis
+    if kind.shape == "mesh":
+        assert body.hull is not None
+        spec.add_mesh(name=body.name, uservert=body.hull.ravel().tolist())
+        shape = {"meshname": body.name}
+    # Round things get rolling friction (condim 6), or they never come to rest on the table.
+    rolls = kind.shape in ("sphere", "capsule")
+    soft = kind.material.foundation_modulus < FIRM
+    item.add_geom(
+        name=body.name,
+        type=_GEOM_TYPES[kind.shape],
+        mass=body.mass,
+        rgba=kind.material.rgba,
+        group=OBJECT_GROUP,
+        # The object's contact parameters hold against gel and table alike.
+        priority=1,
+        condim=6 if rolls else 4,
+        # Torsion as a patch of 5 mm radius, a 10 N grasp's, bears it (8/15 of that, Hertz' pressure).
+        friction=[kind.material.friction, 0.0025, 0.0005 if rolls else 0.0001],
+        solref=[0.008 if soft else 0.004, 1],
+        solimp=[0.95, 0.99, 0.001, 0.5, 2],
+        **shape,
+    )
+
+
+def _quaternion(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> list[float]:
+    """wxyz of the frame whose axes, in the parent frame, are x, y, z."""
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.stack([x, y, z], axis=1).ravel())
+    return quat.tolist()
+
+
+def _look(eye: list[float], target: list[float], up: list[float]) -> list[float]:
+    """Orientation of a camera at `eye` that looks at `target` with `up` upwards in its image."""
+    z = np.asarray(eye) - np.asarray(target)
+    z = z / np.linalg.norm(z)
+    x = np.cross(up, z)
+    x = x / np.linalg.norm(x)
+    return _quaternion(x, np.cross(z, x), z)

@@ -1,0 +1,73 @@
+"""One object held in front of one fingertip sensor, without physics: presses for any use."""
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.control.tactile.sensor_models import SensorModel
+from touchgoal.sim_envs.scene.build import build
+from touchgoal.sim_envs.scene.contacts import PadContact
+from touchgoal.sim_envs.scene.objects import Body
+from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
+from touchgoal.sim_envs.tactile.sensor_instance import Unit, sample_unit
+
+
+class PressRig:
+    """Presses a body into the left sensor at a place and with a force of one's choice.
+
+    Forces are taken as given, not solved for: any press can be asked for, possible or not.
+    """
+
+    def __init__(self, body: Body, sensor: SensorModel, unit: Unit) -> None:
+        self._model = build([body]).compile()
+        self._data = mujoco.MjData(self._model)
+        mujoco.mj_forward(self._model, self._data)
+        self._name = body.name
+        self._geoms = frozenset({int(self._model.body(body.name).geomadr[0])})
+        self._pad = TactilePad(self._model, "left", sensor, unit, [body])
+
+    def place(
+        self, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"] | None = None
+    ) -> None:
+        """Put the body at a pose in the sensor's frame, m."""
+        site = self._data.site("left_sensor")
+        R = site.xmat.reshape(3, 3)
+        pose = np.empty(7)
+        pose[:3] = site.xpos + R @ position
+        mujoco.mju_mat2Quat(pose[3:], (R if rotation is None else R @ rotation).ravel())
+        self._data.joint(self._name).qpos = pose
+        mujoco.mj_forward(self._model, self._data)
+
+    def sense(
+        self,
+        force: float,
+        rng: np.random.Generator,
+        shear: tuple[float, float] = (0.0, 0.0),
+        centre: tuple[float, float] = (0.0, 0.0),
+    ) -> TactileFrame:
+        """The sensor's reading.
+
+        Args:
+            force: with which the body presses, N.
+            rng: of the camera's noise.
+            shear: force along the sensor's x and y, N.
+            centre: where the forces act, m in the sensor's frame.
+        """
+        (x, y), (sx, sy) = centre, shear
+        torque = np.array([-y * force, x * force, x * sy - y * sx])
+        contact = PadContact(np.array([sx, sy, -force]), torque, 0.0, self._geoms)
+        return self._pad.sense(self._data, contact, rng)
+
+
+def warm_up(bodies: list[Body], sensor: SensorModel) -> None:
+    """Press each body once, and it drags: loading the machine code of a touch takes up to a second.
+
+    For a simulator that must keep up with a clock or a client.
+    """
+    rng = np.random.default_rng(0)
+    unit = sample_unit(sensor, rng)
+    for body in bodies:
+        rig = PressRig(body, sensor, unit)
+        rig.place(np.zeros(3))
+        for _ in range(2):  # the second time the gel remembers the first
+            rig.sense(1.0, rng, shear=(0.1, 0.0))

@@ -1,0 +1,380 @@
+"""The arm's side of the Franka control interface, in front of the cell; any libfranka client fits.
+
+Motion in joint or Cartesian position or velocity, and torque; reflexes, limits and lost packets
+abort it with the errors a real arm gives. What it does not simulate: joint and Cartesian impedance
+set by the client (the servo stays at Franka's default), self-collision, guiding.
+"""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.motion.kinematics import GELSIGHT_TCP, rotation_vector
+from touchgoal.control.safety.limits import FR3
+from touchgoal.sim_envs.scene.build import robot_model
+from touchgoal.sim_envs.twin.cell import DT, Cell
+from touchgoal.sim_envs.twin.franka import limits, messages
+from touchgoal.sim_envs.twin.franka.limits import Setpoint, Thresholds
+from touchgoal.sim_envs.twin.franka.messages import MoveStatus, RobotCommand, RobotMode
+
+_LOST = 20  # packets in a row after which the arm stops: Franka's documentation
+_POSITION, _VELOCITY, _POSE, _TWIST, _TORQUE = range(5)  # motion generators; 4 is none
+_EXTERNAL, _OTHER = 2, 3  # controllers
+_SETTERS = {
+    RobotCommand.SET_COLLISION_BEHAVIOUR,
+    RobotCommand.SET_EE_TO_K,
+    RobotCommand.SET_NE_TO_EE,
+    RobotCommand.SET_LOAD,
+    # These change nothing here.
+    RobotCommand.SET_JOINT_IMPEDANCE,
+    RobotCommand.SET_CARTESIAN_IMPEDANCE,
+    RobotCommand.SET_GUIDING_MODE,
+}
+_STRONGEST = FR3.hardware.acceleration  # rad/s^2 of braking; a real reflex brakes harder
+
+Pose = Float[np.ndarray, "4 4"]
+
+
+@dataclass
+class Motion:
+    """A motion in progress.
+
+    Attributes:
+        request: the Move command, answered when the motion ends.
+        generator, controller: what drives it.
+        begun: whether the client has sent a set-point.
+        lost: milliseconds since the last one.
+    """
+
+    request: messages.Request
+    generator: int
+    controller: int
+    begun: bool = False
+    lost: int = 0
+
+
+class FrankaArm:
+    """Serves an arm at `host`, port 1337.
+
+    Attributes:
+        patience: s to wait for a client's answer to each state before the cell goes on without it.
+            Long: lock-step; the packet counts as lost only then.
+        mode: idle, moving, in a reflex, or user-stopped.
+        error: the error in force.
+    """
+
+    def __init__(self, cell: Cell, host: str, patience: float, hand: messages.Link) -> None:
+        """`hand`: the hand's link, which shares the arm's cable."""
+        self.cell, self.patience = cell, patience
+        self.link = messages.Link(host, messages.ROBOT_PORT, messages.ROBOT_VERSION, wide=True)
+        self.mode, self.error = RobotMode.IDLE, ""
+        self._hand = hand
+        self._motion: Motion | None = None
+        self._recovery: messages.Request | None = None
+        self._cleared = False
+        self._sent = self._echoed = 0
+        self._success = 1.0
+        self._thresholds = Thresholds.default()
+        self._ee, self._k = np.eye(4), np.eye(4)  # NE_T_EE and EE_T_K
+        self._state = np.zeros((), messages.ROBOT_STATE)
+        self._rest()
+        self._describe_hand()
+
+    # The twin's loop.
+
+    def receive(self) -> None:
+        """Take what the client has sent, and set the cell's target for the next millisecond."""
+        for request in self.link.requests():
+            self._handle(request)
+        self._take_orders()
+        motion = self._motion
+        if motion is not None and not self.link.connected:
+            self._end(None)
+        elif motion is not None and motion.begun:
+            self._wait(motion)
+        if self._recovery is not None:
+            self._recover(self._recovery)
+
+    def send(self) -> None:
+        """Look for faults after a millisecond, and send the state."""
+        contact = self._feel()
+        if self._motion is not None:
+            fault = limits.arm_fault(self.cell.q, self.cell.dq) or contact.fault
+            if fault is not None:
+                self.abort(fault)
+        self._send_state(contact)
+
+    def close(self) -> None:
+        """Free the port."""
+        self.link.close()
+
+    # Faults, from within and injected.
+
+    def abort(self, error: str) -> None:
+        """Stop with an error, in any motion or none: the arm brakes and waits for recovery."""
+        if error not in messages.ERRORS:
+            raise UserError(
+                f"there is no error {error!r}; choose from: {', '.join(messages.ERRORS)}"
+            )
+        self.error, self.mode = error, RobotMode.REFLEX
+        self._end(MoveStatus.REFLEX_ABORTED)
+        if error in ("joint_reflex", "cartesian_reflex"):
+            self.cell.yield_()
+
+    def freeze(self, frozen: bool) -> None:
+        """Let nothing through in either direction, or let it through again."""
+        self.link.frozen = self._hand.frozen = frozen
+
+    def drop(self) -> None:
+        """Hang up on the client."""
+        self.link.drop()
+
+    def stop_button(self, pressed: bool) -> None:
+        """Press or release the user's stop."""
+        if pressed:
+            self.mode, self.error = RobotMode.USER_STOPPED, ""
+            self._end(MoveStatus.PREEMPTED_BY_SAFETY)
+        elif self.mode == RobotMode.USER_STOPPED:
+            self.mode = RobotMode.IDLE
+
+    def _end(self, status: MoveStatus | None) -> None:
+        """End the motion, if there is one, tell the client how, and brake."""
+        motion, self._motion = self._motion, None
+        self.cell.brake(_STRONGEST)
+        self._rest()
+        if motion is not None and status is not None:
+            self._send_state(self._feel())  # the error first, as on the robot
+            self.link.answer(motion.request, status)
+
+    def _recover(self, request: messages.Request) -> None:
+        """Clear an error once the arm rests and nothing presses; answer when states have said so."""
+        if self._cleared:
+            self.link.answer(request, 0)
+            self._recovery = None
+        elif not self.cell.moving and self._feel().fault is None:
+            self.mode, self.error, self._cleared = RobotMode.IDLE, "", True
+
+    # Commands.
+
+    def _handle(self, request: messages.Request) -> None:
+        command = request.command
+        if command == RobotCommand.MOVE:
+            self._move(request)
+        elif command == RobotCommand.STOP_MOVE:
+            self.link.answer(request, 0)
+            if self._motion is not None:
+                self._end(MoveStatus.PREEMPTED)
+        elif command == RobotCommand.AUTOMATIC_ERROR_RECOVERY:
+            if self.mode == RobotMode.USER_STOPPED:
+                self.link.answer(request, 2)  # rejected: a safety function is active
+            else:
+                self._recovery, self._cleared = request, False
+        elif command == RobotCommand.GET_ROBOT_MODEL:
+            urdf = Path(robot_model()).with_name("fr3_clean.urdf").read_bytes()
+            self.link.answer(request, 0, urdf)
+        elif command in _SETTERS:
+            self._configure(request)
+            self.link.answer(request, 0)
+        else:
+            print(f"the twin does not know the Franka command {command}; client dropped")
+            self.link.drop()
+
+    def _configure(self, request: messages.Request) -> None:
+        payload = request.payload
+        if request.command == RobotCommand.SET_COLLISION_BEHAVIOUR:
+            asked = np.frombuffer(payload, messages.COLLISION_BEHAVIOUR, 1)[0]
+            self._thresholds = Thresholds(
+                **{name: asked[name].copy() for name in asked.dtype.names}
+            )
+        elif request.command == RobotCommand.SET_NE_TO_EE:
+            self._ee = np.frombuffer(payload, "<f8", 16).reshape(4, 4).T
+            self._describe_hand()
+        elif request.command == RobotCommand.SET_EE_TO_K:
+            self._k = np.frombuffer(payload, "<f8", 16).reshape(4, 4).T
+            self._describe_hand()
+        elif request.command == RobotCommand.SET_LOAD:
+            load = np.frombuffer(payload, "<f8", 13)
+            self._state["m_load"], self._state["F_x_Cload"] = load[0], load[1:4]
+            self._state["I_load"] = load[4:]
+
+    def _move(self, request: messages.Request) -> None:
+        if self.mode != RobotMode.IDLE or self._motion is not None:
+            stopped = self.mode == RobotMode.USER_STOPPED
+            status = MoveStatus.REJECTED_BY_SAFETY if stopped else MoveStatus.NOT_POSSIBLE
+            self.link.answer(request, status)
+            return
+        controller, generator = (int(n) for n in np.frombuffer(request.payload, "<u4", 2))
+        if controller == _EXTERNAL:
+            generator = _TORQUE
+        self._motion, self._success = Motion(request, generator, controller), 1.0
+        self.cell.follow(self.cell.q_d.copy(), np.zeros(7))
+        self._rest()
+        self.link.answer(request, MoveStatus.STARTED)
+
+    # Set-points.
+
+    def _wait(self, motion: Motion) -> None:
+        """Give the client time to answer the last state; go on without, up to a point."""
+        deadline = time.monotonic() + self.patience
+        while (
+            self._motion is motion
+            and self.link.connected
+            and self._echoed < self._sent - 1
+            and motion.lost == 0
+            and not self.link.frozen
+            and (left := deadline - time.monotonic()) > 0
+        ):
+            self.link.wait(left)
+            for request in self.link.requests():
+                self._handle(request)
+            self._take_orders()
+        if self._motion is not motion:
+            return
+        lost = self._echoed < self._sent - 1
+        motion.lost = motion.lost + 1 if lost else 0
+        self._success += 0.01 * ((not lost) - self._success)
+        if motion.lost > _LOST:
+            self.abort("communication_constraints_violation")
+        elif lost and motion.generator != _TORQUE:
+            self._go_to(motion, self._last.q + DT * self._last.dq)
+
+    def _take_orders(self) -> None:
+        for datagram in self.link.orders():
+            if len(datagram) != messages.ROBOT_ORDER.itemsize:
+                continue
+            order = np.frombuffer(datagram, messages.ROBOT_ORDER, 1)[0]
+            if int(order["message_id"]) > self._echoed:
+                self._echoed = int(order["message_id"])
+                # Set-points that come after the arm has gone on without them are too old.
+                late = self._motion is not None and self._motion.lost > 0
+                if self._motion is not None and not (late and self._echoed < self._sent - 1):
+                    self._obey(self._motion, order)
+
+    def _obey(self, motion: Motion, order: np.void) -> None:
+        motion.begun, motion.lost = True, 0
+        if order["finished"] or order["torque_finished"]:
+            self._end(MoveStatus.SUCCESS)
+        elif motion.generator == _TORQUE:
+            torque = order["tau_J_d"].copy()
+            fault = limits.torque_fault(self._torque, torque)
+            if fault is not None:
+                self.abort(fault)
+                return
+            self._torque = torque
+            self.cell.push(torque)
+        elif motion.generator == _POSITION:
+            self._go_to(motion, order["q_c"].copy())
+        elif motion.generator == _VELOCITY:
+            self._go_to(motion, self._last.q + DT * order["dq_c"])
+        else:
+            self._go_by_tcp(motion, order)
+
+    def _go_to(self, motion: Motion, q: np.ndarray) -> None:
+        now = limits.after(self._last, q)
+        fault = limits.joint_fault(self._last, now, motion.generator in (_POSE, _TWIST))
+        if fault is not None:
+            self.abort(fault)
+            return
+        self._last = now
+        self.cell.follow(now.q, now.dq)
+
+    def _go_by_tcp(self, motion: Motion, order: np.void) -> None:
+        """One step of differential inverse kinematics from the last set-point."""
+        q = self._last.q
+        now, jacobian = self._at(q)
+        if motion.generator == _POSE:
+            target = order["O_T_EE_c"].reshape(4, 4).T
+            error = np.concatenate(
+                [target[:3, 3] - now[:3, 3], rotation_vector(target[:3, :3] @ now[:3, :3].T)]
+            )
+            twist = error / DT
+        else:
+            twist = order["O_dP_EE_c"]
+        fault = limits.tcp_fault(twist)
+        if fault is not None:
+            self.abort(fault)
+            return
+        inverse = _pseudo_inverse(jacobian).T
+        step = inverse @ (DT * twist)
+        if order["valid_elbow"]:
+            null = np.eye(7) - inverse @ jacobian
+            # The third joint is the elbow; a tenth of what is missing at a time keeps it smooth.
+            step = step + null[:, 2] * 0.1 * (order["elbow_c"][0] - q[2] - step[2])
+        self._go_to(motion, q + step)
+
+    # State.
+
+    def _rest(self) -> None:
+        """What the next set-point is compared with, and the torque the next one."""
+        zero = np.zeros(7)
+        self._last = Setpoint(self.cell.q_d.copy(), zero, zero)
+        self._torque = zero
+
+    def _flange(self) -> Pose:
+        """Of the hand's tool centre point on the flange (F_T_NE)."""
+        T = np.eye(4)
+        arm = FR3.arm
+        c, s = np.cos(arm.hand_yaw), np.sin(arm.hand_yaw)
+        T[:2, :2] = [[c, -s], [s, c]]
+        T[2, 3] = GELSIGHT_TCP
+        return T
+
+    def _describe_hand(self) -> None:
+        state = self._state
+        state["F_T_NE"] = self._flange().T.ravel()
+        state["F_T_EE"] = (self._flange() @ self._ee).T.ravel()
+        state["NE_T_EE"], state["EE_T_K"] = self._ee.T.ravel(), self._k.T.ravel()
+        state["m_ee"], state["I_ee"] = 0.73, np.diag([0.001, 0.0025, 0.0017]).ravel()  # fr3.xml
+        state["F_x_Cee"] = [-0.01, 0.0, 0.03]
+
+    def _at(self, q: np.ndarray) -> tuple[Pose, Float[np.ndarray, "6 7"]]:
+        """Pose and Jacobian of the end effector, which a client may have moved off the TCP."""
+        T = np.eye(4)
+        T[:3, 3], R, jacobian = self.cell.kinematics(q, self._ee[:3, 3])
+        T[:3, :3] = R @ self._ee[:3, :3]
+        return T, jacobian
+
+    def _feel(self) -> limits.Contact:
+        """Estimate the wrench from outside and judge it; joint torques say what it is."""
+        pose, jacobian = self._at(self.cell.q)
+        self._pose, self._wrench = pose, _pseudo_inverse(jacobian) @ self.cell.tau_ext
+        return self._thresholds.judge(self.cell.tau_ext, self._wrench, self._last.ddq)
+
+    def _send_state(self, contact: limits.Contact) -> None:
+        cell, state, motion = self.cell, self._state, self._motion
+        state["message_id"] = self._sent
+        state["q"], state["dq"] = cell.q, cell.dq
+        state["q_d"], state["dq_d"] = cell.q_d, cell.dq_d
+        state["ddq_d"] = self._last.ddq
+        state["theta"], state["dtheta"] = cell.q, cell.dq
+        state["tau_J"] = cell.joint_torque
+        state["tau_J_d"] = self._torque
+        state["O_T_EE"] = self._pose.T.ravel()
+        wanted, jacobian = self._at(cell.q_d)
+        state["O_T_EE_d"] = state["O_T_EE_c"] = wanted.T.ravel()
+        state["O_dP_EE_d"] = state["O_dP_EE_c"] = jacobian @ cell.dq_d
+        state["elbow"] = cell.q[2], np.sign(cell.q[3])
+        state["elbow_d"] = state["elbow_c"] = cell.q_d[2], np.sign(cell.q_d[3])
+        state["tau_ext_hat_filtered"], state["O_F_ext_hat_K"] = cell.tau_ext, self._wrench
+        turned = self._wrench.reshape(2, 3) @ self._pose[:3, :3]
+        state["K_F_ext_hat_K"] = turned.ravel()
+        for name, value in vars(contact).items():
+            state[name] = value
+        state["errors"] = state["reflex_reason"] = [name == self.error for name in messages.ERRORS]
+        moving = motion is not None
+        state["robot_mode"] = RobotMode.MOVE if moving else self.mode
+        state["controller_mode"] = motion.controller if moving else _OTHER
+        # On this side of the wire 0 is idle, and none, which goes with torque, is 5.
+        state["motion_generator_mode"] = motion.generator + 1 if moving else 0
+        state["control_command_success_rate"] = self._success if moving else 0.0
+        self.link.send(state.tobytes())
+        self._sent += 1
+
+
+def _pseudo_inverse(jacobian: Float[np.ndarray, "6 7"]) -> Float[np.ndarray, "6 7"]:
+    """Of J^T: joint torques to the wrench behind them; damped against singular poses."""
+    return np.linalg.solve(jacobian @ jacobian.T + 1e-8 * np.eye(6), jacobian)

@@ -1,0 +1,112 @@
+"""The Franka Hand's service in front of the cell's gripper."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH, GRIPPER_SPEED
+from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE
+from touchgoal.sim_envs.twin.cell import DT, Cell
+from touchgoal.sim_envs.twin.franka import messages
+from touchgoal.sim_envs.twin.franka.messages import HandCommand, HandStatus
+
+_STILL = 1e-3  # m/s of width
+_SETTLED = 0.1  # s without motion after which a move is over
+_SOMETHING = 1e-3  # m: narrower than this the fingers have met
+_KEPT = 2e-3  # m by which the width may change while something is held
+
+
+@dataclass
+class Job:
+    """A command in progress.
+
+    Attributes:
+        request: answered when the job ends.
+        targets: widths (m) still to go to, one after the other.
+        accepted: for a grasp, the open range of widths (m) that count.
+    """
+
+    request: messages.Request
+    targets: list[float]
+    accepted: tuple[float, float] | None = None
+    width: float = np.inf
+    still: float = 0.0
+
+
+class FrankaHand:
+    """Serves the hand at `host`, port 1338.
+
+    A grasp closes until something resists; closing on air fails, whatever width was expected.
+    """
+
+    def __init__(self, cell: Cell, host: str) -> None:
+        self.cell = cell
+        self.link = messages.Link(host, messages.HAND_PORT, messages.HAND_VERSION, wide=False)
+        self._job: Job | None = None
+        self._grasped, self._held = False, 0.0  # m, the width of what is held
+        self._state = np.zeros((), messages.HAND_STATE)
+        self._state["max_width"], self._state["temperature"] = GRIPPER_MAX_WIDTH, 30
+
+    def receive(self) -> None:
+        """Take the client's commands and see how the one in progress stands."""
+        for request in self.link.requests():
+            self._handle(request)
+        if self._job is not None:
+            self._follow_up(self._job)
+
+    def send(self) -> None:
+        """Send the state."""
+        width = self.cell.env.width()
+        self._grasped &= abs(width - self._held) < _KEPT
+        self._state["width"] = max(0.0, width)
+        self._state["is_grasped"] = self._grasped
+        self.link.send(self._state.tobytes())
+        self._state["message_id"] += 1
+
+    def close(self) -> None:
+        """Free the port."""
+        self.link.close()
+
+    def _handle(self, request: messages.Request) -> None:
+        command, job, cell = request.command, self._job, self.cell
+        if job is not None:
+            self._job = None
+            self.link.answer(job.request, HandStatus.ABORTED)
+        self._grasped = False
+        numbers = np.frombuffer(request.payload, "<f8")
+        if command == HandCommand.STOP:
+            cell.grasp(cell.env.width(), GRIPPER_SPEED, cell.grip.force)
+            self.link.answer(request, HandStatus.SUCCESS)
+        elif command == HandCommand.HOMING:
+            self._job = Job(request, [0.0, GRIPPER_MAX_WIDTH])
+            cell.grasp(0.0, GRIPPER_SPEED / 2, GRIPPER_MAX_FORCE / 4)
+        elif command == HandCommand.MOVE:
+            width, speed = numbers
+            self._job = Job(request, [width])
+            cell.grasp(width, speed, GRIPPER_MAX_FORCE / 2)
+        elif command == HandCommand.GRASP:
+            # On the wire: width, then how much narrower and wider will do, then speed and force.
+            width, inner, outer, speed, force = numbers
+            self._job = Job(request, [0.0], (width - inner, width + outer))
+            cell.grasp(0.0, speed, force)
+
+    def _follow_up(self, job: Job) -> None:
+        width = self.cell.env.width()
+        moved, job.width = abs(width - job.width), width
+        job.still = job.still + DT if moved < _STILL * DT else 0.0
+        if job.still < _SETTLED:
+            return
+        job.still = 0.0
+        reached = job.targets.pop(0)
+        if job.targets:
+            self.cell.grasp(job.targets[0], GRIPPER_SPEED / 2, GRIPPER_MAX_FORCE / 4)
+            return
+        self._job = None
+        status = HandStatus.SUCCESS
+        if job.accepted is not None:
+            least, most = job.accepted
+            self._grasped, self._held = max(least, _SOMETHING) < width < most, width
+            status = HandStatus.SUCCESS if self._grasped else HandStatus.UNSUCCESSFUL
+        elif abs(width - reached) > 2e-3:
+            status = HandStatus.UNSUCCESSFUL  # something was in the way
+        self.link.answer(job.request, status)

@@ -1,0 +1,134 @@
+"""What the Franka control interface refuses: limits of set-points, of the arm, of contact."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.control.safety.limits import FR3
+from touchgoal.sim_envs.twin.cell import DT
+
+Joints = Float[np.ndarray, "7"]
+Wrench = Float[np.ndarray, "6"]
+
+# libfranka rate_limiting.h and Franka's documentation of the FR3: m/s and rad/s of the TCP; N m/s.
+_TCP_SPEED, _TCP_TURN, _TORQUE_RATE = 3.0, 2.5, 1000.0
+TORQUE = np.array([87.0] * 4 + [12.0] * 3)  # N m
+_SLACK = 1.01  # for the wire's rounding
+_STEADY = 0.1  # rad/s^2: below it the thresholds for nominal motion hold
+
+
+@dataclass(frozen=True)
+class Setpoint:
+    """A joint set-point with its derivatives: rad, rad/s, rad/s^2."""
+
+    q: Joints
+    dq: Joints
+    ddq: Joints
+
+
+def after(before: Setpoint, q: Joints) -> Setpoint:
+    """The set-point a millisecond later at `q`, with its derivatives."""
+    dq = (q - before.q) / DT
+    return Setpoint(q, dq, (dq - before.dq) / DT)
+
+
+def joint_fault(before: Setpoint, now: Setpoint, cartesian: bool) -> str | None:
+    """Which limit a set-point breaks, as libfranka calls it.
+
+    A client that moves in Cartesian space is held to joint range and speed only, for its set-points
+    pass through the twin's own inverse kinematics.
+    """
+    name = "cartesian_motion_generator_joint" if cartesian else "joint_motion_generator"
+    hardware = FR3.hardware
+    lowest, highest = hardware.speed_range(now.q)
+    outward = np.where(now.q > hardware.upper, now.dq, np.where(now.q < hardware.lower, -now.dq, 0))
+    if not np.isfinite(now.q).all() or (outward > 1e-3).any():
+        return f"{name}_position_limits_violation"
+    if (now.dq > _SLACK * highest + 1e-3).any() or (now.dq < _SLACK * lowest - 1e-3).any():
+        return f"{name}_velocity_limits_violation"
+    if cartesian:
+        return None
+    if (np.abs(now.ddq) > _SLACK * hardware.acceleration).any():
+        return f"{name}_velocity_discontinuity"
+    if (np.abs(now.ddq - before.ddq) > _SLACK * DT * hardware.jerk).any():
+        return f"{name}_acceleration_discontinuity"
+    return None
+
+
+def tcp_fault(twist: Wrench) -> str | None:
+    """Whether a Cartesian set-point is too fast; m/s, rad/s."""
+    fast = np.linalg.norm(twist[:3]) > _SLACK * _TCP_SPEED
+    if fast or not np.linalg.norm(twist[3:]) <= _SLACK * _TCP_TURN:
+        return "cartesian_motion_generator_velocity_limits_violation"
+    return None
+
+
+def torque_fault(before: Joints, now: Joints) -> str | None:
+    """Which limit commanded torques (N m) break."""
+    if not (np.abs(now) <= _SLACK * TORQUE).all():
+        return "tau_j_range_violation"
+    if (np.abs(now - before) > _SLACK * DT * _TORQUE_RATE).any():
+        return "controller_torque_discontinuity"
+    return None
+
+
+def arm_fault(q: Joints, dq: Joints) -> str | None:
+    """Whether the arm itself is where or as fast as it must not be, whoever drives it."""
+    hardware = FR3.hardware
+    if (q < hardware.lower - 0.01).any() or (q > hardware.upper + 0.01).any():
+        return "joint_position_limits_violation"
+    if (np.abs(dq) > 1.1 * hardware.velocity).any():
+        return "joint_velocity_violation"
+    return None
+
+
+@dataclass(frozen=True)
+class Contact:
+    """How hard each joint (N m) and axis of the TCP (N, N m) is touched: 0, contact, collision."""
+
+    joint_contact: Joints
+    joint_collision: Joints
+    cartesian_contact: Wrench
+    cartesian_collision: Wrench
+
+    @property
+    def fault(self) -> str | None:
+        """The reflex a collision sets off."""
+        if self.joint_collision.any():
+            return "joint_reflex"
+        return "cartesian_reflex" if self.cartesian_collision.any() else None
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """A client's collision behaviour: contact above `lower`, collision above `upper`."""
+
+    lower_torque_acceleration: Joints
+    upper_torque_acceleration: Joints
+    lower_torque_nominal: Joints
+    upper_torque_nominal: Joints
+    lower_force_acceleration: Wrench
+    upper_force_acceleration: Wrench
+    lower_force_nominal: Wrench
+    upper_force_nominal: Wrench
+
+    @classmethod
+    def default(cls) -> "Thresholds":
+        """20 N and 20 N m, as libfranka's examples set them."""
+        return cls(*(np.full(n, 20.0) for n in (7, 7, 7, 7, 6, 6, 6, 6)))
+
+    def judge(self, torque: Joints, wrench: Wrench, ddq: Joints) -> Contact:
+        """What a torque (N m) and wrench (N, N m) from outside mean at this acceleration."""
+        steady = np.abs(ddq).max() < _STEADY
+        lower = self.lower_torque_nominal if steady else self.lower_torque_acceleration
+        upper = self.upper_torque_nominal if steady else self.upper_torque_acceleration
+        low = self.lower_force_nominal if steady else self.lower_force_acceleration
+        high = self.upper_force_nominal if steady else self.upper_force_acceleration
+        torque, wrench = np.abs(torque), np.abs(wrench)
+        return Contact(
+            (torque > lower).astype(float),
+            (torque > upper).astype(float),
+            (wrench > low).astype(float),
+            (wrench > high).astype(float),
+        )

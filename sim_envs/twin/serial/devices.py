@@ -1,0 +1,205 @@
+"""Serial devices on pseudo-terminals: a load cell under the table, and a Robotiq gripper."""
+
+import os
+import struct
+import tty
+from pathlib import Path
+
+import numpy as np
+
+from touchgoal.control.grippers.modbus import crc
+from touchgoal.control.sensors.load_cell import seal
+from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH
+from touchgoal.sim_envs.twin.cell import DT, Cell
+
+_LOAD_RATE = 80  # Hz, an HX711's faster rate
+NEWTONS_PER_COUNT, ZERO = 2e-4, 84_213  # of the load cell; a bridge is never balanced
+_LOAD_NOISE = 25.0  # counts
+
+_SLAVE, _ORDERS, _STATUS = 9, 1000, 2000  # Robotiq 2F manual: Modbus slave, first registers
+_POSITIONS = 3, 230  # fully open and closed: where the stroke is linear
+_SPEEDS = 0.020, 0.150  # m/s at 0 and 255
+_FORCES = 20.0, 235.0  # N at 0 and 255
+_MOVING, _STOPPED_OPENING, _STOPPED_CLOSING, _THERE = range(4)  # object detection
+_STILL, _SETTLED = 1e-3, 0.05  # m/s, s
+
+
+class SerialPort:
+    """A pseudo-terminal behind a path that stays the same when it is unplugged and plugged in.
+
+    Attributes:
+        garble: share of messages that lose a byte on their way to the client.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.garble = path, 0.0
+        self._rng = np.random.default_rng(0)
+        self._ends: tuple[int, int] | None = None
+        self.plug()
+
+    def plug(self) -> None:
+        """Plug it in."""
+        if self._ends is not None:
+            return
+        self._ends = os.openpty()
+        for end in self._ends:
+            tty.setraw(end)
+            os.set_blocking(end, False)
+        self.path.unlink(missing_ok=True)
+        self.path.symlink_to(os.ttyname(self._ends[1]))
+
+    def unplug(self) -> None:
+        """Pull it out: a client's next read fails."""
+        if self._ends is not None:
+            for end in self._ends:
+                os.close(end)
+            self._ends = None
+            self.path.unlink(missing_ok=True)
+
+    def read(self) -> bytes:
+        """What the client has sent."""
+        try:
+            return os.read(self._ends[0], 4096) if self._ends else b""
+        except OSError:
+            return b""
+
+    def write(self, message: bytes) -> None:
+        """Send; what nobody reads is lost, as on a wire."""
+        if self._rng.random() < self.garble:
+            cut = int(self._rng.integers(len(message) - 2))  # a line without its \r is still whole
+            message = message[:cut] + message[cut + 1 :]
+        try:
+            if self._ends:
+                os.write(self._ends[0], message)
+        except OSError:
+            pass
+
+
+class LoadCell:
+    """A load cell under the table: lines `milliseconds,counts*CRC`, 80 a second.
+
+    Force in N is `NEWTONS_PER_COUNT * (counts - ZERO)`; CRC is Modbus' CRC-16 of all bytes before
+    the star, as four hexadecimal digits.
+    """
+
+    def __init__(self, cell: Cell, path: Path) -> None:
+        self.cell, self.port = cell, SerialPort(path)
+        self._rng = np.random.default_rng(1)
+        self._milliseconds = 0
+
+    def receive(self) -> None:
+        """Nothing is said to a load cell."""
+        self.port.read()
+
+    def send(self) -> None:
+        """Write a line if one is due."""
+        self._milliseconds += 1
+        if self._milliseconds * _LOAD_RATE % 1000 >= _LOAD_RATE:
+            return
+        counts = ZERO + self.cell.env.table_load() / NEWTONS_PER_COUNT
+        counts += self._rng.normal(0.0, _LOAD_NOISE)
+        line = f"{self._milliseconds},{round(counts)}".encode()
+        self.port.write(seal(line, "crc16") + b"\r\n")
+
+    def close(self) -> None:
+        """Pull the plug."""
+        self.port.unplug()
+
+
+class Robotiq:
+    """A 2F gripper's Modbus registers in front of the cell's gripper; it begins activated.
+
+    Position 3 is the cell's 80 mm between the pads, 230 is closed.
+    """
+
+    def __init__(self, cell: Cell, path: Path) -> None:
+        self.cell, self.port = cell, SerialPort(path)
+        self._unread = b""
+        self._orders = bytearray([0x01, 0, 0, 0, 0, 0])
+        self._ready_in = 0.0  # s of activation left
+        self._width, self._still = np.inf, 0.0
+        self._goal: float | None = None
+
+    def receive(self) -> None:
+        """Take requests and answer them."""
+        self._unread += self.port.read()
+        while (length := _request_length(self._unread)) and len(self._unread) >= length:
+            frame, self._unread = self._unread[:length], self._unread[length:]
+            if frame[0] != _SLAVE or crc(frame[:-2]) != frame[-2:]:
+                self._unread = b""  # the next frame begins after a silence
+                return
+            answer = self._serve(frame)
+            self.port.write(answer + crc(answer))
+
+    def send(self) -> None:
+        """See how far the fingers are."""
+        width = self.cell.env.width()
+        moved, self._width = abs(width - self._width), width
+        self._still = self._still + DT if moved < _STILL * DT else 0.0
+        if self._ready_in > 0:
+            self._ready_in -= DT
+            opening = self._ready_in > 1.0  # it opens, then closes
+            self.cell.grasp(GRIPPER_MAX_WIDTH if opening else 0.0, _SPEEDS[1], _FORCES[0])
+
+    def close(self) -> None:
+        """Pull the plug."""
+        self.port.unplug()
+
+    def _serve(self, frame: bytes) -> bytes:
+        function, register = struct.unpack_from(">xBH", frame)
+        head = frame[:2]
+        if function == 16 and register >= _ORDERS:
+            first = 2 * (register - _ORDERS)
+            data = frame[7:-2]
+            self._orders[first : first + len(data)] = data
+            self._obey()
+            return frame[:6]
+        if function in (3, 4) and register >= _STATUS:
+            (count,) = struct.unpack_from(">H", frame, 4)
+            first = 2 * (register - _STATUS)
+            data = self._status()[first : first + 2 * count]
+            return head + bytes([len(data)]) + data
+        return bytes([frame[0], function | 0x80, 1])  # illegal function
+
+    def _obey(self) -> None:
+        action, _, _, position, speed, force = self._orders[:6]
+        if not action & 0x01:
+            self._ready_in, self._goal = -1.0, None  # reset
+        elif self._ready_in < 0:
+            self._ready_in = 2.0
+        elif action & 0x08 and self._ready_in == 0:
+            opened, closed = _POSITIONS
+            share = min(max((position - opened) / (closed - opened), 0.0), 1.0)
+            goal = (1 - share) * GRIPPER_MAX_WIDTH
+            if goal != self._goal:
+                self._goal, self._still = goal, 0.0
+            self.cell.grasp(goal, _between(_SPEEDS, speed), _between(_FORCES, force))
+        elif self._ready_in == 0 and self._goal is not None:
+            self._goal = None  # without the go bit it stays where it is
+            self.cell.grip.speed = 0.0
+
+    def _status(self) -> bytes:
+        if self._ready_in > 0:
+            state = 1
+        else:
+            self._ready_in, state = (0.0, 3) if self._ready_in >= 0 else (-1.0, 0)
+        going, found = self._goal is not None, _THERE
+        if self._goal is not None and abs(self._width - self._goal) > 2e-3:
+            blocked = _STOPPED_CLOSING if self._width > self._goal else _STOPPED_OPENING
+            found = blocked if self._still > _SETTLED else _MOVING
+        first = (self._orders[0] & 1) | going << 3 | state << 4 | found << 6
+        opened, closed = _POSITIONS
+        share = min(max(1 - self._width / GRIPPER_MAX_WIDTH, 0.0), 1.0)
+        position = round(opened + share * (closed - opened))
+        return bytes([first, 0, 0, self._orders[3], position, 0])
+
+
+def _request_length(unread: bytes) -> int:
+    """Of the request that begins here; 0 if that cannot be said yet."""
+    if len(unread) < 8:
+        return 0
+    return 9 + unread[6] if unread[1] == 16 else 8
+
+
+def _between(span: tuple[float, float], count: int) -> float:
+    return span[0] + (span[1] - span[0]) * count / 255

@@ -1,0 +1,314 @@
+"""A UR controller in front of the cell: RTDE, dashboard and script port; ur-rtde's clients fit."""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.safety.limits import UR5E
+from touchgoal.sim_envs.twin.cell import DT, Cell
+from touchgoal.sim_envs.twin.tcp_ports import Connection, Door
+from touchgoal.sim_envs.twin.ur import messages
+from touchgoal.sim_envs.twin.ur.messages import Package, Safety
+from touchgoal.sim_envs.twin.ur.program import UrProgram
+
+_CYCLE = 2  # ms, of a controller of the e-Series
+_SELDOM = 10  # ms between looks at what is not real-time
+_UNLOCK_DELAY = 5.0  # s after a protective stop before it can be unlocked
+_FORCE_LIMIT = 150.0  # N at the tool; the factory's safety presets run from 100 to 250
+_STOPPED, _PLAYING = 1, 2  # runtime_state
+_POWER_OFF, _IDLE, _RUNNING = 3, 5, 7  # robot_mode
+
+
+class Client:
+    """One RTDE client: its recipes, and how often it wants data."""
+
+    def __init__(self, connection: Connection) -> None:
+        self.connection = connection
+        self.outputs: list[str] = []
+        self.inputs: list[list[str]] = []
+        self.period = _CYCLE  # ms
+        self.started = False
+
+
+class UrController:
+    """Serves a UR at `host`, on the ports every UR has.
+
+    Attributes:
+        frozen: nothing gets through in either direction.
+        safety: normal, protective stop or emergency stop.
+    """
+
+    def __init__(self, cell: Cell, host: str) -> None:
+        self.cell = cell
+        hello = b"Connected: Universal Robots Dashboard Server\n"
+        self._dashboard = Door(host, messages.DASHBOARD, hello)
+        self._script = Door(host, messages.SCRIPT)
+        self._rtde = Door(host, messages.RTDE)
+        self._silent = [Door(host, messages.PRIMARY), Door(host, messages.SECONDARY)]
+        self._clients: dict[Connection, Client] = {}
+        self._said: dict[str, float | Sequence[float]] = {}  # in this millisecond, to any client
+        self._inputs: dict[str, float] = dict.fromkeys(messages.INPUTS, 0)
+        self.frozen = False
+        self.safety, self._mode = Safety.NORMAL, _RUNNING
+        self._stopped_at = self._heard_at = 0.0
+        self._clock = 0.0
+        self._pace = 1.0
+        self._program = self._new_program()
+        self._program.running = False
+
+    # The twin's loop.
+
+    def receive(self) -> None:
+        """Take what clients have sent; move the target on by a millisecond."""
+        self._clock += DT
+        if not self.frozen:
+            self._listen()
+        program = self._program
+        if program.running and self._clock - self._heard_at > program.watchdog:
+            program.end()
+        if program.running and self.cell.steps % _CYCLE == 0:
+            program.cycle()
+        if program.running and program.activity is not None:
+            q, dq = program.activity.step(self.cell.q_d, self.cell.dq_d, self._pace)
+            self.cell.follow(q, dq)
+            hardware = UR5E.hardware
+            if (q < hardware.lower).any() or (q > hardware.upper).any():
+                self.protective_stop()
+
+    def send(self) -> None:
+        """Look for collisions after a millisecond, and send data that is due."""
+        self._feel()
+        if self.safety is Safety.NORMAL and np.linalg.norm(self._wrench[:3]) > _FORCE_LIMIT:
+            self.protective_stop()
+            self.cell.yield_()
+        if self.frozen:
+            return
+        self._said.clear()
+        for client in self._clients.values():
+            if client.started and self.cell.steps % client.period == 0:
+                client.connection.send(messages.package(Package.DATA, self._data(client)))
+
+    def close(self) -> None:
+        """Free the ports."""
+        for door in (self._dashboard, self._script, self._rtde, *self._silent):
+            door.close()
+
+    # Stops, from within and injected.
+
+    def protective_stop(self) -> None:
+        """Stop and hold; unlocked over the dashboard after 5 s."""
+        self.safety, self._stopped_at = Safety.PROTECTIVE_STOP, self._clock
+        self._program.end()
+
+    def abort(self, error: str) -> None:
+        """Stop for a fault; all of a UR's are protective stops."""
+        if error != "protective_stop":
+            raise UserError(f"a UR has no error {error!r}; ask for protective_stop")
+        self.protective_stop()
+
+    def freeze(self, frozen: bool) -> None:
+        """Let nothing through in either direction, or let it through again."""
+        self.frozen = frozen
+
+    def stop_button(self, pressed: bool) -> None:
+        """Press the emergency stop, which takes the power off, or release it."""
+        self.safety = Safety.ROBOT_EMERGENCY_STOP if pressed else Safety.NORMAL
+        if pressed:
+            self._mode = _POWER_OFF
+            self._program.end()
+
+    def drop(self) -> None:
+        """Hang up on every RTDE client."""
+        self._rtde.drop_all()
+
+    # Clients.
+
+    def _listen(self) -> None:
+        if self.cell.steps % _SELDOM == 0:
+            self._listen_to_people()
+        connections = self._rtde.poll()
+        self._clients = {c: self._clients.get(c) or Client(c) for c in connections}
+        for connection, client in self._clients.items():
+            packages, connection.unread = messages.split(connection.unread)
+            for kind, payload in packages:
+                self._handle(client, kind, payload)
+
+    def _listen_to_people(self) -> None:
+        """Dashboard and scripts."""
+        for client in self._dashboard.poll():
+            for line in client.lines():
+                client.send(self._answer(line).encode() + b"\n")
+        for client in self._script.poll():
+            text = client.unread.strip()
+            if text.startswith(b"def") and text.endswith(b"end"):
+                client.unread = b""
+                self._play(text.decode(errors="replace"))
+        for door in self._silent:
+            for client in door.poll():
+                client.unread = b""
+
+    def _handle(self, client: Client, kind: int, payload: bytes) -> None:
+        def answer(body: bytes) -> None:
+            client.connection.send(messages.package(Package(kind), body))
+
+        if kind == Package.PROTOCOL_VERSION:
+            answer(b"\x01" if payload == b"\x00\x02" else b"\x00")
+        elif kind == Package.CONTROLLER_VERSION:
+            answer(np.array(messages.VERSION, ">u4").tobytes())
+        elif kind == Package.OUTPUTS:
+            frequency = float(np.frombuffer(payload[:8], ">f8")[0])
+            client.period = max(_CYCLE, round(1000 / max(frequency, 1.0)))
+            client.outputs, kinds = _recipe(payload[8:], messages.OUTPUTS)
+            answer(b"\x01" + kinds)
+        elif kind == Package.INPUTS:
+            names, kinds = _recipe(payload, messages.INPUTS)
+            client.inputs.append(names)
+            answer(bytes([len(client.inputs)]) + kinds)
+        elif kind in (Package.START, Package.PAUSE):
+            client.started = kind == Package.START
+            answer(b"\x01")
+        elif kind == Package.DATA and 0 < payload[0] <= len(client.inputs):
+            self._take(client.inputs[payload[0] - 1], payload[1:])
+
+    def _take(self, names: list[str], payload: bytes) -> None:
+        form = messages.layout(names, messages.INPUTS)
+        if form.size != len(payload) or "external_force_torque" in names:
+            return
+        self._inputs.update(zip(names, form.unpack(payload), strict=True))
+        self._heard_at = self._clock
+        if "speed_slider_mask" in names and self._inputs["speed_slider_mask"]:
+            self._pace = float(np.clip(self._inputs["speed_slider_fraction"], 0.0, 1.0))
+        if self._program.running:
+            self._program.cycle()
+
+    def _play(self, script: str) -> None:
+        """Start an uploaded program; one that is not ur-rtde's control script ends at once."""
+        name = re.match(r"def\s+(\w+)", script)
+        if self.safety is Safety.NORMAL and self._mode == _RUNNING:
+            self._program.end()
+            self._program = self._new_program()
+            self._program.running = name is not None and name[1] == "rtde_control"
+            self._heard_at = self._clock
+
+    def _new_program(self) -> UrProgram:
+        return UrProgram(self.cell, self._inputs, self.protective_stop)
+
+    def _answer(self, line: str) -> str:
+        """The dashboard's."""
+        safety = self.safety.name
+        running = self._program.running
+        said = {
+            "polyscopeversion": "URSoftware {}.{}.{}.{} (Jan 01 2026)".format(*messages.VERSION),
+            "get serial number": "20265500001",
+            "get robot model": "UR5",
+            "get loaded program": "Loaded program: /programs/none.urp",
+            "is in remote control": "true",
+            "robotmode": "Robotmode: "
+            + {_POWER_OFF: "POWER_OFF", _IDLE: "IDLE", _RUNNING: "RUNNING"}[self._mode],
+            "safetymode": f"Safetymode: {safety}",
+            "safetystatus": f"Safetystatus: {safety}",
+            "running": f"Program running: {str(running).lower()}",
+            "programstate": "PLAYING rtde_control" if running else "STOPPED rtde_control",
+            "quit": "Disconnected",
+        }
+        command = line.lower()
+        if command in said:
+            return said[command]
+        if command == "stop":
+            self._program.end()
+            return "Stopped"
+        if command == "unlock protective stop":
+            return self._unlock()
+        if command in ("power on", "power off", "brake release"):
+            return self._power(command)
+        if command.split(" ")[0] in ("popup", "close", "addtolog", "restart"):
+            return f"{line} done"
+        return f"could not understand: '{line}'"
+
+    def _unlock(self) -> str:
+        if self.safety is Safety.PROTECTIVE_STOP:
+            if self._clock - self._stopped_at < _UNLOCK_DELAY:
+                return "Cannot unlock protective stop until 5s after occurrence"
+            self.safety = Safety.NORMAL
+        return "Protective stop releasing"
+
+    def _power(self, command: str) -> str:
+        if self.safety is Safety.NORMAL:
+            modes = {"power on": _IDLE, "power off": _POWER_OFF, "brake release": _RUNNING}
+            self._mode = modes[command]
+            if self._mode != _RUNNING:
+                self._program.end()
+        return {"power on": "Powering on", "power off": "Powering off"}.get(
+            command, "Brake releasing"
+        )
+
+    # Data.
+
+    def _feel(self) -> None:
+        """The wrench at the TCP that joint torques say is there, base frame."""
+        _, _, J = self.cell.kinematics(self.cell.q, np.zeros(3))
+        self._wrench = np.linalg.solve(J @ J.T + 1e-8 * np.eye(6), J @ self.cell.tau_ext)
+
+    def _data(self, client: Client) -> bytes:
+        numbers: list[float] = []
+        for name in client.outputs:
+            value = self._said.get(name)
+            if value is None:
+                value = self._said[name] = self._value(name)
+            numbers.extend(value if isinstance(value, Sequence) else [value])
+        return b"\x01" + messages.layout(client.outputs, messages.OUTPUTS).pack(*numbers)
+
+    def _value(self, name: str) -> float | Sequence[float]:
+        program, cell = self._program, self.cell
+        if name.startswith("output_int"):
+            return program.ints[int(name.rpartition("_")[2])]
+        if name.startswith("output_double"):
+            return program.doubles[int(name.rpartition("_")[2])]
+        if name in _CONSTANTS:
+            return _CONSTANTS[name]
+        found = _VARIABLES.get(name)
+        if found is not None:
+            value = found(self, program, cell)
+            return value.tolist() if isinstance(value, np.ndarray) else value
+        size = {"VECTOR3D": 3, "VECTOR6D": 6, "VECTOR6INT32": 6}.get(messages.OUTPUTS[name])
+        return 0 if size is None else [0] * size
+
+
+_CONSTANTS: dict[str, float | Sequence[float]] = {
+    "actual_main_voltage": 48.0,
+    "actual_robot_voltage": 48.0,
+    "joint_mode": [255] * 6,  # running
+    "joint_temperatures": [30.0] * 6,
+}
+_VARIABLES = {
+    "timestamp": lambda c, p, cell: c._clock,
+    "target_q": lambda c, p, cell: cell.q_d,
+    "target_qd": lambda c, p, cell: cell.dq_d,
+    "actual_q": lambda c, p, cell: cell.q,
+    "actual_qd": lambda c, p, cell: cell.dq,
+    "target_moment": lambda c, p, cell: cell.joint_torque,
+    "actual_TCP_pose": lambda c, p, cell: p.pose(cell.q),
+    "target_TCP_pose": lambda c, p, cell: p.pose(cell.q_d),
+    "actual_TCP_speed": lambda c, p, cell: cell.kinematics(cell.q, np.zeros(3))[2] @ cell.dq,
+    "target_TCP_speed": lambda c, p, cell: cell.kinematics(cell.q_d, np.zeros(3))[2] @ cell.dq_d,
+    "actual_TCP_force": lambda c, p, cell: c._wrench,
+    "ft_raw_wrench": lambda c, p, cell: c._wrench,
+    "tcp_force_scalar": lambda c, p, cell: float(np.linalg.norm(c._wrench[:3])),
+    "runtime_state": lambda c, p, cell: _PLAYING if p.running else _STOPPED,
+    "robot_mode": lambda c, p, cell: c._mode,
+    "robot_status_bits": lambda c, p, cell: int(c._mode != _POWER_OFF) | p.running << 1,
+    "safety_mode": lambda c, p, cell: int(c.safety),
+    "safety_status": lambda c, p, cell: int(c.safety),
+    "safety_status_bits": lambda c, p, cell: c.safety.bits,
+    "speed_scaling": lambda c, p, cell: c._pace,
+    "target_speed_fraction": lambda c, p, cell: c._pace,
+}
+
+
+def _recipe(payload: bytes, known: dict[str, str]) -> tuple[list[str], bytes]:
+    """Names of a recipe that are known, and the kinds to answer with."""
+    names = [name for name in payload.decode().split(",") if name]
+    kinds = ",".join(known.get(name, "NOT_FOUND") for name in names)
+    return [name for name in names if name in known], kinds.encode()

@@ -1,0 +1,178 @@
+"""How a UR moves between commands: moves with trapezoidal speed, servo, speed, stop."""
+
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.control.motion.kinematics import rotation_matrix, rotation_vector
+from touchgoal.control.safety.braking import braked
+from touchgoal.sim_envs.twin.cell import DT, Cell
+
+_SERVO_ACCELERATION = 40.0  # rad/s^2, the most that ur-rtde lets a client ask for
+_STILL = 1e-3  # rad/s
+
+Joints = Float[np.ndarray, "6"]
+Target = tuple[Joints, Joints]  # rad, rad/s
+
+
+@runtime_checkable
+class Activity(Protocol):
+    """Something the arm is doing."""
+
+    def step(self, q: Joints, dq: Joints, pace: float) -> Target:
+        """The next millisecond's target after the last one; `pace`: the speed slider."""
+        ...
+
+    @property
+    def done(self) -> bool:
+        """Whether it has come to its end."""
+        ...
+
+
+@dataclass
+class _Trapezoid:
+    """Distance covered at constant acceleration, speed, deceleration, from rest to rest."""
+
+    length: float
+    speed: float
+    acceleration: float
+    time: float = 0.0
+
+    def __post_init__(self) -> None:
+        # Too short a way for the full speed: a triangle.
+        self.speed = min(self.speed, np.sqrt(self.length * self.acceleration))
+        self.speed = max(self.speed, 1e-9)
+        self.duration = self.length / self.speed + self.speed / self.acceleration
+
+    def advance(self, dt: float) -> tuple[float, float]:
+        """Share of the way after another `dt` s, and its rate (1/s)."""
+        self.time = min(self.time + dt, self.duration)
+        ramp, left = self.speed / self.acceleration, self.duration - self.time
+        if self.time < ramp:
+            way, rate = self.acceleration * self.time**2 / 2, self.acceleration * self.time
+        elif left > ramp:
+            way, rate = self.speed * (self.time - ramp / 2), self.speed
+        else:
+            way, rate = self.length - self.acceleration * left**2 / 2, self.acceleration * left
+        return way / max(self.length, 1e-12), rate / max(self.length, 1e-12)
+
+
+class JointMove:
+    """`movej`: linear in joint space; speed (rad/s) and acceleration (rad/s^2) of the leading axis.
+
+    A moving arm is brought to rest first.
+    """
+
+    def __init__(self, goal: Joints, speed: float, acceleration: float) -> None:
+        self._goal, self._speed, self._acceleration = goal, speed, acceleration
+        self._law: _Trapezoid | None = None
+
+    def step(self, q: Joints, dq: Joints, pace: float) -> Target:
+        """The next target."""
+        if self._law is None:
+            if np.abs(dq).max() > _STILL:
+                dq = braked(dq, np.full(6, self._acceleration), DT)
+                return q + DT * dq, dq
+            self._start = q
+            length = float(np.abs(self._goal - q).max())
+            self._law = _Trapezoid(length, self._speed, self._acceleration)
+        share, rate = self._law.advance(pace * DT)
+        way = self._goal - self._start
+        return self._start + share * way, pace * rate * way * (not self.done)
+
+    @property
+    def done(self) -> bool:
+        """Whether the goal is reached."""
+        return self._law is not None and self._law.time >= self._law.duration
+
+
+class LineMove:
+    """`movel`: the TCP on a straight line from rest; m/s and m/s^2, or rad if it mostly turns."""
+
+    def __init__(
+        self,
+        cell: Cell,
+        offset: Float[np.ndarray, "3"],
+        position: Float[np.ndarray, "3"],
+        rotation: Float[np.ndarray, "3 3"],
+        speed: float,
+        acceleration: float,
+    ) -> None:
+        self._cell, self._offset = cell, offset
+        self._from, self._R, _ = cell.kinematics(cell.q_d, offset)
+        self._way, self._turn = position - self._from, rotation_vector(rotation @ self._R.T)
+        length = max(float(np.linalg.norm(self._way)), float(np.linalg.norm(self._turn)))
+        self._law = _Trapezoid(length, speed, acceleration)
+
+    def step(self, q: Joints, dq: Joints, pace: float) -> Target:
+        """The next target, by differential inverse kinematics that corrects its own drift."""
+        share, rate = self._law.advance(pace * DT)
+        position, R, jacobian = self._cell.kinematics(q, self._offset)
+        wanted = rotation_matrix(share * self._turn) @ self._R
+        error = np.concatenate(
+            [self._from + share * self._way - position, rotation_vector(wanted @ R.T)]
+        )
+        J = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + 1e-6 * np.eye(6))
+        dq = J @ (error / DT)
+        return q + DT * dq, dq * (not self.done)
+
+    @property
+    def done(self) -> bool:
+        """Whether the goal is reached."""
+        return self._law.time >= self._law.duration
+
+
+@dataclass
+class Servo:
+    """`servoj`: follow a goal (rad) that changes all the time, about `lookahead` s behind it."""
+
+    speed: Joints
+    goal: Joints
+    lookahead: float
+    done: bool = field(default=False, init=False)
+
+    def step(self, q: Joints, dq: Joints, pace: float) -> Target:
+        """The next target."""
+        wanted = np.clip((self.goal - q) / self.lookahead, -self.speed, self.speed)
+        change = _SERVO_ACCELERATION * DT
+        dq = dq + np.clip(wanted - dq, -change, change)
+        return q + DT * dq, dq
+
+
+@dataclass
+class Speed:
+    """`speedj` or `speedl`: go on at a joint speed (rad/s), or a TCP twist (m/s, rad/s)."""
+
+    goal: Joints
+    acceleration: float
+    cell: Cell | None = None
+    done: bool = field(default=False, init=False)
+
+    def step(self, q: Joints, dq: Joints, pace: float) -> Target:
+        """The next target."""
+        goal = self.goal
+        if self.cell is not None:
+            _, _, J = self.cell.kinematics(q, np.zeros(3))
+            goal = J.T @ np.linalg.solve(J @ J.T + 1e-6 * np.eye(6), self.goal)
+        missing = goal - dq
+        most = np.abs(missing).max()
+        dq = dq + missing * min(1.0, self.acceleration * DT / max(most, 1e-12))
+        return q + DT * dq, dq
+
+
+@dataclass
+class Stop:
+    """`stopj`: slow down (rad/s^2, leading axis) along the way, then rest."""
+
+    deceleration: float
+    done: bool = field(default=False, init=False)
+
+    def step(self, q: Joints, dq: Joints, pace: float) -> Target:
+        """The next target."""
+        fastest = float(np.abs(dq).max())
+        left = max(0.0, fastest - self.deceleration * DT)
+        dq = dq * (left / fastest if fastest > 0 else 0.0)
+        self.done = left == 0.0
+        return q + DT * dq, dq

@@ -1,0 +1,224 @@
+"""The control program that ur-rtde uploads, as the controller would run it: register by register.
+
+The URScript itself is not interpreted. What it does with each command number is done here: arguments
+lie in the input registers, answers in the output registers, and output register 0 says 1 (ready for
+a command) or 2 (done).
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.control.motion.kinematics import (
+    GELSIGHT_TCP,
+    UR5E,
+    Kinematics,
+    rotation_matrix,
+    rotation_vector,
+)
+from touchgoal.control.safety.limits import UR5E as ROBOT
+from touchgoal.sim_envs.twin.cell import Cell
+from touchgoal.sim_envs.twin.ur.motion import (
+    Activity,
+    JointMove,
+    LineMove,
+    Servo,
+    Speed,
+    Stop,
+)
+
+_READY, _DONE = 1, 2
+_STREAMED = {6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71}  # acknowledged at once
+_IGNORED = {0, 8, 13, 14, 17, 20, 21, 48, 59, 65, 99}  # payload, force sensor, outputs, a kick
+_STOP_SCRIPT = 255
+_REACH = 0.85  # m, UR5e data sheet
+_FLANGE_TO_TCP = np.array([0.0, 0.0, GELSIGHT_TCP])
+
+Pose = Float[np.ndarray, "6"]  # m, rotation vector (rad)
+
+
+class UrProgram:
+    """One run of the control program.
+
+    Attributes:
+        activity: what the arm is doing for it.
+        ints, doubles: output registers.
+        inputs: the client's input registers by name.
+        running: false once it has ended.
+    """
+
+    def __init__(self, cell: Cell, inputs: dict[str, float], stop: Callable[[], None]) -> None:
+        """`stop` is what the program calls for a protective stop."""
+        self.cell, self.inputs, self._protective_stop = cell, inputs, stop
+        self.activity: Activity | None = None
+        self.ints, self.doubles = [0] * 48, [0.0] * 48
+        self.ints[0], self.running = _READY, True
+        self.watchdog = np.inf  # s without a command after which the program ends
+        self.tcp = np.concatenate([_FLANGE_TO_TCP, np.zeros(3)])
+        self._executing = self._waiting = self._asynchronous = False
+        self._started = 0
+        self._kinematics = Kinematics(UR5E, GELSIGHT_TCP)
+
+    def cycle(self) -> None:
+        """Look at the command register once: every 2 ms, and when a package arrives."""
+        finished = self.activity is None or self.activity.done
+        if self._waiting:
+            if not finished:
+                return
+            self._waiting, self.ints[0] = False, _DONE
+        if self._asynchronous and finished:
+            self._asynchronous = False
+            self.ints[2] = self._started << 24
+        command = self._int(0)
+        if command in _STREAMED:
+            self._do(command)
+            self.ints[0] = _READY
+        elif command == 0:
+            self._executing, self.ints[0] = False, _READY
+        elif not self._executing:
+            self._executing, self.ints[0] = True, 0
+            self._do(command)
+            if not self._waiting and self.running:
+                self.ints[0] = _DONE
+
+    def pose(self, q: Float[np.ndarray, "6"]) -> Pose:
+        """Of the configured TCP at joint positions (rad), base frame."""
+        position, R, _ = self.cell.kinematics(q, self._offset())
+        return np.concatenate([position, rotation_vector(R @ rotation_matrix(self.tcp[3:]))])
+
+    # Commands.
+
+    def _do(self, command: int) -> None:
+        actions = {
+            1: lambda: self._move(JointMove(self._doubles(0), self._double(6), self._double(7))),
+            2: lambda: self._move_to_pose(),
+            3: lambda: self._move(self._line(self._doubles(0))),
+            4: lambda: self._move(self._line(self.pose(self._doubles(0)))),
+            9: lambda: self._go(Speed(self._doubles(0), self._double(6))),
+            10: lambda: self._go(Speed(self._doubles(0), self._double(6), self.cell)),
+            11: lambda: self._servo(self._doubles(0)),
+            15: lambda: self._stop(asynchronous=False),
+            16: lambda: self._stop(asynchronous=False),
+            24: lambda: self._servo(self._inverse(self._doubles(0), self.cell.q_d)),
+            26: lambda: self._answer([0.002]),
+            28: lambda: self._answer(self.pose(self.cell.q_d)),
+            29: self._set_tcp,
+            30: lambda: self._answer(self._inverse(self._doubles(0), self._doubles(6))),
+            31: self._protective_stop,
+            33: lambda: self._stop(asynchronous=self._int(1) == 1),
+            34: lambda: self._stop(asynchronous=self._int(1) == 1),
+            35: self._set_watchdog,
+            36: lambda: self._say(bool(np.linalg.norm(self._doubles(0)[:3]) < _REACH)),
+            37: lambda: self._say(_inside(self._doubles(0))),
+            38: lambda: self._answer(self.cell.joint_torque),
+            40: lambda: self._answer(self.tcp),
+            43: lambda: self._answer(self.pose(self.cell.q)),
+            44: self._forward,
+            46: lambda: self._answer(self._inverse(self._doubles(0), self.cell.q)),
+            47: lambda: self._say(not self.cell.moving),
+            58: lambda: self._answer(self._flange()),
+            _STOP_SCRIPT: self.end,
+        }
+        if command in actions:
+            actions[command]()
+        elif command not in _IGNORED:
+            print(f"the twin does not simulate ur-rtde's command {command}; program ended")
+            self.end()
+
+    def end(self) -> None:
+        """The program ends; the arm comes to rest."""
+        self.running, self.activity = False, None
+        self._waiting, self.ints[0] = False, 0
+        self.cell.brake(ROBOT.hardware.acceleration)
+
+    def _go(self, activity: Activity) -> None:
+        """Stream: what is going on in the same way goes on with the new numbers."""
+        self.activity = activity
+
+    def _servo(self, goal: np.ndarray) -> None:
+        if not np.isfinite(goal).all():
+            self._protective_stop()
+            return
+        lookahead = min(max(self._double(9), 0.03), 0.2)
+        self._go(Servo(ROBOT.hardware.velocity, goal, lookahead))
+
+    def _move(self, activity: Activity) -> None:
+        self.activity = activity
+        if self._int(1) == 1:
+            self._asynchronous = True
+            self._started = (self._started + 1) % 128
+            self.ints[2] = self._started << 24 | 1 << 15
+        else:
+            self._waiting = True
+
+    def _move_to_pose(self) -> None:
+        q = self._inverse(self._doubles(0), self.cell.q_d)
+        self._move(JointMove(q, self._double(6), self._double(7)))
+
+    def _stop(self, asynchronous: bool) -> None:
+        self._asynchronous, self.ints[2] = False, self._started << 24
+        self.activity = Stop(max(0.1, self._double(0)))
+        self._waiting = not asynchronous
+
+    def _set_watchdog(self) -> None:
+        self.watchdog = 1 / self._double(0) if self._double(0) > 0 else np.inf
+
+    def _set_tcp(self) -> None:
+        self.tcp = self._doubles(0)
+
+    def _forward(self) -> None:
+        kept, self.tcp = self.tcp, self._doubles(6)
+        self._answer(self.pose(self._doubles(0)))
+        self.tcp = kept
+
+    # Geometry.
+
+    def _offset(self) -> Float[np.ndarray, "3"]:
+        """Of the configured TCP from the hand's own, in the hand frame, m."""
+        return self.tcp[:3] - _FLANGE_TO_TCP
+
+    def _target(self, pose: Pose) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+        """Where the hand's own TCP has to be for the configured one to have a pose."""
+        R = rotation_matrix(pose[3:]) @ rotation_matrix(self.tcp[3:]).T
+        return pose[:3] - R @ self._offset(), R
+
+    def _line(self, pose: Pose) -> LineMove:
+        R = rotation_matrix(pose[3:]) @ rotation_matrix(self.tcp[3:]).T
+        speed, acceleration = self._double(6), self._double(7)
+        return LineMove(self.cell, self._offset(), pose[:3], R, speed, acceleration)
+
+    def _inverse(self, pose: Pose, near: np.ndarray) -> Float[np.ndarray, "6"]:
+        """Joint positions, by the nearest way; without a solution a UR stops its program."""
+        position, R = self._target(pose)
+        solution = self._kinematics.inverse(position, R, near, posture=0.0)
+        if not solution.reached:
+            print("the twin's UR found no inverse kinematics; protective stop")
+            self._protective_stop()
+            return self.cell.q_d.copy()
+        return solution.q
+
+    def _flange(self) -> Pose:
+        position, R, _ = self.cell.kinematics(self.cell.q, -_FLANGE_TO_TCP)
+        return np.concatenate([position, rotation_vector(R)])
+
+    # Registers.
+
+    def _int(self, index: int) -> int:
+        return int(self.inputs[f"input_int_register_{index}"])
+
+    def _double(self, index: int) -> float:
+        return float(self.inputs[f"input_double_register_{index}"])
+
+    def _doubles(self, index: int) -> Float[np.ndarray, "6"]:
+        return np.array([self._double(index + i) for i in range(6)])
+
+    def _answer(self, numbers) -> None:
+        self.doubles[: len(numbers)] = [float(number) for number in numbers]
+
+    def _say(self, yes: bool) -> None:
+        self.ints[1] = int(yes)
+
+
+def _inside(q: Float[np.ndarray, "6"]) -> bool:
+    return bool(((q >= ROBOT.hardware.lower) & (q <= ROBOT.hardware.upper)).all())
