@@ -44,7 +44,7 @@ build: $(READY)
 weights: $(READY)
 	$(BIN)/touchgoal collect-demos --episodes 40 --seed 100000 --out runs/weights/val
 	$(BIN)/touchgoal collect-demos --episodes 240 --seed 0 --out runs/weights/train
-	$(BIN)/touchgoal train-encoder align --episodes runs/weights/train/episodes \
+	$(BIN)/touchgoal train-encoder align --data runs/weights/train/episodes \
 		--validation runs/weights/val/episodes --scale-episodes 60 --out runs/weights/run
 	cp runs/weights/run/encoder/* encoders/weights/gelsight_mini_offline/
 
@@ -53,7 +53,7 @@ MARKERS := --env.scene.sensor gelsight_mini_markers
 weights-markers: $(READY)
 	$(BIN)/touchgoal collect-demos $(MARKERS) --episodes 40 --seed 100000 --out runs/markers/val
 	$(BIN)/touchgoal collect-demos $(MARKERS) --episodes 240 --seed 0 --out runs/markers/train
-	$(BIN)/touchgoal train-encoder align --episodes runs/markers/train/episodes \
+	$(BIN)/touchgoal train-encoder align --data runs/markers/train/episodes \
 		--validation runs/markers/val/episodes --scale-episodes 60 \
 		--align.sensor gelsight_mini_markers --out runs/markers/run
 	cp runs/markers/run/encoder/* encoders/weights/gelsight_mini_markers_offline/
@@ -64,19 +64,19 @@ weights-markers: $(READY)
 # all of it. (The learners of what ships planned every fourth tick, and it was taught without trials and
 # with four DDIM steps, see docs/next_steps.md.)
 MAZE := runs/maze
-FEEL := --episodes $(MAZE)/train/episodes --validation $(MAZE)/val/episodes \
-	--touch $(MAZE)/mae/encoder --representation tool --train.lr 1e-3
+FEEL := --data $(MAZE)/train/episodes --validation $(MAZE)/val/episodes \
+	--encoder $(MAZE)/mae/encoder --representation body_twist --train.lr 1e-3
 maze-policy: $(READY)
 	$(BIN)/touchgoal collect-demos --task bead-maze --episodes 16 --seed 20000 \
 		--maze.split validation --maze.n-wires 16 --out $(MAZE)/val
 	$(BIN)/touchgoal collect-demos --task bead-maze --episodes 260 --seed 0 --maze.n-wires 260 \
 		--out $(MAZE)/train
-	$(BIN)/touchgoal train-encoder mae --episodes $(MAZE)/train/episodes \
+	$(BIN)/touchgoal train-encoder mae --data $(MAZE)/train/episodes \
 		--validation $(MAZE)/val/episodes --frames 30 --mae.epochs 12 --out $(MAZE)/mae
 	for round in 0 1; do \
 		$(BIN)/touchgoal train-policy $(FEEL) --head regression --trials 0 \
 			--train.epochs $$((6 + 2 * round)) --out $(MAZE)/round-$$round && \
-		$(BIN)/touchgoal collect-demos --task bead-maze --learner $(MAZE)/round-$$round/policy \
+		$(BIN)/touchgoal collect-demos --task bead-maze --policy $(MAZE)/round-$$round/policy \
 			--episodes 120 --seed 5$${round}000 --maze.n-wires 260 --out $(MAZE)/train || exit 1; \
 	done
 	$(BIN)/touchgoal train-policy $(FEEL) --train.epochs 10 \
@@ -89,11 +89,11 @@ maze-policy: $(READY)
 # placements; what it does, from an expert that answers what to do wherever the policy has got to.
 PICK := runs/pick_place
 BLIND := --env.no-tactile --env.cameras
-LEARN := --task pick-place --episodes $(PICK)/train/episodes --validation $(PICK)/val/episodes \
-	--senses $(PICK)/senses/senses --head regression --representation hand --place-noise 0 \
+LEARN := --task pick-place --data $(PICK)/train/episodes --validation $(PICK)/val/episodes \
+	--senses $(PICK)/senses/senses --head regression --representation base_twist --position-noise 0 \
 	--train.lr 1e-3 --train.epochs 16 --train.snapshot-epochs 16
 pick-place-policy: $(READY)
-	$(BIN)/touchgoal train-estimators --episodes runs/weights/train/episodes \
+	$(BIN)/touchgoal train-estimators --data runs/weights/train/episodes \
 		--validation runs/weights/val/episodes --out $(PICK)/senses
 	$(BIN)/touchgoal collect-demos --feedback --episodes 20 --seed 120000 $(BLIND) --out $(PICK)/val
 	$(BIN)/touchgoal collect-demos --feedback --episodes 120 --seed 20000 $(BLIND) \
@@ -103,7 +103,7 @@ pick-place-policy: $(READY)
 	for round in 1 2 3; do \
 		$(BIN)/touchgoal train-policy $(LEARN) --trials 0 \
 			--out $(PICK)/round-$$round && \
-		$(BIN)/touchgoal collect-demos --learner $(PICK)/round-$$round/policy --episodes 120 \
+		$(BIN)/touchgoal collect-demos --policy $(PICK)/round-$$round/policy --episodes 120 \
 			--seed 3$${round}000 $(BLIND) --out $(PICK)/train || exit 1; \
 	done
 	$(BIN)/touchgoal train-policy $(LEARN) --trials 40 --out $(PICK)/policy

@@ -20,16 +20,20 @@ from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import Actor, collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
-from touchgoal.policies.acting import SHIPPED, ActorMaker, Observation, Planner, PolicyActor
-from touchgoal.policies.evaluation import open_loop as compounding
+from touchgoal.policies.acting import SHIPPED, Observation, Planner, PolicyActor, SavedPolicy
+from touchgoal.policies.evaluation import open_loop
 from touchgoal.policies.evaluation.bead_maze import MazeTrial, evaluate, trials_of
-from touchgoal.policies.evaluation.open_loop import Compounded, Plan, compound
+from touchgoal.policies.evaluation.open_loop import OpenLoopErrors, Plan, open_loop_errors
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.follower import WireFollower
 from touchgoal.policies.heads.diffusion import RegressionConfig
 from touchgoal.policies.perception.frozen_touch import load_touch
-from touchgoal.policies.policy import Condition, Policy
-from touchgoal.policies.training.sequence_dataset import Windows, embeddings, read
+from touchgoal.policies.policy import ObservationBatch, Policy
+from touchgoal.policies.training.sequence_dataset import (
+    SequenceDataset,
+    cached_embeddings,
+    load_recordings,
+)
 from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.scene.wires import HELD_OUT, choose
@@ -68,31 +72,31 @@ class Follower:
         return WireFollower(env.config.control_hz)
 
 
-class MisledPlanner(Planner):
+class ShuffledTouchPlanner(Planner):
     """A planner that feels, tick by tick, what was felt on another wire."""
 
-    felt: Float[np.ndarray, "t e"]
+    recorded_touch: Float[np.ndarray, "t e"]
     tick = -1
 
     def plan(self, seen: Any) -> Float[np.ndarray, "h 8"]:
         """As `Planner.plan`."""
-        self.tick = min(self.tick + self.config.execution_horizon, len(self.felt) - 1)
+        self.tick = min(self.tick + self.config.execution_horizon, len(self.recorded_touch) - 1)
         return super().plan(seen)
 
-    def _feel(self, observation: Observation) -> Float[np.ndarray, " e"]:
-        return self.felt[max(self.tick, 0)]
+    def _embed_touch(self, observation: Observation) -> Float[np.ndarray, " e"]:
+        return self.recorded_touch[max(self.tick, 0)]
 
 
 @dataclass(frozen=True)
-class Misled:
+class ShuffledTouch:
     """Makes a policy whose touch was shuffled: it feels another episode, drawn by the trial's seed.
 
     Attributes:
         policy: makes it, undisturbed.
-        episodes: embedded, see `windows.read`.
+        episodes: embedded, see `load_recordings`.
     """
 
-    policy: ActorMaker
+    policy: SavedPolicy
     episodes: EpisodeSet
 
     def __call__(self, env: BeadMaze) -> Actor:
@@ -100,9 +104,9 @@ class Misled:
         torch.set_num_threads(1)
         loaded = checkpoint.load(self.policy.directory)
         touch = load_touch(self.policy.directory / checkpoint.TOUCH)
-        planner = MisledPlanner(loaded, touch)
+        planner = ShuffledTouchPlanner(loaded, touch)
         chosen = int(env.np_random.integers(len(self.episodes)))
-        planner.felt = embeddings(self.episodes, chosen, touch).astype(np.float32)
+        planner.recorded_touch = cached_embeddings(self.episodes, chosen, touch).astype(np.float32)
         return PolicyActor(planner, self.policy.latency)
 
 
@@ -116,7 +120,7 @@ def run(config: Config) -> dict[str, Any]:
         raise UserError("the baselines need at least 2 demonstrations")
     if not config.policies:
         raise UserError("name at least one policy folder with --policies")
-    arms = _arms(config.policies)
+    arms = _group_by_recipe(config.policies)
     with tempfile.TemporaryDirectory() as folder:
         recorded = _record(config, Path(folder) / "episodes")
         opened = {name: _open_loop(arm, recorded, config.workers) for name, arm in arms.items()}
@@ -129,14 +133,14 @@ def run(config: Config) -> dict[str, Any]:
     }
 
 
-def _arms(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
+def _group_by_recipe(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
     arms: dict[str, list[Path]] = {}
     for directory in policies:
         config = checkpoint.load(directory).config
-        senses = ["frozen touch"] * (config.touch_dim > 0)
-        senses += ["end-to-end touch"] * (config.eye is not None)
+        inputs = ["frozen touch"] * (config.touch_dim > 0)
+        inputs += ["end-to-end touch"] * (config.end_to_end is not None)
         episodes = checkpoint.POLICY.provenance(directory)["episodes"]
-        name = f"{' and '.join(senses) or 'state only'}, {episodes} demos"
+        name = f"{' and '.join(inputs) or 'state only'}, {episodes} demos"
         if isinstance(config.head, RegressionConfig):
             name += ", regression"
         arms.setdefault(name, []).append(directory)
@@ -155,27 +159,27 @@ def _closed_loop(
     other = trials_of(choose(maze.split, config.held_out, (HELD_OUT,)), FIRST_SEED + 10_000)
     results: dict[str, list[MazeTrial]] = {}
 
-    def try_(name: str, env: BeadMazeConfig, makers: list[Callable], trials: list) -> None:
+    def run_arm(name: str, env: BeadMazeConfig, makers: list[Callable], trials: list) -> None:
         if not trials:
             return
         print(f"{name}: {len(makers)} x {len(trials)} wires")
         results[name] = [t for m in makers for t in evaluate(env, m, trials, config.workers)]
 
-    try_("expert (sees the wire)", blind, [BeadMazeExpert], jobs)
-    try_("follower (force and first tangent)", blind, [Follower()], jobs)
-    try_(f"follower, {HELD_OUT}", blind, [Follower()], other)
+    run_arm("expert (sees the wire)", blind, [BeadMazeExpert], jobs)
+    run_arm("follower (force and first tangent)", blind, [Follower()], jobs)
+    run_arm(f"follower, {HELD_OUT}", blind, [Follower()], other)
     for name, directories in arms.items():
-        makers = [ActorMaker(d) for d in directories]
-        env = makers[0].observing(maze)
-        try_(name, env, makers, jobs)
-        try_(f"{name}, {HELD_OUT}", env, makers, other)
+        makers = [SavedPolicy(d) for d in directories]
+        env = makers[0].env_config(maze)
+        run_arm(name, env, makers, jobs)
+        run_arm(f"{name}, {HELD_OUT}", env, makers, other)
         if checkpoint.load(directories[0]).config.touch_dim:
-            misled = [Misled(maker, recorded) for maker in makers]
-            try_(f"{name}, shuffled", blind, misled, jobs)
+            shuffled = [ShuffledTouch(maker, recorded) for maker in makers]
+            run_arm(f"{name}, shuffled", blind, shuffled, jobs)
     first = config.policies[0]
     for latency in config.latencies:
-        late = ActorMaker(first, latency=latency)
-        try_(f"first policy, {latency} ticks late", late.observing(maze), [late], jobs)
+        late = SavedPolicy(first, latency=latency)
+        run_arm(f"first policy, {latency} ticks late", late.env_config(maze), [late], jobs)
     return results
 
 
@@ -228,56 +232,62 @@ def _open_loop(
     directories: list[Path], episodes: EpisodeSet, workers: int
 ) -> dict[str, dict[str, Any]]:
     """Errors of an arm and of the trivial baselines, each over demonstrations and seeds."""
-    rows: dict[str, list[tuple[str, Compounded]]] = {}
+    rows: dict[str, list[tuple[str, OpenLoopErrors]]] = {}
     count = len(episodes)
     for seed, directory in enumerate(directories):
         policy = checkpoint.load(directory)
         config, horizon = policy.config, policy.config.prediction_horizon
         touch = load_touch(directory / checkpoint.TOUCH) if config.touch_dim else None
         if touch:
-            read(episodes, range(count), config, touch, workers)  # embeds, all at once
-        recorded = [read(episodes, [i], config, touch) for i in range(count)]
+            load_recordings(episodes, range(count), config, touch, workers)  # embeds, all at once
+        recorded = [load_recordings(episodes, [i], config, touch) for i in range(count)]
         for i in range(count):
             plans = {"policy": _sampled(policy)}
             if touch:
-                plans["policy, shuffled touch"] = _misled(policy, recorded[(i + 1) % count].touch)
+                plans["policy, shuffled touch"] = _with_shuffled_touch(
+                    policy, recorded[(i + 1) % count].touch
+                )
             if seed == 0:
                 others = [r.actions.mean(0) for k, r in enumerate(recorded) if k != i]
                 plans |= {
-                    "zero motion": compounding.zero_motion(horizon),
-                    "repeat last": compounding.repeat_last(config.control_hz, horizon),
-                    "mean action": compounding.always(torch.stack(others).mean(0), horizon),
+                    "zero motion": open_loop.zero_motion(horizon),
+                    "repeat last": open_loop.repeat_last(config.control_hz, horizon),
+                    "mean action": open_loop.constant_action(torch.stack(others).mean(0), horizon),
                 }
             for name, plan in plans.items():
-                errors = compound(plan, Windows(recorded[i], config), config.control_hz)
+                errors = open_loop_errors(
+                    plan, SequenceDataset(recorded[i], config), config.control_hz
+                )
                 rows.setdefault(name, []).append((str(i), errors))
     return {name: _summary(errors) for name, errors in rows.items()}
 
 
 def _sampled(policy: Policy) -> Plan:
     generator = torch.Generator().manual_seed(0)
-    return lambda condition: policy.plan(condition, generator)
+    return lambda batch: policy.plan(batch, generator)
 
 
-def _misled(policy: Policy, felt: torch.Tensor) -> Plan:
+def _with_shuffled_touch(policy: Policy, recorded_touch: torch.Tensor) -> Plan:
     plan = _sampled(policy)
 
-    def misled(condition: Condition) -> torch.Tensor:
-        rows = torch.arange(len(condition.touch)) % len(felt)
-        touch = felt[rows].float()[:, None].expand_as(condition.touch)
-        return plan(Condition(touch, condition.state, condition.pictures))
+    def shuffled(batch: ObservationBatch) -> torch.Tensor:
+        rows = torch.arange(len(batch.touch)) % len(recorded_touch)
+        touch = recorded_touch[rows].float()[:, None].expand_as(batch.touch)
+        return plan(ObservationBatch(touch, batch.state, batch.pictures))
 
-    return misled
+    return shuffled
 
 
-def _summary(rows: list[tuple[str, Compounded]]) -> dict[str, Any]:
+def _summary(rows: list[tuple[str, OpenLoopErrors]]) -> dict[str, Any]:
     errors = [e for _, e in rows]
     return {
         "chunk_mm": np.mean([e.chunk for e in errors], 0).tolist(),
-        "forced_mm": [float(e.forced.mean()) for e in errors],
-        "forced_interval_mm": bootstrap([(name, float(e.forced.mean())) for name, e in rows]),
-        "forced_final_mm": [float(e.forced[-1]) for e in errors],
-        "free_mm": [float(e.free.mean()) for e in errors],
+        "forced_mm": [float(e.teacher_forced.mean()) for e in errors],
+        "forced_interval_mm": bootstrap(
+            [(name, float(e.teacher_forced.mean())) for name, e in rows]
+        ),
+        "forced_final_mm": [float(e.teacher_forced[-1]) for e in errors],
+        "free_mm": [float(e.free_running.mean()) for e in errors],
         "path_mm": float(np.mean([e.path for e in errors])),
     }
 

@@ -15,8 +15,8 @@ from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
 from touchgoal.sim_envs.scene.build import robot_model
 
-STILL = np.zeros(8)
-HOLDING = 70  # ticks after which the expert holds the object in the air
+NO_MOTION = np.zeros(8)
+TICKS_UNTIL_HELD = 70  # ticks after which the expert holds the object in the air
 
 
 @dataclass(frozen=True)
@@ -47,15 +47,15 @@ def run(config: Config) -> dict[str, Any]:
 
 def _physics(config: Config) -> list[Row]:
     n = config.physics_steps
-    peer = mujoco.MjModel.from_xml_string(_wheel_model())
+    peer = mujoco.MjModel.from_xml_string(_franky_sim_model())
     peer_data = mujoco.MjData(peer)
     mujoco.mj_resetDataKeyframe(peer, peer_data, 0)
     rows = [
         _rate("peer: bare FR3 of the wheel, its own settings", config, n, peer, peer_data),
     ]
     env = PickPlace(PickPlaceConfig(cameras=(), tactile=False))
-    for name, ticks in (("object on the table", 0), ("object held in the air", HOLDING)):
-        _start(env, ticks)
+    for name, ticks in (("object on the table", 0), ("object held in the air", TICKS_UNTIL_HELD)):
+        _reset_and_run_expert(env, ticks)
         rows.append(_rate(f"physics, whole cell, {name}", config, n, env.model, env.data))
     env.close()
     return rows
@@ -72,11 +72,11 @@ def _env(config: Config) -> list[Row]:
     ):
         env = PickPlace(replace(task, max_seconds=1e6))
         for name in objects:
-            _start(env, HOLDING, name)
+            _reset_and_run_expert(env, TICKS_UNTIL_HELD, name)
 
             def step(env: PickPlace = env) -> None:
                 for _ in range(n):
-                    env.step(STILL)
+                    env.step(NO_MOTION)
 
             rows.append(
                 measure(
@@ -101,7 +101,7 @@ def _maze(config: Config) -> list[Row]:
 
         def step(env: BeadMaze = env) -> None:
             for _ in range(config.env_steps):
-                env.step(STILL)
+                env.step(NO_MOTION)
 
         name = f"env step (50 physics steps), {what}, bead on the wire"
         rows.append(measure(name, config.repeats, config.env_steps, step))
@@ -109,7 +109,7 @@ def _maze(config: Config) -> list[Row]:
     return rows
 
 
-def _start(env: PickPlace, ticks: int, name: str = "soda_can") -> None:
+def _reset_and_run_expert(env: PickPlace, ticks: int, name: str = "soda_can") -> None:
     """A fresh episode, `ticks` into the expert's plan."""
     env.reset(seed=1, options={"object": name, "mass": 0.1, "grasp_force": 15.0})
     expert = PickPlaceExpert(env)
@@ -117,7 +117,7 @@ def _start(env: PickPlace, ticks: int, name: str = "soda_can") -> None:
         env.step(expert.act({}))
 
 
-def _wheel_model() -> str:
+def _franky_sim_model() -> str:
     spec = mujoco.MjSpec.from_file(str(robot_model()))
     spec.meshdir = str(robot_model().parent / "meshes")
     spec.option.timestep = 1e-3

@@ -23,25 +23,25 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.control.cell.config import Rig, read_rig
-from touchgoal.control.cell.connection import open_station, watchdogs_of
+from touchgoal.control.cell.config import CellConfig, read_cell_file
+from touchgoal.control.cell.connection import cell_watchdogs, connect_cell
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import Safety
 from touchgoal.episodes.metadata import write_file
 from touchgoal.episodes.store import EpisodeSet, validate
 from touchgoal.policies.acting import Observation
-from touchgoal.policies.deploy.actors import Learned, make_actor
-from touchgoal.policies.deploy.control_loop import DeployedActor, Deployment
+from touchgoal.policies.deploy.actors import LearnedActor, make_actor
+from touchgoal.policies.deploy.control_loop import ControlLoop, DeployedActor
 from touchgoal.policies.deploy.session import Session
 from touchgoal.policies.policy import PolicyConfig
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
-from touchgoal.sim_envs.twin.faults import ask
+from touchgoal.sim_envs.twin.faults import ask_twin
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 
-_PATIENCE = 300.0  # s for anything to happen, on a machine however loaded
+_TIMEOUT = 300.0  # s for anything to happen, on a machine however loaded
 _UNLIMITED = resource.RLIM_INFINITY
-_FORKS = multiprocessing.get_context("forkserver")  # one import of everything serves every row
-_FORKS.set_forkserver_preload([__name__])
+_FORKSERVER = multiprocessing.get_context("forkserver")  # one import of everything serves every row
+_FORKSERVER.set_forkserver_preload([__name__])
 
 
 @dataclass(frozen=True)
@@ -57,59 +57,59 @@ class Config:
 
 
 @dataclass(frozen=True)
-class Case:
+class FaultCase:
     """One fault: a line to the twin's port, or a signal, or a policy, or none of these."""
 
     name: str
-    line: str = ""
+    control_line: str = ""
     policy: str = "expert"
     kills: bool = False
     full: bool = False
 
 
 CASES = (
-    Case("none"),
-    Case("server killed in motion", "kill"),
-    Case("link frozen 0.1 s", "freeze 0.1"),
-    Case("link frozen 0.5 s", "freeze 0.5"),
-    Case("link frozen 2 s", "freeze 2"),
-    Case("camera stalled", "stall front 60"),
-    Case("camera frozen on a frame", "repeat front 60"),
-    Case("fingertip unplugged", "lose tactile_left 60"),
-    Case("load cell garbled", "garble load_cell 1.0"),
-    Case("policy: not a number", policy="nan"),
-    Case("policy hangs", policy="hangs"),
-    Case("joint limit ahead", policy="outwards"),
-    Case("force ceiling met", "nudge 0 22 0 3"),
-    Case("contact reflex", "error cartesian_reflex"),
-    Case("user stop", "stop-button on"),
-    Case("deploy killed (-9)", kills=True),
-    Case("disk full", full=True),
+    FaultCase("none"),
+    FaultCase("server killed in motion", "kill"),
+    FaultCase("link frozen 0.1 s", "freeze 0.1"),
+    FaultCase("link frozen 0.5 s", "freeze 0.5"),
+    FaultCase("link frozen 2 s", "freeze 2"),
+    FaultCase("camera stalled", "stall front 60"),
+    FaultCase("camera frozen on a frame", "repeat front 60"),
+    FaultCase("fingertip unplugged", "lose tactile_left 60"),
+    FaultCase("load cell garbled", "garble load_cell 1.0"),
+    FaultCase("policy: not a number", policy="nan"),
+    FaultCase("policy hangs", policy="hangs"),
+    FaultCase("joint limit ahead", policy="outwards"),
+    FaultCase("force ceiling met", "nudge 0 22 0 3"),
+    FaultCase("contact reflex", "error cartesian_reflex"),
+    FaultCase("user stop", "stop-button on"),
+    FaultCase("deploy killed (-9)", kills=True),
+    FaultCase("disk full", full=True),
 )
 
 
 @dataclass(frozen=True)
-class Row:
+class FaultRow:
     """What one fault did.
 
     Attributes:
-        seen: what the operator is told.
+        message: what the operator is told.
         rest: s (simulated) from the fault until the arm is at rest; not a number if the fault stops
             no arm, or takes the controller, and so the twin, away.
         excess: rad beyond the maker's joint range; speed: share of the maker's joint speed.
         force: N, the most that pressed on the robot from outside.
-        kept: whether all is on disk and whole that had been finished, this run's episode included
+        episodes_whole: whether all is on disk and whole that had been finished, this run's episode included
             unless its process or its disk was what failed.
         late: ms by which 99 % of the ticks were late at most.
     """
 
     name: str
-    seen: str
+    message: str
     rest: float
     excess: float
     speed: float
     force: float
-    kept: bool
+    episodes_whole: bool
     late: float
 
 
@@ -127,60 +127,64 @@ def run(config: Config) -> dict[str, Any]:
     return {"table": _table(rows), "rows": [vars(row) for row in rows]}
 
 
-def _run(case: Case, folder: Path, lock_step: bool, number: int) -> Row:
+def _run(case: FaultCase, folder: Path, lock_step: bool, number: int) -> FaultRow:
     folder.mkdir()
     pid = os.getpid()
     host = f"127.{60 + number}.{pid // 250 % 250}.{1 + pid % 250}"
-    broke = folder / "broke"
+    broken_at = folder / "broken_at"
     twin = _spawn(_serve, host, folder, lock_step)
-    _until(lambda: (folder / "rig.json").exists() or not twin.is_alive())
-    rig = read_rig(folder / "rig.json")
-    rig = replace(rig, task=replace(rig.task, start=None))
-    episodes, said = folder / "episodes", folder / "said"
-    deploy = _spawn(_deploy, rig, case, episodes, said, broke)
+    _wait_until(lambda: (folder / "cell.json").exists() or not twin.is_alive())
+    cell = read_cell_file(folder / "cell.json")
+    cell = replace(cell, task=replace(cell.task, start=None))
+    episodes, report = folder / "episodes", folder / "report"
+    deploy = _spawn(_deploy, cell, case, episodes, report, broken_at)
     try:
-        before, after = _inject(case, rig, deploy, said)
-        deploy.join(_PATIENCE)
+        before, after = _inject(case, cell, deploy, report)
+        deploy.join(_TIMEOUT)
         hung = deploy.is_alive()
     finally:
         for process in (deploy, twin):
             process.kill()
             process.join()
-    seen, late = "it hangs", float("nan")
-    if said.exists():
-        late, seen = said.read_text().split("\n", 1)
+    message, late = "it hangs", float("nan")
+    if report.exists():
+        late, message = report.read_text().split("\n", 1)
     elif not hung:
-        seen = "its process is gone; the driver's child brings the arm to rest"
+        message = "its process is gone; the driver's child brings the arm to rest"
     worst = after["worst"] if after else dict.fromkeys(("excess", "speed", "force"), float("nan"))
-    if broke.exists():
-        before = float(broke.read_text())
-    stops = seen != "done" and (case.kills or case.line or broke.exists())
+    if broken_at.exists():
+        before = float(broken_at.read_text())
+    stops = message != "done" and (case.kills or case.control_line or broken_at.exists())
     rest = after["time"] - after["rest"] - before if after and stops else float("nan")
     finished = 1 if case.kills or case.full else 2
-    kept = len(EpisodeSet(episodes)) == finished and not _damaged(episodes)
-    return Row(case.name, seen, rest, **worst, kept=kept, late=float(late))
+    episodes_whole = len(EpisodeSet(episodes)) == finished and not _damaged(episodes)
+    return FaultRow(
+        case.name, message, rest, **worst, episodes_whole=episodes_whole, late=float(late)
+    )
 
 
 def _inject(
-    case: Case, rig: Rig, deploy: ForkServerProcess, said: Path
+    case: FaultCase, cell: CellConfig, deploy: ForkServerProcess, report: Path
 ) -> tuple[float, dict[str, Any] | None]:
     """Break it while the arm moves; the twin's time then, and its truth once the arm rests."""
-    port = rig.task.twin
+    port = cell.task.twin
 
     def truth() -> dict[str, Any]:
-        return ask(port, "truth")
+        return ask_twin(port, "truth")
 
-    _until(lambda: max(np.abs(truth()["dq"])) > 0.1 or said.exists() or not deploy.is_alive())
+    _wait_until(
+        lambda: max(np.abs(truth()["dq"])) > 0.1 or report.exists() or not deploy.is_alive()
+    )
     moment = truth()["time"]
     if case.kills:
         deploy.kill()
-    elif case.line:
+    elif case.control_line:
         try:
-            ask(port, case.line)
+            ask_twin(port, case.control_line)
         except UserError:  # the twin is gone, as asked
             return moment, None
-    _until(lambda: said.exists() or case.kills or not deploy.is_alive())
-    _until(lambda: truth()["rest"] > 0.2)
+    _wait_until(lambda: report.exists() or case.kills or not deploy.is_alive())
+    _wait_until(lambda: truth()["rest"] > 0.2)
     return moment, truth()
 
 
@@ -189,81 +193,85 @@ def _serve(host: str, folder: Path, lock_step: bool) -> None:
     task = PickPlaceConfig(cameras=("front",))
     options = {"object": "wooden_block"}
     twin = Twin(TwinConfig(task, "fr3", 3, options, host, 0, lock_step, folder))
-    write_file(folder / "rig.json", json.dumps(twin.rig).encode())
+    write_file(folder / "cell.json", json.dumps(twin.description).encode())
     twin.run()
 
 
-def _deploy(rig: Rig, case: Case, episodes: Path, said: Path, broke: Path) -> None:
+def _deploy(
+    cell: CellConfig, case: FaultCase, episodes: Path, report: Path, broken_at: Path
+) -> None:
     """The deployment's process; a first, short episode is there before the fault comes."""
-    station = open_station(rig, ft.CONTROL_HZ)
-    safety = Safety(station.robot, ft.CONTROL_HZ, watchdogs_of(rig))
-    truth = partial(ask, rig.task.twin, "truth")
+    connection = connect_cell(cell, ft.CONTROL_HZ)
+    safety = Safety(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
+    truth = partial(ask_twin, cell.task.twin, "truth")
 
-    def session(make: Callable[[Deployment], DeployedActor], seconds: float) -> Session:
-        short = replace(rig, task=replace(rig.task, seconds=seconds))
+    def session(make: Callable[[ControlLoop], DeployedActor], seconds: float) -> Session:
+        short = replace(cell, task=replace(cell.task, seconds=seconds))
         return Session(
-            short, station, safety, episodes, True, make, lambda: "", lambda _: None, truth
+            short, connection, safety, episodes, True, make, lambda: "", lambda _: None, truth
         )
 
-    def expert(deployment: Deployment) -> DeployedActor:
-        return make_actor(rig, None, safety, truth, deployment.commanded)
+    def expert(loop: ControlLoop) -> DeployedActor:
+        return make_actor(cell, None, safety, truth, loop.commanded)
 
-    def breaks() -> None:
-        broke.write_text(str(truth()["time"]))
+    def mark_broken() -> None:
+        broken_at.write_text(str(truth()["time"]))
 
-    session(lambda d: Broken("still", d, breaks), 0.5).run()
+    session(lambda d: BrokenPolicy("still", d, mark_broken), 0.5).run()
     if case.full:  # a file that may not grow fails as on a full disk, in the middle of a write
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, _UNLIMITED))
-    makers: dict[str, Callable[[Deployment], DeployedActor]] = {
+    makers: dict[str, Callable[[ControlLoop], DeployedActor]] = {
         "expert": expert,
-        "hangs": lambda d: Learned(Hanging(d.width, breaks)),
+        "hangs": lambda d: LearnedActor(HangingPlanner(d.width, mark_broken)),
     }
-    make = makers.get(case.policy, lambda d: Broken(case.policy, d, breaks))
+    make = makers.get(case.policy, lambda d: BrokenPolicy(case.policy, d, mark_broken))
     result = session(make, 10.0 if case.policy == "outwards" else 40.0).run()
-    late = 1e3 * np.percentile(result.ticks.late or [np.nan], 99)
+    late = 1e3 * np.percentile(result.log.lateness or [np.nan], 99)
     resource.setrlimit(resource.RLIMIT_FSIZE, (_UNLIMITED, _UNLIMITED))
-    seen = result.trouble or result.ending.reason
+    message = result.recording_error or result.ending.reason
     if case.policy == "outwards":
-        seen += "; clamped: " + ", ".join(f"{name} {n}" for name, n in result.ticks.acted.items())
-    said.write_text(f"{late}\n{seen}")
-    station.close()
+        message += "; clamped: " + ", ".join(
+            f"{name} {n}" for name, n in result.log.limit_counts.items()
+        )
+    report.write_text(f"{late}\n{message}")
+    connection.close()
 
 
-class Broken:
+class BrokenPolicy:
     """A policy that moves well for a second and then breaks as it is told."""
 
-    done, overdue = False, 0.0
+    done, action_age = False, 0.0
 
-    def __init__(self, how: str, deployment: Deployment, breaks: Callable[[], None]) -> None:
-        self._how, self._deployment, self._breaks, self._ticks = how, deployment, breaks, 0
+    def __init__(self, how: str, loop: ControlLoop, mark_broken: Callable[[], None]) -> None:
+        self._how, self._loop, self._mark_broken, self._ticks = how, loop, mark_broken, 0
 
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """See DeployedActor."""
         self._ticks += 1
-        n, width = self._deployment.commanded().size, self._deployment.width
+        n, width = self._loop.commanded().size, self._loop.width
         step = np.zeros(n)
         joint = -1 if self._how == "outwards" else 0  # the wrist's end comes before the workspace's
         step[joint] = 0.0 if self._how == "still" else 0.02
         if self._how == "nan" and self._ticks > ft.CONTROL_HZ:
             step[0] = np.nan
             if self._ticks == ft.CONTROL_HZ + 1:
-                self._breaks()
+                self._mark_broken()
         return np.append(step, width)
 
     def close(self) -> None:
         """Nothing is left behind."""
 
 
-class Hanging:
+class HangingPlanner:
     """A planner that turns the base and then never answers again, in the real planning thread."""
 
     config = PolicyConfig(
         touch_dim=0, touch="", observation_horizon=1, execution_horizon=8, prediction_horizon=16
     )
 
-    def __init__(self, width: float, breaks: Callable[[], None]) -> None:
-        self._width, self._breaks, self._plans = width, breaks, 0
+    def __init__(self, width: float, mark_broken: Callable[[], None]) -> None:
+        self._width, self._mark_broken, self._plans = width, mark_broken, 0
 
     def sense(self, seen: Sequence[Observation]) -> None:
         """It has no senses."""
@@ -272,7 +280,7 @@ class Hanging:
         """Three plans, then none."""
         self._plans += 1
         if self._plans > 3:
-            self._breaks()
+            self._mark_broken()
             threading.Event().wait()
         plan = np.zeros((self.config.prediction_horizon, ft.N_JOINTS + 1), np.float32)
         plan[:, 0], plan[:, -1] = 0.02, self._width
@@ -280,13 +288,13 @@ class Hanging:
 
 
 def _spawn(target: Callable[..., None], *arguments: Any) -> ForkServerProcess:
-    process = _FORKS.Process(target=target, args=arguments)
+    process = _FORKSERVER.Process(target=target, args=arguments)
     process.start()
     return process
 
 
-def _until(holds: Callable[[], bool]) -> None:
-    end = time.monotonic() + _PATIENCE
+def _wait_until(holds: Callable[[], bool]) -> None:
+    end = time.monotonic() + _TIMEOUT
     while not holds() and time.monotonic() < end:
         time.sleep(0.01)
 
@@ -296,17 +304,17 @@ def _damaged(episodes: Path) -> bool:
     return any("belongs to no episode" not in line for line in validate(episodes))
 
 
-def _line(row: Row) -> str:
-    kept = "whole" if row.kept else "LOST"
+def _line(row: FaultRow) -> str:
+    episodes_whole = "whole" if row.episodes_whole else "LOST"
     rest = "-" if np.isnan(row.rest) else f"{row.rest:.2f}"
     limits = f"{'-':>9}{'-':>7}{'-':>8}"
     if not np.isnan(row.excess):
         limits = f"{row.excess:>9.3f}{row.speed:>7.0%}{row.force:>8.1f}"
     late = "-" if np.isnan(row.late) else f"{row.late:.1f}"
-    return f"{row.name:<25}{rest:>7}{limits}{late:>8}  {kept:<7}{row.seen}"
+    return f"{row.name:<25}{rest:>7}{limits}{late:>8}  {episodes_whole:<7}{row.message}"
 
 
-def _table(rows: list[Row]) -> str:
+def _table(rows: list[FaultRow]) -> str:
     head = (
         f"{'fault':<25}{'rest s':>7}{'beyond':>9}{'speed':>7}{'force N':>8}{'late ms':>8}  {'kept':<7}"
         "what the operator sees"

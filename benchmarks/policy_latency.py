@@ -17,11 +17,11 @@ from touchgoal.benchmarks.speed import one_core
 from touchgoal.control import features as ft
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.policies import checkpoint
-from touchgoal.policies.acting import SHIPPED, ActorMaker
+from touchgoal.policies.acting import SHIPPED, SavedPolicy
 from touchgoal.policies.heads.diffusion import Diffusion, DiffusionConfig
 from touchgoal.policies.heads.samplers import SamplerConfig
 from touchgoal.policies.heads.unet import PRESETS
-from touchgoal.policies.perception.end_to_end import shrink
+from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.policy import PolicyConfig
 from touchgoal.sim_envs.base import EnvConfig
 
@@ -75,10 +75,10 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def _stages(config: Config) -> list[Stage]:
-    maker = ActorMaker(config.policy)
+    maker = SavedPolicy(config.policy)
     planner = maker.planner()
     policy = checkpoint.load(config.policy)
-    ticks = _observations(policy.config, maker.observing(EnvConfig()).camera_size)
+    ticks = _observations(policy.config, maker.env_config(EnvConfig()).camera_size)
     stages = []
     if planner.touch is not None:
         encoder = planner.touch.encoder
@@ -93,15 +93,17 @@ def _stages(config: Config) -> list[Stage]:
             ),
             _time("touch encoder, both", config.repeats, lambda: encoder.embed_touch(touch)),
         ]
-    if (eye := policy.config.eye) is not None and policy.eye is not None:
-        pictures = [shrink(ticks[1][k][None], ticks[0][k], eye.size) for k in ft.TACTILE]
+    if (end_to_end := policy.config.end_to_end) is not None and policy.eye is not None:
+        pictures = [
+            difference_images(ticks[1][k][None], ticks[0][k], end_to_end.size) for k in ft.TACTILE
+        ]
         seen = torch.from_numpy(np.stack(pictures, 1))
         look = policy.eye
-        stages.append(_time("pictures through the eye", config.repeats, lambda: look(seen)))
+        stages.append(_time("end-to-end encoder", config.repeats, lambda: look(seen)))
     condition = torch.zeros(1, policy.condition_dim)
     generator = torch.Generator().manual_seed(0)
     stages.append(
-        _time("denoising", config.repeats, lambda: policy.head.plan(condition, generator))
+        _time("denoising", config.repeats, lambda: policy.head.sample(condition, generator))
     )
     turn, seen = iter(range(10**9)), planner.config.observation_horizon
 
@@ -117,22 +119,22 @@ def _published(config: Config) -> list[Stage]:
     if config.large_repeats == 0:
         return []
     generator = torch.Generator().manual_seed(0)
-    sampler = SamplerConfig("ddim", "epsilon", plan_steps=16)
+    sampler = SamplerConfig("ddim", "epsilon", num_inference_steps=16)
     head = Diffusion(DiffusionConfig(PRESETS["published"], sampler), 8, 8, 1550).eval()
     condition = torch.zeros(1, 1550)
     size = sum(p.numel() for p in head.parameters()) / 1e6
     name = f"published U-Net, {size:.0f} M, 16 DDIM steps (random weights)"
-    stages = [_time(name, config.large_repeats, lambda: head.plan(condition, generator))]
+    stages = [_time(name, config.large_repeats, lambda: head.sample(condition, generator))]
     for name, vit in _VITS.items():
-        trunk, both = ViT(vit).eval(), torch.zeros(2, 3, 224, 224)
+        backbone, both = ViT(vit).eval(), torch.zeros(2, 3, 224, 224)
         what = f"{name} at 224 x 224, both fingertips (random weights)"
-        stages.append(_time(what, config.large_repeats, lambda t=trunk, b=both: t.features(b)))
+        stages.append(_time(what, config.large_repeats, lambda t=backbone, b=both: t.features(b)))
     return stages
 
 
 def _observations(config: PolicyConfig, camera: tuple[int, int]) -> list[dict[str, np.ndarray]]:
     rng = np.random.default_rng(0)
-    seen = [key for key in config.proprioception if key not in config.perceived]
+    seen = [key for key in config.proprioception if key not in config.estimated]
     pictures = dict.fromkeys(ft.CAMERAS, (*camera, 3)) | {
         key: ft.FEATURES[key].shape for key in ft.TACTILE
     }

@@ -2,7 +2,7 @@
 
 Expert episodes on seeds that no training saw, and failures to order, measured with the shipped
 encoder. Every definition was fixed before the first result was seen: a curve "drops" at the first
-frame by which half of its net drop has fallen; peaks of an episode's curves are counted above one
+frame by which half of its net drop has fell; peaks of an episode's curves are counted above one
 common noise level, the largest of theirs; goals and sentences are named below.
 """
 
@@ -17,14 +17,14 @@ from tqdm import tqdm
 
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.towers.towers import load_towers
-from touchgoal.episodes.recording import Demonstration, collect
+from touchgoal.episodes.recording import EpisodeSpec, collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.evaluation.success_rate import SuccessRate
-from touchgoal.rewards.curves import Curves, Scale
-from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EpisodeEmbedder, measure
+from touchgoal.rewards.curves import Curves, DistanceNormalizer
+from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EpisodeEmbedder, compute_curves
 from touchgoal.rewards.goals import EpisodeEnd, Goal, LastFrame, Sentence
 from touchgoal.rewards.metrics import CurveMetrics, measure_curve
-from touchgoal.rewards.report.summary import overview
+from touchgoal.rewards.report.summary import metrics_table
 from touchgoal.sim_envs.experts.pick_place import OUTCOMES, Outcome
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.scene.objects import CATALOGUE
@@ -71,7 +71,7 @@ class Config:
 
 
 @dataclass(frozen=True)
-class Test:
+class HeldOutEpisode:
     """One held-out episode, measured against three kinds of goal.
 
     Attributes:
@@ -88,18 +88,18 @@ class Test:
 
 def run(config: Config) -> dict[str, Any]:
     """Record, measure, judge."""
-    encoder = pretrained.load(config.encoder)
+    encoder = pretrained.load_aligned(config.encoder)
     embedder = EpisodeEmbedder(load_towers(encoder.config.towers), encoder)
-    scale = Scale.load(config.encoder / "scale.json")
+    scale = DistanceNormalizer.load(config.encoder / "scale.json")
     with tempfile.TemporaryDirectory() as folder:
         tests = record_and_measure(config, embedder, scale, Path(folder))
     successes = [t for t in tests if t.outcome == "success"]
-    claims = judge(successes, [t for t in tests if t.outcome == "never_touch"])
+    claims = judge_claims(successes, [t for t in tests if t.outcome == "never_touch"])
     parts = [
         "Figure 8: goal = own last frame, held-out successful episodes",
-        overview([t.own for t in successes]),
+        metrics_table([t.own for t in successes]),
         "\nFigure 9: the touch goal replaced by a sentence never trained on",
-        overview([t.words for t in successes]),
+        metrics_table([t.words for t in successes]),
         "\nclaims",
         *(c.line for c in claims),
         "\nsuccess or not, from the last cost to another episode's end (area under ROC)",
@@ -110,19 +110,20 @@ def run(config: Config) -> dict[str, Any]:
         "claims": [vars(c) for c in claims],
         "auc": {o: failure_auc(tests, o) for o in OUTCOMES if o != "success"},
         "episodes": [
-            {"outcome": t.outcome, "own": _dicts(t.own), "words": _dicts(t.words)} for t in tests
+            {"outcome": t.outcome, "own": _metrics_json(t.own), "words": _metrics_json(t.words)}
+            for t in tests
         ],
     }
 
 
 def record_and_measure(
-    config: Config, embedder: EpisodeEmbedder, scale: Scale, folder: Path
-) -> list[Test]:
+    config: Config, embedder: EpisodeEmbedder, scale: DistanceNormalizer, folder: Path
+) -> list[HeldOutEpisode]:
     """Simulate goal and test episodes and measure each test."""
     names = [list(CATALOGUE)[i % len(CATALOGUE)] for i in range(config.episodes)]
 
-    def jobs(first: int, outcome: Outcome) -> list[Demonstration]:
-        return [Demonstration(first + i, outcome, {"object": n}) for i, n in enumerate(names)]
+    def jobs(first: int, outcome: Outcome) -> list[EpisodeSpec]:
+        return [EpisodeSpec(first + i, outcome, {"object": n}) for i, n in enumerate(names)]
 
     goals = folder / "goals"
     task = PickPlaceConfig(distractors=0)
@@ -144,14 +145,14 @@ def record_and_measure(
                     Goal(image=end, tactile=end, text=sentence),
                 )
             )
-            tests.append(Test(str(episodes.meta(i)["outcome"]), own, words, other))
+            tests.append(HeldOutEpisode(str(episodes.meta(i)["outcome"]), own, words, other))
     return tests
 
 
 def _curves(
-    embedder: EpisodeEmbedder, scale: Scale, episode: EmbeddedEpisode, goal: Goal
+    embedder: EpisodeEmbedder, scale: DistanceNormalizer, episode: EmbeddedEpisode, goal: Goal
 ) -> Curves:
-    return measure(episode, embedder.embed_goal(goal, episode), scale)
+    return compute_curves(episode, embedder.embed_goal(goal, episode), scale)
 
 
 @dataclass(frozen=True)
@@ -172,41 +173,43 @@ class Claim:
         return f"  {self.verdict:<8}{self.claim}: {self.evidence}"
 
 
-def judge(successes: Sequence[Test], untouched: Sequence[Test]) -> list[Claim]:
+def judge_claims(
+    successes: Sequence[HeldOutEpisode], untouched: Sequence[HeldOutEpisode]
+) -> list[Claim]:
     """The claims of Figures 8 and 9, and that an episode without touch does not look done."""
-    own = [_common(t.own) for t in successes]
+    own = [_metrics_at_common_noise(t.own) for t in successes]
     lags = [m["tactile"].contact_lag for m in own]
     known = [lag for lag in lags if lag is not None]
-    prompt = SuccessRate(sum(lag is not None and 0 <= lag <= 3 for lag in lags), len(lags))
+    within_3_frames = SuccessRate(sum(lag is not None and 0 <= lag <= 3 for lag in lags), len(lags))
     peaks = {n: [float(m[n].peaks) for m in own] for n in ("image", "image+tactile")}
-    fewer = [a - b for a, b in zip(peaks["image"], peaks["image+tactile"], strict=True)]
-    sooner = {f: _lead(own, f) for f in ("t_drop_50", "t_drop_25", "t_drop_10")}
+    peaks_saved = [a - b for a, b in zip(peaks["image"], peaks["image+tactile"], strict=True)]
+    frames_earlier = {f: _frames_earlier(own, f) for f in ("t_drop_50", "t_drop_25", "t_drop_10")}
     falls = [_fall_after_contact(t.words) for t in successes]
     kept = [t.other.raw["tactile"][-1] / np.median(t.other.raw["tactile"][:5]) for t in untouched]
-    fallen = SuccessRate(sum(f > 0 for f in falls), len(falls))
+    fell = SuccessRate(sum(f > 0 for f in falls), len(falls))
     return [
         Claim(
             "the tactile curve drops within 3 frames of true contact",
-            _all(prompt),
-            f"{prompt} of episodes, lags {min(known)} to {max(known)} frames",
+            _verdict_of_rate(within_3_frames),
+            f"{within_3_frames} of episodes, lags {min(known)} to {max(known)} frames",
         ),
         Claim(
             "the fused curve has fewer peaks than the image curve (mean)",
-            _sign(fewer),
+            _verdict_of_mean(peaks_saved),
             f"{np.mean(peaks['image+tactile']):.2f} against {np.mean(peaks['image']):.2f}, "
-            f"difference {_interval(fewer)}",
+            f"difference {_interval(peaks_saved)}",
         ),
         Claim(
             "the fused curve drops earlier than the tactile one (mean)",
-            _sign(sooner["t_drop_50"]),
-            f"half of its drop by {_interval(sooner['t_drop_50'])} frames "
-            f"(a quarter by {_interval(sooner['t_drop_25'])}, "
-            f"a tenth by {_interval(sooner['t_drop_10'])})",
+            _verdict_of_mean(frames_earlier["t_drop_50"]),
+            f"half of its drop by {_interval(frames_earlier['t_drop_50'])} frames "
+            f"(a quarter by {_interval(frames_earlier['t_drop_25'])}, "
+            f"a tenth by {_interval(frames_earlier['t_drop_10'])})",
         ),
         Claim(
             "with a sentence as goal the cost falls after contact",
-            _all(fallen),
-            f"{fallen} of episodes, by {_interval(falls)} of the way from start to goal",
+            _verdict_of_rate(fell),
+            f"{fell} of episodes, by {_interval(falls)} of the way from start to goal",
         ),
         Claim(
             "an episode that never touches keeps 3/4 of its tactile cost",
@@ -216,13 +219,13 @@ def judge(successes: Sequence[Test], untouched: Sequence[Test]) -> list[Claim]:
     ]
 
 
-def _lead(episodes: Sequence[dict[str, CurveMetrics]], drop: str) -> list[float]:
+def _frames_earlier(episodes: Sequence[dict[str, CurveMetrics]], drop: str) -> list[float]:
     """Frames by which the fused curve drops before the tactile one, where both do."""
     pairs = [(getattr(m["tactile"], drop), getattr(m["image+tactile"], drop)) for m in episodes]
     return [float(a - b) for a, b in pairs if a is not None and b is not None]
 
 
-def _common(curves: Curves) -> dict[str, CurveMetrics]:
+def _metrics_at_common_noise(curves: Curves) -> dict[str, CurveMetrics]:
     """Metrics with one noise level for all curves of an episode."""
     contact = curves.contact.frame
     eps = max(measure_curve(d, contact).eps for d in curves.values.values())
@@ -239,7 +242,7 @@ def _fall_after_contact(curves: Curves) -> float:
     )
 
 
-def failure_auc(tests: Sequence[Test], outcome: str) -> dict[str, float]:
+def failure_auc(tests: Sequence[HeldOutEpisode], outcome: str) -> dict[str, float]:
     """Chance that a success ends nearer the goal than such a failure, by kind of curve."""
     return {
         name: _auc(
@@ -250,7 +253,7 @@ def failure_auc(tests: Sequence[Test], outcome: str) -> dict[str, float]:
     }
 
 
-def failure_table(tests: Sequence[Test]) -> str:
+def failure_table(tests: Sequence[HeldOutEpisode]) -> str:
     """Area under ROC of success against each failure; 0.5 is chance."""
     names = list(tests[0].other.values)
     lines = [f"{'failure':<15}" + "".join(f"{n:>15}" for n in names)]
@@ -265,11 +268,11 @@ def _auc(low: list[float], high: list[float]) -> float:
     return float((difference > 0).mean() + 0.5 * (difference == 0).mean())
 
 
-def _all(rate: SuccessRate) -> str:
+def _verdict_of_rate(rate: SuccessRate) -> str:
     return "holds" if rate.successes == rate.trials else "fails"
 
 
-def _sign(values: Sequence[float]) -> str:
+def _verdict_of_mean(values: Sequence[float]) -> str:
     """Whether a mean that is claimed to be positive is."""
     low, high = _bootstrap(values)
     return "holds" if low > 0 else "fails" if high < 0 else "unsure"
@@ -287,5 +290,5 @@ def _interval(values: Sequence[float]) -> str:
     return f"{np.mean(values):.2f} [{low:.2f}, {high:.2f}]"
 
 
-def _dicts(curves: Curves) -> dict[str, Any]:
+def _metrics_json(curves: Curves) -> dict[str, Any]:
     return {name: m.as_dict() for name, m in curves.metrics().items()}

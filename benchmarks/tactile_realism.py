@@ -15,15 +15,15 @@ import numpy as np
 from jaxtyping import Float32
 from tqdm import tqdm
 
-from touchgoal.benchmarks.taxim_peer import PITCH, TaximRenderer, has_jax, real_presses
-from touchgoal.control.calibration.calibrate import Calibration, fit
+from touchgoal.benchmarks.taxim_peer import PIXEL_PITCH, TaximRenderer, has_jax, real_presses
+from touchgoal.control.calibration.calibrate import FittedCalibration, fit
 from touchgoal.control.calibration.picture_errors import mean_errors, picture_errors
 from touchgoal.control.calibration.pictures import side_by_side
 from touchgoal.control.calibration.press_fit import REGION
 from touchgoal.control.calibration.press_set import PressSet, split, write_presses
 
-HELD_OUT = {"gelsight": 12, "gelsight_mini": 6}
-MAIN = "ours, circles corrected"
+N_TEST_PRESSES = {"gelsight": 12, "gelsight_mini": 6}
+MAIN_METHOD = "ours, circles corrected"
 # L1 (counts, at most) and PSNR (dB, at least) around the contact that the project set itself.
 TARGETS = {"gelsight": (3.9, 33.2), "gelsight_mini": (3.6, 30.5)}
 # Where red, green and blue stand by two sources. GelSight: an earlier fit to the same presses.
@@ -37,7 +37,7 @@ _TAXIM_MOVED = {"gelsight": (2e-3, 0.4), "gelsight_mini": (1e-3, 0.4)}
 _LEGEND = """corrected: labels put through the line that the fitted presses show between label and contact,
 the held-out picture unseen; moved: registered against the held-out picture itself"""
 _CUT = 120, 160  # rows and columns of the examples in the picture
-_EXAMPLES = 2  # of each sensor
+_EXAMPLES_PER_SENSOR = 2  # of each sensor
 
 Colours = Float32[np.ndarray, "h w 3"]
 
@@ -61,21 +61,21 @@ def run(config: Config) -> dict[str, Any]:
     cv2.setNumThreads(1)
     rows: list[dict[str, Any]] = []
     lights: dict[str, tuple[float, ...]] = {}
-    shown: list[tuple[Colours, Colours]] = []
+    examples: list[tuple[Colours, Colours]] = []
     for sensor in config.sensors:
         presses = real_presses(sensor)
         if config.presses is not None:
             write_presses(presses, config.presses / sensor)
         taxim = TaximRenderer(sensor) if has_jax() else None
         for seed in tqdm(range(config.splits), desc=sensor, unit="split"):
-            train, test = split(presses, HELD_OUT[sensor], seed)
-            calibration = fit(train, PITCH, sensor)
-            for method, simulated in _methods(sensor, calibration, train, test, taxim):
+            train, test = split(presses, N_TEST_PRESSES[sensor], seed)
+            fitted = fit(train, PIXEL_PITCH, sensor)
+            for method, simulated in _methods(sensor, fitted, train, test, taxim):
                 errors = mean_errors([*map(picture_errors, test.images, simulated, test.circles)])
                 rows.append({"sensor": sensor, "method": method, "seed": seed, **asdict(errors)})
-                if method == MAIN and seed == 0:
-                    shown += _examples(test, simulated)
-                    lights[sensor] = calibration.photometry.light_azimuths
+                if method == MAIN_METHOD and seed == 0:
+                    examples += _examples(test, simulated)
+                    lights[sensor] = fitted.calibration.light_azimuths
     lines = [_table(rows), _LEGEND, "", _light_table(lights), "", *_verdicts(rows, lights)]
     if not has_jax():
         lines.append("taxim's pictures are left out: pip install 'touchgoal[peers]'")
@@ -83,35 +83,35 @@ def run(config: Config) -> dict[str, Any]:
         "rows": rows,
         "light_azimuths": lights,
         "table": "\n".join(lines),
-        "picture": side_by_side([real for real, _ in shown], [made for _, made in shown]),
+        "picture": side_by_side([real for real, _ in examples], [made for _, made in examples]),
     }
 
 
 def _methods(
     sensor: str,
-    calibration: Calibration,
+    fitted: FittedCalibration,
     train: PressSet,
     test: PressSet,
     taxim: TaximRenderer | None,
 ) -> Iterator[tuple[str, list[Colours]]]:
     """Each way to predict the held-out pictures, by name."""
-    settled = calibration.photometry.background.astype(np.float32)
-    moved, balls = calibration.register(test), calibration.balls(test)
+    background = fitted.calibration.background.astype(np.float32)
+    moved, balls = fitted.fit_circles(test), fitted.ball_radii(test)
     yield "background alone", [test.background.astype(np.float32)] * len(test)
-    yield "background as the presses leave it", [settled] * len(test)
-    trusting = fit(train, PITCH, sensor, trust_labels=True)
-    faces = map(trusting.simulate, trusting.place(test), trusting.balls(test))
+    yield "background as the presses leave it", [background] * len(test)
+    trusting = fit(train, PIXEL_PITCH, sensor, trust_labels=True)
+    faces = map(trusting.simulate, trusting.correct_labels(test), trusting.ball_radii(test))
     yield "ours, circles at face value", [*faces]
-    yield MAIN, [*map(calibration.simulate, calibration.place(test), balls)]
-    yield "ours, circles moved", [*map(calibration.simulate, moved, balls)]
+    yield MAIN_METHOD, [*map(fitted.simulate, fitted.correct_labels(test), balls)]
+    yield "ours, circles moved", [*map(fitted.simulate, moved, balls)]
     if taxim is None:
         return
     labelled = [taxim.render(c, *_TAXIM_LABELLED[sensor]) for c in test.circles]
     yield "taxim table", labelled
     # What the table adds to its own untouched picture, on the background that ours has.
-    yield "taxim table, on our background", [p - taxim.untouched + settled for p in labelled]
+    yield "taxim table, on our background", [p - taxim.untouched + background for p in labelled]
     better = [taxim.render(c, *_TAXIM_MOVED[sensor]) for c in moved]
-    yield "the same, circles moved", [p - taxim.untouched + settled for p in better]
+    yield "the same, circles moved", [p - taxim.untouched + background for p in better]
 
 
 def _examples(test: PressSet, simulated: list[Colours]) -> list[tuple[Colours, Colours]]:
@@ -123,7 +123,7 @@ def _examples(test: PressSet, simulated: list[Colours]) -> list[tuple[Colours, C
         left = int(np.clip(circle[0] - width / 2, 0, image.shape[1] - width))
         cut = slice(top, top + height), slice(left, left + width)
         cuts.append((image[cut].astype(np.float32), picture[cut]))
-    return cuts[:_EXAMPLES]
+    return cuts[:_EXAMPLES_PER_SENSOR]
 
 
 def _median(rows: list[dict[str, Any]], sensor: str, method: str, error: str) -> float:
@@ -144,7 +144,7 @@ def _table(rows: list[dict[str, Any]]) -> str:
                 for error in ("l1_near", "psnr_near", "ssim_near", "l1")
             )
             lines.append(
-                f"{sensor:<15}{HELD_OUT[sensor]:>6}  {method:<36}{l1:>6.2f}{psnr:>7.1f}{ssim:>7.3f}"
+                f"{sensor:<15}{N_TEST_PRESSES[sensor]:>6}  {method:<36}{l1:>6.2f}{psnr:>7.1f}{ssim:>7.3f}"
                 f"{whole:>9.2f}"
             )
     return "\n".join(lines)
@@ -163,14 +163,14 @@ def _light_table(lights: dict[str, tuple[float, ...]]) -> str:
 def _verdicts(rows: list[dict[str, Any]], lights: dict[str, tuple[float, ...]]) -> list[str]:
     lines = []
     for sensor, azimuths in lights.items():
-        l1, psnr = (_median(rows, sensor, MAIN, error) for error in ("l1_near", "psnr_near"))
+        l1, psnr = (_median(rows, sensor, MAIN_METHOD, error) for error in ("l1_near", "psnr_near"))
         most, least = TARGETS[sensor]
         reached = "reached" if l1 <= most and psnr >= least else "MISSED"
         off = max(
             abs((ours - other + 180) % 360 - 180)
             for ours, other in zip(azimuths, OTHER_AZIMUTHS[sensor], strict=True)
         )
-        own = [r for r in rows if r["sensor"] == sensor and r["method"] == MAIN]
+        own = [r for r in rows if r["sensor"] == sensor and r["method"] == MAIN_METHOD]
         worst = (
             f"{max(r['l1_near'] for r in own):.2f} and {min(r['psnr_near'] for r in own):.1f} dB"
         )

@@ -15,8 +15,12 @@ from touchgoal.benchmarks.speed import Row, measure, one_core, table
 from touchgoal.benchmarks.taxim_peer import has_jax, has_taxim
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS, SensorModel
 from touchgoal.sim_envs.scene.objects import CATALOGUE, HARD, Body, Material, ObjectKind, Texture
-from touchgoal.sim_envs.tactile.press_bench import PressRig
-from touchgoal.sim_envs.tactile.sensor_instance import NOMINAL, Unit, sample_unit
+from touchgoal.sim_envs.tactile.press_bench import PressBench
+from touchgoal.sim_envs.tactile.sensor_instance import (
+    NO_RANDOMIZATION,
+    SensorInstance,
+    sample_instance,
+)
 
 # What one 240x320 frame of a ball at least does, counted by hand from the kernels: multiplications
 # and additions, and bytes that leave or enter the first-level cache.
@@ -55,31 +59,31 @@ def _ours(config: Config) -> list[Row]:
         h, w = sensor.image_shape
         for name, body, distance in _bodies():
             for what, kind in (("smooth", body.kind), ("textured", _textured(body.kind))):
-                rig = PressRig(replace(body, kind=kind), sensor, _unit(sensor))
-                rig.place(np.array([1e-3, -0.5e-3, distance - 5e-4]))
-                rows.append(_measure(f"{h}x{w} {name}, {what}", config, _frame(rig)))
-        rig = PressRig(_bodies()[0][1], sensor, _unit(sensor))
-        rows.append(_measure(f"{h}x{w} untouched", config, _frame(rig, force=0.0)))
+                bench = PressBench(replace(body, kind=kind), sensor, _instance(sensor))
+                bench.place(np.array([1e-3, -0.5e-3, distance - 5e-4]))
+                rows.append(_measure(f"{h}x{w} {name}, {what}", config, _frame(bench)))
+        bench = PressBench(_bodies()[0][1], sensor, _instance(sensor))
+        rows.append(_measure(f"{h}x{w} untouched", config, _frame(bench, force=0.0)))
     return rows
 
 
-def _frame(rig: PressRig, force: float = 8.0) -> Callable[[], object]:
+def _frame(bench: PressBench, force: float = 8.0) -> Callable[[], object]:
     """All stages: geometry, force balance, stick and slip, gel, shadows, colours, noise, dots."""
     rng = np.random.default_rng(0)
-    return lambda: rig.sense(force, rng, shear=(1.5, 0.5), centre=(1e-3, -0.5e-3))
+    return lambda: bench.sense(force, rng, shear=(1.5, 0.5), centre=(1e-3, -0.5e-3))
 
 
-def _unit(sensor: SensorModel) -> Unit:
-    unit = sample_unit(GELSIGHT_MINI_MARKERS, np.random.default_rng(0), NOMINAL)
-    if sensor.image_shape == unit.background.shape[1:]:
-        return unit
+def _instance(sensor: SensorModel) -> SensorInstance:
+    instance = sample_instance(GELSIGHT_MINI_MARKERS, np.random.default_rng(0), NO_RANDOMIZATION)
+    if sensor.image_shape == instance.background.shape[1:]:
+        return instance
     return replace(
-        unit,
-        photometry=replace(unit.photometry, pixel_pitch=sensor.pixel_pitch),
-        background=unit.background[:, ::2, ::2].copy(),
-        gain=unit.gain[:, ::2, ::2].copy(),
-        markers=unit.markers / 2,
-        marker_radius=unit.marker_radius / 2,
+        instance,
+        calibration=replace(instance.calibration, pixel_pitch=sensor.pixel_pitch),
+        background=instance.background[:, ::2, ::2].copy(),
+        illumination=instance.illumination[:, ::2, ::2].copy(),
+        markers=instance.markers / 2,
+        marker_radius=instance.marker_radius / 2,
     )
 
 

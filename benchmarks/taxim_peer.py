@@ -16,13 +16,13 @@ from touchgoal.control.calibration.ball import Circle
 from touchgoal.control.calibration.press_set import PressSet
 from touchgoal.control.errors import UserError
 
-PITCH = 0.059e-3
+PIXEL_PITCH = 0.059e-3
 """m per pixel of the presses here: half of the wheel's 640x480 at 0.0295 mm (its params.json)."""
 
 _BALLS = {"gelsight": 2.0e-3, "gelsight_mini": np.nan}  # m; the Mini's is not recorded
-_FULL = 2  # taxim's pixels to one of ours
+_DOWNSAMPLING = 2  # taxim's pixels to one of ours
 _FULL_SHAPE = 480, 640
-_NO_OBJECT = 5.0  # mm above the gel
+_UNTOUCHED_HEIGHT = 5.0  # mm above the gel
 
 
 def real_presses(sensor: str) -> PressSet:
@@ -35,13 +35,13 @@ def real_presses(sensor: str) -> PressSet:
     if spec is None or spec.origin is None:
         raise UserError("the real presses ship with a peer: pip install 'touchgoal[peers]'")
     pack = np.load(Path(spec.origin).parent / "calib" / sensor / "dataPack.npz", allow_pickle=True)
-    images = np.stack([_half(image) for image in pack["imgs"]])
+    images = np.stack([_downsample(image) for image in pack["imgs"]])
     # The centre of pixel 0 is 0 at both sizes; two pixels 0 and 1 become one.
-    centres = (pack["touch_center"].astype(float) + 0.5) / _FULL - 0.5
-    circles = np.column_stack([centres, pack["touch_radius"] / _FULL])
+    centres = (pack["touch_center"].astype(float) + 0.5) / _DOWNSAMPLING - 0.5
+    circles = np.column_stack([centres, pack["touch_radius"] / _DOWNSAMPLING])
     files = tuple(f"press_{i:02d}.png" for i in range(len(images)))
     balls = np.full(len(images), _BALLS[sensor])
-    return PressSet(_half(pack["f0"]), images, circles, balls, files)
+    return PressSet(_downsample(pack["f0"]), images, circles, balls, files)
 
 
 def has_taxim() -> bool:
@@ -69,41 +69,43 @@ class TaximRenderer:
             "gelsight_mini": taxim.CALIB_GELSIGHT_MINI,
         }
         self._simulator = taxim.Taxim(calib_folder=calibrations[sensor], backend="jax")
-        self.untouched = self._picture(np.full(_FULL_SHAPE, _NO_OBJECT, np.float32))
+        self.untouched = self._picture(np.full(_FULL_SHAPE, _UNTOUCHED_HEIGHT, np.float32))
 
     def render(
-        self, circle: Circle, ball_radius: float, share: float
+        self, circle: Circle, ball_radius: float, contact_share: float
     ) -> Float32[np.ndarray, "h w 3"]:
         """Picture of one press.
 
         Args:
             circle: in which ball and gel touch, px.
             ball_radius: m.
-            share: of the deepest overlap that counts as touching. 0: the circle is where the ball
+            contact_share: of the deepest overlap that counts as touching. 0: the circle is where the ball
                 cuts the flat gel; 0.4: where taxim's own gel model clings to it.
         """
-        return self._picture(_ball_height(circle, ball_radius, share))
+        return self._picture(_ball_height(circle, ball_radius, contact_share))
 
     def _picture(self, height: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2 3"]:
         full = 255 * np.asarray(self._simulator.render(height, with_shadow=True))
         rows, columns = _FULL_SHAPE
-        size = columns // _FULL, rows // _FULL
+        size = columns // _DOWNSAMPLING, rows // _DOWNSAMPLING
         return np.asarray(cv2.resize(full, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _ball_height(circle: Circle, ball_radius: float, share: float) -> Float32[np.ndarray, "h w"]:
+def _ball_height(
+    circle: Circle, ball_radius: float, contact_share: float
+) -> Float32[np.ndarray, "h w"]:
     """Height (mm) of a ball over taxim's flat gel, negative where pressed in."""
-    x, y = (circle[:2] + 0.5) * _FULL - 0.5
-    contact = min(circle[2] * PITCH, 0.98 * ball_radius)
+    x, y = (circle[:2] + 0.5) * _DOWNSAMPLING - 0.5
+    contact = min(circle[2] * PIXEL_PITCH, 0.98 * ball_radius)
     rows, columns = np.indices(_FULL_SHAPE)
-    square = ((columns - x) ** 2 + (rows - y) ** 2) * (PITCH / _FULL) ** 2
-    depth = (ball_radius - np.sqrt(ball_radius**2 - contact**2)) / (1 - share)
+    square = ((columns - x) ** 2 + (rows - y) ** 2) * (PIXEL_PITCH / _DOWNSAMPLING) ** 2
+    depth = (ball_radius - np.sqrt(ball_radius**2 - contact**2)) / (1 - contact_share)
     height = ball_radius - np.sqrt(np.maximum(ball_radius**2 - square, 0)) - depth
-    return np.where(square < ball_radius**2, height * 1e3, _NO_OBJECT).astype(np.float32)
+    return np.where(square < ball_radius**2, height * 1e3, _UNTOUCHED_HEIGHT).astype(np.float32)
 
 
-def _half(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+def _downsample(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
     """Half the size; the wheel stores BGR."""
-    size = image.shape[1] // _FULL, image.shape[0] // _FULL
+    size = image.shape[1] // _DOWNSAMPLING, image.shape[0] // _DOWNSAMPLING
     rgb = np.ascontiguousarray(image[..., ::-1])
     return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -9,27 +9,27 @@ _MARKS = {True: "ok", False: "MISSING", None: "-"}
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckResult:
     """One line of the report.
 
     Attributes:
         ok: whether it works; None for something optional that is not there.
-        mend: what to do if it does not.
+        remedy: what to do if it does not.
     """
 
-    what: str
+    name: str
     ok: bool | None
-    says: str
-    mend: str = ""
+    detail: str
+    remedy: str = ""
 
     def __str__(self) -> str:
         """The line."""
-        mend = f"  ->  {self.mend}" if self.mend else ""
-        return f"{_MARKS[self.ok]:<9}{self.what:<18}{self.says}{mend}"
+        remedy = f"  ->  {self.remedy}" if self.remedy else ""
+        return f"{_MARKS[self.ok]:<9}{self.name:<18}{self.detail}{remedy}"
 
 
-def require(findings: Sequence[Finding]) -> None:
+def require_all_ok(results: Sequence[CheckResult]) -> None:
     """UserError, so exit code 1, if something that is needed is missing."""
-    broken = [f for f in findings if f.ok is False]
+    broken = [f for f in results if f.ok is False]
     if broken:
-        raise UserError("; ".join(f"{f.what}: {f.mend or f.says}" for f in broken))
+        raise UserError("; ".join(f"{f.name}: {f.remedy or f.detail}" for f in broken))

@@ -15,7 +15,7 @@ WRIST = "observation.images.wrist"
 TACTILE_LEFT = "observation.images.tactile_left"
 TACTILE_RIGHT = "observation.images.tactile_right"
 ACTION = "action"
-COST = "cost"  # of deployed episodes whose rig names a goal
+COST = "cost"  # of deployed episodes whose cell file names a goal
 
 TACTILE = (TACTILE_LEFT, TACTILE_RIGHT)
 CAMERAS = (FRONT, WRIST)

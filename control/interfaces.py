@@ -138,7 +138,7 @@ class Camera(Protocol):
         ...
 
     @property
-    def trouble(self) -> str:
+    def problem(self) -> str:
         """What a person should know: lost, frozen; empty if all is well."""
         ...
 

@@ -8,19 +8,19 @@ import torch
 
 from touchgoal.control.errors import UserError
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
-from touchgoal.encoders.backbones.touch_backbone import TouchTrunk, TouchTrunkConfig
+from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import ViTConfig
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.towers.towers import same_towers
-from touchgoal.encoders.training.weights import Stored
+from touchgoal.encoders.training.weights import WeightsFormat
 
 _WEIGHTS = Path(__file__).parent / "weights"
 SHIPPED = _WEIGHTS / "gelsight_mini_offline"
-ENCODER = Stored("encoder", "touch encoder", "train one with: touchgoal train-encoder")
+ENCODER = WeightsFormat("encoder", "touch encoder", "train one with: touchgoal train-encoder")
 
 
 def save(
-    encoder: TouchEncoder | TouchTrunk,
+    encoder: TouchEncoder | TouchBackbone,
     directory: Path,
     provenance: dict[str, Any],
     half: bool = True,
@@ -38,7 +38,7 @@ def save(
     ENCODER.save(directory, weights, asdict(encoder.config), provenance)
 
 
-def shipped_for(sensor: str | None) -> Path:
+def shipped_encoder_for(sensor: str | None) -> Path:
     """The encoder that ships for a sensor, on the offline towers; `SHIPPED` if it is unknown.
 
     Raises:
@@ -50,7 +50,9 @@ def shipped_for(sensor: str | None) -> Path:
     return directory
 
 
-def load(directory: Path, sensor: str | None = None, towers: str | None = None) -> TouchEncoder:
+def load_aligned(
+    directory: Path, sensor: str | None = None, towers: str | None = None
+) -> TouchEncoder:
     """Reads an encoder for inference, as float32 on the CPU.
 
     Args:
@@ -70,27 +72,27 @@ def load(directory: Path, sensor: str | None = None, towers: str | None = None) 
         )
     _check_sensor(config, directory, sensor)
     encoder = TouchEncoder(config)
-    ENCODER.fill(encoder, directory)
+    ENCODER.load_weights(encoder, directory)
     return encoder
 
 
-def load_trunk(directory: Path, sensor: str | None = None) -> TouchTrunk:
-    """Reads a self-supervised trunk for inference, as float32 on the CPU; UserError as `load`."""
-    config = ENCODER.read_config(directory, _trunk_config)
+def load_touch_backbone(directory: Path, sensor: str | None = None) -> TouchBackbone:
+    """Reads a self-supervised backbone for inference, as float32 on the CPU; UserError as `load_aligned`."""
+    config = ENCODER.read_config(directory, _backbone_config)
     _check_sensor(config, directory, sensor)
-    encoder = TouchTrunk(config)
-    ENCODER.fill(encoder, directory)
+    encoder = TouchBackbone(config)
+    ENCODER.load_weights(encoder, directory)
     return encoder
 
 
-def load_any(directory: Path) -> TouchEncoder | TouchTrunk:
-    """Reads an encoder of either kind for inference; UserError as `load`."""
-    aligned = "towers" in ENCODER.describe(directory).get("config", {})
-    return load(directory) if aligned else load_trunk(directory)
+def load_encoder(directory: Path) -> TouchEncoder | TouchBackbone:
+    """Reads an encoder of either kind for inference; UserError as `load_aligned`."""
+    aligned = "towers" in ENCODER.read_json(directory).get("config", {})
+    return load_aligned(directory) if aligned else load_touch_backbone(directory)
 
 
 def _check_sensor(
-    config: TouchEncoderConfig | TouchTrunkConfig, directory: Path, sensor: str | None
+    config: TouchEncoderConfig | TouchBackboneConfig, directory: Path, sensor: str | None
 ) -> None:
     if sensor is not None and sensor != config.sensor:
         raise UserError(
@@ -108,8 +110,8 @@ def _aligned_config(fields: dict[str, Any]) -> TouchEncoderConfig:
     return TouchEncoderConfig(**_with_vit(fields))
 
 
-def _trunk_config(fields: dict[str, Any]) -> TouchTrunkConfig:
-    return TouchTrunkConfig(**_with_vit(fields))
+def _backbone_config(fields: dict[str, Any]) -> TouchBackboneConfig:
+    return TouchBackboneConfig(**_with_vit(fields))
 
 
 def _with_vit(fields: dict[str, Any]) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from touchgoal.episodes.schema import (
 )
 
 # Frames a row group: reading one window of touch reads a few groups, not the whole episode.
-ROW_GROUP = 32
+FRAMES_PER_ROW_GROUP = 32
 _FOOTER_KEY = b"touchgoal"
 # Measured on noisy 320 x 240 touch: 3.6 ms and 90 kB a frame; OpenCV's default filter 8.1 ms and
 # 110 kB, PIL at compress_level 1 11.0 ms and 114 kB.
@@ -167,7 +167,7 @@ def write_table(table: pa.Table, description: Description) -> bytes:
     pq.write_table(
         table,
         file,
-        row_group_size=ROW_GROUP,
+        row_group_size=FRAMES_PER_ROW_GROUP,
         compression="none",  # PNG is compressed; the numbers are a thousandth of it
         use_dictionary=False,
         write_statistics=False,  # would repeat whole pictures as a column's least and greatest

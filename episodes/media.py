@@ -119,7 +119,7 @@ def read_frames(path: Path) -> tuple[UInt8[np.ndarray, "n h w 3"], float | None]
         raise UserError(f"{path} is no readable video ({error.strerror}): re-encode it") from error
     if not frames:
         raise UserError(f"{path} holds no frame: record it again")
-    return _stack(path, frames), float(rate) if rate else None
+    return _stack_equal_sizes(path, frames), float(rate) if rate else None
 
 
 def _read_folder(folder: Path) -> UInt8[np.ndarray, "n h w 3"]:
@@ -127,19 +127,19 @@ def _read_folder(folder: Path) -> UInt8[np.ndarray, "n h w 3"]:
     if not paths:
         raise UserError(f"{folder} holds no picture ({', '.join(sorted(_PICTURES))})")
     frames = []
-    for path in sorted(paths, key=lambda path: _natural(path.name)):
+    for path in sorted(paths, key=lambda path: _natural_order(path.name)):
         picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if picture is None:
             raise UserError(f"{path} is no readable picture: remove or replace it")
         frames.append(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
-    return _stack(folder, frames)
+    return _stack_equal_sizes(folder, frames)
 
 
-def _natural(name: str) -> list[tuple[str, int]]:
+def _natural_order(name: str) -> list[tuple[str, int]]:
     return [(text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", name)]
 
 
-def _stack(path: Path, frames: list[np.ndarray]) -> UInt8[np.ndarray, "n h w 3"]:
+def _stack_equal_sizes(path: Path, frames: list[np.ndarray]) -> UInt8[np.ndarray, "n h w 3"]:
     sizes = {frame.shape for frame in frames}
     if len(sizes) > 1:
         raise UserError(f"{path} holds pictures of {len(sizes)} different sizes: make them equal")

@@ -33,17 +33,19 @@ REPAIR = "run: touchgoal repair --mend FOLDER"
 Row = dict[str, Any]
 
 
-def data_path(slot: int) -> str:
-    """Path in the set of the data file number `slot`; each holds one episode."""
-    return DATA_PATH.format(chunk_index=slot // CHUNK, file_index=slot % CHUNK)
+def data_path(file_number: int) -> str:
+    """Path in the set of the data file `file_number`; each holds one episode."""
+    return DATA_PATH.format(chunk_index=file_number // CHUNK, file_index=file_number % CHUNK)
 
 
-def video_path(key: str, slot: int) -> str:
-    """Path in the set of the video of camera `key` number `slot`."""
-    return VIDEO_PATH.format(video_key=key, chunk_index=slot // CHUNK, file_index=slot % CHUNK)
+def video_path(key: str, file_number: int) -> str:
+    """Path in the set of the video of camera `key`, file `file_number`."""
+    return VIDEO_PATH.format(
+        video_key=key, chunk_index=file_number // CHUNK, file_index=file_number % CHUNK
+    )
 
 
-def slot_of(row: Row) -> int:
+def file_number_of(row: Row) -> int:
     """Number of an episode's files; repair leaves gaps, so it may exceed its position."""
     return row["data/chunk_index"] * CHUNK + row["data/file_index"]
 
@@ -63,7 +65,7 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 @dataclass(frozen=True)
-class Catalogue:
+class SetMetadata:
     """What meta/ says of a set of episodes.
 
     Attributes:
@@ -81,12 +83,12 @@ class Catalogue:
     episodes: pa.Table | None = None
 
     @property
-    def next_slot(self) -> int:
+    def next_file_number(self) -> int:
         """Number of the files of the episode to come."""
-        return slot_of(last_row(self.episodes)) + 1 if self.episodes is not None else 0
+        return file_number_of(last_row(self.episodes)) + 1 if self.episodes is not None else 0
 
-    def added(self, description: Description, slot: int) -> "Catalogue":
-        """This catalogue with one more episode, whose files have number `slot`.
+    def with_episode(self, description: Description, file_number: int) -> "SetMetadata":
+        """This metadata with one more episode, whose files have number `file_number`.
 
         Raises:
             UserError: its frame rate, features or facts differ from the set's.
@@ -95,11 +97,11 @@ class Catalogue:
         tasks = tuple(dict.fromkeys((*self.tasks, description.task)))
         stats = description.stats | {
             key: array_statistics(column[:, None])
-            for key, column in self.indices(description).items()
+            for key, column in self.index_columns_for(description).items()
         }
-        row = self._row(description, slot, stats)
+        row = self._row(description, file_number, stats)
         schema = _schema(row) if self.episodes is None else self.episodes.schema
-        if facts := _differing(row, schema):
+        if facts := _differing_facts(row, schema):
             raise UserError(
                 f"the episode's meta differs from the set's in {', '.join(facts)}: give every "
                 "episode of a set the same keys with the same types"
@@ -111,7 +113,7 @@ class Catalogue:
             stats = {key: merge(self.stats[key], stats[key]) for key in stats}
         return replace(self, tasks=tasks, stats=stats, episodes=table)
 
-    def indices(self, description: Description) -> dict[str, Any]:
+    def index_columns_for(self, description: Description) -> dict[str, Any]:
         """The index columns of an episode that would come next."""
         before = last_row(self.episodes)
         tasks = list(dict.fromkeys((*self.tasks, description.task)))
@@ -131,7 +133,9 @@ class Catalogue:
             )
         ours, theirs = self.features, description.features
         differing = sorted(
-            key for key in {*ours, *theirs} if _plain(ours.get(key)) != _plain(theirs.get(key))
+            key
+            for key in {*ours, *theirs}
+            if _dtype_and_shape(ours.get(key)) != _dtype_and_shape(theirs.get(key))
         )
         if differing:
             raise UserError(
@@ -139,10 +143,10 @@ class Catalogue:
                 "presence or shape): record it into another folder"
             )
 
-    def _row(self, description: Description, slot: int, stats: dict[str, Stats]) -> Row:
+    def _row(self, description: Description, file_number: int, stats: dict[str, Stats]) -> Row:
         before = last_row(self.episodes)
         first = before["dataset_to_index"] if before else 0
-        place = {"chunk_index": slot // CHUNK, "file_index": slot % CHUNK}
+        place = {"chunk_index": file_number // CHUNK, "file_index": file_number % CHUNK}
         row: Row = {
             "episode_index": before["episode_index"] + 1 if before else 0,
             "tasks": [description.task],
@@ -189,7 +193,7 @@ class Catalogue:
         }
 
     @classmethod
-    def load(cls, root: Path) -> "Catalogue":
+    def load(cls, root: Path) -> "SetMetadata":
         """Reads all of meta/ of a set.
 
         Raises:
@@ -268,11 +272,11 @@ def last_row(table: pa.Table | None) -> Row:
     return table.select(names).slice(table.num_rows - 1).to_pylist()[0]
 
 
-def _plain(feature: dict[str, Any] | None) -> Any:
+def _dtype_and_shape(feature: dict[str, Any] | None) -> Any:
     return feature and (feature["dtype"], feature["shape"])
 
 
-def _differing(row: Row, schema: pa.Schema) -> list[str]:
+def _differing_facts(row: Row, schema: pa.Schema) -> list[str]:
     """Facts that only one of the two has, or that have another type."""
     ours = _schema(row)
     names = {*ours.names, *schema.names}

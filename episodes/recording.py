@@ -21,7 +21,7 @@ from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
 from touchgoal.sim_envs.experts.pick_place import Outcome
-from touchgoal.sim_envs.scene.filming import Film
+from touchgoal.sim_envs.scene.filming import SceneRecorder
 from touchgoal.sim_envs.tasks import TaskConfig, make_env, make_expert
 
 
@@ -35,8 +35,8 @@ class Actor(Protocol):
 
 
 @dataclass(frozen=True)
-class Demonstration:
-    """One episode to record: the same demonstration always gives the same episode."""
+class EpisodeSpec:
+    """One episode to record: the same spec always gives the same episode."""
 
     seed: int
     outcome: Outcome = "success"
@@ -44,14 +44,14 @@ class Demonstration:
 
 
 CORRECTED = "corrected"  # outcome of an episode in which a learner acted and an expert answered
-Cast = Callable[[Any, Demonstration], tuple[Actor, Actor]]
+Roles = Callable[[Any, EpisodeSpec], tuple[Actor, Actor]]
 """Who acts in an environment after its reset, and whose answers to all that is seen are recorded:
 one and the same expert, or a learner and the expert that corrects it."""
 
 
-def scripted(env: FrankaTactileEnv, demonstration: Demonstration) -> tuple[Actor, Actor]:
-    """The task's expert, succeeding or failing as the demonstration asks; see Cast."""
-    expert = make_expert(env, demonstration.outcome)
+def expert_alone(env: FrankaTactileEnv, spec: EpisodeSpec) -> tuple[Actor, Actor]:
+    """The task's expert, succeeding or failing as the spec asks; see Roles."""
+    expert = make_expert(env, spec.outcome)
     return expert, expert
 
 
@@ -81,49 +81,49 @@ def run(
     yield {**observation, ft.ACTION: still, **info}
 
 
-def demonstrate(
-    env: FrankaTactileEnv, demonstration: Demonstration, cast: Cast = scripted
+def record_episode(
+    env: FrankaTactileEnv, spec: EpisodeSpec, roles: Roles = expert_alone
 ) -> Episode:
     """Record an expert's answers."""
-    observation, info = env.reset(seed=demonstration.seed, options=demonstration.options)
-    actor, expert = cast(env, demonstration)
+    observation, info = env.reset(seed=spec.seed, options=spec.options)
+    actor, expert = roles(env, spec)
     if expert is actor:
-        return to_episode(env, list(run(env, actor, observation, info)), demonstration)
+        return to_episode(env, list(run(env, actor, observation, info)), spec)
     ticks = list(run(env, actor, observation, info, expert))
-    episode = to_episode(env, ticks, demonstration)
+    episode = to_episode(env, ticks, spec)
     return replace(episode, meta={**episode.meta, "outcome": CORRECTED})
 
 
-def demonstrate_on_film(
+def record_with_film(
     env: FrankaTactileEnv,
-    demonstration: Demonstration,
+    spec: EpisodeSpec,
     policy: Callable[[Any], Actor] | None = None,
 ) -> tuple[Episode, UInt8[np.ndarray, "n h w 3"]]:
     """Record and film, tick by tick, the expert or what a policy makes for the environment."""
-    observation, info = env.reset(seed=demonstration.seed, options=demonstration.options)
-    actor = policy(env) if policy else make_expert(env, demonstration.outcome)
-    film = Film(env)
+    observation, info = env.reset(seed=spec.seed, options=spec.options)
+    actor = policy(env) if policy else make_expert(env, spec.outcome)
+    film = SceneRecorder(env)
     ticks = []
     for tick in tqdm(run(env, actor, observation, info), desc="filming", unit="frame"):
         ticks.append(tick)
-        film.shoot()
+        film.capture()
     film.close()
-    return to_episode(env, ticks, demonstration), np.stack(film.frames)
+    return to_episode(env, ticks, spec), np.stack(film.frames)
 
 
 def to_episode(
-    env: FrankaTactileEnv, ticks: list[dict[str, np.ndarray]], demonstration: Demonstration
+    env: FrankaTactileEnv, ticks: list[dict[str, np.ndarray]], spec: EpisodeSpec
 ) -> Episode:
     """The episode of the ticks that were run in an environment."""
     success = bool(ticks[-1][ft.TRUTH_SUCCESS][0])
-    asked_to_fail = demonstration.outcome != "success"
+    asked_to_fail = spec.outcome != "success"
     return Episode(
         frames={key: np.stack([tick[key] for tick in ticks]) for key in ticks[0]},
         task=env.instruction(),
-        meta=env.facts()
+        meta=env.episode_info()
         | {
-            "seed": demonstration.seed,
-            "outcome": demonstration.outcome if success or asked_to_fail else "failure",
+            "seed": spec.seed,
+            "outcome": spec.outcome if success or asked_to_fail else "failure",
             "success": success,
         },
     )
@@ -132,25 +132,25 @@ def to_episode(
 def collect(
     root: Path,
     config: TaskConfig,
-    demonstrations: Sequence[Demonstration],
+    specs: Sequence[EpisodeSpec],
     workers: int,
-    cast: Cast = scripted,
+    roles: Roles = expert_alone,
 ) -> list[dict[str, MetaValue]]:
     """Append demonstrations to the episode set in `root`, in their order.
 
     Workers simulate and encode; this process alone writes, so that an interruption loses at most
-    the episodes in progress. The cast must pickle.
+    the episodes in progress. The roles must pickle.
 
     Returns:
         The `meta` of each episode, outcome and success included.
     """
-    if not demonstrations:
+    if not specs:
         raise UserError("nothing to collect: ask for at least one episode")
     writer = EpisodeWriter(root, fps=config.control_hz)
     metas = []
     with one_core_workers(workers) as pool:
-        encoded = pool.map(partial(_record, config, cast), demonstrations)
-        for episode in tqdm(encoded, total=len(demonstrations), desc="record", unit="episode"):
+        encoded = pool.map(partial(_record, config, roles), specs)
+        for episode in tqdm(encoded, total=len(specs), desc="record", unit="episode"):
             writer.append(episode)
             metas.append(episode.description.meta)
     return metas
@@ -169,9 +169,9 @@ def _use_one_core() -> None:
     os.environ["LP_NUM_THREADS"] = "1"
 
 
-def _record(config: TaskConfig, cast: Cast, demonstration: Demonstration) -> EncodedEpisode:
+def _record(config: TaskConfig, roles: Roles, spec: EpisodeSpec) -> EncodedEpisode:
     env = make_env(config)
     try:
-        return encode(demonstrate(env, demonstration, cast), config.control_hz)
+        return encode(record_episode(env, spec, roles), config.control_hz)
     finally:
         env.close()

@@ -1,6 +1,6 @@
 """Sets of episodes on disk: LeRobotDataset v3, written and read without lerobot.
 
-Every episode has its own data file and its own videos, numbered by the same slot; an append
+Every episode has its own data file and its own videos, numbered by the same number; an append
 writes them first and then everything under meta/, each file in one atomic step, info.json last.
 So a set holds what its info.json says, and a process killed at any moment leaves at most the files
 of the episode in progress, which `repair` takes in (if complete) or moves aside.
@@ -32,11 +32,11 @@ from touchgoal.episodes.encoding import (
     write_table,
 )
 from touchgoal.episodes.media import decode_video
-from touchgoal.episodes.metadata import Catalogue, Row
+from touchgoal.episodes.metadata import Row, SetMetadata
 from touchgoal.episodes.schema import INDEX_DTYPES, Episode, MetaValue, is_camera
 
 REPAIRED = "repaired"
-_TREES = ("data", "videos", "meta")
+_FOLDERS = ("data", "videos", "meta")
 _META = (metadata.INFO, metadata.EPISODES, metadata.TASKS, metadata.STATS)
 _DATA_FILES = "chunk-[0-9][0-9][0-9]/file-[0-9][0-9][0-9].parquet"
 
@@ -59,21 +59,21 @@ class EpisodeWriter:
         """
         self._root = Path(root)
         self._fps = fps
-        self._catalogue: Catalogue | None = None
+        self._metadata: SetMetadata | None = None
         if (self._root / metadata.INFO).exists():
-            self._catalogue = Catalogue.load(self._root)
-            if self._catalogue.fps != fps:
+            self._metadata = SetMetadata.load(self._root)
+            if self._metadata.fps != fps:
                 raise UserError(
-                    f"{root} runs at {self._catalogue.fps} frames per second, not {fps}: continue "
+                    f"{root} runs at {self._metadata.fps} frames per second, not {fps}: continue "
                     "it at its own rate or record into another folder"
                 )
-        problems = _check_totals(self._root, self._catalogue) if self._catalogue else []
-        if problems := problems or _leftovers(self._root, self._catalogue):
+        problems = _contradictions_in_meta(self._root, self._metadata) if self._metadata else []
+        if problems := problems or _unlisted_files(self._root, self._metadata):
             raise UserError(f"{root} was interrupted (see {problems[0]}): {metadata.REPAIR}")
 
     def __len__(self) -> int:
         """Number of episodes in the set."""
-        return 0 if self._catalogue is None else _rows(self._catalogue)
+        return 0 if self._metadata is None else _n_episodes(self._metadata)
 
     def append(self, episode: Episode | EncodedEpisode) -> int:
         """Adds an episode; when this returns, it is on disk for good.
@@ -87,19 +87,19 @@ class EpisodeWriter:
         """
         encoded = encode(episode, self._fps) if isinstance(episode, Episode) else episode
         description = encoded.description
-        current = self._catalogue or Catalogue(self._fps, description.features)
-        slot = current.next_slot
-        updated = current.added(description, slot)
-        if (path := self._root / metadata.data_path(slot)).exists():
+        current = self._metadata or SetMetadata(self._fps, description.features)
+        file_number = current.next_file_number
+        updated = current.with_episode(description, file_number)
+        if (path := self._root / metadata.data_path(file_number)).exists():
             raise UserError(
                 f"{path} appeared while recording: let only one process write to a set, then "
                 f"{metadata.REPAIR}"
             )
         for key, video in encoded.videos.items():
-            metadata.write_file(self._root / metadata.video_path(key, slot), video)
-        metadata.write_file(path, data_file(encoded, current.indices(description)))
+            metadata.write_file(self._root / metadata.video_path(key, file_number), video)
+        metadata.write_file(path, data_file(encoded, current.index_columns_for(description)))
         updated.write(self._root)
-        self._catalogue = updated
+        self._metadata = updated
         return len(self) - 1
 
 
@@ -126,10 +126,10 @@ class EpisodeSet:
                 f"{self.root / metadata.EPISODES} lists {len(self._rows)} of "
                 f"{info['total_episodes']} episodes: {metadata.REPAIR}"
             )
-        self._refuse_foreign(table.column_names)
+        self._refuse_sets_of_others(table.column_names)
 
-    def _refuse_foreign(self, columns: list[str]) -> None:
-        several = len({metadata.slot_of(row) for row in self._rows}) < len(self._rows)
+    def _refuse_sets_of_others(self, columns: list[str]) -> None:
+        several = len({metadata.file_number_of(row) for row in self._rows}) < len(self._rows)
         unchecked = any(f"videos/{k}/crc32" not in columns for k in _cameras(self.features))
         if several or unchecked or not set(self.features) <= set(FEATURES):
             raise UserError(
@@ -192,7 +192,7 @@ class EpisodeSet:
     def _read_data(
         self, row: Row, features: dict[str, dict[str, Any]], frames: np.ndarray
     ) -> dict[str, np.ndarray]:
-        path = self.root / metadata.data_path(metadata.slot_of(row))
+        path = self.root / metadata.data_path(metadata.file_number_of(row))
         try:
             with pq.ParquetFile(path, page_checksum_verification=True) as file:
                 if file.metadata.num_rows != row["length"]:
@@ -202,7 +202,7 @@ class EpisodeSet:
             raise metadata.unreadable(path, error) from error
 
     def _read_video(self, row: Row, key: str, frames: np.ndarray) -> UInt8[np.ndarray, "n h w 3"]:
-        path = self.root / metadata.video_path(key, metadata.slot_of(row))
+        path = self.root / metadata.video_path(key, metadata.file_number_of(row))
         video = _read_video_file(path, row[f"videos/{key}/crc32"])
         return decode_video(video, self.fps, frames.tolist())
 
@@ -217,69 +217,71 @@ def _read_video_file(path: Path, crc32: int) -> bytes:
     return video
 
 
-def _rows(catalogue: Catalogue) -> int:
-    return 0 if catalogue.episodes is None else catalogue.episodes.num_rows
+def _n_episodes(set_metadata: SetMetadata) -> int:
+    return 0 if set_metadata.episodes is None else set_metadata.episodes.num_rows
 
 
-def _slots(catalogue: Catalogue | None) -> list[int]:
-    if catalogue is None or catalogue.episodes is None:
+def _file_numbers(set_metadata: SetMetadata | None) -> list[int]:
+    if set_metadata is None or set_metadata.episodes is None:
         return []
     names = ["data/chunk_index", "data/file_index"]
-    return [metadata.slot_of(row) for row in catalogue.episodes.select(names).to_pylist()]
+    return [metadata.file_number_of(row) for row in set_metadata.episodes.select(names).to_pylist()]
 
 
 def _cameras(features: dict[str, dict[str, Any]]) -> list[str]:
     return [key for key, feature in features.items() if feature["dtype"] == "video"]
 
 
-def _leftovers(root: Path, catalogue: Catalogue | None) -> list[str]:
-    """Files that belong to no episode of the catalogue, as paths in the set."""
+def _unlisted_files(root: Path, set_metadata: SetMetadata | None) -> list[str]:
+    """Files that belong to no episode that the metadata lists, as paths in the set."""
     known = set(_META)
-    cameras = _cameras(catalogue.features) if catalogue else []
-    for slot in _slots(catalogue):
-        known |= {metadata.data_path(slot)} | {metadata.video_path(k, slot) for k in cameras}
-    files = [path for tree in _TREES for path in (root / tree).rglob("*") if path.is_file()]
+    cameras = _cameras(set_metadata.features) if set_metadata else []
+    for file_number in _file_numbers(set_metadata):
+        known |= {metadata.data_path(file_number)} | {
+            metadata.video_path(k, file_number) for k in cameras
+        }
+    files = [path for tree in _FOLDERS for path in (root / tree).rglob("*") if path.is_file()]
     return sorted({path.relative_to(root).as_posix() for path in files} - known)
 
 
-def _check_totals(root: Path, catalogue: Catalogue) -> list[str]:
+def _contradictions_in_meta(root: Path, set_metadata: SetMetadata) -> list[str]:
     """What info.json, stats.json and tasks.parquet contradict in meta/episodes."""
     info = metadata.load_info(root)
-    frames = metadata.last_row(catalogue.episodes)["dataset_to_index"]
+    frames = metadata.last_row(set_metadata.episodes)["dataset_to_index"]
     problems = []
-    if (info["total_episodes"], info["total_frames"]) != (_rows(catalogue), frames):
+    if (info["total_episodes"], info["total_frames"]) != (_n_episodes(set_metadata), frames):
         problems.append(
             f"{root / metadata.INFO} counts {info['total_episodes']} episodes, "
-            f"{root / metadata.EPISODES} {_rows(catalogue)}"
+            f"{root / metadata.EPISODES} {_n_episodes(set_metadata)}"
         )
-    if info["total_tasks"] != len(catalogue.tasks):
+    if info["total_tasks"] != len(set_metadata.tasks):
         problems.append(f"{root / metadata.TASKS} has not the tasks of {root / metadata.INFO}")
-    counts = {key: stats["count"] for key, stats in (catalogue.stats or {}).items()}
-    if counts != {key: [frames] for key in catalogue.features}:
+    counts = {key: stats["count"] for key, stats in (set_metadata.stats or {}).items()}
+    if counts != {key: [frames] for key in set_metadata.features}:
         problems.append(f"{root / metadata.STATS} is not of all {frames} frames")
     return problems
 
 
-def _read_episode(root: Path, slot: int) -> tuple[Description, pa.Table]:
+def _read_episode(root: Path, file_number: int) -> tuple[Description, pa.Table]:
     """Reads every byte of an episode's files; checksums show any damage."""
-    path = root / metadata.data_path(slot)
+    path = root / metadata.data_path(file_number)
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             description, table = read_description(file), file.read()
     except (OSError, pa.ArrowException) as error:
         raise metadata.unreadable(path, error) from error
     for key, crc32 in description.video_crc32.items():
-        _read_video_file(root / metadata.video_path(key, slot), crc32)
+        _read_video_file(root / metadata.video_path(key, file_number), crc32)
     return description, table
 
 
-def _misplaced(table: pa.Table, indices: dict[str, np.ndarray]) -> list[str]:
+def _wrong_index_columns(table: pa.Table, indices: dict[str, np.ndarray]) -> list[str]:
     return [k for k, values in indices.items() if not np.array_equal(table[k].to_numpy(), values)]
 
 
-def _refuse_foreign(root: Path) -> None:
+def _refuse_sets_of_others(root: Path) -> None:
     """Repair would move aside what it does not know, so it must be sure the set is touchgoal's."""
-    if not any((root / tree).is_dir() for tree in _TREES):
+    if not any((root / tree).is_dir() for tree in _FOLDERS):
         raise UserError(f"{root} is not a set of episodes: give the folder of one")
     if (root / metadata.INFO).exists():
         try:
@@ -305,23 +307,25 @@ def validate(root: str | os.PathLike[str]) -> list[str]:
         UserError: not a set of touchgoal, or one of another version.
     """
     root = Path(root)
-    _refuse_foreign(root)
+    _refuse_sets_of_others(root)
     try:
-        catalogue = Catalogue.load(root)
+        set_metadata = SetMetadata.load(root)
     except UserError as error:
         return [str(error)]
-    problems = _check_totals(root, catalogue)
-    rebuilt = Catalogue(catalogue.fps, catalogue.features)
-    for slot in tqdm(_slots(catalogue), desc="validate", unit="episode"):
+    problems = _contradictions_in_meta(root, set_metadata)
+    rebuilt = SetMetadata(set_metadata.fps, set_metadata.features)
+    for file_number in tqdm(_file_numbers(set_metadata), desc="validate", unit="episode"):
         try:
-            description, table = _read_episode(root, slot)
-            if differing := _misplaced(table, rebuilt.indices(description)):
-                name = root / metadata.data_path(slot)
+            description, table = _read_episode(root, file_number)
+            if differing := _wrong_index_columns(table, rebuilt.index_columns_for(description)):
+                name = root / metadata.data_path(file_number)
                 problems.append(f"{name} has wrong {', '.join(differing)}: {metadata.REPAIR}")
-            rebuilt = rebuilt.added(description, slot)
+            rebuilt = rebuilt.with_episode(description, file_number)
         except UserError as error:
             problems.append(str(error))
-    return problems + [f"{root / n} belongs to no episode" for n in _leftovers(root, catalogue)]
+    return problems + [
+        f"{root / n} belongs to no episode" for n in _unlisted_files(root, set_metadata)
+    ]
 
 
 def repair(root: str | os.PathLike[str]) -> list[str]:
@@ -341,29 +345,29 @@ def repair(root: str | os.PathLike[str]) -> list[str]:
     if not validate(root):
         return []
     done: list[str] = []
-    catalogue: Catalogue | None = None
+    set_metadata: SetMetadata | None = None
     for path in tqdm(sorted((root / "data").glob(_DATA_FILES)), desc="repair", unit="episode"):
-        slot = int(path.parent.name[-3:]) * metadata.CHUNK + int(path.stem[-3:])
+        file_number = int(path.parent.name[-3:]) * metadata.CHUNK + int(path.stem[-3:])
         try:
-            description, table = _read_episode(root, slot)
-            before = catalogue or Catalogue(description.fps, description.features)
-            catalogue = before.added(description, slot)
+            description, table = _read_episode(root, file_number)
+            before = set_metadata or SetMetadata(description.fps, description.features)
+            set_metadata = before.with_episode(description, file_number)
         except UserError as error:
             reason = str(error).removesuffix(": " + metadata.REPAIR)
             done.append(f"left out the episode of {path}: {reason}")
             continue
-        if _misplaced(table, before.indices(description)):
-            _renumber(path, description, table, before.indices(description))
+        if _wrong_index_columns(table, before.index_columns_for(description)):
+            _rewrite_index_columns(path, description, table, before.index_columns_for(description))
             done.append(f"renumbered {path}")
-    done += [_set_aside(root, name) for name in _leftovers(root, catalogue)]
-    done += [_set_aside(root, name) for name in _META if (root / name).exists()]
-    if catalogue is None:
+    done += [_move_to_repaired(root, name) for name in _unlisted_files(root, set_metadata)]
+    done += [_move_to_repaired(root, name) for name in _META if (root / name).exists()]
+    if set_metadata is None:
         return [*done, f"no whole episode is left in {root}"]
-    catalogue.write(root)
-    return [*done, f"wrote {root / 'meta'} again for {_rows(catalogue)} episodes"]
+    set_metadata.write(root)
+    return [*done, f"wrote {root / 'meta'} again for {_n_episodes(set_metadata)} episodes"]
 
 
-def _renumber(
+def _rewrite_index_columns(
     path: Path, description: Description, table: pa.Table, indices: dict[str, np.ndarray]
 ) -> None:
     for key, values in indices.items():
@@ -371,7 +375,7 @@ def _renumber(
     metadata.write_file(path, write_table(table, description))
 
 
-def _set_aside(root: Path, name: str) -> str:
+def _move_to_repaired(root: Path, name: str) -> str:
     """Moves a file of the set into `repaired/`, beside what an earlier repair moved there."""
     target = root / REPAIRED / name
     for i in itertools.count(1):

@@ -12,7 +12,7 @@ from touchgoal.control.tactile.contact import detect_contact, threshold_for
 from touchgoal.episodes.store import EpisodeSet
 
 _BACKGROUND_FRAMES = 5
-_VIEW_LEAD = 5
+_VIEW_FRAMES_BEFORE_CONTACT = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,37 +22,37 @@ class Touches:
     Attributes:
         frames: raw sensor RGB, one side each.
         background: the same sensors untouched, per episode and side.
-        background_of: row of `background` that belongs to each frame.
+        background_index: row of `background` that belongs to each frame.
         view: the wrist camera's unoccluded picture of the object, one per episode.
-        view_of: row of `view` that belongs to each frame.
+        view_index: row of `view` that belongs to each frame.
         object: catalogue id of what each frame feels; "" for no contact.
         descriptions: catalogue id -> sentences on how the object feels.
         side: index into `vocabulary.TACTILE` of each frame: 0 left, 1 right.
-        episode_of: index in the set of each frame's episode.
+        episode_index: index in the set of each frame's episode.
     """
 
     frames: UInt8[np.ndarray, "n h w 3"]
     background: UInt8[np.ndarray, "b h w 3"]
-    background_of: Int[np.ndarray, " n"]
+    background_index: Int[np.ndarray, " n"]
     view: UInt8[np.ndarray, "e H W 3"]
-    view_of: Int[np.ndarray, " n"]
+    view_index: Int[np.ndarray, " n"]
     object: tuple[str, ...]
     descriptions: dict[str, list[str]]
     side: Int[np.ndarray, " n"]
-    episode_of: Int[np.ndarray, " n"]
+    episode_index: Int[np.ndarray, " n"]
 
     def __len__(self) -> int:
         """Number of touches, n."""
         return len(self.frames)
 
 
-def collect(
+def collect_touches(
     episodes: EpisodeSet,
     contact_frames_per_episode: int,
-    idle_frames_per_episode: int,
+    no_contact_frames_per_episode: int,
     seed: int,
 ) -> Touches:
-    """Draws frames in contact, and idle ones, evenly from both fingertips of every episode.
+    """Draws frames in contact, and without contact, evenly from both fingertips of every episode.
 
     Contact is the simulator's if the set has it, else `detect_contact`'s. The background is the
     median of a side's first 5 frames. The view is the wrist picture 5 frames before the last one
@@ -62,49 +62,49 @@ def collect(
     Args:
         episodes: a set whose meta has `object` and `descriptions`.
         contact_frames_per_episode: frames in contact to draw, both sides together.
-        idle_frames_per_episode: frames without contact on their side to draw.
+        no_contact_frames_per_episode: frames without contact on their side to draw.
         seed: of the draw; an episode's draw does not depend on the other episodes.
 
     Raises:
         UserError: the set lacks the pictures or the meta, or no episode touches anything.
     """
     sides = _check(episodes)
-    most = len(episodes) * (contact_frames_per_episode + idle_frames_per_episode)
+    most = len(episodes) * (contact_frames_per_episode + no_contact_frames_per_episode)
     frames = np.empty((most, *episodes.features[TACTILE[sides[0]]]["shape"]), np.uint8)
-    drawn, backgrounds, views, filled = [], [], [], 0
+    sampled, backgrounds, views, filled = [], [], [], 0
     for i in tqdm(range(len(episodes)), desc="touches", unit="episode"):
         background = [_background(episodes, i, side) for side in sides]
         contact = _contact(episodes, i, sides)
         rng = np.random.default_rng([seed, i])
-        picks = np.concatenate(
+        picked = np.concatenate(
             [
-                _draw(contact, contact_frames_per_episode, rng),
-                _draw(~contact, idle_frames_per_episode, rng),
+                _sample_frames(contact, contact_frames_per_episode, rng),
+                _sample_frames(~contact, no_contact_frames_per_episode, rng),
             ]
         )
         for column, side in enumerate(sides):
-            rows = np.flatnonzero(picks[:, 1] == column)
+            rows = np.flatnonzero(picked[:, 1] == column)
             key = TACTILE[side]
-            frames[filled + rows] = episodes.read(i, [key], picks[rows, 0].tolist()).frames[key]
-        filled += len(picks)
-        felt = contact[picks[:, 0], picks[:, 1]]
-        drawn.append(np.column_stack([np.full(len(picks), i), picks[:, 1], felt]))
+            frames[filled + rows] = episodes.read(i, [key], picked[rows, 0].tolist()).frames[key]
+        filled += len(picked)
+        in_contact = contact[picked[:, 0], picked[:, 1]]
+        sampled.append(np.column_stack([np.full(len(picked), i), picked[:, 1], in_contact]))
         backgrounds += background
         views.append(_view(episodes, i, contact))
-    episode_of, column, felt = np.concatenate(drawn).T
-    if not felt.any():
+    episode_index, column, in_contact = np.concatenate(sampled).T
+    if not in_contact.any():
         raise UserError(f"nothing is touched in {episodes.root}: give episodes with contact")
     names = [str(episodes.meta(i)["object"]) for i in range(len(episodes))]
     return Touches(
         frames=frames[:filled],
         background=np.stack(backgrounds),
-        background_of=episode_of * len(sides) + column,
+        background_index=episode_index * len(sides) + column,
         view=np.stack(views),
-        view_of=episode_of,
-        object=tuple(names[i] if f else "" for i, f in zip(episode_of, felt, strict=True)),
+        view_index=episode_index,
+        object=tuple(names[i] if f else "" for i, f in zip(episode_index, in_contact, strict=True)),
         descriptions=_descriptions(episodes),
         side=np.asarray(sides)[column],
-        episode_of=episode_of,
+        episode_index=episode_index,
     )
 
 
@@ -123,7 +123,7 @@ def touch_background(frames: UInt8[np.ndarray, "n h w 3"]) -> UInt8[np.ndarray, 
     return np.median(frames[:_BACKGROUND_FRAMES], axis=0).astype(np.uint8)
 
 
-def felt_contact(frames: UInt8[np.ndarray, "t h w 3"]) -> Bool[np.ndarray, " t"]:
+def contact_per_frame(frames: UInt8[np.ndarray, "t h w 3"]) -> Bool[np.ndarray, " t"]:
     """Whether a fingertip touches something, frame by frame; in the first 5 it must not."""
     untouched, background = frames[:_BACKGROUND_FRAMES], touch_background(frames)
     return detect_contact(frames, background, threshold_for(untouched, background))
@@ -140,10 +140,10 @@ def _contact(episodes: EpisodeSet, i: int, sides: list[int]) -> Bool[np.ndarray,
         return episodes.read(i, [TRUTH_CONTACT]).frames[TRUTH_CONTACT][:, sides]
     keys = [TACTILE[side] for side in sides]
     frames = episodes.read(i, keys).frames
-    return np.stack([felt_contact(frames[key]) for key in keys], axis=1)
+    return np.stack([contact_per_frame(frames[key]) for key in keys], axis=1)
 
 
-def _draw(
+def _sample_frames(
     mask: Bool[np.ndarray, "t s"], count: int, rng: np.random.Generator
 ) -> Int[np.ndarray, "k 2"]:
     """At most `count` places (frame, column) where the mask is true, in order of time."""
@@ -155,17 +155,17 @@ def _view(
     episodes: EpisodeSet, i: int, contact: Bool[np.ndarray, "t s"]
 ) -> UInt8[np.ndarray, "H W 3"]:
     touched = np.flatnonzero(contact.any(axis=1))
-    frame = max(int(touched[0]) - 1 - _VIEW_LEAD, 0) if len(touched) else 0
+    frame = max(int(touched[0]) - 1 - _VIEW_FRAMES_BEFORE_CONTACT, 0) if len(touched) else 0
     return episodes.read(i, [WRIST], [frame]).frames[WRIST][0]
 
 
 def _descriptions(episodes: EpisodeSet) -> dict[str, list[str]]:
     """All sentences said of each object, each once, in the order in which they appear."""
-    said: dict[str, dict[str, None]] = {}
+    sentences_of: dict[str, dict[str, None]] = {}
     for i in range(len(episodes)):
         meta = episodes.meta(i)
         sentences = meta["descriptions"]
         if not isinstance(sentences, list):
             raise UserError(f"{episodes.root}: meta descriptions must be a list of str")
-        said.setdefault(str(meta["object"]), {}).update(dict.fromkeys(sentences))
-    return {name: list(sentences) for name, sentences in said.items()}
+        sentences_of.setdefault(str(meta["object"]), {}).update(dict.fromkeys(sentences))
+    return {name: list(sentences) for name, sentences in sentences_of.items()}

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from touchgoal.control.errors import UserError
-from touchgoal.episodes.recording import Cast, Demonstration, collect, scripted
+from touchgoal.episodes.recording import EpisodeSpec, Roles, collect, expert_alone
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies import checkpoint
 from touchgoal.policies.evaluation.success_rate import SuccessRate
-from touchgoal.policies.training.dagger import Corrected
+from touchgoal.policies.training.dagger import DaggerRoles
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.experts.pick_place import Outcome
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
@@ -37,7 +37,7 @@ class Config:
     feedback: bool = False
     """pick-place: show it by a law of the present state, from which a policy learns better than from
     planned paths."""
-    learner: Path | None = None
+    policy: Path | None = None
     """A policy that acts in the expert's place; what the expert would have done is recorded (DAgger)."""
     seed: int = 0
     """Of the first episode; each further one adds one."""
@@ -53,20 +53,20 @@ def main(config: Config) -> None:
     """Record the episodes and say what came of them."""
     task, options = _choose(config)
     demonstrations = [
-        Demonstration(config.seed + i, outcome, options[i % len(options)])
+        EpisodeSpec(config.seed + i, outcome, options[i % len(options)])
         for i, outcome in enumerate(config.outcomes * config.episodes)
     ]
-    cast = _cast(config)
+    roles = _roles(config)
     out = open_run(config.out, "collect-demos", config)
-    metas = collect(out / "episodes", task, demonstrations, config.workers, cast)
+    metas = collect(out / "episodes", task, demonstrations, config.workers, roles)
     outcomes = Counter(str(meta["outcome"]) for meta in metas)
     write_json(out / "metrics.json", {"outcomes": outcomes, "episodes": metas})
     print(f"{len(metas)} episodes in {out / 'episodes'}")
     for outcome, count in outcomes.items():
         print(f"  {outcome:<14}{count}")
-    if config.learner:
+    if config.policy:
         rate = SuccessRate(sum(bool(meta["success"]) for meta in metas), len(metas))
-        print(f"the learner succeeded in {rate}")
+        print(f"the policy succeeded in {rate}")
 
 
 def _choose(config: Config) -> tuple[TaskConfig, list[dict[str, Any]]]:
@@ -78,11 +78,11 @@ def _choose(config: Config) -> tuple[TaskConfig, list[dict[str, Any]]]:
     return config.env, [{"object": name} for name in names]
 
 
-def _cast(config: Config) -> Cast:
-    if not config.feedback and config.learner is None:
-        return scripted
+def _roles(config: Config) -> Roles:
+    if not config.feedback and config.policy is None:
+        return expert_alone
     if config.outcomes != ("success",) or config.env.release:
         raise UserError("no expert to be asked in any state fails, or lets go: leave these options")
-    if config.learner:
-        checkpoint.load(config.learner)  # what is wrong with it is said before anything is written
-    return Corrected(config.learner)
+    if config.policy:
+        checkpoint.load(config.policy)  # what is wrong with it is said before anything is written
+    return DaggerRoles(config.policy)

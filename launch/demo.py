@@ -11,13 +11,13 @@ from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.media import write_video
-from touchgoal.episodes.recording import Demonstration, demonstrate_on_film
+from touchgoal.episodes.recording import EpisodeSpec, record_with_film
 from touchgoal.episodes.store import EpisodeWriter
-from touchgoal.launch.reward_curves import summarise
+from touchgoal.launch.reward_curves import report_all
 from touchgoal.launch.run_folder import open_run
-from touchgoal.rewards.curves import Scale
-from touchgoal.rewards.embedding_distance import EpisodeEmbedder, measure
-from touchgoal.rewards.goals import choose_goal, parse_goal
+from touchgoal.rewards.curves import DistanceNormalizer
+from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
+from touchgoal.rewards.goals import assign_goals, parse_goal
 from touchgoal.rewards.report.report import write_report
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
 from touchgoal.sim_envs.scene.objects import find
@@ -43,24 +43,24 @@ def main(config: Config) -> None:
     """Load the weights first, so that a missing one costs no simulation; then record and judge."""
     find(config.object)
     sensor = find_sensor(config.env.scene.sensor).name
-    directory = pretrained.shipped_for(sensor)
-    encoder = pretrained.load(directory, sensor=sensor)
-    scale = Scale.load(directory / "scale.json")
+    directory = pretrained.shipped_encoder_for(sensor)
+    encoder = pretrained.load_aligned(directory, sensor=sensor)
+    scale = DistanceNormalizer.load(directory / "scale.json")
     embedder = EpisodeEmbedder(load_towers(encoder.config.towers), encoder)
     out = open_run(config.out, "demo", config)
 
     env = PickPlace(config.env)
-    demonstration = Demonstration(config.seed, options={"object": config.object})
-    episode, frames = demonstrate_on_film(env, demonstration)
+    demonstration = EpisodeSpec(config.seed, options={"object": config.object})
+    episode, frames = record_with_film(env, demonstration)
     env.close()
     write_video(out / "episode.mp4", frames, config.env.control_hz)
     EpisodeWriter(out / "episodes", config.env.control_hz).append(episode)
 
     embedded = embedder.embed_episode(episode, config.env.control_hz, config.object)
     specs = [parse_goal("last"), parse_goal(f"text:{config.words}")]
-    goal = embedder.embed_goal(choose_goal(specs, embedded.modalities), embedded)
-    curves = measure(embedded, goal, scale)
+    goal = embedder.embed_goal(assign_goals(specs, embedded.modalities), embedded)
+    curves = compute_curves(embedded, goal, scale)
     write_report(curves, out, "curves", {"encoder": directory.name, **embedder.space})
     print(f"\n{episode.task}: {episode.meta['outcome']} in {len(episode) - 1} ticks")
-    summarise([curves], out)
+    report_all([curves], out)
     print(f"video: {out / 'episode.mp4'}\ncurves: {out / 'curves.png'}")

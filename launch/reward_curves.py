@@ -19,11 +19,11 @@ from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.metadata import INFO
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.run_folder import open_run, write_json
-from touchgoal.rewards.curves import Curves, Scale
-from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EpisodeEmbedder, measure
-from touchgoal.rewards.goals import choose_goal, parse_goal
+from touchgoal.rewards.curves import Curves, DistanceNormalizer
+from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EpisodeEmbedder, compute_curves
+from touchgoal.rewards.goals import assign_goals, parse_goal
 from touchgoal.rewards.report.report import write_report
-from touchgoal.rewards.report.summary import overview
+from touchgoal.rewards.report.summary import metrics_table
 
 
 @dataclass(frozen=True)
@@ -48,29 +48,29 @@ def main(config: Config) -> None:
     """Embed, measure, and write a plot, a CSV and a JSON for each episode."""
     specs = [parse_goal(text) for text in config.goal or ("last",)]
     sources = _open(config)
-    directory = config.encoder or pretrained.shipped_for(sources.sensor)
-    encoder = pretrained.load(directory, sensor=sources.sensor)
-    scale = Scale.load(directory / "scale.json")
+    directory = config.encoder or pretrained.shipped_encoder_for(sources.sensor)
+    encoder = pretrained.load_aligned(directory, sensor=sources.sensor)
+    scale = DistanceNormalizer.load(directory / "scale.json")
     embedder = EpisodeEmbedder(load_towers(encoder.config.towers), encoder, config.camera)
     out, curves = None, []
     for name, index in tqdm(sources.items, desc="curves", unit="episode"):
         embedded = sources.embed(embedder, index)
-        goal = embedder.embed_goal(choose_goal(specs, embedded.modalities), embedded)
-        measured = measure(embedded, goal, scale)
+        goal = embedder.embed_goal(assign_goals(specs, embedded.modalities), embedded)
+        measured = compute_curves(embedded, goal, scale)
         out = out or open_run(config.out, "reward-curves", config)
         write_report(measured, out, name, {"encoder": str(directory), **embedder.space})
         curves.append(measured)
     assert out is not None  # a source has at least one item
-    summarise(curves, out)
+    report_all(curves, out)
 
 
-def summarise(curves: list[Curves], out: Path) -> None:
+def report_all(curves: list[Curves], out: Path) -> None:
     """Print the table of all curves and write it to metrics.json."""
     write_json(
         out / "metrics.json",
         [{"source": c.source, **{k: m.as_dict() for k, m in c.metrics().items()}} for c in curves],
     )
-    print(overview(curves))
+    print(metrics_table(curves))
     print(f"plots, CSV and JSON of each: {out}")
 
 

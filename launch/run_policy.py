@@ -11,9 +11,9 @@ import numpy as np
 
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.media import write_video
-from touchgoal.episodes.recording import Actor, Demonstration, demonstrate_on_film
+from touchgoal.episodes.recording import Actor, EpisodeSpec, record_with_film
 from touchgoal.launch.run_folder import open_run, write_json
-from touchgoal.policies.acting import SHIPPED, ActorMaker
+from touchgoal.policies.acting import SHIPPED, SavedPolicy
 from touchgoal.policies.evaluation import bead_maze as maze_trials
 from touchgoal.policies.evaluation import pick_place as rollout
 from touchgoal.policies.evaluation.bead_maze import MazeTrial
@@ -104,17 +104,17 @@ def _follower(env: BeadMaze) -> WireFollower:
     return WireFollower(env.config.control_hz)
 
 
-def _learned(config: Config) -> ActorMaker:
+def _learned(config: Config) -> SavedPolicy:
     """A policy on disk; UserError if it does not fit the task, before anything is simulated."""
     task = config.maze if config.task == "bead-maze" else config.env
     directory = SHIPPED[config.task] if config.policy == "shipped" else Path(config.policy)
-    return ActorMaker(directory, latency=config.latency).checked(task)
+    return SavedPolicy(directory, latency=config.latency).check_task(task)
 
 
 def _observe(task: Task, policy: object) -> Task:
     """The task with the pictures that the policy looks at, and no others."""
-    if isinstance(policy, ActorMaker):
-        return policy.observing(task)
+    if isinstance(policy, SavedPolicy):
+        return policy.env_config(task)
     return replace(task, tactile=False, cameras=())
 
 
@@ -124,14 +124,14 @@ def _report(out: Path, trials: list[Trial] | list[MazeTrial], printed: str) -> N
 
 
 def _film(
-    out: Path, task: TaskConfig, ranked: list[Demonstration], policy: Callable[[Any], Actor]
+    out: Path, task: TaskConfig, ranked: list[EpisodeSpec], policy: Callable[[Any], Actor]
 ) -> None:
     """Films the worst episode, the median and the best; `ranked` has the worst first."""
     places = {"worst": 0, "median": len(ranked) // 2, "best": len(ranked) - 1}
     env = make_env(replace(task, tactile=True))
     for name in list(places)[: len(ranked)]:
         job = ranked[places[name]]
-        _, frames = demonstrate_on_film(env, job, policy)
+        _, frames = record_with_film(env, job, policy)
         write_video(out / f"{name}.mp4", frames, task.control_hz)
         print(f"{name} episode (seed {job.seed}): {out / f'{name}.mp4'}")
     env.close()

@@ -16,7 +16,7 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.control.sensors.keyboard import Keyboard
-from touchgoal.episodes.recording import Demonstration, run, to_episode
+from touchgoal.episodes.recording import EpisodeSpec, run, to_episode
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.run_folder import open_run, write_json
@@ -24,7 +24,7 @@ from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
 from touchgoal.sim_envs.experts.teleoperator import HELP, Teleoperator, TeleoperatorConfig
 from touchgoal.sim_envs.scene.wires import choose, find
 
-_GIVE_UP = "q"
+_GIVE_UP_KEY = "q"
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,12 @@ def main(config: Config) -> None:
             for i in range(config.episodes):
                 wire = names[i % len(names)]
                 print(f"{wire}, {i + 1} of {config.episodes}: {HELP}  q give up  Ctrl-C end")
-                job = Demonstration(config.seed + i, options={"wire": wire})
-                episode = lead(env, job, keyboard, config.hand)
+                job = EpisodeSpec(config.seed + i, options={"wire": wire})
+                episode = record_attempt(env, job, keyboard, config.hand)
                 if episode is None:
                     print("\ngiven up: not kept")
                     continue
-                failed = ", ".join(env.troubles()) or "out of time"
+                failed = ", ".join(env.failures()) or "out of time"
                 ending = "arrived" if episode.meta["success"] else failed
                 print(f"\n{ending}: saving")
                 writer.append(episode)
@@ -82,8 +82,8 @@ def main(config: Config) -> None:
             print(f"\n{kept}: {out / 'episodes'}")
 
 
-def lead(
-    env: BeadMaze, job: Demonstration, keyboard: Keyboard, config: TeleoperatorConfig
+def record_attempt(
+    env: BeadMaze, job: EpisodeSpec, keyboard: Keyboard, config: TeleoperatorConfig
 ) -> Episode | None:
     """The episode that a person leads to its end, good or bad; None if they give it up.
 
@@ -91,22 +91,22 @@ def lead(
         KeyboardInterrupt: they typed Ctrl-C.
     """
     observation, info = env.reset(seed=job.seed, options=job.options)
-    keyboard.typed()  # what was meant for the last wire
+    keyboard.read_keys()  # what was meant for the last wire
     hand, ticks, due = Teleoperator(env, config), [], time.monotonic()
     for tick in run(env, hand, observation, info):
         ticks.append(tick)
-        keys = keyboard.typed()
-        if _GIVE_UP in keys:
+        keys = keyboard.read_keys()
+        if _GIVE_UP_KEY in keys:
             return None
         hand.press(keys)
-        _show(tick, hand.held)
+        _show_status(tick, hand.held)
         now = time.monotonic()
         due = max(due + 1 / env.config.control_hz, now)  # what was late is not made up for
         time.sleep(due - now)
     return to_episode(env, ticks, job)
 
 
-def _show(tick: dict[str, np.ndarray], held: str) -> None:
+def _show_status(tick: dict[str, np.ndarray], held: str) -> None:
     """One line that is written over."""
     if sys.stdout.isatty():
         progress, force = tick[ft.TRUTH_PROGRESS][0], np.linalg.norm(tick[ft.WRENCH][:3])

@@ -11,51 +11,57 @@ import numpy as np
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import Mode
 from touchgoal.control.sensors.keyboard import Keyboard
-from touchgoal.policies.deploy.control_loop import View
+from touchgoal.policies.deploy.control_loop import TickStatus
 
 HELP = "space or Ctrl-C stops the arm, Enter ends the task; neither is an emergency stop"
-_WISHES = {"\n": "done", "\r": "done", " ": "stop", "q": "stop"}
+_KEY_REQUESTS = {"\n": "done", "\r": "done", " ": "stop", "q": "stop"}
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_REFRESH = 4  # ticks between lines
+_TICKS_PER_LINE = 4  # ticks between lines
 
 
 class Terminal:
     """Asked every tick what the operator wants; shows every few ticks what happens."""
 
     def __init__(self) -> None:
-        self._asked, self._count = "", 0
+        self._request, self._tick_count = "", 0
         self._keyboard = Keyboard(sys.stdin) if sys.stdin.isatty() else None
 
-    def wanted(self) -> str:
-        """See Deployment. A stop outweighs what was typed before it."""
-        if self._keyboard is not None and self._asked != "stop":
+    def operator_request(self) -> str:
+        """See ControlLoop. A stop outweighs what was typed before it."""
+        if self._keyboard is not None and self._request != "stop":
             try:
-                wishes = {_WISHES.get(key, "") for key in self._keyboard.typed()}
+                requests = {_KEY_REQUESTS.get(key, "") for key in self._keyboard.read_keys()}
             except (KeyboardInterrupt, UserError):  # Ctrl-C, or the terminal has gone
-                wishes = {"stop"}
-            self._asked = "stop" if "stop" in wishes else max(wishes, default="") or self._asked
-        return self._asked
+                requests = {"stop"}
+            self._request = (
+                "stop" if "stop" in requests else max(requests, default="") or self._request
+            )
+        return self._request
 
-    def show(self, view: View) -> None:
-        """See Deployment."""
-        self._count += 1
-        if self._count % _REFRESH or not sys.stdout.isatty():
+    def show_tick(self, status: TickStatus) -> None:
+        """See ControlLoop."""
+        self._tick_count += 1
+        if self._tick_count % _TICKS_PER_LINE or not sys.stdout.isatty():
             return
-        state, sensed = view.state, view.sensed
-        acted = ", ".join(state.acted)
-        mode = state.mode if state.mode is not Mode.MOVE or not acted else f"{state.mode} ({acted})"
+        state, sensed = status.state, status.sensed
+        active_limits = ", ".join(state.active_limits)
+        mode = (
+            state.mode
+            if state.mode is not Mode.MOVE or not active_limits
+            else f"{state.mode} ({active_limits})"
+        )
         force = float(np.linalg.norm(sensed.arm.wrench[:3]))
-        cost = "" if view.cost is None else f"cost {view.cost:5.2f}"
+        cost = "" if status.cost is None else f"cost {status.cost:5.2f}"
         line = (
-            f"{view.seconds:6.1f} s  {mode:<24}  {force:5.1f} N  gel {1e3 * sensed.touch.max():3.1f} mm  gripper {1e3 * view.width:3.0f} mm"
-            f"  pictures {1e3 * sensed.age:4.0f} ms  late {1e3 * view.late:4.1f} ms  {cost}"
+            f"{status.seconds:6.1f} s  {mode:<24}  {force:5.1f} N  gel {1e3 * sensed.indentation.max():3.1f} mm  gripper {1e3 * status.width:3.0f} mm"
+            f"  pictures {1e3 * sensed.age:4.0f} ms  late {1e3 * status.late:4.1f} ms  {cost}"
         )
         print(f"\r{line[:118]:<118}", end="", flush=True)
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Keys and signals are taken as wishes while this lasts, and then as before."""
-        before = {number: signal.signal(number, self._signalled) for number in _SIGNALS}
+        """Keys and signals are taken as requests while this lasts, and then as before."""
+        before = {number: signal.signal(number, self._on_signal) for number in _SIGNALS}
         try:
             with self._keyboard or nullcontext():
                 yield
@@ -65,5 +71,5 @@ class Terminal:
             if sys.stdout.isatty():
                 print()
 
-    def _signalled(self, *_: Any) -> None:
-        self._asked = "stop"
+    def _on_signal(self, *_: Any) -> None:
+        self._request = "stop"

@@ -15,16 +15,16 @@ from touchgoal.encoders.ssl import frames as touch_frames
 from touchgoal.encoders.ssl.mae import MaeConfig, train_mae
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.episodes.touches import collect
+from touchgoal.episodes.touches import collect_touches
 from touchgoal.launch.run_folder import open_run
-from touchgoal.rewards.embedding_distance import EpisodeEmbedder, fit_scale
+from touchgoal.rewards.embedding_distance import EpisodeEmbedder, fit_normalizer
 
 
 @dataclass(frozen=True)
 class Align:
     """Options of train-encoder align."""
 
-    episodes: Path
+    data: Path
     """Set of episodes to learn from."""
     validation: Path
     """Set of other episodes, by which the best epoch is chosen."""
@@ -34,7 +34,7 @@ class Align:
     """Frozen image and text towers: offline, or a CLIP as Hugging Face id or local directory."""
     contact_frames: int = 24
     """Frames in contact taken from each episode."""
-    idle_frames: int = 8
+    no_contact_frames: int = 8
     """Frames without contact taken from each episode."""
     scale_episodes: int = 40
     """Successful training episodes that fix the scale of the costs (encoder/scale.json)."""
@@ -56,12 +56,12 @@ class AlignPaper(Align):
 class Mae:
     """Options of train-encoder mae."""
 
-    episodes: Path
+    data: Path
     """Set of episodes to learn from."""
     validation: Path
     """Set of other episodes, on which losses are measured."""
     out: Path | None = None
-    """Folder of the run; the trunk goes to its `encoder/`."""
+    """Folder of the run; the backbone goes to its `encoder/`."""
     frames: int = 40
     """Ticks drawn from each episode, both fingertips of each."""
     resume: bool = False
@@ -88,12 +88,12 @@ def main(config: Align | Mae) -> None:
 
 
 def _train_mae(config: Mae) -> None:
-    sets = EpisodeSet(config.episodes), EpisodeSet(config.validation)
+    sets = EpisodeSet(config.data), EpisodeSet(config.validation)
     out = open_run(config.out, "train-encoder", config)
     mae = config.mae
-    train, val = (touch_frames.draw(s, mae.sensor, config.frames, mae.seed) for s in sets)
+    train, val = (touch_frames.sample_frames(s, mae.sensor, config.frames, mae.seed) for s in sets)
     train_mae(train, val, mae, out, _recipe(*sets), config.resume)
-    print(f"trunk: {out / 'encoder'}")
+    print(f"backbone: {out / 'encoder'}")
 
 
 def _recipe(episodes: EpisodeSet, validation: EpisodeSet) -> dict[str, Any]:
@@ -107,14 +107,14 @@ def _recipe(episodes: EpisodeSet, validation: EpisodeSet) -> dict[str, Any]:
 
 def _align(config: Align) -> None:
     """Cut touches from the episodes, train, fit the scale of the costs."""
-    episodes, validation = EpisodeSet(config.episodes), EpisodeSet(config.validation)
+    episodes, validation = EpisodeSet(config.data), EpisodeSet(config.validation)
     for s in (episodes, validation):
         for i in range(len(s)):
             touch_frames.check_sensor(s, i, config.align.sensor)
     towers = load_towers(config.towers)
     out = open_run(config.out, "train-encoder", config)
     train, val = (
-        collect(s, config.contact_frames, config.idle_frames, config.align.seed)
+        collect_touches(s, config.contact_frames, config.no_contact_frames, config.align.seed)
         for s in (episodes, validation)
     )
     print(f"{len(train)} touches of {len(train.descriptions)} objects; {len(val)} for validation")
@@ -126,5 +126,5 @@ def _align(config: Align) -> None:
         embedder.embed_episode(episodes.read(i), episodes.fps, f"{episodes.root}#{i}")
         for i in tqdm(chosen[: config.scale_episodes], desc="scale", unit="episode")
     ]
-    fit_scale(embedded, ("image", "tactile", "text")).save(out / "encoder" / "scale.json")
+    fit_normalizer(embedded, ("image", "tactile", "text")).save(out / "encoder" / "scale.json")
     print(f"encoder and scale: {out / 'encoder'}")

@@ -13,16 +13,20 @@ from touchgoal.encoders import pretrained
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies.perception.frozen_touch import load_touch
-from touchgoal.policies.perception.placements import place
-from touchgoal.policies.perception.pose_estimator import SightConfig
-from touchgoal.policies.perception.state_estimation import SensesConfig, SensesNetwork, save_senses
+from touchgoal.policies.perception.placements import render_placements
+from touchgoal.policies.perception.pose_estimator import PoseEstimatorConfig
+from touchgoal.policies.perception.state_estimation import (
+    StateEstimatorConfig,
+    StateEstimatorNetwork,
+    save_estimator,
+)
 from touchgoal.policies.perception.training import (
-    LearnConfig,
-    felt,
-    judge_contact,
-    judge_sight,
-    learn_contact,
-    learn_sight,
+    EstimatorTrainConfig,
+    contact_error_rate,
+    embed_touch_and_contact,
+    pose_errors,
+    train_contact_estimator,
+    train_pose_estimator,
 )
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 
@@ -33,22 +37,22 @@ _SEED, _VALIDATION_SEED = 4_000_000, 4_900_000  # of the things placed
 class Config:
     """Options of train-estimators."""
 
-    episodes: Path
+    data: Path
     """Set of pick-and-place episodes with touch, to learn contact from."""
     validation: Path
     """Set of other episodes, on which contact is judged."""
     out: Path | None = None
     """Folder of the run; the senses go to its `senses/`."""
-    touch: Path = pretrained.SHIPPED
+    encoder: Path = pretrained.SHIPPED
     """Folder of a frozen touch encoder (train-encoder). It is not copied: the shipped one is found
     again, another one is to be put into the senses' `touch/`."""
-    things: int = 600
+    objects: int = 600
     """Objects to look at, of random kind and size."""
-    places: int = 20
+    placements: int = 20
     """On the table, for each of them."""
-    sight: SightConfig = SightConfig()
+    pose_estimator: PoseEstimatorConfig = PoseEstimatorConfig()
     """The network that looks."""
-    learn: LearnConfig = LearnConfig()
+    train: EstimatorTrainConfig = EstimatorTrainConfig()
     """The training."""
     env: PickPlaceConfig = field(default_factory=PickPlaceConfig)
     """Options of the task."""
@@ -58,26 +62,32 @@ class Config:
 
 def main(config: Config) -> None:
     """Place, embed, train, judge."""
-    touch = load_touch(config.touch)
+    touch = load_touch(config.encoder)
     out = open_run(config.out, "train-estimators", config)
-    torch.manual_seed(config.learn.seed)
-    network = SensesNetwork(SensesConfig(touch.name, touch.dim, config.sight))
-    sets = EpisodeSet(config.episodes), EpisodeSet(config.validation)
-    rows, validation = (felt(episodes, touch, config.workers) for episodes in sets)
-    learn_contact(network, *rows, config.learn)
-    errors: dict = {"contact": judge_contact(network, *validation)}
-    cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key, _ in config.sight.windows)
-    size = config.sight.size
-    env = replace(config.env, tactile=False, cameras=cameras, camera_size=size)
-    learn_sight(
-        network.sight,
-        place(env, config.things, config.places, _SEED, config.workers),
-        config.learn,
+    torch.manual_seed(config.train.seed)
+    network = StateEstimatorNetwork(
+        StateEstimatorConfig(touch.name, touch.dim, config.pose_estimator)
     )
-    others = place(env, max(1, config.things // 8), 5, _VALIDATION_SEED, config.workers)
-    errors |= judge_sight(network.sight, others)
+    sets = EpisodeSet(config.data), EpisodeSet(config.validation)
+    rows, validation = (
+        embed_touch_and_contact(episodes, touch, config.workers) for episodes in sets
+    )
+    train_contact_estimator(network, *rows, config.train)
+    errors: dict = {"contact": contact_error_rate(network, *validation)}
+    cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key, _ in config.pose_estimator.crops)
+    size = config.pose_estimator.size
+    env = replace(config.env, tactile=False, cameras=cameras, camera_size=size)
+    train_pose_estimator(
+        network.sight,
+        render_placements(env, config.objects, config.placements, _SEED, config.workers),
+        config.train,
+    )
+    others = render_placements(
+        env, max(1, config.objects // 8), 5, _VALIDATION_SEED, config.workers
+    )
+    errors |= pose_errors(network.sight, others)
     recipe = {"command": shlex.join(["touchgoal", *sys.argv[1:]]), "errors": errors}
-    save_senses(network, out / "senses", recipe)
+    save_estimator(network, out / "senses", recipe)
     write_json(out / "metrics.json", errors)
     print(f"contact: {errors['contact']:.2%} of ticks misread")
     for name, (middle, most) in list(errors.items())[1:]:

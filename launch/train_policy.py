@@ -15,19 +15,19 @@ from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies import checkpoint
-from touchgoal.policies.acting import ActorMaker
-from touchgoal.policies.actions import Representation
+from touchgoal.policies.acting import SavedPolicy
+from touchgoal.policies.actions import ActionRepresentation
 from touchgoal.policies.evaluation import bead_maze as maze_trials
 from touchgoal.policies.evaluation import pick_place as rollout
 from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.heads.samplers import SamplerConfig
 from touchgoal.policies.heads.unet import PRESETS
-from touchgoal.policies.perception.end_to_end import EyeConfig
+from touchgoal.policies.perception.end_to_end import EndToEndConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
-from touchgoal.policies.perception.state_estimation import READ, load_senses
+from touchgoal.policies.perception.state_estimation import ESTIMATED, load_estimator
 from touchgoal.policies.policy import PolicyConfig, TouchReading
 from touchgoal.policies.training.model_selection import Score, add_parts, select
-from touchgoal.policies.training.sequence_dataset import Windows, read
+from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
 from touchgoal.policies.training.train import POLICY, TrainConfig, train
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
@@ -43,13 +43,13 @@ _TRIALS = 2_000_000  # seed of the first trial
 class Config:
     """Options of train-policy."""
 
-    episodes: Path
+    data: Path
     """Set of episodes to learn from: successful ones, and those in which a learner was corrected."""
     validation: Path
     """Set of other episodes, on which losses are measured."""
     task: Literal["pick-place", "bead-maze"] = "bead-maze"
     """Where snapshots are tried."""
-    touch: Path | None = None
+    encoder: Path | None = None
     """Folder of a frozen touch encoder (train-encoder); without one the policy does not feel."""
     end_to_end: bool = False
     """Feel through a touch ViT that is trained along, instead of a frozen encoder."""
@@ -64,16 +64,16 @@ class Config:
     """Size of the diffusion's U-Net, or regression instead."""
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     """How the diffusion is trained and sampled."""
-    representation: Representation = "tool"
-    """Of the actions while learning; "tool" also sees along the hand's own axes, and does not go
-    with senses: choose "hand" there."""
+    representation: ActionRepresentation = "body_twist"
+    """Of the actions while learning; "body_twist" also sees along the hand's own axes, and does not go
+    with senses: choose "base_twist" there."""
     touch_reading: TouchReading = "wrench"
     """What the policy makes of a frozen embedding: the wrench on the pads, or anything ("free")."""
-    touch_width: int = 64
+    touch_projection_dim: int = 64
     """Numbers to which a frozen embedding is projected, if freely, see `PolicyConfig`."""
     touch_noise: float = 0.1
     """Of frozen embeddings while learning, see `PolicyConfig`."""
-    place_noise: float = 0.3
+    position_noise: float = 0.3
     """Of joint and TCP positions while learning, if they are seen, see `PolicyConfig`."""
     observation_horizon: int = 2
     """Ticks seen."""
@@ -99,23 +99,26 @@ def main(config: Config) -> None:
         raise UserError("to resume a run, name its folder with --out")
     if not 0 < config.share <= 1:
         raise UserError("share must be above 0 and at most 1")
-    if config.end_to_end and config.touch:
+    if config.end_to_end and config.encoder:
         raise UserError("end-to-end touch takes no frozen encoder: leave it out")
     parts = {
         name: folder
-        for name, folder in ((checkpoint.TOUCH, config.touch), (checkpoint.SENSES, config.senses))
+        for name, folder in (
+            (checkpoint.TOUCH, config.encoder),
+            (checkpoint.ESTIMATOR, config.senses),
+        )
         if folder
     }
     if config.senses:
-        load_senses(config.senses)
-    touch = load_touch(config.touch) if config.touch else None
-    sets = EpisodeSet(config.episodes), EpisodeSet(config.validation)
+        load_estimator(config.senses)
+    touch = load_touch(config.encoder) if config.encoder else None
+    sets = EpisodeSet(config.data), EpisodeSet(config.validation)
     policy = _policy_config(config, sets[0], touch)
     out = open_run(config.out, "train-policy", config)
     chosen = [_instructive(s) for s in sets]
     chosen[0] = chosen[0][: max(1, round(config.share * len(chosen[0])))]
     windows, validation = (
-        Windows(read(s, rows, policy, touch, config.workers), policy)
+        SequenceDataset(load_recordings(s, rows, policy, touch, config.workers), policy)
         for s, rows in zip(sets, chosen, strict=True)
     )
     print(f"{len(windows)} windows of {len(chosen[0])} episodes; {len(validation)} for validation")
@@ -142,11 +145,11 @@ def _policy_config(
         touch_dim=touch.dim if touch else 0,
         touch=touch.name if touch else "",
         touch_reading=config.touch_reading,
-        touch_width=config.touch_width,
+        touch_projection_dim=config.touch_projection_dim,
         touch_noise=config.touch_noise,
-        place_noise=config.place_noise,
-        eye=EyeConfig() if config.end_to_end else None,
-        proprioception=_COLUMNS + (ft.WRENCH, *READ) if config.senses else _COLUMNS,
+        position_noise=config.position_noise,
+        end_to_end=EndToEndConfig() if config.end_to_end else None,
+        proprioception=_COLUMNS + (ft.WRENCH, *ESTIMATED) if config.senses else _COLUMNS,
         representation=config.representation,
         observation_horizon=config.observation_horizon,
         execution_horizon=config.execution_horizon,
@@ -163,13 +166,13 @@ def _instructive(episodes: EpisodeSet) -> list[int]:
 
 
 def _try(config: Config, directory: Path) -> Score:
-    maker = ActorMaker(directory)
+    maker = SavedPolicy(directory)
     if config.task == "bead-maze":
         wires = choose(config.maze.split, config.trials, config.maze.families)
         jobs = maze_trials.trials_of(wires, _TRIALS)
-        trials = maze_trials.evaluate(maker.observing(config.maze), maker, jobs, config.workers)
+        trials = maze_trials.evaluate(maker.env_config(config.maze), maker, jobs, config.workers)
     else:
         jobs = rollout.demonstrations_of(list(CATALOGUE), config.trials, _TRIALS)
-        trials = rollout.evaluate(maker.observing(config.env), maker, jobs, config.workers)
+        trials = rollout.evaluate(maker.env_config(config.env), maker, jobs, config.workers)
     success = float(np.mean([t.success for t in trials]))
     return success, float(np.mean([t.progress for t in trials]))

@@ -9,7 +9,7 @@ diffusion_policy's real-robot tasks). On a CPU this is a matter of days.
 from dataclasses import dataclass, field
 
 from touchgoal.launch import train_policy
-from touchgoal.policies.actions import Representation
+from touchgoal.policies.actions import ActionRepresentation
 from touchgoal.policies.heads.samplers import SamplerConfig
 from touchgoal.policies.policy import TouchReading
 from touchgoal.policies.training.train import TrainConfig
@@ -22,18 +22,20 @@ class Config(train_policy.Config):
     head: train_policy.Head = "published"
     """Size of the diffusion's U-Net."""
     sampler: SamplerConfig = field(
-        default_factory=lambda: SamplerConfig("ddpm", "epsilon", train_steps=100, plan_steps=100)
+        default_factory=lambda: SamplerConfig(
+            "ddpm", "epsilon", num_train_timesteps=100, num_inference_steps=100
+        )
     )
     """How the diffusion is trained and sampled."""
-    representation: Representation = "delta"
+    representation: ActionRepresentation = "delta"
     """Of the actions while learning."""
     touch_reading: TouchReading = "free"
     """What the policy makes of a frozen embedding."""
-    touch_width: int = 256
+    touch_projection_dim: int = 256
     """Numbers to which a frozen embedding is projected."""
     touch_noise: float = 0.0
     """Of frozen embeddings while learning; none in the paper."""
-    place_noise: float = 0.0
+    position_noise: float = 0.0
     """Of joint and TCP positions while learning; none in the paper."""
     execution_horizon: int = 8
     """Ticks of a plan that are done before the next one."""

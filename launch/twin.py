@@ -1,7 +1,7 @@
 """Serve the simulated cell over the robot's and the sensors' own wire protocols.
 
 Any libfranka or RTDE client, any MJPEG reader and any serial client can drive it. It runs until
-Ctrl-C; where everything is stands in a table and in `rig.json`.
+Ctrl-C; where everything is stands in a table and in `cell.json`.
 """
 
 import signal
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from touchgoal.launch.run_folder import open_run, write_json
-from touchgoal.sim_envs.base import STREAMED
+from touchgoal.sim_envs.base import STREAM_SIZE
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
@@ -37,12 +37,12 @@ class Config:
     wire: str = ""
     """bead-maze: which wire, such as helix-17; default: drawn."""
     out: Path | None = None
-    """Folder of the run: rig.json, serial devices."""
-    env: PickPlaceConfig = field(default_factory=lambda: PickPlaceConfig(camera_size=STREAMED))
+    """Folder of the run: cell.json, serial devices."""
+    env: PickPlaceConfig = field(default_factory=lambda: PickPlaceConfig(camera_size=STREAM_SIZE))
     """Options of pick-place."""
     maze: BeadMazeConfig = field(
         default_factory=lambda: BeadMazeConfig(
-            cameras=("front", "wrist"), camera_size=STREAMED, split="validation", n_wires=20
+            cameras=("front", "wrist"), camera_size=STREAM_SIZE, split="validation", n_wires=20
         )
     )
     """Options of bead-maze."""
@@ -71,8 +71,11 @@ def main(config: Config) -> None:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
-    write_json(out / "rig.json", twin.rig)
-    print(table(twin.rig) + f"\n{'rig file':<18}{out / 'rig.json'}\nCtrl-C ends it.", flush=True)
+    write_json(out / "cell.json", twin.description)
+    print(
+        table(twin.description) + f"\n{'cell file':<18}{out / 'cell.json'}\nCtrl-C ends it.",
+        flush=True,
+    )
     try:
         twin.run()
     finally:
@@ -80,10 +83,10 @@ def main(config: Config) -> None:
     print("\nstopped")
 
 
-def table(rig: dict) -> str:
+def table(cell: dict) -> str:
     """Where everything is."""
-    lines = {"task": rig["instruction"], f"arm ({rig['arm']})": rig["address"]}
-    lines["gripper"] = rig["gripper"].get("port") or rig["gripper"]["address"]
-    lines |= {key.rpartition(".")[2]: address for key, address in rig["images"].items()}
-    lines |= {"load cell": rig["load_cell"]["port"], "faults": rig["faults"]}
+    lines = {"task": cell["instruction"], f"arm ({cell['arm']})": cell["address"]}
+    lines["gripper"] = cell["gripper"].get("port") or cell["gripper"]["address"]
+    lines |= {key.rpartition(".")[2]: address for key, address in cell["images"].items()}
+    lines |= {"load cell": cell["load_cell"]["port"], "faults": cell["faults"]}
     return "\n".join(f"{name:<18}{where}" for name, where in lines.items())

@@ -14,10 +14,10 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.policies import checkpoint
-from touchgoal.policies.perception.end_to_end import shrink
+from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
-from touchgoal.policies.perception.state_estimation import Senses, load_senses
-from touchgoal.policies.policy import Condition, Policy, PolicyConfig
+from touchgoal.policies.perception.state_estimation import StateEstimator, load_estimator
+from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
 from touchgoal.sim_envs.base import EnvConfig
 
 _WEIGHTS = Path(__file__).parent / "weights"
@@ -29,13 +29,13 @@ Observation = Mapping[str, np.ndarray]
 
 
 @runtime_checkable
-class Reads(Protocol):
+class Estimator(Protocol):
     """Senses, or what stands for them."""
 
-    def read(
+    def estimate(
         self, observation: Observation, first: Observation
     ) -> dict[str, Float32[np.ndarray, " n"]]:
-        """See Senses."""
+        """See StateEstimator."""
         ...
 
 
@@ -49,7 +49,7 @@ class Planner:
         self,
         policy: Policy,
         touch: TouchEmbedder | None,
-        senses: Reads | None = None,
+        estimator: Estimator | None = None,
         seed: int = 0,
     ) -> None:
         """For one episode.
@@ -57,7 +57,7 @@ class Planner:
         Args:
             policy: for inference.
             touch: embedder of the training; None for a policy without touch.
-            senses: that read the columns which only a simulator knows; None if there are none.
+            estimator: that read the columns which only a simulator knows; None if there are none.
             seed: of the plans' noise.
 
         Raises:
@@ -69,12 +69,12 @@ class Planner:
                 f"the policy feels through {config.touch!r}, not {touch.name if touch else ''!r}: "
                 "load the touch encoder that it was trained with"
             )
-        if config.perceived and senses is None:
-            raise UserError(f"the policy acts on {config.perceived[0]}: give it senses to read it")
-        self._policy, self.touch, self._senses = policy, touch, senses
+        if config.estimated and estimator is None:
+            raise UserError(f"the policy acts on {config.estimated[0]}: give it senses to read it")
+        self._policy, self.touch, self._estimator = policy, touch, estimator
         self._generator = torch.Generator().manual_seed(seed)
         self._first: Observation = {}
-        self._known: list[tuple[Observation, np.ndarray, np.ndarray]] = []
+        self._embedded: list[tuple[Observation, np.ndarray, np.ndarray]] = []
 
     def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]:
         """Actions from the latest observation on.
@@ -83,38 +83,41 @@ class Planner:
             seen: the last `observation_horizon` observations, oldest first. The oldest one of the
                 first call is the episode's first, untouched one.
         """
-        self.sense(seen)
-        _, touch, state = zip(*self._known, strict=True)
+        self.embed(seen)
+        _, touch, state = zip(*self._embedded, strict=True)
         touch, state = (torch.from_numpy(np.stack(x)).float()[None] for x in (touch, state))
-        condition = Condition(touch, state, self._look(seen[-1]))
-        return self._policy.plan(condition, self._generator)[0].numpy()
+        batch = ObservationBatch(touch, state, self._difference_images(seen[-1]))
+        return self._policy.plan(batch, self._generator)[0].numpy()
 
-    def sense(self, seen: Sequence[Observation]) -> None:
+    def embed(self, seen: Sequence[Observation]) -> None:
         """Embed these ahead of a `plan` that begins with some of them: most of the work."""
         self._first = self._first or seen[0]
-        self._known = [(observation, *self._sense(observation)) for observation in seen]
+        self._embedded = [(observation, *self._embed_tick(observation)) for observation in seen]
 
-    def _sense(self, observation: Observation) -> tuple[np.ndarray, np.ndarray]:
+    def _embed_tick(self, observation: Observation) -> tuple[np.ndarray, np.ndarray]:
         """The embedding (e,) and the proprioception (s,) of one tick."""
-        for before, touch, state in self._known:
+        for before, touch, state in self._embedded:
             if before is observation:
                 return touch, state
         known = dict(observation)
-        if self._senses:
-            known |= self._senses.read(observation, self._first)
+        if self._estimator:
+            known |= self._estimator.estimate(observation, self._first)
         state = np.concatenate([known[key] for key in self.config.proprioception])
-        return self._feel(observation), state
+        return self._embed_touch(observation), state
 
-    def _feel(self, observation: Observation) -> Float32[np.ndarray, " e"]:
+    def _embed_touch(self, observation: Observation) -> Float32[np.ndarray, " e"]:
         if self.touch is None:
             return np.empty(0, np.float32)
         return self.touch.embed_tick(observation, self._first)
 
-    def _look(self, observation: Observation) -> UInt8[Tensor, "1 k h w 3"] | None:
-        eye = self.config.eye
-        if eye is None:
+    def _difference_images(self, observation: Observation) -> UInt8[Tensor, "1 k h w 3"] | None:
+        end_to_end = self.config.end_to_end
+        if end_to_end is None:
             return None
-        pictures = [shrink(observation[k][None], self._first[k], eye.size) for k in ft.TACTILE]
+        pictures = [
+            difference_images(observation[k][None], self._first[k], end_to_end.size)
+            for k in ft.TACTILE
+        ]
         return torch.from_numpy(np.stack(pictures, 1))
 
 
@@ -169,7 +172,7 @@ class PolicyActor:
 
 
 @dataclass(frozen=True)
-class ActorMaker:
+class SavedPolicy:
     """Makes actors of a policy on disk, in any process.
 
     Attributes:
@@ -188,34 +191,34 @@ class ActorMaker:
     def planner(self) -> Planner:
         """What makes its plans in one episode."""
         policy = checkpoint.load(self.directory)
-        return Planner(policy, self._touch(policy.config), self._senses(policy.config))
+        return Planner(policy, self._touch(policy.config), self._estimator(policy.config))
 
-    def checked(self, task: EnvConfig) -> "ActorMaker":
+    def check_task(self, task: EnvConfig) -> "SavedPolicy":
         """Itself; UserError if the policy cannot act in the task."""
         policy = checkpoint.load(self.directory, control_hz=task.control_hz)
-        touch, senses = self._touch(policy.config), self._senses(policy.config)
+        touch, estimator = self._touch(policy.config), self._estimator(policy.config)
         sensor = find_sensor(task.scene.sensor).name
-        for embedder in (touch, senses and senses.touch):
+        for embedder in (touch, estimator and estimator.touch):
             if embedder and embedder.sensor != sensor:
                 raise UserError(
                     f"the policy in {self.directory} feels with {embedder.sensor}, the task has "
                     f"{sensor}: choose that sensor for the scene"
                 )
-        PolicyActor(Planner(policy, touch, senses), self.latency)
+        PolicyActor(Planner(policy, touch, estimator), self.latency)
         return self
 
-    def observing(self, task: Task) -> Task:
+    def env_config(self, task: Task) -> Task:
         """The task with the pictures that the policy looks at, and no others."""
         config = checkpoint.load(self.directory).config
-        senses = self._senses(config)
-        keys = senses.cameras if senses else ()
-        felt = config.touch_dim > 0 or config.eye is not None or senses is not None
+        estimator = self._estimator(config)
+        keys = estimator.cameras if estimator else ()
+        needs_touch = config.touch_dim > 0 or config.end_to_end is not None or estimator is not None
         cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key in keys)
-        task = replace(task, tactile=felt, cameras=cameras)
-        return replace(task, camera_size=senses.camera_size) if senses else task
+        task = replace(task, tactile=needs_touch, cameras=cameras)
+        return replace(task, camera_size=estimator.camera_size) if estimator else task
 
     def _touch(self, config: PolicyConfig) -> TouchEmbedder | None:
         return load_touch(self.directory / checkpoint.TOUCH) if config.touch_dim else None
 
-    def _senses(self, config: PolicyConfig) -> Senses | None:
-        return load_senses(self.directory / checkpoint.SENSES) if config.perceived else None
+    def _estimator(self, config: PolicyConfig) -> StateEstimator | None:
+        return load_estimator(self.directory / checkpoint.ESTIMATOR) if config.estimated else None

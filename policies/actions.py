@@ -1,7 +1,7 @@
 """What a policy predicts of a chunk of actions, and the scales it learns in.
 
 An action (8,) is the joint change (7) of one tick, rad, and the gripper width target, m
-(`vocabulary.ACTION`). A chunk is the actions of h ticks from the latest observation on.
+(`features.ACTION`). A chunk is the actions of h ticks from the latest observation on.
 """
 
 from functools import cache
@@ -17,7 +17,7 @@ from touchgoal.control.features import N_JOINTS
 from touchgoal.control.motion.kinematics import Fr3Kinematics
 
 ACTION_DIM = N_JOINTS + 1
-Representation = Literal["delta", "chunk", "absolute", "hand", "tool"]
+ActionRepresentation = Literal["delta", "chunk", "absolute", "base_twist", "body_twist"]
 """Of the joints: each tick's change; the change since the chunk's start; the joint positions that
 these changes lead to from the measured ones; the hand's displacement and turn since the chunk's start
 (m, rad, base frame, to first order) with the third joint's change for the elbow, which is nearly the
@@ -25,56 +25,56 @@ same wherever on the table the hand does the same; the hand's displacement and t
 the elbow going where the joints move least. The gripper's width is a target in all five."""
 
 _DAMPING = 1e-6  # m^2, as in inverse kinematics
-_CONSTANT = 1e-6  # in SI units: smaller than anything that a policy should learn to vary
+_MIN_RANGE = 1e-6  # in SI units: smaller than anything that a policy should learn to vary
 
 
-def represent(
-    actions: Float[Tensor, "b h 8"], joints: Float[Tensor, "b 7"], kind: Representation
+def to_representation(
+    actions: Float[Tensor, "b h 8"], joints: Float[Tensor, "b 7"], kind: ActionRepresentation
 ) -> Float[Tensor, "b h 8"]:
     """Actions in a representation; `joints` (rad) are those measured at the chunk's start."""
     if kind == "delta":
         return actions
     targets = actions[..., :N_JOINTS].cumsum(1)
-    if kind == "hand":
-        targets = targets @ _hand(joints).mT
-    if kind == "tool":
-        targets = F.pad(targets @ along_the_hand(joints).mT, (0, 1))
+    if kind == "base_twist":
+        targets = targets @ _base_jacobian_and_elbow(joints).mT
+    if kind == "body_twist":
+        targets = F.pad(targets @ body_jacobian(joints).mT, (0, 1))
     if kind == "absolute":
         targets = joints[:, None] + targets
     return torch.cat([targets, actions[..., N_JOINTS:]], -1)
 
 
 def to_actions(
-    represented: Float[Tensor, "b h 8"], joints: Float[Tensor, "b 7"], kind: Representation
+    represented: Float[Tensor, "b h 8"], joints: Float[Tensor, "b 7"], kind: ActionRepresentation
 ) -> Float[Tensor, "b h 8"]:
-    """The inverse of `represent`."""
+    """The inverse of `to_representation`."""
     if kind == "delta":
         return represented
     targets = represented[..., :N_JOINTS]
-    if kind == "hand":
-        targets = torch.linalg.solve(_hand(joints), targets.mT).mT
-    if kind == "tool":
-        targets = targets[..., :6] @ _least_motion(along_the_hand(joints)).mT
+    if kind == "base_twist":
+        targets = torch.linalg.solve(_base_jacobian_and_elbow(joints), targets.mT).mT
+    if kind == "body_twist":
+        targets = targets[..., :6] @ _damped_pseudoinverse(body_jacobian(joints)).mT
     start = joints if kind == "absolute" else torch.zeros_like(joints)
     changes = torch.cat([targets[:, :1] - start[:, None], targets.diff(dim=1)], 1)
     return torch.cat([changes, represented[..., N_JOINTS:]], -1)
 
 
-def _hand(joints: Float[Tensor, "b 7"]) -> Float[Tensor, "b 7 7"]:
+def _base_jacobian_and_elbow(joints: Float[Tensor, "b 7"]) -> Float[Tensor, "b 7 7"]:
     """From small changes of the joints to the hand's displacement, its turn, the third joint's."""
     rows, _ = _kinematics().jacobians(joints.cpu().numpy().astype(np.float64))
     elbow = torch.eye(N_JOINTS)[2].expand(len(rows), 1, -1)
     return torch.cat([torch.from_numpy(rows).float(), elbow], 1).to(joints)
 
 
-def along_the_hand(joints: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 6 7"]:
+def body_jacobian(joints: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 6 7"]:
     """From small changes of the joints to the TCP's displacement and turn along the TCP's axes."""
     J, R = _kinematics().jacobians(joints.reshape(-1, N_JOINTS).cpu().numpy().astype(np.float64))
     own = R.mT[:, None] @ J.reshape(-1, 2, 3, N_JOINTS)
     return torch.from_numpy(own).float().to(joints).reshape(*joints.shape[:-1], 6, N_JOINTS)
 
 
-def _least_motion(J: Float[Tensor, "b 6 7"]) -> Float[Tensor, "b 7 6"]:
+def _damped_pseudoinverse(J: Float[Tensor, "b 6 7"]) -> Float[Tensor, "b 7 6"]:
     """From a displacement and turn to the least change of the joints, damped where none will do."""
     return J.mT @ torch.linalg.inv(J @ J.mT + _DAMPING * torch.eye(6).to(J))
 
@@ -84,7 +84,7 @@ def _kinematics() -> Fr3Kinematics:
     return Fr3Kinematics()
 
 
-class Scale(nn.Module):
+class Normalizer(nn.Module):
     """An affine map of every component to the range that a network likes, and back.
 
     A component that was constant becomes 0, and comes back as the constant.
@@ -104,7 +104,7 @@ class Scale(nn.Module):
         low, high = values.amin(0), values.amax(0)
         self._set((low + high) / 2, (high - low) / 2)
 
-    def fit_spread(self, values: Float[Tensor, "n ..."]) -> None:
+    def fit_mean_std(self, values: Float[Tensor, "n ..."]) -> None:
         """From now on, these values become ones of mean 0 and variance 1."""
         self._set(values.mean(0), values.std(0, correction=0))
 
@@ -119,4 +119,4 @@ class Scale(nn.Module):
 
     def _set(self, centre: Tensor, size: Tensor) -> None:
         self.centre.copy_(centre)
-        self.size.copy_(torch.where(size < _CONSTANT, 0.0, size))
+        self.size.copy_(torch.where(size < _MIN_RANGE, 0.0, size))

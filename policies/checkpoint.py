@@ -5,15 +5,15 @@ from pathlib import Path
 from typing import Any
 
 from touchgoal.control.errors import UserError
-from touchgoal.encoders.training.weights import Stored
+from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.heads.samplers import SamplerConfig
 from touchgoal.policies.heads.unet import UNetConfig
-from touchgoal.policies.perception.end_to_end import EyeConfig
+from touchgoal.policies.perception.end_to_end import EndToEndConfig
 from touchgoal.policies.policy import Policy, PolicyConfig
 
-TOUCH, SENSES = "touch", "senses"  # folders beside the weights: of the touch encoder, of senses
-POLICY = Stored("policy", "policy", "train one with: touchgoal train-policy")
+TOUCH, ESTIMATOR = "touch", "senses"  # folders beside the weights: of the touch encoder, of senses
+POLICY = WeightsFormat("policy", "policy", "train one with: touchgoal train-policy")
 
 
 def save(policy: Policy, directory: Path, provenance: dict[str, Any]) -> None:
@@ -50,14 +50,14 @@ def load(directory: Path, control_hz: int | None = None) -> Policy:
             f"at its own rate, or {POLICY.remedy}"
         )
     policy = Policy(config)
-    POLICY.fill(policy, directory)
+    POLICY.load_weights(policy, directory)
     return policy
 
 
 def _config(fields: dict[str, Any]) -> PolicyConfig:
     head = fields.pop("head")
-    if eye := fields.pop("eye", None):
-        fields["eye"] = EyeConfig(**eye | {"size": tuple(eye["size"])})
+    if end_to_end := fields.pop("end_to_end", None):
+        fields["end_to_end"] = EndToEndConfig(**end_to_end | {"size": tuple(end_to_end["size"])})
     fields["proprioception"] = tuple(fields["proprioception"])
     return PolicyConfig(**fields, head=_read_head(head))
 

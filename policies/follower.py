@@ -61,7 +61,9 @@ class WireFollower:
         self._target = self._target + tick * (config.speed * heading + config.compliance * across)
         lag = self._target - position
         self._target = position + lag * min(1.0, config.lead / max(np.linalg.norm(lag), 1e-9))
-        wanted = self._kinematics.inverse(self._target, fingers_across(heading), self._command).q
+        wanted = self._kinematics.solve_ik_near(
+            self._target, fingers_across(heading), self._command
+        ).q
         action = np.append(wanted - self._command, 0.0)
         self._command = wanted
         return action

@@ -18,7 +18,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.features import TACTILE, TRUTH_CONTACT
 from touchgoal.episodes.metadata import write_file
 from touchgoal.episodes.schema import Episode
-from touchgoal.episodes.touches import felt_contact
+from touchgoal.episodes.touches import contact_per_frame
 from touchgoal.rewards.metrics import CurveMetrics, measure_curve
 
 FUSED = {"image+tactile": ("image", "tactile"), "image+text": ("image", "text")}
@@ -81,17 +81,17 @@ class Curves:
         return {name: measure_curve(d, self.contact.frame) for name, d in self.values.items()}
 
 
-def yardstick(modality: str, own: bool) -> str:
+def median_name(modality: str, own: bool) -> str:
     """Name of what a distance is scaled by: "image", or "own image" for a goal in the episode."""
     return f"own {modality}" if own else modality
 
 
 @dataclass(frozen=True)
-class Scale:
+class DistanceNormalizer:
     """Where successful training episodes start and end, in raw cosine distance.
 
     n(d) = (d - goal) / (start - goal): 1 at the usual start, 0 at the usual end. There is one pair
-    of medians for each `yardstick`: a modality, with goals from elsewhere or from the own episode.
+    of medians for each `median_name`: a modality, with goals from elsewhere or from the own episode.
 
     Attributes:
         start: median raw distance of the start of a training episode to a goal.
@@ -125,7 +125,7 @@ class Scale:
         """
         normalised = {}
         for m, d in raw.items():
-            name = yardstick(m, m in own)
+            name = median_name(m, m in own)
             if name not in self.start:
                 raise UserError(f"the scale has no '{name}', only {list(self.start)}; fit it again")
             if self.space[m] != space[m]:
@@ -141,7 +141,7 @@ class Scale:
         write_file(path, (json.dumps(asdict(self), indent=2) + "\n").encode())
 
     @classmethod
-    def load(cls, path: Path) -> "Scale":
+    def load(cls, path: Path) -> "DistanceNormalizer":
         """Read what `save` wrote.
 
         Raises:
@@ -158,7 +158,7 @@ class Scale:
         return cls(**content)
 
 
-def with_fused(
+def add_fused_curves(
     normalised: Mapping[str, Float[np.ndarray, " n"]],
 ) -> dict[str, Float[np.ndarray, " n"]]:
     """Normalised single curves and, for each pair of `FUSED` that is there, their mean."""
@@ -197,7 +197,7 @@ def first_contact(episode: Episode) -> Contact:
     sides = [episode.frames[key] for key in TACTILE if key in episode.frames]
     if not sides:
         return Contact(None, "no touch")
-    touching = [felt_contact(side) for side in sides]
+    touching = [contact_per_frame(side) for side in sides]
     return Contact(_first(np.stack(touching, axis=1)), "detected")
 
 

@@ -7,7 +7,7 @@ All distances are cosine distances, 1 - cos, in [0, 2]:
 - text: touch embedding of each fingertip against the projected goal sentence, mean over sides.
 
 Raw distances of different modalities are not comparable (a modality gap keeps touch and text far
-apart even at the goal), so a `Scale`, fitted once on successful training episodes, maps each to 1
+apart even at the goal), so a `DistanceNormalizer`, fitted once on successful training episodes, maps each to 1
 at the usual start and 0 at the usual end. Scaling each episode by its own extremes instead would
 turn the noise of an episode that never touches anything into a perfect curve.
 """
@@ -29,10 +29,10 @@ from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import (
     Contact,
     Curves,
-    Scale,
+    DistanceNormalizer,
+    add_fused_curves,
     first_contact,
-    with_fused,
-    yardstick,
+    median_name,
 )
 from touchgoal.rewards.goals import (
     EpisodeEnd,
@@ -137,7 +137,7 @@ class EpisodeEmbedder:
         if encoder is not None:
             encoder.check_towers(towers)
             encoder.eval()
-            self._space |= dict.fromkeys(("tactile", "text"), _fingerprint(encoder))
+            self._space |= dict.fromkeys(("tactile", "text"), _weights_hash(encoder))
 
     @property
     def space(self) -> Mapping[str, str]:
@@ -202,14 +202,14 @@ class EpisodeEmbedder:
             return self._embed_pictures(spec.read())[0]
         if isinstance(spec, EpisodeEnd):
             return self._embed_pictures(spec.read([self._camera]).frames[self._camera][-1:])[0]
-        return own.image[_own_frame(spec, own)]
+        return own.image[_frame_index(spec, own)]
 
     def _goal_touch(
         self, spec: LastFrame | FrameNumber | EpisodeEnd, own: EmbeddedEpisode
     ) -> Float32[np.ndarray, "sides k"]:
         if isinstance(spec, EpisodeEnd):
             return self._embed_touch(spec.read(own.sides), own.sides, str(spec))[:, -1]
-        return _touch(own)[:, _own_frame(spec, own)]
+        return _touch(own)[:, _frame_index(spec, own)]
 
     def _embed_pictures(self, frames: UInt8[np.ndarray, "n h w 3"]) -> Float32[np.ndarray, "n d"]:
         embeddings = self._towers.embed_images(frames).float()
@@ -237,26 +237,32 @@ def distances(episode: EmbeddedEpisode, goal: EmbeddedGoal) -> dict[str, Float[n
     """Raw cosine distance per frame, for each modality that has a goal."""
     raw = {}
     if goal.image is not None:
-        raw["image"] = _to_pictures(episode.image, goal.image[None])[:, 0]
+        raw["image"] = _image_distances(episode.image, goal.image[None])[:, 0]
     if goal.touch is not None and episode.touch is not None:
-        raw["tactile"] = _to_touches(episode.touch, goal.touch[None])[:, 0]
+        raw["tactile"] = _touch_distances(episode.touch, goal.touch[None])[:, 0]
     if goal.text is not None and episode.touch is not None:
-        raw["text"] = _to_sentences(episode.touch, goal.text[None])[:, 0]
+        raw["text"] = _text_distances(episode.touch, goal.text[None])[:, 0]
     return raw
 
 
-def measure(episode: EmbeddedEpisode, goal: EmbeddedGoal, scale: Scale | None) -> Curves:
+def compute_curves(
+    episode: EmbeddedEpisode, goal: EmbeddedGoal, scale: DistanceNormalizer | None
+) -> Curves:
     """Curves of one trajectory to one goal; without a scale raw ones alone, and none fused.
 
     Raises:
         UserError: the scale lacks a modality or was fitted for other encoders.
     """
     raw = distances(episode, goal)
-    normalised = {} if scale is None else with_fused(scale.normalise(raw, episode.space, goal.own))
+    normalised = (
+        {} if scale is None else add_fused_curves(scale.normalise(raw, episode.space, goal.own))
+    )
     return Curves(episode.source, goal.forms, episode.fps, episode.contact, raw, normalised)
 
 
-def fit_scale(episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Modality]) -> Scale:
+def fit_normalizer(
+    episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Modality]
+) -> DistanceNormalizer:
     """Fit the scale on successful training episodes.
 
     Each episode is measured against two kinds of goal, because its own end is much nearer than
@@ -274,11 +280,11 @@ def fit_scale(episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Modality
     for modality in modalities:
         for own in (False, True) if modality != "text" else (False,):
             starts, ends = _training_distances(episodes, modality, own)
-            name = yardstick(modality, own)
+            name = median_name(modality, own)
             separated[name] = _check_separation(name, starts, ends)
             start[name], goal[name] = float(np.median(starts)), float(np.median(ends))
     space = {m: episodes[0].space[m] for m in modalities}
-    return Scale(start, goal, separated, space, len(episodes))
+    return DistanceNormalizer(start, goal, separated, space, len(episodes))
 
 
 def _check_separation(
@@ -334,12 +340,12 @@ def _training_distances(
         if not goals and modality != "text":
             continue
         if modality == "image":
-            d = _to_pictures(e.image, np.stack([o.image[-1] for o in goals]))
+            d = _image_distances(e.image, np.stack([o.image[-1] for o in goals]))
         elif modality == "tactile":
-            d = _to_touches(_touch(e), np.stack([_touch(o)[:, -1] for o in goals]))
+            d = _touch_distances(_touch(e), np.stack([_touch(o)[:, -1] for o in goals]))
         else:
             assert e.descriptions is not None  # checked with the training episodes
-            d = _to_sentences(_touch(e), e.descriptions)
+            d = _text_distances(_touch(e), e.descriptions)
         starts.append(np.median(d[:START_FRAMES], axis=0))
         ends.append(np.median(d[-1 - END_FRAMES : -1], axis=0))
     return np.concatenate([[], *starts]), np.concatenate([[], *ends])
@@ -350,26 +356,26 @@ def _touch(episode: EmbeddedEpisode) -> Float32[np.ndarray, "sides n k"]:
     return episode.touch
 
 
-def _to_pictures(
+def _image_distances(
     image: Float32[np.ndarray, "n d"], goals: Float32[np.ndarray, "g d"]
 ) -> Float[np.ndarray, "n g"]:
     return 1 - image.astype(np.float64) @ goals.astype(np.float64).T
 
 
-def _to_touches(
+def _touch_distances(
     touch: Float32[np.ndarray, "sides n k"], goals: Float32[np.ndarray, "g sides k"]
 ) -> Float[np.ndarray, "n g"]:
     cosine = np.einsum("snk,gsk->ng", touch, goals, dtype=np.float64)
     return 1 - cosine / len(touch)
 
 
-def _to_sentences(
+def _text_distances(
     touch: Float32[np.ndarray, "sides n k"], goals: Float32[np.ndarray, "g k"]
 ) -> Float[np.ndarray, "n g"]:
     return 1 - np.mean(touch, axis=0, dtype=np.float64) @ goals.astype(np.float64).T
 
 
-def _own_frame(spec: LastFrame | FrameNumber, own: EmbeddedEpisode) -> int:
+def _frame_index(spec: LastFrame | FrameNumber, own: EmbeddedEpisode) -> int:
     if isinstance(spec, LastFrame):
         return len(own) - 1
     if spec.index >= len(own):
@@ -379,7 +385,7 @@ def _own_frame(spec: LastFrame | FrameNumber, own: EmbeddedEpisode) -> int:
     return spec.index
 
 
-def _fingerprint(encoder: TouchEncoder) -> str:
+def _weights_hash(encoder: TouchEncoder) -> str:
     """Short hash of weights and preprocessor, the same wherever the encoder was loaded from.
 
     Saving rounds the weights, so a scale is fitted with an encoder loaded from disk.

@@ -46,7 +46,7 @@ FORMS = "last, frame:K, image:PATH, episode:ROOT#K or text:SENTENCE"
 class LastFrame:
     """The last frame of the measured episode itself."""
 
-    speaks_for: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
+    modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
 
     def __str__(self) -> str:
         """The form a user writes."""
@@ -58,7 +58,7 @@ class FrameNumber:
     """Frame `index` (from 0) of the measured episode itself."""
 
     index: int
-    speaks_for: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
+    modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
 
     def __str__(self) -> str:
         """The form a user writes."""
@@ -70,7 +70,7 @@ class PictureFile:
     """A picture file of the goal, as the measured camera would see it."""
 
     path: Path
-    speaks_for: ClassVar[tuple[Modality, ...]] = ("image",)
+    modalities: ClassVar[tuple[Modality, ...]] = ("image",)
 
     def __str__(self) -> str:
         """The form a user writes."""
@@ -97,7 +97,7 @@ class EpisodeEnd:
 
     root: Path
     index: int
-    speaks_for: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
+    modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
 
     def __str__(self) -> str:
         """The form a user writes."""
@@ -128,7 +128,7 @@ class Sentence:
     """How the object feels, in words. Sentence encoders hardly see a "not": say what is there."""
 
     text: str
-    speaks_for: ClassVar[tuple[Modality, ...]] = ("text",)
+    modalities: ClassVar[tuple[Modality, ...]] = ("text",)
 
     def __str__(self) -> str:
         """The form a user writes."""
@@ -181,7 +181,7 @@ def parse_goal(text: str) -> GoalSpec:
     raise UserError(f"goal '{text}' is not understood; write {FORMS}")
 
 
-def choose_goal(specs: Sequence[GoalSpec], available: Sequence[Modality]) -> Goal:
+def assign_goals(specs: Sequence[GoalSpec], available: Sequence[Modality]) -> Goal:
     """Give each available modality the first goal that speaks for it.
 
     Args:
@@ -195,10 +195,10 @@ def choose_goal(specs: Sequence[GoalSpec], available: Sequence[Modality]) -> Goa
         raise UserError(f"no goal was given; write {FORMS}")
     taken: dict[str, GoalSpec] = {}
     for spec in specs:
-        wanted = [m for m in spec.speaks_for if m in available]
+        wanted = [m for m in spec.modalities if m in available]
         if not wanted:
             raise UserError(
-                f"goal '{spec}' speaks for {' and '.join(spec.speaks_for)}, but this source has "
+                f"goal '{spec}' speaks for {' and '.join(spec.modalities)}, but this source has "
                 f"{' and '.join(available)} only; leave the goal out"
             )
         free = [m for m in wanted if m not in taken]
@@ -208,4 +208,4 @@ def choose_goal(specs: Sequence[GoalSpec], available: Sequence[Modality]) -> Goa
                 f"{' and '.join(wanted)}; put it first or leave it out"
             )
         taken |= dict.fromkeys(free, spec)
-    return Goal(**taken)  # pyright: ignore[reportArgumentType]  speaks_for fixes the types
+    return Goal(**taken)  # pyright: ignore[reportArgumentType]  modalities fixes the types

@@ -119,11 +119,11 @@ def measure_curve(d: Curve, contact: int | None, eps: float | None = None) -> Cu
     Raises:
         ValueError: fewer than 2 frames, a value that is not finite, a contact outside the curve.
     """
-    d = _checked(d, contact)
+    d = _validated(d, contact)
     sigma, noise_frames = noise(d, contact)
     eps = max(3 * sigma, EPS_FLOOR) if eps is None else eps
     time = np.arange(len(d))
-    varies = float(np.ptp(d)) > EPS_FLOOR
+    not_constant = float(np.ptp(d)) > EPS_FLOOR
     start, end = start_value(d), float(d[-1])
     drop = start - end
     change = np.diff(d)
@@ -139,10 +139,10 @@ def measure_curve(d: Curve, contact: int | None, eps: float | None = None) -> Cu
         end=end,
         net_drop=drop,
         drop_to_noise=drop / max(sigma, EPS_FLOOR / 3),
-        spearman=spearman(-d, time) if varies else None,
-        kendall_tau_b=kendall_tau_b(-d, time) if varies else None,
-        kendall_tolerant=kendall_tau_b(np.round(-d / eps), time) if varies else None,
-        pearson=pearson(-d, time) if varies else None,
+        spearman=spearman(-d, time) if not_constant else None,
+        kendall_tau_b=kendall_tau_b(-d, time) if not_constant else None,
+        kendall_tolerant=kendall_tau_b(np.round(-d / eps), time) if not_constant else None,
+        pearson=pearson(-d, time) if not_constant else None,
         peaks=len(find_peaks(d, eps)),
         largest_rebound=rebound,
         relative_rebound=rebound / drop if drop > eps else None,
@@ -255,7 +255,7 @@ def kendall_tau_b(x: Curve, y: Curve) -> float | None:
     return float(agreement / np.sqrt(distinct_x * distinct_y))
 
 
-def _checked(d: Curve, contact: int | None) -> Float[np.ndarray, " n"]:
+def _validated(d: Curve, contact: int | None) -> Float[np.ndarray, " n"]:
     if len(d) < 2:
         raise ValueError(f"a curve needs at least 2 frames, this one has {len(d)}")
     if not np.isfinite(d).all():

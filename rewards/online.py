@@ -8,32 +8,36 @@ import torch
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import CONTROL_HZ, FRONT, TACTILE
-from touchgoal.control.sensors.latest_value import Newest
+from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
 from touchgoal.encoders.towers.towers import Towers
-from touchgoal.rewards.curves import Contact, Scale
+from touchgoal.rewards.curves import Contact, DistanceNormalizer
 from touchgoal.rewards.embedding_distance import (
     EmbeddedEpisode,
     EmbeddedGoal,
     EpisodeEmbedder,
-    measure,
+    compute_curves,
 )
-from touchgoal.rewards.goals import GoalSpec, choose_goal
+from touchgoal.rewards.goals import GoalSpec, assign_goals
 
-_FIRST = 30.0  # s for the first cost, which warms everything up
-_IDLE = 0.005  # s between looks for a new tick
+_FIRST_COST_TIMEOUT = 30.0  # s for the first cost, which warms everything up
+_IDLE_SLEEP = 0.005  # s between looks for a new tick
 
 Observation = Mapping[str, np.ndarray]
 
 
-class LiveCost:
+class OnlineCost:
     """Measures ticks in a thread: the newest one whenever it is through with the last.
 
     The fingertips' background is the first tick's: they are untouched then.
     """
 
     def __init__(
-        self, towers: Towers, encoder: TouchEncoder, scale: Scale, goals: Sequence[GoalSpec]
+        self,
+        towers: Towers,
+        encoder: TouchEncoder,
+        scale: DistanceNormalizer,
+        goals: Sequence[GoalSpec],
     ) -> None:
         """Starts the thread; `close` ends it.
 
@@ -46,38 +50,38 @@ class LiveCost:
         """
         self._towers, self._encoder, self._scale, self._goals = towers, encoder, scale, goals
         self._embedder = EpisodeEmbedder(towers, encoder)
-        self._first: Observation = {}
+        self._untouched: Observation = {}
         self._goal: EmbeddedGoal | None = None
-        self._tick: Observation | None = None
-        self._newest = Newest("cost", self._take, _FIRST)
+        self._observation: Observation | None = None
+        self._latest = LatestValue("cost", self._measure_newest, _FIRST_COST_TIMEOUT)
 
-    def look(self, observation: Observation) -> float:
+    def latest_cost(self, observation: Observation) -> float:
         """Hand a tick over; the newest cost there is, 1 at the usual start and 0 at the usual end.
 
         The mean over the modalities that have a goal. It waits for the first one alone. DriverError,
         with the reason, if nothing can be measured.
         """
-        self._tick = observation
-        return self._newest.read()
+        self._observation = observation
+        return self._latest.read()
 
     def close(self) -> None:
         """End the thread."""
-        self._newest.close()
+        self._latest.close()
 
-    def _take(self) -> float | None:
-        observation, self._tick = self._tick, None
+    def _measure_newest(self) -> float | None:
+        observation, self._observation = self._observation, None
         if observation is None:
-            time.sleep(_IDLE)
+            time.sleep(_IDLE_SLEEP)
             return None
         torch.set_num_threads(1)  # of this thread: the control loop needs the other core
-        self._first = self._first or observation
+        self._untouched = self._untouched or observation
         episode = self._embed(observation)
         if self._goal is None:
-            goal = choose_goal(self._goals, episode.modalities)
+            goal = assign_goals(self._goals, episode.modalities)
             if goal.own:
                 raise UserError("task.rewards: last and frame:K are not known before the end")
             self._goal = self._embedder.embed_goal(goal, episode)
-        curves = measure(episode, self._goal, self._scale)
+        curves = compute_curves(episode, self._goal, self._scale)
         return float(np.mean([curves.normalised[name][0] for name in curves.raw]))
 
     def _embed(self, observation: Observation) -> EmbeddedEpisode:
@@ -86,7 +90,9 @@ class LiveCost:
             raise UserError("task.rewards: the cost looks through the front camera: add it")
         image = self._towers.embed_images(observation[FRONT][None]).float()
         sides = tuple(key for key in TACTILE if key in observation)
-        touch = [self._encoder.embed_frames(observation[k][None], self._first[k]) for k in sides]
+        touch = [
+            self._encoder.embed_frames(observation[k][None], self._untouched[k]) for k in sides
+        ]
         return EmbeddedEpisode(
             source="this run",
             fps=CONTROL_HZ,

@@ -24,11 +24,11 @@ from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, ContactReader, PadCont
 from touchgoal.sim_envs.scene.objects import Body
 from touchgoal.sim_envs.scene.rendering import open_renderer
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
-from touchgoal.sim_envs.tactile.sensor_instance import Spread, sample_unit
+from touchgoal.sim_envs.tactile.sensor_instance import SensorRandomization, sample_instance
 
 GRIPPER_MAX_WIDTH = 0.08  # m, Franka Hand
-STRAY_SECONDS = 0.5  # for which a disturbance keeps its direction
-STREAMED = (256, 256)  # rows, columns of what a twin's cameras send, more than is recorded
+DISTURBANCE_SECONDS = 0.5  # for which a disturbance keeps its direction
+STREAM_SIZE = (256, 256)  # rows, columns of what a twin's cameras send, more than is recorded
 GRIPPER_SPEED = 0.1  # m/s of width, Franka Hand's datasheet maximum
 _SETPOINT_PERIOD = 0.002  # s: set-points coarser than 2 ms shake the wrist (MuJoCo 4.0.0)
 
@@ -46,9 +46,9 @@ class EnvConfig:
         control_hz: control ticks per second.
         max_seconds: after which an episode is truncated.
         disturbance: rms speed (m/s) along each axis at which the hand strays from what is
-            commanded, and, times `stray_turn`, its rms rate of turn (rad/s). An expert then shows
+            commanded, and, times `disturbance_rotation`, its rms rate of turn (rad/s). An expert then shows
             how to come back, and what it is recorded to do is right (DART, Laskey 2017).
-        spread: between the units of the sensor; every episode has two of its own.
+        randomization: between the units of the sensor; every episode has two of its own.
         scene: robot, sensors, physics.
     """
 
@@ -58,7 +58,7 @@ class EnvConfig:
     control_hz: int = ft.CONTROL_HZ
     max_seconds: float = 8.0
     disturbance: float = 0.0
-    spread: Spread = Spread()
+    randomization: SensorRandomization = SensorRandomization()
     scene: SceneConfig = SceneConfig()
 
 
@@ -71,7 +71,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     holds with `grasp_force` N on each finger, as the Franka Hand's `grasp` does.
     """
 
-    stray_turn = 2.0  # rad of disturbance per m of it
+    disturbance_rotation = 2.0  # rad of disturbance per m of it
     metadata = {"render_modes": ["rgb_array"], "render_fps": ft.CONTROL_HZ}  # noqa: RUF012
 
     def __init__(self, config: EnvConfig, render_mode: str | None = None) -> None:
@@ -87,7 +87,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.grasp_force = 15.0
         self.bodies: list[Body] = []
         self._renderer: mujoco.Renderer | None = None
-        self._person: mujoco.Renderer | None = None
+        self._view_renderer: mujoco.Renderer | None = None
         self._pads: list[TactilePad] = []
 
     # What a task defines.
@@ -97,19 +97,19 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         """The episode's task in words."""
 
     @abstractmethod
-    def _sample(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
+    def _sample_episode(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
         """Choose the episode: set `bodies` and `grasp_force`, UserError on a bad option."""
 
     @abstractmethod
-    def _extend(self, spec: mujoco.MjSpec) -> None:
+    def _add_task_objects(self, spec: mujoco.MjSpec) -> None:
         """Add the task's own parts to the scene."""
 
     @abstractmethod
-    def _place(self, rng: np.random.Generator) -> None:
+    def _place_objects(self, rng: np.random.Generator) -> None:
         """Put the objects where the episode starts."""
 
     @abstractmethod
-    def _judge(self) -> tuple[float, bool]:
+    def _evaluate(self) -> tuple[float, bool]:
         """Progress in [0, 1] and success after a tick."""
 
     # Gymnasium.
@@ -120,17 +120,17 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         """Start an episode; the same seed and options give the same episode."""
         super().reset(seed=seed)
         rng = self.np_random
-        self._sample(rng, dict(options or {}))
-        self._compile(rng)
-        self._place(rng)
+        self._sample_episode(rng, dict(options or {}))
+        self._compile_scene(rng)
+        self._place_objects(rng)
         self.command = self.start_joints(rng)
-        self._drift = np.zeros(6)
-        self._opening = GRIPPER_MAX_WIDTH / 2
+        self._disturbance_state = np.zeros(6)
+        self._finger_target = GRIPPER_MAX_WIDTH / 2
         self.data.qpos[self.arm_positions] = self.command
-        self.data.qpos[self._fingers] = self._opening
+        self.data.qpos[self._fingers] = self._finger_target
         self._ticks = 0
-        self._settle()
-        self._judge()
+        self._let_settle()
+        self._evaluate()
         return self._observe(), self._info(0.0, False)
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -140,12 +140,12 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
             size = self.n_joints + 1
             raise ValueError(f"an action is {size} finite numbers, not {action}")
         if self.config.disturbance > 0:
-            action = action + np.append(self._stray(), 0.0)
+            action = action + np.append(self._disturbance(), 0.0)
         low, high = self._limits.low, self._limits.high
         action = np.clip(action, low, high)
         before = self._progress
         self.begin_tick()
-        self._advance(action[:-1], action[-1], seconds=1 / self.config.control_hz)
+        self._run_tick(action[:-1], action[-1], seconds=1 / self.config.control_hz)
         progress, success = self.end_tick()
         truncated = self._ticks >= self.config.max_seconds * self.config.control_hz
         info = self._info(progress, success)
@@ -153,21 +153,21 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
 
     def render(self) -> UInt8[np.ndarray, "h w 3"]:
         """A picture for people, from the side camera, 480 x 640."""
-        if self._person is None:
-            self._person = open_renderer(self.model, 480, 640)
-        self._person.update_scene(self.data, "side")
-        return self._person.render()
+        if self._view_renderer is None:
+            self._view_renderer = open_renderer(self.model, 480, 640)
+        self._view_renderer.update_scene(self.data, "side")
+        return self._view_renderer.render()
 
     def close(self) -> None:
         """Free the OpenGL contexts."""
-        for renderer in (self._renderer, self._person):
+        for renderer in (self._renderer, self._view_renderer):
             if renderer is not None:
                 renderer.close()
-        self._renderer, self._person = None, None
+        self._renderer, self._view_renderer = None, None
 
     # What experts and drivers use.
 
-    def facts(self) -> dict[str, Any]:
+    def episode_info(self) -> dict[str, Any]:
         """What distinguishes the present episode: the object and how it is gripped."""
         body = self.bodies[0]
         return {
@@ -179,20 +179,20 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
             "sensor": self.sensor.name,
         }
 
-    def layout(self) -> dict[str, list[float]]:
+    def scene_layout(self) -> dict[str, list[float]]:
         """Where things are in the base frame, as plain numbers: the object's pose (m, wxyz)."""
         return {"object": self.object_pose().tolist()}
 
     def scene(self, config: SceneConfig) -> mujoco.MjSpec:
         """The present episode's scene, built with these options."""
         spec = build(self.bodies, config)
-        self._extend(spec)
+        self._add_task_objects(spec)
         return spec
 
     def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
         """Joint positions with the open hand over the table, a little different each time."""
         position = np.array([0.45, 0.0, 0.26]) + rng.uniform(-0.03, 0.03, 3)
-        return self.kinematics.reach(
+        return self.kinematics.solve_ik(
             position, fingers_down(rng.uniform(-0.2, 0.2)), self.robot.arm.home
         )
 
@@ -209,32 +209,32 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     def begin_tick(self) -> None:
         """What happens in the cell by itself as a control tick begins; here nothing."""
 
-    def advance(self, joints: np.ndarray, width: float, speed: float, steps: int = 1) -> None:
+    def step_physics(self, joints: np.ndarray, width: float, speed: float, steps: int = 1) -> None:
         """Physics steps under a servo set-point (rad), while the gripper goes to `width` (m).
 
         The gripper moves at `speed` (m/s of width) and presses with `grasp_force` at most.
         """
         travel = speed / 2 * steps * self.model.opt.timestep  # m of one finger
-        self._opening += min(max(width / 2 - self._opening, -travel), travel)
+        self._finger_target += min(max(width / 2 - self._finger_target, -travel), travel)
         self.model.actuator_forcerange[self._gripper, 0] = -2 * self.grasp_force
         self.data.ctrl[: self.n_joints] = joints
-        self.data.ctrl[self._gripper] = self._opening
+        self.data.ctrl[self._gripper] = self._finger_target
         mujoco.mj_step(self.model, self.data, nstep=steps)
 
-    def refresh(self) -> None:
+    def update_contacts(self) -> None:
         """Bring contacts, poses and all else that follows from the state up to date with it."""
         mujoco.mj_forward(self.model, self.data)
         self._contacts, self._external = self._reader.read(self.data)
 
     def end_tick(self, begun: bool = True) -> tuple[float, bool]:
-        """Progress in [0, 1] and success after a control tick; `refresh` first.
+        """Progress in [0, 1] and success after a control tick; `update_contacts` first.
 
         The episode's clock stands still until it has `begun`.
         """
         self._ticks += begun
-        return self._judge()
+        return self._evaluate()
 
-    def troubles(self) -> list[str]:
+    def failures(self) -> list[str]:
         """Names of what has failed after the last tick; here nothing can."""
         return []
 
@@ -252,41 +252,47 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
 
     def width_target(self) -> float:
         """Where the gripper has been sent, m."""
-        return 2 * self._opening
+        return 2 * self._finger_target
 
     def external_wrench(self) -> Float[np.ndarray, "6"]:
-        """Force (N) and torque (N m) from outside at the TCP, base frame, at the last `refresh`."""
+        """Force (N) and torque (N m) from outside at the TCP, base frame, at the last `update_contacts`."""
         return self._external
 
     def table_load(self) -> float:
         """Force (N) with which objects and robot press down on the table."""
         return self._reader.load(self.data, self.model.geom("table").id)
 
-    def picture(self, camera: str) -> UInt8[np.ndarray, "h w 3"]:
+    def render_camera(self, camera: str) -> UInt8[np.ndarray, "h w 3"]:
         """What a camera sees, RGB."""
         assert self._renderer is not None
         self._renderer.update_scene(self.data, camera)
         return self._renderer.render()
 
-    def feel(self, side: int) -> TactileFrame:
-        """What the left (0) or right (1) sensor shows; `refresh` first, keep to the order of time."""
+    def read_tactile(self, side: int) -> TactileFrame:
+        """What the left (0) or right (1) sensor shows; `update_contacts` first, keep to the order of time."""
         return self._pads[side].sense(self.data, self._contacts[side], self.np_random)
 
     # Insides.
 
-    def _settle(self) -> None:
+    def _let_settle(self) -> None:
         """Physics before the first observation: objects come to rest, the hand is open."""
-        self._advance(np.zeros(self.n_joints), GRIPPER_MAX_WIDTH, seconds=0.3)
+        self._run_tick(np.zeros(self.n_joints), GRIPPER_MAX_WIDTH, seconds=0.3)
 
-    def _stray(self) -> Float[np.ndarray, " n"]:
+    def _disturbance(self) -> Float[np.ndarray, " n"]:
         """Joint change (rad) that nobody commanded: a random walk of the hand's velocity."""
         tick = 1 / self.config.control_hz
-        keep = np.exp(-tick / STRAY_SECONDS)
-        self._drift = keep * self._drift + np.sqrt(1 - keep**2) * self.np_random.normal(size=6)
-        twist = self.config.disturbance * np.repeat([1.0, self.stray_turn], 3) * self._drift
+        keep = np.exp(-tick / DISTURBANCE_SECONDS)
+        self._disturbance_state = keep * self._disturbance_state + np.sqrt(
+            1 - keep**2
+        ) * self.np_random.normal(size=6)
+        twist = (
+            self.config.disturbance
+            * np.repeat([1.0, self.disturbance_rotation], 3)
+            * self._disturbance_state
+        )
         return np.linalg.pinv(self.kinematics.jacobian(self.command)) @ (twist * tick)
 
-    def _compile(self, rng: np.random.Generator) -> None:
+    def _compile_scene(self, rng: np.random.Generator) -> None:
         self.close()
         self.model = model = self.scene(self.config.scene).compile()
         self.data = mujoco.MjData(model)
@@ -298,15 +304,17 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self._tcp = model.site("tcp").id
         self._reader = ContactReader(model)
         self._frames: list[TactileFrame] = []
-        sensor, spread = self.sensor, self.config.spread
+        sensor, randomization = self.sensor, self.config.randomization
         self._pads = [
-            TactilePad(model, side, sensor, sample_unit(sensor, rng, spread), self.bodies)
+            TactilePad(
+                model, side, sensor, sample_instance(sensor, rng, randomization), self.bodies
+            )
             for side in (SIDES if self.config.tactile else ())
         ]
         if self.config.cameras:
             self._renderer = open_renderer(model, *self.config.camera_size)
 
-    def _advance(self, delta: np.ndarray, width: float, seconds: float) -> None:
+    def _run_tick(self, delta: np.ndarray, width: float, seconds: float) -> None:
         """Physics for one tick, with set-points interpolated."""
         setpoints = round(seconds / _SETPOINT_PERIOD)
         steps = round(_SETPOINT_PERIOD / self.model.opt.timestep)
@@ -315,8 +323,8 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.command = np.clip(start + delta, limits[:, 0], limits[:, 1])
         for k in range(1, setpoints + 1):
             joints = start + (self.command - start) * (k / setpoints)
-            self.advance(joints, width, GRIPPER_SPEED, steps)
-        self.refresh()
+            self.step_physics(joints, width, GRIPPER_SPEED, steps)
+        self.update_contacts()
 
     def _observe(self) -> Observation:
         data = self.data
@@ -329,9 +337,9 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         }
         observation = {key: value.astype(np.float32) for key, value in values.items()}
         for camera in self.config.cameras:
-            observation[ft.IMAGE_PREFIX + camera] = self.picture(camera)
+            observation[ft.IMAGE_PREFIX + camera] = self.render_camera(camera)
         if self._pads:
-            self._frames = [self.feel(side) for side in range(2)]
+            self._frames = [self.read_tactile(side) for side in range(2)]
             for key, frame in zip(ft.TACTILE, self._frames, strict=True):
                 observation[key] = frame.image
         return observation

@@ -89,7 +89,7 @@ class BeadMaze(FrankaTactileEnv):
     """
 
     config: BeadMazeConfig
-    stray_turn = 20.0  # rad of disturbance per m of it: the hole turns with the hand
+    disturbance_rotation = 20.0  # rad of disturbance per m of it: the hole turns with the hand
 
     def __init__(self, config: BeadMazeConfig | None = None, render_mode: str | None = None):
         super().__init__(config or BeadMazeConfig(), render_mode)
@@ -108,7 +108,7 @@ class BeadMaze(FrankaTactileEnv):
         """The fixture holds the bead while the hand closes on it, and lets go of it then."""
         self.data.eq_active[self.model.equality("fixture").id] = self.grasping
 
-    def troubles(self) -> list[str]:
+    def failures(self) -> list[str]:
         """Of drop, jam and over_force, what is so after the last tick."""
         names = ft.FEATURES[ft.TRUTH_FAILURE].names
         return [name for name, true in zip(names, self.failure, strict=True) if true]
@@ -117,15 +117,15 @@ class BeadMaze(FrankaTactileEnv):
         """The episode's task in words."""
         return "lead the bead along the wire to its other end"
 
-    def facts(self) -> dict[str, Any]:
+    def episode_info(self) -> dict[str, Any]:
         """What distinguishes the episode: body and wire."""
-        return super().facts() | {
+        return super().episode_info() | {
             "wire": self.wire.name,
             "family": self.wire.family,
             "disturbance": self.config.disturbance,
         }
 
-    def _sample(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
+    def _sample_episode(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
         config = self.config
         unknown = options.keys() - {"wire", "grasp_force"}
         if unknown:
@@ -144,12 +144,12 @@ class BeadMaze(FrankaTactileEnv):
         self._friction = rng.uniform(*config.wire_friction)
         self.bodies = [Body(BEADS[config.bead], _SIZES[config.bead], BEAD_MASS)]
 
-    def _extend(self, spec: mujoco.MjSpec) -> None:
+    def _add_task_objects(self, spec: mujoco.MjSpec) -> None:
         add_wire(spec, self.wire, self._friction)
-        thread(spec, self.wire, self._friction)
+        thread_bead(spec, self.wire, self._friction)
 
-    def _place(self, rng: np.random.Generator) -> None:
-        self.s = START
+    def _place_objects(self, rng: np.random.Generator) -> None:
+        self.arc_length = START
         self.failure = np.zeros(3, bool)
         self._furthest, self._stalled_ticks = START, 0
 
@@ -161,27 +161,27 @@ class BeadMaze(FrankaTactileEnv):
         guess = self.robot.arm.home.copy()
         # the hand's yaw; wires head into the half plane y > 0, or nearly so
         guess[-1] -= (np.arctan2(tangent[1], tangent[0]) + np.pi / 2) % (2 * np.pi) - np.pi / 2
-        return self.kinematics.reach(point + offset, R, guess)
+        return self.kinematics.solve_ik(point + offset, R, guess)
 
-    def _settle(self) -> None:
+    def _let_settle(self) -> None:
         """The hand is open around the bead, just wide enough to keep off the wire."""
-        self._opening = BEAD_RADIUS + 0.004
-        self.data.qpos[self._fingers] = self._opening
+        self._finger_target = BEAD_RADIUS + 0.004
+        self.data.qpos[self._fingers] = self._finger_target
         self.data.eq_active[self.model.equality("fixture").id] = 1
-        self._advance(np.zeros(self.n_joints), 2 * self._opening, seconds=0.1)
+        self._run_tick(np.zeros(self.n_joints), 2 * self._finger_target, seconds=0.1)
 
-    def _stray(self) -> Float[np.ndarray, " n"]:
-        return np.zeros(self.n_joints) if self.grasping else super()._stray()
+    def _disturbance(self) -> Float[np.ndarray, " n"]:
+        return np.zeros(self.n_joints) if self.grasping else super()._disturbance()
 
-    def _judge(self) -> tuple[float, bool]:
+    def _evaluate(self) -> tuple[float, bool]:
         bead = self.object_pose()[:3]
-        self.s = self.wire.project(bead, self.s)
-        if self.grasping or self.s > self._furthest + 0.002:
-            self._furthest, self._stalled_ticks = self.s, 0
+        self.arc_length = self.wire.project(bead, self.arc_length)
+        if self.grasping or self.arc_length > self._furthest + 0.002:
+            self._furthest, self._stalled_ticks = self.arc_length, 0
         else:
             self._stalled_ticks += 1
         self.failure = np.array([self._dropped(bead), self._jammed(), self._over_force()])
-        progress = float(np.clip((self.s - START) / (END - START), 0.0, 1.0))
+        progress = float(np.clip((self.arc_length - START) / (END - START), 0.0, 1.0))
         return progress, progress == 1.0 and not self.failure.any()
 
     def _dropped(self, bead: np.ndarray) -> bool:
@@ -190,7 +190,7 @@ class BeadMaze(FrankaTactileEnv):
             return False
         geom = self.model.geom("object").id
         held = any(geom in pad.geoms for pad in self.pad_contacts())
-        point, _ = self.wire.at(self.s)
+        point, _ = self.wire.at(self.arc_length)
         return not held or bool(np.linalg.norm(bead - point) > 0.003)
 
     def _jammed(self) -> bool:
@@ -225,7 +225,7 @@ def add_wire(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
         maze.add_geom(size=[1.5 * WIRE_RADIUS, 0, 0], fromto=post, **steel)
 
 
-def thread(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
+def thread_bead(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
     """Give the bead its hole, a ring of capsules along its axis (z), and put it on the wire.
 
     The hole's clearance, friction and binding then follow from contacts. Eight capsules drag 8 %

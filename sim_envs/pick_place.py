@@ -68,10 +68,10 @@ class PickPlace(FrankaTactileEnv):
         """The episode's task in words."""
         return f"pick up the {self.bodies[0].kind.name.replace('_', ' ')} and place it on the disc"
 
-    def layout(self) -> dict[str, list[float]]:
+    def scene_layout(self) -> dict[str, list[float]]:
         """The object's pose; where to close the hand (m, and yaw in rad); where it is to go (m)."""
         grasp = [*self.object_pose()[:3].tolist(), self.grasp_yaw()]
-        return super().layout() | {"grasp": grasp, "goal": self.goal.tolist()}
+        return super().scene_layout() | {"grasp": grasp, "goal": self.goal.tolist()}
 
     def grasp_yaw(self, name: str = "object") -> float:
         """Hand yaw that closes across an object, within a quarter turn of the comfortable one."""
@@ -102,11 +102,11 @@ class PickPlace(FrankaTactileEnv):
         self.command = self.start_joints(rng)
         data.qpos[self.arm_positions] = self.command
         data.qvel[:] = 0
-        self.refresh()
-        self._begin()
+        self.update_contacts()
+        self._note_start()
         return self._observe(), self._info(0.0, False)
 
-    def _sample(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
+    def _sample_episode(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
         config = self.config
         unknown = options.keys() - {"object", "mass", "grasp_force"}
         if unknown:
@@ -127,7 +127,7 @@ class PickPlace(FrankaTactileEnv):
             )
         *self._positions, self.goal = _spread(rng, len(self.bodies) + 1)
 
-    def _extend(self, spec: mujoco.MjSpec) -> None:
+    def _add_task_objects(self, spec: mujoco.MjSpec) -> None:
         spec.worldbody.add_geom(
             name="goal",
             type=mujoco.mjtGeom.mjGEOM_CYLINDER,
@@ -139,31 +139,31 @@ class PickPlace(FrankaTactileEnv):
             group=VISUAL_GROUP,
         )
 
-    def _place(self, rng: np.random.Generator) -> None:
+    def _place_objects(self, rng: np.random.Generator) -> None:
         for body, position in zip(self.bodies, self._positions, strict=True):
             yaw = rng.uniform(-np.pi, np.pi)
             joint = self.data.joint(body.name)
             joint.qpos[:3] = *position, body.rest_height + 0.001
             joint.qpos[3:] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
 
-    def _settle(self) -> None:
-        super()._settle()
-        self._begin()
+    def _let_settle(self) -> None:
+        super()._let_settle()
+        self._note_start()
 
-    def _begin(self) -> None:
+    def _note_start(self) -> None:
         """Take note of how an episode begins."""
         position, twice = self.object_pose()[:3], 2 * self.grasp_yaw()
         self.start = np.array([*position, np.cos(twice), np.sin(twice), *self.goal], np.float32)
-        self._reach = max(self._tcp_distance(position), 1e-3)
+        self._initial_distance = max(self._tcp_distance(position), 1e-3)
         self._still_ticks, self._lifted, self._put_down = 0, False, False
 
     def _info(self, progress: float, success: bool) -> dict[str, Any]:
         return super()._info(progress, success) | {ft.TRUTH_START: self.start.copy()}
 
-    def _stray(self) -> Float[np.ndarray, " n"]:
-        return np.zeros(self.n_joints) if self._put_down else super()._stray()
+    def _disturbance(self) -> Float[np.ndarray, " n"]:
+        return np.zeros(self.n_joints) if self._put_down else super()._disturbance()
 
-    def _judge(self) -> tuple[float, bool]:
+    def _evaluate(self) -> tuple[float, bool]:
         position = self.object_pose()[:3]
         height = float(position[2] - self.start[2])
         self._lifted |= height > _LIFTED
@@ -194,7 +194,9 @@ class PickPlace(FrankaTactileEnv):
         if there:
             return 0.95
         if not held:
-            return 0.25 * float(np.clip(1 - self._tcp_distance(position) / self._reach, 0, 1))
+            return 0.25 * float(
+                np.clip(1 - self._tcp_distance(position) / self._initial_distance, 0, 1)
+            )
         travelled = 1 - away / float(np.linalg.norm(self.start[:2] - self.goal))
         carried = 0.35 + 0.5 * float(np.clip(travelled, 0, 1))
         if away < self.config.tolerance:

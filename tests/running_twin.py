@@ -24,7 +24,7 @@ class RunningTwin:
     """A twin at the n-th address of this process.
 
     Attributes:
-        rig: what its rig.json says.
+        description: what its cell.json says.
     """
 
     def __init__(self, arguments: list[str], out: Path, n: int) -> None:
@@ -37,15 +37,15 @@ class RunningTwin:
             text=True,
         )
         deadline = time.monotonic() + 120
-        while not (out / "rig.json").exists():
+        while not (out / "cell.json").exists():
             alive = self._process.poll() is None and time.monotonic() < deadline
             assert alive, self._process.communicate()[1]
             time.sleep(0.05)
-        self.rig: dict[str, Any] = json.loads((out / "rig.json").read_text())
+        self.description: dict[str, Any] = json.loads((out / "cell.json").read_text())
 
     def ask(self, line: str) -> dict[str, Any]:
         """What the twin answers to an order or a question."""
-        return faults.ask(self.rig["faults"], line)
+        return faults.ask_twin(self.description["faults"], line)
 
     def at_rest(self) -> dict[str, Any]:
         """The truth once the arm is at rest."""

@@ -6,40 +6,47 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from toy_policies import TOY, feeling, policy_for, rng, toy_ticks, toy_windows
+from toy_policies import (
+    TOY,
+    torch_rng,
+    toy_dataset,
+    toy_observations,
+    toy_policy,
+    toy_touch_embedder,
+)
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.policies.acting import Planner, PolicyActor
 from touchgoal.policies.deploy.realtime import RealTimeActor
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
-from touchgoal.policies.policy import Condition, Policy
+from touchgoal.policies.policy import ObservationBatch, Policy
 
 
 @pytest.mark.parametrize("latency", [0, 1, 3])
 def test_an_actor_does_its_plans_in_order_and_on_time(latency: int) -> None:
-    touch = feeling()
+    touch = toy_touch_embedder()
     config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
-    policy, ticks = policy_for(config, toy_windows(config)).eval(), toy_ticks(8)
+    policy, ticks = toy_policy(config, toy_dataset(config)).eval(), toy_observations(8)
     actor = PolicyActor(Planner(policy, touch, seed=5), latency)
     done = [actor.act(dict(tick)) for tick in ticks]  # nobody else keeps them
     rows = np.stack([touch.embed_tick(tick, ticks[0]) for tick in ticks])
     states = np.stack([np.concatenate([tick[ft.STATE], tick[ft.TCP_POSE]]) for tick in ticks])
-    generator, expected = rng(5), []
+    generator, expected = torch_rng(5), []
     for asked in range(0, 8, 3):  # ticks on whose observation a plan is made
         asked = max(asked - latency, 0)
         seen = [max(asked - 1, 0), asked]
-        condition = Condition(
+        batch = ObservationBatch(
             torch.from_numpy(rows[seen])[None], torch.from_numpy(states[seen])[None]
         )
-        plan = policy.plan(condition, generator)[0].numpy()
+        plan = policy.plan(batch, generator)[0].numpy()
         first = latency if expected else 0
         expected += list(plan[first : first + 3])
     np.testing.assert_allclose(done, expected[:8], rtol=1e-5)
 
 
 def test_an_actor_refuses_what_it_cannot_do() -> None:
-    touch = feeling()
+    touch = toy_touch_embedder()
     policy = Policy(replace(TOY, touch_dim=touch.dim))
     with pytest.raises(UserError, match="load the touch encoder"):
         Planner(policy, None)
@@ -66,9 +73,9 @@ class SlowPlanner(Planner):
 def test_a_late_plan_is_joined_where_it_should_be_by_now() -> None:
     """Every action is one that a plan meant for this very tick; none waits for a plan."""
     config = replace(TOY, touch_dim=0, touch="", execution_horizon=3)
-    planner = SlowPlanner(policy_for(config, toy_windows(config)).eval(), pause=0.05)
+    planner = SlowPlanner(toy_policy(config, toy_dataset(config)).eval(), pause=0.05)
     actor, done = RealTimeActor(planner), []
-    for i, tick in enumerate(toy_ticks(40)):
+    for i, tick in enumerate(toy_observations(40)):
         tick[ft.STATE][0] = i
         done.append(actor.act(tick))
         time.sleep(0.02)
@@ -76,24 +83,24 @@ def test_a_late_plan_is_joined_where_it_should_be_by_now() -> None:
     for i, action in enumerate(done):
         meant = [p[i - tick] for tick, p in planner.plans if 0 <= i - tick < 8]
         assert any(np.array_equal(action, m) for m in meant) or not action[:7].any()
-    assert len(planner.plans) > 4 and sum(not a[:7].any() for a in done) == actor.starved
+    assert len(planner.plans) > 4 and sum(not a[:7].any() for a in done) == actor.ticks_without_plan
     assert len(actor.latencies) == len(planner.plans) - 1
 
 
 def test_a_quick_plan_is_done_from_the_tick_it_was_made_on() -> None:
     """So an arm does what was judged in simulation, where plans take no time."""
-    touch = feeling()
+    touch = toy_touch_embedder()
     config = replace(TOY, touch_dim=touch.dim, execution_horizon=3, control_hz=2)
-    policy = policy_for(config, toy_windows(config)).eval()
+    policy = toy_policy(config, toy_dataset(config)).eval()
     threaded, plain = RealTimeActor(Planner(policy, touch)), PolicyActor(Planner(policy, touch))
-    for tick in toy_ticks(10):
+    for tick in toy_observations(10):
         np.testing.assert_array_equal(threaded.act(tick), plain.act(tick))
     threaded.close()
 
 
 def test_a_failing_planner_stops_the_actor() -> None:
     config = replace(TOY, touch_dim=0, touch="")
-    actor = RealTimeActor(Planner(policy_for(config, toy_windows(config)).eval(), None))
+    actor = RealTimeActor(Planner(toy_policy(config, toy_dataset(config)).eval(), None))
     with pytest.raises(KeyError):
         actor.act({})
     actor.close()
@@ -101,9 +108,9 @@ def test_a_failing_planner_stops_the_actor() -> None:
 
 def test_a_planner_that_fails_later_is_not_waited_for() -> None:
     config = replace(TOY, touch_dim=0, touch="", execution_horizon=1)
-    planner = Planner(policy_for(config, toy_windows(config)).eval(), None)
-    actor = RealTimeActor(planner, patience=3600)
-    actor.act(toy_ticks(1)[0])
+    planner = Planner(toy_policy(config, toy_dataset(config)).eval(), None)
+    actor = RealTimeActor(planner, timeout=3600)
+    actor.act(toy_observations(1)[0])
     with pytest.raises(KeyError):
         actor.act({})
     actor.close()

@@ -20,7 +20,7 @@ from touchgoal.encoders.alignment.align import (
     align,
     batch_losses,
 )
-from touchgoal.encoders.alignment.data import Augmentation, TouchData, prepare
+from touchgoal.encoders.alignment.data import Augmentation, TouchData, prepare_touch_data
 from touchgoal.encoders.alignment.retrieval import mean_average_precision, top1
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
 from touchgoal.episodes.touches import Touches
@@ -58,7 +58,7 @@ class FakeTowers:
 
 
 def make_touches(per_object: int, seed: int) -> Touches:
-    """One episode of each object; a third of the touches is idle; each object has its own dent."""
+    """One episode of each object; a third of the touches is without contact; each object has its own dent."""
     rng = np.random.default_rng(seed)
     names = list(DESCRIPTIONS)
     frames, objects, episode = [], [], []
@@ -79,13 +79,13 @@ def make_touches(per_object: int, seed: int) -> Touches:
     return Touches(
         frames=np.stack(frames),
         background=np.stack([background] * 3),
-        background_of=np.array(episode),
+        background_index=np.array(episode),
         view=view,
-        view_of=np.array(episode),
+        view_index=np.array(episode),
         object=tuple(objects),
         descriptions=DESCRIPTIONS,
         side=np.zeros(len(frames), int),
-        episode_of=np.array(episode),
+        episode_index=np.array(episode),
     )
 
 
@@ -105,20 +105,20 @@ def final_weights(out_dir: Path) -> torch.Tensor:
 
 
 def test_prepared_data_pairs_touch_with_object_and_view() -> None:
-    data = prepare(TRAIN, FakeTowers(), "gelsight_mini", CONFIG.idle_texts)
+    data = prepare_touch_data(TRAIN, FakeTowers(), "gelsight_mini", CONFIG.no_contact_texts)
     assert data.names == ("", "ball", "brush", "cloth")
     assert [data.names[i] for i in data.label] == list(TRAIN.object)
     assert data.contact.tolist() == [name != "" for name in TRAIN.object]
     assert data.touch.shape == (36, 3, 120, 160)
-    assert data.says.sum(1).tolist() == [len(CONFIG.idle_texts), 3, 3, 3]
+    assert data.describes.sum(1).tolist() == [len(CONFIG.no_contact_texts), 3, 3, 3]
     rows = torch.arange(36)
     drawn = [data.draw_sentences(rows, torch.Generator().manual_seed(seed)) for seed in (0, 0, 1)]
     assert torch.equal(drawn[0], drawn[1]) and not torch.equal(drawn[0], drawn[2])
-    assert data.says[data.label, drawn[0]].all()
+    assert data.describes[data.label, drawn[0]].all()
 
 
-def test_without_idle_texts_idle_touches_are_left_out() -> None:
-    data = prepare(TRAIN, FakeTowers(), "gelsight_mini", ())
+def test_without_their_texts_touches_without_contact_are_left_out() -> None:
+    data = prepare_touch_data(TRAIN, FakeTowers(), "gelsight_mini", ())
     assert data.names == ("ball", "brush", "cloth") and len(data) == 24 and data.contact.all()
 
 
@@ -131,7 +131,9 @@ def test_without_idle_texts_idle_touches_are_left_out() -> None:
 )
 def test_unfit_touches_are_refused(change: dict, message: str) -> None:
     with pytest.raises(UserError, match=message):
-        prepare(replace(TRAIN, **change), FakeTowers(), "gelsight_mini", CONFIG.idle_texts)
+        prepare_touch_data(
+            replace(TRAIN, **change), FakeTowers(), "gelsight_mini", CONFIG.no_contact_texts
+        )
 
 
 def test_augmentation() -> None:
@@ -167,7 +169,7 @@ def random_batch() -> AlignedBatch:
     return AlignedBatch(touch.requires_grad_(), text, image, label != 0, label[:, None] == label)
 
 
-def test_idle_touches_learn_from_text_only() -> None:
+def test_touches_without_contact_learn_from_text_only() -> None:
     batch = random_batch()
     losses = batch_losses(batch, False, CONFIG)
     (gradient,) = torch.autograd.grad(losses["loss_touch_image"], batch.touch, retain_graph=True)
@@ -208,7 +210,7 @@ def test_one_batch_can_be_learned_by_heart(tmp_path: Path) -> None:
     best = max(m["touch_to_text_map"] + m["touch_to_image_map"] for m in history)
     assert best > 1.98
     assert history[-1]["touch_to_text_top1"] == history[-1]["touch_to_image_top1"] == 1
-    assert history[-1]["idle_accuracy"] == 1
+    assert history[-1]["contact_accuracy"] == 1
     # a touch cannot know which of its object's sentences is drawn, hence the wider margin
     for modality, margin in (("text", 0.3), ("image", 0.1)):
         loss, floor = (history[-1][f"touch_to_{modality}_{k}"] for k in ("loss", "floor"))
@@ -220,7 +222,7 @@ def test_one_batch_can_be_learned_by_heart(tmp_path: Path) -> None:
 
 def test_what_is_returned_is_what_is_saved(tmp_path: Path) -> None:
     encoder = align(TRAIN, VAL, FakeTowers(), replace(CONFIG, epochs=1), tmp_path, {"data": "toy"})
-    saved = pretrained.load(tmp_path / "encoder", sensor="gelsight_mini", towers="fake")
+    saved = pretrained.load_aligned(tmp_path / "encoder", sensor="gelsight_mini", towers="fake")
     assert torch.equal(weights(saved), weights(encoder))
     provenance = pretrained.ENCODER.provenance(tmp_path / "encoder")
     assert (
@@ -245,8 +247,8 @@ def test_killed_and_resumed_is_bit_identical(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "whole", {})
-    evaluate = align_module.evaluate
-    calls = iter([evaluate])
+    evaluate_retrieval = align_module.evaluate_retrieval
+    calls = iter([evaluate_retrieval])
 
     def killed_in_second_epoch(encoder: TouchEncoder, data: TouchData) -> dict[str, float]:
         step = next(calls, None)
@@ -254,7 +256,7 @@ def test_killed_and_resumed_is_bit_identical(
             raise KeyboardInterrupt
         return step(encoder, data)
 
-    monkeypatch.setattr(align_module, "evaluate", killed_in_second_epoch)
+    monkeypatch.setattr(align_module, "evaluate_retrieval", killed_in_second_epoch)
     with pytest.raises(KeyboardInterrupt):
         align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "parts", {})
     monkeypatch.undo()
@@ -272,7 +274,7 @@ def test_paper_preset_runs_with_towers_pretrained_together(tmp_path: Path) -> No
     (line,) = (tmp_path / "metrics.jsonl").read_text().splitlines()
     metrics = json.loads(line)
     assert metrics["touch_to_image_loss"] >= metrics["touch_to_image_floor"] - 1e-4
-    assert "idle_accuracy" not in metrics
+    assert "contact_accuracy" not in metrics
 
 
 def test_bad_directories_and_configs_are_refused(tmp_path: Path) -> None:

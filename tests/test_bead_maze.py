@@ -11,7 +11,7 @@ from touchgoal.control.tactile.contact import detect_contact
 from touchgoal.episodes.recording import run
 from touchgoal.policies.evaluation.bead_maze import evaluate, trials_of
 from touchgoal.policies.follower import WireFollower
-from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig, add_wire, thread
+from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig, add_wire, thread_bead
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.scene import wires
 from touchgoal.sim_envs.scene.wires import FAMILIES, LENGTH, MIN_RADIUS, Wire, choose, find
@@ -99,7 +99,7 @@ def test_bead_slides_as_coulomb_says(degrees: float, slides: bool) -> None:
     bead.add_freejoint()
     bead.add_geom(name="object", size=[0.01, 0, 0], mass=0.01, contype=0, conaffinity=0)
     add_wire(spec, straight, friction=0.2)
-    thread(spec, straight, friction=0.2)
+    thread_bead(spec, straight, friction=0.2)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, nstep=500)
@@ -173,7 +173,7 @@ def test_bead_stays_on_the_wire_whatever_the_hand_does(maze: BeadMaze) -> None:
         action[7] = 0.0
         *_, info = maze.step(action)
         pressed |= info[ft.TRUTH_FAILURE][2]
-        point, _ = maze.wire.at(maze.wire.project(maze.object_pose()[:3], maze.s))
+        point, _ = maze.wire.at(maze.wire.project(maze.object_pose()[:3], maze.arc_length))
         assert np.linalg.norm(maze.object_pose()[:3] - point) < 2e-3
     assert pressed
 

@@ -13,9 +13,8 @@ from touchgoal.control.calibration.ball import ball_overlap, press_surface
 from touchgoal.control.calibration.calibrate import fit
 from touchgoal.control.calibration.press_set import PressSet, read_presses, split, write_presses
 from touchgoal.control.errors import UserError
-from touchgoal.control.tactile import gel
-from touchgoal.control.tactile import sensor_calibration as photometry
-from touchgoal.control.tactile.sensor_calibration import Photometry
+from touchgoal.control.tactile import gel, sensor_calibration
+from touchgoal.control.tactile.sensor_calibration import SensorCalibration
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.launch.__main__ import main
 
@@ -23,16 +22,16 @@ SHAPE, PITCH, BALL, NOISE = (120, 160), 0.118e-3, 3e-3, 1.0
 AZIMUTHS = (25.0, 150.0, -85.0)  # no sensor's
 
 
-def known_sensor() -> Photometry:
+def known_sensor() -> SensorCalibration:
     """Three lamps by hand: linear and quadratic terms that change over the image, shadows."""
     angles = np.radians(AZIMUTHS)
     y, x = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]] / 100
     glow = [110 + 40 * np.cos(a) * (x - 0.8) + 40 * np.sin(a) * (y - 0.6) for a in angles]
-    response = np.zeros((3, photometry.N_FEATURES, 3), np.float32)
+    response = np.zeros((3, sensor_calibration.N_FEATURES, 3), np.float32)
     response[:, :2, 0] = 90 * np.stack([np.cos(angles), np.sin(angles)], -1)
     response[:, [2, 4], 0] = -20
     response[:, 0, 1] = response[:, 1, 2] = 10
-    return Photometry(
+    return SensorCalibration(
         sensor="gelsight_mini",
         background=np.stack(glow, -1).astype(np.uint8),
         pixel_pitch=PITCH,
@@ -41,20 +40,20 @@ def known_sensor() -> Photometry:
         shadow_slope=0.2,
         shadow=-15 * np.eye(3, dtype=np.float32),
         penumbra=0.1e-3,
-        steepest=0.9,
-        deepest=2e-3,
-        bulge=(1.05e-3, 0.525e-3, 0.2625e-3, 0.1225e-3),
+        max_slope=0.9,
+        max_depth=2e-3,
+        blur_sigmas=(1.05e-3, 0.525e-3, 0.2625e-3, 0.1225e-3),
         noise=NOISE,
     )
 
 
-def made_presses(sensor: Photometry, n: int = 20) -> PressSet:
+def made_presses(sensor: SensorCalibration, n: int = 20) -> PressSet:
     """Presses all over the gel, with circles drawn by a hand that is off by a pixel."""
     rng = np.random.default_rng(0)
     true = rng.uniform([20, 20, 9], [140, 100, 14], (n, 3))
     images = []
     for circle in true:
-        clean = photometry.shade(sensor, press_surface(sensor, circle, BALL))
+        clean = sensor_calibration.shade(sensor, press_surface(sensor, circle, BALL))
         images.append((clean + NOISE * rng.normal(size=clean.shape)).round().clip(0, 255))
     labels = (true + rng.normal(0, [1, 1, 0.4], (n, 3))).round(1)
     files = tuple(f"{i:02d}.png" for i in range(n))
@@ -87,7 +86,9 @@ def test_ball_touches_where_it_is_said_to() -> None:
 def test_light_comes_from_where_it_stands() -> None:
     """A hill's flank towards a lamp is brighter in its colour, and the shadow lies behind."""
     sensor = known_sensor()
-    change = photometry.shade(sensor, press_surface(sensor, np.array([80.0, 60.0, 12.0]), BALL))
+    change = sensor_calibration.shade(
+        sensor, press_surface(sensor, np.array([80.0, 60.0, 12.0]), BALL)
+    )
     change -= sensor.background
     for channel, azimuth in enumerate(np.radians(AZIMUTHS)):
         flank = np.rint([60 + 9 * np.sin(azimuth), 80 + 9 * np.cos(azimuth)]).astype(int)
@@ -100,8 +101,8 @@ def test_light_comes_from_where_it_stands() -> None:
 def test_calibrate_finds_known_lights(
     presses: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    main(["calibrate", str(presses), "--scale", "0.118", "--out", str(tmp_path)])
-    found = photometry.load(tmp_path / "sensor_file")
+    main(["calibrate", str(presses), "--mm-per-pixel", "0.118", "--out", str(tmp_path)])
+    found = sensor_calibration.load(tmp_path / "sensor_file")
     for azimuth, true in zip(found.light_azimuths, AZIMUTHS, strict=True):
         assert off_by(azimuth, true) < 10
     assert found.noise == pytest.approx(NOISE, rel=0.15)
@@ -123,10 +124,10 @@ def test_presses_in_one_place_say_nothing_about_the_rest(presses: Path) -> None:
     middle = together.take(np.argsort(spread)[:8])
     unknown = replace(middle, ball_radius=np.full(8, np.nan))
     found = fit(unknown, PITCH, "gelsight_mini", trust_labels=True)
-    assert not found.position and found.ball_fitted
-    assert np.abs(found.photometry.response[..., 0]).max() > 10
-    assert not found.photometry.response[..., 1:].any()
-    for azimuth, true in zip(found.photometry.light_azimuths, AZIMUTHS, strict=True):
+    assert not found.varies_over_image and found.ball_fitted
+    assert np.abs(found.calibration.response[..., 0]).max() > 10
+    assert not found.calibration.response[..., 1:].any()
+    for azimuth, true in zip(found.calibration.light_azimuths, AZIMUTHS, strict=True):
         assert off_by(azimuth, true) < 10
 
 
@@ -183,22 +184,22 @@ def test_unfit_presses_are_refused(
     write_presses(read_presses(presses, PITCH), folder)
     damage(folder)
     with pytest.raises(SystemExit) as stopped:
-        main(["calibrate", str(folder), "--scale", "0.118", "--out", str(out)])
+        main(["calibrate", str(folder), "--mm-per-pixel", "0.118", "--out", str(out)])
     assert says in str(stopped.value.code) and "\n" not in str(stopped.value.code)
     assert not out.exists()
 
 
 def test_sensor_file_comes_back(tmp_path: Path) -> None:
     kept = known_sensor()
-    photometry.save(kept, tmp_path, {"source": "made up"})
-    found = photometry.load(tmp_path)
-    for field in fields(Photometry):
+    sensor_calibration.save(kept, tmp_path, {"source": "made up"})
+    found = sensor_calibration.load(tmp_path)
+    for field in fields(SensorCalibration):
         before, after = getattr(kept, field.name), getattr(found, field.name)
         if isinstance(before, str):
             assert before == after
         else:
             np.testing.assert_allclose(np.array(after), np.array(before), rtol=1e-6)
-    assert photometry.read_provenance(tmp_path)["source"] == "made up"
+    assert sensor_calibration.read_provenance(tmp_path)["source"] == "made up"
 
 
 @pytest.mark.parametrize(
@@ -218,17 +219,17 @@ def test_sensor_file_comes_back(tmp_path: Path) -> None:
 def test_foreign_sensor_file_is_refused(
     tmp_path: Path, damage: Callable[[Path], object], says: str
 ) -> None:
-    photometry.save(known_sensor(), tmp_path, {})
+    sensor_calibration.save(known_sensor(), tmp_path, {})
     damage(tmp_path)
     with pytest.raises(UserError) as refused:
-        photometry.load(tmp_path)
+        sensor_calibration.load(tmp_path)
     assert says in str(refused.value)
 
 
 @pytest.mark.parametrize("name", sorted(SENSORS))
 def test_shipped_sensor_files_fit_their_models(name: str) -> None:
     model = SENSORS[name]
-    shipped = photometry.load(model.sensor_file)
+    shipped = sensor_calibration.load(model.sensor_file)
     assert shipped.background.shape[:2] == model.image_shape
     assert shipped.pixel_pitch == pytest.approx(model.pixel_pitch)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from touchgoal.control.arms.driver_process import Child
+from touchgoal.control.arms.driver_process import DriverProcess
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError
 
@@ -56,8 +56,8 @@ class Odd:
 PARENT = """
 import sys
 from odd_driver import Odd
-from touchgoal.control.arms.driver_process import Child
-child = Child(Odd, sys.argv[1])
+from touchgoal.control.arms.driver_process import DriverProcess
+child = DriverProcess(Odd, sys.argv[1])
 print("ready", flush=True)
 if sys.argv[2:]:
     child.call("hang", timeout=1.0 if sys.argv[2] == "short" else 60.0)
@@ -75,10 +75,10 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "log"
 
 
-def odd(log: Path, mood: str = "", connect_timeout: float = 10.0) -> Child:
+def odd(log: Path, mood: str = "", connect_timeout: float = 10.0) -> DriverProcess:
     from odd_driver import Odd  # pyright: ignore[reportMissingImports]
 
-    return Child(Odd, str(log), mood, connect_timeout=connect_timeout)
+    return DriverProcess(Odd, str(log), mood, connect_timeout=connect_timeout)
 
 
 def pid(log: Path) -> int:

@@ -93,7 +93,7 @@ def test_reward_curves_of_a_video_and_of_a_folder(episodes: Path, tmp_path: Path
 @pytest.mark.slow
 def test_train_encoder_then_use_it(episodes: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    run("train-encoder", "align", "--episodes", episodes, "--validation", episodes, "--out", out,
+    run("train-encoder", "align", "--data", episodes, "--validation", episodes, "--out", out,
         "--align.vit", "tiny", "--align.epochs", 12, "--align.batch-size", 32)  # fmt: skip
     kept = pretrained.ENCODER.provenance(out / "encoder")
     assert kept["episodes"] == 2 and kept["command"].startswith("touchgoal")
@@ -153,12 +153,12 @@ def test_learning_the_bead_maze(
     one = ("--workers", 1)
     run("collect-demos", "--task", "bead-maze", "--episodes", 1, "--maze.disturbance", 0, *one,
         "--out", "demos")  # fmt: skip
-    both = ("--episodes", "demos/episodes", "--validation", "demos/episodes")
+    both = ("--data", "demos/episodes", "--validation", "demos/episodes")
     run("train-encoder", "mae", *both, "--frames", 8, "--mae.vit", "tiny", "--mae.epochs", 1,
         "--mae.batch-size", 8, "--out", "mae")  # fmt: skip
     learn = ("train-policy", *both, *one, "--head", "tiny", "--train.epochs", 2, "--trials", 1,
              "--train.snapshot-epochs", 1, "--maze.max-seconds", 1)  # fmt: skip
-    run(*learn, "--touch", "mae/encoder", "--out", "policy")
+    run(*learn, "--encoder", "mae/encoder", "--out", "policy")
     tried = json.loads(Path("policy/metrics.json").read_text())["snapshots"]
     assert set(tried) == {"epoch-0001", "epoch-0002"}
     capsys.readouterr()
@@ -173,7 +173,7 @@ def test_learning_the_bead_maze(
         "--large-repeats", 0)  # fmt: skip
     assert "denoising" in capsys.readouterr().out
     run("train-policy-paper", *both, *one, "--head", "tiny", "--sampler.plan-steps", 2, "--trials", 0,
-        "--touch", "mae/encoder", "--train.epochs", 1, "--out", "paper")  # fmt: skip
+        "--encoder", "mae/encoder", "--train.epochs", 1, "--out", "paper")  # fmt: skip
     paper = checkpoint.load(Path("paper/policy")).config
     assert paper.representation == "delta" and paper.touch_reading == "free"
     assert Path("paper/policy/touch/encoder.json").is_file()
@@ -191,17 +191,17 @@ def test_learning_to_pick_and_place(
     """From placements and demonstrations to a policy that is corrected; too little of everything."""
     monkeypatch.chdir(tmp_path)
     one, blind = ("--workers", 1), ("--env.no-tactile", "--env.cameras", "--out", "demos")
-    run("train-estimators", "--episodes", episodes, "--validation", episodes, *one, "--things", 2,
-        "--places", 2, "--learn.steps", 2, "--learn.contact-steps", 2, "--out", "senses")  # fmt: skip
+    run("train-estimators", "--data", episodes, "--validation", episodes, *one, "--objects", 2,
+        "--placements", 2, "--train.steps", 2, "--train.contact-steps", 2, "--out", "senses")  # fmt: skip
     run("collect-demos", "--feedback", "--episodes", 1, *one, *blind)
-    both = ("--episodes", "demos/episodes", "--validation", "demos/episodes")
+    both = ("--data", "demos/episodes", "--validation", "demos/episodes")
     run("train-policy", "--task", "pick-place", *both, *one, "--senses", "senses/senses", "--head",
-        "regression", "--representation", "hand", "--train.epochs", 1, "--trials", 1,
+        "regression", "--representation", "base_twist", "--train.epochs", 1, "--trials", 1,
         "--env.max-seconds", 0.5, "--out", "policy")  # fmt: skip
     capsys.readouterr()
-    run("collect-demos", "--learner", "policy/policy", "--episodes", 1, *one, *blind,
+    run("collect-demos", "--policy", "policy/policy", "--episodes", 1, *one, *blind,
         "--env.max-seconds", 0.5)  # fmt: skip
-    assert "the learner succeeded in 0/1" in capsys.readouterr().out
+    assert "the policy succeeded in 0/1" in capsys.readouterr().out
     found = EpisodeSet(Path("demos/episodes"))
     assert [found.meta(i)["outcome"] for i in range(2)] == ["success", "corrected"]
 
@@ -256,10 +256,10 @@ def test_wrong_encoder_for_the_sensor(
 def test_wrong_sensor_for_the_encoder(
     episodes: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    both = ("--episodes", episodes, "--validation", episodes)
+    both = ("--data", episodes, "--validation", episodes)
     out, sensor = tmp_path / "out", ("--align.sensor", "gelsight_mini_markers")
     message = refused(capsys, "train-encoder", "align", *both, *sensor, "--out", out)
-    assert "was felt with gelsight_mini, not" in message and not out.exists()
+    assert "was recorded with gelsight_mini, not" in message and not out.exists()
 
 
 def test_corrupt_episode_is_named(

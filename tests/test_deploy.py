@@ -12,17 +12,17 @@ import pytest
 from running_twin import RunningTwin
 
 from touchgoal.control import features as ft
-from touchgoal.control.cell.config import Rig, read_rig
-from touchgoal.control.cell.connection import watchdogs_of
+from touchgoal.control.cell.config import CellConfig, read_cell_file
+from touchgoal.control.cell.connection import cell_watchdogs
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import Safety
 from touchgoal.episodes.store import EpisodeSet, validate
 from touchgoal.launch.__main__ import main
-from touchgoal.policies.deploy.control_loop import Deployment, Ticks, View
-from touchgoal.sim_envs.twin.in_process import simulate
+from touchgoal.policies.deploy.control_loop import ControlLoop, RunLog, TickStatus
+from touchgoal.sim_envs.twin.in_process import simulate_cell
 
-_PATIENCE = 300  # s for a deployment, on a machine however loaded
-RIGS = Path(__file__).parents[1] / "launch" / "cells"
+_PATIENCE = 300  # s for a loop, on a machine however loaded
+CELL_FILES = Path(__file__).parents[1] / "launch" / "cells"
 SIM = """
 arm = "sim"
 gripper = { kind = "franka_hand" }
@@ -46,9 +46,17 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningTwin]:
 
 def deploying(twin: RunningTwin, out: Path) -> "subprocess.Popen[str]":
     """`touchgoal deploy --execute` as a person runs it: in here its types would be checked meanwhile."""
-    rig = out / "rig.json"
-    rig.write_text(json.dumps(twin.rig))
-    command = [sys.executable, "-m", "touchgoal.launch", "deploy", str(rig), "--execute", "--yes"]
+    cell_file = out / "cell.json"
+    cell_file.write_text(json.dumps(twin.description))
+    command = [
+        sys.executable,
+        "-m",
+        "touchgoal.launch",
+        "deploy",
+        str(cell_file),
+        "--execute",
+        "--yes",
+    ]
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen([*command, "--out", str(out / "run")], **pipes)
 
@@ -61,8 +69,8 @@ def touch_comes_nearer(out: Path) -> bool:
     return report["metrics"]["tactile"]["end"] < report["metrics"]["tactile"]["start"]
 
 
-def rig_of(folder: Path, text: str) -> Path:
-    path = folder / "rig.toml"
+def write_cell_file(folder: Path, text: str) -> Path:
+    path = folder / "cell.toml"
     path.write_text(text)
     return path
 
@@ -115,14 +123,14 @@ def test_a_stalled_camera_stops_the_arm_and_the_episode_is_kept(
 
 
 def test_a_simulated_arm_reaches_the_same_outcome(tmp_path: Path) -> None:
-    run("deploy", rig_of(tmp_path, SIM), "--execute", "--yes", "--out", tmp_path / "run")
+    run("deploy", write_cell_file(tmp_path, SIM), "--execute", "--yes", "--out", tmp_path / "run")
     said = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert said["success"] and EpisodeSet(tmp_path / "run" / "episodes").meta(0)["arm"] == "sim"
 
 
 def test_a_dry_run_moves_and_records_nothing(tmp_path: Path) -> None:
     text = SIM.replace("seed = 3", "seed = 3, seconds = 1.0")
-    run("deploy", rig_of(tmp_path, text), "--out", tmp_path / "run")
+    run("deploy", write_cell_file(tmp_path, text), "--out", tmp_path / "run")
     said = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert said["ticks"] > 10 and said["episode"] is None and not said["success"]
 
@@ -130,7 +138,7 @@ def test_a_dry_run_moves_and_records_nothing(tmp_path: Path) -> None:
 class Acts:
     """Moves the base at 0.2 rad/s, and after `after` ticks does `then`."""
 
-    done, overdue = False, 0.0
+    done, action_age = False, 0.0
 
     def __init__(self, after: int, then: float) -> None:
         self._left, self._then = after, then
@@ -142,9 +150,9 @@ class Acts:
     def close(self) -> None: ...
 
 
-def deployed(rig: Rig, actor: Acts, stop_after: int = 10_000) -> tuple[str, bool, float]:
+def deployed(cell: CellConfig, actor: Acts, stop_after: int = 10_000) -> tuple[str, bool, float]:
     """How it ends, whether it was stopped, and the farthest that the first joint got (rad)."""
-    station, count = simulate(rig, ft.CONTROL_HZ), 0
+    connection, count = simulate_cell(cell, ft.CONTROL_HZ), 0
 
     def wanted() -> str:
         nonlocal count
@@ -153,32 +161,32 @@ def deployed(rig: Rig, actor: Acts, stop_after: int = 10_000) -> tuple[str, bool
 
     far = [0.0]
 
-    def show(view: View) -> None:
-        far[0] = max(far[0], float(view.sensed.arm.q[0]))
+    def show(status: TickStatus) -> None:
+        far[0] = max(far[0], float(status.sensed.arm.q[0]))
 
-    safety = Safety(station.robot, ft.CONTROL_HZ, watchdogs_of(rig))
-    deployment = Deployment(station, safety, True, wanted, show)
-    ending = deployment.run(actor, 20.0, Ticks())
-    assert np.abs(station.arm.read().velocity).max() < 0.01
+    safety = Safety(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
+    loop = ControlLoop(connection, safety, True, wanted, show)
+    ending = loop.run(actor, 20.0, RunLog())
+    assert np.abs(connection.arm.read().velocity).max() < 0.01
     return ending.reason, ending.stopped, far[0]
 
 
 @pytest.fixture
-def bare(tmp_path: Path) -> Rig:
+def bare(tmp_path: Path) -> CellConfig:
     text = SIM.replace('cameras.front = { source = "simulated" }\n', "")
-    return read_rig(rig_of(tmp_path, text))
+    return read_cell_file(write_cell_file(tmp_path, text))
 
 
-def test_a_policy_that_is_not_a_number_and_an_operator_stop_the_arm(bare: Rig) -> None:
+def test_a_policy_that_is_not_a_number_and_an_operator_stop_the_arm(bare: CellConfig) -> None:
     reason, stopped, _ = deployed(bare, Acts(10, np.nan))
     assert stopped and "not a number" in reason
     reason, stopped, _ = deployed(bare, Acts(10_000, 0.0), stop_after=15)
     assert stopped and reason == "stopped by the operator"
 
 
-@pytest.mark.parametrize("path", sorted(RIGS.glob("*.toml")), ids=lambda p: p.stem)
-def test_example_rigs_are_read(path: Path) -> None:
-    assert read_rig(path).task.name == "pick-place"
+@pytest.mark.parametrize("path", sorted(CELL_FILES.glob("*.toml")), ids=lambda p: p.stem)
+def test_example_cell_files_are_read(path: Path) -> None:
+    assert read_cell_file(path).task.name == "pick-place"
 
 
 @pytest.mark.parametrize(
@@ -194,6 +202,6 @@ def test_example_rigs_are_read(path: Path) -> None:
         ("arm =", "is no TOML"),
     ],
 )
-def test_a_bad_rig_file_is_one_line(wrong: str, says: str, tmp_path: Path) -> None:
+def test_a_bad_cell_file_is_one_line(wrong: str, says: str, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=says):
-        read_rig(rig_of(tmp_path, wrong))
+        read_cell_file(write_cell_file(tmp_path, wrong))

@@ -12,7 +12,7 @@ import pytest
 from running_twin import RunningTwin
 
 from touchgoal.control.arms import franka, ur
-from touchgoal.control.arms.streaming import ArmConfig, ArmProcess, moved_wrench
+from touchgoal.control.arms.streaming import ArmConfig, ArmProcess, shift_wrench
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import FRONT
 from touchgoal.control.grippers.franka_hand import FrankaHand
@@ -68,14 +68,14 @@ class Twin(RunningTwin):
             "fr3": (franka.FrankaClient, franka.RATE, FR3),
             "ur5e": (ur.UrClient, ur.RATE, UR5E),
         }[name]
-        address = self.rig["address"]
-        self.config = ArmConfig(address, robot, GELSIGHT_TCP, HZ, rate, silence=0.5)
+        address = self.description["address"]
+        self.config = ArmConfig(address, robot, GELSIGHT_TCP, HZ, rate, state_timeout=0.5)
 
     def connect(self) -> ArmProcess:
         return ArmProcess(self.client, self.config)
 
     def gripper(self) -> Gripper:
-        gripper = self.rig["gripper"]
+        gripper = self.description["gripper"]
         if gripper["kind"] == "franka_hand":
             return FrankaHand(gripper["address"])
         widths = tuple(gripper["widths"])
@@ -237,13 +237,13 @@ def test_a_gripper_opens_closes_and_is_clipped_to_its_stroke(twin: Twin) -> None
 
 
 def test_a_camera_and_a_load_cell_give_fresh_readings(twin: Twin) -> None:
-    address = twin.rig["images"][FRONT]
+    address = twin.description["images"][FRONT]
     camera = VideoCamera(VideoConfig(address, rate=10.0, frozen_after=np.inf))
     first = camera.read()
     until(lambda: camera.read().stamp > first.stamp + 0.3)
     assert isinstance(camera, Camera) and first.image.dtype == np.uint8
     camera.close()
-    cell = SerialLoadCell(LoadCellConfig(**twin.rig["load_cell"], highest=100.0))
+    cell = SerialLoadCell(LoadCellConfig(**twin.description["load_cell"], max_force=100.0))
     reading = cell.read()
     assert isinstance(cell, LoadCell) and abs(reading.force) < 5
     until(lambda: cell.read().stamp > reading.stamp)
@@ -268,5 +268,5 @@ def test_no_controller_is_said(client: type) -> None:
 
 def test_a_wrench_is_moved_with_its_lever() -> None:
     down = np.array([0, 0, -10.0, 0, 0, 0])
-    moved = moved_wrench(down, np.array([0.1, 0, 0]), np.zeros(3))
+    moved = shift_wrench(down, np.array([0.1, 0, 0]), np.zeros(3))
     np.testing.assert_allclose(moved, [0, 0, -10, 0, 1, 0])

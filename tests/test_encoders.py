@@ -113,12 +113,12 @@ def test_kept_patches_are_all_that_is_seen() -> None:
     order = torch.stack([torch.randperm(12), torch.randperm(12)])
     everything = vit(images).gather(1, order[:, :, None].expand(-1, -1, 32))
     torch.testing.assert_close(vit(images, order), everything, atol=1e-5, rtol=1e-5)
-    keep = torch.tensor([[0, 5], [5, 3]])
+    ids_keep = torch.tensor([[0, 5], [5, 3]])
     changed = images.clone()
     changed[:, :, 80:] = 9  # the last row of patches, 8 to 11
-    torch.testing.assert_close(vit(changed, keep), vit(images, keep))
+    torch.testing.assert_close(vit(changed, ids_keep), vit(images, ids_keep))
     changed[:, :, 40:80, 40:80] = 9  # patch 5
-    assert not torch.allclose(vit(changed, keep), vit(images, keep))
+    assert not torch.allclose(vit(changed, ids_keep), vit(images, ids_keep))
 
 
 def test_position_matters() -> None:
@@ -243,13 +243,13 @@ def test_saved_encoder_is_the_same(tmp_path: Path) -> None:
     encoder = make_encoder()
     touch = torch.randn(8, 3, 120, 160)
     pretrained.save(encoder, tmp_path / "full", {"seed": 3}, half=False)
-    full = pretrained.load(tmp_path / "full", sensor="gelsight_mini", towers="fake")
+    full = pretrained.load_aligned(tmp_path / "full", sensor="gelsight_mini", towers="fake")
     assert torch.equal(full.embed_touch(touch), encoder.embed_touch(touch))
     assert full.config == encoder.config and not full.training
     assert pretrained.ENCODER.provenance(tmp_path / "full") == {"seed": 3}
 
     pretrained.save(encoder, tmp_path / "half", {})
-    half = pretrained.load(tmp_path / "half")
+    half = pretrained.load_aligned(tmp_path / "half")
     cosine = (half.embed_touch(touch) * encoder.embed_touch(touch)).sum(1)
     assert (1 - cosine).max() < 1e-3
     full_bytes, half_bytes = (
@@ -311,13 +311,13 @@ def test_damaged_files_are_refused(tmp_path: Path, damage: str) -> None:
     spoil, message = DAMAGES[damage]
     spoil(tmp_path)
     with pytest.raises(UserError, match=message) as error:
-        pretrained.load(tmp_path)
+        pretrained.load_aligned(tmp_path)
     assert "\n" not in str(error.value)
 
 
 def test_encoder_for_another_use_is_refused(tmp_path: Path) -> None:
     pretrained.save(make_encoder(), tmp_path, {})
     with pytest.raises(UserError, match="is for gelsight_mini, not digit"):
-        pretrained.load(tmp_path, sensor="digit")
+        pretrained.load_aligned(tmp_path, sensor="digit")
     with pytest.raises(UserError, match="with the towers fake, not offline"):
-        pretrained.load(tmp_path, towers="offline")
+        pretrained.load_aligned(tmp_path, towers="offline")

@@ -121,7 +121,7 @@ def test_only_what_is_asked_for_is_decoded(small: Path) -> None:
     for path in (small / "videos").rglob("*.mp4"):
         path.write_bytes(b"not a video")
     data = small / metadata.data_path(0)
-    damage(data, data.read_bytes().index(PNG_START) + 100)
+    flip_byte(data, data.read_bytes().index(PNG_START) + 100)
     episode = EpisodeSet(small).read(0, [ft.STATE])
     np.testing.assert_array_equal(episode.frames[ft.STATE], make_episode(0).frames[ft.STATE])
 
@@ -249,24 +249,27 @@ def test_repair_leaves_foreign_sets_alone(small: Path) -> None:
     assert sorted(small.rglob("*")) == before
 
 
-def damage(path: Path, position: int) -> None:
+def flip_byte(path: Path, position: int) -> None:
     data = bytearray(path.read_bytes())
     data[position] ^= 0xFF
     path.write_bytes(data)
 
 
-def cut(path: Path) -> None:
+def cut_in_half(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
 DAMAGE = {
     "flipped byte in touch": (
         metadata.data_path(1),
-        lambda path: damage(path, path.read_bytes().index(PNG_START) + 100),
+        lambda path: flip_byte(path, path.read_bytes().index(PNG_START) + 100),
     ),
-    "half a data file": (metadata.data_path(1), cut),
-    "flipped byte in a video": (metadata.video_path(ft.WRIST, 1), lambda path: damage(path, 400)),
-    "half a video": (metadata.video_path(ft.WRIST, 1), cut),
+    "half a data file": (metadata.data_path(1), cut_in_half),
+    "flipped byte in a video": (
+        metadata.video_path(ft.WRIST, 1),
+        lambda path: flip_byte(path, 400),
+    ),
+    "half a video": (metadata.video_path(ft.WRIST, 1), cut_in_half),
     "no data file": (metadata.data_path(1), Path.unlink),
     "no video": (metadata.video_path(ft.WRIST, 1), Path.unlink),
 }
@@ -289,7 +292,7 @@ def test_a_damaged_episode_is_named_and_moved_aside(small: Path, case: str) -> N
 
 
 @pytest.mark.parametrize("name", [metadata.INFO, metadata.EPISODES, metadata.TASKS, metadata.STATS])
-@pytest.mark.parametrize("harm", [cut, Path.unlink])
+@pytest.mark.parametrize("harm", [cut_in_half, Path.unlink])
 def test_damaged_metadata_is_made_again(small: Path, name: str, harm) -> None:
     before = {path: path.read_bytes() for path in (small / "meta").rglob("*") if path.is_file()}
     harm(small / name)
@@ -314,7 +317,7 @@ def test_killed_at_every_write(small: Path, monkeypatch: pytest.MonkeyPatch) -> 
             nonlocal calls
             if calls == step // 2:
                 if step % 2:
-                    cut(Path(source))
+                    cut_in_half(Path(source))
                 raise Killed
             calls += 1
             replace(source, target)

@@ -5,23 +5,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toy_policies import TOY, policy_for, toy_windows
+from toy_policies import TOY, toy_dataset, toy_policy
 
 from touchgoal.control import features as ft
-from touchgoal.episodes.recording import CORRECTED, Demonstration, demonstrate
+from touchgoal.episodes.recording import CORRECTED, EpisodeSpec, record_episode
 from touchgoal.policies import checkpoint
-from touchgoal.policies.perception.state_estimation import READ
-from touchgoal.policies.training.dagger import Corrected
+from touchgoal.policies.perception.state_estimation import ESTIMATED
+from touchgoal.policies.training.dagger import DaggerRoles
 from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
 
 BLIND = PickPlaceConfig(cameras=(), tactile=False)
-JOB = Demonstration(1, options={"object": "wooden_block"})
+JOB = EpisodeSpec(1, options={"object": "wooden_block"})
 
 
 @pytest.mark.parametrize("disturbance", [0.0, 0.01])
 def test_it_picks_and_places_though_it_is_led_astray(disturbance: float) -> None:
-    episode = demonstrate(PickPlace(replace(BLIND, disturbance=disturbance)), JOB, Corrected())
+    episode = record_episode(PickPlace(replace(BLIND, disturbance=disturbance)), JOB, DaggerRoles())
     assert episode.meta["success"]
     moved = np.abs(episode.frames[ft.ACTION][:, :7])
     assert moved.max() < 0.1  # rad a tick, 2 rad/s: an FR3 may turn its slowest joint as fast
@@ -43,14 +43,18 @@ def test_it_comes_back_from_where_it_never_went() -> None:
 
 def test_a_learner_acts_and_is_corrected(tmp_path: Path) -> None:
     config = replace(
-        TOY, touch_dim=0, touch="", proprioception=(ft.STATE, ft.TCP_POSE, *READ), place_noise=0.0
+        TOY,
+        touch_dim=0,
+        touch="",
+        proprioception=(ft.STATE, ft.TCP_POSE, *ESTIMATED),
+        position_noise=0.0,
     )
-    checkpoint.save(policy_for(config, toy_windows(config)), tmp_path / "learner", {})
-    cast, env = Corrected(tmp_path / "learner"), PickPlace(replace(BLIND, max_seconds=1.0))
-    episode = demonstrate(env, JOB, cast)
+    checkpoint.save(toy_policy(config, toy_dataset(config)), tmp_path / "learner", {})
+    roles, env = DaggerRoles(tmp_path / "learner"), PickPlace(replace(BLIND, max_seconds=1.0))
+    episode = record_episode(env, JOB, roles)
     assert episode.meta["outcome"] == CORRECTED
     observation, _ = env.reset(seed=JOB.seed, options=JOB.options)
-    learner, expert = cast(env, JOB)
+    learner, expert = roles(env, JOB)
     for tick in range(20):
         answer, action = expert.act(observation), learner.act(observation)
         np.testing.assert_array_equal(episode.frames[ft.STATE][tick], observation[ft.STATE])

@@ -61,7 +61,7 @@ def test_inverse_reaches_the_workspace_within_limits() -> None:
     for _ in range(100):
         position = rng.uniform([0.38, -0.25, 0.017], [0.62, 0.25, 0.35])
         rotation = fingers_down(rng.uniform(-1.5, 1.5))
-        q = arm.reach(position, rotation, FR3_HOME)
+        q = arm.solve_ik(position, rotation, FR3_HOME)
         assert (q > FR3_LOWER).all() and (q < FR3_UPPER).all()
         reached, turned = arm.forward(q)
         assert np.linalg.norm(reached - position) < 1e-4
@@ -70,7 +70,7 @@ def test_inverse_reaches_the_workspace_within_limits() -> None:
 
 def test_out_of_reach_is_said() -> None:
     with pytest.raises(UserError, match="cannot reach"):
-        Fr3Kinematics().reach(np.array([1.5, 0, 0.2]), fingers_down(0), FR3_HOME)
+        Fr3Kinematics().solve_ik(np.array([1.5, 0, 0.2]), fingers_down(0), FR3_HOME)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 0.3, 2.0, np.pi - 1e-6, np.pi])
@@ -125,7 +125,7 @@ def test_what_is_reachable_is_reached_in_any_orientation(arm: Kinematics) -> Non
             continue
         count += 1
         try:
-            q = arm.reach(position, rotation, limits.home)
+            q = arm.solve_ik(position, rotation, limits.home)
         except UserError:
             missed += 1
             continue

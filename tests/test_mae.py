@@ -13,7 +13,7 @@ from touchgoal.encoders.backbones.vit import random_patches
 from touchgoal.encoders.probes.ridge import ridge_r2
 from touchgoal.encoders.ssl import mae as mae_module
 from touchgoal.encoders.ssl.frames import TouchFrames
-from touchgoal.encoders.ssl.mae import MaeConfig, MaskedAutoencoder, patches, train_mae
+from touchgoal.encoders.ssl.mae import MaeConfig, MaskedAutoencoder, patchify, train_mae
 
 TOY = MaeConfig(vit="tiny", decoder_width=16, decoder_depth=1, epochs=3, batch_size=16, lr=3e-3)
 
@@ -34,12 +34,12 @@ def blobs(count: int, seed: int) -> TouchFrames:
 def test_the_mean_of_the_tokens_learns_where_and_how_strong(tmp_path: Path) -> None:
     train, val = blobs(256, 0), blobs(64, 1)
     config = replace(TOY, epochs=8)
-    trunk = train_mae(train, val, config, tmp_path, {"data": "toy"})
+    backbone = train_mae(train, val, config, tmp_path, {"data": "toy"})
     metrics = pretrained.ENCODER.provenance(tmp_path / "encoder")["metrics"]
     assert metrics["validation_loss"] < metrics["validation_power"]
     assert min(metrics[f"force_{axis}_r2"] for axis in "xyz") > 0.8
     frames = np.full((2, 120, 160, 3), 100, np.uint8)
-    assert np.allclose(*trunk.embed_frames(frames, frames[0]))  # the same touch, twice
+    assert np.allclose(*backbone.embed_frames(frames, frames[0]))  # the same touch, twice
 
 
 @pytest.mark.parametrize("bottleneck", [True, False])
@@ -71,19 +71,19 @@ def test_a_killed_training_ends_with_the_same_weights(
 def test_only_unseen_patches_count_where_tokens_are_seen() -> None:
     torch.manual_seed(0)
     model = MaskedAutoencoder(replace(TOY, bottleneck=False))
-    vit = model.trunk.config.vit
+    vit = model.backbone.config.vit
     touch = torch.randn(2, 3, 120, 160)
-    keep = random_patches(vit, 2, 0.5, torch.Generator().manual_seed(0))
-    drawn, real = model.draw(touch, keep), patches(touch, vit)
-    seen = torch.zeros(drawn.shape[:2], dtype=torch.bool).scatter(1, keep, True)
-    expected = ((drawn - real) ** 2)[~seen].mean()
-    torch.testing.assert_close(model.loss(touch, keep), expected)
+    ids_keep = random_patches(vit, 2, 0.5, torch.Generator().manual_seed(0))
+    reconstructed, real = model.reconstruct(touch, ids_keep), patchify(touch, vit)
+    seen = torch.zeros(reconstructed.shape[:2], dtype=torch.bool).scatter(1, ids_keep, True)
+    expected = ((reconstructed - real) ** 2)[~seen].mean()
+    torch.testing.assert_close(model.loss(touch, ids_keep), expected)
 
 
-def test_patches_are_where_the_trunk_sees_them() -> None:
-    vit = MaskedAutoencoder(TOY).trunk.config.vit
+def test_patches_are_where_the_backbone_sees_them() -> None:
+    vit = MaskedAutoencoder(TOY).backbone.config.vit
     image = torch.arange(120 * 160.0).view(1, 1, 120, 160).expand(1, 3, -1, -1)
-    first = patches(image, vit)[0, 1].view(3, vit.patch_size, vit.patch_size)
+    first = patchify(image, vit)[0, 1].view(3, vit.patch_size, vit.patch_size)
     size = vit.patch_size
     torch.testing.assert_close(first[0], image[0, 0, :size, size : 2 * size])
 
@@ -97,9 +97,9 @@ def test_ridge_reads_what_is_linear_and_nothing_else() -> None:
 
 
 def test_an_encoder_of_the_other_kind_is_refused(tmp_path: Path) -> None:
-    pretrained.save(MaskedAutoencoder(TOY).trunk, tmp_path, {})
-    assert pretrained.load_any(tmp_path).config.sensor == "gelsight_mini_markers"
+    pretrained.save(MaskedAutoencoder(TOY).backbone, tmp_path, {})
+    assert pretrained.load_encoder(tmp_path).config.sensor == "gelsight_mini_markers"
     with pytest.raises(UserError, match="is damaged"):
-        pretrained.load(tmp_path)
+        pretrained.load_aligned(tmp_path)
     with pytest.raises(UserError, match="is damaged"):
-        pretrained.load_trunk(pretrained.SHIPPED)
+        pretrained.load_touch_backbone(pretrained.SHIPPED)

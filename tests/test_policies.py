@@ -2,8 +2,8 @@
 
 import pytest
 
-from touchgoal.episodes.recording import Demonstration
-from touchgoal.policies.acting import SHIPPED, ActorMaker
+from touchgoal.episodes.recording import EpisodeSpec
+from touchgoal.policies.acting import SHIPPED, SavedPolicy
 from touchgoal.policies.evaluation.pick_place import evaluate
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
@@ -21,7 +21,7 @@ def test_wilson_interval(successes: int, trials: int, low: float, high: float) -
 
 def test_trials_depend_on_their_seed_alone() -> None:
     config = PickPlaceConfig(cameras=(), tactile=False)
-    jobs = [Demonstration(seed, options={"object": "toy_brick"}) for seed in (1, 2)]
+    jobs = [EpisodeSpec(seed, options={"object": "toy_brick"}) for seed in (1, 2)]
     assert evaluate(config, PickPlaceExpert, jobs, workers=2) == [
         *evaluate(config, PickPlaceExpert, jobs[:1], workers=1),
         *evaluate(config, PickPlaceExpert, jobs[1:], workers=1),
@@ -29,8 +29,8 @@ def test_trials_depend_on_their_seed_alone() -> None:
 
 
 def test_what_ships_picks_and_places() -> None:
-    maker = ActorMaker(SHIPPED["pick-place"])
-    config = maker.observing(PickPlaceConfig())
+    maker = SavedPolicy(SHIPPED["pick-place"])
+    config = maker.env_config(PickPlaceConfig())
     assert config.cameras == ("front",) and config.tactile
-    (trial,) = evaluate(config, maker, [Demonstration(2_000_000)], workers=1)
+    (trial,) = evaluate(config, maker, [EpisodeSpec(2_000_000)], workers=1)
     assert trial.success

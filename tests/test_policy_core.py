@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from toy_policies import DIFFUSION, FLOW, TOY, feeling, policy_for, rng, toy_ticks, toy_windows
+from toy_policies import (
+    DIFFUSION,
+    FLOW,
+    TOY,
+    torch_rng,
+    toy_dataset,
+    toy_observations,
+    toy_policy,
+    toy_touch_embedder,
+)
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
@@ -17,22 +26,30 @@ from touchgoal.control.motion.kinematics import FR3_HOME, Fr3Kinematics
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies import checkpoint
-from touchgoal.policies.actions import Representation, Scale, represent, to_actions
+from touchgoal.policies.actions import (
+    ActionRepresentation,
+    Normalizer,
+    to_actions,
+    to_representation,
+)
 from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
-from touchgoal.policies.perception.proprioception import unroll
-from touchgoal.policies.policy import Condition, Policy, PolicyConfig
+from touchgoal.policies.perception.proprioception import network_input
+from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
 from touchgoal.policies.training import ema
 from touchgoal.policies.training import train as train_module
-from touchgoal.policies.training.sequence_dataset import read
+from touchgoal.policies.training.sequence_dataset import load_recordings
 from touchgoal.policies.training.train import TrainConfig, train
 
 import mujoco  # isort: skip - after touchgoal, which chooses the OpenGL platform
 
 
-@pytest.mark.parametrize("kind", ["delta", "chunk", "absolute", "hand"])
-def test_representations_round_trip(kind: Representation) -> None:
-    actions, joints = torch.randn(5, 8, 8, generator=rng()), torch.randn(5, 7, generator=rng(1))
-    represented = represent(actions, joints, kind)
+@pytest.mark.parametrize("kind", ["delta", "chunk", "absolute", "base_twist"])
+def test_representations_round_trip(kind: ActionRepresentation) -> None:
+    actions, joints = (
+        torch.randn(5, 8, 8, generator=torch_rng()),
+        torch.randn(5, 7, generator=torch_rng(1)),
+    )
+    represented = to_representation(actions, joints, kind)
     torch.testing.assert_close(to_actions(represented, joints, kind), actions, rtol=1e-4, atol=1e-4)
     if kind == "absolute":
         torch.testing.assert_close(represented[:, -1, :7], joints + actions[..., :7].sum(1))
@@ -43,31 +60,33 @@ def test_along_the_hand_every_way_the_arm_faces_is_the_same() -> None:
     kinematics, columns = Fr3Kinematics(), (ft.STATE, ft.TCP_POSE)
     q = FR3_HOME + np.random.default_rng(0).normal(0, 0.2, (2, 7))
     q[1, 1:] = q[0, 1:]
-    velocity = 0.1 * torch.randn(1, 7, generator=rng()).expand(2, -1)
+    velocity = 0.1 * torch.randn(1, 7, generator=torch_rng()).expand(2, -1)
     poses = []
     for position, R in map(kinematics.forward, q):
         mujoco.mju_mat2Quat(quaternion := np.zeros(4), R.ravel())
         poses.append(torch.from_numpy(np.concatenate([position, quaternion])).float())
     joints = torch.from_numpy(q).float()
     state = torch.cat([joints, velocity, torch.full((2, 1), 0.03), torch.stack(poses)], 1)
-    seen = unroll(state, columns, "tool")
+    seen = network_input(state, columns, "body_twist")
     torch.testing.assert_close(seen[0], seen[1], atol=1e-6, rtol=1e-5)
     np.testing.assert_allclose(seen[0, 7:], kinematics.forward(q[0])[1][2], atol=1e-6)
     J, R = kinematics.jacobian(q[0]), kinematics.forward(q[0])[1]
     np.testing.assert_allclose(seen[0, :3], R.T @ J[:3] @ velocity[0].numpy(), atol=1e-6)
-    changes = 0.01 * torch.randn(2, 8, 8, generator=rng(1))
-    done = represent(changes, joints, "tool")
-    least = to_actions(done, joints, "tool")  # the same but for the elbow, which moves less
-    torch.testing.assert_close(represent(least, joints, "tool"), done, atol=1e-5, rtol=1e-3)
+    changes = 0.01 * torch.randn(2, 8, 8, generator=torch_rng(1))
+    done = to_representation(changes, joints, "body_twist")
+    least = to_actions(done, joints, "body_twist")  # the same but for the elbow, which moves less
+    torch.testing.assert_close(
+        to_representation(least, joints, "body_twist"), done, atol=1e-5, rtol=1e-3
+    )
     assert (least[..., :7].norm(dim=-1) <= changes[..., :7].norm(dim=-1)).all()
-    assert torch.equal(to_actions(done[:1], joints[:1], "tool")[..., 7], changes[:1, :, 7])
-    same = to_actions(done[:1].expand(2, -1, -1), joints, "tool")
+    assert torch.equal(to_actions(done[:1], joints[:1], "body_twist")[..., 7], changes[:1, :, 7])
+    same = to_actions(done[:1].expand(2, -1, -1), joints, "body_twist")
     torch.testing.assert_close(same[0], same[1], atol=1e-6, rtol=1e-4)
 
 
 def test_scales_round_trip_and_keep_constants() -> None:
-    values = torch.randn(100, 3, generator=rng()) * torch.tensor([1e-3, 5.0, 0.0]) + 2
-    scale = Scale((3,))
+    values = torch.randn(100, 3, generator=torch_rng()) * torch.tensor([1e-3, 5.0, 0.0]) + 2
+    scale = Normalizer((3,))
     scale.fit_range(values)
     scaled = scale(values)
     assert scaled.amin(0).tolist() == pytest.approx([-1, -1, 0], abs=1e-3)
@@ -84,7 +103,7 @@ def test_average_follows_its_schedule() -> None:
 
 
 def test_windows_stay_inside_their_episode() -> None:
-    windows = toy_windows(TOY, (3, 20))
+    windows = toy_dataset(TOY, (3, 20))
     recorded = windows.recorded
     condition, actions = windows.take(torch.tensor([0, 2, 3, 22]))
     state, done = recorded.state, recorded.actions
@@ -107,22 +126,22 @@ def test_windows_stay_inside_their_episode() -> None:
     ids=["ddim-chunk", "flow-absolute", "regression-delta"],
 )
 def test_a_toy_batch_is_learned_by_heart(config: PolicyConfig) -> None:
-    windows = toy_windows(config, (6, 6))
-    policy = policy_for(config, windows)
+    windows = toy_dataset(config, (6, 6))
+    policy = toy_policy(config, windows)
     rows = torch.arange(len(windows))
     (condition, actions), wrench = windows.take(rows), windows.wrench(rows)
-    optimiser, generator = torch.optim.Adam(policy.parameters(), 5e-3), rng()
+    optimiser, generator = torch.optim.Adam(policy.parameters(), 5e-3), torch_rng()
     for _ in range(120):
         loss = policy.loss(condition, actions, generator, wrench)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    plan = policy.plan(condition, rng(3))
+    plan = policy.plan(condition, torch_rng(3))
     assert plan.shape == actions.shape
     error, spread = plan - actions, actions - actions.mean(0)
     assert error.square().mean() < 0.1 * spread.square().mean()
     assert (plan[..., 7] == 0).all()
-    assert torch.equal(plan, policy.plan(condition, rng(3)))
+    assert torch.equal(plan, policy.plan(condition, torch_rng(3)))
 
 
 CONFIG = TrainConfig(epochs=3, batch_size=8, lr=1e-3, snapshot_epochs=2, seed=4)
@@ -131,7 +150,7 @@ CONFIG = TrainConfig(epochs=3, batch_size=8, lr=1e-3, snapshot_epochs=2, seed=4)
 def test_a_killed_training_ends_as_an_uninterrupted_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    windows, other = toy_windows(TOY), toy_windows(TOY, seed=1)
+    windows, other = toy_dataset(TOY), toy_dataset(TOY, seed=1)
     whole = train(TOY, windows, other, CONFIG, tmp_path / "whole", {"data": "toy"})
     validate = train_module._Run.validate
 
@@ -163,15 +182,15 @@ def test_a_saved_policy_plans_the_same(
     tmp_path: Path, head: DiffusionConfig | RegressionConfig
 ) -> None:
     config = replace(TOY, head=head, representation="absolute")
-    windows = toy_windows(config)
-    policy = policy_for(config, windows)
+    windows = toy_dataset(config)
+    policy = toy_policy(config, windows)
     for weight in policy.parameters():
         weight.data = weight.data.half().float()
     checkpoint.save(policy, tmp_path, {})
     loaded = checkpoint.load(tmp_path, control_hz=20)
     assert loaded.config == config
     condition, _ = windows.take(torch.arange(3))
-    assert torch.equal(loaded.plan(condition, rng()), policy.plan(condition, rng()))
+    assert torch.equal(loaded.plan(condition, torch_rng()), policy.plan(condition, torch_rng()))
 
 
 def test_a_turn_looks_the_same_by_either_quaternion() -> None:
@@ -179,10 +198,10 @@ def test_a_turn_looks_the_same_by_either_quaternion() -> None:
     state[:, 18:] /= state[:, 18:].norm(dim=1, keepdim=True)
     other = torch.cat([state[:, :18], -state[:, 18:]], 1)
     columns = ft.STATE, ft.TCP_POSE
-    seen = unroll(state, columns, "chunk")
-    torch.testing.assert_close(seen, unroll(other, columns, "chunk"))
-    turned = unroll(state, columns, "tool")
-    torch.testing.assert_close(turned, unroll(other, columns, "tool"))
+    seen = network_input(state, columns, "chunk")
+    torch.testing.assert_close(seen, network_input(other, columns, "chunk"))
+    turned = network_input(state, columns, "body_twist")
+    torch.testing.assert_close(turned, network_input(other, columns, "body_twist"))
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, state[0, 18:].double().numpy())
     np.testing.assert_allclose(seen[0, 18:].reshape(2, 3).T, matrix.reshape(3, 3)[:, :2], atol=1e-6)
@@ -209,31 +228,31 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
 
 
 def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    writer, embedder = EpisodeWriter(tmp_path / "set/episodes"), feeling()
+    writer, embedder = EpisodeWriter(tmp_path / "set/episodes"), toy_touch_embedder()
     config = replace(TOY, touch_dim=embedder.dim, touch_reading="free")
     for n in (4, 6):
-        ticks = [{**tick, ft.ACTION: tick[ft.STATE][:8]} for tick in toy_ticks(n)]
+        ticks = [{**tick, ft.ACTION: tick[ft.STATE][:8]} for tick in toy_observations(n)]
         writer.append(Episode({k: np.stack([t[k] for t in ticks]) for k in ticks[0]}, "feel"))
     episodes = EpisodeSet(tmp_path / "set/episodes")
-    first = read(episodes, [0, 1], config, embedder)
+    first = load_recordings(episodes, [0, 1], config, embedder)
     monkeypatch.setattr(embedder, "embed", None)  # a second embedding would fail
-    again = read(episodes, [1], config, embedder)
+    again = load_recordings(episodes, [1], config, embedder)
     assert first.lengths == (4, 6)
     assert torch.equal(first.touch[4:], again.touch)
     assert first.state.shape == (10, 22) and torch.equal(first.actions[4:], again.actions)
-    frames = toy_ticks(4)
+    frames = toy_observations(4)
     row = torch.from_numpy(embedder.embed_tick(frames[3], frames[0])).half()
     torch.testing.assert_close(first.touch[3], row, rtol=1e-2, atol=1e-2)
     for path in tmp_path.glob("set/embeddings/toy/000000.npy"):
         np.save(path, np.load(path)[1:])
     with pytest.raises(UserError, match="does not fit episode 0"):
-        read(episodes, [0], config, embedder)
+        load_recordings(episodes, [0], config, embedder)
     with pytest.raises(UserError, match='choose touch_reading "free"'):
-        read(episodes, [0], replace(config, touch_reading="wrench"), embedder)
+        load_recordings(episodes, [0], replace(config, touch_reading="wrench"), embedder)
     with pytest.raises(UserError, match="make its config"):
-        read(episodes, [0], config, None)
-    blind = read(episodes, [0], replace(config, touch_dim=0, touch=""), None)
+        load_recordings(episodes, [0], config, None)
+    blind = load_recordings(episodes, [0], replace(config, touch_dim=0, touch=""), None)
     assert blind.touch.shape == (4, 0)
     Policy(replace(config, touch_dim=0)).plan(
-        Condition(blind.touch[None, :2].float(), blind.state[None, :2]), rng()
+        ObservationBatch(blind.touch[None, :2].float(), blind.state[None, :2]), torch_rng()
     )

@@ -21,14 +21,21 @@ from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncode
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.rewards.curves import Contact, Curves, Scale, first_contact, reward, with_fused
+from touchgoal.rewards.curves import (
+    Contact,
+    Curves,
+    DistanceNormalizer,
+    add_fused_curves,
+    first_contact,
+    reward,
+)
 from touchgoal.rewards.embedding_distance import (
     EmbeddedEpisode,
     EmbeddedGoal,
     EpisodeEmbedder,
+    compute_curves,
     distances,
-    fit_scale,
-    measure,
+    fit_normalizer,
 )
 from touchgoal.rewards.goals import (
     EpisodeEnd,
@@ -37,7 +44,7 @@ from touchgoal.rewards.goals import (
     Modality,
     PictureFile,
     Sentence,
-    choose_goal,
+    assign_goals,
     parse_goal,
 )
 from touchgoal.rewards.report.report import write_report
@@ -147,15 +154,15 @@ def test_unknown_goal_lists_the_forms(text: str) -> None:
 
 def test_each_modality_takes_the_first_goal_that_speaks_for_it() -> None:
     last, picture, words = LastFrame(), PictureFile(Path("a.png")), Sentence("soft")
-    chosen = choose_goal([picture, last, words], ALL)
+    chosen = assign_goals([picture, last, words], ALL)
     assert (chosen.image, chosen.tactile, chosen.text) == (picture, last, words)
     assert chosen.as_dict() == {"image": "image:a.png", "tactile": "last", "text": "text:soft"}
     with pytest.raises(UserError, match="'image:a.png' is never used: 'last' before it"):
-        choose_goal([last, picture], ALL)
+        assign_goals([last, picture], ALL)
     with pytest.raises(UserError, match="speaks for text, but this source has image only"):
-        choose_goal([last, words], ["image"])
+        assign_goals([last, words], ["image"])
     with pytest.raises(UserError, match="no goal"):
-        choose_goal([], ALL)
+        assign_goals([], ALL)
 
 
 def test_distances_by_hand() -> None:
@@ -172,18 +179,18 @@ def test_distances_by_hand() -> None:
 
 def test_scale_maps_the_usual_start_to_one_and_end_to_zero(tmp_path: Path) -> None:
     training = [embedded("a" * (k + 1), jitter=1.0) for k in range(4)]
-    scale = fit_scale(training, ["image", "tactile"])
+    scale = fit_normalizer(training, ["image", "tactile"])
     new = embedded("new episode", jitter=1.0)
-    curves = measure(new, goal_of(training[0]), replace_text(scale))
+    curves = compute_curves(new, goal_of(training[0]), replace_text(scale))
     for name in ("image", "tactile", "image+tactile"):
         assert curves.normalised[name][:3] == pytest.approx(np.ones(3), abs=0.1)
         assert curves.normalised[name][-1] == pytest.approx(0, abs=0.1)
     scale.save(tmp_path / "scale.json")
-    assert Scale.load(tmp_path / "scale.json") == scale
+    assert DistanceNormalizer.load(tmp_path / "scale.json") == scale
     assert [p.name for p in tmp_path.iterdir()] == ["scale.json"]
 
 
-def replace_text(scale: Scale) -> Scale:
+def replace_text(scale: DistanceNormalizer) -> DistanceNormalizer:
     """The scale with an entry for text, which the drawn words cannot fit (their ends are alike)."""
     return replace(
         scale,
@@ -197,26 +204,28 @@ def test_own_ends_and_those_of_others_have_their_own_medians() -> None:
     """The five frames before the last lie at 8 8 4 2 2 and at 40 degrees, the goals at 0, 40."""
     still = replace(embedded("a"), image=direction([90.0] * 34 + [8.0, 8.0, 4.0, 2.0, 2.0, 0.0]))
     turned = replace(embedded("b"), image=direction([90.0] * 30 + [40.0] * 10))
-    scale = fit_scale([still, turned], ["image"])
+    scale = fit_normalizer([still, turned], ["image"])
 
     def median(*degrees: float) -> object:
         return pytest.approx(np.median(1 - np.cos(np.radians(degrees))), abs=1e-6)
 
     assert scale.start == {"image": median(50, 90), "own image": median(90, 50)}
     assert scale.goal == {"image": median(36, 40), "own image": median(4, 0)}
-    assert measure(still, replace(goal_of(still), own=frozenset(ALL), touch=None, text=None), scale)
+    assert compute_curves(
+        still, replace(goal_of(still), own=frozenset(ALL), touch=None, text=None), scale
+    )
 
 
 def test_touch_goals_are_ends_with_the_same_object() -> None:
     apple = embedded("apple")
     assert apple.touch is not None
     pear = replace(apple, touch=-apple.touch, object="pear")
-    scale = fit_scale([apple, replace(apple), pear], ["tactile"])
+    scale = fit_normalizer([apple, replace(apple), pear], ["tactile"])
     assert scale.goal["tactile"] == pytest.approx(0, abs=1e-6)
     with pytest.raises(UserError, match="nearer the goal in 0% of 2 pairs"):
-        fit_scale([apple, replace(pear, object="apple")], ["tactile"])
+        fit_normalizer([apple, replace(pear, object="apple")], ["tactile"])
     with pytest.raises(UserError, match="no two training episodes share an object"):
-        fit_scale([apple, pear], ["tactile"])
+        fit_normalizer([apple, pear], ["tactile"])
 
 
 def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
@@ -224,52 +233,54 @@ def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
     lost = replace(good, touch=direction([[90.0] * 20 + [140.0] * 20] * 2))
     held = replace(good, touch=direction([[90.0] * 20 + [60.0] * 20] * 2))
     with pytest.raises(UserError, match="nearer the goal in 67% of 3 pairs"):
-        fit_scale([held, held, lost], ["text"])
+        fit_normalizer([held, held, lost], ["text"])
     misses = [embedded("a" * (k + 1), touches=False, jitter=1.0) for k in range(8)]
     noise = [replace(miss, success=True) for miss in misses]
     with pytest.raises(UserError, match="'text': the end is nearer the goal in 0%"):
-        fit_scale([good], ["text"])
+        fit_normalizer([good], ["text"])
     with pytest.raises(UserError, match="'tactile'"):
-        fit_scale(noise, ["tactile"])
+        fit_normalizer(noise, ["tactile"])
     with pytest.raises(UserError, match="miss failed"):
-        fit_scale([good, embedded("miss", touches=False)], ["image"])
+        fit_normalizer([good, embedded("miss", touches=False)], ["image"])
     with pytest.raises(UserError, match="other encoders"):
-        fit_scale([good, replace(good, space={"image": "z"})], ["image"])
+        fit_normalizer([good, replace(good, space={"image": "z"})], ["image"])
     with pytest.raises(UserError, match="at least one"):
-        fit_scale([], ["image"])
-    scale = fit_scale([good, replace(good)], ["image"])
+        fit_normalizer([], ["image"])
+    scale = fit_normalizer([good, replace(good)], ["image"])
     with pytest.raises(UserError, match="has no 'tactile'"):
-        measure(good, goal_of(good), scale)
+        compute_curves(good, goal_of(good), scale)
     with pytest.raises(UserError, match="was fitted for a, these curves come from z"):
         scale.normalise({"image": np.ones(3)}, {"image": "z"}, frozenset())
     (tmp_path / "broken.json").write_text("{")
     with pytest.raises(UserError, match="is not a scale"):
-        Scale.load(tmp_path / "broken.json")
+        DistanceNormalizer.load(tmp_path / "broken.json")
     with pytest.raises(UserError, match="there is no scale"):
-        Scale.load(tmp_path / "none.json")
+        DistanceNormalizer.load(tmp_path / "none.json")
 
 
 def test_an_episode_that_never_touches_stays_away_from_the_goal() -> None:
     """Its picture ends at the goal, its touch does not; its own last frame would hide that."""
     training = [embedded("a" * (k + 1), jitter=1.0) for k in range(4)]
-    scale = replace_text(fit_scale(training, ["image", "tactile"]))
+    scale = replace_text(fit_normalizer(training, ["image", "tactile"]))
     miss = embedded("never touches", touches=False, jitter=1.0)
-    other = measure(miss, goal_of(training[0]), scale).metrics()
+    other = compute_curves(miss, goal_of(training[0]), scale).metrics()
     assert other["image"].end < 0.1
     assert other["tactile"].end > 0.9 and other["tactile"].t_drop_50 is None
     assert other["image+tactile"].end > 0.4
-    assert measure(miss, goal_of(miss), scale).metrics()["image+tactile"].end < 0.1
+    assert compute_curves(miss, goal_of(miss), scale).metrics()["image+tactile"].end < 0.1
 
 
 def test_a_modality_with_a_larger_range_does_not_win() -> None:
     falling, flat = np.linspace(1, 0, 30), np.ones(30)
-    fused = with_fused({"image": falling, "text": flat})
+    fused = add_fused_curves({"image": falling, "text": flat})
     assert list(fused) == ["image", "text", "image+text"]
     assert fused["image+text"] == pytest.approx((falling + 1) / 2)
-    raw_ranges = Scale({"image": 0.3, "tactile": 1.9}, {"image": 0.2, "tactile": 0.1}, {}, {}, 1)
+    raw_ranges = DistanceNormalizer(
+        {"image": 0.3, "tactile": 1.9}, {"image": 0.2, "tactile": 0.1}, {}, {}, 1
+    )
     same = {"image": "a", "tactile": "b"}
     raw = {"image": 0.2 + 0.1 * falling, "tactile": 0.1 + 1.8 * falling[::-1]}
-    both = with_fused(replace(raw_ranges, space=same).normalise(raw, same, frozenset()))
+    both = add_fused_curves(replace(raw_ranges, space=same).normalise(raw, same, frozenset()))
     assert both["image+tactile"] == pytest.approx(np.full(30, 0.5))
 
 
@@ -290,8 +301,8 @@ def test_contact_is_the_simulators_or_detected() -> None:
 def test_episode_is_embedded_once_for_all_goals(embedder: EpisodeEmbedder) -> None:
     e = embedder.embed_episode(recorded(), 20.0, "mine")
     assert e.modalities == ALL and (e.object, e.success) == ("apple", True)
-    goal = choose_goal([LastFrame(), Sentence("hard and smooth")], e.modalities)
-    curves = measure(e, embedder.embed_goal(goal, e), None)
+    goal = assign_goals([LastFrame(), Sentence("hard and smooth")], e.modalities)
+    curves = compute_curves(e, embedder.embed_goal(goal, e), None)
     assert set(curves.raw) == set(ALL) and not curves.normalised
     assert curves.raw["image"][-1] == pytest.approx(0, abs=1e-6)
     assert np.ptp(curves.raw["tactile"][:7]) < 1e-6 < 1e-4 < curves.raw["tactile"][0]
@@ -299,10 +310,10 @@ def test_episode_is_embedded_once_for_all_goals(embedder: EpisodeEmbedder) -> No
     assert e.descriptions is not None and embedder.embed_goal(goal, e).text is not None
     assert embedder.embed_goal(goal, e).text == pytest.approx(e.descriptions[0], abs=1e-6)
 
-    third = embedder.embed_goal(choose_goal([FrameNumber(3)], e.modalities), e)
+    third = embedder.embed_goal(assign_goals([FrameNumber(3)], e.modalities), e)
     assert distances(e, third)["image"].argmin() == 3
     with pytest.raises(UserError, match="frames are 0 to 11"):
-        embedder.embed_goal(choose_goal([FrameNumber(12)], e.modalities), e)
+        embedder.embed_goal(assign_goals([FrameNumber(12)], e.modalities), e)
 
 
 def test_goals_from_a_picture_and_from_another_episode(
@@ -315,15 +326,15 @@ def test_goals_from_a_picture_and_from_another_episode(
     other = embedder.embed_episode(stored, 20.0, "set#1")
     mine = embedder.embed_episode(recorded(color=160), 20.0, "mine")
     spec = parse_goal(f"episode:{tmp_path / 'set'}#1")
-    end = embedder.embed_goal(choose_goal([spec], ALL), mine)
+    end = embedder.embed_goal(assign_goals([spec], ALL), mine)
     assert other.touch is not None and end.touch is not None and end.image is not None
     assert end.image == pytest.approx(other.image[-1], abs=1e-5)
     assert end.touch == pytest.approx(other.touch[:, -1], abs=1e-5)
     with pytest.raises(UserError, match="episodes 0 to 1"):
-        embedder.embed_goal(choose_goal([EpisodeEnd(tmp_path / "set", 2)], ALL), mine)
+        embedder.embed_goal(assign_goals([EpisodeEnd(tmp_path / "set", 2)], ALL), mine)
 
     Image.fromarray(stored.frames[FRONT][-1]).save(tmp_path / "end.png")
-    picture = embedder.embed_goal(choose_goal([PictureFile(tmp_path / "end.png")], ALL), mine)
+    picture = embedder.embed_goal(assign_goals([PictureFile(tmp_path / "end.png")], ALL), mine)
     assert picture.touch is None and picture.image == pytest.approx(other.image[-1], abs=1e-5)
     (tmp_path / "end.png").write_text("no picture")
     with pytest.raises(UserError, match=r"end\.png cannot be read"):
@@ -337,10 +348,10 @@ def test_video_has_pictures_alone(embedder: EpisodeEmbedder) -> None:
     episode = embedder.embed_episode(recorded(), 20.0, "mine")
     for any_embedder in (embedder, EpisodeEmbedder(PaintTowers(), None)):
         video = any_embedder.embed_video(frames, 30.0, "a.mp4")
-        goal = choose_goal([LastFrame()], video.modalities)
-        curves = measure(video, any_embedder.embed_goal(goal, video), None)
+        goal = assign_goals([LastFrame()], video.modalities)
+        curves = compute_curves(video, any_embedder.embed_goal(goal, video), None)
         assert list(curves.values) == ["image"] and curves.contact.frame is None
-        of_episode = measure(episode, embedder.embed_goal(goal, episode), None)
+        of_episode = compute_curves(episode, embedder.embed_goal(goal, episode), None)
         assert curves.values["image"] == pytest.approx(of_episode.values["image"])
         assert curves.values["image"][0] > 0.01
 
@@ -367,7 +378,7 @@ def test_report_holds_the_curves(tmp_path: Path) -> None:
         fps=20.0,
         contact=Contact(12, "truth"),
         raw=raw,
-        normalised=with_fused({"image": fall, "tactile": fall**2}),
+        normalised=add_fused_curves({"image": fall, "tactile": fall**2}),
     )
     paths = write_report(curves, tmp_path / "out", "ep3", {"encoder": "tiny"})
     with Image.open(paths["png"]) as picture:

@@ -15,7 +15,7 @@ from hypothesis.extra.numpy import arrays
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety import limits as robots
-from touchgoal.control.safety.action_filter import Limit, Mode, Reading, Safety, SafetyState
+from touchgoal.control.safety.action_filter import Limit, Measurements, Mode, Safety, SafetyState
 from touchgoal.control.safety.limits import RobotLimits
 
 HZ = 20
@@ -24,8 +24,8 @@ LAYERS = {robot.arm.name: Safety(robot, HZ) for robot in (robots.FR3, robots.UR5
 EPS = 1e-9
 
 
-def reading(q: np.ndarray, **changes: object) -> Reading:
-    calm = Reading(q, np.zeros(3), np.zeros(q.size), np.zeros(2), 0.0, 0.0, 0.0)
+def reading(q: np.ndarray, **changes: object) -> Measurements:
+    calm = Measurements(q, np.zeros(3), np.zeros(q.size), np.zeros(2), 0.0, 0.0, 0.0)
     return replace(calm, **changes)  # pyright: ignore[reportArgumentType]
 
 
@@ -47,7 +47,7 @@ def check(layer: Safety, path: list[SafetyState]) -> None:
 def run(layer: Safety, actions: list[np.ndarray]) -> SafetyState:
     path = [layer.start(layer.limits.arm.home)]
     for action in actions:
-        path.append(layer.advance(path[-1], action, reading(path[-1].q)))
+        path.append(layer.filter_action(path[-1], action, reading(path[-1].q)))
     if actions:
         check(layer, path)
     return path[-1]
@@ -89,8 +89,8 @@ def test_nothing_leaves_the_limits_in_a_long_random_walk(name: str) -> None:
         push, path = rng.choice([0.0, 0.01, 0.05, 1.0, 1e300]) * rng.standard_normal(n), [state]
         for _ in range(25):
             action = push + 0.02 * rng.standard_normal(n)
-            path.append(layer.advance(path[-1], action, reading(path[-1].q)))
-            seen |= set(path[-1].acted)
+            path.append(layer.filter_action(path[-1], action, reading(path[-1].q)))
+            seen |= set(path[-1].active_limits)
         check(layer, path)
         state = path[-1]
     assert {Limit.STEP, Limit.VELOCITY, Limit.ACCELERATION, Limit.WORKSPACE} <= seen
@@ -100,9 +100,9 @@ def test_a_gentle_command_passes_untouched() -> None:
     layer = LAYERS["FR3"]
     state = layer.start(layer.limits.arm.home)
     action = np.full(7, 0.002)
-    after = layer.advance(state, action, reading(state.q))
+    after = layer.filter_action(state, action, reading(state.q))
     np.testing.assert_allclose(after.q, state.q + action, atol=1e-15)
-    assert after.mode is Mode.MOVE and after.acted == ()
+    assert after.mode is Mode.MOVE and after.active_limits == ()
 
 
 def test_the_joint_margin_is_reached_and_named() -> None:
@@ -110,8 +110,8 @@ def test_the_joint_margin_is_reached_and_named() -> None:
     state = layer.start(layer.limits.arm.home)
     named = set()
     for _ in range(150):
-        state = layer.advance(state, np.eye(7)[6], reading(state.q))
-        named |= set(state.acted)
+        state = layer.filter_action(state, np.eye(7)[6], reading(state.q))
+        named |= set(state.active_limits)
     assert state.q[6] == pytest.approx(layer.joints.upper[6], abs=1e-9) and Limit.MARGIN in named
 
 
@@ -138,7 +138,7 @@ def test_the_first_fault_brakes_within_limits_and_stays(
     for tick in range(12):
         # Later faults and calm readings change nothing.
         now = bad if tick == 0 else reading(state.q, touch=np.full(2, 99.0 * (tick % 2)))
-        after = layer.advance(state, np.full(7, -0.02), now)
+        after = layer.filter_action(state, np.full(7, -0.02), now)
         check(layer, [state, after])
         state = after
         assert state.mode is Mode.STOP and state.fault and state.fault.limit is limit
@@ -149,11 +149,11 @@ def test_the_first_fault_brakes_within_limits_and_stays(
 def test_what_is_stale_holds_then_resumes_or_stops(age: str) -> None:
     layer = LAYERS["FR3"]
     state = run(layer, [np.full(7, 0.01)] * 3)
-    held = layer.advance(state, np.full(7, 0.01), reading(state.q, **{age: 0.12}))
+    held = layer.filter_action(state, np.full(7, 0.01), reading(state.q, **{age: 0.12}))
     assert held.mode is Mode.HOLD and held.fault is None
     assert (np.abs(held.velocity) < np.abs(state.velocity)).all()
-    assert layer.advance(held, np.full(7, 0.01), reading(held.q)).mode is Mode.MOVE
-    assert layer.advance(held, np.full(7, 0.01), reading(held.q, **{age: 1.0})).fault
+    assert layer.filter_action(held, np.full(7, 0.01), reading(held.q)).mode is Mode.MOVE
+    assert layer.filter_action(held, np.full(7, 0.01), reading(held.q, **{age: 1.0})).fault
 
 
 def test_actions_that_are_no_numbers_hold_then_stop() -> None:
@@ -161,7 +161,7 @@ def test_actions_that_are_no_numbers_hold_then_stop() -> None:
     state = layer.start(layer.limits.arm.home)
     modes = []
     for _ in range(12):
-        state = layer.advance(state, np.full(7, np.nan), reading(state.q))
+        state = layer.filter_action(state, np.full(7, np.nan), reading(state.q))
         modes.append(state.mode)
     assert modes[0] is Mode.HOLD and modes[-1] is Mode.STOP
     assert state.fault and state.fault.limit is Limit.NOT_A_NUMBER
@@ -184,9 +184,9 @@ def test_the_gripper_is_asked_for_widths_inside_its_stroke_and_kept_while_the_ar
 ) -> None:
     layer = LAYERS["FR3"]
     start = layer.start(layer.limits.arm.home)
-    moving = layer.advance(start, np.zeros(7), reading(start.q))
-    width = layer.width(moving, target, 0.03)
+    moving = layer.filter_action(start, np.zeros(7), reading(start.q))
+    width = layer.filter_width(moving, target, 0.03)
     assert width == (np.clip(target, 0, 0.08) if np.isfinite(target) else 0.03)
     for age in (0.2, 1.0):  # hold, stop
-        held = layer.advance(moving, np.zeros(7), reading(start.q, state_age=age))
-        assert layer.width(held, target, 0.03) == 0.03
+        held = layer.filter_action(moving, np.zeros(7), reading(start.q, state_age=age))
+        assert layer.filter_width(held, target, 0.03) == 0.03

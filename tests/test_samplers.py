@@ -2,16 +2,16 @@
 
 import pytest
 import torch
-from toy_policies import rng
+from toy_policies import torch_rng
 
 from touchgoal.control.errors import UserError
 from touchgoal.policies.heads.samplers import (
-    FLOW_STEPS,
+    FLOW_TIME_SCALE,
     SamplerConfig,
-    mend,
-    signal_power,
-    spoil,
-    visited,
+    add_noise,
+    alphas_cumprod,
+    denoise,
+    inference_timesteps,
 )
 from touchgoal.policies.heads.unet import PRESETS, ShortConv1d, UNet
 
@@ -33,7 +33,7 @@ def test_unet_is_the_published_one() -> None:
 
 @pytest.mark.parametrize("ticks", [1, 2, 8])
 def test_short_convolution_is_a_convolution(ticks: int) -> None:
-    x, conv = torch.randn(3, 4, ticks, generator=rng()), ShortConv1d(4, 6, 5)
+    x, conv = torch.randn(3, 4, ticks, generator=torch_rng()), ShortConv1d(4, 6, 5)
     expected = torch.nn.functional.conv1d(x, conv.weight, conv.bias, padding=2)
     torch.testing.assert_close(conv(x), expected)
 
@@ -43,14 +43,14 @@ def exact(config: SamplerConfig):
 
     def network(x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         if config.kind == "flow":
-            t = step[0] / FLOW_STEPS
+            t = step[0] / FLOW_TIME_SCALE
             gain = (t * DEVIATION**2 - (1 - t)) / (t**2 * DEVIATION**2 + (1 - t) ** 2)
             velocity = MEAN + gain * (x - t * MEAN)
-            return velocity if config.predict == "velocity" else x + (1 - t) * velocity
-        power = signal_power(config.train_steps)[int(step[0])].float()
+            return velocity if config.prediction_type == "velocity" else x + (1 - t) * velocity
+        power = alphas_cumprod(config.num_train_timesteps)[int(step[0])].float()
         gain = DEVIATION**2 * power.sqrt() / (DEVIATION**2 * power + 1 - power)
         clean = MEAN + gain * (x - power.sqrt() * MEAN)
-        if config.predict == "sample":
+        if config.prediction_type == "sample":
             return clean
         return (x - power.sqrt() * clean) / (1 - power).sqrt()
 
@@ -63,44 +63,44 @@ def exact(config: SamplerConfig):
         SamplerConfig("ddim", "sample", 1000, 200, clip=9),
         SamplerConfig("ddim", "epsilon", 1000, 200, clip=9),
         SamplerConfig("ddpm", "sample", 1000, 1000, clip=9),
-        SamplerConfig("flow", "velocity", plan_steps=200, clip=9),
-        SamplerConfig("flow", "sample", plan_steps=200, clip=9),
+        SamplerConfig("flow", "velocity", num_inference_steps=200, clip=9),
+        SamplerConfig("flow", "sample", num_inference_steps=200, clip=9),
     ],
-    ids=lambda c: f"{c.kind}-{c.predict}",
+    ids=lambda c: f"{c.kind}-{c.prediction_type}",
 )
 def test_exact_denoiser_gives_the_gaussian_back(config: SamplerConfig) -> None:
-    noise = torch.randn(4000, 4, 1, generator=rng())
-    samples = mend(config, exact(config), noise, rng(1))
+    noise = torch.randn(4000, 4, 1, generator=torch_rng())
+    samples = denoise(config, exact(config), noise, torch_rng(1))
     assert samples.mean().item() == pytest.approx(MEAN, abs=0.01)
     assert samples.std().item() == pytest.approx(DEVIATION, rel=0.03)
 
 
 @pytest.mark.parametrize("predict", ["epsilon", "sample"])
 def test_forward_process_has_the_schedules_statistics(predict: str) -> None:
-    config = SamplerConfig(predict=predict, train_steps=10)  # pyright: ignore[reportArgumentType]
+    config = SamplerConfig(prediction_type=predict, num_train_timesteps=10)  # pyright: ignore[reportArgumentType]
     clean = torch.full((20_000, 2, 1), 0.7)
-    noisy, step, wanted = spoil(config, clean, rng())
-    for t, power in enumerate(signal_power(10).tolist()):
+    noisy, step, target = add_noise(config, clean, torch_rng())
+    for t, power in enumerate(alphas_cumprod(10).tolist()):
         at = noisy[step == t]
         assert at.mean().item() == pytest.approx(0.7 * power**0.5, abs=0.05)
         assert at.std().item() == pytest.approx((1 - power) ** 0.5, rel=0.05)
-    power = signal_power(10)[step.long()].float().view(-1, 1, 1)
-    noise = wanted if predict == "epsilon" else (noisy - power.sqrt() * wanted) / (1 - power).sqrt()
+    power = alphas_cumprod(10)[step.long()].float().view(-1, 1, 1)
+    noise = target if predict == "epsilon" else (noisy - power.sqrt() * target) / (1 - power).sqrt()
     assert noise.std().item() == pytest.approx(1, abs=0.02)
 
 
 def test_flow_goes_straight() -> None:
-    clean = torch.randn(50, 4, 2, generator=rng())
-    noisy, step, velocity = spoil(SamplerConfig("flow", "velocity"), clean, rng(1))
-    left = 1 - step.view(-1, 1, 1) / FLOW_STEPS
+    clean = torch.randn(50, 4, 2, generator=torch_rng())
+    noisy, step, velocity = add_noise(SamplerConfig("flow", "velocity"), clean, torch_rng(1))
+    left = 1 - step.view(-1, 1, 1) / FLOW_TIME_SCALE
     torch.testing.assert_close(noisy + left * velocity, clean)
 
 
 def test_plans_start_from_noise_alone() -> None:
-    assert visited(SamplerConfig(plan_steps=4)).tolist() == [99, 74, 49, 24]
-    assert signal_power(100)[-1] < 1e-4
+    assert inference_timesteps(SamplerConfig(num_inference_steps=4)).tolist() == [99, 74, 49, 24]
+    assert alphas_cumprod(100)[-1] < 1e-4
     with pytest.raises(UserError, match="ask for fewer"):
-        SamplerConfig(plan_steps=101)
+        SamplerConfig(num_inference_steps=101)
     with pytest.raises(UserError, match="cannot predict velocity"):
         SamplerConfig("ddim", "velocity")
 
@@ -116,10 +116,10 @@ def test_samplers_equal_diffusers(kind: str) -> None:
     theirs = (diffusers.DDPMScheduler if kind == "ddpm" else diffusers.DDIMScheduler)(**options)
     steps = 100 if kind == "ddpm" else 10
     theirs.set_timesteps(steps)
-    config = SamplerConfig(kind, "epsilon", plan_steps=steps)  # pyright: ignore[reportArgumentType]
-    x = noise = torch.randn(3, 8, 2, generator=rng())
-    generator, more = rng(1), {"use_clipped_model_output": True} if kind == "ddim" else {}
+    config = SamplerConfig(kind, "epsilon", num_inference_steps=steps)  # pyright: ignore[reportArgumentType]
+    x = noise = torch.randn(3, 8, 2, generator=torch_rng())
+    generator, more = torch_rng(1), {"use_clipped_model_output": True} if kind == "ddim" else {}
     for t in theirs.timesteps:
         x = theirs.step(x.tanh(), t, x, generator=generator, **more).prev_sample
-    ours = mend(config, lambda x, t: x.tanh(), noise, rng(1))
+    ours = denoise(config, lambda x, t: x.tanh(), noise, torch_rng(1))
     torch.testing.assert_close(ours, x, atol=1e-3, rtol=1e-3)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.motion.kinematics import FR3, Fr3Kinematics, Kinematics, fingers_down
+from touchgoal.control.motion.kinematics import FR3_ARM, Fr3Kinematics, Kinematics, fingers_down
 from touchgoal.control.motion.self_collision import (
     SelfDistance,
-    require_apart,
+    require_no_self_collision,
     segment_distance,
 )
 from touchgoal.control.motion.trajectories import joint_move
@@ -20,12 +20,17 @@ def test_the_capsules_cover_the_arms_meshes() -> None:
     import mujoco  # after touchgoal, which chooses the OpenGL platform
 
     model = build([]).compile()
-    data, distance = mujoco.MjData(model), SelfDistance(FR3)
-    data.qpos[:7] = FR3.home
+    data, distance = mujoco.MjData(model), SelfDistance(FR3_ARM)
+    data.qpos[:7] = FR3_ARM.home
     mujoco.mj_kinematics(model, data)
     ends = np.array([p for c in distance.body for p in (c.start, c.end)])
     frames = [c.frame for c in distance.body for _ in range(2)]
-    placed = Kinematics(FR3, 0.0).track(ends, frames)(FR3.home).full().T.reshape(-1, 2, 3)
+    placed = (
+        Kinematics(FR3_ARM, 0.0)
+        .points_on_links(ends, frames)(FR3_ARM.home)
+        .full()
+        .T.reshape(-1, 2, 3)
+    )
     names = [f"fr3_link{i}" for i in range(8)] + ["hand"]
     for part, name in enumerate(names):
         geom = model.body(name).geomadr[0]
@@ -60,13 +65,13 @@ def test_segment_distance_is_the_least_over_all_points() -> None:
 
 def test_moves_over_the_table_are_free_and_one_into_the_arm_itself_is_not() -> None:
     robot, arm, rng = robots.FR3, Fr3Kinematics(), np.random.default_rng(1)
-    distance, q = SelfDistance(FR3), FR3.home
+    distance, q = SelfDistance(FR3_ARM), FR3_ARM.home
     for _ in range(20):
         position = rng.uniform([0.38, -0.25, 0.02], [0.62, 0.25, 0.35])
-        goal = arm.reach(position, fingers_down(rng.uniform(-1.5, 1.5)), FR3.home)
-        require_apart(joint_move(q, goal, robot.policy), distance)
+        goal = arm.solve_ik(position, fingers_down(rng.uniform(-1.5, 1.5)), FR3_ARM.home)
+        require_no_self_collision(joint_move(q, goal, robot.policy), distance)
         q = goal
     folded = np.array([0.0, -0.6, 0.0, -2.9, 0.0, 0.8, 0.8])  # the hand into the shoulder
     assert distance.gap(folded[None])[0] < 0
     with pytest.raises(UserError, match="of itself"):
-        require_apart(joint_move(FR3.home, folded, robot.policy), distance)
+        require_no_self_collision(joint_move(FR3_ARM.home, folded, robot.policy), distance)

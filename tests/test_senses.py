@@ -6,40 +6,54 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_policies import TOY, feeling, policy_for, rng, toy_ticks, toy_windows
+from toy_policies import (
+    TOY,
+    torch_rng,
+    toy_dataset,
+    toy_observations,
+    toy_policy,
+    toy_touch_embedder,
+)
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.policies.acting import SHIPPED, ActorMaker, Planner
+from touchgoal.policies.acting import SHIPPED, Planner, SavedPolicy
 from touchgoal.policies.perception.placements import Placements
-from touchgoal.policies.perception.pose_estimator import SightConfig
-from touchgoal.policies.perception.proprioception import unroll
+from touchgoal.policies.perception.pose_estimator import PoseEstimatorConfig
+from touchgoal.policies.perception.proprioception import network_input
 from touchgoal.policies.perception.state_estimation import (
-    READ,
-    Senses,
-    SensesConfig,
-    SensesNetwork,
-    load_senses,
-    save_senses,
+    ESTIMATED,
+    StateEstimator,
+    StateEstimatorConfig,
+    StateEstimatorNetwork,
+    load_estimator,
+    save_estimator,
 )
 from touchgoal.policies.perception.training import (
-    LearnConfig,
-    judge_sight,
-    learn_contact,
-    learn_sight,
+    EstimatorTrainConfig,
+    pose_errors,
+    train_contact_estimator,
+    train_pose_estimator,
 )
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.pick_place import WORKSPACE, PickPlace, PickPlaceConfig
 
-SMALL = SightConfig(
-    (16, 16), windows=((ft.FRONT, (0, 16, 0, 16)),), channels=8, glances=4, detail=4, width=16
+SMALL = PoseEstimatorConfig(
+    (16, 16),
+    crops=((ft.FRONT, (0, 16, 0, 16)),),
+    channels=8,
+    keypoints=4,
+    keypoint_features=4,
+    width=16,
 )
 
 
-def toy_senses() -> Senses:
+def toy_estimator() -> StateEstimator:
     torch.manual_seed(0)
-    touch = feeling()
-    return Senses(SensesNetwork(SensesConfig(touch.name, touch.dim, SMALL)).eval(), touch)
+    touch = toy_touch_embedder()
+    return StateEstimator(
+        StateEstimatorNetwork(StateEstimatorConfig(touch.name, touch.dim, SMALL)).eval(), touch
+    )
 
 
 def test_the_start_is_seen_from_the_hand() -> None:
@@ -50,7 +64,9 @@ def test_the_start_is_seen_from_the_hand() -> None:
     left = 2 * (yaw - hand)
     for contact in ([0.0, 1.0], [1.0, 1.0]):  # the object matters, or the goal
         held = contact == [1.0, 1.0]
-        seen = unroll(torch.tensor([pose + contact + start]), columns, "hand")[0, 11:].numpy()
+        seen = network_input(torch.tensor([pose + contact + start]), columns, "base_twist")[
+            0, 11:
+        ].numpy()
         way = np.array([0.0, 0.0, -0.17, 0.1, -0.2] if held else [-0.05, 0.05, -0.17, 0.0, 0.0])
         twice = [0.0, 0.0] if held else [np.cos(left), np.sin(left)]
         expected = [*way, *twice, *way / (np.abs(way) + 0.02)]
@@ -58,46 +74,52 @@ def test_the_start_is_seen_from_the_hand() -> None:
 
 
 def test_contact_is_learnt() -> None:
-    touch = torch.randn(400, 6, generator=rng())
+    touch = torch.randn(400, 6, generator=torch_rng())
     contact = torch.stack([touch[:, 0] > 0, touch[:, 3] > 0], 1)  # one number of each fingertip
-    network = SensesNetwork(SensesConfig("toy", 6, SMALL))
-    learn_contact(network, touch, contact, LearnConfig(contact_steps=1500, touch_noise=0.1))
+    network = StateEstimatorNetwork(StateEstimatorConfig("toy", 6, SMALL))
+    train_contact_estimator(
+        network, touch, contact, EstimatorTrainConfig(contact_steps=1500, touch_noise=0.1)
+    )
     assert ((network.contact(touch) > 0) == contact).float().mean() > 0.9
 
 
 def test_a_place_is_learnt() -> None:
     """A bright spot on grey, where it is to be found again."""
     torch.manual_seed(0)
-    spots = torch.randint(0, 14, (256, 2), generator=rng())
+    spots = torch.randint(0, 14, (256, 2), generator=torch_rng())
     pictures = torch.full((256, 16, 16, 3), 128, dtype=torch.uint8)
     for picture, (row, column) in zip(pictures, spots, strict=True):
         picture[row : row + 2, column : column + 2] = 255
     start = torch.zeros(256, 7)
     start[:, 3] = 1.0
     start[:, :2] = spots / 100
-    placements = Placements({ft.FRONT: pictures}, torch.randn(256, 7, generator=rng()), start)
-    sight = SensesNetwork(SensesConfig("toy", 6, SMALL)).sight
-    learn_sight(sight, placements, LearnConfig(steps=300, lr=1e-2))
-    assert judge_sight(sight, placements)["object_mm"][0] < 15  # 60 by chance
+    placements = Placements({ft.FRONT: pictures}, torch.randn(256, 7, generator=torch_rng()), start)
+    sight = StateEstimatorNetwork(StateEstimatorConfig("toy", 6, SMALL)).sight
+    train_pose_estimator(sight, placements, EstimatorTrainConfig(steps=300, lr=1e-2))
+    assert pose_errors(sight, placements)["object_mm"][0] < 15  # 60 by chance
 
 
 def test_senses_survive_the_disk(tmp_path: Path) -> None:
-    senses = toy_senses()
-    save_senses(senses.network, tmp_path, {})
+    estimator = toy_estimator()
+    save_estimator(estimator.network, tmp_path, {})
     with pytest.raises(UserError, match="feel through 'toy'"):
-        load_senses(tmp_path)  # finds the shipped touch encoder
+        load_estimator(tmp_path)  # finds the shipped touch encoder
 
 
 def test_a_policy_acts_on_its_senses() -> None:
     config = replace(
-        TOY, touch_dim=0, touch="", proprioception=(ft.STATE, ft.TCP_POSE, *READ), place_noise=0.0
+        TOY,
+        touch_dim=0,
+        touch="",
+        proprioception=(ft.STATE, ft.TCP_POSE, *ESTIMATED),
+        position_noise=0.0,
     )
-    policy, ticks = policy_for(config, toy_windows(config)).eval(), toy_ticks(3)
+    policy, ticks = toy_policy(config, toy_dataset(config)).eval(), toy_observations(3)
     for tick in ticks:
         tick[ft.FRONT] = np.zeros((16, 16, 3), np.uint8)
     with pytest.raises(UserError, match=r"truth\.contact"):
         Planner(policy, None)
-    planner = Planner(policy, None, toy_senses())
+    planner = Planner(policy, None, toy_estimator())
     plans = [planner.plan(ticks[i : i + 2]) for i in range(2)]
     assert plans[0].shape == (config.prediction_horizon, 8) and np.isfinite(plans).all()
 
@@ -120,5 +142,5 @@ def test_a_rearrangement_is_a_beginning() -> None:
 @pytest.mark.parametrize("task", SHIPPED)
 def test_what_ships_fits_its_task(task: str) -> None:
     config = BeadMazeConfig() if task == "bead-maze" else PickPlaceConfig()
-    maker = ActorMaker(SHIPPED[task]).checked(config)
-    assert maker.observing(config).tactile
+    maker = SavedPolicy(SHIPPED[task]).check_task(config)
+    assert maker.env_config(config).tactile

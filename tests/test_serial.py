@@ -21,7 +21,7 @@ from touchgoal.control.sensors.load_cell import (
     Sample,
     SerialLoadCell,
     parse,
-    seal,
+    with_checksum,
 )
 
 
@@ -48,7 +48,7 @@ def until(holds: Callable[[], bool], seconds: float = 5.0) -> None:
 
 def counted(k: int) -> bytes:
     """Line k: time k, value 1000 + k."""
-    return seal(b"%d,%d" % (k, 1000 + k), "crc16") + b"\n"
+    return with_checksum(b"%d,%d" % (k, 1000 + k), "crc16") + b"\n"
 
 
 def damage(message: bytes, rng: random.Random) -> bytes:
@@ -67,7 +67,7 @@ def damage(message: bytes, rng: random.Random) -> bytes:
 
 def test_a_load_cell_is_read_in_newtons(line: tuple[int, str]) -> None:
     device, port = line
-    cell = SerialLoadCell(LoadCellConfig(port, newtons_per_count=0.01, zero=1000.0, highest=50.0))
+    cell = SerialLoadCell(LoadCellConfig(port, newtons_per_count=0.01, zero=1000.0, max_force=50.0))
     before = time.monotonic()
     for k in range(6):
         os.write(device, counted(k))
@@ -80,11 +80,11 @@ def test_a_load_cell_is_read_in_newtons(line: tuple[int, str]) -> None:
 @pytest.mark.parametrize(("checksum", "believed"), [("none", 6436), ("xor", 145), ("crc16", 0)])
 def test_how_many_garbled_lines_are_believed(checksum: Checksum, believed: int) -> None:
     """Of 30,000 or more; the shares stand in the driver's docstring. With crc16, none."""
-    cell = LoadCellConfig("", 2e-4, 84_213, highest=100.0, checksum=checksum)
+    cell = LoadCellConfig("", 2e-4, 84_213, max_force=100.0, checksum=checksum)
     rng, lines, sent, stream = random.Random(0), set(), set(), []
     for k in range(50_000):
         value = rng.randrange(84_213, 104_213)
-        line = seal(b"%d,%d" % (12 * k, value), checksum)
+        line = with_checksum(b"%d,%d" % (12 * k, value), checksum)
         lines.add(line)
         sent.add(Sample(2e-4 * (value - 84_213), 12 * k))
         stream.append(damage(line + b"\n", rng))
@@ -96,14 +96,14 @@ def test_how_many_garbled_lines_are_believed(checksum: Checksum, believed: int) 
 
 def test_the_checksums_are_the_usual_ones() -> None:
     """The check value of CRC-16/MODBUS, and a sentence of the NMEA standard."""
-    assert seal(b"123456789", "crc16") == b"123456789*4B37"
-    assert seal(b"GPGLL,5300.97914,N,00259.98174,E,125926,A", "xor").endswith(b"*28")
+    assert with_checksum(b"123456789", "crc16") == b"123456789*4B37"
+    assert with_checksum(b"GPGLL,5300.97914,N,00259.98174,E,125926,A", "xor").endswith(b"*28")
 
 
 def test_what_a_poor_cable_brings_is_counted(line: tuple[int, str]) -> None:
     """Every reading is of a sent line, and all else is counted, however the reads cut it up."""
     device, port = line
-    config = LoadCellConfig(port, newtons_per_count=1.0, zero=0.0, highest=1e5)
+    config = LoadCellConfig(port, newtons_per_count=1.0, zero=0.0, max_force=1e5)
     cell = SerialLoadCell(config)
     rng, seen = random.Random(0), set()
     lines = [damage(counted(k), rng) if k % 4 == 2 else counted(k) for k in range(200)]
@@ -123,7 +123,7 @@ def test_what_a_poor_cable_brings_is_counted(line: tuple[int, str]) -> None:
 @pytest.mark.parametrize("bad", [b"5,9e9", b"5,nan", b"5", b"5,x", b"2,1"])
 def test_wrong_ranges_fields_and_times_are_refused(line: tuple[int, str], bad: bytes) -> None:
     device, port = line
-    cell = SerialLoadCell(LoadCellConfig(port, 1.0, 0.0, highest=10.0, checksum="none"))
+    cell = SerialLoadCell(LoadCellConfig(port, 1.0, 0.0, max_force=10.0, checksum="none"))
     os.write(device, b"half a li\n3,4\n" + bad + b"\n")
     until(lambda: cell.read().rejected == 0 and cell.read().force == 4.0)
     os.write(device, b"6,7\n")

@@ -25,10 +25,14 @@ from touchgoal.sim_envs.tactile.geometry import (
 )
 from touchgoal.sim_envs.tactile.optics import render
 from touchgoal.sim_envs.tactile.pad import TactileFrame
-from touchgoal.sim_envs.tactile.press_bench import PressRig
-from touchgoal.sim_envs.tactile.sensor_instance import NOMINAL, Spread, sample_unit
+from touchgoal.sim_envs.tactile.press_bench import PressBench
+from touchgoal.sim_envs.tactile.sensor_instance import (
+    NO_RANDOMIZATION,
+    SensorRandomization,
+    sample_instance,
+)
 
-UNIT = sample_unit(MINI, np.random.default_rng(0), NOMINAL)
+INSTANCE = sample_instance(MINI, np.random.default_rng(0), NO_RANDOMIZATION)
 
 
 def rotation(axis: int, angle: float) -> np.ndarray:
@@ -98,9 +102,9 @@ def test_scan_lines_find_what_rays_find() -> None:
 
 def sense(body: Body, at: np.ndarray | list[float], force: float = 10.0) -> TactileFrame:
     """What a nominal Mini shows of a body held at `at` (m) in its frame."""
-    rig = PressRig(body, MINI, UNIT)
-    rig.place(np.asarray(at, float))
-    return rig.sense(force, np.random.default_rng(1), centre=(float(at[0]), float(at[1])))
+    bench = PressBench(body, MINI, INSTANCE)
+    bench.place(np.asarray(at, float))
+    return bench.sense(force, np.random.default_rng(1), centre=(float(at[0]), float(at[1])))
 
 
 @pytest.mark.parametrize("force", [2.0, 15.0])
@@ -136,36 +140,38 @@ def test_contact_appears_where_it_is() -> None:
     assert columns.mean() == pytest.approx(159.5 + dx / MINI.pixel_pitch, abs=1)
     assert rows.mean() == pytest.approx(119.5 + dy / MINI.pixel_pitch, abs=1)
     # Each flank shines in the colour of the light that it faces.
-    change = frame.image.astype(float) - UNIT.photometry.background
+    change = frame.image.astype(float) - INSTANCE.calibration.background
     y, x = np.mgrid[0:240, 0:320] - np.array([rows.mean(), columns.mean()]).reshape(2, 1, 1)
-    for channel, (rx, ry) in enumerate(UNIT.photometry.response[:, :2, 0]):
+    for channel, (rx, ry) in enumerate(INSTANCE.calibration.response[:, :2, 0]):
         towards = (x * rx + y * ry) / np.hypot(rx, ry)
         near, far = frame.mask & (towards > 12), frame.mask & (towards < -12)
         assert change[near, channel].mean() > change[far, channel].mean() + 10
 
 
-def test_fast_picture_is_the_photometry_s() -> None:
+def test_fast_picture_is_the_reference_formula_s() -> None:
     """Half the resolution and 1/16 count steps against the reference at full resolution."""
     frame = sense(Body(CATALOGUE["glass_ball"], (0.008,), 0.1), at=[1e-3, 0, 0.007], force=6.0)
-    quiet = replace(UNIT, noise=np.zeros_like(UNIT.noise))
+    quiet = replace(INSTANCE, noise=np.zeros_like(INSTANCE.noise))
     fast = render(frame.surface, quiet, np.random.default_rng(0)).astype(float)
-    slow = np.clip(shade(UNIT.photometry, frame.depth), 0, 255)
-    assert np.abs(slow - UNIT.photometry.background).max() > 40
+    slow = np.clip(shade(INSTANCE.calibration, frame.depth), 0, 255)
+    assert np.abs(slow - INSTANCE.calibration.background).max() > 40
     error = np.abs(fast - slow)
     assert error.mean() < 0.6 and np.quantile(error, 0.999) < 6
 
 
 @pytest.mark.parametrize("sensor", [MINI, DIGIT])
 def test_torch_gives_the_same_picture_and_its_gradient(sensor: SensorModel) -> None:
-    unit = sample_unit(sensor, np.random.default_rng(0))
-    unit = replace(unit, noise=np.zeros_like(unit.noise))
-    rig = PressRig(Body(CATALOGUE["golf_ball"], (0.01,), 0.1), sensor, unit)
-    rig.place(np.array([1e-3, 0, 0.01]))
-    frame = rig.sense(8.0, np.random.default_rng(0))
+    instance = sample_instance(sensor, np.random.default_rng(0))
+    instance = replace(instance, noise=np.zeros_like(instance.noise))
+    bench = PressBench(Body(CATALOGUE["golf_ball"], (0.01,), 0.1), sensor, instance)
+    bench.place(np.array([1e-3, 0, 0.01]))
+    frame = bench.sense(8.0, np.random.default_rng(0))
     overlap = torch.tensor(frame.overlap[None], requires_grad=True)
-    batched_surface = batched.deform(overlap, 2 * unit.pixel_pitch, unit.photometry.bulge)
+    batched_surface = batched.deform(
+        overlap, 2 * instance.pixel_pitch, instance.calibration.blur_sigmas
+    )
     assert np.abs(batched_surface.detach().numpy()[0] - frame.surface).max() < 1e-7  # 0.1 um
-    picture = batched.render(overlap, unit)
+    picture = batched.render(overlap, instance)
     planes = np.moveaxis(frame.image, -1, 0)
     assert np.abs(picture.detach().numpy()[0] - planes).max() < 0.7  # counts
     picture[0, :, 80:160, 60:180].sum().backward()
@@ -175,7 +181,7 @@ def test_torch_gives_the_same_picture_and_its_gradient(sensor: SensorModel) -> N
     place = tuple(int(i) for i in np.unravel_index(frame.overlap.argmax(), frame.overlap.shape))
     step = torch.zeros_like(exact)
     step[0, place[0], place[1]] = 1e-8
-    up, down = (batched.render(exact + s * step, unit)[0, :, 80:160, 60:180] for s in (1, -1))
+    up, down = (batched.render(exact + s * step, instance)[0, :, 80:160, 60:180] for s in (1, -1))
     slope = float((up - down).sum()) / 2e-8
     assert float(overlap.grad[0][place]) == pytest.approx(slope, rel=0.02)
 
@@ -198,8 +204,8 @@ def test_degenerate_contacts_stay_finite(at: list[float], force: float, half: fl
 
 
 def test_same_seed_same_sensor() -> None:
-    one, again, other = (sample_unit(MINI, np.random.default_rng(s)) for s in (3, 3, 4))
-    for name in ("background", "noise", "gain"):
+    one, again, other = (sample_instance(MINI, np.random.default_rng(s)) for s in (3, 3, 4))
+    for name in ("background", "noise", "illumination"):
         np.testing.assert_array_equal(getattr(one, name), getattr(again, name))
     assert (one.background != other.background).mean() > 0.5
     assert one.pixel_pitch != other.pixel_pitch
@@ -208,12 +214,12 @@ def test_same_seed_same_sensor() -> None:
 
 def test_turned_lights_turn_the_response() -> None:
     """A unit's lights stand within the spread of the model's; the response's size stays."""
-    typical, spread = UNIT.photometry, Spread()
+    typical, randomization = INSTANCE.calibration, SensorRandomization()
     for seed in range(5):
-        unit = sample_unit(MINI, np.random.default_rng(seed)).photometry
-        was, now = (p.response[:, 0, 0] + 1j * p.response[:, 1, 0] for p in (typical, unit))
-        assert np.abs(np.angle(now / was, deg=True)).max() <= spread.azimuth
-        assert np.abs(np.abs(now / was) - 1).max() < 5 * spread.gain
+        instance = sample_instance(MINI, np.random.default_rng(seed)).calibration
+        was, now = (p.response[:, 0, 0] + 1j * p.response[:, 1, 0] for p in (typical, instance))
+        assert np.abs(np.angle(now / was, deg=True)).max() <= randomization.azimuth
+        assert np.abs(np.abs(now / was) - 1).max() < 5 * randomization.gain
 
 
 def test_untouched_sensor_shows_only_noise() -> None:

@@ -18,7 +18,7 @@ from touchgoal.sim_envs.tactile.markers import (
     layer_compliance,
     rest_positions,
 )
-from touchgoal.sim_envs.tactile.press import settle
+from touchgoal.sim_envs.tactile.press import press_until_balanced
 
 GRID = Grid(88, 108, 4 * MINI.pixel_pitch)
 Y, X = (
@@ -59,7 +59,7 @@ def feel(
     """The field after a history of contacts."""
     field = None
     for contact in contacts:
-        press = settle(height, GRID.pitch, contact, modulus, MINI)
+        press = press_until_balanced(height, GRID.pitch, contact, modulus, MINI)
         field = force_field(press, field, contact, friction, MINI)
     assert field is not None
     return field
@@ -115,8 +115,8 @@ def test_degenerate_contacts_stay_finite(height: np.ndarray, normal: float) -> N
 
 
 def test_tilt_carries_a_moment_and_nothing_tilts_without() -> None:
-    upright = settle(EVERYWHERE, GRID.pitch, wrench(20.0), 3e8, MINI)
-    tilted = settle(EVERYWHERE, GRID.pitch, wrench(20.0, (2e-3, 0.0)), 3e8, MINI)
+    upright = press_until_balanced(EVERYWHERE, GRID.pitch, wrench(20.0), 3e8, MINI)
+    tilted = press_until_balanced(EVERYWHERE, GRID.pitch, wrench(20.0, (2e-3, 0.0)), 3e8, MINI)
     assert upright.tilt == pytest.approx((0, 0), abs=1e-6)
     # Linear foundation of area A and second moment I: F / (k A), and F e / (k I + what holds it).
     width, height = GRID.columns * GRID.pitch, GRID.rows * GRID.pitch
@@ -125,7 +125,7 @@ def test_tilt_carries_a_moment_and_nothing_tilts_without() -> None:
     assert tilted.tilt == pytest.approx((20 * 2e-3 / stiffness, 0), rel=0.02, abs=1e-6)
     assert tilted.shift == pytest.approx(upright.shift, rel=1e-3)
     seated = EVERYWHERE.copy()
-    tilted.seat(seated, GRID.pitch)
+    tilted.push_in(seated, GRID.pitch)
     np.testing.assert_allclose(3e8 * seated, tilted.pressure, rtol=1e-4)
 
 
@@ -236,7 +236,7 @@ def test_incipient_slip_leads_gross_slip(normal: float) -> None:
     incipient, gross, solver = [], [], []
     for _ in range(400):
         contact = slider.move(1e-3, 2)
-        press = settle(slider.height(), GRID.pitch, contact, 3e8, MINI)
+        press = press_until_balanced(slider.height(), GRID.pitch, contact, 3e8, MINI)
         field = force_field(press, field, contact, FRICTION, MINI)
         found = field.wrench()
         scale = np.linalg.norm(contact.force)

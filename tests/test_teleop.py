@@ -45,7 +45,7 @@ def moved(
 
 def test_keys_push_the_hand_as_it_is_turned(maze: BeadMaze) -> None:
     hand = Teleoperator(maze, TeleoperatorConfig(speed=0.02))
-    _, heading = maze.wire.at(maze.s)
+    _, heading = maze.wire.at(maze.arc_length)
     right = np.cross(heading, UP) / np.linalg.norm(np.cross(heading, UP))
     up = np.cross(right, heading)
     for keys, way in (("w", heading), ("d", right), ("r", up), ("wd", heading + right)):
@@ -63,7 +63,7 @@ def test_keys_push_the_hand_as_it_is_turned(maze: BeadMaze) -> None:
 )
 def test_keys_turn_the_hand(maze: BeadMaze, left: str, right: str, axis: list[int]) -> None:
     """Left seen from above, nose up, right side down: about the hand's x ahead, y right, z down."""
-    hand = Teleoperator(maze, TeleoperatorConfig(turn=0.4))
+    hand = Teleoperator(maze, TeleoperatorConfig(turn_speed=0.4))
     for key, sign in ((left, 1), (right, -1)):
         hand.press(" " + key)
         step, before, after = moved(maze, hand)
@@ -76,7 +76,7 @@ def test_keys_turn_the_hand(maze: BeadMaze, left: str, right: str, axis: list[in
 
 
 def test_a_key_is_held_until_its_time_its_opposite_or_space(maze: BeadMaze) -> None:
-    hand = Teleoperator(maze, TeleoperatorConfig(hold=0.2))
+    hand = Teleoperator(maze, TeleoperatorConfig(hold_seconds=0.2))
     hand.press("wx\x1b[A")  # the last ones mean nothing
     speeds = [np.linalg.norm(moved(maze, hand)[0]) / TICK for _ in range(5)]
     np.testing.assert_allclose(speeds, [0.025] * 4 + [0], atol=1e-3)
@@ -88,7 +88,7 @@ def test_a_key_is_held_until_its_time_its_opposite_or_space(maze: BeadMaze) -> N
 
 
 def test_the_hand_gives_way_to_the_wire(maze: BeadMaze) -> None:
-    hand = Teleoperator(maze, TeleoperatorConfig(give=2e-3, give_turn=2.0))
+    hand = Teleoperator(maze, TeleoperatorConfig(compliance=2e-3, rotational_compliance=2.0))
     step, before, after = moved(maze, hand, (0.0, 5.0, 0.0, 0.0, 0.0, 0.1))
     np.testing.assert_allclose(step, [0, 5 * 2e-3 * TICK, 0], atol=3e-5)
     turn = after @ before.T
@@ -133,7 +133,7 @@ def test_a_terminal_that_goes_is_said() -> None:
     with os.fdopen(terminal) as stream, Keyboard(stream) as keyboard:
         os.write(end, b"w d")
         select.select([terminal], [], [], 5)
-        assert keyboard.typed() == "w d" and keyboard.typed() == ""
+        assert keyboard.read_keys() == "w d" and keyboard.read_keys() == ""
         os.close(end)
         with pytest.raises(UserError, match="the terminal has gone"):
-            keyboard.typed()
+            keyboard.read_keys()

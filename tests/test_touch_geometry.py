@@ -18,11 +18,16 @@ from touchgoal.sim_envs.scene.objects import CATALOGUE, Body, ObjectKind
 from touchgoal.sim_envs.tactile.markers import draw
 from touchgoal.sim_envs.tactile.optics import render, render_untouched
 from touchgoal.sim_envs.tactile.pad import TactileFrame
-from touchgoal.sim_envs.tactile.press_bench import PressRig
-from touchgoal.sim_envs.tactile.sensor_instance import NOMINAL, STEP, Unit, sample_unit
+from touchgoal.sim_envs.tactile.press_bench import PressBench
+from touchgoal.sim_envs.tactile.sensor_instance import (
+    COUNT_STEP,
+    NO_RANDOMIZATION,
+    SensorInstance,
+    sample_instance,
+)
 
 HEIGHT, WIDTH = GELSIGHT_MINI.image_shape
-MINI = sample_unit(GELSIGHT_MINI, np.random.default_rng(0), NOMINAL)
+MINI = sample_instance(GELSIGHT_MINI, np.random.default_rng(0), NO_RANDOMIZATION)
 GLASS = CATALOGUE["glass_ball"]
 BLOCK = ObjectKind("block", "box", GLASS.material, ())
 
@@ -37,18 +42,18 @@ def press(
     body: Body,
     force: float,
     sensor: SensorModel = GELSIGHT_MINI,
-    unit: Unit = MINI,
+    instance: SensorInstance = MINI,
     rotation: np.ndarray | None = None,
     at: tuple[float, float] = (1e-3, -0.5e-3),
 ) -> TactileFrame:
-    rig = PressRig(body, sensor, unit)
-    rig.place(np.array([*at, 0.03]), rotation)
-    return rig.sense(force, np.random.default_rng(1), centre=at)
+    bench = PressBench(body, sensor, instance)
+    bench.place(np.array([*at, 0.03]), rotation)
+    return bench.sense(force, np.random.default_rng(1), centre=at)
 
 
-def untouched(unit: Unit, n: int, seed: int = 0) -> np.ndarray:
+def untouched(instance: SensorInstance, n: int, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    return np.stack([render_untouched(unit, rng) for _ in range(n)])
+    return np.stack([render_untouched(instance, rng) for _ in range(n)])
 
 
 class DriftingUnit:
@@ -60,10 +65,10 @@ class DriftingUnit:
             rng.normal(size=(4, 5, 3)), (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC
         )
         change = self._start * 0.047 * rng.normal(size=(3, 1, 1))
-        change += 0.0094 * 255 / STEP * rng.normal(size=(3, 1, 1))
-        self._change = change + 0.0093 * 255 / STEP * np.moveaxis(pattern, -1, 0)
+        change += 0.0094 * 255 / COUNT_STEP * rng.normal(size=(3, 1, 1))
+        self._change = change + 0.0093 * 255 / COUNT_STEP * np.moveaxis(pattern, -1, 0)
 
-    def at(self, frame: int) -> Unit:
+    def at(self, frame: int) -> SensorInstance:
         share = np.sin(2 * np.pi * frame / self._period)
         return replace(MINI, background=(self._start + share * self._change).astype(np.int16))
 
@@ -91,7 +96,7 @@ def test_a_touch_is_no_background() -> None:
     with pytest.raises(UserError, match="untouched"):
         Background(np.concatenate([still, touch[None]]))
     with pytest.raises(UserError, match="reference"):
-        Background(touch[None], reference=MINI.photometry.background)
+        Background(touch[None], reference=MINI.calibration.background)
 
 
 # Contact.
@@ -100,13 +105,13 @@ def test_a_touch_is_no_background() -> None:
 def test_no_false_alarm_in_drifting_light() -> None:
     rng = np.random.default_rng(3)
     light = DriftingUnit(rng)
-    unit = light.at(0)
-    detector = ContactDetector(Background(untouched(unit, 5)))
+    instance = light.at(0)
+    detector = ContactDetector(Background(untouched(instance, 5)))
     far = 0.0
     for i in range(1000):
         if i % 10 == 0:  # light drifts much slower than frames come
-            unit = light.at(i)
-        frame = render_untouched(unit, rng)
+            instance = light.at(i)
+        frame = render_untouched(instance, rng)
         assert not detector.update(frame), f"frame {i}"
         far = max(far, abs(float(frame.mean() - detector.background.reference.mean())))
     assert far > 1, "the light must really drift"
@@ -129,16 +134,18 @@ def test_contact_is_told_from_drift() -> None:
         )
         hull = rng.normal(size=(30, 3)) if kind.shape == "mesh" else None
         hull = None if hull is None else 0.025 * hull / np.linalg.norm(hull, axis=1, keepdims=True)
-        rig = PressRig(Body(kind, size, 0.1, hull=hull), GELSIGHT_MINI, MINI)
+        bench = PressBench(Body(kind, size, 0.1, hull=hull), GELSIGHT_MINI, MINI)
         i = 0
         for _ in range(3):
-            rig.place(np.array([*rng.uniform(-3e-3, 3e-3, 2), 0.03]), turned(1, 90) @ turned(0, 9))
+            bench.place(
+                np.array([*rng.uniform(-3e-3, 3e-3, 2), 0.03]), turned(1, 90) @ turned(0, 9)
+            )
             for force in (*[0.0] * 15, 0.3, 0.5, 1, 5, 20, 20, 20, 5, 1, 0.3):
-                unit = light.at(i)
+                instance = light.at(i)
                 if force:
-                    frame = render(rig.sense(force, rng).surface, unit, rng)
+                    frame = render(bench.sense(force, rng).surface, instance, rng)
                 else:
-                    frame = render_untouched(unit, rng)
+                    frame = render_untouched(instance, rng)
                 detector.update(frame)
                 strengths[force > 0].append(detector.strength)
                 i += 1
@@ -148,19 +155,21 @@ def test_contact_is_told_from_drift() -> None:
 # Markers.
 
 
-def dotted(image: np.ndarray, unit: Unit, moved: np.ndarray | float = 0.0) -> np.ndarray:
+def dotted(
+    image: np.ndarray, instance: SensorInstance, moved: np.ndarray | float = 0.0
+) -> np.ndarray:
     image = image.copy()
-    draw(image, (unit.markers + moved).astype(np.float32), unit.marker_radius)
+    draw(image, (instance.markers + moved).astype(np.float32), instance.marker_radius)
     return image
 
 
 @pytest.fixture(scope="module")
-def gel() -> Unit:
-    return sample_unit(DOTTED, np.random.default_rng(0), NOMINAL)
+def gel() -> SensorInstance:
+    return sample_instance(DOTTED, np.random.default_rng(0), NO_RANDOMIZATION)
 
 
 @pytest.mark.parametrize("name", ["golf_ball", "brick", "rope_coil"])
-def test_markers_are_followed_to_half_the_pitch(gel: Unit, name: str) -> None:
+def test_markers_are_followed_to_half_the_pitch(gel: SensorInstance, name: str) -> None:
     rng = np.random.default_rng(5)
     assert DOTTED.markers is not None
     tracker = MarkerTracker(
@@ -168,14 +177,14 @@ def test_markers_are_followed_to_half_the_pitch(gel: Unit, name: str) -> None:
     )
     kind = CATALOGUE[name]
     size = (0.02, 0.02, 0.02)[: {"sphere": 1, "cylinder": 2}.get(kind.shape, 3)]
-    rig = PressRig(Body(kind, size, 0.1), DOTTED, gel)
-    rig.place(np.array([0, 0, 0.03]), turned(1, 90))
+    bench = PressBench(Body(kind, size, 0.1), DOTTED, gel)
+    bench.place(np.array([0, 0, 0.03]), turned(1, 90))
     away = gel.markers - np.array([180, 100])
     dragged = np.exp(-(away**2).sum(1) / (2 * 70**2))[:, None] * [13.0, -9.0]  # 15.8 px, px
     worst, steps = 0.0, 12
     for step in [*range(steps + 1), *range(steps, -1, -1)]:
         moved = dragged * step / steps
-        shaded = render(rig.sense(0.3 + step, rng).surface, gel, rng)
+        shaded = render(bench.sense(0.3 + step, rng).surface, gel, rng)
         now = tracker.update(dotted(shaded, gel, moved))
         assert now.found.all() and now.found.size == 63
         error = now.positions.reshape(-1, 2) - (gel.markers + moved)
@@ -184,7 +193,7 @@ def test_markers_are_followed_to_half_the_pitch(gel: Unit, name: str) -> None:
     assert np.linalg.norm(tracker.displacement, axis=-1).max() < 0.3
 
 
-def test_a_hidden_marker_is_flagged_and_found_again(gel: Unit) -> None:
+def test_a_hidden_marker_is_flagged_and_found_again(gel: SensorInstance) -> None:
     rng = np.random.default_rng(6)
     plain = render_untouched(gel, rng)
     assert DOTTED.markers is not None
@@ -207,7 +216,7 @@ def test_a_hidden_marker_is_flagged_and_found_again(gel: Unit) -> None:
     ("degrees", "scale", "shift"), [(12, 1.0, 4), (-20, 0.9, 0), (3, 1.15, -6)]
 )
 def test_the_grid_is_ordered_however_it_lies(
-    gel: Unit, degrees: float, scale: float, shift: float
+    gel: SensorInstance, degrees: float, scale: float, shift: float
 ) -> None:
     matrix = cv2.getRotationMatrix2D((159.5, 119.5), degrees, 0.8 * scale)
     matrix[:, 2] += shift
@@ -231,7 +240,7 @@ def test_a_gel_without_its_markers_is_refused() -> None:
             find_markers(image, DOTTED.markers, MINI.pixel_pitch)
 
 
-def test_painting_markers_over_gives_the_plain_gel(gel: Unit) -> None:
+def test_painting_markers_over_gives_the_plain_gel(gel: SensorInstance) -> None:
     plain = press(Body(GLASS, (0.01,), 0.1), 2.0).image
     painted = without_markers(dotted(plain, gel), gel.markers, gel.marker_radius)
     changed = (painted != plain).any(2)
@@ -253,11 +262,11 @@ PRESSES = {
 @pytest.mark.parametrize("name", PRESSES)
 def test_depth_comes_back(sensor: SensorModel, name: str) -> None:
     """Within 5 % of the indentation, averaged over the contact."""
-    unit = sample_unit(sensor, np.random.default_rng(0), NOMINAL)
+    instance = sample_instance(sensor, np.random.default_rng(0), NO_RANDOMIZATION)
     body, force, rotation = PRESSES[name]
-    frame = press(body, force, sensor, unit, rotation)
-    background = Background(untouched(unit, 8)).image
-    depth = DepthEstimator(unit.photometry).estimate(frame.image, background)
+    frame = press(body, force, sensor, instance, rotation)
+    background = Background(untouched(instance, 8)).image
+    depth = DepthEstimator(instance.calibration).estimate(frame.image, background)
     contact = frame.depth > 0.05 * frame.depth.max()
     assert contact.mean() > 0.02
     assert np.abs(depth - frame.depth)[contact].mean() < 0.05 * frame.depth.max()
@@ -266,22 +275,22 @@ def test_depth_comes_back(sensor: SensorModel, name: str) -> None:
 
 def test_an_untouched_gel_is_flat() -> None:
     background = Background(untouched(MINI, 8)).image
-    depth = DepthEstimator(MINI.photometry).estimate(untouched(MINI, 1, seed=1)[0], background)
+    depth = DepthEstimator(MINI.calibration).estimate(untouched(MINI, 1, seed=1)[0], background)
     assert np.abs(depth).max() < 10e-6
 
 
 @pytest.mark.parametrize("frame", ["background", "black", "white", "snow"])
 def test_strange_frames_give_finite_depths(frame: str) -> None:
-    background = MINI.photometry.background
+    background = MINI.calibration.background
     snow = np.random.default_rng(0).integers(0, 256, background.shape, np.uint8)
     black, white = np.zeros_like(background), np.full_like(background, 255)
     image = {"background": background, "black": black, "white": white, "snow": snow}[frame]
-    depth = DepthEstimator(MINI.photometry).estimate(image)
+    depth = DepthEstimator(MINI.calibration).estimate(image)
     assert np.isfinite(depth).all() and (frame != "background" or not depth.any())
 
 
 @pytest.mark.parametrize("force", [1.0, 4.0, 10.0])
-def test_force_from_depth_and_markers(gel: Unit, force: float) -> None:
+def test_force_from_depth_and_markers(gel: SensorInstance, force: float) -> None:
     """On a marker gel: depth within 5 %, the normal force within 15 %, shear to the stiffness."""
     frame = press(Body(GLASS, (0.015,), 0.1), force, DOTTED, gel)
     still = dotted(untouched(gel, 1)[0], gel)
@@ -291,7 +300,7 @@ def test_force_from_depth_and_markers(gel: Unit, force: float) -> None:
     image = dotted(render(frame.surface, gel, np.random.default_rng(2)), gel, moved)
     now = tracker.update(image)
     rest = without_markers(still, tracker.rest.positions, gel.marker_radius)
-    depth = DepthEstimator(gel.photometry).estimate(
+    depth = DepthEstimator(gel.calibration).estimate(
         without_markers(image, now.positions, gel.marker_radius), rest.astype(np.float32)
     )
     assert np.abs(depth - frame.depth).mean() < 0.05 * frame.depth.max()

@@ -7,7 +7,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.episodes.touches import collect
+from touchgoal.episodes.touches import collect_touches
 
 
 def touch_episode(seed: int, truth: bool) -> Episode:
@@ -33,28 +33,30 @@ def test_touches(tmp_path: Path, truth: bool) -> None:
     for seed in range(3):
         writer.append(touch_episode(seed, truth))
     episodes = EpisodeSet(tmp_path)
-    touches = collect(episodes, contact_frames_per_episode=8, idle_frames_per_episode=3, seed=0)
+    touches = collect_touches(
+        episodes, contact_frames_per_episode=8, no_contact_frames_per_episode=3, seed=0
+    )
     assert len(touches) == 2 * (8 + 3) + 3
     assert [touches.object.count(name) for name in ("thing_0", "thing_1", "")] == [8, 8, 9]
     assert set(touches.side) == {0, 1}
     assert touches.descriptions["thing_1"] == ["feels like 1", "hard"]
-    bumped = touches.frames.astype(int) - touches.background[touches.background_of]
+    bumped = touches.frames.astype(int) - touches.background[touches.background_index]
     felt = bumped[:, 50, 60, 0] > 15
     assert felt.tolist() == [name != "" for name in touches.object]
     assert np.abs(bumped[~felt].mean(axis=(1, 2, 3))).max() < 2, "the background is its own"
     # the last frame before contact is 19; five frames earlier the wrist picture is 14 * 6 bright
     assert touches.view[:2].mean(axis=(1, 2, 3)) == pytest.approx(14 * 6, abs=3)
-    np.testing.assert_array_equal(touches.view_of, touches.episode_of)
-    again = collect(episodes, 8, 3, seed=0)
+    np.testing.assert_array_equal(touches.view_index, touches.episode_index)
+    again = collect_touches(episodes, 8, 3, seed=0)
     np.testing.assert_array_equal(again.frames, touches.frames)
-    assert (collect(episodes, 8, 3, seed=1).frames != touches.frames).any()
+    assert (collect_touches(episodes, 8, 3, seed=1).frames != touches.frames).any()
 
 
 def test_touches_need_touch_and_names(tmp_path: Path) -> None:
     episode = touch_episode(2, truth=True)
     EpisodeWriter(tmp_path / "untouched").append(episode)
     with pytest.raises(UserError, match="nothing is touched"):
-        collect(EpisodeSet(tmp_path / "untouched"), 8, 3, seed=0)
+        collect_touches(EpisodeSet(tmp_path / "untouched"), 8, 3, seed=0)
     EpisodeWriter(tmp_path / "unnamed").append(Episode(episode.frames, "touch", {}))
     with pytest.raises(UserError, match="lacks meta descriptions, object"):
-        collect(EpisodeSet(tmp_path / "unnamed"), 8, 3, seed=0)
+        collect_touches(EpisodeSet(tmp_path / "unnamed"), 8, 3, seed=0)

@@ -5,7 +5,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from touchgoal.control.motion.tracker import Tracker
-from touchgoal.control.safety.action_filter import Reading, Safety
+from touchgoal.control.safety.action_filter import Measurements, Safety
 from touchgoal.control.safety.limits import FR3, UR5E, JointLimits
 
 DT = 1e-3
@@ -16,7 +16,7 @@ def track(limits: JointLimits, start: np.ndarray, targets: list[tuple[np.ndarray
     tracker = Tracker(limits, 0.05)
     state, q = tracker.start(start), [start] * 4
     for target, ticks in targets:
-        state = tracker.aim(state, target)
+        state = tracker.set_target(state, target)
         for _ in range(ticks):
             state = tracker.step(state)
             q.append(state.q)
@@ -79,13 +79,13 @@ def test_behind_the_safety_layer_the_fingers_stay_in_their_box() -> None:
     for tick in range(200):
         if tick % 25 == 0:
             push = rng.choice([0.05, 1.0]) * rng.standard_normal(7)
-        calm = Reading(state.q, np.zeros(3), np.zeros(7), np.zeros(2), 0.0, 0.0, 0.0)
-        state = layer.advance(state, push, calm)
+        calm = Measurements(state.q, np.zeros(3), np.zeros(7), np.zeros(2), 0.0, 0.0, 0.0)
+        state = layer.filter_action(state, push, calm)
         ticks += 50
         if rng.random() > 0.1:
             targets.append((state.q, ticks))
             ticks = 0
     q = track(FR3.interface, FR3.arm.home, targets)
     check_within(FR3.interface, q)
-    fingers, box = layer.monitored(q[::10])[:, 1:], FR3.fingertips
+    fingers, box = layer.monitored_points(q[::10])[:, 1:], FR3.fingertips
     assert np.maximum(box.lower - fingers, fingers - box.upper).max() < 2e-3

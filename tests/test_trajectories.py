@@ -13,7 +13,7 @@ from touchgoal.control.motion.kinematics import (
 from touchgoal.control.motion.trajectories import (
     Trajectory,
     joint_move,
-    require_inside,
+    require_inside_workspace,
     straight_line,
 )
 from touchgoal.control.safety import limits as robots
@@ -61,7 +61,7 @@ def test_retreats_are_straight_and_within_limits(robot: RobotLimits, arm: Kinema
     limits, rng = robot.policy, np.random.default_rng(1)
     for _ in range(6):
         low = rng.uniform([0.4, -0.2, 0.03], [0.6, 0.2, 0.1])
-        q = arm.reach(low, fingers_down(rng.uniform(-1, 1)), arm.arm.home)
+        q = arm.solve_ik(low, fingers_down(rng.uniform(-1, 1)), arm.arm.home)
         high, rotation = low + np.array([0.05, -0.05, 0.2]), fingers_down(rng.uniform(-1, 1))
         move = straight_line(arm, q, high, rotation, limits)
         assert (peak_shares(move, limits) <= 1).all()
@@ -87,4 +87,6 @@ def test_what_cannot_be_done_is_refused_in_a_line() -> None:
     with pytest.raises(UserError, match="cannot follow"):
         straight_line(arm, home, np.array([1.5, 0, 0.3]), fingers_down(0), limits)
     with pytest.raises(UserError, match="workspace box"):
-        require_inside(joint_move(home, home + 1.5 * np.eye(7)[0], limits), Safety(robot, 20))
+        require_inside_workspace(
+            joint_move(home, home + 1.5 * np.eye(7)[0], limits), Safety(robot, 20)
+        )

@@ -14,7 +14,7 @@ from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
 from touchgoal.sim_envs.scene.build import SceneConfig
 from touchgoal.sim_envs.twin import faults
-from touchgoal.sim_envs.twin.cell import Cell
+from touchgoal.sim_envs.twin.cell import SimulatedCell
 
 pytestmark = pytest.mark.realtime
 
@@ -22,11 +22,11 @@ pytestmark = pytest.mark.realtime
 @pytest.mark.parametrize("arm", ["fr3", "ur5e"])
 def test_arm_follows_without_lag(arm: Literal["fr3", "ur5e"]) -> None:
     scene = SceneConfig(arm=arm)
-    cell = Cell(PickPlace(PickPlaceConfig(cameras=(), tactile=False, scene=scene)), 3, {})
+    cell = SimulatedCell(PickPlace(PickPlaceConfig(cameras=(), tactile=False, scene=scene)), 3, {})
     start, error = cell.q_d.copy(), 0.0
     for _ in range(1500):
         phase = 4 * (cell.time + 1e-3)  # 0.8 rad/s and 3.2 rad/s^2 at most
-        cell.follow(start + 0.2 * (1 - np.cos(phase)), np.full(len(start), 0.8 * np.sin(phase)))
+        cell.set_target(start + 0.2 * (1 - np.cos(phase)), np.full(len(start), 0.8 * np.sin(phase)))
         cell.step()
         error = max(error, float(np.abs(cell.q - cell.q_d).max()))
     assert error < 5e-3  # 0.08 rad without feed-forward
@@ -38,12 +38,12 @@ def test_arm_follows_without_lag(arm: Literal["fr3", "ur5e"]) -> None:
 
 def test_fixture_waits_for_the_first_grasp() -> None:
     maze = BeadMazeConfig(split="validation", n_wires=20, tactile=False)
-    cell = Cell(BeadMaze(maze), 3, {})
+    cell = SimulatedCell(BeadMaze(maze), 3, {})
     for _ in range(2000):
         cell.step()
     fixture = cell.env.model.equality("fixture").id
     assert cell.env.data.eq_active[fixture]
-    cell.grasp(0.0, 0.1, 10.0)
+    cell.command_gripper(0.0, 0.1, 10.0)
     for _ in range(1000):
         cell.step()
     assert not cell.env.data.eq_active[fixture] and not cell.failures
@@ -52,7 +52,7 @@ def test_fixture_waits_for_the_first_grasp() -> None:
 
 def test_pictures_come_freeze_and_stop(fr3: RunningTwin) -> None:
     name = "tactile_left"
-    url = fr3.rig["images"][f"observation.images.{name}"]
+    url = fr3.description["images"][f"observation.images.{name}"]
     capture = cv2.VideoCapture(url)
     frames = [capture.read()[1] for _ in range(3)]
     assert frames[0].shape == (240, 320, 3) and not np.array_equal(frames[1], frames[2])
@@ -66,13 +66,13 @@ def test_pictures_come_freeze_and_stop(fr3: RunningTwin) -> None:
     assert not cv2.VideoCapture(url).isOpened()
     fr3.ask(f"lose {name} 0")
     assert cv2.VideoCapture(url).read()[0]
-    front = cv2.VideoCapture(fr3.rig["images"]["observation.images.front"]).read()[1]
+    front = cv2.VideoCapture(fr3.description["images"]["observation.images.front"]).read()[1]
     assert front.shape == (256, 256, 3) and front.std() > 10
 
 
 def test_load_cell_weighs_is_garbled_and_unplugged(fr3: RunningTwin) -> None:
     fr3.begin('reset 3 {"object": "wooden_block", "mass": 0.1}')
-    config = LoadCellConfig(**fr3.rig["load_cell"], highest=100.0)
+    config = LoadCellConfig(**fr3.description["load_cell"], max_force=100.0)
 
     def readings(n: int) -> list[float | None]:
         device.reset_input_buffer()
@@ -101,4 +101,4 @@ def test_mistakes_say_what_to_do(fr3: RunningTwin) -> None:
     with pytest.raises(UserError, match="unknown object 'teapot'"):
         fr3.ask('reset 0 {"object": "teapot"}')
     with pytest.raises(UserError, match="no twin answers at 127.0.0.1:9"):
-        faults.ask("127.0.0.1:9", "truth")
+        faults.ask_twin("127.0.0.1:9", "truth")

@@ -13,11 +13,11 @@ import pytest
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError, TactileSensor
 from touchgoal.control.sensors.tactile_camera import (
-    DIGIT_VIEW,
-    GELSIGHT_MINI_VIEW,
-    UNCHANGED,
-    Fingertip,
-    cut,
+    DIGIT_CROP,
+    GELSIGHT_MINI_CROP,
+    NO_CROP,
+    TactileCamera,
+    crop_to_sensor,
 )
 from touchgoal.control.sensors.usb_cameras import find_sensor_camera, list_cameras
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
@@ -106,7 +106,7 @@ def test_a_slow_reader_of_a_stream_sees_the_present(streamer: Streamer) -> None:
     assert streamer.count - number(frame.image) < 20 < frame.sequence
     assert frame.image[80, 64, 0] > 140 > 60 > frame.image[80, 64, 2], "RGB, not BGR"
     assert frame.stamp <= time.monotonic() and camera.rate > 10
-    until(lambda: camera.trouble == "")
+    until(lambda: camera.problem == "")
     camera.close()
 
 
@@ -114,19 +114,19 @@ def test_a_frozen_picture_and_a_stalled_stream_grow_old_and_are_said(streamer: S
     camera = VideoCamera(VideoConfig(streamer.url, rate=50.0))
     camera.read()
     streamer.frozen = True
-    until(lambda: "one picture" in camera.trouble)
+    until(lambda: "one picture" in camera.problem)
     frozen = camera.read()
     time.sleep(0.2)
     assert camera.read().stamp == frozen.stamp and camera.read().sequence > frozen.sequence
     streamer.frozen = False
-    until(lambda: camera.read().stamp > frozen.stamp and camera.trouble == "")
+    until(lambda: camera.read().stamp > frozen.stamp and camera.problem == "")
     streamer.stalled = True
-    until(lambda: "last frame" in camera.trouble or "gone" in camera.trouble)
+    until(lambda: "last frame" in camera.problem or "gone" in camera.problem)
     stalled = camera.read()
     time.sleep(0.2)
     assert camera.read() is stalled
     streamer.stalled = False
-    until(lambda: camera.read().sequence > stalled.sequence and camera.trouble == "")
+    until(lambda: camera.read().sequence > stalled.sequence and camera.problem == "")
     camera.close()
 
 
@@ -134,9 +134,9 @@ def test_a_lost_stream_is_joined_again(streamer: Streamer) -> None:
     camera = VideoCamera(VideoConfig(streamer.url, rate=50.0))
     last = camera.read().sequence
     streamer.hang_up()
-    until(lambda: "gone" in camera.trouble)
+    until(lambda: "gone" in camera.problem)
     again = Streamer(streamer.server_port)
-    until(lambda: camera.trouble == "" and camera.read().sequence > last + 5)
+    until(lambda: camera.problem == "" and camera.read().sequence > last + 5)
     camera.close()
     again.hang_up()
 
@@ -157,7 +157,7 @@ def test_files_are_played_at_their_rate_then_said_to_have_ended(tmp_path: Path, 
     start = time.monotonic()
     camera = VideoCamera(VideoConfig(source, rate=50.0))
     assert camera.read().sequence < 12
-    until(lambda: "ended" in camera.trouble)
+    until(lambda: "ended" in camera.problem)
     assert time.monotonic() - start > 11 / 50 and number(camera.read().image) == 12
     camera.close()
 
@@ -171,17 +171,17 @@ def test_a_missing_source_is_said_in_a_line(tmp_path: Path) -> None:
 def test_a_fingertip_is_cut_turned_and_scaled(tmp_path: Path) -> None:
     whole = np.zeros((616, 820, 3), np.uint8)
     whole[88:528, 117:703] = (10, 200, 30)  # all but a seventh at each side
-    seen = cut(whole, GELSIGHT_MINI, GELSIGHT_MINI_VIEW)
+    seen = crop_to_sensor(whole, GELSIGHT_MINI, GELSIGHT_MINI_CROP)
     assert seen.shape == (240, 320, 3) and (seen[1:-1, 1:-1] == (10, 200, 30)).all()
     lying = np.zeros((240, 320, 3), np.uint8)
     lying[:, -1] = 255  # its right edge is the top of the upright picture
-    assert cut(lying, DIGIT, DIGIT_VIEW).shape == (320, 240, 3)
-    assert (cut(lying, DIGIT, DIGIT_VIEW)[0] == 255).all()
+    assert crop_to_sensor(lying, DIGIT, DIGIT_CROP).shape == (320, 240, 3)
+    assert (crop_to_sensor(lying, DIGIT, DIGIT_CROP)[0] == 255).all()
     with pytest.raises(UserError, match="quarter_turns"):
-        cut(lying, DIGIT, UNCHANGED)
+        crop_to_sensor(lying, DIGIT, NO_CROP)
     cv2.imwrite(str(tmp_path / "0.png"), whole[..., ::-1])
-    sensor = Fingertip(
-        VideoCamera(VideoConfig(str(tmp_path / "%d.png"))), GELSIGHT_MINI, GELSIGHT_MINI_VIEW
+    sensor = TactileCamera(
+        VideoCamera(VideoConfig(str(tmp_path / "%d.png"))), GELSIGHT_MINI, GELSIGHT_MINI_CROP
     )
     assert sensor.read().image.shape[:2] == sensor.model.image_shape
     assert sensor.read() is sensor.read() and isinstance(sensor, TactileSensor)

@@ -23,11 +23,11 @@ from touchgoal.control.interfaces import DriverError
 
 _GRACE = 1.0  # s that the kernel's alarm gives beyond the parent's patience
 _CLOSING = 3.0  # s to bring an arm to rest and disconnect
-_GAVE_UP = 3  # exit code; the reason is the last line of output
+_EXIT_WITH_REASON = 3  # exit code; the reason is the last line of output
 
 
 @runtime_checkable
-class ChildDriver(Protocol):
+class Driver(Protocol):
     """What runs in the child: `tick` every `period` s, any other method when the parent calls it."""
 
     period: float
@@ -41,24 +41,24 @@ class ChildDriver(Protocol):
         ...
 
 
-class Child:
+class DriverProcess:
     """Parent's end: makes `driver(*args)` in a child process and calls its methods.
 
     `driver` is a class at the top of an importable module; arguments and answers are pickled. Calls
     may come from several threads, not from a signal handler.
 
     Attributes:
-        end: why there is no process any more; empty while there is.
+        exit_reason: why there is no process any more; empty while there is.
 
     Raises:
         UserError, DriverError: what the driver raised, or it did not connect in time.
     """
 
     def __init__(
-        self, driver: Callable[..., ChildDriver], *args: Any, connect_timeout: float = 30.0
+        self, driver: Callable[..., Driver], *args: Any, connect_timeout: float = 30.0
     ) -> None:
         self._name, self._lock = driver.__qualname__, threading.Lock()
-        self.end = ""
+        self.exit_reason = ""
         self._output = tempfile.TemporaryFile()
         self._pipe, theirs = Pipe()
         # Its own session: Ctrl-C is for the parent, which then stops the arm in good order.
@@ -90,7 +90,7 @@ class Child:
                 self._process.wait(_CLOSING + _GRACE)
             except subprocess.TimeoutExpired:
                 self._kill()
-        self.end = self.end or f"{self._name} is closed"
+        self.exit_reason = self.exit_reason or f"{self._name} is closed"
         self._pipe.close()
         self._output.close()
 
@@ -100,15 +100,15 @@ class Child:
                 self._pipe.send(request)
                 if not self._pipe.poll(timeout):
                     self._kill()
-                    self.end = (
+                    self.exit_reason = (
                         f"{self._name} did not {what} within {timeout:g} s and was ended: check "
                         "power, cable and address, and that no other program holds the device"
                     )
-                    raise DriverError(self.end)
+                    raise DriverError(self.exit_reason)
                 failure, result = self._pipe.recv()
             except (EOFError, OSError) as error:
-                self.end = self.end or self._obituary()
-                raise DriverError(self.end) from error
+                self.exit_reason = self.exit_reason or self._read_exit_reason()
+                raise DriverError(self.exit_reason) from error
         if failure is not None:
             raise failure
         return result
@@ -117,7 +117,7 @@ class Child:
         self._process.kill()
         return self._process.wait()
 
-    def _obituary(self) -> str:
+    def _read_exit_reason(self) -> str:
         try:
             code = self._process.wait(_GRACE)
         except subprocess.TimeoutExpired:
@@ -125,20 +125,20 @@ class Child:
         self._output.seek(0)
         lines = self._output.read().decode(errors="replace").split("\n")
         last = next((line.strip()[:200] for line in reversed(lines) if line.strip()), "")
-        if code == _GAVE_UP:
+        if code == _EXIT_WITH_REASON:
             return last
         how = signal.Signals(-code).name if code < 0 else f"code {code}"
         return f"{self._name} ended by itself ({how}): {last or 'it said nothing'}"
 
 
-def _as_sent(error: Exception) -> Exception:
+def _picklable(error: Exception) -> Exception:
     """An exception that the parent can unpickle without the client's library."""
     if isinstance(error, UserError | DriverError):
         return error
-    return DriverError(one_line(error))
+    return DriverError(error_line(error))
 
 
-def one_line(error: Exception) -> str:
+def error_line(error: Exception) -> str:
     """What a library says, for a person; the project's own errors are for a person already."""
     text = " ".join(str(error).split())
     return text if isinstance(error, UserError | DriverError) else f"{type(error).__name__}: {text}"
@@ -149,17 +149,17 @@ def _alarm(seconds: float) -> None:
     signal.setitimer(signal.ITIMER_REAL, seconds)
 
 
-def _answer(driver: ChildDriver, pipe: Connection) -> None:
+def _answer(driver: Driver, pipe: Connection) -> None:
     method, args, timeout = pipe.recv()
     _alarm(timeout + _GRACE)
     try:
         reply = None, getattr(driver, method)(*args)
     except Exception as error:
-        reply = _as_sent(error), None
+        reply = _picklable(error), None
     pipe.send(reply)
 
 
-def _serve(driver: ChildDriver, pipe: Connection) -> None:
+def _serve(driver: Driver, pipe: Connection) -> None:
     """Ticks and answers until the parent closes the pipe or dies."""
     due = time.monotonic()
     while True:
@@ -178,7 +178,7 @@ def _main(pipe: Connection) -> None:
     try:
         driver = make(*args)
     except Exception as error:
-        pipe.send((_as_sent(error), None))
+        pipe.send((_picklable(error), None))
         return
     pipe.send((None, None))
     try:
@@ -187,8 +187,8 @@ def _main(pipe: Connection) -> None:
         _alarm(_CLOSING)
         driver.close()
     except Exception as error:
-        print(one_line(error), file=sys.stderr, flush=True)
-        os._exit(_GAVE_UP)
+        print(error_line(error), file=sys.stderr, flush=True)
+        os._exit(_EXIT_WITH_REASON)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from touchgoal.control.arms.streaming import ArmClient, ArmConfig, ArmProcess, moved_wrench
+from touchgoal.control.arms.streaming import ArmClient, ArmConfig, ArmProcess, shift_wrench
 from touchgoal.control.interfaces import ArmReading, DriverError, Joints
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.limits import JointLimits
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     import franky
 
 RATE = 200.0  # Hz of velocity commands
-SILENCE = 0.5  # s; libfranka itself gives up after 1 s
-_LASTS_MS = 100  # of each
-_PULL = 10.0  # 1/s towards the commanded position
+STATE_TIMEOUT = 0.5  # s; libfranka itself gives up after 1 s
+_COMMAND_MS = 100  # of each
+_POSITION_GAIN = 10.0  # 1/s towards the commanded position
 _SHARE = 0.9  # of franky's limits that the stream uses; the rest is for the pull
 _TORQUE_REFLEX, _FORCE_REFLEX = 20.0, 30.0  # Nm and N; franky's defaults, beyond RobotLimits.force
 
@@ -75,7 +75,7 @@ class FrankaClient(ArmClient):
         return ArmReading(
             q=state.q,
             velocity=state.dq,
-            wrench=moved_wrench(state.O_F_ext_hat_K, contact, tcp),
+            wrench=shift_wrench(state.O_F_ext_hat_K, contact, tcp),
             torque=state.tau_ext_hat_filtered,
             fault=self._fault(state),
             stamp=self._stamped(state.time.to_sec()),
@@ -93,9 +93,9 @@ class FrankaClient(ArmClient):
         return f"{self._aborted}; recover the arm" if self._aborted else ""
 
     def _send(self, q: Joints, velocity: Joints) -> None:
-        wanted = velocity + _PULL * (q - self._commanded)
+        wanted = velocity + _POSITION_GAIN * (q - self._commanded)
         motion = self._franky.JointVelocityMotion(
-            np.clip(wanted, -self._ceiling, self._ceiling), self._franky.Duration(_LASTS_MS)
+            np.clip(wanted, -self._ceiling, self._ceiling), self._franky.Duration(_COMMAND_MS)
         )
         try:
             self._require().move(motion, asynchronous=True)
@@ -121,6 +121,6 @@ def _errors(state: "franky.RobotState") -> str:
     return ", ".join(n for n in dir(errors) if getattr(errors, n) is True) or "unnamed"
 
 
-def franka(config: ArmConfig) -> ArmProcess:
+def connect_franka(config: ArmConfig) -> ArmProcess:
     """Connects to an FR3 with FCI switched on in Desk."""
     return ArmProcess(FrankaClient, config)

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.arms.driver_process import Child
+from touchgoal.control.arms.driver_process import DriverProcess
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import ArmReading, DriverError, Joints
 from touchgoal.control.motion.tracker import Tracker, TrackerState
 from touchgoal.control.safety.limits import JointLimits, RobotLimits
 
-_LATE = 4  # periods that a late tick makes up for at once
+_MAX_CATCH_UP = 4  # periods that a late tick makes up for at once
 _BRAKING = 1.5  # s for coming to rest on closing
 _REST, _LOOK = 0.01, 0.05  # rad/s over so many s that count as rest
 
@@ -33,7 +33,7 @@ class ArmConfig:
         tcp_offset: m along the hand's z axis from the flange to the tool centre point.
         hz: of the commands that come.
         rate: Hz of the stream that goes out.
-        silence: s without news of the controller after which it is lost. Each driver has its own;
+        state_timeout: s without news of the controller after which it is lost. Each driver has its own;
             a simulator on a loaded machine needs more.
     """
 
@@ -42,7 +42,7 @@ class ArmConfig:
     tcp_offset: float
     hz: float
     rate: float
-    silence: float
+    state_timeout: float
 
 
 class ArmClient(ABC):
@@ -97,11 +97,11 @@ class ArmClient(ABC):
         if self._state is None:
             self._state = self._tracker.start(self._commanded)
             self._streamed = self._reading.time
-        self._state = self._tracker.aim(self._state, q)
+        self._state = self._tracker.set_target(self._state, q)
 
     def stop(self) -> None:
         """Brake, and take no command until `recover`."""
-        self._latch("stopped on request; recover the arm to go on")
+        self._refuse_from_now_on("stopped on request; recover the arm to go on")
 
     def tick(self) -> None:
         """Read the state and stream the next command.
@@ -109,19 +109,19 @@ class ArmClient(ABC):
         The stream goes by the controller's clock: a simulator may be slower than the one on the wall.
         """
         now = time.monotonic()
-        punctual = now - self._ticked < self.config.silence / 2
+        punctual = now - self._ticked < self.config.state_timeout / 2
         self._ticked = now
         self._reading = self._measure()
-        if punctual and now - self._reading.stamp > self.config.silence:
+        if punctual and now - self._reading.stamp > self.config.state_timeout:
             raise DriverError(
-                f"no state for {1e3 * self.config.silence:.0f} ms: check power and cable, then recover"
+                f"no state for {1e3 * self.config.state_timeout:.0f} ms: check power and cable, then recover"
             )
         if self._reading.fault:
-            self._latch(self._reading.fault)
+            self._refuse_from_now_on(self._reading.fault)
         if self._state is None:
             return
         time_, before = self._reading.time, self._state.q
-        periods = min(round((time_ - self._streamed) / self.period), _LATE)
+        periods = min(round((time_ - self._streamed) / self.period), _MAX_CATCH_UP)
         if periods < 1:
             return
         self._streamed = max(self._streamed + periods * self.period, time_ - self.period)
@@ -131,7 +131,7 @@ class ArmClient(ABC):
 
     def close(self) -> None:
         """Bring the arm to rest and let go of it."""
-        self._latch("closed")
+        self._refuse_from_now_on("closed")
         end = time.monotonic() + _BRAKING
         with suppress(Exception):
             while time.monotonic() < end:
@@ -140,9 +140,9 @@ class ArmClient(ABC):
                 self.tick()
                 if np.abs(self._reading.q - before).max() < _REST * _LOOK:
                     break
-        self._let_go()
+        self._disconnect_quietly()
 
-    def _latch(self, reason: str) -> None:
+    def _refuse_from_now_on(self, reason: str) -> None:
         """Brake; the first reason stays."""
         self._state = None
         if not self._refusal:
@@ -150,7 +150,7 @@ class ArmClient(ABC):
             with suppress(Exception):
                 self._halt()
 
-    def _let_go(self) -> None:
+    def _disconnect_quietly(self) -> None:
         with suppress(Exception):
             self._disconnect()
 
@@ -167,45 +167,47 @@ class ArmProcess:
     def __init__(
         self, client: type[ArmClient], config: ArmConfig, connect_timeout: float = 30.0
     ) -> None:
-        self._make = lambda recover: Child(client, config, recover, connect_timeout=connect_timeout)
-        self._child = self._make(False)
-        self._last: ArmReading = self._child.call("read")
+        self._make = lambda recover: DriverProcess(
+            client, config, recover, connect_timeout=connect_timeout
+        )
+        self._process = self._make(False)
+        self._last: ArmReading = self._process.call("read")
 
     def read(self) -> ArmReading:
         """See Arm. Of a lost arm it is the last reading, with the reason as its fault."""
         try:
-            self._last = self._child.call("read")
+            self._last = self._process.call("read")
         except DriverError as error:
             self._last = replace(self._last, fault=str(error))
         return self._last
 
     def command(self, q: Joints) -> None:
         """See Arm."""
-        self._child.call("command", q)
+        self._process.call("command", q)
 
     def stop(self) -> None:
         """See Arm. There is nothing to do for a lost arm: its controller stops it."""
-        if self._child.alive:
+        if self._process.alive:
             with suppress(DriverError):
-                self._child.call("stop")
+                self._process.call("stop")
 
     def recover(self) -> None:
         """See Arm."""
-        self._child.close()
+        self._process.close()
         try:
-            self._child = self._make(True)
+            self._process = self._make(True)
         except DriverError as error:
-            self._child.end = f"not recovered: {error}"
+            self._process.exit_reason = f"not recovered: {error}"
             raise
         if fault := self.read().fault:
             raise DriverError(f"not recovered: {fault}")
 
     def close(self) -> None:
         """See Arm."""
-        self._child.close()
+        self._process.close()
 
 
-def moved_wrench(
+def shift_wrench(
     wrench: Float[np.ndarray, "6"], origin: Float[np.ndarray, "3"], point: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "6"]:
     """A wrench (N, Nm) about `origin` as seen about `point` (m), all in one frame."""

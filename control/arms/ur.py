@@ -10,13 +10,13 @@ import time
 
 import numpy as np
 
-from touchgoal.control.arms.streaming import ArmClient, ArmConfig, ArmProcess, moved_wrench
+from touchgoal.control.arms.streaming import ArmClient, ArmConfig, ArmProcess, shift_wrench
 from touchgoal.control.interfaces import ArmReading, DriverError, Joints
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.limits import JointLimits
 
 RATE = 125.0  # Hz of servoJ; 20 to 500
-SILENCE = 0.05  # s
+STATE_TIMEOUT = 0.05  # s
 _GAIN = 300.0  # of servoJ, 100 to 2000; URScript's default
 _LOOKAHEAD = 0.03, 0.2  # s, servoJ's range; the arm lags by about this much
 _BRAKING = 10.0  # rad/s^2 of servoStop; ur-rtde's default
@@ -65,7 +65,7 @@ class UrClient(ArmClient):
         tcp, _ = self._kinematics.forward(q)
         # About the controller's own TCP, in its base frame, the tool's weight taken off.
         wrench = np.array(receive.getActualTCPForce())
-        wrench = moved_wrench(wrench, np.array(receive.getActualTCPPose()[:3]), tcp)
+        wrench = shift_wrench(wrench, np.array(receive.getActualTCPPose()[:3]), tcp)
         reading = ArmReading(
             q=q,
             velocity=np.array(receive.getActualQd()),
@@ -108,6 +108,6 @@ class UrClient(ArmClient):
         self._receive.disconnect()
 
 
-def universal_robot(config: ArmConfig) -> ArmProcess:
+def connect_ur(config: ArmConfig) -> ArmProcess:
     """Connects to a UR in remote control."""
     return ArmProcess(UrClient, config)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from touchgoal.control.tactile import gel
-from touchgoal.control.tactile.sensor_calibration import Photometry
+from touchgoal.control.tactile.sensor_calibration import SensorCalibration
 
 Circle = Float[np.ndarray, " 3"]
 """Centre x (column), centre y (row) and radius of a contact, px; (0, 0) is the first pixel."""
@@ -36,9 +36,9 @@ def ball_overlap(
 
 
 def press_surface(
-    photometry: Photometry, circle: Circle, ball_radius: float
+    calibration: SensorCalibration, circle: Circle, ball_radius: float
 ) -> Float32[np.ndarray, "h w"]:
     """Surface of the gel (m) under a ball; the sensor file gives the gel's bulge."""
-    rows, cols, _ = photometry.background.shape
-    raw = ball_overlap((rows, cols), photometry.pixel_pitch, circle, ball_radius)
-    return gel.deform(raw, photometry.pixel_pitch, photometry.bulge)
+    rows, cols, _ = calibration.background.shape
+    raw = ball_overlap((rows, cols), calibration.pixel_pitch, circle, ball_radius)
+    return gel.deform(raw, calibration.pixel_pitch, calibration.blur_sigmas)

@@ -10,21 +10,26 @@ from jaxtyping import Float, Float32, UInt8
 
 from touchgoal.control.calibration.ball import Circle, press_surface
 from touchgoal.control.calibration.press_fit import (
+    BLUR_PYRAMID,
     NARROWEST,
-    PYRAMID,
     WIDEST,
     FitState,
     PressFit,
 )
 from touchgoal.control.calibration.press_set import PressSet
-from touchgoal.control.tactile.sensor_calibration import N_FEATURES, Photometry, features, shade
+from touchgoal.control.tactile.sensor_calibration import (
+    N_FEATURES,
+    SensorCalibration,
+    shade,
+    shape_features,
+)
 
 STEPS = 7
 """How often `fit` reports progress."""
 
 # Position terms need presses spread over the picture: the standard deviation of the centres, as a
 # share of the picture, in both directions (evenly spread over all of it: 0.29).
-_SPREAD = 0.1
+_MIN_SPREAD = 0.1
 _FAR = 4.0  # contact radii from which on a press leaves the gel as it was
 
 
@@ -41,97 +46,97 @@ class LabelCorrection:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class FittedCalibration:
     """A fitted sensor and what was learnt on the way.
 
     Attributes:
-        photometry: the sensor file to be.
+        calibration: the sensor file to be.
         circles: of the fitted presses, where their pictures say they are, px.
         ball_radius: of the fitted presses, m.
         ball_fitted: whether the presses left the ball's radius open. Slopes and depths are then no
             better known than that radius, which pictures tell poorly.
-        position: whether the response may vary over the image; not if all presses lie in one place.
-        labels: how the labels were off.
+        varies_over_image: whether the response may vary over the image; not if all presses lie in one place.
+        label_correction: how the labels were off.
     """
 
-    photometry: Photometry
+    calibration: SensorCalibration
     circles: Float[np.ndarray, "n 3"]
     ball_radius: Float[np.ndarray, " n"]
     ball_fitted: bool
-    position: bool
-    labels: LabelCorrection
+    varies_over_image: bool
+    label_correction: LabelCorrection
 
-    def balls(self, presses: PressSet) -> Float[np.ndarray, " n"]:
+    def ball_radii(self, presses: PressSet) -> Float[np.ndarray, " n"]:
         """Ball radii (m) of other presses: theirs, or the fitted one."""
         known = presses.ball_radius
         return np.where(np.isnan(known), self.ball_radius.mean(), known)
 
-    def place(self, presses: PressSet) -> Float[np.ndarray, "n 3"]:
+    def correct_labels(self, presses: PressSet) -> Float[np.ndarray, "n 3"]:
         """Where the labels of other presses are to be believed to lie (px), the pictures unseen."""
-        circles = self.labels.offset + self.labels.slope * presses.circles
-        widest = WIDEST * self.balls(presses) / self.photometry.pixel_pitch
+        circles = self.label_correction.offset + self.label_correction.slope * presses.circles
+        widest = WIDEST * self.ball_radii(presses) / self.calibration.pixel_pitch
         circles[:, 2] = circles[:, 2].clip(NARROWEST, widest)
         return circles
 
-    def register(self, presses: PressSet) -> Float[np.ndarray, "n 3"]:
+    def fit_circles(self, presses: PressSet) -> Float[np.ndarray, "n 3"]:
         """Circles (px) of other presses, moved from their labels to where their pictures say.
 
         That looks at the pictures: an error at these circles is the model's alone, an error at
-        `place` the labels' as well.
+        `correct_labels` the labels' as well.
         """
-        steps = PressFit(presses, self.photometry.background, self.position)
-        state = FitState(self.photometry, self.place(presses), self.balls(presses))
+        steps = PressFit(presses, self.calibration.background, self.varies_over_image)
+        state = FitState(self.calibration, self.correct_labels(presses), self.ball_radii(presses))
         for _ in range(8):
-            state = steps.registered(state)
+            state = steps.fit_circles(state)
         return state.circles
 
     def simulate(self, circle: Circle, ball_radius: float) -> Float32[np.ndarray, "h w 3"]:
         """Picture of a press, RGB counts without noise; px and m."""
-        return shade(self.photometry, press_surface(self.photometry, circle, ball_radius))
+        return shade(self.calibration, press_surface(self.calibration, circle, ball_radius))
 
 
 def fit(
     presses: PressSet,
     pitch: float,
     sensor: str,
-    tick: Callable[[], object] = lambda: None,
+    on_progress: Callable[[], object] = lambda: None,
     trust_labels: bool = False,
-) -> Calibration:
+) -> FittedCalibration:
     """Calibrate a sensor.
 
     Args:
         presses: see `read_presses`.
         pitch: m per pixel.
         sensor: name of the sensor model.
-        tick: called STEPS times as the work proceeds.
+        on_progress: called STEPS times as the work proceeds.
         trust_labels: leave the circles as they are, but for one common scale of their radii.
     """
-    background, position = settled_background(presses), _spread_out(presses)
-    steps = PressFit(presses, background, position, trust_labels)
+    background, varies_over_image = median_background(presses), _spread_out(presses)
+    steps = PressFit(presses, background, varies_over_image, trust_labels)
     ball_fitted = bool(np.isnan(presses.ball_radius).any())
-    blank = _blank(background, pitch, sensor, noise(presses))
-    state = steps.started(blank, presses.ball_radius)
-    tick()
+    initial = _initial_calibration(background, pitch, sensor, noise(presses))
+    state = steps.initialise(initial, presses.ball_radius)
+    on_progress()
     for _ in range(2):
-        state = steps.tuned(steps.lit(state))
-        tick()
-        state = steps.settled(state, 3)
-        tick()
+        state = steps.select_hyperparameters(steps.fit_response(state))
+        on_progress()
+        state = steps.alternate(state, 3)
+        on_progress()
         if ball_fitted:
-            state = steps.with_ball(steps.resized(state))
-        tick()
-    state = steps.lit(steps.settled(state, 3))
-    return Calibration(
-        photometry=_limited(state),
+            state = steps.fit_ball_radius(steps.fit_common_scale(state))
+        on_progress()
+    state = steps.fit_response(steps.alternate(state, 3))
+    return FittedCalibration(
+        calibration=_with_limits(state),
         circles=state.circles,
         ball_radius=state.ball_radius,
         ball_fitted=ball_fitted,
-        position=position,
-        labels=_label_correction(presses.circles, state.circles),
+        varies_over_image=varies_over_image,
+        label_correction=_label_correction(presses.circles, state.circles),
     )
 
 
-def settled_background(presses: PressSet) -> UInt8[np.ndarray, "h w 3"]:
+def median_background(presses: PressSet) -> UInt8[np.ndarray, "h w 3"]:
     """The background as the presses show it away from their contacts.
 
     A gel settles under the first presses: bands of several counts against the picture taken before
@@ -158,11 +163,11 @@ def noise(presses: PressSet) -> float:
     return float(np.mean(spreads))
 
 
-def _blank(
+def _initial_calibration(
     background: UInt8[np.ndarray, "h w 3"], pitch: float, sensor: str, noise: float
-) -> Photometry:
+) -> SensorCalibration:
     """A sensor file to start from: no response, no limits, a typical gel."""
-    return Photometry(
+    return SensorCalibration(
         sensor=sensor,
         background=background,
         pixel_pitch=pitch,
@@ -171,27 +176,27 @@ def _blank(
         shadow_slope=0.1,
         shadow=np.zeros((3, 3), np.float32),
         penumbra=0.1e-3,
-        steepest=math.inf,
-        deepest=math.inf,
-        bulge=tuple(0.35 * sigma for sigma in PYRAMID),
+        max_slope=math.inf,
+        max_depth=math.inf,
+        blur_sigmas=tuple(0.35 * sigma for sigma in BLUR_PYRAMID),
         noise=noise,
     )
 
 
 def _spread_out(presses: PressSet) -> bool:
     rows, cols, _ = presses.background.shape
-    return bool((presses.circles[:, :2].std(0) > _SPREAD * np.array([cols, rows])).all())
+    return bool((presses.circles[:, :2].std(0) > _MIN_SPREAD * np.array([cols, rows])).all())
 
 
-def _limited(state: FitState) -> Photometry:
+def _with_limits(state: FitState) -> SensorCalibration:
     """With the steepest slope and the largest depth of the presses as the model's limits."""
-    photometry, steepest, deepest = state.photometry, 0.0, 0.0
+    calibration, max_slope, max_depth = state.calibration, 0.0, 0.0
     for circle, ball in zip(state.circles, state.ball_radius, strict=True):
-        surface = press_surface(photometry, circle, ball)
-        nx, ny = features(surface, photometry.pixel_pitch, math.inf, math.inf)[:2]
-        steepest = max(steepest, float(np.hypot(nx, ny).max()))
-        deepest = max(deepest, float(surface.max()))
-    return replace(photometry, steepest=steepest, deepest=deepest)
+        surface = press_surface(calibration, circle, ball)
+        nx, ny = shape_features(surface, calibration.pixel_pitch, math.inf, math.inf)[:2]
+        max_slope = max(max_slope, float(np.hypot(nx, ny).max()))
+        max_depth = max(max_depth, float(surface.max()))
+    return replace(calibration, max_slope=max_slope, max_depth=max_depth)
 
 
 def _label_correction(

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from touchgoal.control.tactile.sensor_calibration import Photometry
+from touchgoal.control.tactile.sensor_calibration import SensorCalibration
 
 CONTRAST = 4  # of the difference column
 _LIGHTS = {"R": (213, 94, 0), "G": (0, 158, 115), "B": (0, 114, 178)}  # Okabe and Ito
@@ -37,7 +37,7 @@ def side_by_side(
     return np.vstack([heading, *rows])
 
 
-def light_compass(photometry: Photometry, size: int = 320) -> UInt8[np.ndarray, "s s 3"]:
+def light_compass(calibration: SensorCalibration, size: int = 320) -> UInt8[np.ndarray, "s s 3"]:
     """Where in the image the lights stand, by channel, RGB: x to the right, y down.
 
     A line's length is the channel's response to slope in the middle of the image, relative to the
@@ -48,10 +48,10 @@ def light_compass(photometry: Photometry, size: int = 320) -> UInt8[np.ndarray, 
     cv2.circle(picture, (centre, centre), round(reach), _GREY, 1, cv2.LINE_AA)
     for text, dx, dy in (("0", 1, 0), ("90", 0, 1), ("180", -1, 0), ("-90", 0, -1)):
         _write(picture, text, centre + dx * 1.18 * reach, centre + dy * 1.18 * reach, _GREY)
-    strength = np.linalg.norm(photometry.response[:, :2, 0], axis=1)
+    strength = np.linalg.norm(calibration.response[:, :2, 0], axis=1)
     lengths = (reach * strength / strength.max()).tolist()
     for (name, colour), azimuth, length in zip(
-        _LIGHTS.items(), photometry.light_azimuths, lengths, strict=True
+        _LIGHTS.items(), calibration.light_azimuths, lengths, strict=True
     ):
         dx, dy = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
         tip = round(centre + length * dx), round(centre + length * dy)

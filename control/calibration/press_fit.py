@@ -1,7 +1,7 @@
 """The steps by which a sensor's light and gel are fitted to ball presses.
 
 Given the surface under each press, the change of colour is linear in the unknown response
-(`photometry.columns`): least squares. Around that alternate where exactly each ball lies (hand-made
+(`sensor_calibration.design_matrix`): least squares. Around that alternate where exactly each ball lies (hand-made
 circles are off by pixels) and the few numbers that are not linear, chosen by cross-validation.
 """
 
@@ -17,28 +17,28 @@ from touchgoal.control.calibration.ball import Circle, press_surface
 from touchgoal.control.calibration.press_set import PressSet
 from touchgoal.control.tactile.sensor_calibration import (
     N_FEATURES,
-    Photometry,
-    columns,
-    gain,
-    weights,
+    SensorCalibration,
+    coefficients,
+    design_matrix,
+    illumination,
 )
 
 REGION = 3.0
 """Radius of the region that is fitted and judged around a press, in labelled contact radii."""
 NARROWEST, WIDEST = 2.0, 0.98
 """Contact radius: px at least, and as a share of the ball's at most."""
-PYRAMID = (3.0e-3, 1.5e-3, 0.75e-3, 0.35e-3)
+BLUR_PYRAMID = (3.0e-3, 1.5e-3, 0.75e-3, 0.35e-3)
 """Standard deviations of Taxim's gel, m; one factor scales them all."""
 
 _PIXELS = 5000  # of a press that take part in the fit
 _FOLDS = 4
 _RIDGE = 1e-3  # of each term's own energy; between 1e-4 and 1e-2 the held-out error hardly moves
 # What cross-validation chooses from.
-_BULGE_SCALES = (0.15, 0.25, 0.35, 0.5, 0.7, 1.0)
+_BLUR_SCALES = (0.15, 0.25, 0.35, 0.5, 0.7, 1.0)
 _SHADOW_SLOPES = (0.05, 0.1, 0.2, 0.4, 0.8)
 _PENUMBRAS = (0.03e-3, 0.1e-3, 0.3e-3, 1e-3)
 _LABEL_SCALES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1)
-_RESIZES = (0.65, 0.8, 1.0, 1.25)
+_COMMON_SCALES = (0.65, 0.8, 1.0, 1.25)
 _BALLS_PER_CONTACT = (1.1, 1.3, 1.6, 2.0, 2.5, 3.5)
 
 Weights = Float64[np.ndarray, "3 terms"]
@@ -49,12 +49,12 @@ class FitState:
     """Where the fit stands.
 
     Attributes:
-        photometry: the sensor file so far.
+        calibration: the sensor file so far.
         circles: of the presses, px.
         ball_radius: m, one a press.
     """
 
-    photometry: Photometry
+    calibration: SensorCalibration
     circles: Float64[np.ndarray, "n 3"]
     ball_radius: Float64[np.ndarray, " n"]
 
@@ -68,7 +68,7 @@ class _Sample:
 
 
 @dataclass(frozen=True)
-class _Normals:
+class _NormalEquations:
     """Normal equations of one press, per channel."""
 
     square: Float64[np.ndarray, "3 terms terms"]
@@ -87,7 +87,7 @@ class PressFit:
     Args:
         presses: what to fit.
         background: the untouched sensor (RGB) that changes are taken against.
-        position: whether the response may vary over the image.
+        varies_over_image: whether the response may vary over the image.
         trust_labels: whether circles stay as they are.
     """
 
@@ -95,119 +95,121 @@ class PressFit:
         self,
         presses: PressSet,
         background: UInt8[np.ndarray, "h w 3"],
-        position: bool,
+        varies_over_image: bool,
         trust_labels: bool = False,
     ) -> None:
         self._labels = presses.circles
         self._trust_labels = trust_labels
-        self._light = gain(background).reshape(-1, 3)
+        self._light = illumination(background).reshape(-1, 3)
         self._samples = [
             _sample(image, background, circle)
             for image, circle in zip(presses.images, presses.circles, strict=True)
         ]
         self._used = np.ones(3 * N_FEATURES + 3, bool)
-        self._used[N_FEATURES : 3 * N_FEATURES] = position
+        self._used[N_FEATURES : 3 * N_FEATURES] = varies_over_image
 
-    def started(self, blank: Photometry, ball_radius: Float64[np.ndarray, " n"]) -> FitState:
+    def initialise(
+        self, initial: SensorCalibration, ball_radius: Float64[np.ndarray, " n"]
+    ) -> FitState:
         """With the common scale of the labelled radii that explains the pictures best.
 
         Args:
-            blank: a sensor file without response.
+            initial: a sensor file without response.
             ball_radius: m, one a press; NaN if open, then twice the largest contact's.
         """
         starts = []
         for scale in _LABEL_SCALES:
             circles = self._labels * [1, 1, scale]
-            contact = circles[:, 2] * blank.pixel_pitch
+            contact = circles[:, 2] * initial.pixel_pitch
             ball = np.where(np.isnan(ball_radius), 2 * contact.max(), ball_radius)
             if (contact < WIDEST * ball).all():
-                starts.append(FitState(blank, circles, ball))
+                starts.append(FitState(initial, circles, ball))
         return self._best(starts)
 
-    def tuned(self, state: FitState) -> FitState:
+    def select_hyperparameters(self, state: FitState) -> FitState:
         """With the gel and the shadows that cross-validation prefers, one after the other."""
-        state = self._with_bulge(state)
-        state = self._with_choice(state, "shadow_slope", _SHADOW_SLOPES)
-        return self._with_choice(state, "penumbra", _PENUMBRAS)
+        state = self._select_blur(state)
+        state = self._select_value(state, "shadow_slope", _SHADOW_SLOPES)
+        return self._select_value(state, "penumbra", _PENUMBRAS)
 
-    def settled(self, state: FitState, rounds: int) -> FitState:
+    def alternate(self, state: FitState, rounds: int) -> FitState:
         """Response and circles in turn."""
         for _ in range(rounds):
-            state = self.lit(state)
+            state = self.fit_response(state)
             if not self._trust_labels:
-                state = self.registered(state)
+                state = self.fit_circles(state)
         return state
 
-    def resized(self, state: FitState) -> FitState:
+    def fit_common_scale(self, state: FitState) -> FitState:
         """With all contacts and balls larger or smaller, if that explains the pictures better.
 
         A weaker response to steeper slopes, or a wider bulge around a smaller contact, looks nearly
         the same: single steps would take long.
         """
         candidates = []
-        for scale in _RESIZES:
+        for scale in _COMMON_SCALES:
             circles = state.circles * [1, 1, scale]
             resized = replace(state, circles=circles, ball_radius=state.ball_radius * scale)
-            candidates.append(self._with_bulge(self.settled(resized, 2)))
+            candidates.append(self._select_blur(self.alternate(resized, 2)))
         return self._best(candidates)
 
-    def with_ball(self, state: FitState) -> FitState:
+    def fit_ball_radius(self, state: FitState) -> FitState:
         """With the ball radius (one for all presses) that explains the pictures best."""
-        widest = state.circles[:, 2].max() * state.photometry.pixel_pitch
+        widest = state.circles[:, 2].max() * state.calibration.pixel_pitch
         balls = [np.full(len(state.circles), ratio * widest) for ratio in _BALLS_PER_CONTACT]
-        return self._best([self.settled(replace(state, ball_radius=ball), 2) for ball in balls])
+        return self._best([self.alternate(replace(state, ball_radius=ball), 2) for ball in balls])
 
-    def lit(self, state: FitState) -> FitState:
+    def fit_response(self, state: FitState) -> FitState:
         """With the response that fits best, and the lights where it says they stand."""
         for _ in range(2):  # where the lights stand decides where shadows fall
-            solved = self._solve(self._normals(state))
-            state = replace(state, photometry=_with_weights(state.photometry, solved))
+            solved = self._solve(self._normal_equations(state))
+            state = replace(state, calibration=_with_response(state.calibration, solved))
         return state
 
-    def registered(self, state: FitState) -> FitState:
+    def fit_circles(self, state: FitState) -> FitState:
         """With every circle moved towards where its picture says it is."""
         everything = zip(state.circles, state.ball_radius, self._samples, self._labels, strict=True)
-        moved = [self._moved(state.photometry, *press) for press in everything]
+        moved = [self._refine_circle(state.calibration, *press) for press in everything]
         return replace(state, circles=np.stack(moved))
 
-    def _with_bulge(self, state: FitState) -> FitState:
-        bulges = [tuple(scale * sigma for sigma in PYRAMID) for scale in _BULGE_SCALES]
-        return self._with_choice(state, "bulge", bulges)
+    def _select_blur(self, state: FitState) -> FitState:
+        pyramids = [tuple(scale * sigma for sigma in BLUR_PYRAMID) for scale in _BLUR_SCALES]
+        return self._select_value(state, "blur_sigmas", pyramids)
 
-    def _with_choice(self, state: FitState, name: str, values: Sequence[Any]) -> FitState:
+    def _select_value(self, state: FitState, name: str, values: Sequence[Any]) -> FitState:
         """With the value of one number of the sensor file that cross-validation prefers."""
-        photometries = [replace(state.photometry, **{name: value}) for value in values]
-        return self._best([replace(state, photometry=p) for p in photometries])
+        calibrations = [replace(state.calibration, **{name: value}) for value in values]
+        return self._best([replace(state, calibration=p) for p in calibrations])
 
     def _best(self, candidates: Sequence[FitState]) -> FitState:
         return min(candidates, key=self._held_out_loss)
 
     def _held_out_loss(self, state: FitState) -> float:
         """Squared error (counts^2) summed over the presses, each predicted without its fold."""
-        normals = self._normals(state)
+        normals = self._normal_equations(state)
         loss = 0.0
         for fold in range(_FOLDS):
             solved = self._solve([n for i, n in enumerate(normals) if i % _FOLDS != fold])
             loss += sum(n.loss(solved) for n in normals[fold::_FOLDS])
         return loss
 
-    def _normals(self, state: FitState) -> list[_Normals]:
+    def _normal_equations(self, state: FitState) -> list[_NormalEquations]:
         everything = zip(state.circles, state.ball_radius, self._samples, strict=True)
-        return [self._press_normals(state.photometry, *press) for press in everything]
+        return [self._press_normal_equations(state.calibration, *press) for press in everything]
 
-    def _press_normals(
-        self, photometry: Photometry, circle: Circle, ball: float, sample: _Sample
-    ) -> _Normals:
-        terms = columns(photometry, press_surface(photometry, circle, ball), sample.pixels)
+    def _press_normal_equations(
+        self, calibration: SensorCalibration, circle: Circle, ball: float, sample: _Sample
+    ) -> _NormalEquations:
+        terms = design_matrix(calibration, press_surface(calibration, circle, ball), sample.pixels)
         squares, products = [], []
         for channel in range(3):
             lit = terms.astype(np.float64) * self._light[sample.pixels, channel]
             squares.append(lit @ lit.T)
             products.append(lit @ sample.change[:, channel])
         energy = float((sample.change.astype(np.float64) ** 2).sum())
-        return _Normals(np.stack(squares), np.stack(products), energy)
+        return _NormalEquations(np.stack(squares), np.stack(products), energy)
 
-    def _solve(self, normals: Sequence[_Normals]) -> Weights:
+    def _solve(self, normals: Sequence[_NormalEquations]) -> Weights:
         product = np.sum([n.product for n in normals], 0)
         square = np.sum([n.square for n in normals], 0)
         solved = np.zeros_like(product)
@@ -220,12 +222,17 @@ class PressFit:
             )
         return solved
 
-    def _moved(
-        self, photometry: Photometry, circle: Circle, ball: float, sample: _Sample, label: Circle
+    def _refine_circle(
+        self,
+        calibration: SensorCalibration,
+        circle: Circle,
+        ball: float,
+        sample: _Sample,
+        label: Circle,
     ) -> Circle:
         """One damped Gauss-Newton step of centre and radius."""
-        model, light, step = weights(photometry), self._light[sample.pixels], 0.25
-        widest = WIDEST * ball / photometry.pixel_pitch
+        model, light, step = coefficients(calibration), self._light[sample.pixels], 0.25
+        widest = WIDEST * ball / calibration.pixel_pitch
 
         def bounded(at: Circle) -> Circle:
             x, y, radius = label
@@ -233,8 +240,8 @@ class PressFit:
             return at.clip(least, [x + radius, y + radius, min(1.5 * radius, widest)])
 
         def residual(at: Circle) -> Float32[np.ndarray, " m"]:
-            surface = press_surface(photometry, bounded(at), ball)
-            terms = columns(photometry, surface, sample.pixels)
+            surface = press_surface(calibration, bounded(at), ball)
+            terms = design_matrix(calibration, surface, sample.pixels)
             return ((model @ terms).T * light - sample.change).ravel()
 
         here = residual(circle)
@@ -262,12 +269,12 @@ def _sample(
     return _Sample(pixels, change)
 
 
-def _with_weights(photometry: Photometry, solved: Weights) -> Photometry:
+def _with_response(calibration: SensorCalibration, solved: Weights) -> SensorCalibration:
     response, shadow = np.split(solved.astype(np.float32), [3 * N_FEATURES], 1)
     response = response.reshape(3, 3, N_FEATURES).transpose(0, 2, 1)
     azimuths = np.degrees(np.arctan2(response[:, 1, 0], response[:, 0, 0]))
     return replace(
-        photometry,
+        calibration,
         response=response,
         shadow=shadow,
         light_azimuths=tuple(float(a) for a in azimuths),

@@ -1,4 +1,4 @@
-"""A rig file: which arm, gripper, sensors, task and limits belong together; read strictly."""
+"""A cell file: which arm, gripper, sensors, task and limits belong together; read strictly."""
 
 import json
 import tomllib
@@ -10,11 +10,11 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 
-EXAMPLES = "see launch/cells/"
+_EXAMPLES = "see launch/cells/"
 
 
 @dataclass(frozen=True)
-class GripperRig:
+class GripperSection:
     """A gripper.
 
     Attributes:
@@ -33,7 +33,7 @@ class GripperRig:
 
 
 @dataclass(frozen=True)
-class FingertipsRig:
+class FingertipsSection:
     """The two fingertip sensors.
 
     Attributes:
@@ -49,7 +49,7 @@ class FingertipsRig:
 
 
 @dataclass(frozen=True)
-class CameraRig:
+class CameraSection:
     """A camera: device (`/dev/video2`), index or stream; its rate (Hz) and (width, height)."""
 
     source: str
@@ -58,17 +58,17 @@ class CameraRig:
 
 
 @dataclass(frozen=True)
-class LoadCellRig:
+class LoadCellSection:
     """A load cell: see `control.load_cell.LoadCellConfig`."""
 
     port: str
     newtons_per_count: float
     zero: float
-    highest: float = 200.0
+    max_force: float = 200.0
 
 
 @dataclass(frozen=True)
-class TaskRig:
+class TaskSection:
     """What is to be done.
 
     Attributes:
@@ -101,7 +101,7 @@ class TaskRig:
 
 
 @dataclass(frozen=True)
-class SafetyRig:
+class SafetySection:
     """Tighter or looser than `control.limits`; what is not given stays as it is there.
 
     Attributes:
@@ -126,7 +126,7 @@ class SafetyRig:
 
 
 @dataclass(frozen=True)
-class Rig:
+class CellConfig:
     """Everything `deploy` needs to know.
 
     Attributes:
@@ -135,13 +135,13 @@ class Rig:
     """
 
     arm: Literal["fr3", "ur5e", "sim"]
-    gripper: GripperRig
-    task: TaskRig
+    gripper: GripperSection
+    task: TaskSection
     address: str = ""
-    fingertips: FingertipsRig | None = None
-    cameras: dict[str, CameraRig] = field(default_factory=dict)
-    load_cell: LoadCellRig | None = None
-    safety: SafetyRig = field(default_factory=SafetyRig)
+    fingertips: FingertipsSection | None = None
+    cameras: dict[str, CameraSection] = field(default_factory=dict)
+    load_cell: LoadCellSection | None = None
+    safety: SafetySection = field(default_factory=SafetySection)
     lock_step: bool = False
 
     @property
@@ -150,8 +150,8 @@ class Rig:
         return self.fingertips.sensor if self.fingertips else "gelsight_mini"
 
 
-def read_rig(path: Path, policy: str = "") -> Rig:
-    """Read a rig file (TOML), or the `rig.json` that a twin has written.
+def read_cell_file(path: Path, policy: str = "") -> CellConfig:
+    """Read a cell file (TOML), or the `cell.json` that a twin has written.
 
     Args:
         path: of the file.
@@ -161,7 +161,7 @@ def read_rig(path: Path, policy: str = "") -> Rig:
         UserError: no such file, bad syntax, an unknown key, or a value that is missing or wrong.
     """
     if not path.is_file():
-        raise UserError(f"there is no rig file {path}: {EXAMPLES}")
+        raise UserError(f"there is no cell file {path}: {_EXAMPLES}")
     try:
         text = path.read_text()
         table = _of_twin(json.loads(text)) if path.suffix == ".json" else tomllib.loads(text)
@@ -169,28 +169,28 @@ def read_rig(path: Path, policy: str = "") -> Rig:
         raise UserError(f"{path} is no TOML: {error}") from error
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
         raise UserError(
-            f"{path} is no rig.json of a twin: start one with touchgoal twin"
+            f"{path} is no cell.json of a twin: start one with touchgoal twin"
         ) from error
     try:
-        rig = _read(Rig, table, "")
+        cell = _read(CellConfig, table, "")
         if policy:
-            rig = replace(rig, task=replace(rig.task, policy=policy))
-        _check(rig)
+            cell = replace(cell, task=replace(cell.task, policy=policy))
+        _check(cell)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    return rig
+    return cell
 
 
-def _check(rig: Rig) -> None:
+def _check(cell: CellConfig) -> None:
     """What a type does not say."""
-    gripper, task = rig.gripper, rig.task
-    if rig.arm != "sim" and not rig.address:
+    gripper, task = cell.gripper, cell.task
+    if cell.arm != "sim" and not cell.address:
         raise UserError("address is missing: give the arm's, such as 172.16.0.2")
     needed = {"franka_hand": "address", "robotiq": "port"}[gripper.kind]
-    if rig.arm != "sim" and not getattr(gripper, needed):
+    if cell.arm != "sim" and not getattr(gripper, needed):
         raise UserError(f"gripper.{needed} is missing: a {gripper.kind} needs it")
     known = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.CAMERAS]
-    if unknown := rig.cameras.keys() - set(known):
+    if unknown := cell.cameras.keys() - set(known):
         raise UserError(f"cameras.{min(unknown)} is unknown: there are {', '.join(known)}")
     if task.policy == "expert" and task.name == "bead-maze":
         raise UserError(
@@ -199,42 +199,42 @@ def _check(rig: Rig) -> None:
     if task.policy == "follower" and task.name != "bead-maze":
         raise UserError("task.policy: the follower is for the bead-maze; expert or a folder")
     knows = task.twin or (task.grasp and task.goal)
-    if task.policy == "expert" and rig.arm != "sim" and not knows:
+    if task.policy == "expert" and cell.arm != "sim" and not knows:
         raise UserError("task.grasp and task.goal are missing: measure where they are, in metres")
 
 
-def _of_twin(rig: dict[str, Any]) -> dict[str, Any]:
-    """A twin's description of itself as a rig.
+def _of_twin(cell: dict[str, Any]) -> dict[str, Any]:
+    """A twin's description of itself as a cell.
 
     In lock-step time goes as slowly as the machine needs: by the clock on the wall, which drivers go
     by, pictures may be rare and the link silent for longer.
     """
-    images = {key.removeprefix(ft.IMAGE_PREFIX): url for key, url in rig["images"].items()}
+    images = {key.removeprefix(ft.IMAGE_PREFIX): url for key, url in cell["images"].items()}
     sides = {key.removeprefix("tactile_"): images.pop(key) for key in list(images) if "tac" in key}
-    pick_place = rig["task"] == "pick-place"
-    slow = {"rate": 1.0} if rig["lock_step"] else {}
+    pick_place = cell["task"] == "pick-place"
+    slow = {"rate": 1.0} if cell["lock_step"] else {}
     table = {
-        "arm": rig["arm"],
-        "address": rig["address"],
-        "gripper": rig["gripper"],
+        "arm": cell["arm"],
+        "address": cell["address"],
+        "gripper": cell["gripper"],
         "cameras": {name: {"source": url, **slow} for name, url in images.items()},
-        "load_cell": rig["load_cell"],
-        "lock_step": rig["lock_step"],
+        "load_cell": cell["load_cell"],
+        "lock_step": cell["lock_step"],
         "task": {
-            "name": rig["task"],
+            "name": cell["task"],
             "policy": "expert" if pick_place else "shipped",
-            "instruction": rig["instruction"],
-            "twin": rig["faults"],
+            "instruction": cell["instruction"],
+            "twin": cell["faults"],
             "seconds": 40.0,
-            "seed": rig["seed"],
-            **rig["options"],
+            "seed": cell["seed"],
+            **cell["options"],
         },
     }
-    table["safety"] = {"silence": 2.0} if rig["lock_step"] else {}
+    table["safety"] = {"silence": 2.0} if cell["lock_step"] else {}
     if not pick_place:
         table["safety"]["force"] = 25.0  # a wire pushes back; the controller's reflex is at 30
     if sides:
-        table["fingertips"] = {"sensor": rig["sensor"], **sides, **slow}
+        table["fingertips"] = {"sensor": cell["sensor"], **sides, **slow}
     return table
 
 
@@ -272,7 +272,7 @@ def _read_table(kind: Any, table: Any, where: str) -> Any:
     for name, f in known.items():
         needed = f.default is MISSING and f.default_factory is MISSING
         if needed and name not in table:
-            raise UserError(f"{dot}{name} is missing: {EXAMPLES}")
+            raise UserError(f"{dot}{name} is missing: {_EXAMPLES}")
     hints = get_type_hints(kind)
     return kind(**{n: _read(hints[n], value, f"{dot}{n}") for n, value in table.items()})
 

@@ -1,4 +1,4 @@
-"""A rig's devices, connected: what the control loop reads and commands, and by which clock."""
+"""A cell's devices, connected: what the control loop reads and commands, and by which clock."""
 
 import time
 from collections import deque
@@ -12,10 +12,15 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.control.arms import franka, ur
 from touchgoal.control.arms.streaming import ArmConfig
-from touchgoal.control.cell.config import FingertipsRig, GripperRig, Rig, SafetyRig
+from touchgoal.control.cell.config import (
+    CellConfig,
+    FingertipsSection,
+    GripperSection,
+    SafetySection,
+)
 from touchgoal.control.errors import UserError
 from touchgoal.control.grippers.franka_hand import FrankaHand
-from touchgoal.control.grippers.non_blocking import BackgroundGripper
+from touchgoal.control.grippers.non_blocking import NonBlockingGripper
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
 from touchgoal.control.interfaces import Arm, Camera, Gripper, LoadCell
 from touchgoal.control.motion.kinematics import GELSIGHT_TCP
@@ -23,19 +28,19 @@ from touchgoal.control.safety.action_filter import Deadline, Watchdogs
 from touchgoal.control.safety.limits import FR3, UR5E, Box, RobotLimits
 from touchgoal.control.sensors.load_cell import LoadCellConfig, SerialLoadCell
 from touchgoal.control.sensors.tactile_camera import (
-    DIGIT_VIEW,
-    GELSIGHT_MINI_VIEW,
-    UNCHANGED,
-    Fingertip,
+    DIGIT_CROP,
+    GELSIGHT_MINI_CROP,
+    NO_CROP,
+    TactileCamera,
 )
 from touchgoal.control.sensors.usb_cameras import find_sensor_camera
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_models import DIGIT, find_sensor
 
-_STOP_AFTER = 5  # times the age at which the arm holds
-_STANDS = 1.0  # s on the wall for which an arm's clock may stand
-_LOOK = 0.002  # s between looks at it
-_REMEMBERED = 2000  # of them
+_STOP_FACTOR = 5  # times the age at which the arm holds
+_CLOCK_TIMEOUT = 1.0  # s on the wall for which an arm's clock may stand
+_POLL_INTERVAL = 0.002  # s between looks at it
+_HISTORY_LENGTH = 2000  # of them
 
 
 @runtime_checkable
@@ -80,34 +85,34 @@ class ArmClock:
 
     def __init__(self, arm: Arm) -> None:
         self._arm = arm
-        self._told = deque([(time.monotonic(), arm.read().time)], maxlen=_REMEMBERED)
+        self._clock_history = deque([(time.monotonic(), arm.read().time)], maxlen=_HISTORY_LENGTH)
 
     def now(self) -> float:
         """See Clock."""
         news, wall = self._arm.read().time, time.monotonic()
-        since, last = self._told[-1]
+        since, last = self._clock_history[-1]
         if news > last:
-            self._told.append((wall, news))
+            self._clock_history.append((wall, news))
             return news
-        return last + max(0.0, wall - since - _STANDS)
+        return last + max(0.0, wall - since - _CLOCK_TIMEOUT)
 
     def age(self, stamp: float) -> float:
         """See Clock."""
-        return self.now() - float(np.interp(stamp, *np.array(self._told).T))
+        return self.now() - float(np.interp(stamp, *np.array(self._clock_history).T))
 
     def wait(self, until: float) -> None:
         """See Clock."""
         while self.now() < until:
-            time.sleep(_LOOK)
+            time.sleep(_POLL_INTERVAL)
 
 
 @dataclass(frozen=True)
-class Station:
+class CellConnection:
     """Connected devices; `close` brings the arm to rest and releases all of them.
 
     Attributes:
         cameras: fingertips included, by their key in the vocabulary.
-        truth: what a simulator knows (`sim_envs.twin.cell.Cell.truth`); None of a real cell. It may
+        truth: what a simulator knows (`sim_envs.twin.cell.SimulatedCell.truth`); None of a real cell. It may
             take a while: not for the control loop.
     """
 
@@ -127,13 +132,13 @@ class Station:
                     stack.callback(device.close)
 
 
-def open_station(rig: Rig, hz: float) -> Station:
-    """Connect to everything in a rig with a real arm or a twin; commands will come at `hz`.
+def connect_cell(cell: CellConfig, hz: float) -> CellConnection:
+    """Connect to everything in a cell with a real arm or a twin; commands will come at `hz`.
 
     Raises:
         UserError, DriverError: something is not there; what was connected is released.
     """
-    robot = limits_of(rig)
+    robot = cell_limits(cell)
     with ExitStack() as undo:
 
         def keep(device: Any) -> Any:
@@ -141,25 +146,25 @@ def open_station(rig: Rig, hz: float) -> Station:
             return device
 
         cameras = {}
-        for name, camera in rig.cameras.items():
+        for name, camera in cell.cameras.items():
             config = VideoConfig(camera.source, camera.size, camera.rate)
             cameras[ft.IMAGE_PREFIX + name] = keep(VideoCamera(config))
-        if rig.fingertips:
+        if cell.fingertips:
             for key, source in zip(
-                ft.TACTILE, (rig.fingertips.left, rig.fingertips.right), strict=True
+                ft.TACTILE, (cell.fingertips.left, cell.fingertips.right), strict=True
             ):
-                cameras[key] = keep(_fingertip(rig.fingertips, source))
-        load_cell = keep(SerialLoadCell(_load_cell(rig))) if rig.load_cell else None
-        gripper = keep(_gripper(rig.gripper))
-        arm = keep(_arm(rig, robot, hz))
+                cameras[key] = keep(_tactile_camera(cell.fingertips, source))
+        load_cell = keep(SerialLoadCell(_load_cell(cell))) if cell.load_cell else None
+        gripper = keep(_gripper(cell.gripper))
+        arm = keep(_arm(cell, robot, hz))
         undo.pop_all()
-    clock = ArmClock(arm) if rig.lock_step else RealClock()
-    return Station(robot, arm, gripper, cameras, load_cell, clock)
+    clock = ArmClock(arm) if cell.lock_step else RealClock()
+    return CellConnection(robot, arm, gripper, cameras, load_cell, clock)
 
 
-def limits_of(rig: Rig) -> RobotLimits:
-    """The robot's limits with the rig's own in place of some."""
-    robot, own = UR5E if rig.arm == "ur5e" else FR3, rig.safety
+def cell_limits(cell: CellConfig) -> RobotLimits:
+    """The robot's limits with the cell's own in place of some."""
+    robot, own = UR5E if cell.arm == "ur5e" else FR3, cell.safety
     given = {
         name: value
         for name in ("velocity_share", "force", "torque", "touch")
@@ -169,17 +174,17 @@ def limits_of(rig: Rig) -> RobotLimits:
     return replace(robot, **given, **boxes)
 
 
-def watchdogs_of(rig: Rig) -> Watchdogs:
-    """The rig's own deadlines."""
-    own = rig.safety
+def cell_watchdogs(cell: CellConfig) -> Watchdogs:
+    """The cell's own deadlines."""
+    own = cell.safety
     return replace(
         Watchdogs(),
-        observation=Deadline(own.observation_age, _STOP_AFTER * own.observation_age),
-        state=Deadline(own.state_age, _STOP_AFTER * own.state_age),
+        observation=Deadline(own.observation_age, _STOP_FACTOR * own.observation_age),
+        state=Deadline(own.state_age, _STOP_FACTOR * own.state_age),
     )
 
 
-def _box(box: Box, own: SafetyRig, name: str) -> Box:
+def _box(box: Box, own: SafetySection, name: str) -> Box:
     lower, upper = getattr(own, f"{name}_lower"), getattr(own, f"{name}_upper")
     box = Box(
         box.lower if lower is None else np.array(lower),
@@ -190,32 +195,34 @@ def _box(box: Box, own: SafetyRig, name: str) -> Box:
     return box
 
 
-def _arm(rig: Rig, robot: RobotLimits, hz: float) -> Arm:
-    ur5e = rig.arm == "ur5e"
-    rate, silence = (ur.RATE, ur.SILENCE) if ur5e else (franka.RATE, franka.SILENCE)
-    silence = rig.safety.silence or silence
-    config = ArmConfig(rig.address, robot, GELSIGHT_TCP, hz, rate, silence)
-    return ur.universal_robot(config) if ur5e else franka.franka(config)
+def _arm(cell: CellConfig, robot: RobotLimits, hz: float) -> Arm:
+    ur5e = cell.arm == "ur5e"
+    rate, silence = (ur.RATE, ur.STATE_TIMEOUT) if ur5e else (franka.RATE, franka.STATE_TIMEOUT)
+    silence = cell.safety.silence or silence
+    config = ArmConfig(cell.address, robot, GELSIGHT_TCP, hz, rate, silence)
+    return ur.connect_ur(config) if ur5e else franka.connect_franka(config)
 
 
-def _gripper(rig: GripperRig) -> Gripper:
-    if rig.kind == "franka_hand":
-        return BackgroundGripper(FrankaHand(rig.address, rig.force))
-    return Robotiq(RobotiqConfig(rig.port, rig.activate, force=rig.force, widths=rig.widths))
+def _gripper(cell: GripperSection) -> Gripper:
+    if cell.kind == "franka_hand":
+        return NonBlockingGripper(FrankaHand(cell.address, cell.force))
+    return Robotiq(RobotiqConfig(cell.port, cell.activate, force=cell.force, widths=cell.widths))
 
 
-def _load_cell(rig: Rig) -> LoadCellConfig:
-    assert rig.load_cell is not None
-    cell = rig.load_cell
-    return LoadCellConfig(cell.port, cell.newtons_per_count, cell.zero, cell.highest)
+def _load_cell(cell: CellConfig) -> LoadCellConfig:
+    assert cell.load_cell is not None
+    load_cell = cell.load_cell
+    return LoadCellConfig(
+        load_cell.port, load_cell.newtons_per_count, load_cell.zero, load_cell.max_force
+    )
 
 
-def _fingertip(rig: FingertipsRig, source: str) -> Fingertip:
+def _tactile_camera(cell: FingertipsSection, source: str) -> TactileCamera:
     """By serial number over USB, or a stream whose pictures are the sensor's already."""
-    model = find_sensor(rig.sensor)
-    rate = rig.rate or model.frame_rate
+    model = find_sensor(cell.sensor)
+    rate = cell.rate or model.frame_rate
     if "/" in source:
-        return Fingertip(VideoCamera(VideoConfig(source, rate=rate)), model, UNCHANGED)
-    view = DIGIT_VIEW if model.name == DIGIT.name else GELSIGHT_MINI_VIEW
+        return TactileCamera(VideoCamera(VideoConfig(source, rate=rate)), model, NO_CROP)
+    crop = DIGIT_CROP if model.name == DIGIT.name else GELSIGHT_MINI_CROP
     device = find_sensor_camera(model, source).device
-    return Fingertip(VideoCamera(VideoConfig(device, rate=rate)), model, view)
+    return TactileCamera(VideoCamera(VideoConfig(device, rate=rate)), model, crop)

@@ -9,7 +9,7 @@ on its way in grasps that.
 
 import time
 
-from touchgoal.control.arms.driver_process import Child
+from touchgoal.control.arms.driver_process import DriverProcess
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError, GripperReading
 
@@ -103,20 +103,20 @@ class FrankaHand:
     """The Gripper protocol over a hand; it closes with `force` (N, 30 to 70)."""
 
     def __init__(self, address: str, force: float = 30.0) -> None:
-        self._child = Child(FrankaHandClient, address, force)
+        self._process = DriverProcess(FrankaHandClient, address, force)
 
     def read(self) -> GripperReading:
         """See Gripper."""
-        return self._child.call("read")
+        return self._process.call("read")
 
     def command(self, width: float) -> None:
         """See Gripper."""
-        self._child.call("command", width)
+        self._process.call("command", width)
 
     def stop(self) -> None:
         """See Gripper."""
-        self._child.call("stop")
+        self._process.call("stop")
 
     def close(self) -> None:
         """See Gripper."""
-        self._child.close()
+        self._process.close()

@@ -3,22 +3,22 @@
 import time
 
 from touchgoal.control.interfaces import Gripper, GripperReading
-from touchgoal.control.sensors.latest_value import Newest
+from touchgoal.control.sensors.latest_value import LatestValue
 
 _PAUSE = 0.01  # s between exchanges
 
 
-class BackgroundGripper:
+class NonBlockingGripper:
     """The Gripper protocol over another one (measured: a Franka Hand answers in up to 50 ms)."""
 
     def __init__(self, gripper: Gripper) -> None:
         self._gripper = gripper
         self._wanted: float | None = None
-        self._newest = Newest("gripper", self._take)
+        self._latest = LatestValue("gripper", self._take)
 
     def read(self) -> GripperReading:
         """See Gripper."""
-        return self._newest.read()
+        return self._latest.read()
 
     def command(self, width: float) -> None:
         """See Gripper; a fault shows in the next reading."""
@@ -31,7 +31,7 @@ class BackgroundGripper:
 
     def close(self) -> None:
         """See Gripper."""
-        self._newest.close()
+        self._latest.close()
         self._gripper.close()
 
     def _take(self) -> GripperReading:

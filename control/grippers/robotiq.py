@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from touchgoal.control.errors import UserError
 from touchgoal.control.grippers.modbus import Modbus
 from touchgoal.control.interfaces import DriverError, GripperReading
-from touchgoal.control.sensors.latest_value import Newest
+from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.control.sensors.serial_port import open_port
 
 _SLAVE, _OUTPUT, _INPUT = 9, 0x03E8, 0x07D0
@@ -70,11 +70,11 @@ class Robotiq:
         except Exception:
             self._port.close()
             raise
-        self._newest = Newest(f"gripper {config.port}", self._take)
+        self._latest = LatestValue(f"gripper {config.port}", self._take)
 
     def read(self) -> GripperReading:
         """See Gripper."""
-        return self._newest.read()
+        return self._latest.read()
 
     def command(self, width: float) -> None:
         """See Gripper."""
@@ -93,7 +93,7 @@ class Robotiq:
 
     def close(self) -> None:
         """See Gripper."""
-        self._newest.close()
+        self._latest.close()
         self._port.close()
 
     def _start(self) -> None:

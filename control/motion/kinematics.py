@@ -75,26 +75,26 @@ def _rotation(axis: str, angle: casadi.SX | float) -> casadi.SX:
 
 
 @dataclass(frozen=True)
-class Arm:
-    """A serial arm: links as above, flange (m beyond the last joint, along its z), limits (rad).
+class ArmModel:
+    """A serial arm: links as above, flange_offset (m beyond the last joint, along its z), limits (rad).
 
     `hand_yaw` (rad) turns the hand on the flange; `home` is where the inverse rests.
     """
 
     name: str
     links: tuple[tuple[tuple[float, float, float], float], ...]
-    flange: float
+    flange_offset: float
     hand_yaw: float
     lower: Joints
     upper: Joints
     home: Joints
 
 
-FR3 = Arm("FR3", _FR3_LINKS, 0.107, -np.pi / 4, FR3_LOWER, FR3_UPPER, FR3_HOME)
-UR5E = Arm("UR5e", _UR5E_LINKS, 0.0996, 0.0, UR5E_LOWER, UR5E_UPPER, UR5E_HOME)
+FR3_ARM = ArmModel("FR3", _FR3_LINKS, 0.107, -np.pi / 4, FR3_LOWER, FR3_UPPER, FR3_HOME)
+UR5E_ARM = ArmModel("UR5e", _UR5E_LINKS, 0.0996, 0.0, UR5E_LOWER, UR5E_UPPER, UR5E_HOME)
 
 
-def _frames(arm: Arm, q: casadi.SX) -> list[tuple[casadi.SX, casadi.SX]]:
+def _frames(arm: ArmModel, q: casadi.SX) -> list[tuple[casadi.SX, casadi.SX]]:
     """Origin and rotation of the base, of each link behind its joint, and of the hand."""
     p, R = casadi.SX.zeros(3), casadi.SX.eye(3)
     frames = [(p, R)]
@@ -102,10 +102,10 @@ def _frames(arm: Arm, q: casadi.SX) -> list[tuple[casadi.SX, casadi.SX]]:
         p = p + R @ casadi.DM(offset)
         R = R @ _rotation("x", twist) @ _rotation("z", q[i])
         frames.append((p, R))
-    return [*frames, (p + R[:, 2] * arm.flange, R @ _rotation("z", arm.hand_yaw))]
+    return [*frames, (p + R[:, 2] * arm.flange_offset, R @ _rotation("z", arm.hand_yaw))]
 
 
-def _chain(arm: Arm, tcp_offset: float) -> casadi.Function:
+def _chain(arm: ArmModel, tcp_offset: float) -> casadi.Function:
     """CasADi function q -> TCP position (3), rotation (3, 3), geometric Jacobian (6, n)."""
     q = casadi.SX.sym("q", len(arm.links))
     _, *joints, (hand, R) = _frames(arm, q)
@@ -114,8 +114,8 @@ def _chain(arm: Arm, tcp_offset: float) -> casadi.Function:
     return casadi.Function("chain", [q], [p, R, casadi.horzcat(*columns)])
 
 
-def _step(arm: Arm, tcp_offset: float) -> casadi.Function:
-    """CasADi function of one step of damped least squares, for `Kinematics.inverse`.
+def _step(arm: ArmModel, tcp_offset: float) -> casadi.Function:
+    """CasADi function of one step of damped least squares, for `Kinematics.solve_ik_near`.
 
     (q, target position and rotation by rows (12), posture) -> next q, pose error of q (6: m, rad).
     All in one function, so that a step is one call: 6 us, of which a numpy version would spend most
@@ -160,7 +160,7 @@ def _rotation_error(R: casadi.SX) -> casadi.SX:
 
 
 @dataclass(frozen=True)
-class Solution:
+class IkSolution:
     """Joint positions (rad) with what is left of the error, in m and rad."""
 
     q: Joints
@@ -176,7 +176,7 @@ class Solution:
 class Kinematics:
     """An arm with a tool whose centre point lies `tcp_offset` m along the hand's z axis."""
 
-    def __init__(self, arm: Arm, tcp_offset: float) -> None:
+    def __init__(self, arm: ArmModel, tcp_offset: float) -> None:
         self.arm = arm
         self._chain = _chain(arm, tcp_offset)
         self._step = _step(arm, tcp_offset)
@@ -200,7 +200,7 @@ class Kinematics:
         _, R, J = (side_by_side.full() for side_by_side in self._chain.map(len(q))(q.T))
         return J.reshape(6, *q.shape).transpose(1, 0, 2), R.reshape(3, len(q), 3).transpose(1, 0, 2)
 
-    def inverse(
+    def solve_ik_near(
         self,
         position: Vector3,
         rotation: Matrix3,
@@ -209,7 +209,7 @@ class Kinematics:
         iterations: int = 60,
         posture: float = 0.02,
         tolerance: float = 1e-5,
-    ) -> Solution:
+    ) -> IkSolution:
         """Damped least squares from `start`, drawn to the arm's home in the null space.
 
         Damping keeps steps finite near singularities; `posture` (share a step) keeps the elbow where
@@ -237,18 +237,18 @@ class Kinematics:
             if left < tolerance**2:
                 break
             q[:] = nearer
-        return Solution(q, float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:])))
+        return IkSolution(q, float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:])))
 
-    def reach(self, position: Vector3, rotation: Matrix3, start: Joints) -> Joints:
+    def solve_ik(self, position: Vector3, rotation: Matrix3, start: Joints) -> Joints:
         """Joint positions for a pose; UserError if the arm cannot reach it.
 
         If there is no way from `start`, another posture is looked for, which may be far from it.
         """
-        solution = self.inverse(position, rotation, start)
+        solution = self.solve_ik_near(position, rotation, start)
         for posture in self._postures:
             if solution.reached:
                 return solution.q
-            other = self.inverse(position, rotation, posture)
+            other = self.solve_ik_near(position, rotation, posture)
             solution = other if other.reached else solution
         raise UserError(
             f"the {self.arm.name} cannot reach {np.round(position, 3).tolist()} m in this "
@@ -256,7 +256,7 @@ class Kinematics:
             f"{solution.rotation_error:.3f} rad); move the target closer"
         )
 
-    def track(
+    def points_on_links(
         self, points: Float[np.ndarray, "k 3"], frames: Sequence[int] | None = None
     ) -> casadi.Function:
         """CasADi function of joint positions (n, m) -> points (m) fixed to parts of the arm.
@@ -279,14 +279,14 @@ class Fr3Kinematics(Kinematics):
     """The FR3 with the Franka Hand."""
 
     def __init__(self, tcp_offset: float = GELSIGHT_TCP) -> None:
-        super().__init__(FR3, tcp_offset)
+        super().__init__(FR3_ARM, tcp_offset)
 
 
 class Ur5eKinematics(Kinematics):
     """The UR5e with a gripper on its flange."""
 
     def __init__(self, tcp_offset: float = GELSIGHT_TCP) -> None:
-        super().__init__(UR5E, tcp_offset)
+        super().__init__(UR5E_ARM, tcp_offset)
 
 
 def rotation_vector(R: Matrix3) -> Vector3:

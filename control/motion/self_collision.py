@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.motion.kinematics import FR3, UR5E, Arm, Kinematics
+from touchgoal.control.motion.kinematics import FR3_ARM, UR5E_ARM, ArmModel, Kinematics
 from touchgoal.control.motion.trajectories import Trajectory
 
 Point = tuple[float, float, float]
@@ -15,7 +15,7 @@ Points = Float[np.ndarray, "*k 3"]
 
 @dataclass(frozen=True)
 class Capsule:
-    """All points within `radius` (m) of a segment in the frame of a part (see Kinematics.track)."""
+    """All points within `radius` (m) of a segment in the frame of a part (see Kinematics.points_on_links)."""
 
     frame: int
     start: Point
@@ -65,7 +65,7 @@ _UR5E = (
     *_hand(7),
 )
 
-_BODIES = {FR3.name: _FR3, UR5E.name: _UR5E}
+_BODIES = {FR3_ARM.name: _FR3, UR5E_ARM.name: _UR5E}
 _POINT = 1e-12  # m^2; a shorter segment is a point
 _NEIGHBOURS = 3  # parts in a row that the joints' ranges alone keep apart
 
@@ -73,11 +73,11 @@ _NEIGHBOURS = 3  # parts in a row that the joints' ranges alone keep apart
 class SelfDistance:
     """The gaps of one arm."""
 
-    def __init__(self, arm: Arm) -> None:
+    def __init__(self, arm: ArmModel) -> None:
         body = self.body = _BODIES[arm.name]
         ends = np.array([point for capsule in body for point in (capsule.start, capsule.end)])
         frames = [capsule.frame for capsule in body for _ in range(2)]
-        self._ends = Kinematics(arm, 0.0).track(ends, frames)
+        self._ends = Kinematics(arm, 0.0).points_on_links(ends, frames)
         pairs = [
             (i, j)
             for i, a in enumerate(body)
@@ -102,7 +102,9 @@ class SelfDistance:
         return apart - self._radii
 
 
-def require_apart(trajectory: Trajectory, distance: SelfDistance, margin: float = 5e-3) -> None:
+def require_no_self_collision(
+    trajectory: Trajectory, distance: SelfDistance, margin: float = 5e-3
+) -> None:
     """UserError if parts of the arm come closer than `margin` (m) on the way (looked at 100 Hz)."""
     gap = distance.gap(trajectory.sample(100))
     if gap.min() < margin:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.safety.braking import highest_speed
+from touchgoal.control.safety.braking import max_stoppable_speed
 from touchgoal.control.safety.limits import JointLimits
 
 Joints = Float[np.ndarray, "n"]
@@ -26,7 +26,7 @@ class TrackerState:
         q: commanded joint positions, rad.
         reference: where the straight line to the target is, rad.
         target: the policy's last target, rad.
-        pace: rad a millisecond of the reference.
+        reference_step: rad a millisecond of the reference.
         velocity: of the follower, rad/s.
         window: the follower's last positions, oldest first, rad.
     """
@@ -34,7 +34,7 @@ class TrackerState:
     q: Joints
     reference: Joints
     target: Joints
-    pace: Joints
+    reference_step: Joints
     velocity: Joints
     window: Float[np.ndarray, "m n"]
 
@@ -58,7 +58,7 @@ class Tracker:
         still = np.zeros(q.size)
         return TrackerState(q, q, q, still, still, np.tile(q, (self._window, 1)))
 
-    def aim(self, state: TrackerState, target: Joints) -> TrackerState:
+    def set_target(self, state: TrackerState, target: Joints) -> TrackerState:
         """A new target (rad) from the policy, clamped to the limits; not a number: it is left out.
 
         It is to be reached one period from now, or as soon after as the limits allow.
@@ -66,16 +66,20 @@ class Tracker:
         if not np.isfinite(target).all():
             return state
         target = np.clip(target, self.limits.lower, self.limits.upper)
-        return replace(state, target=target, pace=np.abs(target - state.reference) / self._ticks)
+        return replace(
+            state, target=target, reference_step=np.abs(target - state.reference) / self._ticks
+        )
 
     def step(self, state: TrackerState) -> TrackerState:
         """One tick of the interface; `q` of the result is the command."""
         limits, dt = self.limits, self.dt
         left = state.target - state.reference
-        reference = state.reference + np.clip(left, -state.pace, state.pace)
+        reference = state.reference + np.clip(left, -state.reference_step, state.reference_step)
         last = state.window[-1]
         gap = reference - last
-        speed = np.minimum(highest_speed(np.abs(gap), limits.acceleration, dt), limits.velocity)
+        speed = np.minimum(
+            max_stoppable_speed(np.abs(gap), limits.acceleration, dt), limits.velocity
+        )
         reach = limits.acceleration * dt
         wanted = np.sign(gap) * speed
         velocity = np.clip(wanted, state.velocity - reach, state.velocity + reach)

@@ -79,7 +79,7 @@ def straight_line(
     q = [np.asarray(start, dtype=np.float64)]
     for s in (nodes[1:] + 1) / 2:
         # Least motion, solved to rounding: noise of the solver would come back as jerk.
-        solution = kinematics.inverse(
+        solution = kinematics.solve_ik_near(
             origin + s * (position - origin),
             rotation_matrix(s * turn) @ turned,
             q[-1],
@@ -107,7 +107,7 @@ def straight_line(
     return trajectory
 
 
-def require_inside(trajectory: Trajectory, safety: Safety) -> None:
+def require_inside_workspace(trajectory: Trajectory, safety: Safety) -> None:
     """UserError if the flange or the fingers leave their boxes on the way (looked at 100 Hz)."""
     inside = safety.inside_workspace(trajectory.sample(100))
     if not inside.all():

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.motion.kinematics import Kinematics
-from touchgoal.control.safety.braking import braked, highest_speed
+from touchgoal.control.safety.braking import braked_velocity, max_stoppable_speed
 from touchgoal.control.safety.limits import RobotLimits
 
 Joints = Float[np.ndarray, "n"]
@@ -80,7 +80,7 @@ class Watchdogs:
 
 
 @dataclass(frozen=True)
-class Reading:
+class Measurements:
     """What the sensors say in a tick.
 
     Attributes:
@@ -108,7 +108,7 @@ class SafetyState:
         q: commanded joint positions, rad.
         velocity: of the command, rad/s.
         mode: see Mode.
-        acted: limits that changed the command this tick.
+        active_limits: limits that changed the command this tick.
         fault: the first fault; it stays.
         bad_actions: ticks since the last action of finite numbers.
     """
@@ -116,7 +116,7 @@ class SafetyState:
     q: Joints
     velocity: Joints
     mode: Mode = Mode.HOLD
-    acted: tuple[Limit, ...] = ()
+    active_limits: tuple[Limit, ...] = ()
     fault: Fault | None = None
     bad_actions: int = 0
 
@@ -133,7 +133,7 @@ class Safety:
         self.limits, self.joints, self.dt = limits, limits.policy, 1 / hz
         self.watchdogs = watchdogs or Watchdogs()
         edges = np.array(((0.0, 0.0, 0.0), *limits.finger_edges))
-        self._points = Kinematics(limits.arm, 0.0).track(edges)
+        self._points = Kinematics(limits.arm, 0.0).points_on_links(edges)
         unit = self.joints.acceleration * self.dt
         self._braking_ticks = int(np.ceil(self.joints.velocity / unit).max()) + 1
 
@@ -153,7 +153,9 @@ class Safety:
             )
         return SafetyState(np.array(q), np.zeros(q.size))
 
-    def advance(self, state: SafetyState, action: Joints, reading: Reading) -> SafetyState:
+    def filter_action(
+        self, state: SafetyState, action: Joints, reading: Measurements
+    ) -> SafetyState:
         """One tick: the safe command for a wanted joint change (rad), relative to the last command.
 
         The arm holds while something is stale or the action is not finite; it stops at the first
@@ -169,7 +171,7 @@ class Safety:
             return self._brake(state, Mode.HOLD, stale, None)
         return self._move(state, action)
 
-    def width(self, state: SafetyState, target: float, last: float) -> float:
+    def filter_width(self, state: SafetyState, target: float, last: float) -> float:
         """The gripper width (m) to command in the tick that led to `state`.
 
         The target inside the stroke; the last command while the arm holds or is stopped, so that
@@ -181,15 +183,15 @@ class Safety:
 
     def inside_workspace(self, q: Float[np.ndarray, "k n"]) -> Bool[np.ndarray, " k"]:
         """Whether flange and finger edges lie in their boxes, for each of k postures."""
-        points = self.monitored(q)
-        flange = self.limits.flange.holds(points[:, 0])
-        return flange & self.limits.fingertips.holds(points[:, 1:]).all(axis=1)
+        points = self.monitored_points(q)
+        flange = self.limits.flange.contains(points[:, 0])
+        return flange & self.limits.fingertips.contains(points[:, 1:]).all(axis=1)
 
-    def monitored(self, q: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k 3 3"]:
+    def monitored_points(self, q: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k 3 3"]:
         """Flange and the two finger edges in the base frame (m), for each of k postures."""
         return self._points(q.T).full().T.reshape(len(q), 3, 3)
 
-    def _ages(self, reading: Reading) -> list[tuple[Limit, float, Deadline]]:
+    def _ages(self, reading: Measurements) -> list[tuple[Limit, float, Deadline]]:
         w = self.watchdogs
         return [
             (Limit.STALE_OBSERVATION, reading.observation_age, w.observation),
@@ -197,10 +199,10 @@ class Safety:
             (Limit.STALE_STATE, reading.state_age, w.state),
         ]
 
-    def _stale(self, reading: Reading) -> tuple[Limit, ...]:
+    def _stale(self, reading: Measurements) -> tuple[Limit, ...]:
         return tuple(name for name, age, dead in self._ages(reading) if not age <= dead.hold)
 
-    def _fault(self, state: SafetyState, reading: Reading) -> Fault | None:
+    def _fault(self, state: SafetyState, reading: Measurements) -> Fault | None:
         """The first ceiling exceeded; a reading that is not a number exceeds its ceiling."""
         limits = self.limits
         checks = [(name, age, dead.stop) for name, age, dead in self._ages(reading)]
@@ -217,27 +219,29 @@ class Safety:
         return None
 
     def _brake(
-        self, state: SafetyState, mode: Mode, acted: tuple[Limit, ...], fault: Fault | None
+        self, state: SafetyState, mode: Mode, active_limits: tuple[Limit, ...], fault: Fault | None
     ) -> SafetyState:
-        velocity = braked(state.velocity, self.joints.acceleration, self.dt)
+        velocity = braked_velocity(state.velocity, self.joints.acceleration, self.dt)
         q = state.q + velocity * self.dt
-        return replace(state, q=q, velocity=velocity, mode=mode, acted=acted, fault=fault)
+        return replace(
+            state, q=q, velocity=velocity, mode=mode, active_limits=active_limits, fault=fault
+        )
 
     def _move(self, state: SafetyState, action: Joints) -> SafetyState:
-        j, dt, acted = self.joints, self.dt, []
+        j, dt, active_limits = self.joints, self.dt, []
 
         def clamp(velocity: Joints, low: Joints, high: Joints, name: Limit) -> Joints:
             clamped = np.clip(velocity, low, high)
             if (np.abs(clamped - velocity) > _ROUNDING).any():
-                acted.append(name)
+                active_limits.append(name)
             return clamped
 
         step = np.full(action.size, self.limits.max_step)
         # Clipped before the division: the largest floats would overflow.
         velocity = clamp(action, -step, step, Limit.STEP) / dt
         velocity = clamp(velocity, -j.velocity, j.velocity, Limit.VELOCITY)
-        down = -highest_speed(state.q - j.lower, j.acceleration, dt)
-        up = highest_speed(j.upper - state.q, j.acceleration, dt)
+        down = -max_stoppable_speed(state.q - j.lower, j.acceleration, dt)
+        up = max_stoppable_speed(j.upper - state.q, j.acceleration, dt)
         velocity = clamp(velocity, down, up, Limit.MARGIN)
         reach = j.acceleration * dt
         velocity = clamp(
@@ -245,9 +249,11 @@ class Safety:
         )
         safe = self._into_workspace(state, velocity)
         if safe is not velocity:
-            acted.append(Limit.WORKSPACE)
+            active_limits.append(Limit.WORKSPACE)
         q = state.q + safe * dt
-        return replace(state, q=q, velocity=safe, mode=Mode.MOVE, acted=tuple(acted))
+        return replace(
+            state, q=q, velocity=safe, mode=Mode.MOVE, active_limits=tuple(active_limits)
+        )
 
     def _into_workspace(self, state: SafetyState, wanted: Joints) -> Joints:
         """The wanted velocity, or as much of it as lets braking end inside the boxes.
@@ -258,7 +264,7 @@ class Safety:
         """
         if self._stops_inside(state.q, wanted[None])[0]:
             return wanted
-        rest = braked(state.velocity, self.joints.acceleration, self.dt)
+        rest = braked_velocity(state.velocity, self.joints.acceleration, self.dt)
         tries = rest + _SHARES[:, None] * (wanted - rest)
         good = np.flatnonzero(self._stops_inside(state.q, tries))
         return tries[good[0]] if good.size else rest
@@ -269,7 +275,7 @@ class Safety:
         """For each candidate velocity: are this tick and the braking after it inside the boxes?"""
         path = [q + velocity * self.dt]
         for _ in range(self._braking_ticks):
-            velocity = braked(velocity, self.joints.acceleration, self.dt)
+            velocity = braked_velocity(velocity, self.joints.acceleration, self.dt)
             path.append(path[-1] + velocity * self.dt)
         inside = self.inside_workspace(np.concatenate(path))
         return np.all(inside.reshape(len(path), -1), axis=0)

@@ -7,7 +7,7 @@ Joints = Float[np.ndarray, "*k joints"]
 PerJoint = Float[np.ndarray, " joints"]
 
 
-def highest_speed(gap: Joints, acceleration: PerJoint, dt: float) -> Joints:
+def max_stoppable_speed(gap: Joints, acceleration: PerJoint, dt: float) -> Joints:
     """Highest speed (rad/s) for this tick that can still be braked to rest within `gap` (rad).
 
     Braking takes `acceleration * dt` off the speed each tick of `dt` s. In these units speed u
@@ -20,6 +20,6 @@ def highest_speed(gap: Joints, acceleration: PerJoint, dt: float) -> Joints:
     return unit * (g + n * (n + 1) / 2) / (n + 1)
 
 
-def braked(velocity: Joints, acceleration: PerJoint, dt: float) -> Joints:
+def braked_velocity(velocity: Joints, acceleration: PerJoint, dt: float) -> Joints:
     """Velocity (rad/s) after one tick of braking, each joint by itself."""
     return velocity - np.clip(velocity, -acceleration * dt, acceleration * dt)

@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from touchgoal.control.motion import kinematics
-from touchgoal.control.motion.kinematics import GELSIGHT_TCP, Arm
+from touchgoal.control.motion.kinematics import GELSIGHT_TCP, ArmModel
 
 Joints = Float[np.ndarray, "n"]
 Vector3 = Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True)
-class Taper:
+class SpeedTaper:
     """Speed shrinking near a joint's ends: |v| <= sqrt(gain (end - q)) - offset (rad, s)."""
 
     offset: Joints
@@ -34,9 +34,9 @@ class JointLimits:
     velocity: Joints
     acceleration: Joints
     jerk: Joints
-    taper: Taper | None = None
+    taper: SpeedTaper | None = None
 
-    def inside(self, margin: float) -> "JointLimits":
+    def with_margin(self, margin: float) -> "JointLimits":
         """The same with a range `margin` rad narrower at both ends."""
         return JointLimits(
             self.lower + margin,
@@ -78,7 +78,7 @@ class Box:
     lower: Vector3
     upper: Vector3
 
-    def holds(self, points: Float[np.ndarray, "*k 3"]) -> Bool[np.ndarray, "*k"]:
+    def contains(self, points: Float[np.ndarray, "*k 3"]) -> Bool[np.ndarray, "*k"]:
         """Whether each point lies inside; False for what is not a number."""
         return np.all((points >= self.lower) & (points <= self.upper), axis=-1)
 
@@ -101,7 +101,7 @@ class RobotLimits:
         stroke: m, least and largest width that a gripper is asked for.
     """
 
-    arm: Arm
+    arm: ArmModel
     hardware: JointLimits
     flange: Box
     fingertips: Box
@@ -125,7 +125,7 @@ class RobotLimits:
     @property
     def interface(self) -> JointLimits:
         """What the 1 kHz command and the arm's own moves stay within: the maker's, less a margin."""
-        return self.hardware.inside(self.margin)
+        return self.hardware.with_margin(self.margin)
 
     @property
     def policy(self) -> JointLimits:
@@ -140,7 +140,7 @@ class RobotLimits:
 # Hand grasps with, goes in by 1.2 mm, a pebble's edge by 2 mm. Compare it with your sensor's sheet.
 
 FR3 = RobotLimits(
-    arm=kinematics.FR3,
+    arm=kinematics.FR3_ARM,
     # Range: franka_description joint_limits.yaml. Speed, acceleration, jerk, taper: libfranka
     # rate_limiting.h ("Limits for Franka Research 3"), where gain is twice the deceleration.
     hardware=JointLimits(
@@ -149,7 +149,7 @@ FR3 = RobotLimits(
         velocity=np.array([2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26]),
         acceleration=np.full(7, 10.0),
         jerk=np.full(7, 5000.0),
-        taper=Taper(
+        taper=SpeedTaper(
             offset=np.array([0.30, 0.20, 0.20, 0.30, 0.35, 0.35, 0.35]),
             gain=np.array([12.0, 5.17, 7.0, 8.0, 34.0, 11.0, 34.0]),
             lower=np.array([-2.7501, -1.7918, -2.9065, -3.0481, -2.8101, 0.54092, -3.0196]),
@@ -162,7 +162,7 @@ FR3 = RobotLimits(
 )
 
 UR5E = RobotLimits(
-    arm=kinematics.UR5E,
+    arm=kinematics.UR5E_ARM,
     # Range and speed: Universal_Robots_ROS2_Description ur5e/joint_limits.yaml (180 deg/s).
     # Acceleration is unpublished; 3.14 is our choice (drivers.md 6). So is jerk, which the controller
     # does not enforce: full acceleration in 20 ms; its lookahead at the shortest is 30.

@@ -38,7 +38,7 @@ class Keyboard:
         with contextlib.suppress(termios.error):  # it has gone
             termios.tcsetattr(self._terminal, termios.TCSAFLUSH, self._before)
 
-    def typed(self) -> str:
+    def read_keys(self) -> str:
         """The keys since the last call, in their order; "" if there are none.
 
         Raises:

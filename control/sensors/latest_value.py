@@ -9,24 +9,24 @@ from touchgoal.control.interfaces import DriverError
 T = TypeVar("T")
 
 
-class Newest(Generic[T]):
-    """Calls `take` over and over; what it returns, unless None, is the newest reading.
+class LatestValue(Generic[T]):
+    """Calls `poll` over and over; what it returns, unless None, is the newest reading.
 
-    `take` must return within about a second, if only with None. An exception ends the thread, and
+    `poll` must return within about a second, if only with None. An exception ends the thread, and
     `read` then raises DriverError with its words.
     """
 
-    def __init__(self, name: str, take: Callable[[], T | None], first: float = 5.0) -> None:
-        self._name, self._take, self._patience = name, take, first
+    def __init__(self, name: str, poll: Callable[[], T | None], first_timeout: float = 5.0) -> None:
+        self._name, self._poll, self._first_timeout = name, poll, first_timeout
         self._value: T | None = None
         self._error: Exception | None = None
-        self._news, self._stop = threading.Event(), threading.Event()
+        self._updated, self._stop = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     def read(self) -> T:
-        """The newest reading; it waits `first` s for the first one."""
-        self._news.wait(self._patience)
+        """The newest reading; it waits `first_timeout` s for the first one."""
+        self._updated.wait(self._first_timeout)
         if self._error is not None:
             raise DriverError(f"{self._name}: {self._error}") from self._error
         if self._value is None:
@@ -34,18 +34,18 @@ class Newest(Generic[T]):
         return self._value
 
     def close(self) -> None:
-        """End the thread; what `take` uses may be released afterwards."""
+        """End the thread; what `poll` uses may be released afterwards."""
         self._stop.set()
         self._thread.join()
 
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
-                value = self._take()
+                value = self._poll()
             except Exception as error:  # of any library; `read` passes it on
                 self._error = error
-                self._news.set()
+                self._updated.set()
                 return
             if value is not None:
                 self._value = value
-                self._news.set()
+                self._updated.set()

@@ -15,12 +15,12 @@ from typing import Literal
 
 from touchgoal.control.grippers.modbus import crc
 from touchgoal.control.interfaces import LoadReading
-from touchgoal.control.sensors.latest_value import Newest
+from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.control.sensors.serial_port import open_port
 
 Checksum = Literal["none", "xor", "crc16"]
 
-_LONGEST = 256  # bytes of a line
+_MAX_LINE_LENGTH = 256  # bytes of a line
 
 
 @dataclass(frozen=True)
@@ -30,16 +30,16 @@ class LoadCellConfig:
     Attributes:
         port, baud: such as /dev/ttyACM0, 115200.
         newtons_per_count, zero: force = newtons_per_count * (value - zero).
-        highest: N; a line beyond it, of either sign, is refused.
+        max_force: N; a line beyond it, of either sign, is refused.
         value_field: which comma-separated field holds the value, from 0.
         time_field: which field holds the device's clock, whose steps must be positive; None: none.
-        checksum: what lines end in: see `seal`.
+        checksum: what lines end in: see `with_checksum`.
     """
 
     port: str
     newtons_per_count: float
     zero: float
-    highest: float
+    max_force: float
     baud: int = 115200
     value_field: int = 1
     time_field: int | None = 0
@@ -59,7 +59,7 @@ def parse(line: bytes, config: LoadCellConfig) -> Sample | None:
     text = line
     if config.checksum != "none":
         text = line.rpartition(b"*")[0]
-        if seal(text, config.checksum) != text + line[len(text) :].upper():
+        if with_checksum(text, config.checksum) != text + line[len(text) :].upper():
             return None
     fields = text.split(b",")
     try:
@@ -67,12 +67,12 @@ def parse(line: bytes, config: LoadCellConfig) -> Sample | None:
         clock = None if config.time_field is None else float(fields[config.time_field])
     except (ValueError, IndexError):
         return None
-    if not abs(force) <= config.highest or (clock is not None and not math.isfinite(clock)):
+    if not abs(force) <= config.max_force or (clock is not None and not math.isfinite(clock)):
         return None
     return Sample(force, clock)
 
 
-def seal(text: bytes, checksum: Checksum) -> bytes:
+def with_checksum(text: bytes, checksum: Checksum) -> bytes:
     """A line with its checksum, as firmware prints it.
 
     `*` and the exclusive or of all bytes as two hexadecimal digits (as NMEA has it), or `*` and
@@ -92,16 +92,16 @@ class SerialLoadCell:
         self.config = config
         self._port = open_port(config.port, config.baud, timeout=0.2)
         self._buffer, self._clock, self._rejected = b"", -math.inf, 0
-        self._whole = False  # whether the buffer starts at a line's start
-        self._newest = Newest(f"load cell {config.port}", self._take)
+        self._at_line_start = False  # whether the buffer starts at a line's start
+        self._latest = LatestValue(f"load cell {config.port}", self._take)
 
     def read(self) -> LoadReading:
         """See LoadCell."""
-        return self._newest.read()
+        return self._latest.read()
 
     def close(self) -> None:
         """See LoadCell."""
-        self._newest.close()
+        self._latest.close()
         self._port.close()
 
     def _take(self) -> LoadReading | None:
@@ -110,18 +110,18 @@ class SerialLoadCell:
         stamp, newest = time.monotonic(), None
         *lines, self._buffer = self._buffer.split(b"\n")
         for line in lines:
-            sample = parse(line.strip(), self.config) if self._whole else None
-            if sample is not None and self._goes_on(sample):
+            sample = parse(line.strip(), self.config) if self._at_line_start else None
+            if sample is not None and self._clock_advances(sample):
                 newest = LoadReading(sample.force, self._rejected, stamp)
             else:
-                self._rejected += self._whole
-            self._whole = True
-        if len(self._buffer) > _LONGEST:  # noise, or the wrong baud rate
-            self._buffer, self._whole = b"", False
+                self._rejected += self._at_line_start
+            self._at_line_start = True
+        if len(self._buffer) > _MAX_LINE_LENGTH:  # noise, or the wrong baud rate
+            self._buffer, self._at_line_start = b"", False
             self._rejected += 1
         return newest
 
-    def _goes_on(self, sample: Sample) -> bool:
+    def _clock_advances(self, sample: Sample) -> bool:
         """Whether the device's clock has advanced, if it has one."""
         if sample.clock is None:
             return True

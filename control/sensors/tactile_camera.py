@@ -12,7 +12,7 @@ from touchgoal.control.tactile.sensor_models import SensorModel
 
 
 @dataclass(frozen=True)
-class View:
+class Crop:
     """How a sensor's picture lies in its camera's.
 
     Attributes:
@@ -28,16 +28,16 @@ class View:
 
 # Of a whole GelSight Mini picture its SDK cuts a seventh off each side, the case's edge, and scales
 # the rest; digit-interface turns the pictures upright.
-GELSIGHT_MINI_VIEW = View(border=1 / 7)
-DIGIT_VIEW = View(quarter_turns=1)
-UNCHANGED = View()
+GELSIGHT_MINI_CROP = Crop(border=1 / 7)
+DIGIT_CROP = Crop(quarter_turns=1)
+NO_CROP = Crop()
 
 
-class Fingertip:
+class TactileCamera:
     """The TactileSensor protocol over a Camera; it closes the camera with it."""
 
-    def __init__(self, camera: Camera, model: SensorModel, view: View) -> None:
-        self._camera, self._model, self._view = camera, model, view
+    def __init__(self, camera: Camera, model: SensorModel, crop: Crop) -> None:
+        self._camera, self._model, self._crop = camera, model, crop
         self._last: tuple[Frame, Frame] | None = None
 
     @property
@@ -51,15 +51,18 @@ class Fingertip:
         return self._camera.rate
 
     @property
-    def trouble(self) -> str:
+    def problem(self) -> str:
         """See Camera."""
-        return self._camera.trouble
+        return self._camera.problem
 
     def read(self) -> Frame:
         """See Camera; UserError if the picture's proportions are not the sensor's."""
         frame = self._camera.read()
         if self._last is None or self._last[0] is not frame:
-            self._last = frame, replace(frame, image=cut(frame.image, self._model, self._view))
+            self._last = (
+                frame,
+                replace(frame, image=crop_to_sensor(frame.image, self._model, self._crop)),
+            )
         return self._last[1]
 
     def close(self) -> None:
@@ -67,22 +70,22 @@ class Fingertip:
         self._camera.close()
 
 
-def cut(
-    image: UInt8[np.ndarray, "h w 3"], model: SensorModel, view: View
+def crop_to_sensor(
+    image: UInt8[np.ndarray, "h w 3"], model: SensorModel, crop: Crop
 ) -> UInt8[np.ndarray, "H W 3"]:
     """The sensor's picture in its camera's, at the model's shape."""
-    image = np.rot90(image, view.quarter_turns)
-    if view.mirrored:
+    image = np.rot90(image, crop.quarter_turns)
+    if crop.mirrored:
         image = image[:, ::-1]
     height, width = image.shape[:2]
-    top, left = int(view.border * height), int(view.border * width)
+    top, left = int(crop.border * height), int(crop.border * width)
     image = image[top : height - top, left : width - left]
     rows, columns = model.image_shape
     ratio = image.shape[1] / image.shape[0] / (columns / rows)
     if not 0.97 < ratio < 1.03:
         raise UserError(
             f"the picture of the {model.name} is {image.shape[1]}x{image.shape[0]}, not "
-            f"{columns}:{rows}: correct `border` or `quarter_turns` of its view"
+            f"{columns}:{rows}: correct `border` or `quarter_turns` of its crop"
         )
     if image.shape[:2] == (rows, columns):
         return np.ascontiguousarray(image)

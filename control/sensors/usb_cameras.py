@@ -37,12 +37,12 @@ def list_cameras(root: Path = _ROOT) -> list[UsbCamera]:
     """All USB cameras; of a camera's several nodes the one with pictures (index 0)."""
     found = []
     for node in sorted(root.glob("video*"), key=lambda n: (len(n.name), n.name)):
-        if _text(node / "index") != "0":
+        if _read_text(node / "index") != "0":
             continue
         usb = _usb_device(node)
-        serial = _text(usb / "serial") if usb else ""
-        product = _text(usb / "product") if usb else ""
-        found.append(UsbCamera(f"/dev/{node.name}", product or _text(node / "name"), serial))
+        serial = _read_text(usb / "serial") if usb else ""
+        product = _read_text(usb / "product") if usb else ""
+        found.append(UsbCamera(f"/dev/{node.name}", product or _read_text(node / "name"), serial))
     return found
 
 
@@ -79,5 +79,5 @@ def _usb_device(node: Path) -> Path | None:
     return next((p for p in (device, *device.parents) if (p / "idProduct").exists()), None)
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     return path.read_text(errors="replace").strip() if path.exists() else ""

@@ -15,18 +15,18 @@ import numpy as np
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import Frame
-from touchgoal.control.sensors.latest_value import Newest
+from touchgoal.control.sensors.latest_value import LatestValue
 
-# A lost stream is told in `trouble`; what the libraries print about it would tear a live view apart.
+# A lost stream is told in `problem`; what the libraries print about it would tear a live view apart.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_FATAL)
 
 _READ_TIMEOUT = 1000  # ms without a frame after which OpenCV gives up on a stream
 _OPEN_TIMEOUT = 5000  # ms to open it the first time: the first frame may take longer to come
-_REOPEN = 0.5  # s between attempts
+_REOPEN_INTERVAL = 0.5  # s between attempts
 _RATE_WINDOW = 2.0  # s that the rate is measured over
-_LATE = 3.0  # periods without a frame that mean trouble
-_SAMPLE = 4  # pixels; every so many are compared for frozen pictures
+_LATE_PERIODS = 3.0  # periods without a frame that mean a problem
+_COMPARE_STRIDE = 4  # pixels; every so many are compared for frozen pictures
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class VideoConfig:
         source: index of a camera (`0`), a device (`/dev/video2`), a file, an image sequence
             (`frame_%04d.png`) or the address of an MJPEG stream (`http://...`).
         size: (width, height) to ask a camera for; None: its default.
-        rate: Hz; of a camera to ask for, of images to play, and what `trouble` compares with.
+        rate: Hz; of a camera to ask for, of images to play, and what `problem` compares with.
         frozen_after: s of pixel-for-pixel the same picture after which it counts as old. Sensor
             noise makes real pictures differ; rendered ones may rightly stand still: then infinity.
     """
@@ -68,38 +68,38 @@ class VideoCamera:
     def __init__(self, config: VideoConfig) -> None:
         self.config = config
         self._capture = _open(config, _OPEN_TIMEOUT)
-        self._sequence, self._times = 0, deque[float]()
+        self._count, self._grab_times = 0, deque[float]()
         self._image: np.ndarray | None = None
-        self._changed = self._due = time.monotonic()
+        self._changed_at = self._next_frame_at = time.monotonic()
         self._lost = ""
-        self._newest = Newest(f"camera {config.source}", self._take)
+        self._latest = LatestValue(f"camera {config.source}", self._take)
 
     @property
     def rate(self) -> float:
         """See Camera: over the last 2 s."""
         now = time.monotonic()
-        times = [t for t in tuple(self._times) if t > now - _RATE_WINDOW]
+        times = [t for t in tuple(self._grab_times) if t > now - _RATE_WINDOW]
         return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
 
     @property
-    def trouble(self) -> str:
+    def problem(self) -> str:
         """See Camera."""
         frame, now = self.read(), time.monotonic()
         if self._lost:
             return f"{self.config.source} {self._lost}"
-        if self._times[-1] - frame.stamp > self.config.frozen_after:
+        if self._grab_times[-1] - frame.stamp > self.config.frozen_after:
             return f"{self.config.source} shows one picture for {now - frame.stamp:.1f} s"
-        if now - frame.stamp > _LATE / self.config.rate:
+        if now - frame.stamp > _LATE_PERIODS / self.config.rate:
             return f"{self.config.source} gave its last frame {now - frame.stamp:.2f} s ago"
         return ""
 
     def read(self) -> Frame:
         """See Camera."""
-        return self._newest.read()
+        return self._latest.read()
 
     def close(self) -> None:
         """See Camera."""
-        self._newest.close()
+        self._latest.close()
         self._capture.release()
 
     def _take(self) -> Frame | None:
@@ -112,54 +112,56 @@ class VideoCamera:
             self._reopen()
             return None
         self._lost = ""
-        self._sequence += 1
-        self._times.append(stamp)
-        while self._times[0] < stamp - _RATE_WINDOW:
-            self._times.popleft()
-        if self._image is None or _differ(image, self._image):
-            self._changed = stamp
+        self._count += 1
+        self._grab_times.append(stamp)
+        while self._grab_times[0] < stamp - _RATE_WINDOW:
+            self._grab_times.popleft()
+        if self._image is None or _differs(image, self._image):
+            self._changed_at = stamp
         self._image = image
-        frozen = stamp - self._changed > self.config.frozen_after
+        frozen = stamp - self._changed_at > self.config.frozen_after
         rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-        return Frame(rgb, self._sequence, self._changed if frozen else stamp)
+        return Frame(rgb, self._count, self._changed_at if frozen else stamp)
 
     def _wait_for_turn(self) -> None:
-        self._due = max(self._due + 1 / self.config.rate, time.monotonic() - 1 / self.config.rate)
-        time.sleep(max(self._due - time.monotonic(), 0))
+        self._next_frame_at = max(
+            self._next_frame_at + 1 / self.config.rate, time.monotonic() - 1 / self.config.rate
+        )
+        time.sleep(max(self._next_frame_at - time.monotonic(), 0))
 
     def _reopen(self) -> None:
         if self.config.is_file:
             self._lost = "has ended"
-            time.sleep(_REOPEN)
+            time.sleep(_REOPEN_INTERVAL)
             return
         self._lost = "is gone: check its cable"
         self._capture.release()
-        time.sleep(_REOPEN)
+        time.sleep(_REOPEN_INTERVAL)
         try:
             self._capture = _open(self.config, _READ_TIMEOUT)
         except UserError:
             pass  # not back yet
 
 
-def _open(config: VideoConfig, patience: int) -> cv2.VideoCapture:
-    """Within `patience` ms if it is a stream."""
+def _open(config: VideoConfig, timeout_ms: int) -> cv2.VideoCapture:
+    """Within `timeout_ms` ms if it is a stream."""
     source = int(config.source) if config.source.isdigit() else config.source
     if config.is_camera:
         capture = cv2.VideoCapture(source, cv2.CAP_V4L2)
     elif config.is_file:
         capture = cv2.VideoCapture(source)
     else:
-        opening = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, patience]
+        opening = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms]
         reading = [cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_TIMEOUT]
         capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, opening + reading)
     if not capture.isOpened():
         raise UserError(f"cannot open {config.source}: check cable, address and permission (video)")
     if config.is_camera:
-        _set_up(capture, config)
+        _configure_camera(capture, config)
     return capture
 
 
-def _set_up(capture: cv2.VideoCapture, config: VideoConfig) -> None:
+def _configure_camera(capture: cv2.VideoCapture, config: VideoConfig) -> None:
     """Format, size and rate of a camera, read back because drivers ignore what they cannot do."""
     capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
     if config.size is not None:
@@ -179,6 +181,6 @@ def _set_up(capture: cv2.VideoCapture, config: VideoConfig) -> None:
     capture.set(cv2.CAP_PROP_FPS, config.rate)
 
 
-def _differ(image: np.ndarray, before: np.ndarray) -> bool:
-    sample = slice(None, None, _SAMPLE)
+def _differs(image: np.ndarray, before: np.ndarray) -> bool:
+    sample = slice(None, None, _COMPARE_STRIDE)
     return not np.array_equal(image[sample, sample], before[sample, sample])

@@ -1,7 +1,7 @@
 """From a sensor's picture to the depth of its gel: the sensor file's model, turned round.
 
 One colour may belong to two slopes, to a shadow or to a depth, so pixels are not inverted one by
-one. The surface is sought as a whole whose picture (`photometry`) is the frame, by Gauss-Newton
+one. The surface is sought as a whole whose picture (`sensor_calibration.shade`) is the frame, by Gauss-Newton
 steps on the squared error: every pixel is read in the light of its neighbours, and what comes out is
 a surface. A step is a Poisson-like equation with free (Neumann) borders, solved by conjugate
 gradients that the cosine transform preconditions. Coarse grids come first: they cost little.
@@ -14,7 +14,12 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from touchgoal.control.tactile.background import cosines
-from touchgoal.control.tactile.sensor_calibration import Photometry, gain, monomials, shadows
+from touchgoal.control.tactile.sensor_calibration import (
+    SensorCalibration,
+    illumination,
+    monomials,
+    shadows,
+)
 
 Map = Float32[np.ndarray, "h w"]
 Colours = Float32[np.ndarray, "3 h w"]
@@ -39,21 +44,21 @@ _TILTED = 0.05  # slope below which the direction is noise
 class DepthEstimator:
     """Reconstructs the gel's surface from single frames of one sensor.
 
-    What the sensor file does not tell apart, no frame shows. Walls steeper than its `steepest` come
-    out too low, except where the depth's own colour (up to `deepest`) says how deep they go. Without
+    What the sensor file does not tell apart, no frame shows. Walls steeper than its `max_slope` come
+    out too low, except where the depth's own colour (up to `max_depth`) says how deep they go. Without
     such a colour, depth counts from the lowest tenth of what is seen: too shallow where a contact
     fills the view.
 
     Args:
-        photometry: the sensor file.
+        calibration: the sensor file.
         finest: side of the smallest cells, px. 8 takes a third of the time of 2 and finds the
             deepest point of most contacts as well.
     """
 
-    def __init__(self, photometry: Photometry, finest: int = 2) -> None:
-        self._photometry = photometry
+    def __init__(self, calibration: SensorCalibration, finest: int = 2) -> None:
+        self._calibration = calibration
         self._schedule = [step for step in _SCHEDULE if step[0] >= finest]
-        self._levels = [_Level(photometry, cell) for cell, *_ in self._schedule]
+        self._levels = [_Level(calibration, cell) for cell, *_ in self._schedule]
 
     def estimate(
         self,
@@ -68,7 +73,7 @@ class DepthEstimator:
                 painted over as well; None: the sensor file's.
         """
         if background is None:
-            background = self._photometry.background.astype(np.float32)
+            background = self._calibration.background.astype(np.float32)
         change = image - background
         surface = np.zeros((1, 1), np.float32)
         for level, (_, steps, searched, inner) in zip(self._levels, self._schedule, strict=True):
@@ -91,12 +96,12 @@ class _Linear:
 class _Level:
     """The model of the picture and its inverse on cells of some pixels."""
 
-    def __init__(self, photometry: Photometry, cell: int) -> None:
-        p = self._photometry = photometry
+    def __init__(self, calibration: SensorCalibration, cell: int) -> None:
+        p = self._calibration = calibration
         rows, columns, _ = p.background.shape
         h, w = self._shape = rows // cell, columns // cell
         self._pitch = p.pixel_pitch * cell
-        light = cv2.resize(gain(p.background), (w, h), interpolation=cv2.INTER_AREA)
+        light = cv2.resize(illumination(p.background), (w, h), interpolation=cv2.INTER_AREA)
         self._gain = np.ascontiguousarray(np.moveaxis(light, 2, 0))
         self._noise = np.float32(np.hypot(p.noise / cell, _MODEL_ERROR))
         self._rest = np.float32(cell**2 / _PATCH / _REST**2)
@@ -139,31 +144,31 @@ class _Level:
         return surface
 
     def _linearise(self, seen: Colours, surface: Map, search: bool) -> _Linear:
-        p = self._photometry
+        p = self._calibration
         gx, gy = self._slopes(surface)
         dark = shadows(p, surface, self._pitch)
         # What shadows and depth leave for the slopes to explain.
-        left = seen - self._per_depth * np.minimum(surface, np.float32(p.deepest))
+        left = seen - self._per_depth * np.minimum(surface, np.float32(p.max_depth))
         left -= self._gain * np.tensordot(p.shadow, dark, 1)
-        lit, by_gx, by_gy = self._lit(gx, gy)
-        error = left - lit
+        shading, by_gx, by_gy = self._shading(gx, gy)
+        error = left - shading
         moved = self._search(left, error, gx, gy) if search else None
         if moved is not None:
-            lit, by_gx, by_gy = self._lit(*moved)
-            error = left - lit
+            shading, by_gx, by_gy = self._shading(*moved)
+            error = left - shading
         size = np.sqrt(np.einsum("chw,chw->hw", error, error)) / self._noise
         weight = self._noise**-2 / np.maximum(size / np.float32(_OUTLIER), 1)
         if moved is not None:
             error += by_gx * (moved[0] - gx) + by_gy * (moved[1] - gy)
-        return _Linear(error, by_gx, by_gy, self._per_depth * (surface < p.deepest), weight)
+        return _Linear(error, by_gx, by_gy, self._per_depth * (surface < p.max_depth), weight)
 
-    def _lit(self, gx: Map, gy: Map) -> tuple[Colours, Colours, Colours]:
+    def _shading(self, gx: Map, gy: Map) -> tuple[Colours, Colours, Colours]:
         """What slopes add to the picture, and the derivatives of that by gx and gy."""
-        p = self._photometry
+        p = self._calibration
         square = gx * gx + gy * gy
-        steep = square > (1 + square) * np.float32(p.steepest**2)
-        # n = -g / length; beyond `steepest` only the direction of g counts.
-        squared = np.where(steep, square / np.float32(p.steepest**2), 1 + square)
+        steep = square > (1 + square) * np.float32(p.max_slope**2)
+        # n = -g / length; beyond `max_slope` only the direction of g counts.
+        squared = np.where(steep, square / np.float32(p.max_slope**2), 1 + square)
         bend = np.where(steep, 1 / np.maximum(square, 1e-6), 1 / squared)
         inverse = -1 / np.sqrt(squared)
         terms = self._coefficients @ _terms(gx * inverse, gy * inverse).reshape(10, -1)
@@ -182,7 +187,7 @@ class _Level:
         i, j = np.nonzero(bad)
         if not len(i):
             return None
-        lengths = np.linspace(0, self._photometry.steepest, _LENGTHS + 2)[1:-1].astype(np.float32)
+        lengths = np.linspace(0, self._calibration.max_slope, _LENGTHS + 2)[1:-1].astype(np.float32)
         slope = np.sqrt(square[i, j])
         x, y = (-lengths[:, None] * g[i, j] / slope for g in (gx, gy))
         values = self._coefficients[: 3 * len(self._places)] @ _terms(x, y).reshape(10, -1)
@@ -233,7 +238,7 @@ class _Level:
         return step
 
     def _slopes(self, surface: Map) -> tuple[Map, Map]:
-        """Central differences, the edge replicated, as in `photometry.features`."""
+        """Central differences, the edge replicated, as in `sensor_calibration.shape_features`."""
         p = cv2.copyMakeBorder(surface, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
         half = np.float32(0.5 / self._pitch)
         return (p[1:-1, 2:] - p[1:-1, :-2]) * half, (p[2:, 1:-1] - p[:-2, 1:-1]) * half

@@ -25,13 +25,13 @@ NEARBY_CELLS = (
 )
 
 
-def cells(pitch: float) -> int:
+def pixels_per_cell(pitch: float) -> int:
     """How many pixels of a pitch (m) make one side of a coarse cell: a power of two."""
     return 2 ** max(round(math.log2(CELL / pitch)), 0)
 
 
-def deform(raw: HeightField, pitch: float, bulge: tuple[float, ...]) -> HeightField:
-    """Surface of the gel under an object's overlap `raw` (m, 0 where there is none).
+def deform(overlap: HeightField, pitch: float, blur_sigmas: tuple[float, ...]) -> HeightField:
+    """Surface of the gel under an object's `overlap` (m, 0 where there is none).
 
     The gel follows the object where they touch and bulges smoothly around it: Taxim's
     contact-constrained pyramid, on coarse cells. (Box blurs would be faster, but
@@ -39,17 +39,17 @@ def deform(raw: HeightField, pitch: float, bulge: tuple[float, ...]) -> HeightFi
     is added back inside the contact.
 
     Args:
-        raw: overlap with the undeformed gel.
+        overlap: overlap with the undeformed gel.
         pitch: m per pixel.
-        bulge: standard deviations of the pyramid, coarse to fine, m.
+        blur_sigmas: standard deviations of the pyramid, coarse to fine, m.
     """
-    h, w = raw.shape
-    scale = cells(pitch)
-    low = cv2.resize(raw, (w // scale, h // scale), interpolation=cv2.INTER_AREA)
+    h, w = overlap.shape
+    scale = pixels_per_cell(pitch)
+    low = cv2.resize(overlap, (w // scale, h // scale), interpolation=cv2.INTER_AREA)
     around = 2 * NEARBY_CELLS + 1
     contact = low > CONTACT_SHARE * cv2.dilate(low, np.ones((around, around), np.uint8))
     smooth = low
-    for sigma in bulge:
+    for sigma in blur_sigmas:
         blurred = cv2.GaussianBlur(smooth, (0, 0), sigma / (pitch * scale))
         smooth = np.where(contact, low, blurred)
     smooth = cv2.GaussianBlur(smooth, (5, 5), 0)  # the constraint's edge is no edge of the gel
@@ -57,7 +57,7 @@ def deform(raw: HeightField, pitch: float, bulge: tuple[float, ...]) -> HeightFi
     smooth, low, soft = (
         cv2.resize(a, (w, h), interpolation=cv2.INTER_LINEAR) for a in (smooth, low, soft)
     )
-    return cv2.GaussianBlur(smooth + soft * (raw - low), (3, 3), 0)
+    return cv2.GaussianBlur(smooth + soft * (overlap - low), (3, 3), 0)
 
 
 def shadow_depth(
@@ -75,7 +75,7 @@ def shadow_depth(
         slope: tangent of the lights' height above the gel plane.
     """
     h, w = surface.shape
-    scale = cells(pitch)
+    scale = pixels_per_cell(pitch)
     low = cv2.resize(surface, (w // scale, h // scale), interpolation=cv2.INTER_AREA)
     rise = slope * pitch * scale
     longest = min(math.ceil(float(low.max()) / rise), SHADOW_CELLS)  # no shadow reaches farther
@@ -83,7 +83,7 @@ def shadow_depth(
     for shadow, azimuth in zip(shadows, azimuths, strict=True):
         # Measured from a plane that climbs to the light, the running maximum is a plain one.
         tilted = low - _plane(azimuth, rise, low.shape)
-        depth = cv2.dilate(tilted, _towards(azimuth, longest)) - tilted
+        depth = cv2.dilate(tilted, _ray_mask(azimuth, longest)) - tilted
         cv2.resize(cv2.blur(depth, (3, 3)), (w, h), dst=shadow, interpolation=cv2.INTER_LINEAR)
     return shadows
 
@@ -97,7 +97,7 @@ def _plane(azimuth: float, rise: float, shape: tuple[int, int]) -> HeightField:
 
 
 @lru_cache(maxsize=256)
-def _towards(azimuth: float, reach: int) -> UInt8[np.ndarray, "k k"]:
+def _ray_mask(azimuth: float, reach: int) -> UInt8[np.ndarray, "k k"]:
     """Mask of the cells within reach of the middle one in a direction, degrees."""
     steps, angle = np.arange(reach + 1), math.radians(azimuth)
     y, x = (reach + np.rint(steps * f(angle)).astype(int) for f in (math.sin, math.cos))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.tactile.sensor_calibration import N_FEATURES, Photometry
+from touchgoal.control.tactile.sensor_calibration import N_FEATURES, SensorCalibration
 from touchgoal.control.tactile.sensor_models import SensorModel
 
 
@@ -37,7 +37,7 @@ class LedRing:
 DIGIT_RING = LedRing(azimuths=(-150.0, -30.0, 90.0), radius=20e-3, distance=17e-3)
 
 
-def from_led_ring(sensor: SensorModel, ring: LedRing) -> Photometry:
+def from_led_ring(sensor: SensorModel, ring: LedRing) -> SensorCalibration:
     """Colours by Lambert's law with the inverse square of the distance.
 
     A lamp in direction l lights a surface of normal n by n.l: linear in the normal's part in the
@@ -58,7 +58,7 @@ def from_led_ring(sensor: SensorModel, ring: LedRing) -> Photometry:
         response[channel, :2] = ring.brightness * _fit(place, slopes)
         response[channel, [2, 4], 0] = -ring.brightness / 2
     elevation = ring.distance / ring.radius
-    return Photometry(
+    return SensorCalibration(
         sensor=sensor.name,
         background=np.clip(background, 0, 255).astype(np.uint8),
         pixel_pitch=sensor.pixel_pitch,
@@ -68,9 +68,9 @@ def from_led_ring(sensor: SensorModel, ring: LedRing) -> Photometry:
         shadow=np.diag(np.full(3, -ring.shadowed * ring.brightness)).astype(np.float32),
         penumbra=5e-5,
         # Steeper than this a wall turns away from the lamps.
-        steepest=float(np.sin(np.arctan(elevation))),
-        deepest=1e-3,
-        bulge=(1.05e-3, 0.525e-3, 0.2625e-3, 0.1225e-3),  # as fitted to the Mini's gel
+        max_slope=float(np.sin(np.arctan(elevation))),
+        max_depth=1e-3,
+        blur_sigmas=(1.05e-3, 0.525e-3, 0.2625e-3, 0.1225e-3),  # as fitted to the Mini's gel
         noise=0.97,
     )
 

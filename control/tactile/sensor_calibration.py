@@ -2,7 +2,7 @@
 
 The model. A gel surface h(x, y), m into the gel (`gel.deform`), has slopes gx = dh/dx, gy = dh/dy
 by central differences and the unit normal's image-plane part (nx, ny) = -(gx, gy) / sqrt(1 + gx^2
-+ gy^2). With the ten features f_k of `features`, position p = (1, u, v), u and v from -1 to 1
++ gy^2). With the ten features f_k of `shape_features`, position p = (1, u, v), u and v from -1 to 1
 across columns and rows, and the shadow depths s_l of `gel.shadow_depth`, channel c shows
 
     I_c = background_c + noise + gain_c (
@@ -11,7 +11,7 @@ across columns and rows, and the shadow depths s_l of `gel.shadow_depth`, channe
 
 The gain is the blurred background divided by its mean: where little light falls, slopes change the
 picture little. The polynomial holds for what the presses showed and no further: a normal steeper
-than `steepest` is shortened to it, a depth beyond `deepest` counts as `deepest`, for shadows too.
+than `max_slope` is shortened to it, a depth beyond `max_depth` counts as `max_depth`, for shadows too.
 """
 
 import json
@@ -36,22 +36,22 @@ _MAKE = "make one with: touchgoal calibrate PRESSES"
 
 
 @dataclass(frozen=True)
-class Photometry:
+class SensorCalibration:
     """One sensor's colours, as `touchgoal calibrate` fits them to presses.
 
     Attributes:
         sensor: name of the sensor model.
         background: the untouched sensor, RGB.
         pixel_pitch: m per pixel.
-        response: counts per channel and feature (`features`); the last axis multiplies (1, u, v),
+        response: counts per channel and feature (`shape_features`); the last axis multiplies (1, u, v),
             where u and v run from -1 to 1 across columns and rows.
         light_azimuths: where in the image each light stands, degrees from x (right) towards y
             (down).
         shadow_slope: tangent of the lights' height above the gel plane.
         shadow: counts per channel in the deepest shadow of each light.
         penumbra: shadow depth (`gel.shadow_depth`) at which half of that is reached, m.
-        steepest, deepest: largest length of (nx, ny), and depth in m, in the presses.
-        bulge: standard deviations of the gel's bulge, coarse to fine, m (`gel.deform`).
+        max_slope, max_depth: largest length of (nx, ny), and depth in m, in the presses.
+        blur_sigmas: standard deviations of the gel's bulge, coarse to fine, m (`gel.deform`).
         noise: standard deviation of the camera's noise, counts.
     """
 
@@ -63,27 +63,27 @@ class Photometry:
     shadow_slope: float
     shadow: Float32[np.ndarray, "3 lights"]
     penumbra: float
-    steepest: float
-    deepest: float
-    bulge: tuple[float, ...]
+    max_slope: float
+    max_depth: float
+    blur_sigmas: tuple[float, ...]
     noise: float
 
 
-def gain(background: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+def illumination(background: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
     """How strongly the light falls over the image, per channel relative to its mean."""
     light = cv2.GaussianBlur(background.astype(np.float32), (0, 0), background.shape[1] / 40)
     return light / light.mean((0, 1))
 
 
-def features(
-    surface: Float32[np.ndarray, "h w"], pitch: float, steepest: float, deepest: float
+def shape_features(
+    surface: Float32[np.ndarray, "h w"], pitch: float, max_slope: float, max_depth: float
 ) -> Float32[np.ndarray, "10 h w"]:
     """What the colours are linear in.
 
     Args:
         surface: of the gel, m into the gel.
         pitch: m per pixel.
-        steepest, deepest: see `Photometry`.
+        max_slope, max_depth: see `SensorCalibration`.
 
     Returns:
         nx, ny, nx^2, nx ny, ny^2, nx^3, nx^2 ny, nx ny^2, ny^3 of the unit normal's components in
@@ -92,10 +92,10 @@ def features(
     padded = np.pad(surface, 1, mode="edge")
     gx = (padded[1:-1, 2:] - padded[1:-1, :-2]) * np.float32(0.5 / pitch)
     gy = (padded[2:, 1:-1] - padded[:-2, 1:-1]) * np.float32(0.5 / pitch)
-    # |n| = s / sqrt(1 + s^2) for slope s; at most `steepest`
+    # |n| = s / sqrt(1 + s^2) for slope s; at most `max_slope`
     square = gx * gx + gy * gy
-    inverse = -1 / np.sqrt(np.maximum(1 + square, square / np.float32(steepest**2)))
-    depth = np.minimum(surface, np.float32(deepest))
+    inverse = -1 / np.sqrt(np.maximum(1 + square, square / np.float32(max_slope**2)))
+    depth = np.minimum(surface, np.float32(max_depth))
     return np.stack([*monomials(gx * inverse, gy * inverse), depth])
 
 
@@ -108,76 +108,80 @@ def monomials(
 
 
 def shadows(
-    photometry: Photometry, surface: Float32[np.ndarray, "h w"], pitch: float
+    calibration: SensorCalibration, surface: Float32[np.ndarray, "h w"], pitch: float
 ) -> Float32[np.ndarray, "lights h w"]:
     """Share of each light's full shadow, 0 to 1, on a gel surface of any resolution.
 
     Args:
-        photometry: where the lights stand and how their shadows begin.
-        surface: of the gel, m; a depth beyond `deepest` counts as `deepest`.
+        calibration: where the lights stand and how their shadows begin.
+        surface: of the gel, m; a depth beyond `max_depth` counts as `max_depth`.
         pitch: of the surface, m per pixel.
     """
-    known = np.minimum(surface, np.float32(photometry.deepest))
-    depth = gel.shadow_depth(known, pitch, photometry.light_azimuths, photometry.shadow_slope)
-    depth /= depth + np.float32(photometry.penumbra)
+    known = np.minimum(surface, np.float32(calibration.max_depth))
+    depth = gel.shadow_depth(known, pitch, calibration.light_azimuths, calibration.shadow_slope)
+    depth /= depth + np.float32(calibration.penumbra)
     return depth
 
 
-def columns(
-    photometry: Photometry, surface: Float32[np.ndarray, "h w"], pixels: Int[np.ndarray, " n"]
+def design_matrix(
+    calibration: SensorCalibration,
+    surface: Float32[np.ndarray, "h w"],
+    pixels: Int[np.ndarray, " n"],
 ) -> Float32[np.ndarray, "terms n"]:
     """What the change of colour is linear in: the features, times 1, u and v, then the shadows.
 
     Args:
-        photometry: only its numbers that are not linear are used.
+        calibration: only its numbers that are not linear are used.
         surface: of the gel, m.
         pixels: flat indices of the pixels wanted.
     """
     h, w = surface.shape
-    shape = features(surface, photometry.pixel_pitch, photometry.steepest, photometry.deepest)
+    shape = shape_features(
+        surface, calibration.pixel_pitch, calibration.max_slope, calibration.max_depth
+    )
     shape = shape.reshape(N_FEATURES, -1)[:, pixels]
     v, u = np.divmod(pixels, w) * (2 / np.array([[h - 1], [w - 1]], np.float32)) - 1
-    dark = shadows(photometry, surface, photometry.pixel_pitch).reshape(-1, h * w)[:, pixels]
+    dark = shadows(calibration, surface, calibration.pixel_pitch).reshape(-1, h * w)[:, pixels]
     terms = np.concatenate([shape, shape * u, shape * v, dark])
     return terms.astype(np.float32, copy=False)
 
 
-def weights(photometry: Photometry) -> Float32[np.ndarray, "3 terms"]:
-    """What each of `columns` counts for, per channel."""
-    response = photometry.response.transpose(0, 2, 1).reshape(3, -1)
-    return np.concatenate([response, photometry.shadow], 1)
+def coefficients(calibration: SensorCalibration) -> Float32[np.ndarray, "3 terms"]:
+    """What each of `design_matrix` counts for, per channel."""
+    response = calibration.response.transpose(0, 2, 1).reshape(3, -1)
+    return np.concatenate([response, calibration.shadow], 1)
 
 
 def shade(
-    photometry: Photometry, surface: Float32[np.ndarray, "h w"]
+    calibration: SensorCalibration, surface: Float32[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w 3"]:
     """RGB picture of a gel surface without noise, in counts, neither rounded nor clipped.
 
     The reference: short and slow. The simulator's fused kernels must agree with it.
     """
-    terms = columns(photometry, surface, np.arange(surface.size))
-    change = (weights(photometry) @ terms).T.reshape(*surface.shape, 3)
-    return photometry.background + gain(photometry.background) * change
+    terms = design_matrix(calibration, surface, np.arange(surface.size))
+    change = (coefficients(calibration) @ terms).T.reshape(*surface.shape, 3)
+    return calibration.background + illumination(calibration.background) * change
 
 
-def save(photometry: Photometry, folder: Path, provenance: dict[str, Any]) -> None:
+def save(calibration: SensorCalibration, folder: Path, provenance: dict[str, Any]) -> None:
     """Write `sensor.json` and `background.png`; an older sensor file there is replaced.
 
     Args:
-        photometry: what to keep.
+        calibration: what to keep.
         folder: made if needed.
         provenance: where it comes from, JSON-able: source, command, presses, held-out errors.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    rows, columns, _ = photometry.background.shape
-    numbers = {name: _plain(getattr(photometry, name)) for name in _NUMBERS}
+    rows, columns, _ = calibration.background.shape
+    numbers = {name: _plain(getattr(calibration, name)) for name in _NUMBERS}
     description = {"format": FORMAT, "image_shape": [rows, columns], **numbers}
     text = json.dumps({**description, "provenance": provenance}, indent=1)
-    cv2.imwrite(str(folder / _BACKGROUND), photometry.background[..., ::-1])
+    cv2.imwrite(str(folder / _BACKGROUND), calibration.background[..., ::-1])
     (folder / _JSON).write_text(_INNERMOST.sub(lambda m: " ".join(m[0].split()), text) + "\n")
 
 
-def load(folder: Path) -> Photometry:
+def load(folder: Path) -> SensorCalibration:
     """Read what `save` wrote.
 
     Raises:
@@ -204,11 +208,11 @@ def load(folder: Path) -> Photometry:
     for name, shape in shapes.items():
         if values[name].shape != shape:
             raise UserError(f"{path}: {name} is {values[name].shape}, not {shape}: {_MAKE}")
-    for name in ("pixel_pitch", "shadow_slope", "penumbra", "steepest", "deepest"):
+    for name in ("pixel_pitch", "shadow_slope", "penumbra", "max_slope", "max_depth"):
         if not values[name] > 0:
             raise UserError(f"{path}: {name} must be positive, not {values[name]}: {_MAKE}")
     background = np.ascontiguousarray(image[..., ::-1])
-    return Photometry(background=background, **values)
+    return SensorCalibration(background=background, **values)
 
 
 def read_provenance(folder: Path) -> dict[str, Any]:
@@ -261,9 +265,9 @@ _NUMBERS: dict[str, Callable[[Any], Any]] = {
     "shadow_slope": _number,
     "shadow": _array,
     "penumbra": _number,
-    "steepest": _number,
-    "deepest": _number,
-    "bulge": _numbers,
+    "max_slope": _number,
+    "max_depth": _number,
+    "blur_sigmas": _numbers,
     "noise": _number,
 }
 _INNERMOST = re.compile(r"\[[^\[\]{}]*\]")  # lists of numbers go on one line

@@ -44,7 +44,7 @@ class SensorModel:
         normal_stiffness: of the gel as a whole under a typical curved contact, N/m.
         shear_stiffness: of the gel as a whole, N/m.
         frame_rate: Hz.
-        sensor_file: folder with the colours of a typical unit (`control.touch.photometry`).
+        sensor_file: folder with the colours of a typical unit (`control.tactile.sensor_calibration`).
         markers: dots printed on the gel, if any.
     """
 

@@ -13,9 +13,9 @@ from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.alignment.data import Augmentation, TouchData, prepare
+from touchgoal.encoders.alignment.data import Augmentation, TouchData, prepare_touch_data
 from touchgoal.encoders.alignment.infonce import info_nce, loss_floor, symmetric_info_nce
-from touchgoal.encoders.alignment.retrieval import evaluate
+from touchgoal.encoders.alignment.retrieval import evaluate_retrieval
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS as VIT_PRESETS
 from touchgoal.encoders.backbones.vit import random_patches
@@ -32,7 +32,7 @@ class AlignConfig:
 
     Attributes:
         sensor: Name of the fingertip sensor.
-        vit: Size of the touch trunk: "tiny", "small" or "huge".
+        vit: Size of the touch backbone: "tiny", "small" or "huge".
         embedding_dim: Width of the shared space, when heads are trained into one.
         epochs: Passes over the touches.
         batch_size: Touches a step; all of them if there are fewer.
@@ -48,11 +48,11 @@ class AlignConfig:
         symmetric: Both directions of each term; otherwise touch picks images and texts.
         multi_positive: Everything of the same object (or with the same sentence) is right;
             otherwise only the partner is.
-        idle_texts: Said of touches without contact; if empty these are left out.
+        no_contact_texts: Said of touches without contact; if empty these are left out.
         token_share: Patches of each touch seen in training. Half of them costs half and does not
             harm (FLIP, Li et al. 2023).
         augmentation: Of the touches.
-        bfloat16: Autocast of the trunk. Measured: 20 times slower on a CPU without AVX-512.
+        bfloat16: Autocast of the backbone. Measured: 20 times slower on a CPU without AVX-512.
         device: Of the training.
         seed: Of everything random.
     """
@@ -72,7 +72,7 @@ class AlignConfig:
     image_text_weight: float = 1.0
     symmetric: bool = True
     multi_positive: bool = True
-    idle_texts: tuple[str, ...] = (
+    no_contact_texts: tuple[str, ...] = (
         "nothing touches the sensor",
         "an untouched gel, no contact",
         "the fingertip feels nothing",
@@ -91,7 +91,7 @@ PRESETS: dict[str, AlignConfig] = {
     # 10,000 touches in about 15 minutes on two CPU cores
     "default": AlignConfig(),
     # Section V of the paper. What it leaves open is plain here: a constant learning rate, no
-    # augmentation, no idle touches. Meant for CLIP towers and a large GPU.
+    # augmentation, no touches without contact. Meant for CLIP towers and a large GPU.
     "paper": AlignConfig(
         vit="huge",
         epochs=100,
@@ -105,7 +105,7 @@ PRESETS: dict[str, AlignConfig] = {
         text_weight=1.0,
         symmetric=False,
         multi_positive=False,
-        idle_texts=(),
+        no_contact_texts=(),
         token_share=1.0,
         augmentation=Augmentation(),
         device="cuda",
@@ -146,16 +146,18 @@ def align(
     resumable.check(out_dir, resume, config.device)
     if config.epochs < 1 or config.batch_size < 2:
         raise UserError("training needs at least 1 epoch and batches of at least 2 touches")
-    data, val_data = (prepare(t, towers, config.sensor, config.idle_texts) for t in (train, val))
+    data, val_data = (
+        prepare_touch_data(t, towers, config.sensor, config.no_contact_texts) for t in (train, val)
+    )
     run = _Run(config, towers, data)
     if resume:
         run.restore(out_dir)
     out_dir.mkdir(parents=True, exist_ok=True)
     for epoch in range(len(run.history), config.epochs):
-        metrics = run.train_epoch(epoch) | evaluate(run.encoder, val_data)
+        metrics = run.train_epoch(epoch) | evaluate_retrieval(run.encoder, val_data)
         run.note({"epoch": epoch + 1} | metrics)
         run.checkpoint(out_dir)
-        tqdm.write(_line(metrics, epoch + 1, config.epochs))
+        tqdm.write(_progress_line(metrics, epoch + 1, config.epochs))
     run.encoder.load_state_dict(run.best)
     provenance = {
         **recipe,
@@ -164,7 +166,7 @@ def align(
         "metrics": max(run.history, key=_score),
     }
     pretrained.save(run.encoder, out_dir / _ENCODER, provenance)
-    return pretrained.load(out_dir / _ENCODER)
+    return pretrained.load_aligned(out_dir / _ENCODER)
 
 
 class _Run:
@@ -195,8 +197,8 @@ class _Run:
         progress = tqdm(batches, desc=f"epoch {epoch + 1}/{config.epochs}", leave=False)
         for step, rows in enumerate(progress):
             for group in self.optimiser.param_groups:
-                group["lr"] = _rate(config, epoch * self.steps + step, self.steps)
-            batch = _embed(self.encoder, self.data, rows, config, generator)
+                group["lr"] = _learning_rate(config, epoch * self.steps + step, self.steps)
+            batch = _embed_batch(self.encoder, self.data, rows, config, generator)
             losses = batch_losses(batch, self.encoder.config.pretrained_together, config)
             self.optimiser.zero_grad()
             losses["loss"].backward()
@@ -245,7 +247,7 @@ def _optimiser(encoder: TouchEncoder, config: AlignConfig) -> torch.optim.Optimi
     return kind(groups, lr=config.lr)
 
 
-def _rate(config: AlignConfig, step: int, steps_per_epoch: int) -> float:
+def _learning_rate(config: AlignConfig, step: int, steps_per_epoch: int) -> float:
     steps = config.epochs * steps_per_epoch
     return config.lr * resumable.warmed_cosine(step, steps, config.warmup * steps, config.final_lr)
 
@@ -269,7 +271,7 @@ class AlignedBatch:
     same: Bool[Tensor, "b b"]
 
 
-def _embed(
+def _embed_batch(
     encoder: TouchEncoder,
     data: TouchData,
     rows: Int[Tensor, " b"],
@@ -279,18 +281,18 @@ def _embed(
     device = config.device
     sentences = data.draw_sentences(rows, generator)
     touch = config.augmentation(data.touch[rows].float(), generator).to(device)
-    keep = None
+    ids_keep = None
     if config.token_share < 1:
         vit = encoder.config.vit
-        keep = random_patches(vit, len(rows), config.token_share, generator).to(device)
+        ids_keep = random_patches(vit, len(rows), config.token_share, generator).to(device)
     with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=config.bfloat16):
-        embedded = encoder.embed_touch(touch, keep).float()
+        embedded = encoder.embed_touch(touch, ids_keep).float()
     label = data.label[rows]
     same = (label[:, None] == label) | (sentences[:, None] == sentences)
     return AlignedBatch(
         touch=embedded,
         text=encoder.project_text(data.texts[sentences].to(device)),
-        image=encoder.project_image(data.images[data.view_of[rows]].to(device)),
+        image=encoder.project_image(data.images[data.view_index[rows]].to(device)),
         contact=data.contact[rows].to(device),
         same=same.to(device),
     )
@@ -301,7 +303,7 @@ def batch_losses(
 ) -> dict[str, Float[Tensor, ""]]:
     """The weighted sum "loss" (the paper's Eq. 2) and its terms.
 
-    Idle touches have no picture and take part in touch-text only. A batch with fewer than two
+    Touches without contact have no picture and take part in touch-text only. A batch with fewer than two
     touches in contact has no image terms.
     """
     nce = symmetric_info_nce if config.symmetric else info_nce
@@ -338,7 +340,7 @@ def _score(metrics: dict[str, float]) -> float:
     return (metrics["touch_to_text_map"] + metrics["touch_to_image_map"]) / 2
 
 
-def _line(metrics: dict[str, float], epoch: int, epochs: int) -> str:
+def _progress_line(metrics: dict[str, float], epoch: int, epochs: int) -> str:
     m = metrics
     return (
         f"epoch {epoch}/{epochs}  loss {m['loss']:.3f}  "

@@ -14,7 +14,7 @@ from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.towers.towers import BATCH, Towers
 from touchgoal.episodes.touches import Touches
 
-IDLE = ""
+NO_CONTACT = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,21 +24,21 @@ class TouchData:
     Attributes:
         touch: Preprocessed frames; half precision, for they fill the memory.
         label: Row of `names` that each touch feels.
-        contact: False for idle touches, which have texts but no picture.
-        view_of: Row of `images` of each touch.
+        contact: False for touches without contact, which have texts but no picture.
+        view_index: Row of `images` of each touch.
         images: The image tower's embedding of each view, not normalised.
         texts: The text tower's embedding of each sentence, not normalised.
-        says: Sentence j describes name i.
+        describes: Sentence j describes name i.
         names: Sorted, so "" comes first.
     """
 
     touch: Float16[Tensor, "n 3 h w"]
     label: Int[Tensor, " n"]
     contact: Bool[Tensor, " n"]
-    view_of: Int[Tensor, " n"]
+    view_index: Int[Tensor, " n"]
     images: Float[Tensor, "e i"]
     texts: Float[Tensor, "m t"]
-    says: Bool[Tensor, "k m"]
+    describes: Bool[Tensor, "k m"]
     names: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -49,11 +49,13 @@ class TouchData:
         self, rows: Int[Tensor, " b"], generator: torch.Generator
     ) -> Int[Tensor, " b"]:
         """One random sentence (row of `texts`) for each of these touches."""
-        return torch.multinomial(self.says[self.label[rows]].float(), 1, generator=generator)[:, 0]
+        return torch.multinomial(self.describes[self.label[rows]].float(), 1, generator=generator)[
+            :, 0
+        ]
 
 
-def prepare(
-    touches: Touches, towers: Towers, sensor: str, idle_texts: tuple[str, ...]
+def prepare_touch_data(
+    touches: Touches, towers: Towers, sensor: str, no_contact_texts: tuple[str, ...]
 ) -> TouchData:
     """Runs preprocessor and towers once over everything.
 
@@ -61,26 +63,28 @@ def prepare(
         touches: Raw frames.
         towers: Frozen towers.
         sensor: Name of the fingertip sensor.
-        idle_texts: What is said of touches without contact; without any, those are left out.
+        no_contact_texts: What is said of touches without contact; without any, those are left out.
 
     Raises:
         UserError: Frames of another sensor, an object without descriptions, or no contact.
     """
     objects = np.asarray(touches.object)
-    kept = np.flatnonzero((objects != IDLE) | bool(idle_texts))
+    kept = np.flatnonzero((objects != NO_CONTACT) | bool(no_contact_texts))
     objects = objects[kept]
-    if not (objects != IDLE).any():
+    if not (objects != NO_CONTACT).any():
         raise UserError("no touch is in contact: record episodes that touch something")
     names = tuple(sorted(set(objects.tolist())))
-    sentences, says = _sentences(names, touches.descriptions | {IDLE: list(idle_texts)})
+    sentences, describes = _sentences(
+        names, touches.descriptions | {NO_CONTACT: list(no_contact_texts)}
+    )
     return TouchData(
         touch=_preprocess(touches, kept, sensor),
         label=torch.from_numpy(np.searchsorted(names, objects)),
-        contact=torch.from_numpy(objects != IDLE),
-        view_of=torch.from_numpy(touches.view_of[kept].astype(np.int64)),
+        contact=torch.from_numpy(objects != NO_CONTACT),
+        view_index=torch.from_numpy(touches.view_index[kept].astype(np.int64)),
         images=_embed_views(touches.view, towers),
         texts=towers.embed_texts(sentences),
-        says=says,
+        describes=describes,
         names=names,
     )
 
@@ -92,15 +96,15 @@ def _sentences(
         if not descriptions.get(name):
             raise UserError(f"the object '{name}' has no descriptions: say how it feels")
     sentences = sorted({sentence for name in names for sentence in descriptions[name]})
-    says = torch.tensor([[s in descriptions[name] for s in sentences] for name in names])
-    return sentences, says
+    describes = torch.tensor([[s in descriptions[name] for s in sentences] for name in names])
+    return sentences, describes
 
 
 def _preprocess(touches: Touches, rows: np.ndarray, sensor: str) -> Float16[Tensor, "n 3 h w"]:
     preprocess = preprocessor_for(sensor)
     out = torch.empty(len(rows), 3, *preprocess.size, dtype=torch.float16)
     for i, row in enumerate(tqdm(rows, desc="preprocess", unit="touch", leave=False)):
-        background = touches.background[touches.background_of[row]]
+        background = touches.background[touches.background_index[row]]
         out[i] = torch.from_numpy(preprocess(touches.frames[row : row + 1], background)[0])
     return out
 

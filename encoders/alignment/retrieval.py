@@ -6,13 +6,13 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from touchgoal.encoders.alignment.data import IDLE, TouchData
+from touchgoal.encoders.alignment.data import NO_CONTACT, TouchData
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
 from touchgoal.encoders.backbones.touch_backbone import BATCH
 
 
 @torch.no_grad()
-def evaluate(encoder: TouchEncoder, data: TouchData) -> dict[str, float]:
+def evaluate_retrieval(encoder: TouchEncoder, data: TouchData) -> dict[str, float]:
     """Retrieval by cosine, of touches in contact.
 
     Returns:
@@ -20,8 +20,8 @@ def evaluate(encoder: TouchEncoder, data: TouchData) -> dict[str, float]:
         object being the mean of its sentences' or views' embeddings; `chance_top1`.
         `touch_to_text_map`, `touch_to_image_map`: mean average precision over all sentences or
         all views, right ones being those of the object; `chance_text_map`, `chance_image_map`.
-        `idle_accuracy` (if there are idle touches): how often the nearest sentences, with those
-        for no contact among them, tell rightly whether anything is touched; `chance_idle` is the
+        `contact_accuracy` (if there are touches without contact): how often the nearest sentences, with those
+        for no contact among them, tell rightly whether anything is touched; `chance_contact` is the
         share of the larger group.
     """
     encoder.eval()
@@ -33,11 +33,11 @@ def evaluate(encoder: TouchEncoder, data: TouchData) -> dict[str, float]:
     images = encoder.project_image(data.images.to(device)).cpu()
     felt = sorted(set(data.label[data.contact].tolist()))
     label = torch.searchsorted(torch.tensor(felt), data.label[data.contact])
-    shows = _shows(data)[felt]
+    shows = _views_of_names(data)[felt]
     seen = shows.any(0)  # views of episodes that gave no touch in contact are nobody's
     metrics = {"chance_top1": 1 / len(felt)}
     for modality, gallery, belongs in (
-        ("text", texts, data.says[felt]),
+        ("text", texts, data.describes[felt]),
         ("image", images[seen], shows[:, seen]),
     ):
         cosines = touch[data.contact] @ _prototypes(gallery, belongs).T
@@ -46,19 +46,19 @@ def evaluate(encoder: TouchEncoder, data: TouchData) -> dict[str, float]:
         similarity = (touch[data.contact] @ gallery.T).numpy()
         metrics[f"touch_to_{modality}_map"] = mean_average_precision(similarity, relevant)
         metrics[f"chance_{modality}_map"] = mean_average_precision(0 * similarity, relevant)
-    if IDLE in data.names:
-        cosines = touch @ _prototypes(texts, data.says).T
-        says_contact = cosines.argmax(1) != data.names.index(IDLE)
+    if NO_CONTACT in data.names:
+        cosines = touch @ _prototypes(texts, data.describes).T
+        says_contact = cosines.argmax(1) != data.names.index(NO_CONTACT)
         share = data.contact.float().mean().item()
-        metrics["idle_accuracy"] = (says_contact == data.contact).float().mean().item()
-        metrics["chance_idle"] = max(share, 1 - share)
+        metrics["contact_accuracy"] = (says_contact == data.contact).float().mean().item()
+        metrics["chance_contact"] = max(share, 1 - share)
     return metrics
 
 
-def _shows(data: TouchData) -> Bool[Tensor, "k e"]:
+def _views_of_names(data: TouchData) -> Bool[Tensor, "k e"]:
     """View j is a picture of name i."""
     shows = torch.zeros(len(data.names), len(data.images), dtype=torch.bool)
-    shows[data.label[data.contact], data.view_of[data.contact]] = True
+    shows[data.label[data.contact], data.view_index[data.contact]] = True
     return shows
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor, nn
 
 from touchgoal.control.errors import UserError
-from touchgoal.encoders.backbones.touch_backbone import TouchEmbedding
+from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.towers.towers import Towers, same_towers
@@ -20,7 +20,7 @@ class TouchEncoderConfig:
     """What an encoder is and what it was trained with.
 
     Attributes:
-        vit: The touch trunk.
+        vit: The touch backbone.
         embedding_dim: Width of the shared space.
         sensor: Name of the fingertip sensor.
         preprocessor: `TactilePreprocessor.id` in use at training.
@@ -46,7 +46,7 @@ class TouchEncoderConfig:
         """The configuration that fits these towers.
 
         Args:
-            vit: The touch trunk.
+            vit: The touch backbone.
             towers: The frozen towers.
             sensor: Name of the fingertip sensor.
             embedding_dim: Width of the shared space; towers pretrained together bring their own.
@@ -66,10 +66,10 @@ class TouchEncoderConfig:
         )
 
 
-class TouchEncoder(TouchEmbedding):
+class TouchEncoder(BaseTouchEncoder):
     """Touch, images and texts as unit vectors of one space.
 
-    As in ImageBind, the touch head is a LayerNorm (the trunk's last layer), pooling and a bias-free
+    As in ImageBind, the touch head is a LayerNorm (the backbone's last layer), pooling and a bias-free
     linear layer. When the towers were not pretrained together, images and texts have bias-free
     linear heads too; otherwise their embeddings are only normalised.
     """
@@ -86,10 +86,10 @@ class TouchEncoder(TouchEmbedding):
         self.text_head = None if together else nn.Linear(config.text_dim, d, bias=False)
 
     def embed_touch(
-        self, touch: Float[Tensor, "n 3 h w"], keep: Int[Tensor, "n k"] | None = None
+        self, touch: Float[Tensor, "n 3 h w"], ids_keep: Int[Tensor, "n k"] | None = None
     ) -> Float[Tensor, "n d"]:
-        """See TouchEmbedding."""
-        return F.normalize(self.touch_head(self.trunk.features(touch, keep)), dim=1)
+        """See BaseTouchEncoder."""
+        return F.normalize(self.touch_head(self.trunk.features(touch, ids_keep)), dim=1)
 
     def project_image(self, embeddings: Float[Tensor, "n k"]) -> Float[Tensor, "n d"]:
         """Brings the image tower's embeddings into the shared space."""

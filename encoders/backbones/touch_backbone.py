@@ -1,4 +1,4 @@
-"""A touch trunk: a ViT over touch alone, as self-supervision leaves it."""
+"""A touch backbone: a ViT over touch alone, as self-supervision leaves it."""
 
 from dataclasses import dataclass
 
@@ -14,8 +14,8 @@ BATCH = 64  # frames at once
 
 
 @dataclass(frozen=True)
-class TouchTrunkConfig:
-    """What a trunk is and what it was trained with.
+class TouchBackboneConfig:
+    """What a backbone is and what it was trained with.
 
     Attributes:
         vit: Its size.
@@ -28,7 +28,7 @@ class TouchTrunkConfig:
     preprocessor: str
 
     @classmethod
-    def for_sensor(cls, vit: ViTConfig, sensor: str) -> "TouchTrunkConfig":
+    def for_sensor(cls, vit: ViTConfig, sensor: str) -> "TouchBackboneConfig":
         """The configuration for a sensor; UserError for an unknown one."""
         return cls(vit, sensor, preprocessor_for(sensor).id)
 
@@ -38,7 +38,7 @@ class TouchTrunkConfig:
         return self.vit.width
 
 
-class TouchEmbedding(nn.Module):
+class BaseTouchEncoder(nn.Module):
     """What embeds touch, of any kind: subclasses say how preprocessed frames become embeddings."""
 
     def __init__(self, sensor: str, embedding_dim: int) -> None:
@@ -48,9 +48,9 @@ class TouchEmbedding(nn.Module):
         self._width = embedding_dim
 
     def embed_touch(
-        self, touch: Float[Tensor, "n 3 h w"], keep: Int[Tensor, "n k"] | None = None
+        self, touch: Float[Tensor, "n 3 h w"], ids_keep: Int[Tensor, "n k"] | None = None
     ) -> Float[Tensor, "n d"]:
-        """Embeds preprocessed frames, of which only the patches in `keep` are seen if given."""
+        """Embeds preprocessed frames, of which only the patches in `ids_keep` are seen if given."""
         raise NotImplementedError
 
     @property
@@ -74,17 +74,17 @@ class TouchEmbedding(nn.Module):
         return rows
 
 
-class TouchTrunk(TouchEmbedding):
+class TouchBackbone(BaseTouchEncoder):
     """Touch as the mean of a ViT's tokens."""
 
-    def __init__(self, config: TouchTrunkConfig) -> None:
-        """Builds a randomly initialised trunk; UserError for an unknown sensor."""
+    def __init__(self, config: TouchBackboneConfig) -> None:
+        """Builds a randomly initialised backbone; UserError for an unknown sensor."""
         super().__init__(config.sensor, config.embedding_dim)
         self.config = config
         self.vit = ViT(config.vit)
 
     def embed_touch(
-        self, touch: Float[Tensor, "n 3 h w"], keep: Int[Tensor, "n k"] | None = None
+        self, touch: Float[Tensor, "n 3 h w"], ids_keep: Int[Tensor, "n k"] | None = None
     ) -> Float[Tensor, "n d"]:
-        """See TouchEmbedding."""
-        return self.vit.features(touch, keep)
+        """See BaseTouchEncoder."""
+        return self.vit.features(touch, ids_keep)

@@ -16,7 +16,7 @@ class ViTConfig:
     """Size of a transformer.
 
     Attributes:
-        image_size: Height and width in pixels that the trunk is meant for; other sizes work too.
+        image_size: Height and width in pixels that the backbone is meant for; other sizes work too.
         patch_size: Side of a square patch in pixels.
         channels: Input channels.
         width: Size of a token.
@@ -105,7 +105,7 @@ class ViT(nn.Module):
     """
 
     def __init__(self, config: ViTConfig) -> None:
-        """Builds a randomly initialised trunk."""
+        """Builds a randomly initialised backbone."""
         super().__init__()
         self.config = config
         c = config
@@ -119,7 +119,7 @@ class ViT(nn.Module):
                 # keeps the variance of the residual stream independent of depth, as in GPT-2
                 nn.init.xavier_uniform_(weight, gain=1 / math.sqrt(2 * c.depth))
 
-    def patchify(self, images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b n d"]:
+    def embed_patches(self, images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b n d"]:
         """Patch embeddings with positions, row by row, without the class token."""
         size = self.config.patch_size
         h, w = images.shape[2:]
@@ -129,21 +129,21 @@ class ViT(nn.Module):
         return tokens.flatten(2).transpose(1, 2) + positions.to(tokens)
 
     def forward(
-        self, images: Float[Tensor, "b c h w"], keep: Int[Tensor, "b k"] | None = None
+        self, images: Float[Tensor, "b c h w"], ids_keep: Int[Tensor, "b k"] | None = None
     ) -> Float[Tensor, "b t d"]:
         """Normalised output tokens.
 
         Args:
             images: Preprocessed images.
-            keep: Indices (row by row) of the patches each image keeps; all when None. The dropped
+            ids_keep: Indices (row by row) of the patches each image keeps; all when None. The dropped
                 ones are never computed, as masked self-supervision wants.
 
         Returns:
-            One token for each kept patch in the order of `keep`; the class token, if any, first.
+            One token for each kept patch in the order of `ids_keep`; the class token, if any, first.
         """
-        tokens = self.patchify(images)
-        if keep is not None:
-            tokens = tokens.gather(1, keep[:, :, None].expand(-1, -1, tokens.shape[2]))
+        tokens = self.embed_patches(images)
+        if ids_keep is not None:
+            tokens = tokens.gather(1, ids_keep[:, :, None].expand(-1, -1, tokens.shape[2]))
         if self.class_token is not None:
             tokens = torch.cat([self.class_token.expand(len(tokens), -1, -1), tokens], 1)
         for block in self.blocks:
@@ -151,10 +151,10 @@ class ViT(nn.Module):
         return self.norm(tokens)
 
     def features(
-        self, images: Float[Tensor, "b c h w"], keep: Int[Tensor, "b k"] | None = None
+        self, images: Float[Tensor, "b c h w"], ids_keep: Int[Tensor, "b k"] | None = None
     ) -> Float[Tensor, "b d"]:
         """One vector an image: the class token if there is one, else the mean of the tokens."""
-        tokens = self(images, keep)
+        tokens = self(images, ids_keep)
         return tokens[:, 0] if self.class_token is not None else tokens.mean(1)
 
 
@@ -169,7 +169,9 @@ def random_patches(
 
 def _initialise(module: nn.Module) -> None:
     if isinstance(module, nn.Linear):
-        nn.init.xavier_uniform_(module.weight)  # as MAE: right for narrow trunks as for wide ones
+        nn.init.xavier_uniform_(
+            module.weight
+        )  # as MAE: right for narrow backbones as for wide ones
         nn.init.zeros_(module.bias)
     elif isinstance(module, nn.Conv2d) and module.bias is not None:
         fan_in = module.weight[0].numel()

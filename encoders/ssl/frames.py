@@ -32,7 +32,7 @@ class TouchFrames:
         return len(self.touch)
 
 
-def draw(episodes: EpisodeSet, sensor: str, per_episode: int, seed: int) -> TouchFrames:
+def sample_frames(episodes: EpisodeSet, sensor: str, per_episode: int, seed: int) -> TouchFrames:
     """Draws ticks at random from every episode, and takes both fingertips of each.
 
     The background is a fingertip's first frame: episodes start untouched.
@@ -66,10 +66,10 @@ def draw(episodes: EpisodeSet, sensor: str, per_episode: int, seed: int) -> Touc
 
 
 def check_sensor(episodes: EpisodeSet, i: int, sensor: str) -> None:
-    """Raises UserError if an episode says that it was felt with another sensor."""
+    """Raises UserError if an episode says that it was recorded with another sensor."""
     felt = episodes.meta(i).get("sensor", sensor)
     if felt != sensor:
         raise UserError(
-            f"episode {i} of {episodes.root} was felt with {felt}, not {sensor}: name that sensor, "
+            f"episode {i} of {episodes.root} was recorded with {felt}, not {sensor}: name that sensor, "
             "or record with this one"
         )

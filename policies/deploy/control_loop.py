@@ -15,16 +15,16 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.control.cell.connection import RealClock, Station
+from touchgoal.control.cell.connection import CellConnection, RealClock
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError
-from touchgoal.control.safety.action_filter import Limit, Reading, Safety, SafetyState
-from touchgoal.policies.deploy.observation import Sensed, StationReader
+from touchgoal.control.safety.action_filter import Limit, Measurements, Safety, SafetyState
+from touchgoal.policies.deploy.observation import CellReading, ObservationReader
 from touchgoal.sim_envs.base import Observation
 
-_REST = 0.01  # rad/s
-_RESTING = 3.0  # s to wait for that by the loop's clock
-_PATIENCE = 10.0  # s on the wall for the same
+_REST_SPEED = 0.01  # rad/s
+_REST_TIMEOUT = 3.0  # s to wait for that by the loop's clock
+_REST_WALL_TIMEOUT = 10.0  # s on the wall for the same
 
 ADVICE = {
     Limit.NOT_A_NUMBER: "the policy's output is broken: do not use this checkpoint",
@@ -39,7 +39,7 @@ ADVICE = {
 
 
 @contextmanager
-def _ahead_of_others() -> Iterator[None]:
+def _realtime_priority() -> Iterator[None]:
     """This thread, and none that it starts, before all that is not real-time, where that is allowed."""
     try:
         os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
@@ -58,11 +58,11 @@ class DeployedActor(Protocol):
 
     Attributes:
         done: whether it is through.
-        overdue: s for which it has had no answer.
+        action_age: s for which it has had no answer.
     """
 
     done: bool
-    overdue: float
+    action_age: float
 
     def act(self, observation: Observation) -> np.ndarray:
         """Joint change (rad) for this tick and gripper width (m)."""
@@ -81,37 +81,41 @@ class Ending:
         reason: what happened, for a person.
         stopped: whether the arm was stopped, by a fault or a person, rather than came to its end.
         advice: what to do about it.
-        rest: s from the decision to stop until the arm was at rest; infinite if it was not seen.
+        rest_seconds: s from the decision to stop until the arm was at rest; infinite if it was not seen.
     """
 
     reason: str
     stopped: bool = False
     advice: str = ""
-    rest: float = 0.0
+    rest_seconds: float = 0.0
 
     def __str__(self) -> str:
         """The fault report."""
         if not self.stopped:
             return self.reason
-        rest = f"at rest after {self.rest:.2f} s" if np.isfinite(self.rest) else "NOT seen at rest"
+        rest = (
+            f"at rest after {self.rest_seconds:.2f} s"
+            if np.isfinite(self.rest_seconds)
+            else "NOT seen at rest"
+        )
         return f"STOPPED: {self.reason}\n  the arm: {rest}\n  what to do: {self.advice}"
 
 
 @dataclass
-class Ticks:
+class RunLog:
     """What has been recorded.
 
     Attributes:
         rows: of each tick: observation and what was commanded, by key.
-        late: s by which each tick began too late.
-        answered: s after which the actor had answered, each time.
-        acted: how often each limit changed a command.
+        lateness: s by which each tick began too late.
+        answer_times: s after which the actor had answered, each time.
+        limit_counts: how often each limit changed a command.
     """
 
     rows: list[dict[str, np.ndarray]] = field(default_factory=list)
-    late: list[float] = field(default_factory=list)
-    answered: list[float] = field(default_factory=list)
-    acted: dict[str, int] = field(default_factory=dict)
+    lateness: list[float] = field(default_factory=list)
+    answer_times: list[float] = field(default_factory=list)
+    limit_counts: dict[str, int] = field(default_factory=dict)
 
     def frames(self) -> dict[str, np.ndarray]:
         """Key -> (T, ...)."""
@@ -119,19 +123,19 @@ class Ticks:
 
 
 @dataclass(frozen=True)
-class View:
+class TickStatus:
     """A tick, for whoever watches; no cost without a goal."""
 
     seconds: float
     state: SafetyState
-    sensed: Sensed
+    sensed: CellReading
     width: float
     late: float
     cost: float | None
 
 
-class Deployment:
-    """One station under one safety layer.
+class ControlLoop:
+    """One connection under one safety layer.
 
     Attributes:
         state: the safety layer's.
@@ -140,57 +144,57 @@ class Deployment:
 
     def __init__(
         self,
-        station: Station,
+        connection: CellConnection,
         safety: Safety,
         execute: bool,
-        wanted: Callable[[], str],
-        show: Callable[[View], None],
+        operator_request: Callable[[], str],
+        on_tick: Callable[[TickStatus], None],
         cost: Callable[[Observation], float] | None = None,
         camera_size: tuple[int, int] = ft.CAMERA_SHAPE[:2],
     ) -> None:
         """The arm is at rest.
 
         Args:
-            station: what is read and commanded.
+            connection: what is read and commanded.
             safety: its limits, and the control rate.
             execute: False: a dry run.
-            wanted: asked every tick: "stop" (a person wants that), "done" (likewise), or "".
-            show: told of every tick; must not wait.
+            operator_request: asked every tick: "stop" (a person wants that), "done" (likewise), or "".
+            on_tick: told of every tick; must not wait.
             cost: measures how far from its goal a tick is, for the view and the record.
             camera_size: rows and columns of cameras' pictures, as observed and recorded.
 
         Raises:
             UserError: the arm rests where it may not be, or a camera's pictures are too small.
         """
-        self._station, self._safety, self._execute = station, safety, execute
-        self._wanted, self._show, self._cost = wanted, show, cost
-        self.reader = StationReader(station, camera_size)
-        self.state = safety.start(station.arm.read().q)
-        self.width = station.gripper.read().width
+        self._connection, self._safety, self._execute = connection, safety, execute
+        self._operator_request, self._on_tick, self._cost = operator_request, on_tick, cost
+        self.reader = ObservationReader(connection, camera_size)
+        self.state = safety.start(connection.arm.read().q)
+        self.width = connection.gripper.read().width
 
     def commanded(self) -> np.ndarray:
         """Joint positions (rad) commanded now."""
         return self.state.q
 
-    def run(self, actor: DeployedActor, seconds: float, ticks: Ticks) -> Ending:
+    def run(self, actor: DeployedActor, seconds: float, log: RunLog) -> Ending:
         """Let it act until it is done, time is up, someone wants it or something is wrong."""
         try:
-            real = isinstance(self._station.clock, RealClock)
-            with _ahead_of_others() if real else nullcontext():
-                return self._loop(actor, seconds, ticks)
+            real = isinstance(self._connection.clock, RealClock)
+            with _realtime_priority() if real else nullcontext():
+                return self._loop(actor, seconds, log)
         except (DriverError, UserError) as error:
             return self.stop(str(error), "check what it names, then start again")
         except Exception as error:  # the policy's, most likely; the arm must not go on
             said = " ".join(str(error).split())
             return self.stop(f"{type(error).__name__}: {said}", "the program or the policy failed")
 
-    def _loop(self, actor: DeployedActor, seconds: float, ticks: Ticks) -> Ending:
-        clock = self._station.clock
+    def _loop(self, actor: DeployedActor, seconds: float, log: RunLog) -> Ending:
+        clock = self._connection.clock
         begin = due = clock.now()
         first = True
         while True:
             late = clock.now() - due
-            ending = self._tick(actor, ticks, clock.now() - begin, late)
+            ending = self._tick(actor, log, clock.now() - begin, late)
             if ending is None and actor.done:
                 ending = Ending("done")
             if ending is None and clock.now() - begin > seconds:
@@ -198,7 +202,7 @@ class Deployment:
             if ending is not None:
                 return ending
             if not first:
-                ticks.late.append(late)
+                log.lateness.append(late)
             # What was missed is not made up for, and the first tick warms the policy up.
             dt, now = self._safety.dt, clock.now()
             due = now + dt if first else max(due + dt, now - dt)
@@ -209,73 +213,76 @@ class Deployment:
         """Stop the arm and watch it come to rest."""
         if not self._execute:
             return Ending(reason, True, advice)
-        arm, clock = self._station.arm, self._station.clock
-        began, end = clock.now(), time.monotonic() + _PATIENCE
+        arm, clock = self._connection.arm, self._connection.clock
+        began, end = clock.now(), time.monotonic() + _REST_WALL_TIMEOUT
         arm.stop()
         rest, last = np.inf, arm.read().time
-        while clock.now() - began < _RESTING and time.monotonic() < end:
+        while clock.now() - began < _REST_TIMEOUT and time.monotonic() < end:
             clock.wait(clock.now() + self._safety.dt / 5)
             reading = arm.read()
-            if reading.time > last and np.abs(reading.velocity).max() < _REST:
+            if reading.time > last and np.abs(reading.velocity).max() < _REST_SPEED:
                 rest = clock.now() - began
                 break
             last = reading.time
         return Ending(reason, True, advice, rest)
 
     def _tick(
-        self, actor: DeployedActor, ticks: Ticks, seconds: float, late: float
+        self, actor: DeployedActor, log: RunLog, seconds: float, late: float
     ) -> Ending | None:
-        sensed = self.reader.look()
+        sensed = self.reader.read()
         if not self._execute:
-            sensed = self._imagined(sensed)
+            sensed = self._as_commanded(sensed)
         if sensed.fault:
             return self.stop(sensed.fault, "see above; then start deploy again")
-        if wanted := self._wanted():
-            if wanted == "done":
+        if request := self._operator_request():
+            if request == "done":
                 return Ending("ended by the operator")
             return self.stop("stopped by the operator", "start deploy again when you are ready")
         asked = time.perf_counter()
         action = np.asarray(actor.act(sensed.observation), np.float64)
-        ticks.answered.append(time.perf_counter() - asked)
-        reading = Reading(
+        log.answer_times.append(time.perf_counter() - asked)
+        reading = Measurements(
             q=sensed.arm.q,
             force=sensed.arm.wrench[:3],
             torque=sensed.arm.torque,
-            touch=sensed.touch,
+            touch=sensed.indentation,
             observation_age=sensed.age,
-            action_age=actor.overdue,
-            state_age=self._station.clock.age(sensed.arm.stamp) if self._execute else 0.0,
+            action_age=actor.action_age,
+            state_age=self._connection.clock.age(sensed.arm.stamp) if self._execute else 0.0,
         )
-        before, self.state = self.state, self._safety.advance(self.state, action[:-1], reading)
-        self.width = self._safety.width(self.state, float(action[-1]), self.width)
-        for limit in self.state.acted:
-            ticks.acted[limit] = ticks.acted.get(limit, 0) + 1
+        before, self.state = (
+            self.state,
+            self._safety.filter_action(self.state, action[:-1], reading),
+        )
+        self.width = self._safety.filter_width(self.state, float(action[-1]), self.width)
+        for limit in self.state.active_limits:
+            log.limit_counts[limit] = log.limit_counts.get(limit, 0) + 1
         cost = self._cost(sensed.observation) if self._cost else None
-        self._show(View(seconds, self.state, sensed, self.width, late, cost))
+        self._on_tick(TickStatus(seconds, self.state, sensed, self.width, late, cost))
         if self.state.fault is not None:
-            return self._at_fault(sensed)
+            return self._stop_for_fault(sensed)
         if self._execute:
-            self._station.arm.command(self.state.q)
-            self._station.gripper.command(self.width)
+            self._connection.arm.command(self.state.q)
+            self._connection.gripper.command(self.width)
         done = np.append(self.state.q - before.q, self.width).astype(np.float32)
         row = {**sensed.observation, ft.ACTION: done}
         if cost is not None:
             row[ft.COST] = np.array([cost], np.float32)
-        ticks.rows.append(row)
+        log.rows.append(row)
         return None
 
-    def _at_fault(self, sensed: Sensed) -> Ending:
+    def _stop_for_fault(self, sensed: CellReading) -> Ending:
         fault = self.state.fault
         assert fault is not None
         reason = str(fault)
         if fault.limit == Limit.STALE_OBSERVATION:
-            reason += f" s ({sensed.oldest}; {self.reader.trouble() or 'it is slow'})"
+            reason += f" s ({sensed.oldest_source}; {self.reader.problem() or 'it is slow'})"
         if fault.limit == Limit.TOUCH and self._execute:  # open by as much as both gels give way
             width = sensed.gripper.width + 2 * self._safety.limits.touch
-            self._station.gripper.command(min(width, self._safety.limits.stroke[1]))
+            self._connection.gripper.command(min(width, self._safety.limits.stroke[1]))
         return self.stop(reason, ADVICE.get(fault.limit, "look at what it names"))
 
-    def _imagined(self, sensed: Sensed) -> Sensed:
+    def _as_commanded(self, sensed: CellReading) -> CellReading:
         """As if the arm had followed."""
         q, velocity = self.state.q, self.state.velocity
         state = np.concatenate([q, velocity, [self.width]]).astype(np.float32)

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.control.cell.config import Rig
-from touchgoal.control.cell.connection import Station
-from touchgoal.control.checks import Finding
+from touchgoal.control.cell.config import CellConfig
+from touchgoal.control.cell.connection import CellConnection
+from touchgoal.control.checks import CheckResult
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import Camera, DriverError, TactileSensor
 from touchgoal.control.safety.action_filter import Safety
@@ -21,79 +21,81 @@ from touchgoal.control.tactile.markers import find_markers, without_markers
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.store import EpisodeWriter
-from touchgoal.policies.deploy.actors import learned
+from touchgoal.policies.deploy.actors import load_policy
 
-_LEAST_RATE = 0.8  # of what the rig says of a camera
+_MIN_RATE_SHARE = 0.8  # of what the cell says of a camera
 # Counts by which a fingertip may differ from its sensor file's. Simulated units differ by 1 to 2, a
 # grasp makes 20 and more; real units differ by more than simulated ones (unmeasured here).
-_TOUCHED = 12.0
-_LOOK = 1.0  # s for which cameras are watched
-_DISK = 2e9  # bytes: a 40 s episode with both fingertips takes 0.4 GB at most
+_TOUCHED_COUNTS = 12.0
+_WATCH_SECONDS = 1.0  # s for which cameras are watched
+_MIN_FREE_BYTES = 2e9  # bytes: a 40 s episode with both fingertips takes 0.4 GB at most
 _CLIENTS = {"fr3": "franky-control", "ur5e": "ur-rtde", "sim": "mujoco"}
 
 
-def preflight(rig: Rig, station: Station, safety: Safety, episodes: Path) -> list[Finding]:
+def preflight(
+    cell: CellConfig, connection: CellConnection, safety: Safety, episodes: Path
+) -> list[CheckResult]:
     """Every check, in the order of the table."""
-    rates = watch(station)
+    rates = measure_rates(connection)
     checks: list[tuple[str, Callable[[], str]]] = [
-        ("client", lambda: _client(rig)),
-        ("arm", lambda: _arm(station, safety)),
+        ("client", lambda: _client(cell)),
+        ("arm", lambda: _arm(connection, safety)),
         ("limits", lambda: _limits(safety)),
-        ("gripper", lambda: _gripper(station)),
+        ("gripper", lambda: _gripper(connection)),
     ]
-    for key, camera in station.cameras.items():
-        nominal = _nominal(rig, key)
+    for key, camera in connection.cameras.items():
+        nominal = _nominal_rate(cell, key)
         check = partial(_camera, camera, rates[key], nominal)
         checks.append((key.removeprefix(ft.IMAGE_PREFIX), check))
-    if station.load_cell:
-        checks.append(("load cell", lambda: _load_cell(station)))
+    if connection.load_cell:
+        checks.append(("load cell", lambda: _load_cell(connection)))
     checks += [
-        ("policy", lambda: _policy(rig)),
+        ("policy", lambda: _policy(cell)),
         ("disk", lambda: _disk(episodes)),
         ("episodes", lambda: _episodes(episodes)),
     ]
-    return list(_findings(checks))
+    return list(_run_checks(checks))
 
 
-def watch(station: Station) -> dict[str, float]:
-    """At what rate each camera runs (Hz), by the station's clock."""
-    begin = station.clock.now()
-    before = _sequences(station)
-    station.clock.wait(begin + _LOOK)
-    after, seconds = _sequences(station), station.clock.now() - begin
+def measure_rates(connection: CellConnection) -> dict[str, float]:
+    """At what rate each camera runs (Hz), by the connection's clock."""
+    begin = connection.clock.now()
+    before = _sequences(connection)
+    connection.clock.wait(begin + _WATCH_SECONDS)
+    after, seconds = _sequences(connection), connection.clock.now() - begin
     return {key: (after[key] - before[key]) / seconds for key in after}
 
 
-def _sequences(station: Station) -> dict[str, int]:
+def _sequences(connection: CellConnection) -> dict[str, int]:
     """How many pictures each camera has taken; 0 of one that is broken, which its check tells."""
-    counts = dict.fromkeys(station.cameras, 0)
-    for key, camera in station.cameras.items():
+    counts = dict.fromkeys(connection.cameras, 0)
+    for key, camera in connection.cameras.items():
         with suppress(DriverError):
             counts[key] = camera.read().sequence
     return counts
 
 
-def _findings(checks: list[tuple[str, Callable[[], str]]]) -> Iterator[Finding]:
+def _run_checks(checks: list[tuple[str, Callable[[], str]]]) -> Iterator[CheckResult]:
     for what, check in checks:
         try:
-            yield Finding(what, True, check())
+            yield CheckResult(what, True, check())
         except (UserError, DriverError) as error:
-            yield Finding(what, False, "", str(error))
+            yield CheckResult(what, False, "", str(error))
 
 
-def _client(rig: Rig) -> str:
-    name = _CLIENTS[rig.arm]
+def _client(cell: CellConfig) -> str:
+    name = _CLIENTS[cell.arm]
     try:
         return f"{name} {importlib.metadata.version(name)}"
     except importlib.metadata.PackageNotFoundError as error:
         raise UserError(f"{name} is not installed: pip install {name}") from error
 
 
-def _arm(station: Station, safety: Safety) -> str:
-    reading = station.arm.read()
+def _arm(connection: CellConnection, safety: Safety) -> str:
+    reading = connection.arm.read()
     if reading.fault:
         raise UserError(reading.fault)
-    age = station.clock.age(reading.stamp)
+    age = connection.clock.age(reading.stamp)
     if age > safety.watchdogs.state.stop:
         raise UserError(f"its state is {age:.2f} s old: check the network to the controller")
     if np.abs(reading.velocity).max() > 0.05:
@@ -102,7 +104,7 @@ def _arm(station: Station, safety: Safety) -> str:
     if force > safety.limits.force / 2:
         raise UserError(f"it feels {force:.1f} N at rest: set the hand's mass in Desk, or clear it")
     safety.start(reading.q)
-    return f"{station.robot.arm.name} at {np.round(reading.q, 2).tolist()} rad, {force:.1f} N"
+    return f"{connection.robot.arm.name} at {np.round(reading.q, 2).tolist()} rad, {force:.1f} N"
 
 
 def _limits(safety: Safety) -> str:
@@ -113,23 +115,23 @@ def _limits(safety: Safety) -> str:
     )
 
 
-def _gripper(station: Station) -> str:
-    reading = station.gripper.read()
+def _gripper(connection: CellConnection) -> str:
+    reading = connection.gripper.read()
     if reading.fault:
         raise UserError(reading.fault)
     return f"{1e3 * reading.width:.0f} mm"
 
 
-def _nominal(rig: Rig, key: str) -> float:
+def _nominal_rate(cell: CellConfig, key: str) -> float:
     if key in ft.TACTILE:
-        assert rig.fingertips is not None
-        return rig.fingertips.rate or find_sensor(rig.sensor).frame_rate
-    return rig.cameras[key.removeprefix(ft.IMAGE_PREFIX)].rate
+        assert cell.fingertips is not None
+        return cell.fingertips.rate or find_sensor(cell.sensor).frame_rate
+    return cell.cameras[key.removeprefix(ft.IMAGE_PREFIX)].rate
 
 
 def _camera(camera: Camera, rate: float, nominal: float) -> str:
-    if camera.trouble:
-        raise UserError(camera.trouble)
+    if camera.problem:
+        raise UserError(camera.problem)
     untouched = ""
     if isinstance(camera, TactileSensor):
         frame, model = camera.read().image, camera.model
@@ -139,33 +141,35 @@ def _camera(camera: Camera, rate: float, nominal: float) -> str:
         background = load(model.sensor_file).background
         # A unit differs from the sensor file's; a contact is told by far more than that.
         strength = float(contact_strength(frame[None], background)[0])
-        if strength > _TOUCHED:
+        if strength > _TOUCHED_COUNTS:
             raise UserError(
                 f"it looks touched ({strength:.0f} counts): clear it, or if it is not, fit your "
                 "own sensor file: touchgoal calibrate"
             )
         untouched = f", {strength:.1f} counts from the sensor file's untouched gel"
-    if rate < _LEAST_RATE * nominal:
+    if rate < _MIN_RATE_SHARE * nominal:
         raise UserError(f"{rate:.1f} of {nominal:g} pictures a second: check cable, light and load")
     return f"{rate:.1f} Hz{untouched}"
 
 
-def _load_cell(station: Station) -> str:
-    assert station.load_cell is not None
-    reading = station.load_cell.read()
+def _load_cell(connection: CellConnection) -> str:
+    assert connection.load_cell is not None
+    reading = connection.load_cell.read()
     return f"{reading.force:.1f} N, {reading.rejected} lines refused"
 
 
-def _policy(rig: Rig) -> str:
-    learned(rig)
-    return f"{rig.task.policy}, at {ft.CONTROL_HZ} Hz"
+def _policy(cell: CellConfig) -> str:
+    load_policy(cell)
+    return f"{cell.task.policy}, at {ft.CONTROL_HZ} Hz"
 
 
 def _disk(episodes: Path) -> str:
     folder = next(p for p in (episodes, *episodes.resolve().parents) if p.exists())
     free = shutil.disk_usage(folder).free
-    if free < _DISK:
-        raise UserError(f"{free / 1e9:.1f} GB are free in {folder}: make room for {_DISK / 1e9:g}")
+    if free < _MIN_FREE_BYTES:
+        raise UserError(
+            f"{free / 1e9:.1f} GB are free in {folder}: make room for {_MIN_FREE_BYTES / 1e9:g}"
+        )
     return f"{free / 1e9:.0f} GB free"
 
 

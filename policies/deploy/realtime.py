@@ -14,8 +14,8 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.policies.acting import Observation
 
-_FIRST = 20.0  # s for the first plan; it warms everything up
-_CLOSING = 2.0  # s for a plan under way when the episode ends
+_FIRST_PLAN_TIMEOUT = 20.0  # s for the first plan; it warms everything up
+_CLOSE_TIMEOUT = 2.0  # s for a plan under way when the episode ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +37,12 @@ class Horizons(Protocol):
 
 
 @runtime_checkable
-class Plans(Protocol):
+class ChunkPlanner(Protocol):
     """Anything that plans: a `Planner`."""
 
     @property
     def config(self) -> Horizons: ...  # noqa: D102
-    def sense(self, seen: Sequence[Observation]) -> None: ...  # noqa: D102
+    def embed(self, seen: Sequence[Observation]) -> None: ...  # noqa: D102
     def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]: ...  # noqa: D102
 
 
@@ -57,29 +57,29 @@ class RealTimeActor:
 
     Attributes:
         latencies: seconds from an observation to its plan, of every plan but the first.
-        starved: ticks for which no plan was ready.
-        overdue: s for which that has been so without a break.
+        ticks_without_plan: ticks for which no plan was ready.
+        action_age: s for which that has been so without a break.
         failure: what ended the planning thread, if something did; `act` raises it.
     """
 
-    def __init__(self, planner: Plans, patience: float | None = None) -> None:
+    def __init__(self, planner: ChunkPlanner, timeout: float | None = None) -> None:
         """Starts an episode; `close` ends the thread.
 
         Args:
             planner: of this episode.
-            patience: s for which a plan that is due is waited for; None: half a tick.
+            timeout: s for which a plan that is due is waited for; None: half a tick.
         """
         self._planner, self._config = planner, planner.config
         self.latencies: list[float] = []
-        self.starved = 0
-        self.overdue = 0.0
+        self.ticks_without_plan = 0
+        self.action_age = 0.0
         self.failure: BaseException | None = None
         self._sensed = -1  # tick of the newest observation that the thread has taken
         half = 0.5 / planner.config.control_hz
-        self._patience = half if patience is None else patience
+        self._timeout = half if timeout is None else timeout
         self._tick = -1
-        self._seen: list[Observation] = []
-        self._asked = 0.0  # when the newest observation came, monotonic s
+        self._history: list[Observation] = []
+        self._observed_at = 0.0  # when the newest observation came, monotonic s
         self._plan: _Plan | None = None
         self._width = 0.0
         self._condition = threading.Condition()
@@ -91,16 +91,18 @@ class RealTimeActor:
         with self._condition:
             first = self._tick < 0
             self._tick += 1
-            before = self._seen or [observation] * self._config.observation_horizon
-            self._seen = [*before[1:], observation]
-            self._asked = time.monotonic()
+            before = self._history or [observation] * self._config.observation_horizon
+            self._history = [*before[1:], observation]
+            self._observed_at = time.monotonic()
             self._condition.notify_all()
             if first:
                 self._thread.start()
-                if not self._condition.wait_for(self._answered, _FIRST):
-                    raise UserError(f"the policy made no plan in {_FIRST:.0f} s: make it smaller")
+                if not self._condition.wait_for(self._has_plan, _FIRST_PLAN_TIMEOUT):
+                    raise UserError(
+                        f"the policy made no plan in {_FIRST_PLAN_TIMEOUT:.0f} s: make it smaller"
+                    )
             elif not self._slow and self._due():
-                self._condition.wait_for(self._settled, self._patience)
+                self._condition.wait_for(self._plan_not_due, self._timeout)
             if self.failure is not None:
                 raise self.failure
             return self._action()
@@ -111,7 +113,7 @@ class RealTimeActor:
             self._closed = True
             self._condition.notify_all()
         if self._thread.is_alive():
-            self._thread.join(_CLOSING)
+            self._thread.join(_CLOSE_TIMEOUT)
 
     def _action(self) -> np.ndarray:
         assert self._plan is not None
@@ -119,16 +121,16 @@ class RealTimeActor:
         if k < len(self._plan.actions):
             action = self._plan.actions[k]
             self._width = float(action[ft.N_JOINTS])
-            self.overdue = 0.0
+            self.action_age = 0.0
             return action
-        self.starved += 1
-        self.overdue += 1 / self._config.control_hz
+        self.ticks_without_plan += 1
+        self.action_age += 1 / self._config.control_hz
         return np.append(np.zeros(ft.N_JOINTS), self._width).astype(np.float32)
 
-    def _settled(self) -> bool:
+    def _plan_not_due(self) -> bool:
         return self._closed or self.failure is not None or not self._due()
 
-    def _answered(self) -> bool:
+    def _has_plan(self) -> bool:
         return self._plan is not None or self.failure is not None
 
     def _work(self) -> None:
@@ -137,7 +139,7 @@ class RealTimeActor:
             while (task := self._wait()) is not None:
                 tick, seen, asked, due = task
                 if not due:
-                    self._planner.sense(seen)
+                    self._planner.embed(seen)
                     continue
                 actions = self._planner.plan(seen)
                 with self._condition:
@@ -158,11 +160,15 @@ class RealTimeActor:
                 lambda: self._due() or (self._sensed < self._tick and self._due(seen))
             )
             self._sensed = self._tick
-            return None if self._closed else (self._tick, [*self._seen], self._asked, self._due())
+            return (
+                None
+                if self._closed
+                else (self._tick, [*self._history], self._observed_at, self._due())
+            )
 
     @property
     def _slow(self) -> bool:
-        return bool(self.latencies) and self.latencies[-1] > self._patience
+        return bool(self.latencies) and self.latencies[-1] > self._timeout
 
     def _due(self, ahead: int = 0) -> bool:
         """Whether it is time for another plan, or will be in some ticks; or for the end."""

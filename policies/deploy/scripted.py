@@ -11,26 +11,35 @@ from touchgoal.control.motion.kinematics import GELSIGHT_TCP, Kinematics, finger
 from touchgoal.control.motion.trajectories import (
     Trajectory,
     joint_move,
-    require_inside,
+    require_inside_workspace,
     straight_line,
 )
 from touchgoal.control.safety.action_filter import Safety
 from touchgoal.sim_envs.base import Observation
 
-_SHARE = 0.9  # of what the safety layer lets a policy do: a plan should not be clamped
-_START_SHARE = 0.3  # of that, for the start move: a person watches where it goes
-_BEHIND = 0.02  # rad; the arm was held: the plan waits until it has caught up
-_LAG = 0.12  # rad between command and arm beyond which the plan waits; 0.06 is usual at this speed
-_MOVING = 5e-4  # m a tick that the gripper does when it moves
+_SPEED_SHARE = 0.9  # of what the safety layer lets a policy do: a plan should not be clamped
+_START_SPEED_SHARE = 0.3  # of that, for the start move: a person watches where it goes
+_HELD_ERROR = 0.02  # rad; the arm was held: the plan waits until it has caught up
+_MAX_LAG = (
+    0.12  # rad between command and arm beyond which the plan waits; 0.06 is usual at this speed
+)
+_GRIPPER_MOVES = 5e-4  # m a tick that the gripper does when it moves
 _CLEARANCE = 0.12  # m above the object before and after the grasp
-_LOWEST = 0.0185, 0.0172  # m of a grasp, of a placement: the sensors' cases stay above the table
-_FEEL_DOWN = 0.004  # m below the grasp's height to look for the table
-_SUPPORT = 2.5  # N upwards, more than while it was carried, that mean the table carries it
-_CLOSE, _FEEL, _HOLD = 1.0, 3.0, 0.8  # s for closing the hand, feeling for the table, at the end
+_MIN_HEIGHTS = (
+    0.0185,
+    0.0172,
+)  # m of a grasp, of a placement: the sensors' cases stay above the table
+_PROBE_DEPTH = 0.004  # m below the grasp's height to look for the table
+_TABLE_FORCE = 2.5  # N upwards, more than while it was carried, that mean the table carries it
+_CLOSE_SECONDS, _PROBE_SECONDS, _HOLD_SECONDS = (
+    1.0,
+    3.0,
+    0.8,
+)  # s for closing the hand, feeling for the table, at the end
 
 
 @dataclass(frozen=True)
-class Place:
+class PickPlacePoses:
     """Where things are in the base frame.
 
     Attributes:
@@ -52,15 +61,15 @@ class Segment:
     until_supported: bool = False
 
 
-class Script:
+class ScriptedActor:
     """An actor that walks through segments; the plan waits while the arm is held.
 
     Attributes:
         done: whether the last segment is over.
-        overdue: always 0: a script is never late.
+        action_age: always 0: a script is never late.
     """
 
-    overdue = 0.0
+    action_age = 0.0
 
     def __init__(self, segments: list[Segment], commanded: Callable[[], np.ndarray], hz: float):
         """An actor.
@@ -72,7 +81,7 @@ class Script:
         """
         self._commanded, self._tick = commanded, 1 / hz
         self._wrench, self._measured = np.zeros(6), commanded()
-        self._width, self._still = np.inf, False
+        self._width, self._gripper_still = np.inf, False
         self.done = False
         self._actions = self._run(segments)
 
@@ -81,7 +90,7 @@ class Script:
         self._wrench = observation[ft.WRENCH]
         self._measured = observation[ft.STATE][: self._measured.size].astype(np.float64)
         width = float(observation[ft.STATE][-1])
-        self._still, self._width = abs(width - self._width) < _MOVING, width
+        self._gripper_still, self._width = abs(width - self._width) < _GRIPPER_MOVES, width
         return next(self._actions)
 
     def close(self) -> None:
@@ -92,17 +101,17 @@ class Script:
         for segment in segments:
             width, t, weight = segment.width, 0.0, self._wrench[2]
             while t < segment.seconds:
-                if segment.until_supported and self._wrench[2] - weight > _SUPPORT:
+                if segment.until_supported and self._wrench[2] - weight > _TABLE_FORCE:
                     # Command what is, not what was asked: the lag would press on the table.
                     yield np.append(self._measured - self._commanded(), width)
                     break
                 wanted = still
                 lag = np.abs(self._commanded() - self._measured).max()
                 if segment.path is None:  # seconds in which nothing moves
-                    t = t + self._tick if self._still and lag < _BEHIND else 0.0
+                    t = t + self._tick if self._gripper_still and lag < _HELD_ERROR else 0.0
                 else:
                     at = segment.path.at(t)
-                    if np.abs(at - self._commanded()).max() < _BEHIND and lag < _LAG:
+                    if np.abs(at - self._commanded()).max() < _HELD_ERROR and lag < _MAX_LAG:
                         t += self._tick
                         at = segment.path.at(t)
                     wanted = at - self._commanded()
@@ -114,48 +123,52 @@ class Script:
 
 def start_move(
     goal: np.ndarray, width: float, safety: Safety, commanded: Callable[[], np.ndarray]
-) -> Script:
+) -> ScriptedActor:
     """Slowly to a posture (rad), the gripper staying at `width` (m).
 
     UserError if the way leaves the workspace.
     """
-    limits = safety.joints.scaled(_START_SHARE, _START_SHARE)
+    limits = safety.joints.scaled(_START_SPEED_SHARE, _START_SPEED_SHARE)
     path = joint_move(commanded(), goal, limits)
-    require_inside(path, safety)
-    return Script([Segment(path, width, path.duration)], commanded, 1 / safety.dt)
+    require_inside_workspace(path, safety)
+    return ScriptedActor([Segment(path, width, path.duration)], commanded, 1 / safety.dt)
 
 
-def pick_and_place(place: Place, safety: Safety, commanded: Callable[[], np.ndarray]) -> Script:
+def pick_and_place(
+    place: PickPlacePoses, safety: Safety, commanded: Callable[[], np.ndarray]
+) -> ScriptedActor:
     """Grasp, carry, set down until the table is felt, and keep holding.
 
     UserError if the arm cannot go there inside its workspace; nothing has moved then.
     """
     robot = safety.limits
     kinematics = Kinematics(robot.arm, GELSIGHT_TCP)
-    limits = safety.joints.scaled(_SHARE, _SHARE)
+    limits = safety.joints.scaled(_SPEED_SHARE, _SPEED_SHARE)
     x, y, z, yaw = place.grasp
-    z = max(z, _LOWEST[0])
+    z = max(z, _MIN_HEIGHTS[0])
     pick, put = np.array([x, y, z]), np.array([*place.goal, z])
-    deepest = np.array([*place.goal, max(z - _FEEL_DOWN, _LOWEST[1])])
+    deepest = np.array([*place.goal, max(z - _PROBE_DEPTH, _MIN_HEIGHTS[1])])
     up, opened = np.array([0, 0, _CLEARANCE]), robot.stroke[1]
     q = commanded()
 
-    def line(to: np.ndarray, width: float, least: float = 0.0, felt: bool = False) -> Segment:
+    def line(
+        to: np.ndarray, width: float, least: float = 0.0, until_supported: bool = False
+    ) -> Segment:
         nonlocal q
         path = straight_line(kinematics, q, to, fingers_down(yaw), limits)
-        require_inside(path, safety)
+        require_inside_workspace(path, safety)
         q = path.at(path.duration)
         path = replace(path, duration=max(path.duration, least))
-        return Segment(path, width, path.duration, felt)
+        return Segment(path, width, path.duration, until_supported)
 
     segments = [
         line(pick + up, opened),
         line(pick, opened),
-        Segment(None, 0.0, _CLOSE),
+        Segment(None, 0.0, _CLOSE_SECONDS),
         line(pick + up, 0.0),
         line(put + up, 0.0),
         line(put + [0, 0, 0.004], 0.0),
-        line(deepest, 0.0, _FEEL, felt=True),
-        Segment(None, 0.0, _HOLD),
+        line(deepest, 0.0, _PROBE_SECONDS, until_supported=True),
+        Segment(None, 0.0, _HOLD_SECONDS),
     ]
-    return Script(segments, commanded, 1 / safety.dt)
+    return ScriptedActor(segments, commanded, 1 / safety.dt)

@@ -8,21 +8,27 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.control.cell.config import Rig
-from touchgoal.control.cell.connection import Station
+from touchgoal.control.cell.config import CellConfig
+from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import Safety
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeWriter
-from touchgoal.policies.deploy.control_loop import DeployedActor, Deployment, Ending, Ticks, View
+from touchgoal.policies.deploy.control_loop import (
+    ControlLoop,
+    DeployedActor,
+    Ending,
+    RunLog,
+    TickStatus,
+)
 from touchgoal.policies.deploy.scripted import start_move
 from touchgoal.sim_envs.base import Observation
 
-_AT_START = 0.02  # rad from the start pose after the start move
-_NEAR = 0.1  # rad; nearer than that no start move is made
-_SETTLES = 2.0  # s that a simulator may take to see that the task is done
+_START_TOLERANCE = 0.02  # rad from the start pose after the start move
+_CLOSE_TO_START = 0.1  # rad; nearer than that no start move is made
+_SETTLE_TIME = 2.0  # s that a simulator may take to see that the task is done
 
-MakeActor = Callable[[Deployment], DeployedActor]
+MakeActor = Callable[[ControlLoop], DeployedActor]
 
 
 @dataclass(frozen=True)
@@ -31,17 +37,17 @@ class Result:
 
     Attributes:
         ending: how the run ended.
-        ticks: what was recorded.
+        log: what was recorded.
         success: the simulator's judgement; None where nobody knows.
         episode: index of the recorded episode; None without one.
-        trouble: why there is none, if there should be one.
+        recording_error: why there is none, if there should be one.
     """
 
     ending: Ending
-    ticks: Ticks
+    log: RunLog
     success: bool | None
     episode: int | None
-    trouble: str = ""
+    recording_error: str = ""
 
 
 @dataclass(frozen=True)
@@ -50,19 +56,19 @@ class Session:
 
     Attributes:
         execute: False: a dry run, which records nothing.
-        make: the actor, when the arm is at its start.
-        wanted, show, cost, camera_size: see Deployment.
+        make_actor: the actor, when the arm is at its start.
+        operator_request, on_tick, cost, camera_size: see ControlLoop.
         truth: what a simulator knows.
     """
 
-    rig: Rig
-    station: Station
+    cell: CellConfig
+    connection: CellConnection
     safety: Safety
     episodes: Path
     execute: bool
-    make: MakeActor
-    wanted: Callable[[], str]
-    show: Callable[[View], None]
+    make_actor: MakeActor
+    operator_request: Callable[[], str]
+    on_tick: Callable[[TickStatus], None]
     truth: Callable[[], dict[str, Any]] | None
     cost: Callable[[Observation], float] | None = None
     camera_size: tuple[int, int] = ft.CAMERA_SHAPE[:2]
@@ -73,60 +79,62 @@ class Session:
         Raises:
             UserError, DriverError: it cannot even begin; nothing has moved.
         """
-        deployment = Deployment(
-            self.station,
+        loop = ControlLoop(
+            self.connection,
             self.safety,
             self.execute,
-            self.wanted,
-            self.show,
+            self.operator_request,
+            self.on_tick,
             self.cost,
             self.camera_size,
         )
-        ticks = Ticks()
-        ending = self._to_start(deployment)
+        log = RunLog()
+        ending = self._move_to_start(loop)
         if ending is None:
-            ending = self._perform(deployment, ticks)
-        success = self._judge(ending)
-        episode, trouble = None, ""
-        if self.execute and ticks.rows:
+            ending = self._run_actor(loop, log)
+        success = self._success(ending)
+        episode, recording_error = None, ""
+        if self.execute and log.rows:
             try:
-                episode = self._record(ticks, ending, success)
+                episode = self._record(log, ending, success)
             except (OSError, UserError) as error:
-                trouble = f"this episode could not be kept ({error}); those before it are whole"
-        return Result(ending, ticks, success, episode, trouble)
+                recording_error = (
+                    f"this episode could not be kept ({error}); those before it are whole"
+                )
+        return Result(ending, log, success, episode, recording_error)
 
-    def _to_start(self, deployment: Deployment) -> Ending | None:
+    def _move_to_start(self, loop: ControlLoop) -> Ending | None:
         """Why it does not go on; None if the arm is where the task begins."""
-        if self.rig.task.start is None:
+        if self.cell.task.start is None:
             return None
-        start = np.array(self.rig.task.start)
-        if start.shape != deployment.commanded().shape:
+        start = np.array(self.cell.task.start)
+        if start.shape != loop.commanded().shape:
             raise UserError(f"task.start has {start.size} joints: this arm has another number")
-        if np.abs(start - deployment.commanded()).max() > _NEAR:
-            move = start_move(start, deployment.width, self.safety, deployment.commanded)
-            ending = deployment.run(move, 60.0, Ticks())
+        if np.abs(start - loop.commanded()).max() > _CLOSE_TO_START:
+            move = start_move(start, loop.width, self.safety, loop.commanded)
+            ending = loop.run(move, 60.0, RunLog())
             if not move.done or ending.stopped:
                 return ending
-            off = float(np.abs(start - deployment.commanded()).max())
-            if off > _AT_START:
-                return deployment.stop(
+            off = float(np.abs(start - loop.commanded()).max())
+            if off > _START_TOLERANCE:
+                return loop.stop(
                     f"the start pose was missed by {off:.3f} rad",
                     "look for what holds the arm back",
                 )
         return None
 
-    def _perform(self, deployment: Deployment, ticks: Ticks) -> Ending:
-        actor = self.make(deployment)
+    def _run_actor(self, loop: ControlLoop, log: RunLog) -> Ending:
+        actor = self.make_actor(loop)
         try:
-            return deployment.run(actor, self.rig.task.seconds, ticks)
+            return loop.run(actor, self.cell.task.seconds, log)
         finally:
             actor.close()
 
-    def _judge(self, ending: Ending) -> bool | None:
+    def _success(self, ending: Ending) -> bool | None:
         if self.truth is None or not self.execute:
             return None
-        clock = self.station.clock
-        end = clock.now() + (0.0 if ending.stopped else _SETTLES)
+        clock = self.connection.clock
+        end = clock.now() + (0.0 if ending.stopped else _SETTLE_TIME)
         try:
             while not (success := bool(self.truth()["success"])) and clock.now() < end:
                 clock.wait(clock.now() + self.safety.dt)
@@ -134,16 +142,16 @@ class Session:
             return None
         return success
 
-    def _record(self, ticks: Ticks, ending: Ending, success: bool | None) -> int:
-        rig = self.rig
+    def _record(self, log: RunLog, ending: Ending, success: bool | None) -> int:
+        cell = self.cell
         outcome = {True: "success", False: "failure", None: "unknown"}[success]
         meta: dict[str, MetaValue] = {
-            "sensor": rig.sensor,
-            "arm": rig.arm,
-            "policy": rig.task.policy,
+            "sensor": cell.sensor,
+            "arm": cell.arm,
+            "policy": cell.task.policy,
             "outcome": "stopped" if ending.stopped else outcome,
             "ending": ending.reason,
         }
-        task = rig.task.instruction or rig.task.name
-        episode = Episode(frames=ticks.frames(), task=task, meta=meta)
+        task = cell.task.instruction or cell.task.name
+        episode = Episode(frames=log.frames(), task=task, meta=meta)
         return EpisodeWriter(self.episodes, fps=ft.CONTROL_HZ).append(episode)

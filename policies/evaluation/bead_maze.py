@@ -7,7 +7,7 @@ import numpy as np
 from tqdm import tqdm
 
 from touchgoal.control import features as ft
-from touchgoal.episodes.recording import Actor, Demonstration, one_core_workers, run
+from touchgoal.episodes.recording import Actor, EpisodeSpec, one_core_workers, run
 from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
 from touchgoal.sim_envs.scene.wires import Wire
 
@@ -36,15 +36,15 @@ class MazeTrial:
     seconds: float
 
 
-def trials_of(wires: list[Wire], seed: int) -> list[Demonstration]:
+def trials_of(wires: list[Wire], seed: int) -> list[EpisodeSpec]:
     """One trial on each wire; the seeds, from `seed` on, place the maze and grip the bead."""
-    return [Demonstration(seed + i, options={"wire": w.name}) for i, w in enumerate(wires)]
+    return [EpisodeSpec(seed + i, options={"wire": w.name}) for i, w in enumerate(wires)]
 
 
 def evaluate(
     config: BeadMazeConfig,
     policy: Callable[[BeadMaze], Actor],
-    trials: list[Demonstration],
+    trials: list[EpisodeSpec],
     workers: int,
 ) -> list[MazeTrial]:
     """Run what `policy` makes for each trial's environment; it must pickle."""
@@ -55,7 +55,7 @@ def evaluate(
 
 
 def _try(
-    config: BeadMazeConfig, policy: Callable[[BeadMaze], Actor], trial: Demonstration
+    config: BeadMazeConfig, policy: Callable[[BeadMaze], Actor], trial: EpisodeSpec
 ) -> MazeTrial:
     env = BeadMaze(config)
     observation, info = env.reset(seed=trial.seed, options=trial.options)

@@ -4,9 +4,9 @@ The paper compares "the compounded trajectory from predicted delta joint angles"
 demonstration on an unseen maze, and leaves open how. Three readings, in mm at the TCP:
 
 - chunk: one plan, compounded from the measured joints, after each of its ticks.
-- forced: the first action of each tick's plan, compounded over the demonstration; every plan sees
+- teacher_forced: the first action of each tick's plan, compounded over the demonstration; every plan sees
   the recording.
-- free: the same, but every plan sees the joints that were compounded so far (and still the
+- free_running: the same, but every plan sees the joints that were compounded so far (and still the
   recorded touch).
 """
 
@@ -20,62 +20,62 @@ from jaxtyping import Float
 from torch import Tensor
 
 from touchgoal.control.motion.kinematics import Fr3Kinematics
-from touchgoal.policies.policy import Condition
-from touchgoal.policies.training.sequence_dataset import Windows
+from touchgoal.policies.policy import ObservationBatch
+from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
-Plan = Callable[[Condition], Float[Tensor, "b h 8"]]
+Plan = Callable[[ObservationBatch], Float[Tensor, "b h 8"]]
 
 
 @dataclass(frozen=True, eq=False)
-class Compounded:
+class OpenLoopErrors:
     """Errors along one demonstration, mm.
 
     Attributes:
         chunk: mean over all plans, after each tick of the plan.
-        forced: at each tick.
-        free: at each tick.
+        teacher_forced: at each tick.
+        free_running: at each tick.
         path: length of the TCP's way, mm.
     """
 
     chunk: Float[np.ndarray, " h"]
-    forced: Float[np.ndarray, " t"]
-    free: Float[np.ndarray, " t"]
+    teacher_forced: Float[np.ndarray, " t"]
+    free_running: Float[np.ndarray, " t"]
     path: float
 
 
-def compound(plan: Plan, demonstration: Windows, control_hz: int) -> Compounded:
+def open_loop_errors(plan: Plan, demonstration: SequenceDataset, control_hz: int) -> OpenLoopErrors:
     """Errors of a planner along one demonstration.
 
     Args:
-        plan: conditions to actions, such as `Policy.plan` or a baseline.
-        demonstration: windows of one episode, whose state is `vocabulary.STATE` and TCP pose.
+        plan: observation batches to actions, such as `Policy.plan` or a baseline.
+        demonstration: windows of one episode, whose state is `features.STATE` and TCP pose.
         control_hz: ticks per second, which turns joint changes to velocities for `free`.
     """
     count = len(demonstration)
-    condition, actions = demonstration.take(torch.arange(count))
-    joints = condition.joints.numpy()
-    planned, done = plan(condition).numpy()[..., :7], actions.numpy()[..., :7]
+    batch, actions = demonstration.take(torch.arange(count))
+    joints = batch.joints.numpy()
+    planned, done = plan(batch).numpy()[..., :7], actions.numpy()[..., :7]
     course = joints[0] + np.cumsum(done[:, 0], 0)
-    forced = joints[0] + np.cumsum(planned[:, 0], 0)
-    free = _free(plan, condition, control_hz)
+    teacher_forced = joints[0] + np.cumsum(planned[:, 0], 0)
+    free_running = _free_running(plan, batch, control_hz)
     chunk = _distance(joints[:, None] + planned.cumsum(1), joints[:, None] + done.cumsum(1))
     way = np.linalg.norm(np.diff(_positions(course), axis=0), axis=1).sum()
-    return Compounded(
+    return OpenLoopErrors(
         chunk=chunk.mean(0),
-        forced=_distance(forced, course),
-        free=_distance(free, course),
+        teacher_forced=_distance(teacher_forced, course),
+        free_running=_distance(free_running, course),
         path=1e3 * float(way),
     )
 
 
-def _free(plan: Plan, condition: Condition, control_hz: int) -> Float[np.ndarray, "t 7"]:
+def _free_running(plan: Plan, batch: ObservationBatch, control_hz: int) -> Float[np.ndarray, "t 7"]:
     """Joints after each tick, where each plan sees the joints compounded so far."""
     kinematics = Fr3Kinematics()
-    joints = condition.joints[0].numpy().astype(np.float64)
-    states, velocity, course = [], condition.state[0, -1, 7:14].numpy(), []
+    joints = batch.joints[0].numpy().astype(np.float64)
+    states, velocity, course = [], batch.state[0, -1, 7:14].numpy(), []
     quaternion = np.zeros(4)
-    horizon = condition.state.shape[1]
-    rows = zip(condition.touch, condition.state, strict=True)
+    horizon = batch.state.shape[1]
+    rows = zip(batch.touch, batch.state, strict=True)
     for i, (touch, state) in enumerate(rows):
         position, R = kinematics.forward(joints)
         now = state[-1].clone()
@@ -84,8 +84,8 @@ def _free(plan: Plan, condition: Condition, control_hz: int) -> Float[np.ndarray
         mujoco.mju_mat2Quat(quaternion, R.ravel())  # as the environment's observation
         now[18:22] = torch.from_numpy(quaternion)
         states = [*(states or [now] * horizon)[1:], now]
-        pictures = None if condition.pictures is None else condition.pictures[i : i + 1]
-        seen = Condition(touch[None], torch.stack(states)[None], pictures)
+        pictures = None if batch.pictures is None else batch.pictures[i : i + 1]
+        seen = ObservationBatch(touch[None], torch.stack(states)[None], pictures)
         action = plan(seen)[0, 0, :7].numpy()
         velocity = action * control_hz
         joints = joints + action
@@ -107,19 +107,19 @@ def _positions(joints: Float[np.ndarray, "... 7"]) -> Float[np.ndarray, "... 3"]
 
 def zero_motion(horizon: int) -> Plan:
     """The baseline that stands still."""
-    return lambda condition: torch.zeros(len(condition.state), horizon, 8)
+    return lambda batch: torch.zeros(len(batch.state), horizon, 8)
 
 
 def repeat_last(control_hz: int, horizon: int) -> Plan:
     """The baseline that goes on at the measured joint velocity."""
 
-    def plan(condition: Condition) -> Float[Tensor, "b h 8"]:
-        change = condition.state[:, -1, 7:14] / control_hz
+    def plan(batch: ObservationBatch) -> Float[Tensor, "b h 8"]:
+        change = batch.state[:, -1, 7:14] / control_hz
         return torch.cat([change, change[:, :1] * 0], 1)[:, None].expand(-1, horizon, -1)
 
     return plan
 
 
-def always(action: Float[Tensor, "8"], horizon: int) -> Plan:
+def constant_action(action: Float[Tensor, "8"], horizon: int) -> Plan:
     """The baseline that does the same action for ever, such as the mean of demonstrations."""
-    return lambda condition: action.expand(len(condition.state), horizon, 8)
+    return lambda batch: action.expand(len(batch.state), horizon, 8)

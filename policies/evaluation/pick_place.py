@@ -7,7 +7,7 @@ import numpy as np
 from tqdm import tqdm
 
 from touchgoal.control import features as ft
-from touchgoal.episodes.recording import Actor, Demonstration, one_core_workers, run
+from touchgoal.episodes.recording import Actor, EpisodeSpec, one_core_workers, run
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
 
 
@@ -35,17 +35,17 @@ class Trial:
     ticks: int
 
 
-def demonstrations_of(objects: list[str], count: int, seed: int) -> list[Demonstration]:
+def demonstrations_of(objects: list[str], count: int, seed: int) -> list[EpisodeSpec]:
     """So many trials, with the objects in turn; the seeds, from `seed` on, do the rest."""
     return [
-        Demonstration(seed + i, options={"object": objects[i % len(objects)]}) for i in range(count)
+        EpisodeSpec(seed + i, options={"object": objects[i % len(objects)]}) for i in range(count)
     ]
 
 
 def evaluate(
     config: PickPlaceConfig,
     policy: Callable[[PickPlace], Actor],
-    demonstrations: list[Demonstration],
+    demonstrations: list[EpisodeSpec],
     workers: int,
 ) -> list[Trial]:
     """Run what `policy` makes for each demonstration's environment; it must pickle."""
@@ -56,7 +56,7 @@ def evaluate(
 
 
 def _try(
-    config: PickPlaceConfig, policy: Callable[[PickPlace], Actor], demonstration: Demonstration
+    config: PickPlaceConfig, policy: Callable[[PickPlace], Actor], demonstration: EpisodeSpec
 ) -> Trial:
     env = PickPlace(config)
     observation, info = env.reset(seed=demonstration.seed, options=demonstration.options)

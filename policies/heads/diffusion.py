@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from touchgoal.policies.heads.samplers import SamplerConfig, mend, spoil
+from touchgoal.policies.heads.samplers import SamplerConfig, add_noise, denoise
 from touchgoal.policies.heads.unet import PRESETS, UNet, UNetConfig
 
 
@@ -38,15 +38,15 @@ class Diffusion(nn.Module):
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
         """Mean squared error of the network's answer at random steps."""
-        noisy, step, wanted = spoil(self.config.sampler, chunk, generator)
-        return F.mse_loss(self.network(noisy, step, condition), wanted)
+        noisy, step, target = add_noise(self.config.sampler, chunk, generator)
+        return F.mse_loss(self.network(noisy, step, condition), target)
 
-    def plan(
+    def sample(
         self, condition: Float[Tensor, "b c"], generator: torch.Generator
     ) -> Float[Tensor, "b h a"]:
         """A drawn chunk for every condition; the generator is the CPU's."""
         noise = torch.randn(len(condition), *self._shape, generator=generator).to(condition)
-        return mend(
+        return denoise(
             self.config.sampler, lambda x, t: self.network(x, t, condition), noise, generator
         )
 
@@ -79,9 +79,9 @@ class Regression(nn.Module):
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
         """Mean squared error; nothing is random."""
-        return F.mse_loss(self.plan(condition, generator), chunk)
+        return F.mse_loss(self.sample(condition, generator), chunk)
 
-    def plan(
+    def sample(
         self, condition: Float[Tensor, "b c"], generator: torch.Generator
     ) -> Float[Tensor, "b h a"]:
         """The chunk for every condition; nothing is random."""

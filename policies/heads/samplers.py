@@ -1,7 +1,7 @@
 """From noise to samples and back: DDPM, DDIM and flow matching.
 
-Each is a way to spoil a clean sample for training, and a way to walk from noise to a sample with a
-network that was trained to mend. The two diffusions are one formula (Song et al. 2021, eq. 12).
+Each is a way to add noise to a clean sample for training, and a way to walk from noise to a sample with a
+network that was trained to denoise. The two diffusions are one formula (Song et al. 2021, eq. 12).
 """
 
 from collections.abc import Callable
@@ -15,65 +15,72 @@ from torch import Tensor
 
 from touchgoal.control.errors import UserError
 
-FLOW_STEPS = 100.0  # what flow time 1 is called to the network, so that its embedding resolves it
-Denoise = Callable[[Float[Tensor, "b h a"], Float[Tensor, " b"]], Float[Tensor, "b h a"]]
+FLOW_TIME_SCALE = (
+    100.0  # what flow time 1 is called to the network, so that its embedding resolves it
+)
+DenoisingNetwork = Callable[[Float[Tensor, "b h a"], Float[Tensor, " b"]], Float[Tensor, "b h a"]]
 
 
 @dataclass(frozen=True)
 class SamplerConfig:
-    """How samples are spoiled and mended.
+    """How samples are noised in training and denoised in use.
 
     Attributes:
         kind: "ddpm" draws fresh noise at every step (Ho et al. 2020), "ddim" none (Song et al.
             2021); both learn the same, so a network trained for one serves the other. "flow" goes
             straight from noise to data (Lipman et al. 2023).
-        predict: what the network answers: the noise ("epsilon") or the flow's velocity, as
+        prediction_type: what the network answers: the noise ("epsilon") or the flow's velocity, as
             published, or the clean sample. The last needs fewer steps and less training where
             samples vary little (3D diffusion policy, Ze et al. 2024, which takes it as well).
-        train_steps: of the squared-cosine schedule (Nichol and Dhariwal 2021).
-        plan_steps: network calls for one sample. Two of "ddim" with "sample" led the bead as well as
+        num_train_timesteps: of the squared-cosine schedule (Nichol and Dhariwal 2021).
+        num_inference_steps: network calls for one sample. Two of "ddim" with "sample" led the bead as well as
             four (docs/next_steps.md); "ddpm" and "epsilon" want more.
         clip: clean samples lie in [-clip, clip].
     """
 
     kind: Literal["ddpm", "ddim", "flow"] = "ddim"
-    predict: Literal["epsilon", "velocity", "sample"] = "sample"
-    train_steps: int = 100
-    plan_steps: int = 2
+    prediction_type: Literal["epsilon", "velocity", "sample"] = "sample"
+    num_train_timesteps: int = 100
+    num_inference_steps: int = 2
     clip: float = 1.0
 
     def __post_init__(self) -> None:
-        """Raises UserError for steps that make no sampler."""
-        if self.plan_steps < 1 or self.train_steps < 2:
-            raise UserError("a sampler needs plan_steps >= 1 and train_steps >= 2")
-        if self.predict == ("epsilon" if self.kind == "flow" else "velocity"):
-            raise UserError(f"a network for {self.kind} cannot predict {self.predict}: try sample")
-        if self.kind != "flow" and self.plan_steps > self.train_steps:
+        """Raises UserError for numbers of steps that make no sampler."""
+        if self.num_inference_steps < 1 or self.num_train_timesteps < 2:
+            raise UserError("a sampler needs num_inference_steps >= 1 and num_train_timesteps >= 2")
+        if self.prediction_type == ("epsilon" if self.kind == "flow" else "velocity"):
             raise UserError(
-                f"plan_steps {self.plan_steps} exceed train_steps {self.train_steps}: some would "
+                f"a network for {self.kind} cannot predict {self.prediction_type}: try sample"
+            )
+        if self.kind != "flow" and self.num_inference_steps > self.num_train_timesteps:
+            raise UserError(
+                f"num_inference_steps {self.num_inference_steps} exceed num_train_timesteps {self.num_train_timesteps}: some would "
                 "do nothing, so ask for fewer"
             )
 
 
 @lru_cache
-def signal_power(steps: int) -> Float[Tensor, " {steps}"]:
+def alphas_cumprod(steps: int) -> Float[Tensor, " {steps}"]:
     """Share of the variance that is signal after each step (alpha-bar), float64."""
     t = torch.arange(steps + 1, dtype=torch.float64) / steps
     power = torch.cos((t + 0.008) / 1.008 * torch.pi / 2) ** 2
     return (1 - (1 - power[1:] / power[:-1]).clamp(max=0.999)).cumprod(0)
 
 
-def visited(config: SamplerConfig) -> Int[Tensor, " {config.plan_steps}"]:
+def inference_timesteps(config: SamplerConfig) -> Int[Tensor, " {config.num_inference_steps}"]:
     """Steps of the schedule that a plan visits, from pure noise on.
 
     Spaced backwards from the last one ("trailing", Lin et al. 2024): the first must be noise alone,
     as that is what a plan starts from.
     """
-    share = torch.arange(config.plan_steps, 0, -1, dtype=torch.float64) / config.plan_steps
-    return (share * config.train_steps).round().long() - 1
+    share = (
+        torch.arange(config.num_inference_steps, 0, -1, dtype=torch.float64)
+        / config.num_inference_steps
+    )
+    return (share * config.num_train_timesteps).round().long() - 1
 
 
-def spoil(
+def add_noise(
     config: SamplerConfig, clean: Float[Tensor, "b h a"], generator: torch.Generator
 ) -> tuple[Float[Tensor, "b h a"], Float[Tensor, " b"], Float[Tensor, "b h a"]]:
     """A training example of every sample, at a random step.
@@ -90,18 +97,18 @@ def spoil(
     noise = torch.randn(clean.shape, generator=generator).to(clean)
     if config.kind == "flow":
         time = torch.rand(b, generator=generator).to(clean)
-        t = _as(time, clean)
-        wanted = clean - noise if config.predict == "velocity" else clean
-        return (1 - t) * noise + t * clean, FLOW_STEPS * time, wanted
-    step = torch.randint(config.train_steps, (b,), generator=generator)
-    power = _as(signal_power(config.train_steps)[step].to(clean), clean)
+        t = _broadcast(time, clean)
+        target = clean - noise if config.prediction_type == "velocity" else clean
+        return (1 - t) * noise + t * clean, FLOW_TIME_SCALE * time, target
+    step = torch.randint(config.num_train_timesteps, (b,), generator=generator)
+    power = _broadcast(alphas_cumprod(config.num_train_timesteps)[step].to(clean), clean)
     noisy = power.sqrt() * clean + (1 - power).sqrt() * noise
-    return noisy, step.to(clean), noise if config.predict == "epsilon" else clean
+    return noisy, step.to(clean), noise if config.prediction_type == "epsilon" else clean
 
 
-def mend(
+def denoise(
     config: SamplerConfig,
-    network: Denoise,
+    network: DenoisingNetwork,
     noise: Float[Tensor, "b h a"],
     generator: torch.Generator,
 ) -> Float[Tensor, "b h a"]:
@@ -113,29 +120,29 @@ def mend(
         noise: standard normal.
         generator: of the noise that "ddpm" adds, on the CPU.
     """
-    walk = _mend_flow if config.kind == "flow" else _mend_diffusion
+    walk = _denoise_flow if config.kind == "flow" else _denoise_diffusion
     return walk(config, network, noise, generator)
 
 
-def _mend_flow(
-    config: SamplerConfig, network: Denoise, x: Tensor, generator: torch.Generator
+def _denoise_flow(
+    config: SamplerConfig, network: DenoisingNetwork, x: Tensor, generator: torch.Generator
 ) -> Tensor:
-    n = config.plan_steps
+    n = config.num_inference_steps
     for i in range(n):
-        answer = network(x, x.new_full((len(x),), FLOW_STEPS * i / n))
-        clean = answer if config.predict == "sample" else x + (1 - i / n) * answer
+        answer = network(x, x.new_full((len(x),), FLOW_TIME_SCALE * i / n))
+        clean = answer if config.prediction_type == "sample" else x + (1 - i / n) * answer
         x = x + (clean.clamp(-config.clip, config.clip) - x) / (n - i)
     return x
 
 
-def _mend_diffusion(
-    config: SamplerConfig, network: Denoise, x: Tensor, generator: torch.Generator
+def _denoise_diffusion(
+    config: SamplerConfig, network: DenoisingNetwork, x: Tensor, generator: torch.Generator
 ) -> Tensor:
-    steps = visited(config).tolist()
-    powers = signal_power(config.train_steps)[steps].tolist()
+    steps = inference_timesteps(config).tolist()
+    powers = alphas_cumprod(config.num_train_timesteps)[steps].tolist()
     for step, power, after in zip(steps, powers, [*powers[1:], 1.0], strict=True):
         answer = network(x, x.new_full((len(x),), step))
-        if config.predict == "epsilon":
+        if config.prediction_type == "epsilon":
             answer = (x - (1 - power) ** 0.5 * answer) / power**0.5
         clean = answer.clamp(-config.clip, config.clip)
         # of the clipped sample: the step then is DDPM's posterior even where it clips
@@ -149,5 +156,5 @@ def _mend_diffusion(
     return x
 
 
-def _as(values: Float[Tensor, " b"], like: Float[Tensor, "b h a"]) -> Tensor:
+def _broadcast(values: Float[Tensor, " b"], like: Float[Tensor, "b h a"]) -> Tensor:
     return values.reshape(-1, *[1] * (like.ndim - 1))

@@ -21,13 +21,13 @@ class UNetConfig:
         channels: of each level; every level but the last halves the number of ticks.
         kernel: ticks a convolution sees, odd.
         groups: of the group norms; divides every number of channels.
-        step_width: of the diffusion step's embedding, even.
+        step_embedding_dim: of the diffusion step's embedding, even.
     """
 
     channels: tuple[int, ...]
     kernel: int = 5
     groups: int = 8
-    step_width: int = 128
+    step_embedding_dim: int = 128
 
     def __post_init__(self) -> None:
         """Raises UserError for sizes that cannot be built."""
@@ -35,21 +35,21 @@ class UNetConfig:
             raise UserError(
                 f"U-Net channels {self.channels} must be multiples of the {self.groups} groups"
             )
-        if self.kernel % 2 == 0 or self.step_width % 2:
-            raise UserError("a U-Net needs an odd kernel and an even step_width")
+        if self.kernel % 2 == 0 or self.step_embedding_dim % 2:
+            raise UserError("a U-Net needs an odd kernel and an even step_embedding_dim")
 
     @property
-    def factor(self) -> int:
+    def tick_multiple(self) -> int:
         """What the number of ticks must be a multiple of."""
         return 2 ** (len(self.channels) - 1)
 
 
 PRESETS: dict[str, UNetConfig] = {
-    "tiny": UNetConfig((16, 32), groups=4, step_width=16),
+    "tiny": UNetConfig((16, 32), groups=4, step_embedding_dim=16),
     # plans on one core within a tick of 20 Hz; two levels, as calls cost more than channels
-    "small": UNetConfig((96, 192), kernel=3, step_width=64),
+    "small": UNetConfig((96, 192), kernel=3, step_embedding_dim=64),
     # diffusion_policy's config for states; its 512-1024-2048 for pictures differs in width alone
-    "published": UNetConfig((256, 512, 1024), step_width=256),
+    "published": UNetConfig((256, 512, 1024), step_embedding_dim=256),
 }
 
 
@@ -64,11 +64,11 @@ class UNet(nn.Module):
         """Builds a randomly initialised network."""
         super().__init__()
         self.config = config
-        w = config.step_width
+        w = config.step_embedding_dim
         self.step = nn.Sequential(nn.Linear(w, 4 * w), nn.Mish(), nn.Linear(4 * w, w))
 
-        def block(inward: int, outward: int) -> ResidualBlock:
-            return ResidualBlock(inward, outward, config.kernel, config.groups)
+        def block(in_channels: int, out_channels: int) -> ResidualBlock:
+            return ResidualBlock(in_channels, out_channels, config.kernel, config.groups)
 
         widths, last = config.channels, config.channels[-1]
         steps = list(zip((action_dim, *widths), widths, strict=False))
@@ -79,7 +79,7 @@ class UNet(nn.Module):
             nn.ModuleList([block(2 * b, a), block(a, a)]) for a, b in reversed(steps[1:])
         )
         self.grow = nn.ModuleList(nn.ConvTranspose1d(n, n, 4, 2, 1) for n in reversed(widths[:-1]))
-        self._sizes = [2 * m.outward for m in self.modules() if isinstance(m, ResidualBlock)]
+        self._sizes = [2 * m.out_channels for m in self.modules() if isinstance(m, ResidualBlock)]
         # one matrix for all blocks: the same numbers as one a block, with fewer calls
         self.film = nn.Sequential(nn.Mish(), nn.Linear(condition_dim + w, sum(self._sizes)))
         self.out = nn.Sequential(
@@ -96,11 +96,13 @@ class UNet(nn.Module):
         """The network's prediction.
 
         Args:
-            noisy: chunks; h is a multiple of `UNetConfig.factor`.
+            noisy: chunks; h is a multiple of `UNetConfig.tick_multiple`.
             step: of the diffusion, 0 to about 100.
             condition: what the chunk depends on.
         """
-        given = torch.cat([self.step(sinusoids(step, self.config.step_width)), condition], 1)
+        given = torch.cat(
+            [self.step(sinusoidal_embedding(step, self.config.step_embedding_dim)), condition], 1
+        )
         films = iter(self.film(given)[:, :, None].split(self._sizes, dim=1))
         x, skips = noisy.transpose(1, 2), []
         for level, blocks in enumerate(self.down):
@@ -122,12 +124,16 @@ class UNet(nn.Module):
 class ResidualBlock(nn.Module):
     """Two convolutions with FiLM between them: the condition scales and shifts every channel."""
 
-    def __init__(self, inward: int, outward: int, kernel: int, groups: int):
+    def __init__(self, in_channels: int, out_channels: int, kernel: int, groups: int):
         super().__init__()
-        self.outward = outward
-        self.one = _convolution(inward, outward, kernel, groups)
-        self.two = _convolution(outward, outward, kernel, groups)
-        self.skip = nn.Identity() if inward == outward else nn.Conv1d(inward, outward, 1)
+        self.out_channels = out_channels
+        self.one = _convolution(in_channels, out_channels, kernel, groups)
+        self.two = _convolution(out_channels, out_channels, kernel, groups)
+        self.skip = (
+            nn.Identity()
+            if in_channels == out_channels
+            else nn.Conv1d(in_channels, out_channels, 1)
+        )
 
     def forward(
         self, x: Float[Tensor, "b i h"], film: Float[Tensor, "b s 1"]
@@ -151,15 +157,15 @@ class ShortConv1d(nn.Conv1d):
         return F.linear(ticks.flatten(2), self.weight.flatten(1), self.bias).transpose(1, 2)
 
 
-def _convolution(inward: int, outward: int, kernel: int, groups: int) -> nn.Sequential:
+def _convolution(in_channels: int, out_channels: int, kernel: int, groups: int) -> nn.Sequential:
     return nn.Sequential(
-        ShortConv1d(inward, outward, kernel),
-        nn.GroupNorm(groups, outward),
+        ShortConv1d(in_channels, out_channels, kernel),
+        nn.GroupNorm(groups, out_channels),
         nn.Mish(),
     )
 
 
-def sinusoids(step: Float[Tensor, " b"], width: int) -> Float[Tensor, "b {width}"]:
+def sinusoidal_embedding(step: Float[Tensor, " b"], width: int) -> Float[Tensor, "b {width}"]:
     """The diffusion step as sines and cosines of wavelengths up to 10,000 (Vaswani et al. 2017)."""
     half = width // 2
     rate = torch.exp(torch.arange(half, device=step.device) * (-math.log(10000.0) / (half - 1)))

@@ -11,7 +11,7 @@ from jaxtyping import Float32
 from touchgoal.control import features as ft
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
-from touchgoal.encoders.backbones.touch_backbone import TouchTrunk
+from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.ssl.frames import check_sensor
 from touchgoal.episodes.store import EpisodeSet
 
@@ -27,13 +27,13 @@ class TouchEmbedder:
         sensor: name of the fingertip sensor.
     """
 
-    def __init__(self, encoder: TouchEncoder | TouchTrunk, name: str) -> None:
+    def __init__(self, encoder: TouchEncoder | TouchBackbone, name: str) -> None:
         self.encoder, self.name = encoder, name
         self.dim = len(ft.TACTILE) * encoder.config.embedding_dim
         self.sensor = encoder.config.sensor
 
     def embed(self, episodes: EpisodeSet, i: int) -> Float32[np.ndarray, "t e"]:
-        """All ticks of an episode; UserError if it was felt with another sensor."""
+        """All ticks of an episode; UserError if it was recorded with another sensor."""
         check_sensor(episodes, i, self.sensor)
         frames = episodes.read(i, ft.TACTILE).frames
         sides = [self.encoder.embed_frames(frames[k], frames[k][0]) for k in ft.TACTILE]
@@ -53,7 +53,7 @@ def load_touch(directory: Path) -> TouchEmbedder:
 
     Embeddings are named after the weights, not after the folder, which may move.
     """
-    encoder = pretrained.load_any(directory)
+    encoder = pretrained.load_encoder(directory)
     digest = hashlib.sha256(pretrained.ENCODER.weights_path(directory).read_bytes()).hexdigest()[
         :12
     ]

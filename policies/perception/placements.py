@@ -1,4 +1,4 @@
-"""How pick-and-place begins, seen many times over: what a sense of sight learns from."""
+"""How pick-and-place begins, seen many times over: what the pose estimator learns from."""
 
 from dataclasses import dataclass
 
@@ -19,8 +19,8 @@ class Placements:
 
     Attributes:
         pictures: of every camera by its column, as it takes them.
-        tcp: pose of the hand, `vocabulary.TCP_POSE`.
-        start: what there is to see, `vocabulary.TRUTH_START`.
+        tcp: pose of the hand, `features.TCP_POSE`.
+        start: what there is to see, `features.TRUTH_START`.
     """
 
     pictures: dict[str, UInt8[Tensor, "n h w 3"]]
@@ -32,20 +32,22 @@ class Placements:
         return len(self.start)
 
 
-def place(config: PickPlaceConfig, things: int, times: int, seed: int, workers: int) -> Placements:
-    """Lays so many things on the table, each so many times.
+def render_placements(
+    config: PickPlaceConfig, objects: int, placements_each: int, seed: int, workers: int
+) -> Placements:
+    """Lays so many objects on the table, each so many times.
 
     Args:
         config: of the task; cameras are those to look through.
-        things: objects of random kind and size, one for every seed from `seed` on.
-        times: places of each.
+        objects: objects of random kind and size, one for every seed from `seed` on.
+        placements_each: places of each.
         seed: of the first thing.
         workers: processes that render.
     """
-    seeds = range(seed, seed + things)
+    seeds = range(seed, seed + objects)
     with one_core_workers(workers) as pool:
-        laid = pool.map(_lay, [config] * things, [times] * things, seeds)
-        rows = [row for some in tqdm(laid, total=things, desc="things") for row in some]
+        rendered = pool.map(_render_object, [config] * objects, [placements_each] * objects, seeds)
+        rows = [row for some in tqdm(rendered, total=objects, desc="objects") for row in some]
     keys = [key for key in ft.CAMERAS if key in rows[0]]
     columns = {
         key: torch.from_numpy(np.stack([row[key] for row in rows]))
@@ -55,11 +57,13 @@ def place(config: PickPlaceConfig, things: int, times: int, seed: int, workers: 
     return Placements(columns, tcp, start)
 
 
-def _lay(config: PickPlaceConfig, times: int, seed: int) -> list[dict[str, np.ndarray]]:
+def _render_object(
+    config: PickPlaceConfig, placements_each: int, seed: int
+) -> list[dict[str, np.ndarray]]:
     env = PickPlace(config)
     observation, info = env.reset(seed=seed)
     rows = [observation | info]
-    for _ in range(times - 1):
+    for _ in range(placements_each - 1):
         observation, info = env.rearrange()
         rows.append(observation | info)
     env.close()

@@ -1,4 +1,4 @@
-"""Sight: a network that reads in the first pictures of an episode what lies where."""
+"""Pose estimator: a network that reads in the first pictures of an episode what lies where."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from touchgoal.control import features as ft
-from touchgoal.policies.actions import Scale
+from touchgoal.policies.actions import Normalizer
 
 Box = tuple[int, int, int, int]
 _START = ft.FEATURES[ft.TRUTH_START].shape[0]
@@ -16,38 +16,38 @@ _TCP = ft.FEATURES[ft.TCP_POSE].shape[0]
 
 
 @dataclass(frozen=True)
-class SightConfig:
+class PoseEstimatorConfig:
     """Where to look, and the networks that look.
 
     Attributes:
         size: rows and columns of the cameras' pictures. With half as many the table is seen at 5 mm a
             pixel, and an object's place is told no better than to 3 mm.
-        windows: of each camera's pictures, by its column, the rows and columns (from, to; from, to)
+        crops: of each camera's pictures, by its column, the rows and columns (from, to; from, to)
             in which the table is seen.
         channels: of the maps of a picture, one cell for 4 x 4 pixels.
-        glances: places looked at in each picture.
-        detail: numbers that describe what is at such a place.
+        keypoints: places found in each picture, by a spatial softmax.
+        keypoint_features: numbers that describe what is at such a place.
         width: of the hidden layer that puts together what they say.
     """
 
     size: tuple[int, int] = (256, 256)
-    windows: tuple[tuple[str, Box], ...] = ((ft.FRONT, (104, 232, 16, 240)),)
+    crops: tuple[tuple[str, Box], ...] = ((ft.FRONT, (104, 232, 16, 240)),)
     channels: int = 32
-    glances: int = 16
-    detail: int = 32
+    keypoints: int = 16
+    keypoint_features: int = 32
     width: int = 256
 
 
-class Sight(nn.Module):
-    """Pictures of the start to `vocabulary.TRUTH_START`."""
+class PoseEstimator(nn.Module):
+    """Pictures of the start to `features.TRUTH_START`."""
 
-    def __init__(self, config: SightConfig) -> None:
-        """Randomly initialised; `fit_scales` comes before training."""
+    def __init__(self, config: PoseEstimatorConfig) -> None:
+        """Randomly initialised; `fit_normalizers` comes before training."""
         super().__init__()
         self.config = config
-        self.networks = nn.ModuleList(_Glances(config) for _ in config.windows)
-        seen = _TCP + config.glances * (2 + config.detail) * len(config.windows)
-        self.tcp_scale, self.start_scale = Scale((_TCP,)), Scale((_START,))
+        self.networks = nn.ModuleList(_SpatialSoftmax(config) for _ in config.crops)
+        seen = _TCP + config.keypoints * (2 + config.keypoint_features) * len(config.crops)
+        self.tcp_scale, self.start_scale = Normalizer((_TCP,)), Normalizer((_START,))
         self.read = nn.Sequential(
             nn.Linear(seen, config.width), nn.Mish(),
             nn.Linear(config.width, config.width), nn.Mish(),
@@ -69,25 +69,25 @@ class Sight(nn.Module):
         self, pictures: dict[str, UInt8[Tensor, "b h w 3"]], tcp: Float[Tensor, "b 7"]
     ) -> Float[Tensor, "b 7"]:
         """The same, scaled to variance 1."""
-        said = [self.tcp_scale(tcp)]
+        parts = [self.tcp_scale(tcp)]
         for (key, (top, bottom, left, right)), network in zip(
-            self.config.windows, self.networks, strict=True
+            self.config.crops, self.networks, strict=True
         ):
-            window = pictures[key][:, top:bottom, left:right].permute(0, 3, 1, 2)
-            said.append(network(window.float() / 64 - 2))
-        return self.read(torch.cat(said, 1))
+            crop = pictures[key][:, top:bottom, left:right].permute(0, 3, 1, 2)
+            parts.append(network(crop.float() / 64 - 2))
+        return self.read(torch.cat(parts, 1))
 
 
-class _Glances(nn.Module):
+class _SpatialSoftmax(nn.Module):
     """Looks at several places of a picture: where each is, in [-1, 1], and what is there."""
 
-    def __init__(self, config: SightConfig) -> None:
+    def __init__(self, config: PoseEstimatorConfig) -> None:
         super().__init__()
-        width, self.glances = config.channels, config.glances
+        width, self.keypoints = config.channels, config.keypoints
         self.patches = nn.Conv2d(3, width, 8, 4, 2)
         self.join = nn.Conv2d(width, width, 3, 1, 1)
-        self.where = nn.Conv2d(width, config.glances, 1)
-        self.what = nn.Conv2d(width, config.detail, 1)
+        self.where = nn.Conv2d(width, config.keypoints, 1)
+        self.what = nn.Conv2d(width, config.keypoint_features, 1)
 
     def forward(self, pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b p"]:
         maps = F.relu(self.join(F.relu(self.patches(pictures))))

@@ -1,7 +1,7 @@
 """Proprioception as a network understands it at once.
 
 Two views of the same columns. From the base: joints and hand as they are. Along the hand's own axes
-("tool"): how the hand moves and which way is up, and nothing of where on the table it is or which way
+("body_twist"): how the hand moves and which way is up, and nothing of where on the table it is or which way
 it faces, so that what was learnt on one wire holds for every wire that bends as much.
 """
 
@@ -10,33 +10,33 @@ from jaxtyping import Float
 from torch import Tensor
 
 from touchgoal.control import features as ft
-from touchgoal.policies.actions import Representation, along_the_hand
+from touchgoal.policies.actions import ActionRepresentation, body_jacobian
 
-_NEAR = 0.02  # m
-_SEEN_ALONG_THE_HAND = {ft.STATE: 7, ft.TCP_POSE: 3}  # columns there are, and their widths
+_LENGTH_SCALE = 0.02  # m
+_BODY_FRAME_WIDTHS = {ft.STATE: 7, ft.TCP_POSE: 3}  # columns there are, and their input_widths
 
 
-def widths(columns: tuple[str, ...], kind: Representation) -> list[int]:
-    """Of what `unroll` makes of each column; KeyError for one that "tool" does not know."""
-    if kind == "tool":
-        return [_SEEN_ALONG_THE_HAND[key] for key in columns]
+def input_widths(columns: tuple[str, ...], kind: ActionRepresentation) -> list[int]:
+    """Of what `network_input` makes of each column; KeyError for one that "body_twist" does not know."""
+    if kind == "body_twist":
+        return [_BODY_FRAME_WIDTHS[key] for key in columns]
     more = {ft.TCP_POSE: 2, ft.TRUTH_START: 5}
     return [ft.FEATURES[key].shape[0] + more.get(key, 0) for key in columns]
 
 
-def places(columns: tuple[str, ...], kind: Representation) -> Float[Tensor, " r"]:
-    """1 for joint and TCP positions, 0 for all else that `unroll` gives."""
+def is_position(columns: tuple[str, ...], kind: ActionRepresentation) -> Float[Tensor, " r"]:
+    """1 for joint and TCP positions, 0 for all else that `network_input` gives."""
     marks = []
-    for key, width in zip(columns, widths(columns, kind), strict=True):
-        count = 0 if kind == "tool" else {ft.STATE: ft.N_JOINTS, ft.TCP_POSE: 3}.get(key, 0)
+    for key, width in zip(columns, input_widths(columns, kind), strict=True):
+        count = 0 if kind == "body_twist" else {ft.STATE: ft.N_JOINTS, ft.TCP_POSE: 3}.get(key, 0)
         marks += [1.0] * count + [0.0] * (width - count)
     return torch.tensor(marks)
 
 
-def unroll(
-    state: Float[Tensor, "... s"], columns: tuple[str, ...], kind: Representation
+def network_input(
+    state: Float[Tensor, "... s"], columns: tuple[str, ...], kind: ActionRepresentation
 ) -> Float[Tensor, "... r"]:
-    """What a network sees of columns of `vocabulary.FEATURES`, side by side.
+    """What a network sees of columns of `features.FEATURES`, side by side.
 
     From the base: the TCP's quaternion becomes the first two columns of its rotation matrix. A
     quaternion and its negative are the same turn, and a measured one jumps between the two as the hand
@@ -49,38 +49,40 @@ def unroll(
     parts, start = {}, 0
     for key in columns:
         parts[key] = state[..., start : (start := start + ft.FEATURES[key].shape[0])]
-    if kind == "tool":
-        parts[ft.STATE] = _motion(parts[ft.STATE])
+    if kind == "body_twist":
+        parts[ft.STATE] = _body_twist(parts[ft.STATE])
         if ft.TCP_POSE in parts:
-            parts[ft.TCP_POSE] = _vertical(parts[ft.TCP_POSE][..., 3:])
+            parts[ft.TCP_POSE] = _vertical_in_body_frame(parts[ft.TCP_POSE][..., 3:])
     elif ft.TCP_POSE in parts:
         pose = parts[ft.TCP_POSE]
-        turned = _two_columns(pose[..., 3:])
+        turned = _rotation_6d(pose[..., 3:])
         if ft.TRUTH_START in parts:
             held = parts[ft.TRUTH_CONTACT].amin(-1, keepdim=True)
-            parts[ft.TRUTH_START] = _from_hand(parts[ft.TRUTH_START], pose[..., :3], turned, held)
+            parts[ft.TRUTH_START] = _start_from_hand(
+                parts[ft.TRUTH_START], pose[..., :3], turned, held
+            )
         parts[ft.TCP_POSE] = torch.cat([pose[..., :3], turned], -1)
     return torch.cat([parts[key] for key in columns], -1)
 
 
-def _motion(state: Float[Tensor, "... 15"]) -> Float[Tensor, "... 7"]:
+def _body_twist(state: Float[Tensor, "... 15"]) -> Float[Tensor, "... 7"]:
     joints, velocity, width = state.split([ft.N_JOINTS, ft.N_JOINTS, 1], -1)
-    return torch.cat([(along_the_hand(joints) @ velocity[..., None])[..., 0], width], -1)
+    return torch.cat([(body_jacobian(joints) @ velocity[..., None])[..., 0], width], -1)
 
 
-def _vertical(quaternion: Float[Tensor, "... 4"]) -> Float[Tensor, "... 3"]:
+def _vertical_in_body_frame(quaternion: Float[Tensor, "... 4"]) -> Float[Tensor, "... 3"]:
     """The base's z axis in the frame that the quaternion turns."""
     w, x, y, z = quaternion.unbind(-1)
     return torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1)
 
 
-def _from_hand(
+def _start_from_hand(
     start: Float[Tensor, "... 7"],
     hand: Float[Tensor, "... 3"],
     turned: Float[Tensor, "... 6"],
     held: Float[Tensor, "... 1"],
 ) -> Float[Tensor, "... 12"]:
-    """`vocabulary.TRUTH_START` relative to the hand's position and yaw."""
+    """`features.TRUTH_START` relative to the hand's position and yaw."""
     cos, sin = turned[..., 0], turned[..., 1]
     cos, sin = cos * cos - sin * sin, 2 * cos * sin  # of twice the hand's yaw
     yaw = torch.stack(
@@ -93,10 +95,10 @@ def _from_hand(
     there, height = (start[..., :2] - hand[..., :2]) * (1 - held), start[..., 2:3] - hand[..., 2:]
     goal, yaw = (start[..., 5:] - hand[..., :2]) * held, yaw * (1 - held)
     way = torch.cat([there, height, goal], -1)
-    return torch.cat([way, yaw, way / (way.abs() + _NEAR)], -1)
+    return torch.cat([way, yaw, way / (way.abs() + _LENGTH_SCALE)], -1)
 
 
-def _two_columns(quaternion: Float[Tensor, "... 4"]) -> Float[Tensor, "... 6"]:
+def _rotation_6d(quaternion: Float[Tensor, "... 4"]) -> Float[Tensor, "... 6"]:
     w, x, y, z = quaternion.unbind(-1)
     columns = [
         1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y),

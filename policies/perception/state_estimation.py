@@ -17,40 +17,40 @@ from torch import Tensor, nn
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.training.weights import Stored
-from touchgoal.policies.actions import Scale
+from touchgoal.encoders.training.weights import WeightsFormat
+from touchgoal.policies.actions import Normalizer
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
-from touchgoal.policies.perception.pose_estimator import Sight, SightConfig
+from touchgoal.policies.perception.pose_estimator import PoseEstimator, PoseEstimatorConfig
 
-SENSES = Stored("senses", "senses", "train them with: touchgoal train-estimators")
-READ = (ft.TRUTH_CONTACT, ft.TRUTH_START)
+ESTIMATOR = WeightsFormat("senses", "senses", "train them with: touchgoal train-estimators")
+ESTIMATED = (ft.TRUTH_CONTACT, ft.TRUTH_START)
 
 
 @dataclass(frozen=True)
-class SensesConfig:
+class StateEstimatorConfig:
     """What is felt and seen through.
 
     Attributes:
         touch: names the embedder of the fingertips, see `touch.py`.
         touch_dim: of its embedding of both fingertips.
-        sight: of the cameras.
+        pose_estimator: of the cameras.
     """
 
     touch: str
     touch_dim: int
-    sight: SightConfig = SightConfig()
+    pose_estimator: PoseEstimatorConfig = PoseEstimatorConfig()
 
 
-class SensesNetwork(nn.Module):
+class StateEstimatorNetwork(nn.Module):
     """One reader of contact for both fingertips, and sight."""
 
-    def __init__(self, config: SensesConfig) -> None:
+    def __init__(self, config: StateEstimatorConfig) -> None:
         """Randomly initialised."""
         super().__init__()
         self.config = config
         one = config.touch_dim // len(ft.TACTILE)
-        self.touch_scale, self.touch = Scale((one,)), nn.Linear(one, 1)
-        self.sight = Sight(config.sight)
+        self.touch_scale, self.touch = Normalizer((one,)), nn.Linear(one, 1)
+        self.sight = PoseEstimator(config.pose_estimator)
 
     def contact(self, touch: Float[Tensor, "b e"]) -> Float[Tensor, "b 2"]:
         """Log-odds that each pad touches something, given embeddings of both."""
@@ -58,8 +58,8 @@ class SensesNetwork(nn.Module):
         return self.touch(self.touch_scale(sides)).squeeze(2)
 
 
-class Senses:
-    """What an observation says of `READ`, as columns of those names.
+class StateEstimator:
+    """What an observation says of `ESTIMATED`, as columns of those names.
 
     Attributes:
         touch: the embedder.
@@ -67,7 +67,7 @@ class Senses:
         camera_size: rows and columns of these.
     """
 
-    def __init__(self, network: SensesNetwork, touch: TouchEmbedder) -> None:
+    def __init__(self, network: StateEstimatorNetwork, touch: TouchEmbedder) -> None:
         """For inference; UserError if the embedder is not the training's."""
         if touch.name != network.config.touch:
             raise UserError(
@@ -75,12 +75,12 @@ class Senses:
                 "touch encoder that they were trained with"
             )
         self.network, self.touch = network, touch
-        self.camera_size = network.config.sight.size
-        self.cameras = tuple(key for key, _ in network.config.sight.windows)
+        self.camera_size = network.config.pose_estimator.size
+        self.cameras = tuple(key for key, _ in network.config.pose_estimator.crops)
         self._start: tuple[Mapping[str, np.ndarray] | None, np.ndarray] = None, np.empty(0)
 
     @torch.inference_mode()
-    def read(
+    def estimate(
         self, observation: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray]
     ) -> dict[str, Float32[np.ndarray, " n"]]:
         """Whether each pad touches something (probability), and how the episode began.
@@ -105,30 +105,34 @@ class Senses:
         return torch.from_numpy(picture)[None]
 
 
-def save_senses(network: SensesNetwork, directory: Path, provenance: dict[str, Any]) -> None:
+def save_estimator(
+    network: StateEstimatorNetwork, directory: Path, provenance: dict[str, Any]
+) -> None:
     """Writes the networks; scales as float32, all else as float16."""
     weights = {name: tensor.detach().cpu() for name, tensor in network.state_dict().items()}
     for name, _ in network.named_parameters():
         weights[name] = weights[name].half()
-    SENSES.save(directory, weights, asdict(network.config), provenance)
+    ESTIMATOR.save(directory, weights, asdict(network.config), provenance)
 
 
-def load_senses(directory: Path) -> Senses:
-    """Reads what `save_senses` wrote, and the touch encoder.
+def load_estimator(directory: Path) -> StateEstimator:
+    """Reads what `save_estimator` wrote, and the touch encoder.
 
     That is in `touch/` beside, or else the shipped one.
 
     Raises:
         UserError: nothing there, damaged, or another touch encoder than the training's.
     """
-    network = SensesNetwork(SENSES.read_config(directory, _config))
-    SENSES.fill(network, directory)
+    network = StateEstimatorNetwork(ESTIMATOR.read_config(directory, _config))
+    ESTIMATOR.load_weights(network, directory)
     own = directory / "touch"
-    return Senses(network, load_touch(own if own.is_dir() else pretrained.SHIPPED))
+    return StateEstimator(network, load_touch(own if own.is_dir() else pretrained.SHIPPED))
 
 
-def _config(fields: dict[str, Any]) -> SensesConfig:
-    sight = fields.pop("sight")
-    windows = tuple((key, tuple(box)) for key, box in sight.pop("windows"))
-    size = tuple(sight.pop("size"))
-    return SensesConfig(**fields, sight=SightConfig(size, windows, **sight))
+def _config(fields: dict[str, Any]) -> StateEstimatorConfig:
+    pose_estimator = fields.pop("pose_estimator")
+    crops = tuple((key, tuple(box)) for key, box in pose_estimator.pop("crops"))
+    size = tuple(pose_estimator.pop("size"))
+    return StateEstimatorConfig(
+        **fields, pose_estimator=PoseEstimatorConfig(size, crops, **pose_estimator)
+    )

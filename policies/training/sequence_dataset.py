@@ -19,21 +19,21 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.policies.perception.end_to_end import EyeConfig, shrink
+from touchgoal.policies.perception.end_to_end import EndToEndConfig, difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
-from touchgoal.policies.policy import Condition, PolicyConfig
+from touchgoal.policies.policy import ObservationBatch, PolicyConfig
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
+class Recordings:
     """n ticks of several episodes, one after the other.
 
     Attributes:
         touch: embeddings of both fingertips; float16, as they are many.
         state: proprioception.
-        actions: `vocabulary.ACTION`.
+        actions: `features.ACTION`.
         lengths: ticks of each episode.
-        pictures: for the policy's eye; None without.
+        pictures: for the end-to-end encoder; None without.
         wrench: what acted on both pads (N, Nm, pad frames); None unless the policy reads it.
     """
 
@@ -45,13 +45,13 @@ class Recorded:
     wrench: Float32[Tensor, "n 12"] | None = None
 
 
-def read(
+def load_recordings(
     episodes: EpisodeSet,
     chosen: Sequence[int],
     config: PolicyConfig,
     embedder: TouchEmbedder | None,
     workers: int = 1,
-) -> Recorded:
+) -> Recordings:
     """Reads episodes, embedding those that are not yet; a kill loses those in progress.
 
     Args:
@@ -66,7 +66,7 @@ def read(
             embeddings of other episodes.
     """
     _check(episodes, chosen, config, embedder)
-    felt = embed(episodes, chosen, embedder, workers) if embedder else None
+    embedded = embed_episodes(episodes, chosen, embedder, workers) if embedder else None
     keys = [*config.proprioception, ft.ACTION, *[ft.TRUTH_PAD_WRENCH] * config.reads_wrench]
     touch, state, actions, pictures, wrench = [], [], [], [], []
     for n, i in enumerate(tqdm(chosen, desc="episodes", unit="episode")):
@@ -75,21 +75,25 @@ def read(
         actions.append(frames[ft.ACTION])
         if config.reads_wrench:
             wrench.append(frames[ft.TRUTH_PAD_WRENCH])
-        touch.append(felt[n] if felt else np.empty((len(actions[-1]), 0), np.float16))
-        if config.eye:
-            pictures.append(_look(episodes, i, config.eye))
+        touch.append(embedded[n] if embedded else np.empty((len(actions[-1]), 0), np.float16))
+        if config.end_to_end:
+            pictures.append(_difference_images(episodes, i, config.end_to_end))
     parts = (torch.from_numpy(np.concatenate(rows)) for rows in (touch, state, actions))
-    return Recorded(
+    return Recordings(
         *parts,
         lengths=tuple(len(rows) for rows in actions),
-        pictures=torch.from_numpy(np.concatenate(pictures)) if config.eye else None,
+        pictures=torch.from_numpy(np.concatenate(pictures)) if config.end_to_end else None,
         wrench=torch.from_numpy(np.concatenate(wrench)) if wrench else None,
     )
 
 
-def _look(episodes: EpisodeSet, i: int, eye: EyeConfig) -> UInt8[np.ndarray, "t k h w 3"]:
+def _difference_images(
+    episodes: EpisodeSet, i: int, end_to_end: EndToEndConfig
+) -> UInt8[np.ndarray, "t k h w 3"]:
     frames = episodes.read(i, ft.TACTILE).frames
-    return np.stack([shrink(frames[key], frames[key][0], eye.size) for key in ft.TACTILE], 1)
+    return np.stack(
+        [difference_images(frames[key], frames[key][0], end_to_end.size) for key in ft.TACTILE], 1
+    )
 
 
 def _check(
@@ -125,15 +129,17 @@ def _check(
         )
 
 
-def embed(
+def embed_episodes(
     episodes: EpisodeSet, chosen: Sequence[int], embedder: TouchEmbedder, workers: int = 1
 ) -> list[Float16[np.ndarray, "t e"]]:
     """The embeddings of episodes, made and kept if they are not yet."""
     _fill_cache(episodes, chosen, embedder, workers)
-    return [embeddings(episodes, i, embedder) for i in chosen]
+    return [cached_embeddings(episodes, i, embedder) for i in chosen]
 
 
-def embeddings(episodes: EpisodeSet, i: int, embedder: TouchEmbedder) -> Float16[np.ndarray, "t e"]:
+def cached_embeddings(
+    episodes: EpisodeSet, i: int, embedder: TouchEmbedder
+) -> Float16[np.ndarray, "t e"]:
     """The embeddings that `read` kept of an episode; UserError if they are another episode's."""
     path = _path(episodes, embedder, i)
     rows = np.load(path)
@@ -172,15 +178,15 @@ def _embed(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> None:
     os.replace(temporary, path)
 
 
-class Windows:
+class SequenceDataset:
     """One window for every recorded tick.
 
     Before an episode's start its first observation is repeated, and after its end its last action,
     which is to stay: as in diffusion_policy.
     """
 
-    def __init__(self, recorded: Recorded, config: PolicyConfig) -> None:
-        """Windows of the config's horizons."""
+    def __init__(self, recorded: Recordings, config: PolicyConfig) -> None:
+        """SequenceDataset of the config's horizons."""
         self.recorded = recorded
         ends = np.cumsum(recorded.lengths)
         first = np.repeat(ends - recorded.lengths, recorded.lengths)[:, None]
@@ -188,12 +194,12 @@ class Windows:
         tick = np.arange(ends[-1])[:, None]
         seen = tick + np.arange(1 - config.observation_horizon, 1)
         done = tick + np.arange(config.prediction_horizon)
-        self._seen = torch.from_numpy(np.maximum(seen, first))
-        self._done = torch.from_numpy(np.minimum(done, last))
+        self._observed = torch.from_numpy(np.maximum(seen, first))
+        self._planned = torch.from_numpy(np.minimum(done, last))
 
     def __len__(self) -> int:
         """Number of windows."""
-        return len(self._seen)
+        return len(self._observed)
 
     @property
     def joints(self) -> Float[Tensor, "n 7"]:
@@ -203,16 +209,16 @@ class Windows:
     @property
     def actions(self) -> Float[Tensor, "n h 8"]:
         """What was done in every window."""
-        return self.recorded.actions[self._done]
+        return self.recorded.actions[self._planned]
 
-    def take(self, rows: Int[Tensor, " b"]) -> tuple[Condition, Float[Tensor, "b h 8"]]:
+    def take(self, rows: Int[Tensor, " b"]) -> tuple[ObservationBatch, Float[Tensor, "b h 8"]]:
         """Some windows: what was seen, what was done."""
-        seen, recorded = self._seen[rows], self.recorded
+        seen, recorded = self._observed[rows], self.recorded
         pictures = None if recorded.pictures is None else recorded.pictures[rows]
-        condition = Condition(recorded.touch[seen].float(), recorded.state[seen], pictures)
-        return condition, recorded.actions[self._done[rows]]
+        batch = ObservationBatch(recorded.touch[seen].float(), recorded.state[seen], pictures)
+        return batch, recorded.actions[self._planned[rows]]
 
     def wrench(self, rows: Int[Tensor, " b"]) -> Float[Tensor, "b o 12"] | None:
         """What acted on both pads when some windows were seen, if it was read."""
         wrench = self.recorded.wrench
-        return None if wrench is None else wrench[self._seen[rows]]
+        return None if wrench is None else wrench[self._observed[rows]]

@@ -12,9 +12,9 @@ from tqdm import tqdm
 from touchgoal.control.errors import UserError
 from touchgoal.encoders.training import checkpoint as resumable
 from touchgoal.policies import checkpoint
-from touchgoal.policies.policy import Condition, Policy, PolicyConfig
+from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
 from touchgoal.policies.training import ema
-from touchgoal.policies.training.sequence_dataset import Windows
+from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 POLICY, SNAPSHOTS = "policy", "snapshots"
 
@@ -50,8 +50,8 @@ class TrainConfig:
 
 def train(
     policy: PolicyConfig,
-    windows: Windows,
-    validation: Windows,
+    windows: SequenceDataset,
+    validation: SequenceDataset,
     config: TrainConfig,
     out_dir: Path,
     recipe: dict[str, Any],
@@ -100,21 +100,21 @@ def train(
         if epoch + 1 == config.epochs:
             checkpoint.save(run.average, out_dir / POLICY, provenance)
         run.checkpoint(out_dir)
-        tqdm.write(_line(run.history[-1], config.epochs))
+        tqdm.write(_progress_line(run.history[-1], config.epochs))
     return checkpoint.load(out_dir / POLICY)
 
 
 class _Run:
     """State of a training that survives a kill."""
 
-    def __init__(self, policy: PolicyConfig, windows: Windows, config: TrainConfig) -> None:
+    def __init__(self, policy: PolicyConfig, windows: SequenceDataset, config: TrainConfig) -> None:
         self.config, self.windows = config, windows
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.policy = Policy(policy)
         touch, state = windows.recorded.touch.float(), windows.recorded.state
         wrench = windows.recorded.wrench
-        self.policy.fit_scales(touch, state, windows.joints, windows.actions, wrench)
+        self.policy.fit_normalizers(touch, state, windows.joints, windows.actions, wrench)
         self.policy.to(config.device)
         self.average = copy.deepcopy(self.policy).eval().requires_grad_(False)
         self.optimiser = torch.optim.AdamW(
@@ -134,7 +134,7 @@ class _Run:
         for i, rows in enumerate(progress):
             step = epoch * self.steps + i
             for group in self.optimiser.param_groups:
-                group["lr"] = _rate(self.config, step, self.config.epochs * self.steps)
+                group["lr"] = _learning_rate(self.config, step, self.config.epochs * self.steps)
             loss = self._loss(self.policy, self.windows, rows, generator)
             self.optimiser.zero_grad()
             loss.backward()
@@ -145,13 +145,13 @@ class _Run:
         return total / self.steps
 
     @torch.no_grad()
-    def validate(self, windows: Windows) -> dict[str, float]:
+    def validate(self, windows: SequenceDataset) -> dict[str, float]:
         """The average's loss, and the error of the joint change (rad) it plans over the chunk."""
         n = min(self.config.validation_windows, len(windows))
         rows = torch.linspace(0, len(windows) - 1, n).long()
-        condition, actions = self._take(windows, rows)
+        batch, actions = self._take(windows, rows)
         generator = torch.Generator().manual_seed(self.config.seed)
-        planned = self.average.plan(condition, generator)
+        planned = self.average.plan(batch, generator)
         error = (planned - actions)[..., :7].sum(1).norm(dim=1).mean()
         loss = self._loss(self.average, windows, rows, generator)
         return {"validation_loss": loss.item(), "validation_error": error.item()}
@@ -174,17 +174,23 @@ class _Run:
         self.history = state["history"]
 
     def _loss(
-        self, policy: Policy, windows: Windows, rows: torch.Tensor, generator: torch.Generator
+        self,
+        policy: Policy,
+        windows: SequenceDataset,
+        rows: torch.Tensor,
+        generator: torch.Generator,
     ) -> torch.Tensor:
         wrench = windows.wrench(rows)
         wrench = None if wrench is None else wrench.to(self.config.device)
         return policy.loss(*self._take(windows, rows), generator, wrench)
 
-    def _take(self, windows: Windows, rows: torch.Tensor) -> tuple[Condition, torch.Tensor]:
-        condition, actions = windows.take(rows)
+    def _take(
+        self, windows: SequenceDataset, rows: torch.Tensor
+    ) -> tuple[ObservationBatch, torch.Tensor]:
+        batch, actions = windows.take(rows)
         device = self.config.device
-        pictures = None if condition.pictures is None else condition.pictures.to(device)
-        seen = Condition(condition.touch.to(device), condition.state.to(device), pictures)
+        pictures = None if batch.pictures is None else batch.pictures.to(device)
+        seen = ObservationBatch(batch.touch.to(device), batch.state.to(device), pictures)
         return seen, actions.to(device)
 
     def _setting(self) -> str:
@@ -192,12 +198,12 @@ class _Run:
         return json.dumps((asdict(self.config), asdict(self.policy.config), lengths))
 
 
-def _rate(config: TrainConfig, step: int, steps: int) -> float:
+def _learning_rate(config: TrainConfig, step: int, steps: int) -> float:
     warmup = min(config.warmup, steps // 10)
     return config.lr * resumable.warmed_cosine(step, steps, warmup)
 
 
-def _line(metrics: dict[str, float], epochs: int) -> str:
+def _progress_line(metrics: dict[str, float], epochs: int) -> str:
     return (
         f"epoch {metrics['epoch']}/{epochs}  loss {metrics['loss']:.4f}  "
         f"validation {metrics['validation_loss']:.4f}, "

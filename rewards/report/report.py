@@ -46,9 +46,9 @@ def write_report(
         The paths by kind: "png", "csv", "json".
     """
     contents = {
-        "png": plot(curves),
-        "csv": table(curves).encode(),
-        "json": (json.dumps(summary(curves, provenance), indent=2) + "\n").encode(),
+        "png": plot_curves(curves),
+        "csv": curves_csv(curves).encode(),
+        "json": (json.dumps(report_json(curves, provenance), indent=2) + "\n").encode(),
     }
     paths = {kind: folder / f"{name}.{kind}" for kind in contents}
     for kind, path in paths.items():
@@ -56,7 +56,7 @@ def write_report(
     return paths
 
 
-def summary(curves: Curves, provenance: Mapping[str, Any]) -> dict[str, Any]:
+def report_json(curves: Curves, provenance: Mapping[str, Any]) -> dict[str, Any]:
     """Metrics of every curve and what they rest on, ready for JSON."""
     return {
         "source": curves.source,
@@ -70,7 +70,7 @@ def summary(curves: Curves, provenance: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def table(curves: Curves) -> str:
+def curves_csv(curves: Curves) -> str:
     """CSV: frame, time (s), then every normalised curve and every raw one (`raw_` in front)."""
     columns = dict(curves.normalised) | {f"raw_{name}": d for name, d in curves.raw.items()}
     text = io.StringIO()
@@ -82,7 +82,7 @@ def table(curves: Curves) -> str:
     return text.getvalue()
 
 
-def plot(curves: Curves) -> bytes:
+def plot_curves(curves: Curves) -> bytes:
     """PNG of 1200 x 700 pixels: all curves over time, the contact marked, each line labelled."""
     figure = Figure(figsize=SIZE_INCHES, dpi=PIXELS_PER_INCH)
     axes = figure.add_axes((0.075, 0.11, 0.745, 0.74))
@@ -95,8 +95,8 @@ def plot(curves: Curves) -> bytes:
     _label_lines(axes, curves)
     goal = "goal: " + " and ".join(dict.fromkeys(curves.goal.values()))
     heading = {"fontsize": 15, "fontweight": "bold", "parse_math": False}
-    figure.text(0.075, 0.935, _shortened(curves.source, 85), **heading)
-    figure.text(0.075, 0.89, _shortened(goal, 125), fontsize=12, color="0.35", parse_math=False)
+    figure.text(0.075, 0.935, _elide_middle(curves.source, 85), **heading)
+    figure.text(0.075, 0.89, _elide_middle(goal, 125), fontsize=12, color="0.35", parse_math=False)
     png = io.BytesIO()
     FigureCanvasAgg(figure).print_png(png, metadata={"Software": None})
     return png.getvalue()
@@ -150,7 +150,7 @@ def _label_lines(axes: Axes, curves: Curves) -> None:
     low, high = axes.get_ylim()
     names = sorted(curves.values, key=lambda name: curves.values[name][-1])
     ends = np.array([(curves.values[name][-1] - low) / (high - low) for name in names])
-    for name, end, height in zip(names, ends, _spread(ends), strict=True):
+    for name, end, height in zip(names, ends, _spread_labels(ends), strict=True):
         color = STYLES[name]["color"]
         axes.annotate(
             name,
@@ -167,14 +167,14 @@ def _label_lines(axes: Axes, curves: Curves) -> None:
         )
 
 
-def _spread(heights: np.ndarray) -> np.ndarray:
+def _spread_labels(heights: np.ndarray) -> np.ndarray:
     """Ascending heights moved apart to at least LABEL_GAP, kept about their mean."""
     rank = np.arange(len(heights)) * LABEL_GAP
     spread = np.maximum.accumulate(heights - rank) + rank
     return spread + np.mean(heights - spread)
 
 
-def _shortened(text: str, length: int) -> str:
+def _elide_middle(text: str, length: int) -> str:
     """The text, its middle left out if it is longer than the picture is wide."""
     half = (length - 3) // 2
     return text if len(text) <= length else f"{text[:half]} … {text[-half:]}"

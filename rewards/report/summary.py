@@ -20,7 +20,7 @@ _COLUMNS: tuple[tuple[str, Callable[[CurveMetrics], float | None]], ...] = (
 )
 
 
-def overview(curves: Sequence[Curves]) -> str:
+def metrics_table(curves: Sequence[Curves]) -> str:
     """Mean of each metric over the episodes, a row for each kind of curve.
 
     A metric that is undefined in some episodes is followed by how many it is the mean of; one that

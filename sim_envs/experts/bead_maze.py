@@ -32,17 +32,17 @@ class BeadMazeExpert:
         tick, grip = 1 / env.config.control_hz, self._grip()
         position, R = env.kinematics.forward(env.command)
         bead = position + R @ grip
-        s = env.wire.project(bead, env.s)
+        s = env.wire.project(bead, env.arc_length)
         point, tangent = env.wire.at(s)
         off = bead - point
         turned = rotation_vector(fingers_across(tangent).T @ R)
         astray = max(float(np.linalg.norm(off)), _LEVER * float(np.linalg.norm(turned)))
         ahead = self._speed * tick * max(0.0, 1 - astray / _SLOW)
         left = max(np.exp(-_RETURN * tick), 1 - _FASTEST * tick / max(astray, 1e-9))
-        point, tangent = env.wire.at(min(s + ahead, env.s + _LEAD))
+        point, tangent = env.wire.at(min(s + ahead, env.arc_length + _LEAD))
         R = fingers_across(tangent) @ _rotation(left * turned)
         target = point + left * off - R @ grip
-        joints = env.kinematics.inverse(target, R, env.command).q
+        joints = env.kinematics.solve_ik_near(target, R, env.command).q
         return np.append(joints - env.command, 0.0)
 
     def _grip(self) -> np.ndarray:

@@ -17,7 +17,7 @@ OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 CLEARANCE = 0.12  # m above the object before and after the grasp
 LOWEST_GRASP = 0.0185  # m: the sensor case (32.5 mm) must stay above the table
 LOWEST_PLACE = 0.0172
-FEEL_DOWN = 0.010  # m below the grasp's height to look for the table when placing
+TOUCHDOWN_DEPTH = 0.010  # m below the grasp's height to look for the table when placing
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class PickPlaceExpert:
             pick[2] += 0.08
         place = np.array([*env.goal, pick[2]])
         above, over = pick + [0, 0, CLEARANCE], place + [0, 0, CLEARANCE]
-        deepest = np.array([*env.goal, max(pick[2] - FEEL_DOWN, LOWEST_PLACE)])
+        deepest = np.array([*env.goal, max(pick[2] - TOUCHDOWN_DEPTH, LOWEST_PLACE)])
         middle = 0.5 * (above + over)
         # Closed on air the pads would touch each other, which is no absence of touch.
         closed = 0.03 if self._outcome == "never_touch" else 0.0
@@ -109,7 +109,7 @@ class PickPlaceExpert:
             Segment("carry", middle, closed, 0.6),
             Segment("carry", over, carried, 0.6),
             Segment("lower", place + [0, 0, 0.004], carried, 0.9, until_supported=True),
-            Segment("feel", deepest, carried, 0.8, until_supported=True),
+            Segment("touch down", deepest, carried, 0.8, until_supported=True),
             Segment("hold", None, carried, 0.8),
         ]
         if env.config.release:
@@ -135,7 +135,7 @@ class PickPlaceExpert:
 
     def _towards(self, position: np.ndarray, yaw: float, width: float) -> np.ndarray:
         env = self._env
-        joints = env.kinematics.reach(position, fingers_down(yaw), env.command)
+        joints = env.kinematics.solve_ik(position, fingers_down(yaw), env.command)
         return np.append(joints - env.command, width)
 
 

@@ -5,7 +5,12 @@ from jaxtyping import Float
 
 from touchgoal.control.motion.kinematics import fingers_down
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH, Observation
-from touchgoal.sim_envs.experts.pick_place import CLEARANCE, FEEL_DOWN, LOWEST_GRASP, LOWEST_PLACE
+from touchgoal.sim_envs.experts.pick_place import (
+    CLEARANCE,
+    LOWEST_GRASP,
+    LOWEST_PLACE,
+    TOUCHDOWN_DEPTH,
+)
 from touchgoal.sim_envs.pick_place import PickPlace
 
 _STEEP = 3.0  # m of height per m that the hand is beside its place
@@ -13,7 +18,7 @@ _NEAR, _GRIPPING = 0.006, 0.015  # m beside the object: for fingers to begin to 
 _OVER, _PLACED = 0.008, 0.014  # m beside the goal: for the object to go down, to stay there
 _BEGUN = GRIPPER_MAX_WIDTH - 0.006  # m of width below which the fingers have begun to close
 _STILL = 0.006  # m/s of width: fingers that something stops
-_SPEED, _CLIMB, _FEEL = 0.3, 0.2, 0.01  # m/s: at most over the table, up and down, near it
+_SPEED, _CLIMB, _TOUCHDOWN = 0.3, 0.2, 0.01  # m/s: at most over the table, up and down, near it
 _CLOSE = 0.006  # m above its place at which the object is lowered no faster than that
 _ACCELERATION = 4.0  # m/s^2
 _RETURN, _LOWER = 5.0, 3.0  # 1/s: speed towards a place per distance to it; down, with the object
@@ -59,7 +64,7 @@ class FeedbackExpert:
         change *= min(1.0, _ACCELERATION / hz / max(float(np.linalg.norm(change)), 1e-9))
         turn = float(np.clip(_RETURN * turn, -_TURN, _TURN)) / hz
         # A learner may have led the arm to where nothing is in reach: the nearest place will do.
-        solution = env.kinematics.inverse(
+        solution = env.kinematics.solve_ik_near(
             here + (pace + change) / hz, fingers_down(yaw + turn), env.command
         )
         return np.append(solution.q - env.command, grip)
@@ -82,8 +87,8 @@ class FeedbackExpert:
         if beside < _PLACED and self._env.object_on_table():
             return np.zeros(3)
         if beside < _OVER and off[2] > -_CLOSE:
-            deepest = max(self._goal[2] - FEEL_DOWN, LOWEST_PLACE)
-            return np.array([0, 0, -_FEEL if here[2] > deepest else 0.0])
+            deepest = max(self._goal[2] - TOUCHDOWN_DEPTH, LOWEST_PLACE)
+            return np.array([0, 0, -_TOUCHDOWN if here[2] > deepest else 0.0])
         return _funnel(off, beside - _OVER, _LOWER)
 
 

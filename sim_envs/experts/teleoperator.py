@@ -31,19 +31,19 @@ class TeleoperatorConfig:
     """How hand and keys respond.
 
     Attributes:
-        speed, turn: m/s and rad/s at which a key moves and turns the free hand.
-        give: m/s by which the hand gives way to a force, per N.
-        give_turn: rad/s by which it gives way to a torque, per N m.
-        hold: s for which a key counts as held after it was typed. A terminal tells of no releases; it
+        speed, turn_speed: m/s and rad/s at which a key moves and turns the free hand.
+        compliance: m/s by which the hand gives way to a force, per N.
+        rotational_compliance: rad/s by which it gives way to a torque, per N m.
+        hold_seconds: s for which a key counts as held after it was typed. A terminal tells of no releases; it
             repeats a held key after some 0.4 s, and only the last one. Two keys typed in turn push
             together.
     """
 
     speed: float = 0.025
-    turn: float = 0.5
-    give: float = 2e-3
-    give_turn: float = 2.0
-    hold: float = 0.5
+    turn_speed: float = 0.5
+    compliance: float = 2e-3
+    rotational_compliance: float = 2.0
+    hold_seconds: float = 0.5
 
 
 class Teleoperator:
@@ -66,7 +66,7 @@ class Teleoperator:
             elif key in _PUSHES:
                 (pair,) = (pair for pair in _PAIRS if key in pair)
                 self._held.pop(pair.replace(key, ""), None)
-                self._held[key] = round(self._config.hold * self._env.config.control_hz)
+                self._held[key] = round(self._config.hold_seconds * self._env.config.control_hz)
 
     def act(self, observation: Observation) -> np.ndarray:
         """The action for the next tick; none while the hand closes on the bead."""
@@ -77,10 +77,10 @@ class Teleoperator:
             return np.zeros(8)
         position, R = env.kinematics.forward(env.command)
         wrench = observation[ft.WRENCH].astype(np.float64).reshape(2, 3)
-        moved, turned = np.array([[c.speed], [c.turn]]) * (push @ R.T)
-        yielded, swung = np.array([[c.give], [c.give_turn]]) * wrench
+        moved, turned = np.array([[c.speed], [c.turn_speed]]) * (push @ R.T)
+        yielded, swung = np.array([[c.compliance], [c.rotational_compliance]]) * wrench
         tick = 1 / env.config.control_hz
         target = position + tick * (moved + yielded)
         R = rotation_matrix(tick * (turned + swung)) @ R
-        joints = env.kinematics.inverse(target, R, env.command).q
+        joints = env.kinematics.solve_ik_near(target, R, env.command).q
         return np.append(joints - env.command, 0.0)

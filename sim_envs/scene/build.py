@@ -17,7 +17,7 @@ from touchgoal.control.motion.kinematics import GELSIGHT_TCP
 from touchgoal.control.safety import limits
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.sim_envs.scene.objects import FIRM, Body
-from touchgoal.sim_envs.scene.ur5e import with_ur5e
+from touchgoal.sim_envs.scene.ur5e import replace_arm_with_ur5e
 
 SIDES = ("left", "right")
 OBJECT_GROUP, VISUAL_GROUP, HIDDEN_GROUP = 1, 2, 3
@@ -64,7 +64,7 @@ def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpe
     """The scene's spec; tasks add to it before they compile it."""
     config = config or SceneConfig()
     if config.arm == "ur5e":
-        spec = mujoco.MjSpec.from_string(with_ur5e(robot_model()))
+        spec = mujoco.MjSpec.from_string(replace_arm_with_ur5e(robot_model()))
     else:
         spec = mujoco.MjSpec.from_file(str(robot_model()))
         # No posture brings these together (none of 20,000 random ones did), but they lie so near

@@ -14,7 +14,7 @@ Picture = UInt8[np.ndarray, "_ _ 3"]  # pictures of different sizes meet in one 
 _HEIGHT = 480
 
 
-class Film:
+class SceneRecorder:
     """Films an environment after its reset: front camera left, the two sensors right.
 
     The full meshes (242k triangles) are drawn in a model of their own; the environment, its
@@ -29,20 +29,20 @@ class Film:
         self._renderer = open_renderer(self._model, _HEIGHT, _HEIGHT)
         self.frames: list[Picture] = []
 
-    def shoot(self) -> None:
+    def capture(self) -> None:
         """Take and keep a picture of the environment as it is now."""
         self._data.qpos[:] = self._env.data.qpos
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, "front")
         scene = self._renderer.render()
-        self.frames.append(beside(scene, [f.image for f in self._env.tactile_frames()]))
+        self.frames.append(scene_beside_touch(scene, [f.image for f in self._env.tactile_frames()]))
 
     def close(self) -> None:
         """Free the OpenGL context."""
         self._renderer.close()
 
 
-def beside(scene: Picture, tactile: list[Picture]) -> Picture:
+def scene_beside_touch(scene: Picture, tactile: list[Picture]) -> Picture:
     """The scene with the tactile images, labelled, in a column right of it."""
     labelled = []
     for name, image in zip(("left", "right"), tactile, strict=False):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from touchgoal.control.motion.kinematics import UR5E
+from touchgoal.control.motion.kinematics import UR5E_ARM
 
 # kg; Universal Robots' DH page (article 45257). Inertia follows from the capsules.
 _MASSES = (3.761, 8.058, 2.846, 1.37, 1.3, 0.365)
@@ -30,7 +30,7 @@ _ARMATURE = (0.2, 0.2, 0.2, 0.1, 0.1, 0.1)  # kg m^2, of rotor and gear: our cho
 _RGBA = "0.72 0.76 0.8 1"
 
 
-def with_ur5e(franka: Path) -> str:
+def replace_arm_with_ur5e(franka: Path) -> str:
     """MJCF of the model in `franka`, its arm replaced by a UR5e that carries the same hand."""
     tree = ET.parse(franka).getroot()
     world, hand = tree.find("worldbody"), tree.find(".//body[@name='hand']")
@@ -53,14 +53,14 @@ def with_ur5e(franka: Path) -> str:
     link = base
     for i in range(len(_MASSES)):
         link = _add_link(link, i)
-    hand.set("pos", _text(0, 0, UR5E.flange))
-    hand.set("quat", _text(np.cos(UR5E.hand_yaw / 2), 0, 0, np.sin(UR5E.hand_yaw / 2)))
+    hand.set("pos", _text(0, 0, UR5E_ARM.flange_offset))
+    hand.set("quat", _text(np.cos(UR5E_ARM.hand_yaw / 2), 0, 0, np.sin(UR5E_ARM.hand_yaw / 2)))
     link.append(hand)
     return ET.tostring(tree, encoding="unicode")
 
 
 def _add_link(parent: ET.Element, i: int) -> ET.Element:
-    offset, twist = UR5E.links[i]
+    offset, twist = UR5E_ARM.links[i]
     turn = _text(np.cos(twist / 2), np.sin(twist / 2), 0, 0)
     link = ET.SubElement(parent, "body", name=f"ur5e_link{i + 1}", pos=_text(*offset), quat=turn)
     ET.SubElement(
@@ -68,7 +68,7 @@ def _add_link(parent: ET.Element, i: int) -> ET.Element:
         "joint",
         name=f"ur5e_joint{i + 1}",
         axis="0 0 1",
-        range=_text(UR5E.lower[i], UR5E.upper[i]),
+        range=_text(UR5E_ARM.lower[i], UR5E_ARM.upper[i]),
         actuatorfrcrange=_text(-_TORQUES[i], _TORQUES[i]),
         armature=_text(_ARMATURE[i]),
     )

@@ -11,21 +11,21 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from touchgoal.control.tactile.gel import CONTACT_SHARE, NEARBY_CELLS, SHADOW_CELLS, cells
-from touchgoal.control.tactile.sensor_calibration import Photometry
-from touchgoal.sim_envs.tactile.sensor_instance import STEP, Unit
+from touchgoal.control.tactile.gel import CONTACT_SHARE, NEARBY_CELLS, SHADOW_CELLS, pixels_per_cell
+from touchgoal.control.tactile.sensor_calibration import SensorCalibration
+from touchgoal.sim_envs.tactile.sensor_instance import COUNT_STEP, SensorInstance
 
 Fields = Float[Tensor, "b h w"]
 
 
-def deform(overlap: Fields, pitch: float, bulge: tuple[float, ...]) -> Fields:
+def deform(overlap: Fields, pitch: float, blur_sigmas: tuple[float, ...]) -> Fields:
     """Surfaces of gels under objects' overlaps (m), as `gel.deform`."""
-    scale = cells(pitch)
+    scale = pixels_per_cell(pitch)
     low = F.avg_pool2d(overlap, scale)
     around = 2 * NEARBY_CELLS + 1
     contact = low > CONTACT_SHARE * F.max_pool2d(low, around, stride=1, padding=NEARBY_CELLS)
     smooth = low
-    for sigma in bulge:
+    for sigma in blur_sigmas:
         smooth = torch.where(contact, low, _blur(smooth, _gaussian(sigma / (pitch * scale), low)))
     smooth = _blur(smooth, _binomial(5, low))
     soft = _blur(contact.to(low), _binomial(5, low))
@@ -33,31 +33,31 @@ def deform(overlap: Fields, pitch: float, bulge: tuple[float, ...]) -> Fields:
     return _blur(smooth + soft * (overlap - low), _binomial(3, low))
 
 
-def colour_change(surface: Fields, unit: Unit) -> Float[Tensor, "b 3 h w"]:
+def colour_change(surface: Fields, instance: SensorInstance) -> Float[Tensor, "b 3 h w"]:
     """What gel surfaces at half the image's resolution add to the untouched image, counts."""
-    photometry, pitch = unit.photometry, 2 * unit.pixel_pitch
-    gain, response, shadow = (
+    calibration, pitch = instance.calibration, 2 * instance.pixel_pitch
+    illumination, response, shadow = (
         torch.as_tensor(a, dtype=surface.dtype, device=surface.device)
-        for a in (unit.gain, photometry.response, photometry.shadow)
+        for a in (instance.illumination, calibration.response, calibration.shadow)
     )
     _, h, w = surface.shape
     u = (4 * torch.arange(w).to(surface) + 1) / (2 * w - 1) - 1
     v = ((4 * torch.arange(h).to(surface) + 1) / (2 * h - 1) - 1)[:, None]
-    known = surface.clamp(max=photometry.deepest)
-    shadows = shadow_depth(known, pitch, photometry.light_azimuths, photometry.shadow_slope)
-    shadows = shadows / (shadows + photometry.penumbra)
+    known = surface.clamp(max=calibration.max_depth)
+    shadows = shadow_depth(known, pitch, calibration.light_azimuths, calibration.shadow_slope)
+    shadows = shadows / (shadows + calibration.penumbra)
     at_rest, along_u, along_v = torch.einsum(
-        "bkhw,ckm->mbchw", _features(surface, pitch, photometry), response
+        "bkhw,ckm->mbchw", _features(surface, pitch, calibration), response
     )
     lit = at_rest + u * along_u + v * along_v
-    return gain * (lit + torch.einsum("blhw,cl->bchw", shadows, shadow))
+    return illumination * (lit + torch.einsum("blhw,cl->bchw", shadows, shadow))
 
 
-def render(overlap: Fields, unit: Unit) -> Float[Tensor, "b 3 h2 w2"]:
+def render(overlap: Fields, instance: SensorInstance) -> Float[Tensor, "b 3 h2 w2"]:
     """Noise-free RGB pictures, counts, of overlaps (m) at half the pictures' resolution."""
-    surface = deform(overlap, 2 * unit.pixel_pitch, unit.photometry.bulge)
-    background = STEP * torch.as_tensor(unit.background).to(overlap)
-    change = F.interpolate(colour_change(surface, unit), scale_factor=2, mode="bilinear")
+    surface = deform(overlap, 2 * instance.pixel_pitch, instance.calibration.blur_sigmas)
+    background = COUNT_STEP * torch.as_tensor(instance.background).to(overlap)
+    change = F.interpolate(colour_change(surface, instance), scale_factor=2, mode="bilinear")
     return (background + change).clamp(0, 255)
 
 
@@ -65,7 +65,7 @@ def shadow_depth(
     surface: Fields, pitch: float, azimuths: tuple[float, ...], slope: float
 ) -> Float[Tensor, "b lights h w"]:
     """How far (m) each point lies below the shadow line of each light, as `gel.shadow_depth`."""
-    scale = cells(pitch)
+    scale = pixels_per_cell(pitch)
     low = F.avg_pool2d(surface, scale)
     third = torch.full((1, 3), 1 / 3).to(surface)[0]
     depths = []
@@ -80,15 +80,17 @@ def shadow_depth(
     return torch.stack(depths, 1)
 
 
-def _features(surface: Fields, pitch: float, photometry: Photometry) -> Float[Tensor, "b 10 h w"]:
+def _features(
+    surface: Fields, pitch: float, calibration: SensorCalibration
+) -> Float[Tensor, "b 10 h w"]:
     padded = F.pad(surface[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
     gx = (padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]) * (0.5 / pitch)
     gy = (padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]) * (0.5 / pitch)
     square = gx * gx + gy * gy
-    inverse = -torch.rsqrt(torch.maximum(1 + square, square / photometry.steepest**2))
+    inverse = -torch.rsqrt(torch.maximum(1 + square, square / calibration.max_slope**2))
     x, y = gx * inverse, gy * inverse
     xx, xy, yy = x * x, x * y, y * y
-    depth = surface.clamp(max=photometry.deepest)
+    depth = surface.clamp(max=calibration.max_depth)
     return torch.stack([x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y, depth], 1)
 
 

@@ -23,10 +23,10 @@ INCIPIENT = 0.25  # share of the normal force whose cells slip
 # Not all: cells that a sliding object has just reached are not loaded yet, and carry up to 1 %.
 GROSS = 0.98
 _ON_CONE = 0.99  # of the friction limit
-_MOST_LEAN = 0.9  # of a cell's normal force
+_MAX_CORRECTION = 0.9  # of a cell's normal force
 # What beyond friction's reach keeps the bristles' motion finite, as a share of their stiffness. The
 # force comes first: torsion gives way where the patch cannot bear both.
-_GIVE, _GIVE_TURN = 1e-5, 1e-3
+_REGULARIZATION, _REGULARIZATION_TORSION = 1e-5, 1e-3
 _FORCE_TOLERANCE = 1e-4  # of the friction limit
 
 
@@ -89,10 +89,10 @@ def _pool(pressure, area, out):
 
 @njit(cache=True, fastmath=True)
 @no_type_check
-def _lean(normal, pitch, place, mx, my):
+def _match_moments(normal, pitch, place, mx, my):
     """Weight the forces, linearly across the patch, so that their first moments become mx and my.
 
-    That neither moves nor spreads the patch; no cell loses or gains more than `_MOST_LEAN`.
+    That neither moves nor spreads the patch; no cell loses or gains more than `_MAX_CORRECTION`.
     """
     rows, columns = normal.shape
     load = sx = sy = sxx = sxy = syy = 0.0
@@ -124,7 +124,7 @@ def _lean(normal, pitch, place, mx, my):
             if normal[i, j] > 0.0:
                 x = (j - 0.5 * (columns - 1)) * pitch + place[0] - cx
                 most = max(most, abs(a * x + b * y))
-    share = _MOST_LEAN / max(most, _MOST_LEAN)
+    share = _MAX_CORRECTION / max(most, _MAX_CORRECTION)
     for i in range(rows):
         y = (i - 0.5 * (rows - 1)) * pitch + place[1] - cy
         for j in range(columns):
@@ -207,24 +207,24 @@ def _balance(bristles, stiffness, area, force_x, force_y, torsion):
     """The rigid motion (x, y, turn) of the tips that makes them carry force and torsion."""
     x, y, limit = bristles[0], bristles[1], bristles[4]
     most, radius = limit.sum(), math.sqrt((x * x + y * y).mean() + area)
-    give = _GIVE * stiffness * x.size
-    give_turn = _GIVE_TURN * stiffness * x.size * radius * radius
+    damping = _REGULARIZATION * stiffness * x.size
+    damping_turn = _REGULARIZATION_TORSION * stiffness * x.size * radius * radius
     ux = uy = turn = 0.0
     total, trial = np.empty(9), np.empty(9)
     _brush_sums(bristles, stiffness, ux, uy, turn, total)
     for _ in range(40):
-        g0 = total[0] - force_x + give * ux
-        g1 = total[1] - force_y + give * uy
-        g2 = total[2] - torsion + give_turn * turn
+        g0 = total[0] - force_x + damping * ux
+        g1 = total[1] - force_y + damping * uy
+        g2 = total[2] - torsion + damping_turn * turn
         if max(abs(g0), abs(g1), abs(g2) / radius) < _FORCE_TOLERANCE * most:
             break
         s0, s1, s2 = solve3(
-            total[3] + give,
+            total[3] + damping,
             total[4],
             total[5],
-            total[6] + give,
+            total[6] + damping,
             total[7],
-            total[8] + give_turn,
+            total[8] + damping_turn,
             -g0,
             -g1,
             -g2,
@@ -234,8 +234,10 @@ def _balance(bristles, stiffness, area, force_x, force_y, torsion):
         for _ in range(12):
             t0, t1, t2 = ux + step * s0, uy + step * s1, turn + step * s2
             _brush_sums(bristles, stiffness, t0, t1, t2, trial)
-            end = (trial[0] - force_x + give * t0) * s0 + (trial[1] - force_y + give * t1) * s1
-            end += (trial[2] - torsion + give_turn * t2) * s2
+            end = (trial[0] - force_x + damping * t0) * s0 + (
+                trial[1] - force_y + damping * t1
+            ) * s1
+            end += (trial[2] - torsion + damping_turn * t2) * s2
             if end <= -0.2 * start:
                 break
             step *= start / (start - end)
@@ -307,7 +309,7 @@ def force_field(
     slipping = np.zeros((rows, columns), bool)
     _pool(press.pressure, np.float32(press.pitch**2), normal)
     (fx, fy, _), (tx, ty, tz), (_, _, z) = contact.force, contact.torque, press.displacement
-    _lean(normal, pitch, press.displacement, ty - z * fx, -tx - z * fy)
+    _match_moments(normal, pitch, press.displacement, ty - z * fx, -tx - z * fy)
     slip_fraction = _brush(
         normal,
         tangential if before is None else before.tangential,

@@ -1,6 +1,6 @@
 """From the gel's surface to what the sensor's camera sees.
 
-The colours change with the surface's slopes and shadows as the unit's photometry says. They are
+The colours change with the surface's slopes and shadows as the unit's calibration says. They are
 computed at half the image's resolution, where the surface is, and blended onto the unit's own
 background and noise. Heights are metres into the gel.
 """
@@ -13,7 +13,7 @@ from jaxtyping import Float32, UInt8
 from numba import njit
 
 from touchgoal.control.tactile.sensor_calibration import shadows
-from touchgoal.sim_envs.tactile.sensor_instance import NOISE_MARGIN, STEP, Unit
+from touchgoal.sim_envs.tactile.sensor_instance import COUNT_STEP, NOISE_MARGIN, SensorInstance
 
 HeightField = Float32[np.ndarray, "h w"]
 
@@ -21,7 +21,7 @@ HeightField = Float32[np.ndarray, "h w"]
 @njit(inline="always", fastmath=True, error_model="numpy")
 @no_type_check
 def _response(x, y, depth, k):
-    """`photometry.features` of a normal and a depth, times their coefficients."""
+    """`sensor_calibration.shape_features` of a normal and a depth, times their coefficients."""
     xx, xy, yy = x * x, x * y, y * y
     linear = k[0] * x + k[1] * y + k[9] * depth
     quadratic = k[2] * xx + k[3] * xy + k[4] * yy
@@ -50,13 +50,13 @@ def _along(k, slope, v):
 @njit(cache=True, fastmath=True, error_model="numpy")
 @no_type_check
 def _colours(surface, per_pitch, response, limits, dark, shadow, gain, out):
-    """`photometry.shade` less the background, at half its resolution, planar."""
+    """`sensor_calibration.shade` less the background, at half its resolution, planar."""
     h, w = surface.shape
     half, one, zero = np.float32(0.5), np.float32(1.0), np.float32(0.0)
     across = ((4.0 * np.arange(w) + 1.0) / (2 * w - 1) - 1.0).astype(np.float32)
     scale = half * per_pitch
-    steepest, deepest = limits
-    flattest = one / (steepest * steepest)
+    max_slope, max_depth = limits
+    flattest = one / (max_slope * max_slope)
     nx, ny, pressed = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
     for i in range(h):
         row, above, below = surface[i], surface[max(i - 1, 0)], surface[min(i + 1, h - 1)]
@@ -66,7 +66,7 @@ def _colours(surface, per_pitch, response, limits, dark, shadow, gain, out):
             square = gx * gx + gy * gy
             inverse = -one / np.sqrt(max(one + square, square * flattest))
             nx[j], ny[j] = gx * inverse, gy * inverse
-            pressed[j] = min(row[j], deepest)
+            pressed[j] = min(row[j], max_depth)
         v = np.float32((4 * i + 1) / (2 * h - 1) - 1)
         d0, d1, d2 = dark[0, i], dark[1, i], dark[2, i]
         for c in range(3):
@@ -80,19 +80,19 @@ def _colours(surface, per_pitch, response, limits, dark, shadow, gain, out):
                 change[j] = light[j] * (lit + s0 * d0[j] + s1 * d1[j] + s2 * d2[j])
 
 
-def colour_change(surface: HeightField, unit: Unit) -> Float32[np.ndarray, "3 h w"]:
+def colour_change(surface: HeightField, instance: SensorInstance) -> Float32[np.ndarray, "3 h w"]:
     """What a gel's shape adds to the untouched image, counts; all at half its resolution."""
-    photometry, pitch = unit.photometry, 2 * unit.pixel_pitch
+    calibration, pitch = instance.calibration, 2 * instance.pixel_pitch
     change = np.empty((3, *surface.shape), np.float32)
-    limits = photometry.steepest, photometry.deepest
+    limits = calibration.max_slope, calibration.max_depth
     _colours(
         surface,
         np.float32(1 / pitch),
-        photometry.response,
+        calibration.response,
         tuple(np.float32(a) for a in limits),
-        shadows(photometry, surface, pitch),
-        photometry.shadow,
-        unit.gain,
+        shadows(calibration, surface, pitch),
+        calibration.shadow,
+        instance.illumination,
         change,
     )
     return change
@@ -105,7 +105,7 @@ def _blend(change, background, noise, oy, ox, out):
     _, h, w = change.shape
     near, far = np.float32(0.75), np.float32(0.25)
     zero, half, full = np.float32(0.0), np.float32(0.5), np.float32(255.0)
-    step = np.float32(STEP)
+    step = np.float32(COUNT_STEP)
     coarse, fine = np.empty(w + 2, np.float32), np.empty(2 * w, np.float32)
     for c in range(3):
         for i in range(2 * h):
@@ -126,23 +126,27 @@ def _blend(change, background, noise, oy, ox, out):
 
 
 def render(
-    surface: HeightField, unit: Unit, rng: np.random.Generator
+    surface: HeightField, instance: SensorInstance, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
     """RGB frame of a gel surface given at half the frame's resolution.
 
     `rng` picks which part of the noise tile this frame gets.
     """
-    change = colour_change(surface, unit)
+    change = colour_change(surface, instance)
     oy, ox = rng.integers(0, NOISE_MARGIN, 2)
-    planes = np.empty(unit.background.shape, np.uint8)
-    _blend(change, unit.background, unit.noise, oy, ox, planes)
+    planes = np.empty(instance.background.shape, np.uint8)
+    _blend(change, instance.background, instance.noise, oy, ox, planes)
     return cv2.merge([planes[0], planes[1], planes[2]])
 
 
-def render_untouched(unit: Unit, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
+def render_untouched(
+    instance: SensorInstance, rng: np.random.Generator
+) -> UInt8[np.ndarray, "h w 3"]:
     """RGB frame of a gel that nothing touches: background and noise alone."""
     oy, ox = rng.integers(0, NOISE_MARGIN, 2)
-    _, h, w = unit.background.shape
-    frame = unit.background + unit.noise[:, oy : oy + h, ox : ox + w]  # in steps
-    red, green, blue = np.clip(np.float32(STEP) * frame + np.float32(0.5), 0, 255).astype(np.uint8)
+    _, h, w = instance.background.shape
+    frame = instance.background + instance.noise[:, oy : oy + h, ox : ox + w]  # in steps
+    red, green, blue = np.clip(np.float32(COUNT_STEP) * frame + np.float32(0.5), 0, 255).astype(
+        np.uint8
+    )
     return cv2.merge([red, green, blue])

@@ -27,8 +27,8 @@ from touchgoal.sim_envs.tactile.geometry import (
 )
 from touchgoal.sim_envs.tactile.markers import GelMotion, draw
 from touchgoal.sim_envs.tactile.optics import render, render_untouched
-from touchgoal.sim_envs.tactile.press import Press, settle
-from touchgoal.sim_envs.tactile.sensor_instance import Unit
+from touchgoal.sim_envs.tactile.press import Press, press_until_balanced
+from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance
 from touchgoal.sim_envs.tactile.texture import add_texture
 
 _PRIMITIVES = {
@@ -84,9 +84,14 @@ class TactilePad:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, side: str, sensor: SensorModel, unit: Unit, bodies: list[Body]
+        self,
+        model: mujoco.MjModel,
+        side: str,
+        sensor: SensorModel,
+        instance: SensorInstance,
+        bodies: list[Body],
     ) -> None:
-        self._model, self._sensor, self._unit = model, sensor, unit
+        self._model, self._sensor, self._instance = model, sensor, instance
         self._site = model.site(f"{side}_sensor").id
         self._materials = {int(model.body(b.name).id): b.kind.material for b in bodies}
         self._geoms = {body: _solid_geoms(model, body) for body in self._materials}
@@ -97,11 +102,11 @@ class TactilePad:
             if int(model.geom_type[geom]) == _MESH
         }
         rows, columns = sensor.image_shape
-        pitch = unit.pixel_pitch
+        pitch = instance.pixel_pitch
         self._image_grid = Grid(rows // _FINE, columns // _FINE, pitch * _FINE)
         self._gel_grid = _gel_grid(sensor, pitch * _COARSE)
         self._field: ForceField | None = None
-        self._motion = self._gel_motion() if len(unit.markers) else None
+        self._motion = self._gel_motion() if len(instance.markers) else None
 
     def sense(
         self, data: mujoco.MjData, contact: PadContact, rng: np.random.Generator
@@ -115,17 +120,17 @@ class TactilePad:
         self._field = force_field(
             press, self._field, contact, self._friction(contact), self._sensor
         )
-        surface = deform(overlap, self._image_grid.pitch, self._unit.photometry.bulge)
-        image = render(surface, self._unit, rng)
+        surface = deform(overlap, self._image_grid.pitch, self._instance.calibration.blur_sigmas)
+        image = render(surface, self._instance, rng)
         if self._motion is not None:
-            moved = self._motion(self._field) / np.float32(self._unit.pixel_pitch)
-            draw(image, self._unit.markers + moved, self._unit.marker_radius)
+            moved = self._motion(self._field) / np.float32(self._instance.pixel_pitch)
+            draw(image, self._instance.markers + moved, self._instance.marker_radius)
         return TactileFrame(image, surface, overlap, self._field)
 
     def _untouched(self, rng: np.random.Generator) -> TactileFrame:
         self._field = None
-        image = render_untouched(self._unit, rng)
-        draw(image, self._unit.markers, self._unit.marker_radius)
+        image = render_untouched(self._instance, rng)
+        draw(image, self._instance.markers, self._instance.marker_radius)
         flat = np.zeros((self._image_grid.rows, self._image_grid.columns), np.float32)
         return TactileFrame(image, flat, flat, None)
 
@@ -133,7 +138,7 @@ class TactilePad:
         """How the printed dots follow the gel."""
         h, w = self._sensor.image_shape
         centre = np.array([w - 1, h - 1]) / 2
-        points = (self._unit.markers - centre) * self._unit.pixel_pitch
+        points = (self._instance.markers - centre) * self._instance.pixel_pitch
         return GelMotion(self._sensor, self._gel_grid, points)
 
     def _touched(self, contact: PadContact) -> list[int]:
@@ -152,7 +157,7 @@ class TactilePad:
     def _press(self, data: mujoco.MjData, contact: PadContact, touched: list[int]) -> Press:
         height = reduce(np.maximum, (self._height(data, b, self._gel_grid) for b in touched))
         modulus = min(self._modulus(self._materials[body]) for body in touched)
-        return settle(height, self._gel_grid.pitch, contact, modulus, self._sensor)
+        return press_until_balanced(height, self._gel_grid.pitch, contact, modulus, self._sensor)
 
     def _overlap(self, data: mujoco.MjData, press: Press, touched: list[int]) -> HeightField:
         """How deep the objects sit in the gel over the image, m."""
@@ -161,7 +166,7 @@ class TactilePad:
     def _one_overlap(self, data: mujoco.MjData, press: Press, body: int) -> HeightField:
         grid, material = self._image_grid, self._materials[body]
         height = self._height(data, body, grid)
-        press.seat(height, grid.pitch)
+        press.push_in(height, grid.pitch)
         position, rotation = self._pose(data, data.xpos[body], data.xmat[body])
         add_texture(height, grid.pitch, material, position - [0, 0, press.shift], rotation)
         share = self._modulus(material) / self._sensor.foundation_modulus

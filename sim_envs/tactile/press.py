@@ -45,7 +45,7 @@ class Press:
     pitch: float
     displacement: tuple[float, float, float]
 
-    def seat(self, height: HeightField, pitch: float) -> None:
+    def push_in(self, height: HeightField, pitch: float) -> None:
         """Move the object's height field, of any grid centred on the sensor frame, in place."""
         _add_plane(height, _columns(height, pitch), pitch, self.shift, *self.tilt)
 
@@ -164,7 +164,7 @@ def _room(value, step, limit):
 
 @njit(cache=True, fastmath=True)
 @no_type_check
-def _settle(height, xs, pitch, volume, mx, my, stiffness, limit):
+def _balance_press(height, xs, pitch, volume, mx, my, stiffness, limit):
     """Shift and slopes; forces in units of a cell's area times the foundation modulus."""
     top = np.empty(height.shape[0], np.float32)
     for i in range(height.shape[0]):
@@ -228,7 +228,7 @@ def _pressure(height, xs, pitch, shift, a, b, modulus, force, out):
         out *= np.float32(force / (total * pitch * pitch))
 
 
-def settle(
+def press_until_balanced(
     height: HeightField, pitch: float, contact: PadContact, modulus: float, sensor: SensorModel
 ) -> Press:
     """Push an object into the gel, and tilt it, until the pressure balances the solver's force.
@@ -258,6 +258,8 @@ def settle(
     mx = (float(torque[1]) - dz * float(force[0])) / stiffness - volume * dx
     my = (-float(torque[0]) - dz * float(force[1])) / stiffness - volume * dy
     xs = _columns(height, pitch)
-    shift, a, b = _settle(sheared, xs, pitch, volume, mx, my, TILT_STIFFNESS / stiffness, MAX_TILT)
+    shift, a, b = _balance_press(
+        sheared, xs, pitch, volume, mx, my, TILT_STIFFNESS / stiffness, MAX_TILT
+    )
     _pressure(sheared, xs, pitch, shift, a, b, modulus, normal, pressure)
     return Press(shift - a * dx - b * dy, (a, b), pressure, pitch, displacement)

@@ -9,22 +9,22 @@ from touchgoal.sim_envs.scene.build import build
 from touchgoal.sim_envs.scene.contacts import PadContact
 from touchgoal.sim_envs.scene.objects import Body
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
-from touchgoal.sim_envs.tactile.sensor_instance import Unit, sample_unit
+from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
 
-class PressRig:
+class PressBench:
     """Presses a body into the left sensor at a place and with a force of one's choice.
 
     Forces are taken as given, not solved for: any press can be asked for, possible or not.
     """
 
-    def __init__(self, body: Body, sensor: SensorModel, unit: Unit) -> None:
+    def __init__(self, body: Body, sensor: SensorModel, instance: SensorInstance) -> None:
         self._model = build([body]).compile()
         self._data = mujoco.MjData(self._model)
         mujoco.mj_forward(self._model, self._data)
         self._name = body.name
         self._geoms = frozenset({int(self._model.body(body.name).geomadr[0])})
-        self._pad = TactilePad(self._model, "left", sensor, unit, [body])
+        self._pad = TactilePad(self._model, "left", sensor, instance, [body])
 
     def place(
         self, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"] | None = None
@@ -65,9 +65,9 @@ def warm_up(bodies: list[Body], sensor: SensorModel) -> None:
     For a simulator that must keep up with a clock or a client.
     """
     rng = np.random.default_rng(0)
-    unit = sample_unit(sensor, rng)
+    instance = sample_instance(sensor, rng)
     for body in bodies:
-        rig = PressRig(body, sensor, unit)
-        rig.place(np.zeros(3))
+        bench = PressBench(body, sensor, instance)
+        bench.place(np.zeros(3))
         for _ in range(2):  # the second time the gel remembers the first
-            rig.sense(1.0, rng, shear=(0.1, 0.0))
+            bench.sense(1.0, rng, shear=(0.1, 0.0))

@@ -6,16 +6,21 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int8, Int16, Shaped
 
-from touchgoal.control.tactile.sensor_calibration import Photometry, gain, load, monomials
+from touchgoal.control.tactile.sensor_calibration import (
+    SensorCalibration,
+    illumination,
+    load,
+    monomials,
+)
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.sim_envs.tactile.markers import rest_positions
 
 NOISE_MARGIN = 64  # px by which the noise tile is larger than a frame
-STEP = 1 / 16  # counts: fine enough, and small enough numbers for the processor's cache
+COUNT_STEP = 1 / 16  # counts: fine enough, and small enough numbers for the processor's cache
 
 
 @dataclass(frozen=True)
-class Spread:
+class SensorRandomization:
     """How much units differ, for domain randomisation.
 
     Brightness: measured over real Minis (Tactile-MNIST: per-unit gain std 0.047; offset std 0.0094
@@ -26,7 +31,7 @@ class Spread:
         gain: standard deviation of each channel's response and brightness, relative.
         offset, pattern: standard deviations added to the background, counts.
         azimuth: largest turn of each light, degrees.
-        bulge: largest change of the gel's bulge, relative.
+        blur_sigmas: largest change of the gel's bulge, relative.
         pitch: whether the pixel pitch is drawn from the model's `pitch_range`.
         marker: largest shift (in pitches) and change of size (relative) of printed dots.
     """
@@ -35,30 +40,32 @@ class Spread:
     offset: float = 2.4
     pattern: float = 2.4
     azimuth: float = 15.0
-    bulge: float = 0.3
+    blur_sigmas: float = 0.3
     pitch: bool = True
     marker: float = 0.1
 
 
-NOMINAL = Spread(gain=0.0, offset=0.0, pattern=0.0, azimuth=0.0, bulge=0.0, pitch=False, marker=0.0)
+NO_RANDOMIZATION = SensorRandomization(
+    gain=0.0, offset=0.0, pattern=0.0, azimuth=0.0, blur_sigmas=0.0, pitch=False, marker=0.0
+)
 
 
 @dataclass(frozen=True)
-class Unit:
+class SensorInstance:
     """One sensor as it came from the factory.
 
     Attributes:
-        photometry: what its lights make of its gel's shape.
+        calibration: what its lights make of its gel's shape.
         background: the untouched frame, RGB in STEPs.
-        gain: how strongly the light falls, per channel, at half the image's resolution.
+        illumination: how strongly the light falls, per channel, at half the image's resolution.
         noise: tile of camera noise in STEPs, larger than the image by NOISE_MARGIN.
         markers: resting (x, y) of the gel's printed dots, px; none on a plain gel.
         marker_radius: px.
     """
 
-    photometry: Photometry
+    calibration: SensorCalibration
     background: Int16[np.ndarray, "3 h w"]
-    gain: Float32[np.ndarray, "3 h3 w3"]
+    illumination: Float32[np.ndarray, "3 h3 w3"]
     noise: Int8[np.ndarray, "3 h2 w2"]
     markers: Float32[np.ndarray, "n 2"]
     marker_radius: float
@@ -66,43 +73,47 @@ class Unit:
     @property
     def pixel_pitch(self) -> float:
         """m per pixel."""
-        return self.photometry.pixel_pitch
+        return self.calibration.pixel_pitch
 
 
-def sample_unit(
-    sensor: SensorModel, rng: np.random.Generator, spread: Spread | None = None
-) -> Unit:
+def sample_instance(
+    sensor: SensorModel, rng: np.random.Generator, randomization: SensorRandomization | None = None
+) -> SensorInstance:
     """A unit of a model, as the sensor file and the spread between units say.
 
     Raises:
         UserError: if the model's sensor file is missing or damaged.
     """
-    spread = spread or Spread()
+    randomization = randomization or SensorRandomization()
     typical = load(sensor.sensor_file)
-    brightness = 1 + spread.gain * rng.normal(size=3)
-    turns = np.radians(spread.azimuth) * rng.uniform(-1, 1, 3)
-    bulge = tuple(b * (1 + spread.bulge * rng.uniform(-1, 1)) for b in typical.bulge)
-    pitch = rng.uniform(*sensor.pitch_range) if spread.pitch else sensor.pixel_pitch
-    photometry = replace(
+    brightness = 1 + randomization.gain * rng.normal(size=3)
+    turns = np.radians(randomization.azimuth) * rng.uniform(-1, 1, 3)
+    blur_sigmas = tuple(
+        b * (1 + randomization.blur_sigmas * rng.uniform(-1, 1)) for b in typical.blur_sigmas
+    )
+    pitch = rng.uniform(*sensor.pitch_range) if randomization.pitch else sensor.pixel_pitch
+    calibration = replace(
         typical,
         pixel_pitch=pitch,
         response=_turned(typical.response, turns) * brightness[:, None, None].astype(np.float32),
-        bulge=bulge,
+        blur_sigmas=blur_sigmas,
     )
     h, w = sensor.image_shape
     smooth = cv2.resize(rng.normal(0, 1, (4, 5, 3)), (w, h), interpolation=cv2.INTER_CUBIC)
     background = typical.background * brightness
-    background += spread.offset * rng.normal(size=3) + spread.pattern * smooth
+    background += randomization.offset * rng.normal(size=3) + randomization.pattern * smooth
     tile = (h + NOISE_MARGIN, w + NOISE_MARGIN, 3)
     common = np.sqrt(0.3)  # of the noise variance is the same in all channels
     noise = common * rng.normal(size=(*tile[:2], 1)) + np.sqrt(0.7) * rng.normal(size=tile)
-    markers, radius = _markers(sensor, pitch, spread.marker, rng)
-    light = cv2.resize(gain(typical.background), (w // 2, h // 2), interpolation=cv2.INTER_AREA)
-    return Unit(
-        photometry,
-        _planar(background / STEP, np.int16),
+    markers, radius = _markers(sensor, pitch, randomization.marker, rng)
+    light = cv2.resize(
+        illumination(typical.background), (w // 2, h // 2), interpolation=cv2.INTER_AREA
+    )
+    return SensorInstance(
+        calibration,
+        _planar(background / COUNT_STEP, np.int16),
         _planar(light, np.float32),
-        _planar(np.clip(typical.noise / STEP * noise, -127, 127), np.int8),
+        _planar(np.clip(typical.noise / COUNT_STEP * noise, -127, 127), np.int8),
         markers,
         radius,
     )
@@ -131,12 +142,12 @@ def _turned(
 
 
 def _markers(
-    sensor: SensorModel, pitch: float, spread: float, rng: np.random.Generator
+    sensor: SensorModel, pitch: float, randomization: float, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "n 2"], float]:
     if sensor.markers is None:
         return np.empty((0, 2), np.float32), 1.0
     grid = sensor.markers
-    shift = spread * rng.uniform(-1, 1, 2) * grid.pitch / pitch
-    size = 1 + spread * rng.uniform(-1, 1)
+    shift = randomization * rng.uniform(-1, 1, 2) * grid.pitch / pitch
+    size = 1 + randomization * rng.uniform(-1, 1)
     rest = rest_positions(grid, sensor.image_shape, pitch) + shift.astype(np.float32)
     return rest, size * grid.diameter / pitch / 2

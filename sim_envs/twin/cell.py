@@ -7,23 +7,25 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.safety.braking import braked
+from touchgoal.control.safety.braking import braked_velocity
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH, GRIPPER_SPEED, FrankaTactileEnv
 from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE, SERVO_DAMPING
 
 DT = 1e-3  # s, of the Franka control interface and of the physics
 AT_REST = 0.01  # rad/s
-_FILTER = 0.02  # s, first order: how fast the arm's estimate of external torque follows; our choice
-_YIELD = 0.02  # s, likewise: how fast an arm that was hit gives way; our choice
+_TORQUE_FILTER_TIME = (
+    0.02  # s, first order: how fast the arm's estimate of external torque follows; our choice
+)
+_YIELD_TIME = 0.02  # s, likewise: how fast an arm that was hit gives way; our choice
 # rad/s^2 of a reflex: four times what motions may use. At once, a wrist would be asked for more torque
 # than it has, and chatter between both ends of it for good.
-_REFLEX = 40.0
+_REFLEX_DECELERATION = 40.0
 
 Joints = Float[np.ndarray, " n"]
 
 
 @dataclass
-class Grip:
+class GripperCommand:
     """What the gripper is told: width (m), its speed (m/s of width), force of each finger (N)."""
 
     width: float
@@ -32,7 +34,7 @@ class Grip:
 
 
 @dataclass
-class Worst:
+class WorstCase:
     """What has been worst since the episode began, for whoever injects faults.
 
     Attributes:
@@ -46,7 +48,7 @@ class Worst:
     force: float = 0.0
 
 
-class Cell:
+class SimulatedCell:
     """A task's cell, advanced a millisecond at a time and judged once a control tick.
 
     The arm is position controlled with velocity feed-forward, so that it follows its set-point
@@ -57,7 +59,7 @@ class Cell:
         q, dq: measured joint positions (rad) and velocities (rad/s).
         q_d, dq_d: their set-points.
         tau_ext: torque (N m) on each joint from outside, filtered.
-        grip: the gripper's orders.
+        gripper_command: the gripper's orders.
     """
 
     def __init__(self, env: FrankaTactileEnv, seed: int, options: dict[str, Any]) -> None:
@@ -77,50 +79,54 @@ class Cell:
         self._torque: Joints | None = None
         self._braking: Joints | None = None
         self._yielding = False
-        self._nudge, self._nudged_until = np.zeros(3), 0.0
+        self._nudge_force, self._nudged_until = np.zeros(3), 0.0
         self.time, self._steps = 0.0, 0
         self.q_d, self.dq_d, self.tau_ext = env.command.copy(), np.zeros(n), np.zeros(n)
         self.q, self.dq = env.joints()
-        self.grip = Grip(env.width_target(), GRIPPER_SPEED, env.grasp_force)
-        self.worst = Worst()
+        self.gripper_command = GripperCommand(env.width_target(), GRIPPER_SPEED, env.grasp_force)
+        self.worst = WorstCase()
         self.progress, self.success, self.failures = 0.0, False, set[str]()
-        self._begun = False  # nobody knows when a client comes: the clock waits for the first grasp
+        self._grasp_begun = (
+            False  # nobody knows when a client comes: the clock waits for the first grasp
+        )
         self._rest_since = 0.0
 
     # What arms and grippers command.
 
-    def follow(self, q_d: Joints, dq_d: Joints) -> None:
+    def set_target(self, q_d: Joints, dq_d: Joints) -> None:
         """Be at `q_d` (rad), moving with `dq_d` (rad/s)."""
-        self._release(torque=False)
+        self._enter_control_mode(torque=False)
         self.q_d, self.dq_d = q_d, dq_d
 
-    def push(self, torque: Joints) -> None:
+    def set_torque(self, torque: Joints) -> None:
         """Apply torques (N m) to the joints, on top of gravity compensation."""
         if self._torque is None:
-            self._release(torque=True)
+            self._enter_control_mode(torque=True)
         self._torque = torque
 
     def brake(self, acceleration: Joints) -> None:
         """Bring the set-point to rest, by rad/s^2 for each joint."""
         if self._torque is not None:
             self.q_d, self.dq_d = self.q.copy(), self.dq.copy()
-        self._release(torque=False)
+        self._enter_control_mode(torque=False)
         self._braking = acceleration
 
-    def yield_(self) -> None:
+    def give_way(self) -> None:
         """Stop here, as hard as a reflex does, and then give way to what presses."""
-        self._release(torque=False)
+        self._enter_control_mode(torque=False)
         self.q_d, self.dq_d, self._yielding = self.q.copy(), self.dq.copy(), True
 
-    def grasp(self, width: float, speed: float, force: float) -> None:
+    def command_gripper(self, width: float, speed: float, force: float) -> None:
         """Send the gripper to `width` (m) at `speed` (m/s), pressing with `force` (N) a finger."""
         width = float(np.clip(width, 0.0, GRIPPER_MAX_WIDTH))
-        self._begun |= width < self.grip.width
-        self.grip = Grip(width, min(speed, GRIPPER_SPEED), min(force, GRIPPER_MAX_FORCE / 2))
+        self._grasp_begun |= width < self.gripper_command.width
+        self.gripper_command = GripperCommand(
+            width, min(speed, GRIPPER_SPEED), min(force, GRIPPER_MAX_FORCE / 2)
+        )
 
     def nudge(self, force: Float[np.ndarray, "3"], seconds: float) -> None:
         """Push the hand with a force (N, base frame) for a while, as a person might."""
-        self._nudge, self._nudged_until = force, self.time + seconds
+        self._nudge_force, self._nudged_until = force, self.time + seconds
 
     # Time.
 
@@ -131,24 +137,30 @@ class Cell:
         if self._steps % tick == 0:
             env.begin_tick()
         if self._braking is not None:
-            self.dq_d = braked(self.dq_d, self._braking, DT)
+            self.dq_d = braked_velocity(self.dq_d, self._braking, DT)
             self.q_d = self.q_d + DT * self.dq_d
         if self._yielding:
-            self.dq_d = braked(self.dq_d, np.full_like(self.dq_d, _REFLEX), DT)
-            self.q_d = self.q_d + DT * self.dq_d + (DT / _YIELD) * (self.q - self.q_d)
-        pushed = self._push()
-        env.grasp_force = self.grip.force
+            self.dq_d = braked_velocity(
+                self.dq_d, np.full_like(self.dq_d, _REFLEX_DECELERATION), DT
+            )
+            self.q_d = self.q_d + DT * self.dq_d + (DT / _YIELD_TIME) * (self.q - self.q_d)
+        pushed = self._apply_nudge()
+        env.grasp_force = self.gripper_command.force
         if self._torque is not None:
             env.data.qfrc_applied[env.arm_dofs] = self._torque
             self.q_d, self.dq_d = self.q, self.dq
-        env.advance(self.q_d + SERVO_DAMPING * self.dq_d, self.grip.width, self.grip.speed)
+        env.step_physics(
+            self.q_d + SERVO_DAMPING * self.dq_d,
+            self.gripper_command.width,
+            self.gripper_command.speed,
+        )
         self._steps += 1
         self.time = self._steps * DT
-        self._measure(pushed)
+        self._update_measurements(pushed)
         if self._steps % tick == 0:
-            env.refresh()
-            self.progress, self.success = env.end_tick(self._begun)
-            self.failures.update(env.troubles())
+            env.update_contacts()
+            self.progress, self.success = env.end_tick(self._grasp_begun)
+            self.failures.update(env.failures())
             force = float(np.linalg.norm(env.external_wrench()[:3]))
             self.worst.force = max(self.worst.force, force)
 
@@ -196,9 +208,9 @@ class Cell:
             "progress": float(self.progress),
             "success": bool(self.success),
             "failures": sorted(self.failures),
-            "layout": self.env.layout(),
+            "layout": self.env.scene_layout(),
             "pad_forces": [pad.normal_force for pad in self.env.pad_contacts()],
-            "facts": self.env.facts(),
+            "facts": self.env.episode_info(),
             "q": self.q.tolist(),
             "dq": self.dq.tolist(),
             "q_d": self.q_d.tolist(),
@@ -213,10 +225,10 @@ class Cell:
     def _tick_steps(self) -> int:
         return round(1 / (self.env.config.control_hz * DT))
 
-    def _push(self) -> Joints:
+    def _apply_nudge(self) -> Joints:
         """Apply the nudge; its torque (N m) on each joint."""
         env = self.env
-        force = self._nudge if self.time < self._nudged_until else np.zeros(3)
+        force = self._nudge_force if self.time < self._nudged_until else np.zeros(3)
         hand = env.model.body("hand").id
         env.data.xfrc_applied[hand, :3] = force
         if not force.any():
@@ -225,11 +237,11 @@ class Cell:
         mujoco.mj_jac(env.model, env.data, jacobian, None, env.data.xipos[hand], hand)
         return force @ jacobian[:, env.arm_dofs]
 
-    def _measure(self, pushed: Joints) -> None:
+    def _update_measurements(self, pushed: Joints) -> None:
         env, limits = self.env, self.env.robot.hardware
         self.q, self.dq = env.joints()
         now = env.joint_contact_torque() + pushed
-        self.tau_ext = self.tau_ext + (DT / _FILTER) * (now - self.tau_ext)
+        self.tau_ext = self.tau_ext + (DT / _TORQUE_FILTER_TIME) * (now - self.tau_ext)
         if self.moving:
             self._rest_since = self.time
         worst = self.worst
@@ -237,7 +249,7 @@ class Cell:
         worst.excess = max(worst.excess, float(outside))
         worst.speed = max(worst.speed, float((np.abs(self.dq) / limits.velocity).max()))
 
-    def _release(self, torque: bool) -> None:
+    def _enter_control_mode(self, torque: bool) -> None:
         """Leave braking and yielding, and change between position servo and torque control."""
         self._braking, self._yielding = None, False
         if torque == (self._torque is not None):

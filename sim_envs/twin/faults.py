@@ -26,14 +26,14 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from touchgoal.control.errors import UserError
-from touchgoal.sim_envs.twin.cell import DT, Cell
+from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.mjpeg import Stream
 from touchgoal.sim_envs.twin.serial.devices import SerialPort
-from touchgoal.sim_envs.twin.tcp_ports import Door
+from touchgoal.sim_envs.twin.tcp_ports import ListeningPort
 
 
 @runtime_checkable
-class Arm(Protocol):
+class FaultyArm(Protocol):
     """What can go wrong with an arm's controller and its link."""
 
     def freeze(self, frozen: bool) -> None:
@@ -49,30 +49,32 @@ class Arm(Protocol):
         """Stop with an error; UserError if there is none of that name."""
 
 
-class Faults:
+class ControlPort:
     """Serves the lines above at a port of its own."""
 
     def __init__(
         self,
-        cell: Cell,
-        arm: Arm,
+        cell: SimulatedCell,
+        arm: FaultyArm,
         streams: dict[str, Stream],
         ports: dict[str, SerialPort],
         host: str,
         port: int,
     ) -> None:
         self._cell, self._arm, self._streams, self._ports = cell, arm, streams, ports
-        self._door = Door(host, port)
-        self._frozen = 0.0  # s left, simulated: a slow machine would end it before a packet is lost
-        self.address = f"{host}:{self._door.port}"
+        self._listener = ListeningPort(host, port)
+        self._frozen_seconds = (
+            0.0  # s left, simulated: a slow machine would end it before a packet is lost
+        )
+        self.address = f"{host}:{self._listener.port}"
 
     def receive(self) -> None:
         """Do what has been asked."""
-        if self._frozen > 0:
-            self._frozen -= DT
-            if self._frozen <= 0:
+        if self._frozen_seconds > 0:
+            self._frozen_seconds -= DT
+            if self._frozen_seconds <= 0:
                 self._arm.freeze(False)
-        for client in self._door.poll():
+        for client in self._listener.poll():
             for line in client.lines():
                 client.send(json.dumps(self._answer(line)).encode() + b"\n")
 
@@ -81,7 +83,7 @@ class Faults:
 
     def close(self) -> None:
         """Free the port."""
-        self._door.close()
+        self._listener.close()
 
     def _answer(self, line: str) -> dict[str, Any]:
         command, _, rest = line.partition(" ")
@@ -93,9 +95,9 @@ class Faults:
             "stop-button": lambda: self._arm.stop_button({"on": True, "off": False}[rest]),
             "error": lambda: self._arm.abort(rest),
             "nudge": lambda: self._nudge(*(float(number) for number in rest.split())),
-            "stall": lambda: self._spoil("stalled", *rest.split()),
-            "repeat": lambda: self._spoil("frozen", *rest.split()),
-            "lose": lambda: self._spoil("lost", *rest.split()),
+            "stall": lambda: self._set_stream_fault("stalled", *rest.split()),
+            "repeat": lambda: self._set_stream_fault("frozen", *rest.split()),
+            "lose": lambda: self._set_stream_fault("lost", *rest.split()),
             "garble": lambda: self._garble(*rest.split()),
             "unplug": lambda: self._ports[rest].unplug(),
             "plug": lambda: self._ports[rest].plug(),
@@ -115,19 +117,19 @@ class Faults:
 
     def _freeze(self, seconds: float) -> None:
         self._arm.freeze(True)
-        self._frozen = seconds
+        self._frozen_seconds = seconds
 
     def _nudge(self, x: float, y: float, z: float, seconds: float) -> None:
         self._cell.nudge(np.array([x, y, z]), seconds)
 
-    def _spoil(self, fault: str, name: str, seconds: str) -> None:
+    def _set_stream_fault(self, fault: str, name: str, seconds: str) -> None:
         setattr(self._streams[name], fault, time.monotonic() + float(seconds))
 
     def _garble(self, name: str, share: str) -> None:
         self._ports[name].garble = float(share)
 
 
-def ask(address: str, line: str) -> dict[str, Any]:
+def ask_twin(address: str, line: str) -> dict[str, Any]:
     """Send one line to a twin's port (`host:port`) and return the answer.
 
     Raises:

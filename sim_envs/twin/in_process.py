@@ -1,4 +1,4 @@
-"""A rig with `arm = "sim"`: the twin's cell behind the drivers' protocols, in this process.
+"""A cell file with `arm = "sim"`: the twin's cell behind the drivers' protocols, in this process.
 
 Nothing runs by itself: the cell goes on while the control loop waits for its next tick, and stamps
 count simulated time. So a run repeats exactly, on however slow a machine; it never runs faster than
@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.control.cell.config import Rig
-from touchgoal.control.cell.connection import Station, limits_of
+from touchgoal.control.cell.config import CellConfig
+from touchgoal.control.cell.connection import CellConnection, cell_limits
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import (
     ArmReading,
@@ -25,21 +25,23 @@ from touchgoal.control.interfaces import (
 )
 from touchgoal.control.motion.tracker import Tracker, TrackerState
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
-from touchgoal.sim_envs.base import GRIPPER_SPEED, STREAMED
+from touchgoal.sim_envs.base import GRIPPER_SPEED, STREAM_SIZE
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.tasks import TaskConfig, make_env
-from touchgoal.sim_envs.twin.cell import DT, Cell
+from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 
-_HOLDS = 0.005  # m between the width asked for and the width there is, that mean something is held
+_HELD_GAP = (
+    0.005  # m between the width asked for and the width there is, that mean something is held
+)
 
 
 class SimulatedClock:
     """See Clock; waiting advances the cell, and what moves it."""
 
-    def __init__(self, cell: Cell, arm: "SimulatedArm") -> None:
+    def __init__(self, cell: SimulatedCell, arm: "SimulatedArm") -> None:
         self._cell, self._arm = cell, arm
-        self._due = time.monotonic()
+        self._next_step_at = time.monotonic()
 
     def now(self) -> float:
         """Simulated s."""
@@ -55,19 +57,21 @@ class SimulatedClock:
         while self._cell.time < until - DT / 2:
             self._arm.step()
             self._cell.step()
-        self._cell.env.refresh()
-        self._due = max(self._due, time.monotonic() - 1.0) + self._cell.time - begin
-        time.sleep(max(0.0, self._due - time.monotonic()))
+        self._cell.env.update_contacts()
+        self._next_step_at = (
+            max(self._next_step_at, time.monotonic() - 1.0) + self._cell.time - begin
+        )
+        time.sleep(max(0.0, self._next_step_at - time.monotonic()))
 
 
 class SimulatedArm:
     """The Arm protocol over the cell; targets go through the tracker, as with the real drivers."""
 
-    def __init__(self, cell: Cell, hz: float) -> None:
+    def __init__(self, cell: SimulatedCell, hz: float) -> None:
         self._cell, self._limits = cell, cell.env.robot.interface
         self._tracker = Tracker(self._limits, 1 / hz, DT)
         self._state: TrackerState | None = None
-        self._refusal = ""
+        self._refused_because = ""
 
     def read(self) -> ArmReading:
         """See Arm."""
@@ -77,31 +81,33 @@ class SimulatedArm:
             velocity=cell.dq.copy(),
             wrench=cell.env.external_wrench().copy(),
             torque=cell.tau_ext.copy(),
-            fault=self._refusal,
+            fault=self._refused_because,
             stamp=cell.time,
             time=cell.time,
         )
 
     def command(self, q: Joints) -> None:
         """See Arm."""
-        if self._refusal:
-            raise DriverError(f"no command is taken: {self._refusal}")
+        if self._refused_because:
+            raise DriverError(f"no command is taken: {self._refused_because}")
         limits = self._limits
         if not (np.isfinite(q).all() and (q >= limits.lower).all() and (q <= limits.upper).all()):
             raise UserError(f"the target {np.round(q, 3).tolist()} rad is beyond a joint's range")
         if self._state is None:
             self._state = self._tracker.start(self._cell.q_d.copy())
-        self._state = self._tracker.aim(self._state, q)
+        self._state = self._tracker.set_target(self._state, q)
 
     def stop(self) -> None:
         """See Arm."""
         self._state = None
-        self._refusal = self._refusal or "stopped on request; recover the arm to go on"
+        self._refused_because = (
+            self._refused_because or "stopped on request; recover the arm to go on"
+        )
         self._cell.brake(self._limits.acceleration)
 
     def recover(self) -> None:
         """See Arm."""
-        self._refusal = ""
+        self._refused_because = ""
 
     def close(self) -> None:
         """See Arm."""
@@ -113,24 +119,24 @@ class SimulatedArm:
             return
         before = self._state.q
         self._state = self._tracker.step(self._state)
-        self._cell.follow(self._state.q, (self._state.q - before) / DT)
+        self._cell.set_target(self._state.q, (self._state.q - before) / DT)
 
 
 class SimulatedGripper:
     """The Gripper protocol over the cell; it closes with `force` (N)."""
 
-    def __init__(self, cell: Cell, force: float) -> None:
+    def __init__(self, cell: SimulatedCell, force: float) -> None:
         self._cell, self._force = cell, force
 
     def read(self) -> GripperReading:
         """See Gripper."""
         cell = self._cell
         width = cell.env.width()
-        return GripperReading(width, width - cell.grip.width > _HOLDS, "", cell.time)
+        return GripperReading(width, width - cell.gripper_command.width > _HELD_GAP, "", cell.time)
 
     def command(self, width: float) -> None:
         """See Gripper."""
-        self._cell.grasp(width, GRIPPER_SPEED, self._force)
+        self._cell.command_gripper(width, GRIPPER_SPEED, self._force)
 
     def stop(self) -> None:
         """See Gripper."""
@@ -142,7 +148,7 @@ class SimulatedGripper:
 class SimulatedCamera:
     """The Camera protocol over one of the cell's; a picture is taken when it is looked at."""
 
-    def __init__(self, cell: Cell, name: str, rate: float) -> None:
+    def __init__(self, cell: SimulatedCell, name: str, rate: float) -> None:
         self._cell, self._name, self._rate = cell, name, rate
         self._frame: Frame | None = None
 
@@ -152,7 +158,7 @@ class SimulatedCamera:
         return self._rate
 
     @property
-    def trouble(self) -> str:
+    def problem(self) -> str:
         """See Camera."""
         return ""
 
@@ -168,24 +174,24 @@ class SimulatedCamera:
         """See Camera."""
 
     def _take(self) -> np.ndarray:
-        return self._cell.env.picture(self._name)
+        return self._cell.env.render_camera(self._name)
 
 
-class SimulatedFingertip(SimulatedCamera):
+class SimulatedTactileCamera(SimulatedCamera):
     """The TactileSensor protocol over one of the cell's."""
 
-    def __init__(self, cell: Cell, side: int, model: SensorModel) -> None:
+    def __init__(self, cell: SimulatedCell, side: int, model: SensorModel) -> None:
         super().__init__(cell, ft.TACTILE[side], model.frame_rate)
         self._side, self.model = side, model
 
     def _take(self) -> np.ndarray:
-        return self._cell.env.feel(self._side).image
+        return self._cell.env.read_tactile(self._side).image
 
 
 class SimulatedLoadCell:
     """The LoadCell protocol: under the table."""
 
-    def __init__(self, cell: Cell) -> None:
+    def __init__(self, cell: SimulatedCell) -> None:
         self._cell = cell
 
     def read(self) -> LoadReading:
@@ -196,41 +202,41 @@ class SimulatedLoadCell:
         """See LoadCell."""
 
 
-def simulate(rig: Rig, hz: float) -> Station:
-    """The station of a rig with `arm = "sim"`: its sensors, task and limits, in simulation."""
-    task = rig.task
+def simulate_cell(config: CellConfig, hz: float) -> CellConnection:
+    """The connection of a cell file with `arm = "sim"`: its sensors, task and limits, in simulation."""
+    task = config.task
     chosen = {"object": task.object, "wire": task.wire}
-    env = make_env(task_of(rig))
-    cell = Cell(env, task.seed, {name: value for name, value in chosen.items() if value})
-    env.refresh()
+    env = make_env(env_config_of(config))
+    cell = SimulatedCell(env, task.seed, {name: value for name, value in chosen.items() if value})
+    env.update_contacts()
     arm = SimulatedArm(cell, hz)
     cameras: dict[str, Camera] = {
         ft.IMAGE_PREFIX + name: SimulatedCamera(cell, name, camera.rate)
-        for name, camera in rig.cameras.items()
+        for name, camera in config.cameras.items()
     }
-    if rig.fingertips:
-        model = find_sensor(rig.sensor)
-        cameras |= {key: SimulatedFingertip(cell, i, model) for i, key in enumerate(ft.TACTILE)}
-    return Station(
-        limits_of(rig),
+    if config.fingertips:
+        model = find_sensor(config.sensor)
+        cameras |= {key: SimulatedTactileCamera(cell, i, model) for i, key in enumerate(ft.TACTILE)}
+    return CellConnection(
+        cell_limits(config),
         arm,
-        SimulatedGripper(cell, rig.gripper.force),
+        SimulatedGripper(cell, config.gripper.force),
         cameras,
-        SimulatedLoadCell(cell) if rig.load_cell else None,
+        SimulatedLoadCell(cell) if config.load_cell else None,
         SimulatedClock(cell, arm),
         cell.truth,
     )
 
 
-def task_of(rig: Rig) -> TaskConfig:
-    """The task's own options with the rig's sensors, at the rate of a deployment."""
-    task = BeadMazeConfig() if rig.task.name == "bead-maze" else PickPlaceConfig()
-    scene = replace(task.scene, sensor=rig.sensor)
+def env_config_of(config: CellConfig) -> TaskConfig:
+    """The task's own options with the cell's sensors, at the rate of a deployment."""
+    task = BeadMazeConfig() if config.task.name == "bead-maze" else PickPlaceConfig()
+    scene = replace(task.scene, sensor=config.sensor)
     return replace(
         task,
-        cameras=tuple(rig.cameras),
-        camera_size=STREAMED,
-        tactile=rig.fingertips is not None,
+        cameras=tuple(config.cameras),
+        camera_size=STREAM_SIZE,
+        tactile=config.fingertips is not None,
         scene=scene,
         control_hz=ft.CONTROL_HZ,
     )

@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import UInt8
 
 from touchgoal.control import features as ft
-from touchgoal.sim_envs.twin.cell import Cell
+from touchgoal.sim_envs.twin.cell import SimulatedCell
 
 _CAMERA_RATE = 30  # Hz, a webcam's
 _CAMERA_NOISE = 1.5  # counts: by it a driver tells a still scene from a frozen camera
 _QUALITY = 95  # of JPEG; real GelSight Minis send MJPEG, too
-_PATIENCE = 0.2  # s between looks at whether the stream is to end
+_POLL_INTERVAL = 0.2  # s between looks at whether the stream is to end
 
 Picture = UInt8[np.ndarray, "h w 3"]
 
@@ -28,32 +28,32 @@ class Stream:
 
     Attributes:
         rate: Hz, simulated.
-        take: takes a picture, RGB.
+        render: takes a picture, RGB.
         stalled, frozen, lost: until when (s, time.monotonic) nothing comes, one picture repeats, or
             clients are cut off and turned away.
     """
 
     rate: int
-    take: Callable[[], Picture]
+    render: Callable[[], Picture]
     stalled: float = 0.0
     frozen: float = 0.0
     lost: float = 0.0
-    watchers: int = 0
+    clients: int = 0
     count: int = 0
     picture: Picture | None = None
-    news: threading.Condition = field(default_factory=threading.Condition)
+    condition: threading.Condition = field(default_factory=threading.Condition)
 
     def publish(self) -> None:
         """A new picture for whoever watches."""
         now = time.monotonic()
-        if now < self.stalled or not self.watchers:
+        if now < self.stalled or not self.clients:
             return
-        picture = self.take()  # even if it is not shown: a sensor goes on feeling
-        with self.news:
+        picture = self.render()  # even if it is not shown: a sensor goes on feeling
+        with self.condition:
             if now >= self.frozen or self.picture is None:
                 self.picture = picture
             self.count += 1
-            self.news.notify_all()
+            self.condition.notify_all()
 
 
 class Streams:
@@ -63,7 +63,7 @@ class Streams:
         streams: by name, such as tactile_left.
     """
 
-    def __init__(self, cell: Cell, host: str, port: int) -> None:
+    def __init__(self, cell: SimulatedCell, host: str, port: int) -> None:
         self._cell, self._host = cell, host
         self._rng = np.random.default_rng(0)
         self._noise = np.empty(0)
@@ -74,9 +74,9 @@ class Streams:
         }
         if env.config.tactile:
             for side, key in enumerate(ft.TACTILE):
-                take = partial(self._feel, side)
+                render = partial(self._tactile_image, side)
                 name = key.removeprefix(ft.IMAGE_PREFIX)
-                self.streams[name] = Stream(round(env.sensor.frame_rate), take)
+                self.streams[name] = Stream(round(env.sensor.frame_rate), render)
         handler = type("Handler", (_Handler,), {"streams": self.streams})
         self._server = ThreadingHTTPServer((host, port), handler)
         self._server.daemon_threads = True
@@ -96,7 +96,7 @@ class Streams:
         """Take the pictures that are due."""
         due = [s for s in self.streams.values() if _is_due(self._cell.steps, s.rate)]
         if due:
-            self._cell.env.refresh()  # watched or not: watching must not change the physics
+            self._cell.env.update_contacts()  # watched or not: watching must not change the physics
         for stream in due:
             stream.publish()
 
@@ -108,15 +108,15 @@ class Streams:
         self._server.server_close()
 
     def _picture(self, camera: str) -> Picture:
-        picture = self._cell.env.picture(camera)
+        picture = self._cell.env.render_camera(camera)
         if self._noise.shape != picture.shape:
             self._noise = self._rng.normal(0.0, _CAMERA_NOISE, picture.shape)
         # one field of noise, shifted: drawing anew takes longer than the picture
         noise = np.roll(self._noise, self._rng.integers(0, picture.shape[:2]), axis=(0, 1))
         return np.clip(picture + noise, 0, 255).astype(np.uint8)
 
-    def _feel(self, side: int) -> Picture:
-        return self._cell.env.feel(side).image
+    def _tactile_image(self, side: int) -> Picture:
+        return self._cell.env.read_tactile(side).image
 
 
 def _is_due(steps: int, rate: int) -> bool:
@@ -141,21 +141,21 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(200)
         self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
         self.end_headers()
-        with stream.news:
-            stream.watchers += 1
+        with stream.condition:
+            stream.clients += 1
         try:
             self._serve(stream)
         except OSError:  # the client has gone
             pass
         finally:
-            with stream.news:
-                stream.watchers -= 1
+            with stream.condition:
+                stream.clients -= 1
 
     def _serve(self, stream: Stream) -> None:
         seen = stream.count
         while time.monotonic() >= stream.lost:
-            with stream.news:
-                if stream.count == seen and not stream.news.wait(_PATIENCE):
+            with stream.condition:
+                if stream.count == seen and not stream.condition.wait(_POLL_INTERVAL):
                     continue
                 seen, picture = stream.count, stream.picture
             assert picture is not None

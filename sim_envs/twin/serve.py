@@ -11,18 +11,18 @@ from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH
 from touchgoal.sim_envs.bead_maze import BeadMazeConfig
 from touchgoal.sim_envs.tactile.press_bench import warm_up
 from touchgoal.sim_envs.tasks import TaskConfig, make_env
-from touchgoal.sim_envs.twin.cell import DT, Cell
-from touchgoal.sim_envs.twin.faults import Faults
+from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
+from touchgoal.sim_envs.twin.faults import ControlPort
 from touchgoal.sim_envs.twin.franka.controller import FrankaArm
 from touchgoal.sim_envs.twin.franka.hand import FrankaHand
 from touchgoal.sim_envs.twin.mjpeg import Streams
 from touchgoal.sim_envs.twin.serial import devices as serial_ports
 from touchgoal.sim_envs.twin.ur.controller import UrController
 
-_BACKLOG = 0.1  # s behind real time beyond which the twin stops trying to catch up
+_MAX_BACKLOG = 0.1  # s behind real time beyond which the twin stops trying to catch up
 # s to wait for a client that drives the arm. In lock-step for as long as a loaded machine needs; in
 # real time about as long as a busy one hiccups.
-_LOCK_STEP_PATIENCE, _PATIENCE = 2.0, 0.1
+_LOCK_STEP_TIMEOUT, _CLIENT_TIMEOUT = 2.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -70,13 +70,13 @@ class Twin:
     with the clock.
 
     Attributes:
-        rig: where everything is, for whoever deploys on it.
+        description: where everything is, for whoever deploys on it.
         stopped: set it to end `run`.
     """
 
     def __init__(self, config: TwinConfig) -> None:
         scene = replace(config.task.scene, arm=config.arm)
-        self.cell = Cell(
+        self.cell = SimulatedCell(
             make_env(replace(config.task, scene=scene)), config.seed, dict(config.options)
         )
         env = self.cell.env
@@ -84,13 +84,13 @@ class Twin:
             env.config.tactile
         ):  # a client would lose the arm while code is loaded at the first touch
             warm_up(env.bodies, env.sensor)
-        self._lock_step, self._due = config.lock_step, time.monotonic()
+        self._lock_step, self._next_step_at = config.lock_step, time.monotonic()
         self.stopped = False
         self._services: list[Service] = []
         with ExitStack() as undo:
             undo.callback(self.close)
             try:
-                self.rig = self._open(config)
+                self.description = self._open(config)
             except OSError as error:
                 raise UserError(
                     f"cannot serve at {config.host} ({error.strerror}); if another twin is there, "
@@ -120,22 +120,22 @@ class Twin:
 
     def _keep_pace(self) -> None:
         now = time.monotonic()
-        allowed = 0.0 if self._lock_step else _BACKLOG
-        self._due = max(self._due + DT, now - allowed)
-        if self._due > now:
-            time.sleep(self._due - now)
+        allowed = 0.0 if self._lock_step else _MAX_BACKLOG
+        self._next_step_at = max(self._next_step_at + DT, now - allowed)
+        if self._next_step_at > now:
+            time.sleep(self._next_step_at - now)
 
     def _open(self, config: TwinConfig) -> dict[str, Any]:
-        """Open every service; returns the rig."""
+        """Open every service; returns the description."""
         cell, host, folder = self.cell, config.host, config.folder
         folder.mkdir(parents=True, exist_ok=True)
         services = self._services
         services.append(load_cell := serial_ports.LoadCell(cell, folder / "load_cell"))
         ports = {"load_cell": load_cell.port}
         if config.arm == "fr3":
-            patience = _LOCK_STEP_PATIENCE if config.lock_step else _PATIENCE
+            timeout = _LOCK_STEP_TIMEOUT if config.lock_step else _CLIENT_TIMEOUT
             services.append(hand := FrankaHand(cell, host))
-            services.append(arm := FrankaArm(cell, host, patience, hand.link))
+            services.append(arm := FrankaArm(cell, host, timeout, hand.link))
             gripper: dict[str, Any] = {"kind": "franka_hand", "address": host}
         else:
             services.append(arm := UrController(cell, host))
@@ -146,7 +146,7 @@ class Twin:
         gripper["force"] = cell.env.grasp_force  # with which the episode's object is to be held
         services.append(streams := Streams(cell, host, config.port))
         control = config.port + 1 if config.port else 0
-        services.append(faults := Faults(cell, arm, streams.streams, ports, host, control))
+        services.append(faults := ControlPort(cell, arm, streams.streams, ports, host, control))
         return {
             "arm": config.arm,
             "address": host,

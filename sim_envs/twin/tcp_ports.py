@@ -5,7 +5,7 @@ import socket
 _MOST_UNSENT = 1_000_000  # bytes a client may leave unread before it is cut off
 
 
-class Connection:
+class ClientConnection:
     """A client; what it has sent is in `unread` until someone takes it."""
 
     def __init__(self, sock: socket.socket) -> None:
@@ -48,7 +48,7 @@ class Connection:
         self.open = False
 
 
-class Door:
+class ListeningPort:
     """A listening port; `greeting` is said to every client."""
 
     def __init__(self, host: str, port: int, greeting: bytes = b"") -> None:
@@ -58,17 +58,17 @@ class Door:
         self._socket.listen(8)
         self._socket.setblocking(False)
         self._greeting = greeting
-        self.clients: list[Connection] = []
+        self.clients: list[ClientConnection] = []
 
     @property
     def port(self) -> int:
         """The port's number."""
         return self._socket.getsockname()[1]
 
-    def poll(self) -> list[Connection]:
+    def poll(self) -> list[ClientConnection]:
         """Let new clients in, hear the others, forget those who left."""
         try:
-            client = Connection(self._socket.accept()[0])
+            client = ClientConnection(self._socket.accept()[0])
             client.send(self._greeting)
             self.clients.append(client)
         except BlockingIOError:

@@ -16,12 +16,12 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.motion.kinematics import GELSIGHT_TCP, rotation_vector
 from touchgoal.control.safety.limits import FR3
 from touchgoal.sim_envs.scene.build import robot_model
-from touchgoal.sim_envs.twin.cell import DT, Cell
+from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.franka import limits, messages
 from touchgoal.sim_envs.twin.franka.limits import Setpoint, Thresholds
 from touchgoal.sim_envs.twin.franka.messages import MoveStatus, RobotCommand, RobotMode
 
-_LOST = 20  # packets in a row after which the arm stops: Franka's documentation
+_MAX_LOST_PACKETS = 20  # packets in a row after which the arm stops: Franka's documentation
 _POSITION, _VELOCITY, _POSE, _TWIST, _TORQUE = range(5)  # motion generators; 4 is none
 _EXTERNAL, _OTHER = 2, 3  # controllers
 _SETTERS = {
@@ -34,7 +34,7 @@ _SETTERS = {
     RobotCommand.SET_CARTESIAN_IMPEDANCE,
     RobotCommand.SET_GUIDING_MODE,
 }
-_STRONGEST = FR3.hardware.acceleration  # rad/s^2 of braking; a real reflex brakes harder
+_BRAKING = FR3.hardware.acceleration  # rad/s^2 of braking; a real reflex brakes harder
 
 Pose = Float[np.ndarray, "4 4"]
 
@@ -61,15 +61,15 @@ class FrankaArm:
     """Serves an arm at `host`, port 1337.
 
     Attributes:
-        patience: s to wait for a client's answer to each state before the cell goes on without it.
+        timeout: s to wait for a client's answer to each state before the cell goes on without it.
             Long: lock-step; the packet counts as lost only then.
         mode: idle, moving, in a reflex, or user-stopped.
         error: the error in force.
     """
 
-    def __init__(self, cell: Cell, host: str, patience: float, hand: messages.Link) -> None:
+    def __init__(self, cell: SimulatedCell, host: str, timeout: float, hand: messages.Link) -> None:
         """`hand`: the hand's link, which shares the arm's cable."""
-        self.cell, self.patience = cell, patience
+        self.cell, self.timeout = cell, timeout
         self.link = messages.Link(host, messages.ROBOT_PORT, messages.ROBOT_VERSION, wide=True)
         self.mode, self.error = RobotMode.IDLE, ""
         self._hand = hand
@@ -77,11 +77,11 @@ class FrankaArm:
         self._recovery: messages.Request | None = None
         self._cleared = False
         self._sent = self._echoed = 0
-        self._success = 1.0
+        self._success_rate = 1.0
         self._thresholds = Thresholds.default()
         self._ee, self._k = np.eye(4), np.eye(4)  # NE_T_EE and EE_T_K
         self._state = np.zeros((), messages.ROBOT_STATE)
-        self._rest()
+        self._reset_setpoint()
         self._describe_hand()
 
     # The twin's loop.
@@ -95,13 +95,13 @@ class FrankaArm:
         if motion is not None and not self.link.connected:
             self._end(None)
         elif motion is not None and motion.begun:
-            self._wait(motion)
+            self._wait_for_client(motion)
         if self._recovery is not None:
-            self._recover(self._recovery)
+            self._try_recovery(self._recovery)
 
     def send(self) -> None:
         """Look for faults after a millisecond, and send the state."""
-        contact = self._feel()
+        contact = self._estimate_wrench()
         if self._motion is not None:
             fault = limits.arm_fault(self.cell.q, self.cell.dq) or contact.fault
             if fault is not None:
@@ -123,7 +123,7 @@ class FrankaArm:
         self.error, self.mode = error, RobotMode.REFLEX
         self._end(MoveStatus.REFLEX_ABORTED)
         if error in ("joint_reflex", "cartesian_reflex"):
-            self.cell.yield_()
+            self.cell.give_way()
 
     def freeze(self, frozen: bool) -> None:
         """Let nothing through in either direction, or let it through again."""
@@ -144,18 +144,18 @@ class FrankaArm:
     def _end(self, status: MoveStatus | None) -> None:
         """End the motion, if there is one, tell the client how, and brake."""
         motion, self._motion = self._motion, None
-        self.cell.brake(_STRONGEST)
-        self._rest()
+        self.cell.brake(_BRAKING)
+        self._reset_setpoint()
         if motion is not None and status is not None:
-            self._send_state(self._feel())  # the error first, as on the robot
+            self._send_state(self._estimate_wrench())  # the error first, as on the robot
             self.link.answer(motion.request, status)
 
-    def _recover(self, request: messages.Request) -> None:
+    def _try_recovery(self, request: messages.Request) -> None:
         """Clear an error once the arm rests and nothing presses; answer when states have said so."""
         if self._cleared:
             self.link.answer(request, 0)
             self._recovery = None
-        elif not self.cell.moving and self._feel().fault is None:
+        elif not self.cell.moving and self._estimate_wrench().fault is None:
             self.mode, self.error, self._cleared = RobotMode.IDLE, "", True
 
     # Commands.
@@ -210,16 +210,16 @@ class FrankaArm:
         controller, generator = (int(n) for n in np.frombuffer(request.payload, "<u4", 2))
         if controller == _EXTERNAL:
             generator = _TORQUE
-        self._motion, self._success = Motion(request, generator, controller), 1.0
-        self.cell.follow(self.cell.q_d.copy(), np.zeros(7))
-        self._rest()
+        self._motion, self._success_rate = Motion(request, generator, controller), 1.0
+        self.cell.set_target(self.cell.q_d.copy(), np.zeros(7))
+        self._reset_setpoint()
         self.link.answer(request, MoveStatus.STARTED)
 
     # Set-points.
 
-    def _wait(self, motion: Motion) -> None:
+    def _wait_for_client(self, motion: Motion) -> None:
         """Give the client time to answer the last state; go on without, up to a point."""
-        deadline = time.monotonic() + self.patience
+        deadline = time.monotonic() + self.timeout
         while (
             self._motion is motion
             and self.link.connected
@@ -236,11 +236,11 @@ class FrankaArm:
             return
         lost = self._echoed < self._sent - 1
         motion.lost = motion.lost + 1 if lost else 0
-        self._success += 0.01 * ((not lost) - self._success)
-        if motion.lost > _LOST:
+        self._success_rate += 0.01 * ((not lost) - self._success_rate)
+        if motion.lost > _MAX_LOST_PACKETS:
             self.abort("communication_constraints_violation")
         elif lost and motion.generator != _TORQUE:
-            self._go_to(motion, self._last.q + DT * self._last.dq)
+            self._go_to(motion, self._setpoint.q + DT * self._setpoint.dq)
 
     def _take_orders(self) -> None:
         for datagram in self.link.orders():
@@ -252,9 +252,9 @@ class FrankaArm:
                 # Set-points that come after the arm has gone on without them are too old.
                 late = self._motion is not None and self._motion.lost > 0
                 if self._motion is not None and not (late and self._echoed < self._sent - 1):
-                    self._obey(self._motion, order)
+                    self._apply_order(self._motion, order)
 
-    def _obey(self, motion: Motion, order: np.void) -> None:
+    def _apply_order(self, motion: Motion, order: np.void) -> None:
         motion.begun, motion.lost = True, 0
         if order["finished"] or order["torque_finished"]:
             self._end(MoveStatus.SUCCESS)
@@ -265,27 +265,27 @@ class FrankaArm:
                 self.abort(fault)
                 return
             self._torque = torque
-            self.cell.push(torque)
+            self.cell.set_torque(torque)
         elif motion.generator == _POSITION:
             self._go_to(motion, order["q_c"].copy())
         elif motion.generator == _VELOCITY:
-            self._go_to(motion, self._last.q + DT * order["dq_c"])
+            self._go_to(motion, self._setpoint.q + DT * order["dq_c"])
         else:
             self._go_by_tcp(motion, order)
 
     def _go_to(self, motion: Motion, q: np.ndarray) -> None:
-        now = limits.after(self._last, q)
-        fault = limits.joint_fault(self._last, now, motion.generator in (_POSE, _TWIST))
+        now = limits.after(self._setpoint, q)
+        fault = limits.joint_fault(self._setpoint, now, motion.generator in (_POSE, _TWIST))
         if fault is not None:
             self.abort(fault)
             return
-        self._last = now
-        self.cell.follow(now.q, now.dq)
+        self._setpoint = now
+        self.cell.set_target(now.q, now.dq)
 
     def _go_by_tcp(self, motion: Motion, order: np.void) -> None:
         """One step of differential inverse kinematics from the last set-point."""
-        q = self._last.q
-        now, jacobian = self._at(q)
+        q = self._setpoint.q
+        now, jacobian = self._pose_and_jacobian(q)
         if motion.generator == _POSE:
             target = order["O_T_EE_c"].reshape(4, 4).T
             error = np.concatenate(
@@ -308,10 +308,10 @@ class FrankaArm:
 
     # State.
 
-    def _rest(self) -> None:
+    def _reset_setpoint(self) -> None:
         """What the next set-point is compared with, and the torque the next one."""
         zero = np.zeros(7)
-        self._last = Setpoint(self.cell.q_d.copy(), zero, zero)
+        self._setpoint = Setpoint(self.cell.q_d.copy(), zero, zero)
         self._torque = zero
 
     def _flange(self) -> Pose:
@@ -331,30 +331,30 @@ class FrankaArm:
         state["m_ee"], state["I_ee"] = 0.73, np.diag([0.001, 0.0025, 0.0017]).ravel()  # fr3.xml
         state["F_x_Cee"] = [-0.01, 0.0, 0.03]
 
-    def _at(self, q: np.ndarray) -> tuple[Pose, Float[np.ndarray, "6 7"]]:
+    def _pose_and_jacobian(self, q: np.ndarray) -> tuple[Pose, Float[np.ndarray, "6 7"]]:
         """Pose and Jacobian of the end effector, which a client may have moved off the TCP."""
         T = np.eye(4)
         T[:3, 3], R, jacobian = self.cell.kinematics(q, self._ee[:3, 3])
         T[:3, :3] = R @ self._ee[:3, :3]
         return T, jacobian
 
-    def _feel(self) -> limits.Contact:
+    def _estimate_wrench(self) -> limits.Contact:
         """Estimate the wrench from outside and judge it; joint torques say what it is."""
-        pose, jacobian = self._at(self.cell.q)
+        pose, jacobian = self._pose_and_jacobian(self.cell.q)
         self._pose, self._wrench = pose, _pseudo_inverse(jacobian) @ self.cell.tau_ext
-        return self._thresholds.judge(self.cell.tau_ext, self._wrench, self._last.ddq)
+        return self._thresholds.judge(self.cell.tau_ext, self._wrench, self._setpoint.ddq)
 
     def _send_state(self, contact: limits.Contact) -> None:
         cell, state, motion = self.cell, self._state, self._motion
         state["message_id"] = self._sent
         state["q"], state["dq"] = cell.q, cell.dq
         state["q_d"], state["dq_d"] = cell.q_d, cell.dq_d
-        state["ddq_d"] = self._last.ddq
+        state["ddq_d"] = self._setpoint.ddq
         state["theta"], state["dtheta"] = cell.q, cell.dq
         state["tau_J"] = cell.joint_torque
         state["tau_J_d"] = self._torque
         state["O_T_EE"] = self._pose.T.ravel()
-        wanted, jacobian = self._at(cell.q_d)
+        wanted, jacobian = self._pose_and_jacobian(cell.q_d)
         state["O_T_EE_d"] = state["O_T_EE_c"] = wanted.T.ravel()
         state["O_dP_EE_d"] = state["O_dP_EE_c"] = jacobian @ cell.dq_d
         state["elbow"] = cell.q[2], np.sign(cell.q[3])
@@ -370,7 +370,7 @@ class FrankaArm:
         state["controller_mode"] = motion.controller if moving else _OTHER
         # On this side of the wire 0 is idle, and none, which goes with torque, is 5.
         state["motion_generator_mode"] = motion.generator + 1 if moving else 0
-        state["control_command_success_rate"] = self._success if moving else 0.0
+        state["control_command_success_rate"] = self._success_rate if moving else 0.0
         self.link.send(state.tobytes())
         self._sent += 1
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH, GRIPPER_SPEED
 from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE
-from touchgoal.sim_envs.twin.cell import DT, Cell
+from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.franka import messages
 from touchgoal.sim_envs.twin.franka.messages import HandCommand, HandStatus
 
@@ -39,7 +39,7 @@ class FrankaHand:
     A grasp closes until something resists; closing on air fails, whatever width was expected.
     """
 
-    def __init__(self, cell: Cell, host: str) -> None:
+    def __init__(self, cell: SimulatedCell, host: str) -> None:
         self.cell = cell
         self.link = messages.Link(host, messages.HAND_PORT, messages.HAND_VERSION, wide=False)
         self._job: Job | None = None
@@ -52,7 +52,7 @@ class FrankaHand:
         for request in self.link.requests():
             self._handle(request)
         if self._job is not None:
-            self._follow_up(self._job)
+            self._update_job(self._job)
 
     def send(self) -> None:
         """Send the state."""
@@ -75,22 +75,22 @@ class FrankaHand:
         self._grasped = False
         numbers = np.frombuffer(request.payload, "<f8")
         if command == HandCommand.STOP:
-            cell.grasp(cell.env.width(), GRIPPER_SPEED, cell.grip.force)
+            cell.command_gripper(cell.env.width(), GRIPPER_SPEED, cell.gripper_command.force)
             self.link.answer(request, HandStatus.SUCCESS)
         elif command == HandCommand.HOMING:
             self._job = Job(request, [0.0, GRIPPER_MAX_WIDTH])
-            cell.grasp(0.0, GRIPPER_SPEED / 2, GRIPPER_MAX_FORCE / 4)
+            cell.command_gripper(0.0, GRIPPER_SPEED / 2, GRIPPER_MAX_FORCE / 4)
         elif command == HandCommand.MOVE:
             width, speed = numbers
             self._job = Job(request, [width])
-            cell.grasp(width, speed, GRIPPER_MAX_FORCE / 2)
+            cell.command_gripper(width, speed, GRIPPER_MAX_FORCE / 2)
         elif command == HandCommand.GRASP:
             # On the wire: width, then how much narrower and wider will do, then speed and force.
             width, inner, outer, speed, force = numbers
             self._job = Job(request, [0.0], (width - inner, width + outer))
-            cell.grasp(0.0, speed, force)
+            cell.command_gripper(0.0, speed, force)
 
-    def _follow_up(self, job: Job) -> None:
+    def _update_job(self, job: Job) -> None:
         width = self.cell.env.width()
         moved, job.width = abs(width - job.width), width
         job.still = job.still + DT if moved < _STILL * DT else 0.0
@@ -99,7 +99,7 @@ class FrankaHand:
         job.still = 0.0
         reached = job.targets.pop(0)
         if job.targets:
-            self.cell.grasp(job.targets[0], GRIPPER_SPEED / 2, GRIPPER_MAX_FORCE / 4)
+            self.cell.command_gripper(job.targets[0], GRIPPER_SPEED / 2, GRIPPER_MAX_FORCE / 4)
             return
         self._job = None
         status = HandStatus.SUCCESS

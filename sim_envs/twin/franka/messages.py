@@ -16,7 +16,7 @@ import numpy as np
 
 ROBOT_PORT, HAND_PORT = 1337, 1338
 ROBOT_VERSION, HAND_VERSION = 10, 3
-_PATIENCE = 0.5  # s that a client may take to read an answer
+_SEND_TIMEOUT = 0.5  # s that a client may take to read an answer
 
 
 def _floats(**sizes: int) -> list[tuple]:
@@ -204,11 +204,11 @@ class Link:
         self._version = version
         self._header = struct.Struct("<III" if wide else "<HII")
         self._status = struct.Struct("<B" if wide else "<H")
-        self._door = socket.socket()
-        self._door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        self._door.bind((host, port))
-        self._door.listen(1)
-        self._door.setblocking(False)
+        self._listener = socket.socket()
+        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self._listener.bind((host, port))
+        self._listener.listen(1)
+        self._listener.setblocking(False)
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._udp.bind((host, 0))
         self._udp.setblocking(False)
@@ -240,7 +240,7 @@ class Link:
             self.drop()
             return []
         self._unread += chunk
-        return list(self._split())
+        return list(self._parse_requests())
 
     def orders(self) -> list[bytes]:
         """Datagrams that have come in."""
@@ -280,19 +280,19 @@ class Link:
     def close(self) -> None:
         """Close everything."""
         self.drop()
-        self._door.close()
+        self._listener.close()
         self._udp.close()
 
     def _accept(self) -> bool:
         try:
-            self._tcp, _ = self._door.accept()
+            self._tcp, _ = self._listener.accept()
         except BlockingIOError:
             return False
         self._tcp.setblocking(False)
         self._tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return True
 
-    def _split(self):
+    def _parse_requests(self):
         size = self._header.size
         while len(self._unread) >= size:
             command, id, length = self._header.unpack_from(self._unread)
@@ -301,11 +301,11 @@ class Link:
             request = Request(command, id, self._unread[size:length])
             self._unread = self._unread[length:]
             if command == RobotCommand.CONNECT:
-                self._greet(request)
+                self._handshake(request)
             elif self.connected:
                 yield request
 
-    def _greet(self, request: Request) -> None:
+    def _handshake(self, request: Request) -> None:
         assert self._tcp is not None
         _, port = struct.unpack_from("<HH", request.payload)
         self._peer = self._tcp.getpeername()[0], port
@@ -318,12 +318,12 @@ class Link:
 
     def _flush(self) -> None:
         """Send what waits, unless the link is frozen; drop a client that does not take it."""
-        deadline = time.monotonic() + _PATIENCE
+        deadline = time.monotonic() + _SEND_TIMEOUT
         while self._unsent and self._tcp is not None and not self.frozen:
             try:
                 self._unsent = self._unsent[self._tcp.send(self._unsent) :]
             except BlockingIOError:
-                select.select([], [self._tcp], [], _PATIENCE)
+                select.select([], [self._tcp], [], _SEND_TIMEOUT)
                 if time.monotonic() > deadline:
                     self.drop()
             except OSError:

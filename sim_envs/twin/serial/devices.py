@@ -8,15 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from touchgoal.control.grippers.modbus import crc
-from touchgoal.control.sensors.load_cell import seal
+from touchgoal.control.sensors.load_cell import with_checksum
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH
-from touchgoal.sim_envs.twin.cell import DT, Cell
+from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 
 _LOAD_RATE = 80  # Hz, an HX711's faster rate
 NEWTONS_PER_COUNT, ZERO = 2e-4, 84_213  # of the load cell; a bridge is never balanced
 _LOAD_NOISE = 25.0  # counts
 
-_SLAVE, _ORDERS, _STATUS = 9, 1000, 2000  # Robotiq 2F manual: Modbus slave, first registers
+_SLAVE, _OUTPUT_REGISTERS, _INPUT_REGISTERS = (
+    9,
+    1000,
+    2000,
+)  # Robotiq 2F manual: Modbus slave, first registers
 _POSITIONS = 3, 230  # fully open and closed: where the stroke is linear
 _SPEEDS = 0.020, 0.150  # m/s at 0 and 255
 _FORCES = 20.0, 235.0  # N at 0 and 255
@@ -82,7 +86,7 @@ class LoadCell:
     the star, as four hexadecimal digits.
     """
 
-    def __init__(self, cell: Cell, path: Path) -> None:
+    def __init__(self, cell: SimulatedCell, path: Path) -> None:
         self.cell, self.port = cell, SerialPort(path)
         self._rng = np.random.default_rng(1)
         self._milliseconds = 0
@@ -99,7 +103,7 @@ class LoadCell:
         counts = ZERO + self.cell.env.table_load() / NEWTONS_PER_COUNT
         counts += self._rng.normal(0.0, _LOAD_NOISE)
         line = f"{self._milliseconds},{round(counts)}".encode()
-        self.port.write(seal(line, "crc16") + b"\r\n")
+        self.port.write(with_checksum(line, "crc16") + b"\r\n")
 
     def close(self) -> None:
         """Pull the plug."""
@@ -112,10 +116,10 @@ class Robotiq:
     Position 3 is the cell's 80 mm between the pads, 230 is closed.
     """
 
-    def __init__(self, cell: Cell, path: Path) -> None:
+    def __init__(self, cell: SimulatedCell, path: Path) -> None:
         self.cell, self.port = cell, SerialPort(path)
         self._unread = b""
-        self._orders = bytearray([0x01, 0, 0, 0, 0, 0])
+        self._output_registers = bytearray([0x01, 0, 0, 0, 0, 0])
         self._ready_in = 0.0  # s of activation left
         self._width, self._still = np.inf, 0.0
         self._goal: float | None = None
@@ -139,7 +143,7 @@ class Robotiq:
         if self._ready_in > 0:
             self._ready_in -= DT
             opening = self._ready_in > 1.0  # it opens, then closes
-            self.cell.grasp(GRIPPER_MAX_WIDTH if opening else 0.0, _SPEEDS[1], _FORCES[0])
+            self.cell.command_gripper(GRIPPER_MAX_WIDTH if opening else 0.0, _SPEEDS[1], _FORCES[0])
 
     def close(self) -> None:
         """Pull the plug."""
@@ -148,21 +152,21 @@ class Robotiq:
     def _serve(self, frame: bytes) -> bytes:
         function, register = struct.unpack_from(">xBH", frame)
         head = frame[:2]
-        if function == 16 and register >= _ORDERS:
-            first = 2 * (register - _ORDERS)
+        if function == 16 and register >= _OUTPUT_REGISTERS:
+            first = 2 * (register - _OUTPUT_REGISTERS)
             data = frame[7:-2]
-            self._orders[first : first + len(data)] = data
-            self._obey()
+            self._output_registers[first : first + len(data)] = data
+            self._apply_registers()
             return frame[:6]
-        if function in (3, 4) and register >= _STATUS:
+        if function in (3, 4) and register >= _INPUT_REGISTERS:
             (count,) = struct.unpack_from(">H", frame, 4)
-            first = 2 * (register - _STATUS)
+            first = 2 * (register - _INPUT_REGISTERS)
             data = self._status()[first : first + 2 * count]
             return head + bytes([len(data)]) + data
         return bytes([frame[0], function | 0x80, 1])  # illegal function
 
-    def _obey(self) -> None:
-        action, _, _, position, speed, force = self._orders[:6]
+    def _apply_registers(self) -> None:
+        action, _, _, position, speed, force = self._output_registers[:6]
         if not action & 0x01:
             self._ready_in, self._goal = -1.0, None  # reset
         elif self._ready_in < 0:
@@ -173,10 +177,12 @@ class Robotiq:
             goal = (1 - share) * GRIPPER_MAX_WIDTH
             if goal != self._goal:
                 self._goal, self._still = goal, 0.0
-            self.cell.grasp(goal, _between(_SPEEDS, speed), _between(_FORCES, force))
+            self.cell.command_gripper(
+                goal, _interpolate(_SPEEDS, speed), _interpolate(_FORCES, force)
+            )
         elif self._ready_in == 0 and self._goal is not None:
             self._goal = None  # without the go bit it stays where it is
-            self.cell.grip.speed = 0.0
+            self.cell.gripper_command.speed = 0.0
 
     def _status(self) -> bytes:
         if self._ready_in > 0:
@@ -187,11 +193,11 @@ class Robotiq:
         if self._goal is not None and abs(self._width - self._goal) > 2e-3:
             blocked = _STOPPED_CLOSING if self._width > self._goal else _STOPPED_OPENING
             found = blocked if self._still > _SETTLED else _MOVING
-        first = (self._orders[0] & 1) | going << 3 | state << 4 | found << 6
+        first = (self._output_registers[0] & 1) | going << 3 | state << 4 | found << 6
         opened, closed = _POSITIONS
         share = min(max(1 - self._width / GRIPPER_MAX_WIDTH, 0.0), 1.0)
         position = round(opened + share * (closed - opened))
-        return bytes([first, 0, 0, self._orders[3], position, 0])
+        return bytes([first, 0, 0, self._output_registers[3], position, 0])
 
 
 def _request_length(unread: bytes) -> int:
@@ -201,5 +207,5 @@ def _request_length(unread: bytes) -> int:
     return 9 + unread[6] if unread[1] == 16 else 8
 
 
-def _between(span: tuple[float, float], count: int) -> float:
+def _interpolate(span: tuple[float, float], count: int) -> float:
     return span[0] + (span[1] - span[0]) * count / 255

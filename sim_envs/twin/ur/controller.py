@@ -7,8 +7,8 @@ import numpy as np
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.limits import UR5E
-from touchgoal.sim_envs.twin.cell import DT, Cell
-from touchgoal.sim_envs.twin.tcp_ports import Connection, Door
+from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
+from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort
 from touchgoal.sim_envs.twin.ur import messages
 from touchgoal.sim_envs.twin.ur.messages import Package, Safety
 from touchgoal.sim_envs.twin.ur.program import UrProgram
@@ -24,7 +24,7 @@ _POWER_OFF, _IDLE, _RUNNING = 3, 5, 7  # robot_mode
 class Client:
     """One RTDE client: its recipes, and how often it wants data."""
 
-    def __init__(self, connection: Connection) -> None:
+    def __init__(self, connection: ClientConnection) -> None:
         self.connection = connection
         self.outputs: list[str] = []
         self.inputs: list[list[str]] = []
@@ -40,21 +40,26 @@ class UrController:
         safety: normal, protective stop or emergency stop.
     """
 
-    def __init__(self, cell: Cell, host: str) -> None:
+    def __init__(self, cell: SimulatedCell, host: str) -> None:
         self.cell = cell
         hello = b"Connected: Universal Robots Dashboard Server\n"
-        self._dashboard = Door(host, messages.DASHBOARD, hello)
-        self._script = Door(host, messages.SCRIPT)
-        self._rtde = Door(host, messages.RTDE)
-        self._silent = [Door(host, messages.PRIMARY), Door(host, messages.SECONDARY)]
-        self._clients: dict[Connection, Client] = {}
-        self._said: dict[str, float | Sequence[float]] = {}  # in this millisecond, to any client
+        self._dashboard = ListeningPort(host, messages.DASHBOARD, hello)
+        self._script = ListeningPort(host, messages.SCRIPT)
+        self._rtde = ListeningPort(host, messages.RTDE)
+        self._unused_ports = [
+            ListeningPort(host, messages.PRIMARY),
+            ListeningPort(host, messages.SECONDARY),
+        ]
+        self._clients: dict[ClientConnection, Client] = {}
+        self._values_sent: dict[
+            str, float | Sequence[float]
+        ] = {}  # in this millisecond, to any client
         self._inputs: dict[str, float] = dict.fromkeys(messages.INPUTS, 0)
         self.frozen = False
         self.safety, self._mode = Safety.NORMAL, _RUNNING
-        self._stopped_at = self._heard_at = 0.0
+        self._stopped_at = self._last_input_at = 0.0
         self._clock = 0.0
-        self._pace = 1.0
+        self._speed_fraction = 1.0
         self._program = self._new_program()
         self._program.running = False
 
@@ -64,36 +69,36 @@ class UrController:
         """Take what clients have sent; move the target on by a millisecond."""
         self._clock += DT
         if not self.frozen:
-            self._listen()
+            self._poll_clients()
         program = self._program
-        if program.running and self._clock - self._heard_at > program.watchdog:
+        if program.running and self._clock - self._last_input_at > program.watchdog:
             program.end()
         if program.running and self.cell.steps % _CYCLE == 0:
             program.cycle()
         if program.running and program.activity is not None:
-            q, dq = program.activity.step(self.cell.q_d, self.cell.dq_d, self._pace)
-            self.cell.follow(q, dq)
+            q, dq = program.activity.step(self.cell.q_d, self.cell.dq_d, self._speed_fraction)
+            self.cell.set_target(q, dq)
             hardware = UR5E.hardware
             if (q < hardware.lower).any() or (q > hardware.upper).any():
                 self.protective_stop()
 
     def send(self) -> None:
         """Look for collisions after a millisecond, and send data that is due."""
-        self._feel()
+        self._estimate_wrench()
         if self.safety is Safety.NORMAL and np.linalg.norm(self._wrench[:3]) > _FORCE_LIMIT:
             self.protective_stop()
-            self.cell.yield_()
+            self.cell.give_way()
         if self.frozen:
             return
-        self._said.clear()
+        self._values_sent.clear()
         for client in self._clients.values():
             if client.started and self.cell.steps % client.period == 0:
                 client.connection.send(messages.package(Package.DATA, self._data(client)))
 
     def close(self) -> None:
         """Free the ports."""
-        for door in (self._dashboard, self._script, self._rtde, *self._silent):
-            door.close()
+        for listener in (self._dashboard, self._script, self._rtde, *self._unused_ports):
+            listener.close()
 
     # Stops, from within and injected.
 
@@ -125,9 +130,9 @@ class UrController:
 
     # Clients.
 
-    def _listen(self) -> None:
+    def _poll_clients(self) -> None:
         if self.cell.steps % _SELDOM == 0:
-            self._listen_to_people()
+            self._poll_dashboard_and_script()
         connections = self._rtde.poll()
         self._clients = {c: self._clients.get(c) or Client(c) for c in connections}
         for connection, client in self._clients.items():
@@ -135,18 +140,18 @@ class UrController:
             for kind, payload in packages:
                 self._handle(client, kind, payload)
 
-    def _listen_to_people(self) -> None:
+    def _poll_dashboard_and_script(self) -> None:
         """Dashboard and scripts."""
         for client in self._dashboard.poll():
             for line in client.lines():
-                client.send(self._answer(line).encode() + b"\n")
+                client.send(self._dashboard_answer(line).encode() + b"\n")
         for client in self._script.poll():
             text = client.unread.strip()
             if text.startswith(b"def") and text.endswith(b"end"):
                 client.unread = b""
                 self._play(text.decode(errors="replace"))
-        for door in self._silent:
-            for client in door.poll():
+        for listener in self._unused_ports:
+            for client in listener.poll():
                 client.unread = b""
 
     def _handle(self, client: Client, kind: int, payload: bytes) -> None:
@@ -170,16 +175,16 @@ class UrController:
             client.started = kind == Package.START
             answer(b"\x01")
         elif kind == Package.DATA and 0 < payload[0] <= len(client.inputs):
-            self._take(client.inputs[payload[0] - 1], payload[1:])
+            self._take_inputs(client.inputs[payload[0] - 1], payload[1:])
 
-    def _take(self, names: list[str], payload: bytes) -> None:
+    def _take_inputs(self, names: list[str], payload: bytes) -> None:
         form = messages.layout(names, messages.INPUTS)
         if form.size != len(payload) or "external_force_torque" in names:
             return
         self._inputs.update(zip(names, form.unpack(payload), strict=True))
-        self._heard_at = self._clock
+        self._last_input_at = self._clock
         if "speed_slider_mask" in names and self._inputs["speed_slider_mask"]:
-            self._pace = float(np.clip(self._inputs["speed_slider_fraction"], 0.0, 1.0))
+            self._speed_fraction = float(np.clip(self._inputs["speed_slider_fraction"], 0.0, 1.0))
         if self._program.running:
             self._program.cycle()
 
@@ -190,12 +195,12 @@ class UrController:
             self._program.end()
             self._program = self._new_program()
             self._program.running = name is not None and name[1] == "rtde_control"
-            self._heard_at = self._clock
+            self._last_input_at = self._clock
 
     def _new_program(self) -> UrProgram:
         return UrProgram(self.cell, self._inputs, self.protective_stop)
 
-    def _answer(self, line: str) -> str:
+    def _dashboard_answer(self, line: str) -> str:
         """The dashboard's."""
         safety = self.safety.name
         running = self._program.running
@@ -246,7 +251,7 @@ class UrController:
 
     # Data.
 
-    def _feel(self) -> None:
+    def _estimate_wrench(self) -> None:
         """The wrench at the TCP that joint torques say is there, base frame."""
         _, _, J = self.cell.kinematics(self.cell.q, np.zeros(3))
         self._wrench = np.linalg.solve(J @ J.T + 1e-8 * np.eye(6), J @ self.cell.tau_ext)
@@ -254,9 +259,9 @@ class UrController:
     def _data(self, client: Client) -> bytes:
         numbers: list[float] = []
         for name in client.outputs:
-            value = self._said.get(name)
+            value = self._values_sent.get(name)
             if value is None:
-                value = self._said[name] = self._value(name)
+                value = self._values_sent[name] = self._value(name)
             numbers.extend(value if isinstance(value, Sequence) else [value])
         return b"\x01" + messages.layout(client.outputs, messages.OUTPUTS).pack(*numbers)
 
@@ -302,8 +307,8 @@ _VARIABLES = {
     "safety_mode": lambda c, p, cell: int(c.safety),
     "safety_status": lambda c, p, cell: int(c.safety),
     "safety_status_bits": lambda c, p, cell: c.safety.bits,
-    "speed_scaling": lambda c, p, cell: c._pace,
-    "target_speed_fraction": lambda c, p, cell: c._pace,
+    "speed_scaling": lambda c, p, cell: c._speed_fraction,
+    "target_speed_fraction": lambda c, p, cell: c._speed_fraction,
 }
 
 

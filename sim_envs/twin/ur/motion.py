@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control.motion.kinematics import rotation_matrix, rotation_vector
-from touchgoal.control.safety.braking import braked
-from touchgoal.sim_envs.twin.cell import DT, Cell
+from touchgoal.control.safety.braking import braked_velocity
+from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 
 _SERVO_ACCELERATION = 40.0  # rad/s^2, the most that ur-rtde lets a client ask for
 _STILL = 1e-3  # rad/s
@@ -21,8 +21,8 @@ Target = tuple[Joints, Joints]  # rad, rad/s
 class Activity(Protocol):
     """Something the arm is doing."""
 
-    def step(self, q: Joints, dq: Joints, pace: float) -> Target:
-        """The next millisecond's target after the last one; `pace`: the speed slider."""
+    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
+        """The next millisecond's target after the last one; `speed_fraction`: the speed slider."""
         ...
 
     @property
@@ -67,25 +67,25 @@ class JointMove:
 
     def __init__(self, goal: Joints, speed: float, acceleration: float) -> None:
         self._goal, self._speed, self._acceleration = goal, speed, acceleration
-        self._law: _Trapezoid | None = None
+        self._profile: _Trapezoid | None = None
 
-    def step(self, q: Joints, dq: Joints, pace: float) -> Target:
+    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
         """The next target."""
-        if self._law is None:
+        if self._profile is None:
             if np.abs(dq).max() > _STILL:
-                dq = braked(dq, np.full(6, self._acceleration), DT)
+                dq = braked_velocity(dq, np.full(6, self._acceleration), DT)
                 return q + DT * dq, dq
             self._start = q
             length = float(np.abs(self._goal - q).max())
-            self._law = _Trapezoid(length, self._speed, self._acceleration)
-        share, rate = self._law.advance(pace * DT)
+            self._profile = _Trapezoid(length, self._speed, self._acceleration)
+        share, rate = self._profile.advance(speed_fraction * DT)
         way = self._goal - self._start
-        return self._start + share * way, pace * rate * way * (not self.done)
+        return self._start + share * way, speed_fraction * rate * way * (not self.done)
 
     @property
     def done(self) -> bool:
         """Whether the goal is reached."""
-        return self._law is not None and self._law.time >= self._law.duration
+        return self._profile is not None and self._profile.time >= self._profile.duration
 
 
 class LineMove:
@@ -93,7 +93,7 @@ class LineMove:
 
     def __init__(
         self,
-        cell: Cell,
+        cell: SimulatedCell,
         offset: Float[np.ndarray, "3"],
         position: Float[np.ndarray, "3"],
         rotation: Float[np.ndarray, "3 3"],
@@ -104,11 +104,11 @@ class LineMove:
         self._from, self._R, _ = cell.kinematics(cell.q_d, offset)
         self._way, self._turn = position - self._from, rotation_vector(rotation @ self._R.T)
         length = max(float(np.linalg.norm(self._way)), float(np.linalg.norm(self._turn)))
-        self._law = _Trapezoid(length, speed, acceleration)
+        self._profile = _Trapezoid(length, speed, acceleration)
 
-    def step(self, q: Joints, dq: Joints, pace: float) -> Target:
+    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
         """The next target, by differential inverse kinematics that corrects its own drift."""
-        share, rate = self._law.advance(pace * DT)
+        share, rate = self._profile.advance(speed_fraction * DT)
         position, R, jacobian = self._cell.kinematics(q, self._offset)
         wanted = rotation_matrix(share * self._turn) @ self._R
         error = np.concatenate(
@@ -121,7 +121,7 @@ class LineMove:
     @property
     def done(self) -> bool:
         """Whether the goal is reached."""
-        return self._law.time >= self._law.duration
+        return self._profile.time >= self._profile.duration
 
 
 @dataclass
@@ -133,7 +133,7 @@ class Servo:
     lookahead: float
     done: bool = field(default=False, init=False)
 
-    def step(self, q: Joints, dq: Joints, pace: float) -> Target:
+    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
         """The next target."""
         wanted = np.clip((self.goal - q) / self.lookahead, -self.speed, self.speed)
         change = _SERVO_ACCELERATION * DT
@@ -147,10 +147,10 @@ class Speed:
 
     goal: Joints
     acceleration: float
-    cell: Cell | None = None
+    cell: SimulatedCell | None = None
     done: bool = field(default=False, init=False)
 
-    def step(self, q: Joints, dq: Joints, pace: float) -> Target:
+    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
         """The next target."""
         goal = self.goal
         if self.cell is not None:
@@ -169,7 +169,7 @@ class Stop:
     deceleration: float
     done: bool = field(default=False, init=False)
 
-    def step(self, q: Joints, dq: Joints, pace: float) -> Target:
+    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
         """The next target."""
         fastest = float(np.abs(dq).max())
         left = max(0.0, fastest - self.deceleration * DT)

@@ -12,13 +12,13 @@ from jaxtyping import Float
 
 from touchgoal.control.motion.kinematics import (
     GELSIGHT_TCP,
-    UR5E,
+    UR5E_ARM,
     Kinematics,
     rotation_matrix,
     rotation_vector,
 )
 from touchgoal.control.safety.limits import UR5E as ROBOT
-from touchgoal.sim_envs.twin.cell import Cell
+from touchgoal.sim_envs.twin.cell import SimulatedCell
 from touchgoal.sim_envs.twin.ur.motion import (
     Activity,
     JointMove,
@@ -48,7 +48,9 @@ class UrProgram:
         running: false once it has ended.
     """
 
-    def __init__(self, cell: Cell, inputs: dict[str, float], stop: Callable[[], None]) -> None:
+    def __init__(
+        self, cell: SimulatedCell, inputs: dict[str, float], stop: Callable[[], None]
+    ) -> None:
         """`stop` is what the program calls for a protective stop."""
         self.cell, self.inputs, self._protective_stop = cell, inputs, stop
         self.activity: Activity | None = None
@@ -58,7 +60,7 @@ class UrProgram:
         self.tcp = np.concatenate([_FLANGE_TO_TCP, np.zeros(3)])
         self._executing = self._waiting = self._asynchronous = False
         self._started = 0
-        self._kinematics = Kinematics(UR5E, GELSIGHT_TCP)
+        self._kinematics = Kinematics(UR5E_ARM, GELSIGHT_TCP)
 
     def cycle(self) -> None:
         """Look at the command register once: every 2 ms, and when a package arrives."""
@@ -72,13 +74,13 @@ class UrProgram:
             self.ints[2] = self._started << 24
         command = self._int(0)
         if command in _STREAMED:
-            self._do(command)
+            self._execute(command)
             self.ints[0] = _READY
         elif command == 0:
             self._executing, self.ints[0] = False, _READY
         elif not self._executing:
             self._executing, self.ints[0] = True, 0
-            self._do(command)
+            self._execute(command)
             if not self._waiting and self.running:
                 self.ints[0] = _DONE
 
@@ -89,7 +91,7 @@ class UrProgram:
 
     # Commands.
 
-    def _do(self, command: int) -> None:
+    def _execute(self, command: int) -> None:
         actions = {
             1: lambda: self._move(JointMove(self._doubles(0), self._double(6), self._double(7))),
             2: lambda: self._move_to_pose(),
@@ -109,14 +111,14 @@ class UrProgram:
             33: lambda: self._stop(asynchronous=self._int(1) == 1),
             34: lambda: self._stop(asynchronous=self._int(1) == 1),
             35: self._set_watchdog,
-            36: lambda: self._say(bool(np.linalg.norm(self._doubles(0)[:3]) < _REACH)),
-            37: lambda: self._say(_inside(self._doubles(0))),
+            36: lambda: self._answer_bool(bool(np.linalg.norm(self._doubles(0)[:3]) < _REACH)),
+            37: lambda: self._answer_bool(_inside(self._doubles(0))),
             38: lambda: self._answer(self.cell.joint_torque),
             40: lambda: self._answer(self.tcp),
             43: lambda: self._answer(self.pose(self.cell.q)),
             44: self._forward,
             46: lambda: self._answer(self._inverse(self._doubles(0), self.cell.q)),
-            47: lambda: self._say(not self.cell.moving),
+            47: lambda: self._answer_bool(not self.cell.moving),
             58: lambda: self._answer(self._flange()),
             _STOP_SCRIPT: self.end,
         }
@@ -191,7 +193,7 @@ class UrProgram:
     def _inverse(self, pose: Pose, near: np.ndarray) -> Float[np.ndarray, "6"]:
         """Joint positions, by the nearest way; without a solution a UR stops its program."""
         position, R = self._target(pose)
-        solution = self._kinematics.inverse(position, R, near, posture=0.0)
+        solution = self._kinematics.solve_ik_near(position, R, near, posture=0.0)
         if not solution.reached:
             print("the twin's UR found no inverse kinematics; protective stop")
             self._protective_stop()
@@ -216,7 +218,7 @@ class UrProgram:
     def _answer(self, numbers) -> None:
         self.doubles[: len(numbers)] = [float(number) for number in numbers]
 
-    def _say(self, yes: bool) -> None:
+    def _answer_bool(self, yes: bool) -> None:
         self.ints[1] = int(yes)
 
 
