@@ -23,7 +23,7 @@ from touchgoal.sim_envs.tactile.geometry import (
     add_mesh,
     add_primitive,
 )
-from touchgoal.sim_envs.tactile.optics import render
+from touchgoal.sim_envs.tactile.optics import colour_change, render
 from touchgoal.sim_envs.tactile.pad import TactileFrame
 from touchgoal.sim_envs.tactile.press_bench import PressBench
 from touchgoal.sim_envs.tactile.sensor_instance import (
@@ -220,6 +220,32 @@ def test_turned_lights_turn_the_response() -> None:
         was, now = (p.response[:, 0, 0] + 1j * p.response[:, 1, 0] for p in (typical, instance))
         assert np.abs(np.angle(now / was, deg=True)).max() <= randomization.azimuth
         assert np.abs(np.abs(now / was) - 1).max() < 5 * randomization.gain
+
+
+@pytest.mark.parametrize("largest_turn", [0.0, 80.0])
+def test_shadows_fall_opposite_the_bright_sides(largest_turn: float) -> None:
+    """Of each light alone, on a bump: the colours brighten towards it, the shadow lies behind."""
+    lights = replace(NO_RANDOMIZATION, azimuth=largest_turn)
+    y, x = np.mgrid[:120, :160].astype(np.float32) - np.array([60, 80], np.float32)[:, None, None]
+    bump = 6e-4 * np.exp(-(x**2 + y**2) / (2 * 9**2)).astype(np.float32)
+
+    def direction(change: np.ndarray) -> complex:
+        return complex((change * x).sum(), (change * y).sum())
+
+    for seed in range(4):
+        instance = sample_instance(MINI, np.random.default_rng(seed), lights)
+        calibration = instance.calibration
+        own_shadow = np.diag(np.diag(calibration.shadow))
+        slopes = np.zeros_like(calibration.response)
+        slopes[:, :2] = calibration.response[:, :2]
+        no_shadow = replace(calibration, response=slopes, shadow=np.zeros_like(own_shadow))
+        no_slopes = replace(calibration, response=np.zeros_like(slopes), shadow=own_shadow)
+        bright, dark = (
+            colour_change(bump, replace(instance, calibration=c)) for c in (no_shadow, no_slopes)
+        )
+        for channel in range(3):
+            towards, away = direction(bright[channel]), direction(-dark[channel])
+            assert abs(np.angle(-away / towards, deg=True)) < 20
 
 
 def test_untouched_sensor_shows_only_noise() -> None:

@@ -87,15 +87,20 @@ def sample_instance(
     randomization = randomization or SensorRandomization()
     typical = load(sensor.sensor_file)
     brightness = 1 + randomization.gain * rng.normal(size=3)
-    turns = np.radians(randomization.azimuth) * rng.uniform(-1, 1, 3)
+    turns = randomization.azimuth * rng.uniform(-1, 1, 3)
     blur_sigmas = tuple(
         b * (1 + randomization.blur_sigmas * rng.uniform(-1, 1)) for b in typical.blur_sigmas
     )
     pitch = rng.uniform(*sensor.pitch_range) if randomization.pitch else sensor.pixel_pitch
+    azimuths = np.array(typical.light_azimuths) + turns
+    channels = brightness.astype(np.float32)[:, None]
     calibration = replace(
         typical,
         pixel_pitch=pitch,
-        response=_turned(typical.response, turns) * brightness[:, None, None].astype(np.float32),
+        response=_turned(typical.response, np.radians(turns)) * channels[..., None],
+        # Light l is that of channel l: where its response turns, its shadows turn with it.
+        light_azimuths=tuple(float(a) for a in azimuths),
+        shadow=typical.shadow * channels,
         blur_sigmas=blur_sigmas,
     )
     h, w = sensor.image_shape
