@@ -28,7 +28,8 @@ from touchgoal.control.cell.connection import cell_watchdogs, connect_cell
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import Safety
 from touchgoal.episodes.metadata import write_file
-from touchgoal.episodes.store import EpisodeSet, validate
+from touchgoal.episodes.repair import validate
+from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.acting import Observation
 from touchgoal.policies.deploy.actors import LearnedActor, make_actor
 from touchgoal.policies.deploy.control_loop import ControlLoop, DeployedActor

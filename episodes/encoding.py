@@ -176,16 +176,20 @@ def write_table(table: pa.Table, description: Description) -> bytes:
     return file.getvalue()
 
 
+def has_description(file: pq.ParquetFile) -> bool:
+    """Whether touchgoal wrote a data file."""
+    return _FOOTER_KEY in (file.schema_arrow.metadata or {})
+
+
 def read_description(file: pq.ParquetFile) -> Description:
     """The description in a data file's footer.
 
     Raises:
         UserError: the file was not written by touchgoal.
     """
-    footer = file.schema_arrow.metadata or {}
-    if _FOOTER_KEY not in footer:
+    if not has_description(file):
         raise UserError("this Parquet file was not written by touchgoal")
-    return Description(**json.loads(footer[_FOOTER_KEY]))
+    return Description(**json.loads(file.schema_arrow.metadata[_FOOTER_KEY]))
 
 
 def _to_arrow(key: str, column: Shaped[np.ndarray, "n d"] | list[bytes]) -> pa.Array:

@@ -8,6 +8,8 @@ its video.
 import io
 import json
 import os
+import sys
+import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from touchgoal.control.errors import UserError
+from touchgoal.control.features import FEATURES
 from touchgoal.episodes.encoding import Description, index_columns
+from touchgoal.episodes.schema import INDEX_DTYPES
 from touchgoal.episodes.statistics import Stats, array_statistics, merge
 
 VERSION = "v3.0"
@@ -28,9 +32,25 @@ INFO = "meta/info.json"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 TASKS = "meta/tasks.parquet"
 STATS = "meta/stats.json"
-REPAIR = "run: touchgoal repair --mend FOLDER"
 
 Row = dict[str, Any]
+
+
+def repair_command(root: Path) -> str:
+    """What an error message tells the user to run."""
+    return f"run: touchgoal repair --fix {root}"
+
+
+def set_folder(path: Path) -> Path:
+    """The set in `path` or in its subfolder `episodes`, where recording commands write it.
+
+    Says on stderr when it is the subfolder; returns `path` if neither holds a set.
+    """
+    inside = path / "episodes"
+    if (path / INFO).exists() or not (inside / INFO).exists():
+        return path
+    print(f"{path} is a run folder: taking the episodes in {inside}", file=sys.stderr)
+    return inside
 
 
 def data_path(file_number: int) -> str:
@@ -81,6 +101,11 @@ class SetMetadata:
     tasks: tuple[str, ...] = ()
     stats: dict[str, Stats] | None = None
     episodes: pa.Table | None = None
+
+    @property
+    def n_episodes(self) -> int:
+        """Number of episodes."""
+        return 0 if self.episodes is None else self.episodes.num_rows
 
     @property
     def next_file_number(self) -> int:
@@ -209,6 +234,17 @@ class SetMetadata:
         )
 
 
+def read_video(root: Path, name: str, crc32: int) -> bytes:
+    """The bytes of a video file of a set; UserError names it if it is missing or damaged."""
+    try:
+        video = (root / name).read_bytes()
+        if zlib.crc32(video) != crc32:
+            raise OSError("its checksum is not the recorded one")
+    except OSError as error:
+        raise unreadable(root, name, error) from error
+    return video
+
+
 def load_info(root: Path) -> dict[str, Any]:
     """Reads meta/info.json.
 
@@ -218,7 +254,7 @@ def load_info(root: Path) -> dict[str, Any]:
     if not (root / INFO).exists():
         raise UserError(
             f"{root} is not a set of episodes (it has no {INFO}): give the folder that a recording "
-            f"command wrote; if a first recording was interrupted there, {REPAIR}"
+            f"command wrote; if a first recording was interrupted there, {repair_command(root)}"
         )
     info = load_json(root, INFO)
     check_version(root, info)
@@ -239,7 +275,7 @@ def load_json(root: Path, name: str) -> dict[str, Any]:
     try:
         return json.loads((root / name).read_bytes())
     except (OSError, ValueError) as error:
-        raise unreadable(root / name, error) from error
+        raise unreadable(root, name, error) from error
 
 
 def load_table(root: Path, name: str, leave_out: str | None = None) -> pa.Table:
@@ -254,14 +290,49 @@ def load_table(root: Path, name: str, leave_out: str | None = None) -> pa.Table:
             kept = [n for n in names if leave_out is None or not n.startswith(leave_out)]
             return file.read(kept).combine_chunks()
     except (OSError, pa.ArrowException) as error:
-        raise unreadable(root / name, error) from error
+        raise unreadable(root, name, error) from error
 
 
-def unreadable(path: Path, error: Exception) -> UserError:
-    """The error, in one line, that a file of a set is missing or broken."""
+def unreadable(root: Path, name: str, error: Exception) -> UserError:
+    """The error, in one line, that the file `name` of a set is missing or broken."""
     if isinstance(error, FileNotFoundError):
-        return UserError(f"{path} is missing: {REPAIR}")
-    return UserError(f"{path} is corrupt ({str(error).splitlines()[0]}): {REPAIR}")
+        return UserError(f"{root / name} is missing: {repair_command(root)}")
+    reason = str(error).splitlines()[0]
+    return UserError(f"{root / name} is corrupt ({reason}): {repair_command(root)}")
+
+
+def refuse_other_writers(root: Path, features: dict[str, Any], episodes: pa.Table | None) -> None:
+    """Raises UserError if lerobot wrote the set or added episodes to it.
+
+    touchgoal writes one file under meta/episodes and one data file an episode, with checksums; lerobot
+    puts several episodes into a file and begins further files.
+
+    Args:
+        root: folder of the set.
+        features: as in info.json.
+        episodes: the table meta/episodes; None if it cannot be read.
+    """
+    listed = (root / "meta/episodes").rglob("*.parquet")
+    if others := sorted(path for path in listed if path != root / EPISODES):
+        raise written_by_others(root, others[0])
+    if not set(features) <= {*FEATURES, *INDEX_DTYPES}:
+        raise written_by_others(root, root / INFO)
+    if episodes is None:
+        return
+    places = episodes.select(["data/chunk_index", "data/file_index"]).to_pylist()
+    cameras = [key for key, feature in features.items() if feature["dtype"] == "video"]
+    unchecked = any(f"videos/{key}/crc32" not in episodes.column_names for key in cameras)
+    if unchecked or len({file_number_of(row) for row in places}) < len(places):
+        raise written_by_others(root, root / EPISODES)
+
+
+def written_by_others(root: Path, path: Path) -> UserError:
+    """The error that a set holds a file that touchgoal did not write."""
+    return UserError(
+        f"{root} holds episodes that lerobot wrote (see {path}); touchgoal reads only its own and "
+        "changes nothing here: use the set with lerobot, or append its episodes to a new set with "
+        "touchgoal's EpisodeWriter (docs/data_format.md)"
+    )
 
 
 def last_row(table: pa.Table | None) -> Row:

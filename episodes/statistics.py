@@ -36,8 +36,8 @@ def image_statistics(images: UInt8[np.ndarray, "n h w 3"]) -> Stats:
 def _histogram_statistics(counts: Float[np.ndarray, " 256"]) -> dict[str, float]:
     levels = np.arange(256)
     present = np.flatnonzero(counts)
-    mean = float(counts @ levels / counts.sum())
-    variance = float(counts @ (levels - mean) ** 2 / counts.sum())
+    mean = float(np.average(levels, weights=counts))
+    variance = float(np.average((levels - mean) ** 2, weights=counts))
     stats = {"min": float(present[0]), "max": float(present[-1])}
     stats |= {"mean": mean, "std": variance**0.5}
     cumulative = np.cumsum(counts)

@@ -1,4 +1,4 @@
-"""Check a set of episodes, and with --mend put right what an interrupted recording left."""
+"""Check a set of episodes; with --fix, make it sound again after an interruption or damage."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from touchgoal.control.errors import UserError
-from touchgoal.episodes.store import repair, validate
+from touchgoal.episodes.repair import repair, validate
 
 
 @dataclass(frozen=True)
@@ -15,18 +15,21 @@ class Config:
     """Options of repair."""
 
     root: Annotated[Path, tyro.conf.Positional]
-    """The set: the folder that holds meta/ and data/."""
-    mend: bool = False
-    """Mend it; without, only say what is wrong. Nothing is ever deleted."""
+    """The set: the folder that holds meta/ and data/, or the run folder around it."""
+    fix: bool = False
+    """Keep every whole episode and move what is damaged into FOLDER/repaired (nothing is deleted).
+    Without --fix, only say what is wrong."""
 
 
 def main(config: Config) -> None:
     """Print the problems, or what was done about them."""
-    if config.mend:
-        print("\n".join(repair(config.root)) or "nothing to mend")
+    if config.fix:
+        print("\n".join(repair(config.root)) or f"{config.root} is sound: nothing to do")
         return
     problems = validate(config.root)
     if problems:
         shown = "\n  ".join(problems)
-        raise UserError(f"{config.root} has {len(problems)} problem(s); --mend repairs:\n  {shown}")
+        raise UserError(
+            f"{config.root} has {len(problems)} problem(s); --fix keeps every whole episode:\n  {shown}"
+        )
     print(f"{config.root} is sound")

@@ -16,7 +16,8 @@ from touchgoal.control.cell.config import CellConfig, read_cell_file
 from touchgoal.control.cell.connection import cell_watchdogs
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import Safety
-from touchgoal.episodes.store import EpisodeSet, validate
+from touchgoal.episodes.repair import validate
+from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.__main__ import main
 from touchgoal.policies.deploy.control_loop import ControlLoop, RunLog, TickStatus
 from touchgoal.sim_envs.twin.in_process import simulate_cell

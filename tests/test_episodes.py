@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
@@ -19,8 +20,10 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.episodes import metadata, statistics
 from touchgoal.episodes.encoding import encode
+from touchgoal.episodes.media import write_video
+from touchgoal.episodes.repair import repair, validate
 from touchgoal.episodes.schema import Episode
-from touchgoal.episodes.store import EpisodeSet, EpisodeWriter, repair, validate
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 
 FPS = 20
 PNG_START = b"\x89PNG"
@@ -240,13 +243,113 @@ def test_refusals_say_what_to_do(small: Path, tmp_path: Path) -> None:
             refuse(small)
 
 
-def test_repair_leaves_foreign_sets_alone(small: Path) -> None:
-    path = small / metadata.data_path(0)
+def add_episodes_like_lerobot(root: Path, extend: bool) -> None:
+    """Two more episodes as lerobot lays them out: both in one data file and one video.
+
+    Args:
+        root: a set of three episodes of 7 frames.
+        extend: the last files are extended (lerobot 0.4), else new ones begun (0.6).
+    """
+    extra = root.with_name("extra")
+    record(extra, range(3, 5))
+    tables = [pq.read_table(extra / metadata.data_path(i)) for i in range(2)]
+    wrist = [EpisodeSet(extra).read(i, [ft.WRIST]).frames[ft.WRIST] for i in range(2)]
+    file = 2 if extend else 3
+    if extend:
+        tables.insert(0, pq.read_table(root / metadata.data_path(2)))
+        wrist.insert(0, EpisodeSet(root).read(2, [ft.WRIST]).frames[ft.WRIST])
+    table = pa.concat_tables([t.replace_schema_metadata(None) for t in tables])
+    first = 35 - len(table)
+    for key, values in (
+        ("index", np.arange(first, 35)),
+        ("episode_index", np.arange(first, 35) // 7),
+    ):
+        table = table.set_column(table.column_names.index(key), key, pa.array(values))
+    pq.write_table(table, root / metadata.data_path(file), compression="snappy")
+    write_video(root / metadata.video_path(ft.WRIST, file), np.concatenate(wrist), FPS)
+    own = pq.read_table(root / metadata.EPISODES).to_pylist()
+    added = [
+        {
+            **{key: value for key, value in own[2].items() if not key.startswith("touchgoal/")},
+            "episode_index": i,
+            "tasks": [f"lift the {i % 2}"],
+            "dataset_from_index": 7 * i,
+            "dataset_to_index": 7 * (i + 1),
+            "data/file_index": file,
+            f"videos/{ft.WRIST}/file_index": file,
+            f"videos/{ft.WRIST}/from_timestamp": (7 * i - first) / FPS,
+            f"videos/{ft.WRIST}/to_timestamp": (7 * (i + 1) - first) / FPS,
+            f"videos/{ft.WRIST}/crc32": None,
+        }
+        for i in (3, 4)
+    ]
+    name = metadata.EPISODES if extend else metadata.EPISODES.replace("file-000", "file-001")
+    pq.write_table(pa.Table.from_pylist([*own, *added] if extend else added), root / name)
+    info = json.loads((root / metadata.INFO).read_text())
+    info |= {"total_episodes": 5, "total_frames": 35, "splits": {"train": "0:5"}}
+    (root / metadata.INFO).write_text(json.dumps(info))
+
+
+@pytest.mark.parametrize("extend", [False, True])
+def test_a_set_that_lerobot_continued_is_left_as_it_is(small: Path, extend: bool) -> None:
+    """Its episodes are sound, if not ours: nothing moves, and nobody is sent to `repair`."""
+    add_episodes_like_lerobot(small, extend)
+    before = {path: path.read_bytes() for path in small.rglob("*") if path.is_file()}
+    for use in (EpisodeSet, lambda root: EpisodeWriter(root, FPS), validate, repair):
+        with pytest.raises(UserError, match="lerobot wrote .* changes nothing here") as error:
+            use(small)
+        assert "touchgoal repair" not in str(error.value) and "\n" not in str(error.value)
+    (small / metadata.INFO).unlink()
+    with pytest.raises(UserError, match="lerobot wrote"):
+        repair(small)
+    del before[small / metadata.INFO]
+    assert {path: path.read_bytes() for path in small.rglob("*") if path.is_file()} == before
+
+
+def test_a_data_file_without_our_description_is_not_moved(small: Path) -> None:
+    path = small / metadata.data_path(1)
     pq.write_table(pq.read_table(path).replace_schema_metadata(None), path)
     before = sorted(small.rglob("*"))
-    with pytest.raises(UserError, match="only its own"):
+    with pytest.raises(UserError, match="reads only its own"):
         repair(small)
     assert sorted(small.rglob("*")) == before
+
+
+def test_the_run_folder_around_a_set_will_do(
+    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    shutil.copytree(small, tmp_path / "run" / "episodes")
+    assert len(EpisodeSet(tmp_path / "run")) == 3
+    assert "taking the episodes in" in capsys.readouterr().err
+    assert validate(tmp_path / "run") == []
+
+
+def test_hidden_files_are_no_damage(small: Path) -> None:
+    for name in (".cache/huggingface/lock", "data/.cache/embeddings/a.parquet", "meta/.DS_Store"):
+        metadata.write_file(small / name, b"")
+    assert validate(small) == []
+    assert EpisodeWriter(small, FPS).append(make_episode(3)) == 3
+
+
+def test_two_recorders_in_one_folder(tmp_path: Path) -> None:
+    """The second is refused before it has done any work; an unused folder goes again."""
+    first = EpisodeWriter(tmp_path / "set", FPS)
+    with pytest.raises(UserError, match="something else is recording into"):
+        EpisodeWriter(tmp_path / "set", FPS)
+    first.close()
+    assert not (tmp_path / "set").exists()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot record into .*give another folder"):
+        EpisodeWriter(tmp_path / "file", FPS)
+
+
+def test_checksum_tells_sets_apart(recorded_small: Path, small: Path) -> None:
+    checksum = EpisodeSet(small).checksum
+    assert checksum == EpisodeSet(recorded_small).checksum, "wherever the set lies"
+    EpisodeWriter(small, FPS).append(make_episode(3))
+    assert EpisodeSet(small).checksum != checksum
+    record(small.with_name("other"), range(1, 4))
+    assert EpisodeSet(small.with_name("other")).checksum != checksum, "as many, other frames"
 
 
 def flip_byte(path: Path, position: int) -> None:
@@ -330,6 +433,7 @@ def test_killed_at_every_write(small: Path, monkeypatch: pytest.MonkeyPatch) -> 
             steps += 1
         finally:
             monkeypatch.setattr(os, "replace", replace)
+        writer.close()
         assert_holds(root, [0, 1, 2])
         with pytest.raises(UserError, match="interrupted.*repair"):
             EpisodeWriter(root, FPS)

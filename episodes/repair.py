@@ -1,0 +1,204 @@
+"""Whether a set of episodes is sound, and making it sound again after a crash or damage."""
+
+import itertools
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from tqdm import tqdm
+
+from touchgoal.control.errors import UserError
+from touchgoal.episodes import metadata
+from touchgoal.episodes.encoding import (
+    Description,
+    has_description,
+    read_description,
+    write_table,
+)
+from touchgoal.episodes.folder_lock import FolderLock
+from touchgoal.episodes.metadata import SetMetadata
+
+REPAIRED = "repaired"
+_FOLDERS = ("data", "videos", "meta")
+_META = (metadata.INFO, metadata.EPISODES, metadata.TASKS, metadata.STATS)
+_DATA_FILES = "chunk-[0-9][0-9][0-9]/file-[0-9][0-9][0-9].parquet"
+
+
+def unlisted_files(root: Path, set_metadata: SetMetadata | None) -> list[str]:
+    """Files that belong to no listed episode, as paths in the set; hidden ones do not count."""
+    known = set(_META)
+    cameras = _cameras(set_metadata.features) if set_metadata else []
+    for file_number in _file_numbers(set_metadata):
+        known |= {metadata.data_path(file_number)} | {
+            metadata.video_path(k, file_number) for k in cameras
+        }
+    files = [path for tree in _FOLDERS for path in (root / tree).rglob("*") if path.is_file()]
+    names = {path.relative_to(root) for path in files}
+    shown = {name.as_posix() for name in names if not any(p.startswith(".") for p in name.parts)}
+    return sorted(shown - known)
+
+
+def contradictions_in_meta(root: Path, set_metadata: SetMetadata) -> list[str]:
+    """What info.json, stats.json and tasks.parquet contradict in meta/episodes."""
+    info = metadata.load_info(root)
+    frames = metadata.last_row(set_metadata.episodes)["dataset_to_index"]
+    problems = []
+    if (info["total_episodes"], info["total_frames"]) != (set_metadata.n_episodes, frames):
+        problems.append(
+            f"{root / metadata.INFO} counts {info['total_episodes']} episodes, "
+            f"{root / metadata.EPISODES} {set_metadata.n_episodes}"
+        )
+    if info["total_tasks"] != len(set_metadata.tasks):
+        problems.append(f"{root / metadata.TASKS} has not the tasks of {root / metadata.INFO}")
+    counts = {key: stats["count"] for key, stats in (set_metadata.stats or {}).items()}
+    if counts != {key: [frames] for key in set_metadata.features}:
+        problems.append(f"{root / metadata.STATS} is not of all {frames} frames")
+    return problems
+
+
+def _file_numbers(set_metadata: SetMetadata | None) -> list[int]:
+    if set_metadata is None or set_metadata.episodes is None:
+        return []
+    names = ["data/chunk_index", "data/file_index"]
+    return [metadata.file_number_of(row) for row in set_metadata.episodes.select(names).to_pylist()]
+
+
+def _cameras(features: dict[str, dict[str, Any]]) -> list[str]:
+    return [key for key, feature in features.items() if feature["dtype"] == "video"]
+
+
+def _read_episode(root: Path, file_number: int) -> tuple[Description, pa.Table]:
+    """Reads every byte of an episode's files; checksums show any damage."""
+    name = metadata.data_path(file_number)
+    try:
+        with pq.ParquetFile(root / name, page_checksum_verification=True) as file:
+            description, table = read_description(file), file.read()
+    except (OSError, pa.ArrowException) as error:
+        raise metadata.unreadable(root, name, error) from error
+    for key, crc32 in description.video_crc32.items():
+        metadata.read_video(root, metadata.video_path(key, file_number), crc32)
+    return description, table
+
+
+def _wrong_index_columns(table: pa.Table, indices: dict[str, np.ndarray]) -> list[str]:
+    return [k for k, values in indices.items() if not np.array_equal(table[k].to_numpy(), values)]
+
+
+def _refuse_sets_of_others(root: Path) -> None:
+    """Repair would move aside what it does not know, so it must be sure the set is touchgoal's."""
+    if not any((root / folder).is_dir() for folder in _FOLDERS):
+        raise UserError(f"{root} is not a set of episodes: give the folder of one")
+    info: dict[str, Any] = {"codebase_version": metadata.VERSION}
+    episodes = None
+    if (root / metadata.INFO).exists():
+        with suppress(UserError):  # damaged: the data files will tell
+            info = metadata.load_json(root, metadata.INFO)
+        metadata.check_version(root, info)
+    with suppress(UserError):
+        episodes = metadata.load_table(root, metadata.EPISODES)
+    metadata.refuse_other_writers(root, info.get("features", {}), episodes)
+    for path in sorted((root / "data").rglob("*.parquet")):
+        with suppress(OSError, pa.ArrowException), pq.ParquetFile(path) as file:
+            if not has_description(file):
+                raise metadata.written_by_others(root, path)
+
+
+def validate(root: str | os.PathLike[str]) -> list[str]:
+    """Reads every file of a set and returns what is wrong, one line a problem; [] if sound.
+
+    Raises:
+        UserError: not a set, one of another version, or one that lerobot wrote or continued.
+    """
+    root = metadata.set_folder(Path(root))
+    _refuse_sets_of_others(root)
+    try:
+        set_metadata = SetMetadata.load(root)
+    except UserError as error:
+        return [str(error)]
+    problems = contradictions_in_meta(root, set_metadata)
+    rebuilt = SetMetadata(set_metadata.fps, set_metadata.features)
+    for file_number in tqdm(_file_numbers(set_metadata), desc="validate", unit="episode"):
+        try:
+            description, table = _read_episode(root, file_number)
+            if differing := _wrong_index_columns(table, rebuilt.index_columns_for(description)):
+                name = root / metadata.data_path(file_number)
+                problems.append(
+                    f"{name} has wrong {', '.join(differing)}: {metadata.repair_command(root)}"
+                )
+            rebuilt = rebuilt.with_episode(description, file_number)
+        except UserError as error:
+            problems.append(str(error))
+    return problems + [
+        f"{root / n} belongs to no episode" for n in unlisted_files(root, set_metadata)
+    ]
+
+
+def repair(root: str | os.PathLike[str]) -> list[str]:
+    """Makes a set sound again after a crash or damage; deletes nothing.
+
+    Every episode whose files are whole is kept, in order; other files move to `repaired/` inside
+    the set, and so does the old meta/, which is made again from the data files. May itself be
+    killed and run again.
+
+    Returns:
+        What was done, one line each; [] if the set was sound.
+
+    Raises:
+        UserError: not a set, one of another version, or one that lerobot wrote or continued.
+    """
+    root = metadata.set_folder(Path(root))
+    if not validate(root):
+        return []
+    lock = FolderLock(root)
+    try:
+        return _repair(root)
+    finally:
+        lock.release()
+
+
+def _repair(root: Path) -> list[str]:
+    done: list[str] = []
+    set_metadata: SetMetadata | None = None
+    for path in tqdm(sorted((root / "data").glob(_DATA_FILES)), desc="repair", unit="episode"):
+        file_number = int(path.parent.name[-3:]) * metadata.CHUNK + int(path.stem[-3:])
+        try:
+            description, table = _read_episode(root, file_number)
+            before = set_metadata or SetMetadata(description.fps, description.features)
+            set_metadata = before.with_episode(description, file_number)
+        except UserError as error:
+            reason = str(error).removesuffix(": " + metadata.repair_command(root))
+            done.append(f"left out the episode of {path}: {reason}")
+            continue
+        if _wrong_index_columns(table, before.index_columns_for(description)):
+            _rewrite_index_columns(path, description, table, before.index_columns_for(description))
+            done.append(f"renumbered {path}")
+    done += [_move_to_repaired(root, name) for name in unlisted_files(root, set_metadata)]
+    done += [_move_to_repaired(root, name) for name in _META if (root / name).exists()]
+    if set_metadata is None:
+        return [*done, f"no whole episode is left in {root}"]
+    set_metadata.write(root)
+    return [*done, f"wrote {root / 'meta'} again for {set_metadata.n_episodes} episodes"]
+
+
+def _rewrite_index_columns(
+    path: Path, description: Description, table: pa.Table, indices: dict[str, np.ndarray]
+) -> None:
+    for key, values in indices.items():
+        table = table.set_column(table.column_names.index(key), key, pa.array(values))
+    metadata.write_file(path, write_table(table, description))
+
+
+def _move_to_repaired(root: Path, name: str) -> str:
+    """Moves a file of the set into `repaired/`, beside what an earlier repair moved there."""
+    target = root / REPAIRED / name
+    for i in itertools.count(1):
+        if not target.exists():
+            break
+        target = root / REPAIRED / f"{name}.{i}"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    os.replace(root / name, target)
+    return f"moved {root / name} to {target}"
