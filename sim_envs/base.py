@@ -22,7 +22,7 @@ from touchgoal.sim_envs.scene.build import (
 )
 from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, ContactReader, PadContact
 from touchgoal.sim_envs.scene.objects import Body
-from touchgoal.sim_envs.scene.rendering import open_renderer
+from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
 from touchgoal.sim_envs.tactile.sensor_instance import SensorRandomization, sample_instance
 
@@ -75,6 +75,8 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     metadata = {"render_modes": ["rgb_array"], "render_fps": ft.CONTROL_HZ}  # noqa: RUF012
 
     def __init__(self, config: EnvConfig, render_mode: str | None = None) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise UserError(f"render_mode is 'rgb_array' or none, not {render_mode!r}")
         self.config, self.render_mode = config, render_mode
         self.sensor = find_sensor(config.scene.sensor)
         self.robot = ROBOTS[config.scene.arm]
@@ -86,8 +88,8 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         )
         self.grasp_force = 15.0
         self.bodies: list[Body] = []
-        self._renderer: mujoco.Renderer | None = None
-        self._view_renderer: mujoco.Renderer | None = None
+        self._renderer: Renderer | None = None
+        self._view_renderer: Renderer | None = None
         self._pads: list[TactilePad] = []
 
     # What a task defines.

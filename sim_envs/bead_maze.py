@@ -1,12 +1,8 @@
-"""The bead maze: lead a bead along a bent wire by feel.
-
-`gymnasium.make("touchgoal.sim_envs.bead_maze:touchgoal/BeadMaze-v0")` imports and makes it.
-"""
+"""The bead maze: lead a bead along a bent wire by feel."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import gymnasium as gym
 import mujoco
 import numpy as np
 from jaxtyping import Float
@@ -15,6 +11,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.control.motion.kinematics import fingers_across
 from touchgoal.sim_envs.base import EnvConfig, FrankaTactileEnv, Observation
+from touchgoal.sim_envs.options import with_options
 from touchgoal.sim_envs.scene import wires
 from touchgoal.sim_envs.scene.build import VISUAL_GROUP, SceneConfig
 from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Texture
@@ -91,8 +88,14 @@ class BeadMaze(FrankaTactileEnv):
     config: BeadMazeConfig
     disturbance_rotation = 20.0  # rad of disturbance per m of it: the hole turns with the hand
 
-    def __init__(self, config: BeadMazeConfig | None = None, render_mode: str | None = None):
-        super().__init__(config or BeadMazeConfig(), render_mode)
+    def __init__(
+        self,
+        config: BeadMazeConfig | None = None,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        """With a config, or with those of its fields that differ from the default by name."""
+        super().__init__(with_options(config or BeadMazeConfig(), options), render_mode)
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control tick; the reward is the tick's gain in progress."""
@@ -261,6 +264,3 @@ def thread_bead(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
         name2="world",
         active=False,
     )
-
-
-gym.register("touchgoal/BeadMaze-v0", "touchgoal.sim_envs.bead_maze:BeadMaze")

@@ -1,12 +1,8 @@
-"""The task of the paper's robot experiment: pick an object up and place it at a goal.
-
-`gymnasium.make("touchgoal.sim_envs.pick_place:touchgoal/PickPlace-v0")` imports and makes it.
-"""
+"""The task of the paper's robot experiment: pick an object up and place it at a goal."""
 
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium as gym
 import mujoco
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +10,7 @@ from jaxtyping import Float
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import EnvConfig, FrankaTactileEnv, Observation
+from touchgoal.sim_envs.options import with_options
 from touchgoal.sim_envs.scene.build import VISUAL_GROUP
 from touchgoal.sim_envs.scene.objects import CATALOGUE, find, sample_body
 
@@ -60,8 +57,14 @@ class PickPlace(FrankaTactileEnv):
 
     config: PickPlaceConfig
 
-    def __init__(self, config: PickPlaceConfig | None = None, render_mode: str | None = None):
-        super().__init__(config or PickPlaceConfig(), render_mode)
+    def __init__(
+        self,
+        config: PickPlaceConfig | None = None,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        """With a config, or with those of its fields that differ from the default by name."""
+        super().__init__(with_options(config or PickPlaceConfig(), options), render_mode)
         self.kinds = [find(name) for name in self.config.objects] or list(CATALOGUE.values())
 
     def instruction(self) -> str:
@@ -222,6 +225,3 @@ def _spread(rng: np.random.Generator, n: int) -> list[np.ndarray]:
         if all(np.linalg.norm(point - other) > _APART for other in points):
             points.append(point)
     return points
-
-
-gym.register("touchgoal/PickPlace-v0", "touchgoal.sim_envs.pick_place:PickPlace")

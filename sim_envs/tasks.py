@@ -1,4 +1,6 @@
-"""The tasks: which environment a config stands for, and who demonstrates it."""
+"""The tasks: their environments by name or by config, and who demonstrates them."""
+
+from typing import Any, Literal, overload
 
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import FrankaTactileEnv
@@ -8,6 +10,34 @@ from touchgoal.sim_envs.experts.pick_place import Outcome, PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
 
 TaskConfig = PickPlaceConfig | BeadMazeConfig
+_ENVIRONMENTS = {"pick-place": PickPlace, "bead-maze": BeadMaze}
+
+
+@overload
+def make(
+    task: Literal["pick-place"], *, render_mode: str | None = None, **options: Any
+) -> PickPlace: ...
+@overload
+def make(
+    task: Literal["bead-maze"], *, render_mode: str | None = None, **options: Any
+) -> BeadMaze: ...
+def make(task: str, *, render_mode: str | None = None, **options: Any) -> FrankaTactileEnv:
+    """The environment of a task, as Gymnasium's: `reset`, `step`, `render`, `close`.
+
+    Args:
+        task: "pick-place" or "bead-maze".
+        render_mode: "rgb_array" for wrappers that record videos.
+        options: fields of the task's config by name, such as `cameras=("front",)`,
+            `camera_size=(96, 96)` or `tactile=False`: see `PickPlaceConfig` and `BeadMazeConfig`.
+            Of a field that is a config itself a dict of what changes will do:
+            `randomization={"gain": 0.0}`.
+
+    Raises:
+        UserError: there is no such task or option, or a value is out of its range.
+    """
+    if task not in _ENVIRONMENTS:
+        raise UserError(f"unknown task {task!r}; choose from: {', '.join(_ENVIRONMENTS)}")
+    return _ENVIRONMENTS[task](render_mode=render_mode, **options)
 
 
 def make_env(config: TaskConfig) -> FrankaTactileEnv:

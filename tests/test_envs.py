@@ -1,5 +1,10 @@
 """Contract of every environment, and the laws that grasping in the simulator must obey."""
 
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,14 +12,14 @@ from gymnasium.utils.env_checker import check_env
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
+from touchgoal.sim_envs.base import FrankaTactileEnv
+from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
 from touchgoal.sim_envs.experts.pick_place import OUTCOMES, PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
 from touchgoal.sim_envs.scene.objects import CATALOGUE, SHAPES
+from touchgoal.sim_envs.tasks import make
 
-ENVS = [
-    "touchgoal.sim_envs.pick_place:touchgoal/PickPlace-v0",
-    "touchgoal.sim_envs.bead_maze:touchgoal/BeadMaze-v0",
-]
+ENVS = ["touchgoal/PickPlace-v0", "touchgoal/BeadMaze-v0"]
 BLIND = PickPlaceConfig(cameras=(), tactile=False)
 STILL = np.zeros(8)
 
@@ -72,6 +77,67 @@ def test_same_seed_same_episode(name: str) -> None:
     for key in runs[0]:
         np.testing.assert_array_equal(runs[0][key], runs[1][key])
     assert not np.array_equal(runs[0][ft.TACTILE_LEFT], runs[2][ft.TACTILE_LEFT])
+
+
+def test_environments_are_registered_on_import() -> None:
+    """In either order; touchgoal alone imports neither Gymnasium nor MuJoCo."""
+    names = set(ENVS)
+    ask = f"assert {names} <= set(gymnasium.registry)"
+    light = "assert not {'gymnasium', 'mujoco'} & set(sys.modules)"
+    for program in (
+        f"import sys, touchgoal; {light}; import gymnasium; {ask}",
+        f"import gymnasium, touchgoal; {ask}",
+    ):
+        subprocess.run([sys.executable, "-c", program], check=True)
+    for name in ENVS:
+        ticks, env = gym.spec(name).max_episode_steps, gym.make(name).unwrapped
+        assert isinstance(env, FrankaTactileEnv)
+        assert ticks == env.config.max_seconds * env.config.control_hz
+
+
+def test_options_by_name() -> None:
+    env = gym.make("touchgoal/PickPlace-v0", camera_size=(96, 90), cameras=("front",))
+    assert env.observation_space[ft.FRONT].shape == (96, 90, 3)  # type: ignore[index]
+    maze = make("bead-maze", tactile=False, randomization={"gain": 0.0})
+    assert isinstance(maze, BeadMaze) and not maze.config.tactile
+    assert maze.config.randomization == replace(BeadMazeConfig().randomization, gain=0.0)
+    assert isinstance(make("pick-place", render_mode="rgb_array"), PickPlace)
+    with pytest.raises(UserError, match="no option 'camera_sise'; did you mean camera_size"):
+        gym.make("touchgoal/PickPlace-v0", camera_sise=(96, 96))
+    with pytest.raises(UserError, match="has no option 'blur_sigma'; did you mean blur_sigmas"):
+        make("pick-place", randomization={"blur_sigma": 0.0})
+    with pytest.raises(UserError, match="unknown task 'place'; choose from: pick-place, bead-maze"):
+        make("place")  # type: ignore[call-overload]
+    with pytest.raises(UserError, match="'rgb_array' or none, not 'human'"):
+        make("pick-place", render_mode="human")
+
+
+@pytest.mark.parametrize("context", ["fork", "forkserver"])
+def test_a_forked_worker_refuses_to_render(context: str) -> None:
+    """In Mesa it would wait for ever, if its parent has rendered."""
+    program = f"""
+import gymnasium as gym, touchgoal
+
+def make():
+    return gym.make("touchgoal/PickPlace-v0", cameras=("front",), tactile=False)
+
+if __name__ == "__main__":
+    make().reset(seed=0)
+    envs = gym.vector.AsyncVectorEnv([make], context="{context}")
+    print(envs.reset(seed=0)[0]["observation.images.front"].shape, flush=True)
+    envs.close()
+"""
+    with tempfile.NamedTemporaryFile("w", suffix=".py") as file:
+        file.write(program)
+        file.flush()
+        ran = subprocess.run(
+            [sys.executable, file.name], capture_output=True, text=True, timeout=120
+        )
+    if context == "fork":
+        assert ran.returncode != 0 and "UserError: this process was forked" in ran.stderr
+        assert 'context="forkserver"' in ran.stderr
+    else:
+        assert ran.returncode == 0 and "(1, 128, 128, 3)" in ran.stdout, ran.stderr
 
 
 @pytest.mark.parametrize("shape", SHAPES)

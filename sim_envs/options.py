@@ -1,0 +1,35 @@
+"""Options by name: `make(task, camera_size=(96, 96))` in place of a config built by hand."""
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from difflib import get_close_matches
+from typing import Any, TypeVar
+
+from touchgoal.control.errors import UserError
+
+Config = TypeVar("Config")
+
+
+def with_options(config: Config, options: Mapping[str, Any]) -> Config:
+    """The config with the fields named in `options` replaced.
+
+    Args:
+        config: a dataclass.
+        options: new values by field name; of a field that is a config itself (`randomization`)
+            either a config or a mapping of the fields of it that change.
+
+    Raises:
+        UserError: there is no such field, or a value is out of its range.
+    """
+    assert is_dataclass(config) and not isinstance(config, type)
+    names = [field.name for field in fields(config)]
+    changes = {}
+    for name, value in options.items():
+        if name not in names:
+            close = get_close_matches(name, names, 1)
+            hint = f"did you mean {close[0]}?" if close else f"there are: {', '.join(names)}"
+            raise UserError(f"{type(config).__name__} has no option {name!r}; {hint}")
+        current = getattr(config, name)
+        nested = is_dataclass(current) and isinstance(value, Mapping)
+        changes[name] = with_options(current, value) if nested else value
+    return replace(config, **changes)
