@@ -49,7 +49,7 @@ weights: $(READY)
 	cp runs/weights/run/encoder/* encoders/weights/gelsight_mini_offline/
 
 # The same for the Mini with markers.
-MARKERS := --env.scene.sensor gelsight_mini_markers
+MARKERS := --env.sensor gelsight_mini_markers
 weights-markers: $(READY)
 	$(BIN)/touchgoal collect-demos $(MARKERS) --episodes 40 --seed 100000 --out runs/markers/val
 	$(BIN)/touchgoal collect-demos $(MARKERS) --episodes 240 --seed 0 --out runs/markers/train

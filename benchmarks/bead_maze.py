@@ -34,7 +34,8 @@ from touchgoal.policies.training.sequence_dataset import (
     cached_embeddings,
     load_recordings,
 )
-from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
+from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.scene.wires import HELD_OUT, choose
 

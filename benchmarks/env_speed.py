@@ -10,9 +10,10 @@ import mujoco
 import numpy as np
 
 from touchgoal.benchmarks.speed import Row, measure, one_core, table
-from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
+from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
-from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.build import robot_model
 
 NO_MOTION = np.zeros(8)

@@ -35,7 +35,7 @@ from touchgoal.policies.deploy.actors import LearnedActor, make_actor
 from touchgoal.policies.deploy.control_loop import ControlLoop, DeployedActor
 from touchgoal.policies.deploy.session import Session
 from touchgoal.policies.policy import PolicyConfig
-from touchgoal.sim_envs.pick_place import PickPlaceConfig
+from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.twin.faults import ask_twin
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 

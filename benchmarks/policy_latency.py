@@ -23,7 +23,7 @@ from touchgoal.policies.heads.samplers import SamplerConfig
 from touchgoal.policies.heads.unet import PRESETS
 from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.policy import PolicyConfig
-from touchgoal.sim_envs.base import EnvConfig
+from touchgoal.sim_envs.config import EnvConfig
 
 _VITS = {
     "ViT-tiny": ViTConfig((224, 224), width=192, depth=12, heads=3),

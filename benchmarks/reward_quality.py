@@ -25,8 +25,8 @@ from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EpisodeEmbedde
 from touchgoal.rewards.goals import EpisodeEnd, Goal, LastFrame, Sentence
 from touchgoal.rewards.metrics import CurveMetrics, measure_curve
 from touchgoal.rewards.report.summary import metrics_table
+from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import OUTCOMES, Outcome
-from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.scene.objects import CATALOGUE
 
 # New wordings: none of these sentences was trained on.

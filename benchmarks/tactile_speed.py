@@ -14,13 +14,10 @@ from numba import njit
 from touchgoal.benchmarks.speed import Row, measure, one_core, table
 from touchgoal.benchmarks.taxim_peer import has_jax, has_taxim
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS, SensorModel
+from touchgoal.sim_envs.config import NO_RANDOMIZATION
 from touchgoal.sim_envs.scene.objects import CATALOGUE, HARD, Body, Material, ObjectKind, Texture
 from touchgoal.sim_envs.tactile.press_bench import PressBench
-from touchgoal.sim_envs.tactile.sensor_instance import (
-    NO_RANDOMIZATION,
-    SensorInstance,
-    sample_instance,
-)
+from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
 # What one 240x320 frame of a ball at least does, counted by hand from the kernels: multiplications
 # and additions, and bytes that leave or enter the first-level cache.

@@ -12,12 +12,10 @@ from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies import checkpoint
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.training.dagger import DaggerRoles
-from touchgoal.sim_envs.bead_maze import BeadMazeConfig
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig
 from touchgoal.sim_envs.experts.pick_place import Outcome
-from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.scene.objects import CATALOGUE, find
 from touchgoal.sim_envs.scene.wires import choose
-from touchgoal.sim_envs.tasks import TaskConfig
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ from touchgoal.rewards.curves import DistanceNormalizer
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
 from touchgoal.rewards.goals import assign_goals, parse_goal
 from touchgoal.rewards.report.report import write_report
-from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.config import PickPlaceConfig
+from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import find
 
 
@@ -42,7 +43,7 @@ class Config:
 def main(config: Config) -> None:
     """Load the weights first, so that a missing one costs no simulation; then record and judge."""
     find(config.object)
-    sensor = find_sensor(config.env.scene.sensor).name
+    sensor = find_sensor(config.env.sensor).name
     directory = pretrained.shipped_encoder_for(sensor)
     encoder = pretrained.load_aligned(directory, sensor=sensor)
     scale = DistanceNormalizer.load(directory / "scale.json")

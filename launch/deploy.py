@@ -32,7 +32,7 @@ from touchgoal.policies.deploy.session import Result, Session
 from touchgoal.rewards.curves import DistanceNormalizer
 from touchgoal.rewards.goals import parse_goal
 from touchgoal.rewards.online import OnlineCost
-from touchgoal.sim_envs.base import EnvConfig
+from touchgoal.sim_envs.config import EnvConfig
 from touchgoal.sim_envs.twin.faults import ask_twin
 from touchgoal.sim_envs.twin.in_process import simulate_cell
 

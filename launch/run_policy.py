@@ -20,13 +20,13 @@ from touchgoal.policies.evaluation.bead_maze import MazeTrial
 from touchgoal.policies.evaluation.pick_place import Trial
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.follower import WireFollower
-from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
+from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
-from touchgoal.sim_envs.pick_place import PickPlaceConfig
 from touchgoal.sim_envs.scene.objects import CATALOGUE, SHAPES, find
 from touchgoal.sim_envs.scene.wires import FAMILIES, choose
-from touchgoal.sim_envs.tasks import TaskConfig, make_env
+from touchgoal.sim_envs.tasks import make_env
 
 Task = TypeVar("Task", PickPlaceConfig, BeadMazeConfig)
 

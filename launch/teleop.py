@@ -20,7 +20,8 @@ from touchgoal.episodes.recording import EpisodeSpec, run, to_episode
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.run_folder import open_run, write_json
-from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
+from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.experts.teleoperator import HELP, Teleoperator, TeleoperatorConfig
 from touchgoal.sim_envs.scene.wires import choose, find
 

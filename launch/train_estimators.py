@@ -28,7 +28,7 @@ from touchgoal.policies.perception.training import (
     train_contact_estimator,
     train_pose_estimator,
 )
-from touchgoal.sim_envs.pick_place import PickPlaceConfig
+from touchgoal.sim_envs.config import PickPlaceConfig
 
 _SEED, _VALIDATION_SEED = 4_000_000, 4_900_000  # of the things placed
 

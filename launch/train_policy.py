@@ -29,8 +29,7 @@ from touchgoal.policies.policy import PolicyConfig, TouchReading
 from touchgoal.policies.training.model_selection import Score, add_parts, select
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
 from touchgoal.policies.training.train import POLICY, TrainConfig, train
-from touchgoal.sim_envs.bead_maze import BeadMazeConfig
-from touchgoal.sim_envs.pick_place import PickPlaceConfig
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.scene.objects import CATALOGUE
 from touchgoal.sim_envs.scene.wires import choose
 

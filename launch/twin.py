@@ -10,9 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from touchgoal.launch.run_folder import open_run, write_json
-from touchgoal.sim_envs.base import STREAM_SIZE
-from touchgoal.sim_envs.bead_maze import BeadMazeConfig
-from touchgoal.sim_envs.pick_place import PickPlaceConfig
+from touchgoal.sim_envs.config import STREAM_SIZE, BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 
 
@@ -35,7 +33,7 @@ class Config:
     object: str = ""
     """pick-place: what to pick up; default: drawn from the catalogue."""
     wire: str = ""
-    """bead-maze: which wire, such as helix-17; default: drawn."""
+    """bead-maze: which wire, such as helix-1; default: drawn."""
     out: Path | None = None
     """Folder of the run: cell.json, serial devices."""
     env: PickPlaceConfig = field(default_factory=lambda: PickPlaceConfig(camera_size=STREAM_SIZE))

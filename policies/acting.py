@@ -18,7 +18,7 @@ from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
 from touchgoal.policies.perception.state_estimation import StateEstimator, load_estimator
 from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
-from touchgoal.sim_envs.base import EnvConfig
+from touchgoal.sim_envs.config import EnvConfig
 
 _WEIGHTS = Path(__file__).parent / "weights"
 Task = TypeVar("Task", bound=EnvConfig)
@@ -197,12 +197,12 @@ class SavedPolicy:
         """Itself; UserError if the policy cannot act in the task."""
         policy = checkpoint.load(self.directory, control_hz=task.control_hz)
         touch, estimator = self._touch(policy.config), self._estimator(policy.config)
-        sensor = find_sensor(task.scene.sensor).name
+        sensor = find_sensor(task.sensor).name
         for embedder in (touch, estimator and estimator.touch):
             if embedder and embedder.sensor != sensor:
                 raise UserError(
                     f"the policy in {self.directory} feels with {embedder.sensor}, the task has "
-                    f"{sensor}: choose that sensor for the scene"
+                    f"{sensor}: add --env.sensor {embedder.sensor}"
                 )
         PolicyActor(Planner(policy, touch, estimator), self.latency)
         return self

@@ -1,7 +1,6 @@
 """What every task shares: a Gymnasium environment around the simulated cell."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -10,56 +9,22 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
 from touchgoal.control.motion.kinematics import GELSIGHT_TCP, Kinematics, fingers_down
 from touchgoal.control.tactile.sensor_models import find_sensor
-from touchgoal.sim_envs.scene.build import (
-    ROBOTS,
-    SIDES,
-    SceneConfig,
-    arm_joints,
-    build,
-)
+from touchgoal.sim_envs.config import EnvConfig, SceneConfig
+from touchgoal.sim_envs.scene.build import ROBOTS, SIDES, arm_joints, build
 from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, ContactReader, PadContact
 from touchgoal.sim_envs.scene.objects import Body
 from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
-from touchgoal.sim_envs.tactile.sensor_instance import SensorRandomization, sample_instance
+from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
 GRIPPER_MAX_WIDTH = 0.08  # m, Franka Hand
 DISTURBANCE_SECONDS = 0.5  # for which a disturbance keeps its direction
-STREAM_SIZE = (256, 256)  # rows, columns of what a twin's cameras send, more than is recorded
 GRIPPER_SPEED = 0.1  # m/s of width, Franka Hand's datasheet maximum
 _SETPOINT_PERIOD = 0.002  # s: set-points coarser than 2 ms shake the wrist (MuJoCo 4.0.0)
 
 Observation = dict[str, np.ndarray]
-
-
-@dataclass(frozen=True)
-class EnvConfig:
-    """Options every task has.
-
-    Attributes:
-        cameras: which of "front" and "wrist" are observed; fewer is faster.
-        camera_size: (rows, columns) of their images.
-        tactile: whether the two fingertip images are observed.
-        control_hz: control ticks per second.
-        max_seconds: after which an episode is truncated.
-        disturbance: rms speed (m/s) along each axis at which the hand strays from what is
-            commanded, and, times `disturbance_rotation`, its rms rate of turn (rad/s). An expert then shows
-            how to come back, and what it is recorded to do is right (DART, Laskey 2017).
-        randomization: between the units of the sensor; every episode has two of its own.
-        scene: robot, sensors, physics.
-    """
-
-    cameras: tuple[str, ...] = ("front", "wrist")
-    camera_size: tuple[int, int] = ft.CAMERA_SHAPE[:2]
-    tactile: bool = True
-    control_hz: int = ft.CONTROL_HZ
-    max_seconds: float = 8.0
-    disturbance: float = 0.0
-    randomization: SensorRandomization = SensorRandomization()
-    scene: SceneConfig = SceneConfig()
 
 
 class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
@@ -78,8 +43,8 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UserError(f"render_mode is 'rgb_array' or none, not {render_mode!r}")
         self.config, self.render_mode = config, render_mode
-        self.sensor = find_sensor(config.scene.sensor)
-        self.robot = ROBOTS[config.scene.arm]
+        self.sensor = find_sensor(config.sensor)
+        self.robot = ROBOTS[config.arm]
         self.n_joints = self.robot.arm.home.size
         self.kinematics = Kinematics(self.robot.arm, GELSIGHT_TCP)
         self.action_space = self._limits = self._action_space()
@@ -296,9 +261,9 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
 
     def _compile_scene(self, rng: np.random.Generator) -> None:
         self.close()
-        self.model = model = self.scene(self.config.scene).compile()
+        self.model = model = self.scene(self.config).compile()
         self.data = mujoco.MjData(model)
-        joints = [model.joint(name) for name in arm_joints(self.config.scene.arm)]
+        joints = [model.joint(name) for name in arm_joints(self.config.arm)]
         self.arm_positions = [joint.qposadr[0] for joint in joints]
         self.arm_dofs = [joint.dofadr[0] for joint in joints]
         self._fingers = [model.joint(f"finger_joint{i}").qposadr[0] for i in (1, 2)]
@@ -365,13 +330,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
 
     def _observed(self) -> list[str]:
         keys = [ft.STATE, ft.TCP_POSE, ft.WRENCH]
-        known = {key.removeprefix(ft.IMAGE_PREFIX) for key in ft.CAMERAS}
-        for camera in self.config.cameras:
-            if camera not in known:
-                raise UserError(
-                    f"unknown camera {camera!r}; choose from: {', '.join(sorted(known))}"
-                )
-            keys.append(ft.IMAGE_PREFIX + camera)
+        keys += [ft.IMAGE_PREFIX + camera for camera in self.config.cameras]
         return keys + (list(ft.TACTILE) if self.config.tactile else [])
 
     def _shape(self, key: str) -> tuple[int, ...]:

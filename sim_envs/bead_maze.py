@@ -1,7 +1,6 @@
 """The bead maze: lead a bead along a bent wire by feel."""
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -10,10 +9,11 @@ from jaxtyping import Float
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.control.motion.kinematics import fingers_across
-from touchgoal.sim_envs.base import EnvConfig, FrankaTactileEnv, Observation
+from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
+from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.options import with_options
 from touchgoal.sim_envs.scene import wires
-from touchgoal.sim_envs.scene.build import VISUAL_GROUP, SceneConfig
+from touchgoal.sim_envs.scene.build import VISUAL_GROUP
 from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Texture
 from touchgoal.sim_envs.scene.wires import LENGTH, Wire
 
@@ -40,36 +40,6 @@ _SIZES = {"sphere": (BEAD_RADIUS,), "cylinder": (BEAD_RADIUS, BEAD_LENGTH / 2)}
 _ROBOT_BIT, _HOLE_BIT = 1, 4
 
 
-@dataclass(frozen=True)
-class BeadMazeConfig(EnvConfig):
-    """Options of the bead maze; reset's `options` override the random draws.
-
-    Attributes:
-        scene: robot, sensors, physics. Only a gel with markers shows the shear, which is what the
-            wire's sideways force is felt by.
-        split: of the wires.
-        families: of the wires.
-        n_wires: of the split, from which each episode draws one.
-        bead: a cylinder feels the wire's direction as a torque, a sphere much less.
-        grasp_force: range of the force of each finger, N.
-        wire_friction: range of the friction coefficient between bead and wire.
-        stall_seconds: without 2 mm of progress after which the bead counts as jammed.
-        max_force: external force on the hand that counts as too much, N.
-    """
-
-    cameras: tuple[str, ...] = ()
-    max_seconds: float = 40.0
-    scene: SceneConfig = SceneConfig(sensor="gelsight_mini_markers")
-    split: wires.Split = "training"
-    families: tuple[wires.Family, ...] = wires.TRAINED
-    n_wires: int = 200
-    bead: Literal["sphere", "cylinder"] = "sphere"
-    grasp_force: tuple[float, float] = (8.0, 12.0)
-    wire_friction: tuple[float, float] = (0.15, 0.25)
-    stall_seconds: float = 5.0
-    max_force: float = 30.0
-
-
 class BeadMaze(FrankaTactileEnv):
     """Grasp the bead, around which the hand starts open, and lead it to the wire's other end.
 
@@ -78,7 +48,7 @@ class BeadMaze(FrankaTactileEnv):
 
     | reset option | meaning |
     |---|---|
-    | `wire` | name of a wire, such as helix-17 |
+    | `wire` | name of a wire, such as helix-1 |
     | `grasp_force` | N of each finger |
 
     Progress: the fraction of the wire between start and end, 30 mm from the posts. An episode also
@@ -138,7 +108,7 @@ class BeadMaze(FrankaTactileEnv):
         if "wire" in options:
             wire = wires.find(options["wire"])
         else:
-            drawn = wires.choose(config.split, config.n_wires, config.families)
+            drawn = config.chosen_wires()
             wire = drawn[rng.integers(len(drawn))]
         place = np.array([0.5, 0.0, 0.17]) + rng.uniform(-0.02, 0.02, 3)
         self.wire = wire.moved(place, rng.uniform(-0.15, 0.15))

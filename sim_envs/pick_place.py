@@ -1,6 +1,5 @@
 """The task of the paper's robot experiment: pick an object up and place it at a goal."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -9,7 +8,8 @@ from jaxtyping import Float
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.sim_envs.base import EnvConfig, FrankaTactileEnv, Observation
+from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
+from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.options import with_options
 from touchgoal.sim_envs.scene.build import VISUAL_GROUP
 from touchgoal.sim_envs.scene.objects import CATALOGUE, find, sample_body
@@ -17,28 +17,6 @@ from touchgoal.sim_envs.scene.objects import CATALOGUE, find, sample_body
 WORKSPACE = ((0.40, 0.60), (-0.20, 0.20))  # m, where objects start and goals lie, base frame
 _LIFTED = 0.03  # m above rest that counts as picked up
 _APART = 0.12  # m at least between objects, and between start and goal
-
-
-@dataclass(frozen=True)
-class PickPlaceConfig(EnvConfig):
-    """Options of the pick-and-place task; reset's `options` override the random draws.
-
-    Attributes:
-        objects: catalogue names to draw from; empty: all.
-        distractors: other objects on the table.
-        mass: range, kg.
-        grasp_force: range of the force of each finger, N.
-        tolerance: distance of the object's centre to the goal that counts as placed, m.
-        release: whether the object must also be let go. The paper's reward curves end in touch, so
-            by default an episode ends with the placed object still held.
-    """
-
-    objects: tuple[str, ...] = ()
-    distractors: int = 0
-    mass: tuple[float, float] = (0.02, 0.2)
-    grasp_force: tuple[float, float] = (5.0, 30.0)
-    tolerance: float = 0.02
-    release: bool = False
 
 
 class PickPlace(FrankaTactileEnv):

@@ -4,12 +4,12 @@ from typing import Any, Literal, overload
 
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import FrankaTactileEnv
-from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
+from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.config import BeadMazeConfig, TaskConfig
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.experts.pick_place import Outcome, PickPlaceExpert
-from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.pick_place import PickPlace
 
-TaskConfig = PickPlaceConfig | BeadMazeConfig
 _ENVIRONMENTS = {"pick-place": PickPlace, "bead-maze": BeadMaze}
 
 

@@ -11,7 +11,8 @@ from touchgoal.control.tactile.contact import detect_contact
 from touchgoal.episodes.recording import run
 from touchgoal.policies.evaluation.bead_maze import evaluate, trials_of
 from touchgoal.policies.follower import WireFollower
-from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig, add_wire, thread_bead
+from touchgoal.sim_envs.bead_maze import BeadMaze, add_wire, thread_bead
+from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.scene import wires
 from touchgoal.sim_envs.scene.wires import FAMILIES, LENGTH, MIN_RADIUS, Wire, choose, find

@@ -180,7 +180,7 @@ def test_learning_the_bead_maze(
     missing = refused(capsys, "run-policy", "--task", "bead-maze", "--policy", "nowhere")
     assert "no policy in nowhere" in missing
     other = refused(capsys, "run-policy", "--task", "bead-maze", "--policy", "policy/policy",
-                    "--maze.scene.sensor", "gelsight_mini")  # fmt: skip
+                    "--maze.sensor", "gelsight_mini")  # fmt: skip
     assert "feels with gelsight_mini_markers" in other
 
 

@@ -13,9 +13,10 @@ from gymnasium.utils.env_checker import check_env
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import FrankaTactileEnv
-from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
+from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import OUTCOMES, PickPlaceExpert
-from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE, SHAPES
 from touchgoal.sim_envs.tasks import make
 
@@ -215,8 +216,8 @@ def test_bad_requests_say_what_to_do(blind: PickPlace) -> None:
         blind.reset(options={"object": "teapot"})
     with pytest.raises(UserError, match="unknown reset option 'colour'"):
         blind.reset(options={"colour": "red"})
-    with pytest.raises(UserError, match="unknown camera"):
-        PickPlace(PickPlaceConfig(cameras=("top",)))
+    with pytest.raises(UserError, match="cameras must be 'front' or 'wrist', not top"):
+        PickPlaceConfig(cameras=("top",))  # pyright: ignore[reportArgumentType]
     blind.reset(seed=0)
     with pytest.raises(UserError, match="needs a second object"):
         PickPlaceExpert(blind, "wrong_object")

@@ -12,8 +12,9 @@ from touchgoal.episodes.recording import CORRECTED, EpisodeSpec, record_episode
 from touchgoal.policies import checkpoint
 from touchgoal.policies.perception.state_estimation import ESTIMATED
 from touchgoal.policies.training.dagger import DaggerRoles
+from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
-from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.pick_place import PickPlace
 
 BLIND = PickPlaceConfig(cameras=(), tactile=False)
 JOB = EpisodeSpec(1, options={"object": "wooden_block"})

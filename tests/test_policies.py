@@ -6,8 +6,8 @@ from touchgoal.episodes.recording import EpisodeSpec
 from touchgoal.policies.acting import SHIPPED, SavedPolicy
 from touchgoal.policies.evaluation.pick_place import evaluate
 from touchgoal.policies.evaluation.success_rate import SuccessRate
+from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
-from touchgoal.sim_envs.pick_place import PickPlaceConfig
 
 
 @pytest.mark.parametrize(

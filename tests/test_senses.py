@@ -35,8 +35,8 @@ from touchgoal.policies.perception.training import (
     train_contact_estimator,
     train_pose_estimator,
 )
-from touchgoal.sim_envs.bead_maze import BeadMazeConfig
-from touchgoal.sim_envs.pick_place import WORKSPACE, PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
+from touchgoal.sim_envs.pick_place import WORKSPACE, PickPlace
 
 SMALL = PoseEstimatorConfig(
     (16, 16),

@@ -9,8 +9,9 @@ import torch
 from touchgoal.control.tactile.sensor_calibration import shade
 from touchgoal.control.tactile.sensor_models import DIGIT, SensorModel
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI as MINI
+from touchgoal.sim_envs.config import NO_RANDOMIZATION, PickPlaceConfig, SensorRandomization
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
-from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE, Body
 from touchgoal.sim_envs.tactile import batched
 from touchgoal.sim_envs.tactile.geometry import (
@@ -26,11 +27,7 @@ from touchgoal.sim_envs.tactile.geometry import (
 from touchgoal.sim_envs.tactile.optics import colour_change, render
 from touchgoal.sim_envs.tactile.pad import TactileFrame
 from touchgoal.sim_envs.tactile.press_bench import PressBench
-from touchgoal.sim_envs.tactile.sensor_instance import (
-    NO_RANDOMIZATION,
-    SensorRandomization,
-    sample_instance,
-)
+from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
 INSTANCE = sample_instance(MINI, np.random.default_rng(0), NO_RANDOMIZATION)
 

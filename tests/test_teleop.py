@@ -15,7 +15,8 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.control.sensors.keyboard import Keyboard
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
+from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.experts.teleoperator import Teleoperator, TeleoperatorConfig
 
 STRAIGHT = "arc-2000009"  # nearly: it turns by 7 degrees

@@ -14,17 +14,13 @@ from touchgoal.control.tactile.force import estimate_force
 from touchgoal.control.tactile.markers import MarkerTracker, find_markers, without_markers
 from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT, GELSIGHT_MINI, SensorModel
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS as DOTTED
+from touchgoal.sim_envs.config import NO_RANDOMIZATION
 from touchgoal.sim_envs.scene.objects import CATALOGUE, Body, ObjectKind
 from touchgoal.sim_envs.tactile.markers import draw
 from touchgoal.sim_envs.tactile.optics import render, render_untouched
 from touchgoal.sim_envs.tactile.pad import TactileFrame
 from touchgoal.sim_envs.tactile.press_bench import PressBench
-from touchgoal.sim_envs.tactile.sensor_instance import (
-    COUNT_STEP,
-    NO_RANDOMIZATION,
-    SensorInstance,
-    sample_instance,
-)
+from touchgoal.sim_envs.tactile.sensor_instance import COUNT_STEP, SensorInstance, sample_instance
 
 HEIGHT, WIDTH = GELSIGHT_MINI.image_shape
 MINI = sample_instance(GELSIGHT_MINI, np.random.default_rng(0), NO_RANDOMIZATION)

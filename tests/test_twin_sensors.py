@@ -10,9 +10,9 @@ from running_twin import RunningTwin
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.sensors.load_cell import LoadCellConfig, parse
-from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
-from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
-from touchgoal.sim_envs.scene.build import SceneConfig
+from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
+from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.twin import faults
 from touchgoal.sim_envs.twin.cell import SimulatedCell
 
@@ -21,8 +21,7 @@ pytestmark = pytest.mark.realtime
 
 @pytest.mark.parametrize("arm", ["fr3", "ur5e"])
 def test_arm_follows_without_lag(arm: Literal["fr3", "ur5e"]) -> None:
-    scene = SceneConfig(arm=arm)
-    cell = SimulatedCell(PickPlace(PickPlaceConfig(cameras=(), tactile=False, scene=scene)), 3, {})
+    cell = SimulatedCell(PickPlace(PickPlaceConfig(cameras=(), tactile=False, arm=arm)), 3, {})
     start, error = cell.q_d.copy(), 0.0
     for _ in range(1500):
         phase = 4 * (cell.time + 1e-3)  # 0.8 rad/s and 3.2 rad/s^2 at most

@@ -8,7 +8,8 @@ from tqdm import tqdm
 
 from touchgoal.control import features as ft
 from touchgoal.episodes.recording import Actor, EpisodeSpec, one_core_workers, run
-from touchgoal.sim_envs.bead_maze import BeadMaze, BeadMazeConfig
+from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.scene.wires import Wire
 
 FAILURES = ft.FEATURES[ft.TRUTH_FAILURE].names

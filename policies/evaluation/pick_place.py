@@ -8,7 +8,8 @@ from tqdm import tqdm
 
 from touchgoal.control import features as ft
 from touchgoal.episodes.recording import Actor, EpisodeSpec, one_core_workers, run
-from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.config import PickPlaceConfig
+from touchgoal.sim_envs.pick_place import PickPlace
 
 
 @dataclass(frozen=True)

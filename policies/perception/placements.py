@@ -10,7 +10,8 @@ from tqdm import tqdm
 
 from touchgoal.control import features as ft
 from touchgoal.episodes.recording import one_core_workers
-from touchgoal.sim_envs.pick_place import PickPlace, PickPlaceConfig
+from touchgoal.sim_envs.config import PickPlaceConfig
+from touchgoal.sim_envs.pick_place import PickPlace
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,9 +5,7 @@ are set. World frame = the robot's base frame, table top at z = 0.
 """
 
 import importlib.util
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import mujoco
 import numpy as np
@@ -16,6 +14,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.motion.kinematics import GELSIGHT_TCP
 from touchgoal.control.safety import limits
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
+from touchgoal.sim_envs.config import SceneConfig
 from touchgoal.sim_envs.scene.objects import FIRM, Body
 from touchgoal.sim_envs.scene.ur5e import replace_arm_with_ur5e
 
@@ -31,25 +30,6 @@ _STIFFNESS = {
 }
 SERVO_DAMPING = 0.1  # s: N m s/rad for each N m/rad of stiffness, fr3.xml
 _SENSOR_DEPTH_IN_FINGER = GELSIGHT_TCP - 0.0584  # finger frame to sensor centre, along z
-
-
-@dataclass(frozen=True)
-class SceneConfig:
-    """What the scene is made of.
-
-    Attributes:
-        arm: whose flange carries the hand.
-        sensor: on both fingers: a name in `control.sensors.SENSORS`, or the folder of a sensor file
-            that `touchgoal calibrate` wrote.
-        meshes: "fast" draws the collision meshes (2.5k triangles, 1 ms a frame in software GL),
-            "full" the visual ones (242k triangles, 30 ms).
-        timestep: of the physics, s.
-    """
-
-    arm: Literal["fr3", "ur5e"] = "fr3"
-    sensor: str = "gelsight_mini"
-    meshes: Literal["fast", "full"] = "fast"
-    timestep: float = 1e-3
 
 
 def robot_model() -> Path:

@@ -23,7 +23,7 @@ class SceneRecorder:
 
     def __init__(self, env: FrankaTactileEnv) -> None:
         self._env = env
-        spec = env.scene(replace(env.config.scene, meshes="full"))
+        spec = env.scene(replace(env.config, meshes="full"))
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         self._renderer = open_renderer(self._model, _HEIGHT, _HEIGHT)

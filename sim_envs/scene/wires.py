@@ -52,7 +52,7 @@ class Wire:
 
     @property
     def name(self) -> str:
-        """Such as helix-17; `find` makes the wire of a name."""
+        """Such as helix-1; `find` makes the wire of a name."""
         return f"{self.family}-{self.seed}"
 
     @cached_property
@@ -126,7 +126,7 @@ def make(family: Family, seed: int) -> Wire | None:
 
 
 def find(name: str) -> Wire:
-    """The wire of a name such as helix-17; UserError if there is none."""
+    """The wire of a name such as helix-1; UserError if there is none."""
     family, _, seed = name.rpartition("-")
     if family not in FAMILIES or not seed.isdecimal():
         raise UserError(

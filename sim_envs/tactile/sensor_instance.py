@@ -13,41 +13,11 @@ from touchgoal.control.tactile.sensor_calibration import (
     monomials,
 )
 from touchgoal.control.tactile.sensor_models import SensorModel
+from touchgoal.sim_envs.config import SensorRandomization
 from touchgoal.sim_envs.tactile.markers import rest_positions
 
 NOISE_MARGIN = 64  # px by which the noise tile is larger than a frame
 COUNT_STEP = 1 / 16  # counts: fine enough, and small enough numbers for the processor's cache
-
-
-@dataclass(frozen=True)
-class SensorRandomization:
-    """How much units differ, for domain randomisation.
-
-    Brightness: measured over real Minis (Tactile-MNIST: per-unit gain std 0.047; offset std 0.0094
-    and smooth pattern std 0.0093 of full scale; channels' noise correlated by 0.24 to 0.39). The
-    others: the differences between published calibrations.
-
-    Attributes:
-        gain: standard deviation of each channel's response and brightness, relative.
-        offset, pattern: standard deviations added to the background, counts.
-        azimuth: largest turn of each light, degrees.
-        blur_sigmas: largest change of the gel's bulge, relative.
-        pitch: whether the pixel pitch is drawn from the model's `pitch_range`.
-        marker: largest shift (in pitches) and change of size (relative) of printed dots.
-    """
-
-    gain: float = 0.047
-    offset: float = 2.4
-    pattern: float = 2.4
-    azimuth: float = 15.0
-    blur_sigmas: float = 0.3
-    pitch: bool = True
-    marker: float = 0.1
-
-
-NO_RANDOMIZATION = SensorRandomization(
-    gain=0.0, offset=0.0, pattern=0.0, azimuth=0.0, blur_sigmas=0.0, pitch=False, marker=0.0
-)
 
 
 @dataclass(frozen=True)
@@ -89,9 +59,9 @@ def sample_instance(
     brightness = 1 + randomization.gain * rng.normal(size=3)
     turns = randomization.azimuth * rng.uniform(-1, 1, 3)
     blur_sigmas = tuple(
-        b * (1 + randomization.blur_sigmas * rng.uniform(-1, 1)) for b in typical.blur_sigmas
+        b * (1 + randomization.blur * rng.uniform(-1, 1)) for b in typical.blur_sigmas
     )
-    pitch = rng.uniform(*sensor.pitch_range) if randomization.pitch else sensor.pixel_pitch
+    pitch = rng.uniform(*sensor.pitch_range) if randomization.pixel_pitch else sensor.pixel_pitch
     azimuths = np.array(typical.light_azimuths) + turns
     channels = brightness.astype(np.float32)[:, None]
     calibration = replace(
@@ -110,7 +80,7 @@ def sample_instance(
     tile = (h + NOISE_MARGIN, w + NOISE_MARGIN, 3)
     common = np.sqrt(0.3)  # of the noise variance is the same in all channels
     noise = common * rng.normal(size=(*tile[:2], 1)) + np.sqrt(0.7) * rng.normal(size=tile)
-    markers, radius = _markers(sensor, pitch, randomization.marker, rng)
+    markers, radius = _markers(sensor, pitch, randomization.markers, rng)
     light = cv2.resize(
         illumination(typical.background), (w // 2, h // 2), interpolation=cv2.INTER_AREA
     )

@@ -25,10 +25,9 @@ from touchgoal.control.interfaces import (
 )
 from touchgoal.control.motion.tracker import Tracker, TrackerState
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
-from touchgoal.sim_envs.base import GRIPPER_SPEED, STREAM_SIZE
-from touchgoal.sim_envs.bead_maze import BeadMazeConfig
-from touchgoal.sim_envs.pick_place import PickPlaceConfig
-from touchgoal.sim_envs.tasks import TaskConfig, make_env
+from touchgoal.sim_envs.base import GRIPPER_SPEED
+from touchgoal.sim_envs.config import STREAM_SIZE, BeadMazeConfig, PickPlaceConfig, TaskConfig
+from touchgoal.sim_envs.tasks import make_env
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 
 _HELD_GAP = (
@@ -231,12 +230,11 @@ def simulate_cell(config: CellConfig, hz: float) -> CellConnection:
 def env_config_of(config: CellConfig) -> TaskConfig:
     """The task's own options with the cell's sensors, at the rate of a deployment."""
     task = BeadMazeConfig() if config.task.name == "bead-maze" else PickPlaceConfig()
-    scene = replace(task.scene, sensor=config.sensor)
     return replace(
         task,
         cameras=tuple(config.cameras),
         camera_size=STREAM_SIZE,
         tactile=config.fingertips is not None,
-        scene=scene,
+        sensor=config.sensor,
         control_hz=ft.CONTROL_HZ,
     )

@@ -8,9 +8,9 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH
-from touchgoal.sim_envs.bead_maze import BeadMazeConfig
+from touchgoal.sim_envs.config import BeadMazeConfig, TaskConfig
 from touchgoal.sim_envs.tactile.press_bench import warm_up
-from touchgoal.sim_envs.tasks import TaskConfig, make_env
+from touchgoal.sim_envs.tasks import make_env
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.faults import ControlPort
 from touchgoal.sim_envs.twin.franka.controller import FrankaArm
@@ -30,7 +30,7 @@ class TwinConfig:
     """A twin.
 
     Attributes:
-        task: what the cell is for; its `scene.arm` is overruled by `arm`.
+        task: what the cell is for; its own `arm` is overruled by `arm`.
         arm: an FR3 with the Franka Hand, or a UR5e whose gripper talks as a Robotiq does.
         seed, options: of the first episode.
         host: loopback address of everything; twins at different ones run side by side.
@@ -75,9 +75,8 @@ class Twin:
     """
 
     def __init__(self, config: TwinConfig) -> None:
-        scene = replace(config.task.scene, arm=config.arm)
         self.cell = SimulatedCell(
-            make_env(replace(config.task, scene=scene)), config.seed, dict(config.options)
+            make_env(replace(config.task, arm=config.arm)), config.seed, dict(config.options)
         )
         env = self.cell.env
         if (
@@ -152,7 +151,7 @@ class Twin:
             "address": host,
             "gripper": gripper,
             "images": streams.addresses(),
-            "sensor": config.task.scene.sensor,
+            "sensor": config.task.sensor,
             "load_cell": {
                 "port": str(load_cell.port.path),
                 "newtons_per_count": serial_ports.NEWTONS_PER_COUNT,

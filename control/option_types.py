@@ -1,0 +1,77 @@
+"""Options with ranges: `Config` classes that are checked whenever one is made, by whomever."""
+
+from typing import Annotated, Any, TypeVar, dataclass_transform
+
+import pydantic.dataclasses
+from pydantic import AfterValidator, Field, ValidationError
+
+from touchgoal.control.errors import UserError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+"""Between 0 and 1, both included."""
+Count = Annotated[int, Field(ge=1)]
+CountOrNone = Annotated[int, Field(ge=0)]
+"""A count that may be 0, for nothing of it."""
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
+Port = Annotated[int, Field(ge=0, le=65535)]
+
+RARE = "rarely needed"
+"""Stands in the annotation of an option that only `--help-all` shows."""
+
+Number = TypeVar("Number", bound=float)
+
+
+def _ordered(bounds: tuple[Number, Number]) -> tuple[Number, Number]:
+    if bounds[0] > bounds[1]:
+        raise ValueError(f"must go from less to more, not {bounds[0]:g} to {bounds[1]:g}")
+    return bounds
+
+
+ORDERED = AfterValidator(_ordered)
+PositiveRange = Annotated[tuple[Positive, Positive], ORDERED]
+"""Lower and upper bound; two equal ones fix the value."""
+
+
+class OptionError(UserError):
+    """Values out of range.
+
+    Attributes:
+        problems: name of each field at fault ("" for several together), and what is wrong.
+    """
+
+    def __init__(self, config: str, problems: list[tuple[str, str]]) -> None:
+        super().__init__(f"{config}: " + "; ".join(f"{k} {v}".strip() for k, v in problems))
+        self.problems = problems
+
+
+Class = TypeVar("Class", bound=type)
+
+
+@dataclass_transform(frozen_default=True)
+def checked_dataclass(cls: Class) -> Class:
+    """A frozen dataclass whose fields are checked by pydantic against their annotations.
+
+    Raises (when an instance is made):
+        OptionError: a value does not fit, or `__post_init__` raised a ValueError.
+    """
+    made: Any = pydantic.dataclasses.dataclass(frozen=True, config={"extra": "forbid"})(cls)
+    initialise = made.__init__
+
+    def checked(self: Any, *args: Any, **kwargs: Any) -> None:
+        try:
+            initialise(self, *args, **kwargs)
+        except ValidationError as error:
+            raise OptionError(cls.__name__, [_problem(e) for e in error.errors()]) from None
+
+    made.__init__ = checked
+    return made
+
+
+def _problem(error: Any) -> tuple[str, str]:
+    field = str(error["loc"][0]) if error["loc"] else ""
+    if error["type"] == "value_error":  # raised by a check of ours, in words of ours
+        return field, error["msg"].removeprefix("Value error, ")
+    return field, f"{error['msg'].replace('Input should be', 'must be')}, not {error['input']}"

@@ -1,0 +1,167 @@
+"""Options of the simulated cell and of each task; light to import, for every command shows them."""
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+
+from touchgoal.control import features as ft
+from touchgoal.control.option_types import (
+    ORDERED,
+    RARE,
+    Count,
+    CountOrNone,
+    Fraction,
+    NotNegative,
+    Positive,
+    PositiveRange,
+    checked_dataclass,
+)
+from touchgoal.sim_envs.scene.objects import find as find_object
+from touchgoal.sim_envs.scene.wires import TRAINED, Family, Split, Wire, choose
+from touchgoal.sim_envs.scene.wires import find as find_wire
+
+TaskName = Literal["pick-place", "bead-maze"]
+Camera = Literal["front", "wrist"]
+ObjectName = Annotated[str, AfterValidator(lambda name: find_object(name).name)]
+"""A name of the catalogue of objects."""
+WireName = Annotated[str, AfterValidator(lambda name: find_wire(name).name)]
+"""A name such as helix-1."""
+ForceRange = Annotated[
+    tuple[Annotated[Positive, Field(le=40.0)], Annotated[Positive, Field(le=40.0)]], ORDERED
+]
+"""Least and greatest force of each finger, N; the simulated gripper presses with 40 N at most."""
+
+STREAM_SIZE = (256, 256)
+"""Rows and columns of what a twin's cameras send, more than is recorded."""
+
+
+@checked_dataclass
+class SensorRandomization:
+    """How much two fingertip sensors of one model differ.
+
+    Brightness: measured over real Minis (Tactile-MNIST: per-unit gain std 0.047; offset std 0.0094
+    and smooth pattern std 0.0093 of full scale; channels' noise correlated by 0.24 to 0.39). The
+    others: the differences between published calibrations.
+    """
+
+    gain: NotNegative = 0.047
+    """Standard deviation of each colour channel's brightness, as a share of it."""
+    offset: NotNegative = 2.4
+    """Standard deviation of a constant added to the untouched picture, counts of 255."""
+    pattern: NotNegative = 2.4
+    """Standard deviation of a smooth pattern added to the untouched picture, counts of 255."""
+    azimuth: NotNegative = 15.0
+    """Largest turn of each light around the gel, degrees."""
+    blur: Fraction = 0.3
+    """Largest change of how far the gel smooths an imprint, as a share of it."""
+    pixel_pitch: bool = True
+    """Draw the millimetres per pixel from the range of the sensor model."""
+    markers: Fraction = 0.1
+    """Largest shift of printed dots (share of their distance) and change of their size (share)."""
+
+
+NO_RANDOMIZATION = SensorRandomization(
+    gain=0.0, offset=0.0, pattern=0.0, azimuth=0.0, blur=0.0, pixel_pitch=False, markers=0.0
+)
+
+
+@checked_dataclass
+class SceneConfig:
+    """What the scene is made of."""
+
+    sensor: str = "gelsight_mini"
+    """Sensor on both fingertips: a name (`touchgoal list sensors`), or the folder of a sensor file
+    that `touchgoal calibrate` wrote."""
+    arm: Literal["fr3", "ur5e"] = "fr3"
+    """Arm that carries the hand."""
+    meshes: Annotated[Literal["fast", "full"], RARE] = "fast"
+    """What cameras see of the arm: its collision meshes (fast: 2,500 triangles, 1 ms a frame in
+    software OpenGL) or its visual ones (full: 242,000 triangles, 30 ms)."""
+    timestep: Annotated[Positive, RARE] = 1e-3
+    """Time step of the physics, s."""
+
+
+@checked_dataclass
+class EnvConfig(SceneConfig):
+    """Options every task has."""
+
+    cameras: tuple[Camera, ...] = ("front", "wrist")
+    """Cameras that are observed; fewer is faster."""
+    camera_size: tuple[Count, Count] = ft.CAMERA_SHAPE[:2]
+    """Rows and columns of the cameras' pictures, px."""
+    tactile: bool = True
+    """Observe the pictures of both fingertips."""
+    control_hz: Annotated[Count, RARE] = ft.CONTROL_HZ
+    """Control ticks per second."""
+    max_seconds: Positive = 8.0
+    """Length after which an episode ends, s."""
+    disturbance: NotNegative = 0.0
+    """Random motion added to what is commanded, so that an expert shows how to come back (DART,
+    Laskey 2017): rms speed along each axis, m/s."""
+    randomization: Annotated[SensorRandomization, RARE] = SensorRandomization()
+    """How much the two fingertip sensors differ, drawn anew for each episode."""
+
+
+@checked_dataclass
+class PickPlaceConfig(EnvConfig):
+    """Options of pick-place; reset's `options` override the random draws."""
+
+    objects: tuple[ObjectName, ...] = ()
+    """Objects to draw from (`touchgoal list objects`); default: all."""
+    distractors: CountOrNone = 0
+    """Other objects on the table."""
+    mass: PositiveRange = (0.02, 0.2)
+    """Lightest and heaviest object, kg."""
+    grasp_force: ForceRange = (5.0, 30.0)
+    """Weakest and strongest force of each finger, N."""
+    tolerance: Positive = 0.02
+    """Distance from the goal within which the object's centre counts as placed, m."""
+    release: bool = False
+    """The object must also be let go. The paper's reward curves end in touch, so by default an
+    episode ends with the placed object still held."""
+
+
+@checked_dataclass
+class BeadMazeConfig(EnvConfig):
+    """Options of bead-maze; reset's `options` override the random draws."""
+
+    # Only a gel with markers shows the shear, by which the wire's sideways force is felt.
+    sensor: str = "gelsight_mini_markers"
+    """Sensor on both fingertips: a name (`touchgoal list sensors`), or the folder of a sensor file
+    that `touchgoal calibrate` wrote. Only a gel with printed dots shows sideways force well."""
+    cameras: tuple[Camera, ...] = ()
+    """Cameras that are observed; fewer is faster."""
+    max_seconds: Positive = 40.0
+    """Length after which an episode ends, s."""
+    wires: tuple[WireName, ...] = ()
+    """Wires to draw from, by name, such as helix-1; default: the first `n-wires` of `split`."""
+    split: Split = "training"
+    """Set from which wires are taken; no wire is in two of them."""
+    families: tuple[Family, ...] = TRAINED
+    """Shapes of wires to take."""
+    n_wires: Count = 200
+    """Number of wires to draw from."""
+    bead: Literal["sphere", "cylinder"] = "sphere"
+    """Shape of the bead: a cylinder feels the wire's direction as a torque, a sphere much less."""
+    grasp_force: ForceRange = (8.0, 12.0)
+    """Weakest and strongest force of each finger, N."""
+    wire_friction: PositiveRange = (0.15, 0.25)
+    """Least and greatest friction coefficient between bead and wire."""
+    stall_seconds: Positive = 5.0
+    """Time without 2 mm of progress after which the bead counts as jammed, s."""
+    max_force: Positive = 30.0
+    """External force on the hand that counts as too much, N."""
+
+    def chosen_wires(self, count: int | None = None) -> list[Wire]:
+        """The wires to draw from; if a count is given, so many of them, named ones in turn."""
+        if not self.wires:
+            return choose(self.split, count or self.n_wires, self.families)
+        named = [find_wire(name) for name in self.wires]
+        return named if count is None else [named[i % len(named)] for i in range(count)]
+
+
+TaskConfig = PickPlaceConfig | BeadMazeConfig
+TASKS: dict[TaskName, type[PickPlaceConfig] | type[BeadMazeConfig]] = {
+    "pick-place": PickPlaceConfig,
+    "bead-maze": BeadMazeConfig,
+}
