@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from touchgoal.control import features as ft
+from touchgoal.control.errors import UserError
 from touchgoal.control.motion.kinematics import GELSIGHT_TCP, Kinematics, fingers_down
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.sim_envs.config import EnvConfig, SceneConfig

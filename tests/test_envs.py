@@ -105,8 +105,8 @@ def test_options_by_name() -> None:
     assert isinstance(make("pick-place", render_mode="rgb_array"), PickPlace)
     with pytest.raises(UserError, match="no option 'camera_sise'; did you mean camera_size"):
         gym.make("touchgoal/PickPlace-v0", camera_sise=(96, 96))
-    with pytest.raises(UserError, match="has no option 'blur_sigma'; did you mean blur_sigmas"):
-        make("pick-place", randomization={"blur_sigma": 0.0})
+    with pytest.raises(UserError, match="has no option 'blurr'; did you mean blur"):
+        make("pick-place", randomization={"blurr": 0.0})
     with pytest.raises(UserError, match="unknown task 'place'; choose from: pick-place, bead-maze"):
         make("place")  # type: ignore[call-overload]
     with pytest.raises(UserError, match="'rgb_array' or none, not 'human'"):
