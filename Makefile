@@ -1,11 +1,15 @@
-# Two commands from a fresh clone: `make demo` and `make test`. Each sets up what it needs.
+# Two commands from a fresh clone: `make demo` and `make test`. Each sets up what it needs;
+# `make setup` does only that.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 CODE := control sim_envs episodes encoders rewards policies benchmarks launch tests
 
-.PHONY: demo test check format build typings weights weights-markers maze-policy pick-place-policy clean
+.PHONY: setup demo test lint check format build typings weights weights-markers maze-policy pick-place-policy clean
+
+setup: $(READY)
+	@echo "touchgoal is ready: $(BIN)/touchgoal --help"
 
 demo: $(READY)
 	$(BIN)/touchgoal doctor --quiet
@@ -16,11 +20,14 @@ test: $(READY)
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not realtime" --durations 20
 	$(BIN)/python -m pytest -m realtime --durations 10
 
-# The quick loop before every commit.
-check: $(READY) typings
+# Format, lint and types.
+lint: $(READY) typings
 	$(BIN)/ruff format --check $(CODE)
 	$(BIN)/ruff check $(CODE)
 	$(BIN)/pyright
+
+# The quick loop before every commit.
+check: lint
 	$(BIN)/python -m pytest -n auto -m "not slow and not realtime"
 
 format: $(READY)
@@ -32,13 +39,16 @@ typings: typings/mujoco
 typings/mujoco: | $(READY)
 	$(BIN)/pybind11-stubgen mujoco -o typings --ignore-all-errors >/dev/null 2>&1
 
-# The built wheel, tested in a clean environment.
+# The source distribution and the wheel made from it; the wheel is tested in a clean environment with
+# the tests that the source distribution holds.
 build: $(READY)
-	rm -rf dist .venv-wheel
+	rm -rf dist build .venv-wheel
 	$(BIN)/python -m build --outdir dist
 	$(PYTHON) -m venv .venv-wheel
-	.venv-wheel/bin/pip install -q -c constraints.txt "$$(echo dist/*.whl)[towers,franka,dev]"
-	.venv-wheel/bin/python -m pytest -n auto -m "not slow and not realtime" --ignore tests/test_layout.py
+	.venv-wheel/bin/pip install -c constraints.txt "$$(echo dist/*.whl)[towers,franka,dev]"
+	tar -xzf dist/*.tar.gz -C dist
+	cd dist/touchgoal-*/ && rm -r src && ../../.venv-wheel/bin/python -m pytest -n auto \
+		-m "not slow and not realtime" --ignore tests/test_layout.py
 
 # How the shipped touch encoder was made: about 25 minutes on 2 cores.
 weights: $(READY)
@@ -110,8 +120,9 @@ pick-place-policy: $(READY)
 	rm -rf policies/weights/pick_place && cp -r $(PICK)/policy/policy policies/weights/pick_place
 
 $(READY): pyproject.toml constraints.txt
+	@echo "setting up $(VENV): about 1 GB from PyPI, 2 to 3 minutes"
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install -q -c constraints.txt -e '.[towers,franka,dev]'
+	$(BIN)/pip install --disable-pip-version-check -c constraints.txt -e '.[towers,franka,dev]'
 	touch $@
 
 clean:

@@ -18,12 +18,13 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import Safety
 from touchgoal.episodes.repair import validate
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.launch import deploy
 from touchgoal.launch.__main__ import main
 from touchgoal.policies.deploy.control_loop import ControlLoop, RunLog, TickStatus
 from touchgoal.sim_envs.twin.in_process import simulate_cell
 
 _PATIENCE = 300  # s for a loop, on a machine however loaded
-CELL_FILES = Path(__file__).parents[1] / "launch" / "cells"
+CELL_FILES = Path(deploy.__file__).parent / "cells"  # of the wheel, where that is tested
 SIM = """
 arm = "sim"
 gripper = { kind = "franka_hand" }

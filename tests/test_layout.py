@@ -72,6 +72,19 @@ def test_version_is_said_once() -> None:
     assert project["version"] == __version__
 
 
+def test_every_data_file_is_packaged() -> None:
+    """What lies beside the code (weights, sensor files, cell files) is in the wheel, too."""
+    pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    packaged = {
+        path.relative_to(ROOT)
+        for package, patterns in pyproject["tool"]["setuptools"]["package-data"].items()
+        for pattern in patterns
+        for path in (ROOT / "/".join(package.split(".")[1:])).glob(pattern)
+    }
+    there = {p.relative_to(ROOT) for f in ORDER for p in (ROOT / f).rglob("*") if p.is_file()}
+    assert {p for p in there if p.suffix not in (".py", ".pyc")} <= packaged
+
+
 def test_control_needs_no_torch() -> None:
     files = (p.relative_to(ROOT).with_suffix("") for p in (ROOT / "control").rglob("*.py"))
     modules = ["touchgoal." + ".".join(f.parts) for f in files]
