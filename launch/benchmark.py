@@ -10,6 +10,7 @@ from touchgoal.benchmarks import (
     bead_maze,
     env_speed,
     faults,
+    motion,
     policy_latency,
     reward_quality,
     tactile_realism,
@@ -23,6 +24,7 @@ BENCHMARKS: dict[type, Any] = {
         bead_maze,
         env_speed,
         faults,
+        motion,
         policy_latency,
         reward_quality,
         tactile_realism,
@@ -33,6 +35,7 @@ Config = (
     Annotated[bead_maze.Config, tyro.conf.subcommand("bead-maze")]
     | Annotated[env_speed.Config, tyro.conf.subcommand("env-speed")]
     | Annotated[faults.Config, tyro.conf.subcommand("faults")]
+    | Annotated[motion.Config, tyro.conf.subcommand("motion")]
     | Annotated[policy_latency.Config, tyro.conf.subcommand("policy-latency")]
     | Annotated[reward_quality.Config, tyro.conf.subcommand("reward-quality")]
     | Annotated[tactile_realism.Config, tyro.conf.subcommand("tactile-realism")]

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.control.motion.kinematics import Fr3Kinematics, fingers_across
+from touchgoal.control.motion.kinematics import Fr3Kinematics
+from touchgoal.control.motion.rotations import fingers_across
 from touchgoal.sim_envs.bead_maze import GRASP_SECONDS
 
 

@@ -10,7 +10,8 @@ from jaxtyping import Float, UInt8
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.control.motion.kinematics import GELSIGHT_TCP, Kinematics, fingers_down
+from touchgoal.control.motion.kinematics import Kinematics
+from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.sim_envs.config import EnvConfig, SceneConfig
 from touchgoal.sim_envs.scene.build import ROBOTS, SIDES, arm_joints, build
@@ -47,7 +48,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.sensor = find_sensor(config.sensor)
         self.robot = ROBOTS[config.arm]
         self.n_joints = self.robot.arm.home.size
-        self.kinematics = Kinematics(self.robot.arm, GELSIGHT_TCP)
+        self.kinematics = Kinematics(self.robot.arm, self.robot.tool.tcp_offset)
         self.action_space = self._limits = self._action_space()
         self.observation_space = gym.spaces.Dict(
             {key: _space(ft.FEATURES[key], self._shape(key)) for key in self._observed()}

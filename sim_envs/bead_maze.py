@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.control.motion.kinematics import fingers_across
+from touchgoal.control.motion.rotations import fingers_across
 from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
 from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.options import with_options

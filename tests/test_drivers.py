@@ -24,7 +24,6 @@ from touchgoal.control.interfaces import (
     Gripper,
     LoadCell,
 )
-from touchgoal.control.motion.kinematics import GELSIGHT_TCP
 from touchgoal.control.safety.limits import FR3, UR5E
 from touchgoal.control.sensors.load_cell import LoadCellConfig, SerialLoadCell
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
@@ -45,7 +44,7 @@ name, address = sys.argv[1:]
 client, rate, robot = {
     "fr3": (franka.FrankaClient, franka.RATE, FR3), "ur5e": (ur.UrClient, ur.RATE, UR5E)
 }[name]
-arm = ArmProcess(client, ArmConfig(address, robot, 0.1, 20.0, rate, 0.5))
+arm = ArmProcess(client, ArmConfig(address, robot, 20.0, rate, 0.5))
 q = arm.read().q
 while True:
     q[0] += 0.01
@@ -69,7 +68,7 @@ class Twin(RunningTwin):
             "ur5e": (ur.UrClient, ur.RATE, UR5E),
         }[name]
         address = self.description["address"]
-        self.config = ArmConfig(address, robot, GELSIGHT_TCP, HZ, rate, state_timeout=0.5)
+        self.config = ArmConfig(address, robot, HZ, rate, state_timeout=0.5)
 
     def connect(self) -> ArmProcess:
         return ArmProcess(self.client, self.config)
@@ -263,7 +262,7 @@ def test_a_taken_franka_is_said_and_not_waited_for(twin: Twin) -> None:
 def test_no_controller_is_said(client: type) -> None:
     robot = FR3 if client is franka.FrankaClient else UR5E
     with pytest.raises(DriverError, match="FCI|verify the IP"):
-        ArmProcess(client, ArmConfig("127.99.99.99", robot, 0.1, HZ, 100.0, 0.5))
+        ArmProcess(client, ArmConfig("127.99.99.99", robot, HZ, 100.0, 0.5))
 
 
 def test_a_wrench_is_moved_with_its_lever() -> None:

@@ -22,7 +22,8 @@ from toy_policies import (
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.control.motion.kinematics import FR3_HOME, Fr3Kinematics
+from touchgoal.control.motion.arm_models import FR3_ARM
+from touchgoal.control.motion.kinematics import Fr3Kinematics
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies import checkpoint
@@ -58,7 +59,7 @@ def test_representations_round_trip(kind: ActionRepresentation) -> None:
 def test_along_the_hand_every_way_the_arm_faces_is_the_same() -> None:
     """Turned about its first, vertical joint, the arm sees and does the same."""
     kinematics, columns = Fr3Kinematics(), (ft.STATE, ft.TCP_POSE)
-    q = FR3_HOME + np.random.default_rng(0).normal(0, 0.2, (2, 7))
+    q = FR3_ARM.home + np.random.default_rng(0).normal(0, 0.2, (2, 7))
     q[1, 1:] = q[0, 1:]
     velocity = 0.1 * torch.randn(1, 7, generator=torch_rng()).expand(2, -1)
     poses = []

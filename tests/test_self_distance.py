@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.motion.kinematics import FR3_ARM, Fr3Kinematics, Kinematics, fingers_down
+from touchgoal.control.motion.arm_models import FR3_ARM
+from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics
+from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.motion.self_collision import (
     SelfDistance,
     require_no_self_collision,

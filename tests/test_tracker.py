@@ -4,9 +4,10 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.tracker import Tracker
 from touchgoal.control.safety.action_filter import Measurements, Safety
-from touchgoal.control.safety.limits import FR3, UR5E, JointLimits
+from touchgoal.control.safety.limits import FR3, UR5E
 
 DT = 1e-3
 

@@ -1,15 +1,15 @@
 """Moves sampled at 1 kHz: inside every limit, at rest at both ends, straight where they say so."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from touchgoal.benchmarks.motion import ruckig_duration
 from touchgoal.control.errors import UserError
-from touchgoal.control.motion.kinematics import (
-    Fr3Kinematics,
-    Kinematics,
-    Ur5eKinematics,
-    fingers_down,
-)
+from touchgoal.control.motion.arm_models import JointLimits
+from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics, Ur5eKinematics
+from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.motion.trajectories import (
     Trajectory,
     joint_move,
@@ -18,7 +18,7 @@ from touchgoal.control.motion.trajectories import (
 )
 from touchgoal.control.safety import limits as robots
 from touchgoal.control.safety.action_filter import Safety
-from touchgoal.control.safety.limits import JointLimits, RobotLimits
+from touchgoal.control.safety.limits import RobotLimits
 
 ROBOTS = [(robots.FR3, Fr3Kinematics()), (robots.UR5E, Ur5eKinematics())]
 
@@ -53,6 +53,22 @@ def test_full_speed_joint_moves_use_a_limit_up_and_exceed_none(
         assert (shares <= 1).all() and shares.max() > 0.97
         np.testing.assert_allclose(move.at(0.0), q, atol=1e-12)
         np.testing.assert_allclose(move.at(move.duration), goal, atol=1e-12)
+        q = goal
+
+
+@pytest.mark.parametrize(("robot", "arm"), ROBOTS, ids=["FR3", "UR5e"])
+@pytest.mark.parametrize("speed", ["interface", "policy"])
+def test_moves_take_little_longer_than_the_fastest(
+    robot: RobotLimits, arm: Kinematics, speed: str
+) -> None:
+    """Ruckig, to which constant limits can be told, lets each joint go its own way in between."""
+    limits, rng = replace(getattr(robot, speed), taper=None), np.random.default_rng(0)
+    q = arm.arm.home
+    for k in range(60):
+        goal = rng.uniform(limits.lower, limits.upper)
+        if k % 3 == 0:  # short ones as well
+            goal = np.clip(q + rng.uniform(-0.3, 0.3, q.size), limits.lower, limits.upper)
+        assert joint_move(q, goal, limits).duration < 1.15 * ruckig_duration(q, goal, limits)
         q = goal
 
 

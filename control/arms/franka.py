@@ -11,8 +11,8 @@ import numpy as np
 
 from touchgoal.control.arms.streaming import ArmClient, ArmConfig, ArmProcess, shift_wrench
 from touchgoal.control.interfaces import ArmReading, DriverError, Joints
+from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.kinematics import Kinematics
-from touchgoal.control.safety.limits import JointLimits
 
 if TYPE_CHECKING:
     import franky
@@ -32,7 +32,8 @@ class FrankaClient(ArmClient):
         import franky
 
         self._franky, self._aborted = franky, ""
-        self._kinematics = Kinematics(self.config.robot.arm, self.config.tcp_offset)
+        robot = self.config.robot
+        self._kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
         # No real-time kernel is asked for: firmware 5.9 and later does without.
         self._robot: franky.Robot | None = franky.Robot(
             self.config.address,

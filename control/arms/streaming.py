@@ -15,8 +15,9 @@ from jaxtyping import Float
 from touchgoal.control.arms.driver_process import DriverProcess
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import ArmReading, DriverError, Joints
+from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.tracker import Tracker, TrackerState
-from touchgoal.control.safety.limits import JointLimits, RobotLimits
+from touchgoal.control.safety.limits import RobotLimits
 
 _MAX_CATCH_UP = 4  # periods that a late tick makes up for at once
 _BRAKING = 1.5  # s for coming to rest on closing
@@ -29,8 +30,7 @@ class ArmConfig:
 
     Attributes:
         address: of the controller.
-        robot: its limits and geometry.
-        tcp_offset: m along the hand's z axis from the flange to the tool centre point.
+        robot: its geometry, tool and limits.
         hz: of the commands that come.
         rate: Hz of the stream that goes out.
         state_timeout: s without news of the controller after which it is lost. Each driver has its own;
@@ -39,7 +39,6 @@ class ArmConfig:
 
     address: str
     robot: RobotLimits
-    tcp_offset: float
     hz: float
     rate: float
     state_timeout: float

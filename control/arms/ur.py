@@ -12,8 +12,8 @@ import numpy as np
 
 from touchgoal.control.arms.streaming import ArmClient, ArmConfig, ArmProcess, shift_wrench
 from touchgoal.control.interfaces import ArmReading, DriverError, Joints
+from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.kinematics import Kinematics
-from touchgoal.control.safety.limits import JointLimits
 
 RATE = 125.0  # Hz of servoJ; 20 to 500
 STATE_TIMEOUT = 0.05  # s
@@ -31,7 +31,8 @@ class UrClient(ArmClient):
         from rtde_control import RTDEControlInterface
         from rtde_receive import RTDEReceiveInterface
 
-        self._kinematics = Kinematics(self.config.robot.arm, self.config.tcp_offset)
+        robot = self.config.robot
+        self._kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
         self._refused = False
         self._receive = RTDEReceiveInterface(self.config.address)
         if recover and self._receive.isProtectiveStopped():

@@ -23,7 +23,6 @@ from touchgoal.control.grippers.franka_hand import FrankaHand
 from touchgoal.control.grippers.non_blocking import NonBlockingGripper
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
 from touchgoal.control.interfaces import Arm, Camera, Gripper, LoadCell
-from touchgoal.control.motion.kinematics import GELSIGHT_TCP
 from touchgoal.control.safety.action_filter import Deadline, Watchdogs
 from touchgoal.control.safety.limits import FR3, UR5E, Box, RobotLimits
 from touchgoal.control.sensors.load_cell import LoadCellConfig, SerialLoadCell
@@ -199,7 +198,7 @@ def _arm(cell: CellConfig, robot: RobotLimits, hz: float) -> Arm:
     ur5e = cell.arm == "ur5e"
     rate, silence = (ur.RATE, ur.STATE_TIMEOUT) if ur5e else (franka.RATE, franka.STATE_TIMEOUT)
     silence = cell.safety.silence or silence
-    config = ArmConfig(cell.address, robot, GELSIGHT_TCP, hz, rate, silence)
+    config = ArmConfig(cell.address, robot, hz, rate, silence)
     return ur.connect_ur(config) if ur5e else franka.connect_franka(config)
 
 

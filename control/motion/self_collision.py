@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.motion.kinematics import FR3_ARM, UR5E_ARM, ArmModel, Kinematics
+from touchgoal.control.motion.arm_models import FR3_ARM, UR5E_ARM, ArmModel
+from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.trajectories import Trajectory
 
 Point = tuple[float, float, float]

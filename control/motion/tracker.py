@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.safety.braking import max_stoppable_speed
-from touchgoal.control.safety.limits import JointLimits
 
 Joints = Float[np.ndarray, "n"]
 

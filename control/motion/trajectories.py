@@ -1,8 +1,8 @@
 """Timed moves for the arm itself: joint moves and straight lines inside every limit.
 
-A path is a Chebyshev polynomial per joint over its length, walked with the minimum-jerk profile.
-Speed, acceleration and jerk scale with the duration to the power of -1, -2 and -3, so the shortest
-duration inside the limits follows from the path's peaks at once.
+A path is a Chebyshev polynomial per joint over its length, walked along an S-curve: as fast as speed,
+acceleration and jerk let it, which for a single joint is the fastest there is. Where a joint's speed
+limit shrinks near the end of its range, slower cruises and longer braking are tried.
 """
 
 from dataclasses import dataclass
@@ -12,23 +12,25 @@ from jaxtyping import Float
 from numpy.polynomial import chebyshev
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.motion.kinematics import (
-    Joints,
-    Kinematics,
+from touchgoal.control.motion.arm_models import JointLimits, Joints
+from touchgoal.control.motion.kinematics import Kinematics
+from touchgoal.control.motion.rotations import (
     Matrix3,
     Vector3,
     rotation_matrix,
     rotation_vector,
 )
+from touchgoal.control.motion.s_curve import SCurve, s_curve
 from touchgoal.control.safety.action_filter import Safety
-from touchgoal.control.safety.limits import JointLimits
 
 _DEGREE = 16  # of a straight line's joints; 0.4 m are then straight within 0.1 mm
 _STRAIGHT = 5e-4  # m off the line that are refused
-_GRID = np.linspace(0, 1, 2001)  # where a path's peaks are looked for
-# For peaks between the grid's points, and because a controller holds the speed over a millisecond
-# against the taper at its end, up to 0.3 % lower.
+_SAMPLES = 1001  # times at which a move is compared with the limits
+# For peaks between those, and because a controller holds the speed over a millisecond against the
+# taper at its end, up to 0.3 % lower.
 _SLACK = 1.005
+# Shares of full speed and of full braking that are tried where full ones would break a limit.
+_SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3, 0.2)
 
 
 @dataclass(frozen=True)
@@ -37,16 +39,21 @@ class Trajectory:
 
     Attributes:
         coefficients: of the Chebyshev polynomials over the path, whose ends are -1 and 1; rad.
-        duration: s.
+        timing: how the path is walked.
     """
 
     coefficients: Float[np.ndarray, "d n"]
-    duration: float
+    timing: SCurve
+
+    @property
+    def duration(self) -> float:
+        """From rest to rest, s."""
+        return self.timing.duration
 
     def at(self, t: Float[np.ndarray, "*k"] | float) -> Float[np.ndarray, "*k n"]:
         """Joint positions (rad) at times `t` (s); before the start and after the end it rests."""
-        tau = np.atleast_1d(np.clip(t, 0, self.duration) / self.duration)
-        s = _minimum_jerk(tau)[0].reshape(np.shape(t))
+        times = np.asarray(t, dtype=np.float64)
+        s = self.timing.derivatives(times.ravel())[0].reshape(times.shape)
         return np.moveaxis(chebyshev.chebval(2 * s - 1, self.coefficients), 0, -1)
 
     def sample(self, hz: float) -> Float[np.ndarray, "k n"]:
@@ -117,23 +124,39 @@ def require_inside_workspace(trajectory: Trajectory, safety: Safety) -> None:
         )
 
 
-def _minimum_jerk(tau: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Path share and its three derivatives: Flash and Hogan 1985."""
-    return (
-        tau**3 * (10 - 15 * tau + 6 * tau**2),
-        30 * tau**2 * (1 - tau) ** 2,
-        60 * tau * (1 - tau) * (1 - 2 * tau),
-        60 * (1 - 6 * tau + 6 * tau**2),
-    )
-
-
 def _timed(coefficients: Float[np.ndarray, "d n"], limits: JointLimits) -> Trajectory:
     """The path walked as fast as the limits let it."""
-    s, s1, s2, s3 = (d[:, None] for d in _minimum_jerk(_GRID))
-    q, q1, q2, q3 = (
-        2**k * chebyshev.chebval(2 * s[:, 0] - 1, chebyshev.chebder(coefficients, k)).T
-        for k in range(4)
-    )
+    q, slope = (_path(coefficients, np.linspace(0, 1, _SAMPLES), k) for k in (0, 1))
+    _require_range(q, limits)
+    steepest = np.abs(slope).max(axis=0)
+    if not steepest.any():
+        return Trajectory(coefficients, s_curve(1e3, 1e6, 1e6, 1e9))  # it is there already
+    full = [
+        float((limit / np.maximum(steepest, 1e-12)).min())
+        for limit in (limits.velocity, limits.acceleration, limits.jerk)
+    ]
+    best = None
+    for cruise in _SHARES:
+        for braking in _SHARES:
+            timing = s_curve(cruise * full[0], full[1], braking * full[1], full[2])
+            if best is not None and timing.duration >= best.duration:
+                break  # slower braking takes longer still
+            timing = timing.slowed(_excess(coefficients, timing, limits))
+            if best is None or timing.duration < best.duration:
+                best = timing
+    assert best is not None
+    return Trajectory(coefficients, best.slowed(_SLACK))
+
+
+def _path(
+    coefficients: Float[np.ndarray, "d n"], s: Float[np.ndarray, " k"], order: int
+) -> Float[np.ndarray, "k n"]:
+    """Joint positions at shares `s` of the path, or their derivative of some order by the share."""
+    derived = chebyshev.chebder(coefficients, order)
+    return 2**order * chebyshev.chebval(2 * s - 1, derived).T
+
+
+def _require_range(q: Float[np.ndarray, "k n"], limits: JointLimits) -> None:
     outside = ((q < limits.lower - 1e-9) | (q > limits.upper + 1e-9)).any(axis=0)
     if outside.any():
         i = int(np.argmax(outside))
@@ -141,18 +164,28 @@ def _timed(coefficients: Float[np.ndarray, "d n"], limits: JointLimits) -> Traje
             f"joint {i + 1} would leave {limits.lower[i]:.3f} to {limits.upper[i]:.3f} rad: "
             "choose another start or goal"
         )
+
+
+def _excess(coefficients: Float[np.ndarray, "d n"], timing: SCurve, limits: JointLimits) -> float:
+    """How many times as long the path must take to be inside every limit; at least once.
+
+    Speed, acceleration and jerk fall with the duration to the power of -1, -2 and -3.
+    """
+    t = np.append(np.linspace(0, timing.duration, _SAMPLES), timing.corners)
+    s, *rates = timing.derivatives(t)
+    s1, s2, s3 = (rate[:, None] for rate in rates)
+    q, q1, q2, q3 = (_path(coefficients, s, order) for order in range(4))
     velocity = q1 * s1
     acceleration = q2 * s1**2 + q1 * s2
     jerk = q3 * s1**3 + 3 * q2 * s1 * s2 + q1 * s3
     low, high = limits.speed_range(q)
     ceiling = np.where(velocity > 0, high, -low)
-    moving = np.abs(velocity) > 1e-12
+    moving = np.abs(velocity) > 1e-9
     if (ceiling[moving] <= 0).any():
         raise UserError("the move ends where the arm allows no speed: keep away from joint limits")
-    duration = max(
+    return max(
+        1.0,
         (np.abs(velocity[moving]) / ceiling[moving]).max(initial=0.0),
         (np.abs(acceleration) / limits.acceleration).max() ** (1 / 2),
         (np.abs(jerk) / limits.jerk).max() ** (1 / 3),
-        1e-3,  # of a move to where the arm already is
     )
-    return Trajectory(coefficients, float(_SLACK * duration))

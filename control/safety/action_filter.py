@@ -132,7 +132,7 @@ class Safety:
     def __init__(self, limits: RobotLimits, hz: float, watchdogs: Watchdogs | None = None) -> None:
         self.limits, self.joints, self.dt = limits, limits.policy, 1 / hz
         self.watchdogs = watchdogs or Watchdogs()
-        edges = np.array(((0.0, 0.0, 0.0), *limits.finger_edges))
+        edges = np.array(((0.0, 0.0, 0.0), *limits.tool.finger_corners))
         self._points = Kinematics(limits.arm, 0.0).points_on_links(edges)
         unit = self.joints.acceleration * self.dt
         self._braking_ticks = int(np.ceil(self.joints.velocity / unit).max()) + 1
@@ -179,7 +179,7 @@ class Safety:
         """
         if state.mode is not Mode.MOVE or not np.isfinite(target):
             return last
-        return float(np.clip(target, *self.limits.stroke))
+        return float(np.clip(target, *self.limits.tool.stroke))
 
     def inside_workspace(self, q: Float[np.ndarray, "k n"]) -> Bool[np.ndarray, " k"]:
         """Whether flange and finger edges lie in their boxes, for each of k postures."""

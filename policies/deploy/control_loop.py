@@ -279,7 +279,7 @@ class ControlLoop:
             reason += f" s ({sensed.oldest_source}; {self.reader.problem() or 'it is slow'})"
         if fault.limit == Limit.TOUCH and self._execute:  # open by as much as both gels give way
             width = sensed.gripper.width + 2 * self._safety.limits.touch
-            self._connection.gripper.command(min(width, self._safety.limits.stroke[1]))
+            self._connection.gripper.command(min(width, self._safety.limits.tool.stroke[1]))
         return self.stop(reason, ADVICE.get(fault.limit, "look at what it names"))
 
     def _as_commanded(self, sensed: CellReading) -> CellReading:

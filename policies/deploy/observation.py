@@ -17,7 +17,8 @@ from touchgoal.control.interfaces import (
     LoadReading,
     TactileSensor,
 )
-from touchgoal.control.motion.kinematics import GELSIGHT_TCP, Kinematics, rotation_vector
+from touchgoal.control.motion.kinematics import Kinematics
+from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.tactile.indentation import IndentationMeter
 
 _MAX_LOAD_CELL_AGE = 0.5  # s without a good line after which a load cell counts as silent
@@ -63,7 +64,8 @@ class ObservationReader:
                     f"{key} takes pictures of {taken[0]} x {taken[1]}, {camera_size[0]} x "
                     f"{camera_size[1]} are needed: make them larger where the camera is set"
                 )
-        self._kinematics = Kinematics(connection.robot.arm, GELSIGHT_TCP)
+        robot = connection.robot
+        self._kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
         self._meters = {
             key: IndentationMeter(camera.model, camera.read().image)
             for key, camera in connection.cameras.items()

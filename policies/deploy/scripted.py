@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control import features as ft
-from touchgoal.control.motion.kinematics import GELSIGHT_TCP, Kinematics, fingers_down
+from touchgoal.control.motion.kinematics import Kinematics
+from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.motion.trajectories import (
     Trajectory,
     joint_move,
@@ -142,13 +143,13 @@ def pick_and_place(
     UserError if the arm cannot go there inside its workspace; nothing has moved then.
     """
     robot = safety.limits
-    kinematics = Kinematics(robot.arm, GELSIGHT_TCP)
+    kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
     limits = safety.joints.scaled(_SPEED_SHARE, _SPEED_SHARE)
     x, y, z, yaw = place.grasp
     z = max(z, _MIN_HEIGHTS[0])
     pick, put = np.array([x, y, z]), np.array([*place.goal, z])
     deepest = np.array([*place.goal, max(z - _PROBE_DEPTH, _MIN_HEIGHTS[1])])
-    up, opened = np.array([0, 0, _CLEARANCE]), robot.stroke[1]
+    up, opened = np.array([0, 0, _CLEARANCE]), robot.tool.stroke[1]
     q = commanded()
 
     def line(

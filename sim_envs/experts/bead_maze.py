@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from touchgoal.control.motion.kinematics import fingers_across, rotation_vector
+from touchgoal.control.motion.rotations import fingers_across, rotation_matrix, rotation_vector
 from touchgoal.sim_envs.base import Observation
 from touchgoal.sim_envs.bead_maze import BeadMaze
 
@@ -40,7 +40,7 @@ class BeadMazeExpert:
         ahead = self._speed * tick * max(0.0, 1 - astray / _SLOW)
         left = max(np.exp(-_RETURN * tick), 1 - _FASTEST * tick / max(astray, 1e-9))
         point, tangent = env.wire.at(min(s + ahead, env.arc_length + _LEAD))
-        R = fingers_across(tangent) @ _rotation(left * turned)
+        R = fingers_across(tangent) @ rotation_matrix(left * turned)
         target = point + left * off - R @ grip
         joints = env.kinematics.solve_ik_near(target, R, env.command).q
         return np.append(joints - env.command, 0.0)
@@ -53,13 +53,3 @@ class BeadMazeExpert:
         tcp = data.site("tcp")
         offset = self._env.object_pose()[:3] - tcp.xpos - 0.5 * (gels[0] + gels[1])
         return tcp.xmat.reshape(3, 3).T @ offset
-
-
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    """Rotation matrix of an axis times angle (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-9:
-        return np.eye(3)
-    x, y, z = vector / angle
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.motion.kinematics import fingers_down
+from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH, Observation
 from touchgoal.sim_envs.pick_place import PickPlace
 

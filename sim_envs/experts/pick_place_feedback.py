@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.motion.kinematics import fingers_down
+from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH, Observation
 from touchgoal.sim_envs.experts.pick_place import (
     CLEARANCE,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.control.motion.kinematics import rotation_matrix
+from touchgoal.control.motion.rotations import rotation_matrix
 from touchgoal.sim_envs.base import Observation
 from touchgoal.sim_envs.bead_maze import BeadMaze
 

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.motion.kinematics import GELSIGHT_TCP
+from touchgoal.control.motion.tool import FRANKA_HAND
 from touchgoal.control.safety import limits
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.sim_envs.config import SceneConfig
@@ -29,7 +29,7 @@ _STIFFNESS = {
     "ur5e": (4500.0, 4500.0, 4500.0, 2000.0, 2000.0, 2000.0),
 }
 SERVO_DAMPING = 0.1  # s: N m s/rad for each N m/rad of stiffness, fr3.xml
-_SENSOR_DEPTH_IN_FINGER = GELSIGHT_TCP - 0.0584  # finger frame to sensor centre, along z
+_SENSOR_DEPTH_IN_FINGER = FRANKA_HAND.tcp_offset - 0.0584  # finger frame to sensor centre, along z
 
 
 def robot_model() -> Path:
@@ -240,7 +240,7 @@ def _add_actuators(spec: mujoco.MjSpec, arm: str) -> None:
 def _add_cameras_and_table(spec: mujoco.MjSpec) -> None:
     world = spec.worldbody
     hand = spec.body("hand")
-    hand.add_site(name="tcp", pos=[0, 0, GELSIGHT_TCP], group=HIDDEN_GROUP)
+    hand.add_site(name="tcp", pos=[0, 0, FRANKA_HAND.tcp_offset], group=HIDDEN_GROUP)
     eye = [0.075, 0.0, 0.02]
     hand.add_camera(name="wrist", pos=eye, quat=_look(eye, [0.012, 0, 0.17], [1, 0, 0]), fovy=62)
     for name, eye, target, fovy in (

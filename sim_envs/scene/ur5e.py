@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from touchgoal.control.motion.kinematics import UR5E_ARM
+from touchgoal.control.motion.arm_models import UR5E_ARM
 
 # kg; Universal Robots' DH page (article 45257). Inertia follows from the capsules.
 _MASSES = (3.761, 8.058, 2.846, 1.37, 1.3, 0.365)

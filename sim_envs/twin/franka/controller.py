@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.motion.kinematics import GELSIGHT_TCP, rotation_vector
+from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.safety.limits import FR3
 from touchgoal.sim_envs.scene.build import robot_model
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
@@ -320,7 +320,7 @@ class FrankaArm:
         arm = FR3.arm
         c, s = np.cos(arm.hand_yaw), np.sin(arm.hand_yaw)
         T[:2, :2] = [[c, -s], [s, c]]
-        T[2, 3] = GELSIGHT_TCP
+        T[2, 3] = FR3.tool.tcp_offset
         return T
 
     def _describe_hand(self) -> None:

@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.motion.kinematics import rotation_matrix, rotation_vector
+from touchgoal.control.motion.rotations import rotation_matrix, rotation_vector
 from touchgoal.control.safety.braking import braked_velocity
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 

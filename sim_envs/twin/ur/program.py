@@ -10,14 +10,9 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.motion.kinematics import (
-    GELSIGHT_TCP,
-    UR5E_ARM,
-    Kinematics,
-    rotation_matrix,
-    rotation_vector,
-)
-from touchgoal.control.safety.limits import UR5E as ROBOT
+from touchgoal.control.motion.kinematics import Kinematics
+from touchgoal.control.motion.rotations import rotation_matrix, rotation_vector
+from touchgoal.control.safety.limits import UR5E
 from touchgoal.sim_envs.twin.cell import SimulatedCell
 from touchgoal.sim_envs.twin.ur.motion import (
     Activity,
@@ -33,7 +28,7 @@ _STREAMED = {6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71}  # ac
 _IGNORED = {0, 8, 13, 14, 17, 20, 21, 48, 59, 65, 99}  # payload, force sensor, outputs, a kick
 _STOP_SCRIPT = 255
 _REACH = 0.85  # m, UR5e data sheet
-_FLANGE_TO_TCP = np.array([0.0, 0.0, GELSIGHT_TCP])
+_FLANGE_TO_TCP = np.array([0.0, 0.0, UR5E.tool.tcp_offset])
 
 Pose = Float[np.ndarray, "6"]  # m, rotation vector (rad)
 
@@ -60,7 +55,7 @@ class UrProgram:
         self.tcp = np.concatenate([_FLANGE_TO_TCP, np.zeros(3)])
         self._executing = self._waiting = self._asynchronous = False
         self._started = 0
-        self._kinematics = Kinematics(UR5E_ARM, GELSIGHT_TCP)
+        self._kinematics = Kinematics(UR5E.arm, UR5E.tool.tcp_offset)
 
     def cycle(self) -> None:
         """Look at the command register once: every 2 ms, and when a package arrives."""
@@ -132,7 +127,7 @@ class UrProgram:
         """The program ends; the arm comes to rest."""
         self.running, self.activity = False, None
         self._waiting, self.ints[0] = False, 0
-        self.cell.brake(ROBOT.hardware.acceleration)
+        self.cell.brake(UR5E.hardware.acceleration)
 
     def _go(self, activity: Activity) -> None:
         """Stream: what is going on in the same way goes on with the new numbers."""
@@ -143,7 +138,7 @@ class UrProgram:
             self._protective_stop()
             return
         lookahead = min(max(self._double(9), 0.03), 0.2)
-        self._go(Servo(ROBOT.hardware.velocity, goal, lookahead))
+        self._go(Servo(UR5E.hardware.velocity, goal, lookahead))
 
     def _move(self, activity: Activity) -> None:
         self.activity = activity
@@ -223,4 +218,4 @@ class UrProgram:
 
 
 def _inside(q: Float[np.ndarray, "6"]) -> bool:
-    return bool(((q >= ROBOT.hardware.lower) & (q <= ROBOT.hardware.upper)).all())
+    return bool(((q >= UR5E.hardware.lower) & (q <= UR5E.hardware.upper)).all())
