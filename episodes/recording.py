@@ -78,7 +78,7 @@ def run(
         observation, _, terminated, truncated, info = env.step(action)
         if terminated or truncated:
             break
-    still = np.append(np.zeros(ft.N_JOINTS), answer[-1]).astype(np.float32)
+    still = np.append(np.zeros(env.n_joints), answer[-1]).astype(np.float32)
     yield {**observation, ft.ACTION: still, **info}
 
 

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import replace
+from typing import Literal
 
 import gymnasium as gym
 import numpy as np
@@ -12,13 +13,14 @@ from gymnasium.utils.env_checker import check_env
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
+from touchgoal.episodes.recording import EpisodeSpec, record_episode
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import OUTCOMES, PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE, SHAPES
-from touchgoal.sim_envs.tasks import make
+from touchgoal.sim_envs.tasks import TaskConfig, make, make_env
 
 ENVS = ["touchgoal/PickPlace-v0", "touchgoal/BeadMaze-v0"]
 BLIND = PickPlaceConfig(cameras=(), tactile=False)
@@ -139,6 +141,16 @@ if __name__ == "__main__":
         assert 'context="forkserver"' in ran.stderr
     else:
         assert ran.returncode == 0 and "(1, 128, 128, 3)" in ran.stdout, ran.stderr
+
+
+@pytest.mark.parametrize("arm", ["fr3", "ur5e"])
+@pytest.mark.parametrize("config", [BLIND, BeadMazeConfig(tactile=False)])
+def test_expert_is_recorded_on_every_arm(config: TaskConfig, arm: Literal["fr3", "ur5e"]) -> None:
+    env = make_env(replace(config, max_seconds=0.6, scene=replace(config.scene, arm=arm)))
+    episode = record_episode(env, EpisodeSpec(seed=0))
+    episode.check()
+    for key in (ft.STATE, ft.ACTION):
+        assert episode.frames[key].shape[1:] == ft.features_of(env.n_joints)[key].shape
 
 
 @pytest.mark.parametrize("shape", SHAPES)

@@ -74,7 +74,7 @@ class Teleoperator:
         push = sum((_PUSHES[key] for key in self._held), np.zeros(6)).reshape(2, 3)
         self._held = {key: ticks - 1 for key, ticks in self._held.items() if ticks > 1}
         if env.grasping:
-            return np.zeros(8)
+            return np.zeros(env.n_joints + 1)
         position, R = env.kinematics.forward(env.command)
         wrench = observation[ft.WRENCH].astype(np.float64).reshape(2, 3)
         moved, turned = np.array([[c.speed], [c.turn_speed]]) * (push @ R.T)
