@@ -146,7 +146,7 @@ if __name__ == "__main__":
 @pytest.mark.parametrize("arm", ["fr3", "ur5e"])
 @pytest.mark.parametrize("config", [BLIND, BeadMazeConfig(tactile=False)])
 def test_expert_is_recorded_on_every_arm(config: TaskConfig, arm: Literal["fr3", "ur5e"]) -> None:
-    env = make_env(replace(config, max_seconds=0.6, scene=replace(config.scene, arm=arm)))
+    env = make_env(replace(config, max_seconds=0.6, arm=arm))
     episode = record_episode(env, EpisodeSpec(seed=0))
     episode.check()
     for key in (ft.STATE, ft.ACTION):
