@@ -43,7 +43,8 @@ class OptionError(UserError):
     """
 
     def __init__(self, config: str, problems: list[tuple[str, str]]) -> None:
-        super().__init__(f"{config}: " + "; ".join(f"{k} {v}".strip() for k, v in problems))
+        lines = dict.fromkeys(f"{name} {what}".strip() for name, what in problems)
+        super().__init__(f"{config}: " + "; ".join(lines))
         self.problems = problems
 
 

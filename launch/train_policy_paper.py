@@ -1,7 +1,7 @@
 """Train the bead-maze policy as Sparsh (C.7) and diffusion_policy say: U-Net of 87 M, DDPM, deltas.
 
 The paper's 30 demonstrations of about 34,000 pairs are
-`touchgoal collect-demos --task bead-maze --episodes 30 --maze.control-hz 60`. It leaves open how many
+`touchgoal collect-demos --task bead-maze --episodes 30 --maze.control-hz 50`. It leaves open how many
 ticks of a plan are done (here all 8), at what rate, and for how long to train (here the 600 epochs of
 diffusion_policy's real-robot tasks). On a CPU this is a matter of days.
 """

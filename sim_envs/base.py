@@ -13,7 +13,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.tactile.sensor_models import find_sensor
-from touchgoal.sim_envs.config import EnvConfig, SceneConfig
+from touchgoal.sim_envs.config import SETPOINT_PERIOD, EnvConfig, SceneConfig
 from touchgoal.sim_envs.scene.build import ROBOTS, SIDES, arm_joints, build
 from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, ContactReader, PadContact
 from touchgoal.sim_envs.scene.objects import Body
@@ -24,7 +24,6 @@ from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 GRIPPER_MAX_WIDTH = 0.08  # m, Franka Hand
 DISTURBANCE_SECONDS = 0.5  # for which a disturbance keeps its direction
 GRIPPER_SPEED = 0.1  # m/s of width, Franka Hand's datasheet maximum
-_SETPOINT_PERIOD = 0.002  # s: set-points coarser than 2 ms shake the wrist (MuJoCo 4.0.0)
 
 Observation = dict[str, np.ndarray]
 
@@ -285,8 +284,8 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
 
     def _run_tick(self, delta: np.ndarray, width: float, seconds: float) -> None:
         """Physics for one tick, with set-points interpolated."""
-        setpoints = round(seconds / _SETPOINT_PERIOD)
-        steps = round(_SETPOINT_PERIOD / self.model.opt.timestep)
+        setpoints = round(seconds / SETPOINT_PERIOD)
+        steps = round(SETPOINT_PERIOD / self.model.opt.timestep)
         start = self.command
         limits = self.model.actuator_ctrlrange[: self.n_joints]
         self.command = np.clip(start + delta, limits[:, 0], limits[:, 1])

@@ -10,7 +10,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.control.motion.rotations import fingers_across
 from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
-from touchgoal.sim_envs.config import BeadMazeConfig
+from touchgoal.sim_envs.config import BeadMazeConfig, BeadMazeReset
 from touchgoal.sim_envs.options import with_options
 from touchgoal.sim_envs.scene import wires
 from touchgoal.sim_envs.scene.build import VISUAL_GROUP
@@ -100,20 +100,16 @@ class BeadMaze(FrankaTactileEnv):
 
     def _sample_episode(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
         config = self.config
-        unknown = options.keys() - {"wire", "grasp_force"}
-        if unknown:
-            raise UserError(
-                f"unknown reset option {sorted(unknown)[0]!r}; there are: wire, grasp_force"
-            )
-        if "wire" in options:
-            wire = wires.find(options["wire"])
+        wanted = with_options(BeadMazeReset(), options)
+        if wanted.wire is not None:
+            wire = wires.find(wanted.wire)
         else:
             drawn = config.chosen_wires()
             wire = drawn[rng.integers(len(drawn))]
         place = np.array([0.5, 0.0, 0.17]) + rng.uniform(-0.02, 0.02, 3)
         self.wire = wire.moved(place, rng.uniform(-0.15, 0.15))
         force = rng.uniform(*config.grasp_force)
-        self.grasp_force = float(options.get("grasp_force", force))
+        self.grasp_force = force if wanted.grasp_force is None else wanted.grasp_force
         self._friction = rng.uniform(*config.wire_friction)
         self.bodies = [Body(BEADS[config.bead], _SIZES[config.bead], BEAD_MASS)]
 

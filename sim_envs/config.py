@@ -9,11 +9,9 @@ from touchgoal.control.option_types import (
     ORDERED,
     RARE,
     Count,
-    CountOrNone,
     Fraction,
     NotNegative,
     Positive,
-    PositiveRange,
     checked_dataclass,
 )
 from touchgoal.sim_envs.scene.objects import find as find_object
@@ -26,10 +24,19 @@ ObjectName = Annotated[str, AfterValidator(lambda name: find_object(name).name)]
 """A name of the catalogue of objects."""
 WireName = Annotated[str, AfterValidator(lambda name: find_wire(name).name)]
 """A name such as helix-1."""
-ForceRange = Annotated[
-    tuple[Annotated[Positive, Field(le=40.0)], Annotated[Positive, Field(le=40.0)]], ORDERED
-]
-"""Least and greatest force of each finger, N; the simulated gripper presses with 40 N at most."""
+Force = Annotated[Positive, Field(le=40.0)]
+"""Of each finger, N; the simulated gripper presses with 40 N at most."""
+ForceRange = Annotated[tuple[Force, Force], ORDERED]
+Mass = Annotated[Positive, Field(ge=0.001, le=3.0)]
+"""kg: lighter objects shake in the solver, heavier ones are beyond what an FR3 carries."""
+Friction = Annotated[Positive, Field(le=2.0)]
+Pixels = Annotated[int, Field(ge=16, multiple_of=2)]
+"""Rows or columns of a camera's picture; recorded video needs even ones."""
+
+MAX_CAMERA_SIZE = (960, 1280)
+"""Rows and columns of the largest picture that the scene renders, px."""
+SETPOINT_PERIOD = 0.002
+"""s between the set-points that a control tick is divided into: coarser ones shake the wrist."""
 
 STREAM_SIZE = (256, 256)
 """Rows and columns of what a twin's cameras send, more than is recorded."""
@@ -44,13 +51,13 @@ class SensorRandomization:
     others: the differences between published calibrations.
     """
 
-    gain: NotNegative = 0.047
+    gain: Annotated[NotNegative, Field(le=0.3)] = 0.047
     """Standard deviation of each colour channel's brightness, as a share of it."""
     offset: NotNegative = 2.4
     """Standard deviation of a constant added to the untouched picture, counts of 255."""
     pattern: NotNegative = 2.4
     """Standard deviation of a smooth pattern added to the untouched picture, counts of 255."""
-    azimuth: NotNegative = 15.0
+    azimuth: Annotated[NotNegative, Field(le=180)] = 15.0
     """Largest turn of each light around the gel, degrees."""
     blur: Fraction = 0.3
     """Largest change of how far the gel smooths an imprint, as a share of it."""
@@ -78,7 +85,14 @@ class SceneConfig:
     """What cameras see of the arm: its collision meshes (fast: 2,500 triangles, 1 ms a frame in
     software OpenGL) or its visual ones (full: 242,000 triangles, 30 ms)."""
     timestep: Annotated[Positive, RARE] = 1e-3
-    """Time step of the physics, s."""
+    """Time step of the physics, s; 2 ms is a whole number of them."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if set-points would not fall on steps of the physics."""
+        if not _is_multiple(SETPOINT_PERIOD, self.timestep):
+            raise ValueError(
+                f"timestep must divide 2 ms (0.002, 0.001, 0.0005, ...), not {self.timestep:g}"
+            )
 
 
 @checked_dataclass
@@ -87,19 +101,33 @@ class EnvConfig(SceneConfig):
 
     cameras: tuple[Camera, ...] = ("front", "wrist")
     """Cameras that are observed; fewer is faster."""
-    camera_size: tuple[Count, Count] = ft.CAMERA_SHAPE[:2]
+    camera_size: tuple[
+        Annotated[Pixels, Field(le=MAX_CAMERA_SIZE[0])],
+        Annotated[Pixels, Field(le=MAX_CAMERA_SIZE[1])],
+    ] = ft.CAMERA_SHAPE[:2]
     """Rows and columns of the cameras' pictures, px."""
     tactile: bool = True
     """Observe the pictures of both fingertips."""
     control_hz: Annotated[Count, RARE] = ft.CONTROL_HZ
-    """Control ticks per second."""
+    """Control ticks per second; a divisor of 500."""
     max_seconds: Positive = 8.0
     """Length after which an episode ends, s."""
-    disturbance: NotNegative = 0.0
+    disturbance: Annotated[NotNegative, Field(le=0.1)] = 0.0
     """Random motion added to what is commanded, so that an expert shows how to come back (DART,
     Laskey 2017): rms speed along each axis, m/s."""
     randomization: Annotated[SensorRandomization, RARE] = SensorRandomization()
     """How much the two fingertip sensors differ, drawn anew for each episode."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a tick is no whole number of set-points, or an episode has none."""
+        super().__post_init__()
+        if not _is_multiple(1 / self.control_hz, SETPOINT_PERIOD):
+            raise ValueError(
+                "control_hz must divide 500, for set-points come every 2 ms (10, 20, 25, 50, 100, "
+                f"...), not {self.control_hz}"
+            )
+        if self.max_seconds * self.control_hz < 1:
+            raise ValueError(f"max_seconds must be at least a tick of 1/{self.control_hz} s")
 
 
 @checked_dataclass
@@ -108,17 +136,29 @@ class PickPlaceConfig(EnvConfig):
 
     objects: tuple[ObjectName, ...] = ()
     """Objects to draw from (`touchgoal list objects`); default: all."""
-    distractors: CountOrNone = 0
+    distractors: Annotated[int, Field(ge=0, le=4)] = 0
     """Other objects on the table."""
-    mass: PositiveRange = (0.02, 0.2)
+    mass: Annotated[tuple[Mass, Mass], ORDERED] = (0.02, 0.2)
     """Lightest and heaviest object, kg."""
     grasp_force: ForceRange = (5.0, 30.0)
     """Weakest and strongest force of each finger, N."""
-    tolerance: Positive = 0.02
+    tolerance: Annotated[Positive, Field(le=0.1)] = 0.02
     """Distance from the goal within which the object's centre counts as placed, m."""
     release: bool = False
     """The object must also be let go. The paper's reward curves end in touch, so by default an
     episode ends with the placed object still held."""
+
+
+@checked_dataclass
+class PickPlaceReset:
+    """Options of `PickPlace.reset`, each in place of a random draw."""
+
+    object: ObjectName | None = None
+    """Name of the catalogue (`touchgoal list objects`)."""
+    mass: Mass | None = None
+    """Of the object, kg."""
+    grasp_force: Force | None = None
+    """Of each finger, N."""
 
 
 @checked_dataclass
@@ -145,7 +185,7 @@ class BeadMazeConfig(EnvConfig):
     """Shape of the bead: a cylinder feels the wire's direction as a torque, a sphere much less."""
     grasp_force: ForceRange = (8.0, 12.0)
     """Weakest and strongest force of each finger, N."""
-    wire_friction: PositiveRange = (0.15, 0.25)
+    wire_friction: Annotated[tuple[Friction, Friction], ORDERED] = (0.15, 0.25)
     """Least and greatest friction coefficient between bead and wire."""
     stall_seconds: Positive = 5.0
     """Time without 2 mm of progress after which the bead counts as jammed, s."""
@@ -158,6 +198,20 @@ class BeadMazeConfig(EnvConfig):
             return choose(self.split, count or self.n_wires, self.families)
         named = [find_wire(name) for name in self.wires]
         return named if count is None else [named[i % len(named)] for i in range(count)]
+
+
+@checked_dataclass
+class BeadMazeReset:
+    """Options of `BeadMaze.reset`, each in place of a random draw."""
+
+    wire: WireName | None = None
+    """Name such as helix-1."""
+    grasp_force: Force | None = None
+    """Of each finger, N."""
+
+
+def _is_multiple(value: float, of: float) -> bool:
+    return value / of >= 0.999 and abs(value / of - round(value / of)) < 1e-6
 
 
 TaskConfig = PickPlaceConfig | BeadMazeConfig

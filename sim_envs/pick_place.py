@@ -9,24 +9,21 @@ from jaxtyping import Float
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
-from touchgoal.sim_envs.config import PickPlaceConfig
+from touchgoal.sim_envs.config import PickPlaceConfig, PickPlaceReset
 from touchgoal.sim_envs.options import with_options
 from touchgoal.sim_envs.scene.build import VISUAL_GROUP
 from touchgoal.sim_envs.scene.objects import CATALOGUE, find, sample_body
 
 WORKSPACE = ((0.40, 0.60), (-0.20, 0.20))  # m, where objects start and goals lie, base frame
 _LIFTED = 0.03  # m above rest that counts as picked up
+_MOST_MISSES = 200  # draws too near to another place, before all are drawn anew
 _APART = 0.12  # m at least between objects, and between start and goal
 
 
 class PickPlace(FrankaTactileEnv):
     """Pick the object up and place it on the disc.
 
-    | reset option | meaning |
-    |---|---|
-    | `object` | catalogue name |
-    | `mass` | kg |
-    | `grasp_force` | N of each finger |
+    `reset` takes the options of `PickPlaceReset`.
 
     Success: the object, once lifted by 3 cm, lies at rest on the table within `tolerance` of the
     goal for half a second, and is let go if `release` asks for it. Progress: reaching (to 0.25),
@@ -72,7 +69,7 @@ class PickPlace(FrankaTactileEnv):
         be after a reset, at rest.
         """
         rng, data = self.np_random, self.data
-        *positions, self.goal = _spread(rng, len(self.bodies) + 1)
+        *positions, self.goal = _random_positions(rng, len(self.bodies) + 1)
         self.model.geom("goal").pos[:2] = self.goal
         for body, position in zip(self.bodies, positions, strict=True):
             pose, turn = data.joint(body.name).qpos, rng.uniform(-np.pi, np.pi)
@@ -89,24 +86,20 @@ class PickPlace(FrankaTactileEnv):
 
     def _sample_episode(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
         config = self.config
-        unknown = options.keys() - {"object", "mass", "grasp_force"}
-        if unknown:
-            raise UserError(
-                f"unknown reset option {sorted(unknown)[0]!r}; there are: object, mass, grasp_force"
-            )
+        wanted = with_options(PickPlaceReset(), options)
         kind = self.kinds[rng.integers(len(self.kinds))]
-        if "object" in options:
-            kind = find(options["object"])
+        if wanted.object is not None:
+            kind = find(wanted.object)
         mass, force = rng.uniform(*config.mass), rng.uniform(*config.grasp_force)
-        self.grasp_force = float(options.get("grasp_force", force))
-        self.bodies = [sample_body(kind, rng, float(options.get("mass", mass)))]
+        self.grasp_force = force if wanted.grasp_force is None else wanted.grasp_force
+        self.bodies = [sample_body(kind, rng, mass if wanted.mass is None else wanted.mass)]
         others = [k for k in CATALOGUE.values() if k.name != kind.name]
         for i in range(config.distractors):
             other = others[rng.integers(len(others))]
             self.bodies.append(
                 sample_body(other, rng, rng.uniform(*config.mass), f"distractor_{i + 1}")
             )
-        *self._positions, self.goal = _spread(rng, len(self.bodies) + 1)
+        *self._positions, self.goal = _random_positions(rng, len(self.bodies) + 1)
 
     def _add_task_objects(self, spec: mujoco.MjSpec) -> None:
         spec.worldbody.add_geom(
@@ -194,12 +187,17 @@ class PickPlace(FrankaTactileEnv):
         )
 
 
-def _spread(rng: np.random.Generator, n: int) -> list[np.ndarray]:
+def _random_positions(rng: np.random.Generator, n: int) -> list[np.ndarray]:
     """Random positions in the workspace, m, at least `_APART` from each other."""
     low, high = np.array(WORKSPACE).T
     points: list[np.ndarray] = []
+    misses = 0
     while len(points) < n:
         point = rng.uniform(low, high)
         if all(np.linalg.norm(point - other) > _APART for other in points):
             points.append(point)
+        else:
+            misses += 1
+        if misses == _MOST_MISSES:  # the first ones leave no room for the others
+            points, misses = [], 0
     return points

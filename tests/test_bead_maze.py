@@ -191,7 +191,7 @@ def test_bad_requests_say_what_to_do(maze: BeadMaze) -> None:
         maze.reset(options={"wire": "knot-1"})
     with pytest.raises(UserError, match="makes no sound wire"):
         find(next(f"roller-{i}" for i in range(100) if wires.make("roller", i) is None))
-    with pytest.raises(UserError, match="unknown reset option 'bead'; there are: wire"):
+    with pytest.raises(UserError, match="BeadMazeReset has no option 'bead'; there are: wire"):
         maze.reset(options={"bead": "cube"})
     with pytest.raises(UserError, match="there are 20 validation wires a family"):
         choose("validation", 100)

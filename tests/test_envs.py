@@ -226,8 +226,12 @@ def test_external_wrench_is_the_weight(blind: PickPlace) -> None:
 def test_bad_requests_say_what_to_do(blind: PickPlace) -> None:
     with pytest.raises(UserError, match="unknown object 'teapot'; choose from: glass_ball"):
         blind.reset(options={"object": "teapot"})
-    with pytest.raises(UserError, match="unknown reset option 'colour'"):
+    with pytest.raises(
+        UserError, match="PickPlaceReset has no option 'colour'; there are: object, mass"
+    ):
         blind.reset(options={"colour": "red"})
+    with pytest.raises(UserError, match="grasp_force must be less than or equal to 40, not 500"):
+        blind.reset(options={"grasp_force": 500})
     with pytest.raises(UserError, match="cameras must be 'front' or 'wrist', not top"):
         PickPlaceConfig(cameras=("top",))  # pyright: ignore[reportArgumentType]
     blind.reset(seed=0)

@@ -14,7 +14,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.motion.tool import FRANKA_HAND
 from touchgoal.control.safety import limits
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
-from touchgoal.sim_envs.config import SceneConfig
+from touchgoal.sim_envs.config import MAX_CAMERA_SIZE, SceneConfig
 from touchgoal.sim_envs.scene.objects import FIRM, Body
 from touchgoal.sim_envs.scene.ur5e import replace_arm_with_ur5e
 
@@ -82,7 +82,7 @@ def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     spec.stat.center = np.array([0.5, 0.0, 0.2])
     visual = spec.visual
     visual.map.znear, visual.map.zfar = 0.01, 10.0  # m: the wrist camera is near the fingers
-    visual.global_.offwidth, visual.global_.offheight = 1280, 960
+    visual.global_.offheight, visual.global_.offwidth = MAX_CAMERA_SIZE
     visual.headlight.active = 1
     visual.headlight.ambient, visual.headlight.diffuse = (
         np.full(3, 0.3, np.float32),
