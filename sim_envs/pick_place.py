@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
 from touchgoal.sim_envs.config import PickPlaceConfig, PickPlaceReset
 from touchgoal.sim_envs.options import with_options
