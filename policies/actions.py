@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from touchgoal.control.features import N_JOINTS
@@ -99,9 +99,19 @@ class Normalizer(nn.Module):
         self.register_buffer("centre", torch.zeros(shape))
         self.register_buffer("size", torch.ones(shape))
 
-    def fit_range(self, values: Float[Tensor, "n ..."]) -> None:
-        """From now on, the least and the greatest of these values become -1 and 1."""
-        low, high = values.amin(0), values.amax(0)
+    def fit_range(
+        self, values: Float[Tensor, "n ..."], valid: Bool[Tensor, "n ..."] | None = None
+    ) -> None:
+        """From now on, the least and the greatest of these values become -1 and 1.
+
+        Only values that are `valid` count, if that is given; a component without any becomes 0.
+        """
+        if valid is None:
+            valid = torch.ones_like(values, dtype=torch.bool)
+        low = values.masked_fill(~valid, torch.inf).amin(0)
+        high = values.masked_fill(~valid, -torch.inf).amax(0)
+        none = ~valid.expand_as(values).any(0)
+        low, high = low.masked_fill(none, 0.0), high.masked_fill(none, 0.0)
         self._set((low + high) / 2, (high - low) / 2)
 
     def fit_mean_std(self, values: Float[Tensor, "n ..."]) -> None:

@@ -5,7 +5,7 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
 from touchgoal.control import features as ft
@@ -184,11 +184,13 @@ class Policy(nn.Module):
         joints: Float[Tensor, "m 7"],
         actions: Float[Tensor, "m h 8"],
         wrench: Float[Tensor, "n 12"] | None = None,
+        action_is_pad: Bool[Tensor, "m h"] | None = None,
     ) -> None:
         """Fits the scales to training data: n ticks, and the chunks of m windows.
 
         Inputs get variance 1, actions the range -1 to 1, for each tick of the chunk by itself: the
-        first of a chunk-relative plan moves an eighth of what the last does.
+        first of a chunk-relative plan moves an eighth of what the last does. Padded actions do not
+        count.
         """
         if self.config.touch_dim:
             self.touch_scale.fit_mean_std(touch)
@@ -196,7 +198,8 @@ class Policy(nn.Module):
             self.wrench_scale.fit_mean_std(wrench)
         columns, kind = self.config.proprioception, self.config.representation
         self.state_scale.fit_mean_std(network_input(state, columns, kind))
-        self.action_scale.fit_range(to_representation(actions, joints, kind))
+        valid = None if action_is_pad is None else ~action_is_pad[..., None]
+        self.action_scale.fit_range(to_representation(actions, joints, kind), valid)
 
     def loss(
         self,
@@ -204,6 +207,7 @@ class Policy(nn.Module):
         actions: Float[Tensor, "b h 8"],
         generator: torch.Generator,
         wrench: Float[Tensor, "b o 12"] | None = None,
+        action_is_pad: Bool[Tensor, "b h"] | None = None,
     ) -> Float[Tensor, ""]:
         """Training loss on windows.
 
@@ -212,6 +216,7 @@ class Policy(nn.Module):
             actions: what was done.
             generator: the CPU's.
             wrench: what acted on both pads, where touch is read as that.
+            action_is_pad: the ticks that lie after the episode's end, of which nothing is learned.
         """
         chunk = to_representation(actions, batch.joints, self.config.representation)
         touch = self._encode_touch(batch, generator)
@@ -221,7 +226,8 @@ class Policy(nn.Module):
             wrench_loss = F.mse_loss(touch, self.wrench_scale(wrench))
             touch = touch.detach()
         encoded = self._encode(batch, touch, generator)
-        return self.head.loss(self.action_scale(chunk), encoded, generator) + wrench_loss
+        loss = self.head.loss(self.action_scale(chunk), encoded, generator, action_is_pad)
+        return loss + wrench_loss
 
     @torch.inference_mode()
     def plan(self, batch: ObservationBatch, generator: torch.Generator) -> Float[Tensor, "b h 8"]:

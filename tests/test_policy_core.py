@@ -117,6 +117,35 @@ def test_windows_stay_inside_their_episode() -> None:
     torch.testing.assert_close(windows.actions[3], actions[2])
 
 
+@pytest.mark.parametrize("head", [DIFFUSION, FLOW, RegressionConfig(64, 2)])
+def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
+    """Neither in the loss nor in the normalizer, whatever the padding holds."""
+    config = replace(TOY, head=head)
+    dataset = toy_dataset(config, (3, 20))
+    assert dataset.action_is_pad[0].tolist() == [False] * 2 + [True] * 6
+    assert dataset.action_is_pad[2].all() and not dataset.action_is_pad[3:12].any()
+    rows = torch.tensor([0, 3])
+    (batch, actions), wrench = dataset.take(rows), dataset.wrench(rows)
+    is_pad = dataset.action_is_pad[rows]
+    other = torch.where(is_pad[..., None], torch.full_like(actions, 9.0), actions)
+    policy = toy_policy(config, dataset)
+    losses = []
+    for chunk in (actions, other):
+        loss = policy.loss(batch, chunk, torch_rng(), wrench, is_pad)
+        losses.append(torch.autograd.grad(loss, policy.head.parameters()))
+    if isinstance(head, RegressionConfig):  # a U-Net sees the padding, noised, beside the rest
+        for one, two in zip(*losses, strict=True):
+            torch.testing.assert_close(one, two)
+    everything = policy.head.loss(torch.zeros(2, 8, 8), torch.zeros(2, policy.condition_dim),
+                                  torch_rng(), torch.ones(2, 8, dtype=torch.bool))  # fmt: skip
+    assert everything == 0
+    wild = toy_dataset(config, (3, 20))
+    wild.recorded.actions[[2, 22]] = 9.0  # the last tick's, never done
+    for name, scale in toy_policy(config, wild).named_buffers():
+        if name.startswith("action_scale"):
+            torch.testing.assert_close(scale, dict(policy.named_buffers())[name])
+
+
 @pytest.mark.parametrize(
     "config",
     [
@@ -133,13 +162,14 @@ def test_a_toy_batch_is_learned_by_heart(config: PolicyConfig) -> None:
     (condition, actions), wrench = windows.take(rows), windows.wrench(rows)
     optimiser, generator = torch.optim.Adam(policy.parameters(), 5e-3), torch_rng()
     for _ in range(120):
-        loss = policy.loss(condition, actions, generator, wrench)
+        loss = policy.loss(condition, actions, generator, wrench, windows.action_is_pad)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
     plan = policy.plan(condition, torch_rng(3))
     assert plan.shape == actions.shape
-    error, spread = plan - actions, actions - actions.mean(0)
+    done = ~windows.action_is_pad
+    error, spread = (plan - actions)[done], (actions - actions[done].mean(0))[done]
     assert error.square().mean() < 0.1 * spread.square().mean()
     assert (plan[..., 7] == 0).all()
     assert torch.equal(plan, policy.plan(condition, torch_rng(3)))

@@ -41,7 +41,9 @@ def toy_policy(config: PolicyConfig, windows: SequenceDataset, seed: int = 0) ->
     torch.manual_seed(seed)
     policy, recorded = Policy(config), windows.recorded
     touch, actions = recorded.touch.float(), windows.actions
-    policy.fit_normalizers(touch, recorded.state, windows.joints, actions, recorded.wrench)
+    policy.fit_normalizers(
+        touch, recorded.state, windows.joints, actions, recorded.wrench, windows.action_is_pad
+    )
     return policy
 
 

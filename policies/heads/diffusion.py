@@ -6,8 +6,7 @@ Both work in the policy's scaled representation of actions, see `policy.py`.
 from dataclasses import dataclass, field
 
 import torch
-import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from touchgoal.policies.heads.samplers import SamplerConfig, add_noise, denoise
@@ -36,10 +35,11 @@ class Diffusion(nn.Module):
         chunk: Float[Tensor, "b h a"],
         condition: Float[Tensor, "b c"],
         generator: torch.Generator,
+        is_pad: Bool[Tensor, "b h"] | None = None,
     ) -> Float[Tensor, ""]:
-        """Mean squared error of the network's answer at random steps."""
+        """Mean squared error of the network's answer at random steps, padded ticks left out."""
         noisy, step, target = add_noise(self.config.sampler, chunk, generator)
-        return F.mse_loss(self.network(noisy, step, condition), target)
+        return masked_mse(self.network(noisy, step, condition), target, is_pad)
 
     def sample(
         self, condition: Float[Tensor, "b c"], generator: torch.Generator
@@ -77,12 +77,26 @@ class Regression(nn.Module):
         chunk: Float[Tensor, "b h a"],
         condition: Float[Tensor, "b c"],
         generator: torch.Generator,
+        is_pad: Bool[Tensor, "b h"] | None = None,
     ) -> Float[Tensor, ""]:
-        """Mean squared error; nothing is random."""
-        return F.mse_loss(self.sample(condition, generator), chunk)
+        """Mean squared error, padded ticks left out; nothing is random."""
+        return masked_mse(self.sample(condition, generator), chunk, is_pad)
 
     def sample(
         self, condition: Float[Tensor, "b c"], generator: torch.Generator
     ) -> Float[Tensor, "b h a"]:
         """The chunk for every condition; nothing is random."""
         return self.network(condition).unflatten(1, self._shape)
+
+
+def masked_mse(
+    predicted: Float[Tensor, "b h a"],
+    target: Float[Tensor, "b h a"],
+    is_pad: Bool[Tensor, "b h"] | None,
+) -> Float[Tensor, ""]:
+    """Mean squared error over the ticks that are not padding; 0 if all are."""
+    error = (predicted - target).square()
+    if is_pad is None:
+        return error.mean()
+    counts = ~is_pad[..., None]
+    return (error * counts).sum() / (counts.sum() * error.shape[-1]).clamp(min=1)

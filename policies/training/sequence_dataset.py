@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float16, Float32, Int, UInt8
 from torch import Tensor
 from tqdm import tqdm
 
@@ -181,12 +181,14 @@ def _embed(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> None:
 class SequenceDataset:
     """One window for every recorded tick.
 
-    Before an episode's start its first observation is repeated, and after its end its last action,
-    which is to stay: as in diffusion_policy.
+    Before an episode's start its first observation is repeated, as in diffusion_policy. What comes
+    after its end is padding: `action_is_pad`, of which nothing is learned. Nobody knows what was
+    right after a failure or when time was up. The last tick is padding too: its observation is the
+    result of the last action, and what is recorded beside it was never done.
     """
 
     def __init__(self, recorded: Recordings, config: PolicyConfig) -> None:
-        """SequenceDataset of the config's horizons."""
+        """Windows of the config's horizons."""
         self.recorded = recorded
         ends = np.cumsum(recorded.lengths)
         first = np.repeat(ends - recorded.lengths, recorded.lengths)[:, None]
@@ -196,6 +198,7 @@ class SequenceDataset:
         done = tick + np.arange(config.prediction_horizon)
         self._observed = torch.from_numpy(np.maximum(seen, first))
         self._planned = torch.from_numpy(np.minimum(done, last))
+        self.action_is_pad: Bool[Tensor, "n h"] = torch.from_numpy(done >= last)
 
     def __len__(self) -> int:
         """Number of windows."""
@@ -208,7 +211,7 @@ class SequenceDataset:
 
     @property
     def actions(self) -> Float[Tensor, "n h 8"]:
-        """What was done in every window."""
+        """What was done in every window; after the end of an episode the last recorded action."""
         return self.recorded.actions[self._planned]
 
     def take(self, rows: Int[Tensor, " b"]) -> tuple[ObservationBatch, Float[Tensor, "b h 8"]]:

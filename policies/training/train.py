@@ -114,7 +114,9 @@ class _Run:
             self.policy = Policy(policy)
         touch, state = windows.recorded.touch.float(), windows.recorded.state
         wrench = windows.recorded.wrench
-        self.policy.fit_normalizers(touch, state, windows.joints, windows.actions, wrench)
+        self.policy.fit_normalizers(
+            touch, state, windows.joints, windows.actions, wrench, windows.action_is_pad
+        )
         self.policy.to(config.device)
         self.average = copy.deepcopy(self.policy).eval().requires_grad_(False)
         self.optimiser = torch.optim.AdamW(
@@ -152,7 +154,9 @@ class _Run:
         batch, actions = self._take(windows, rows)
         generator = torch.Generator().manual_seed(self.config.seed)
         planned = self.average.plan(batch, generator)
-        error = (planned - actions)[..., :7].sum(1).norm(dim=1).mean()
+        off = (planned - actions)[..., :7]
+        off = off.masked_fill(windows.action_is_pad[rows, :, None].to(off.device), 0.0)
+        error = off.sum(1).norm(dim=1).mean()
         loss = self._loss(self.average, windows, rows, generator)
         return {"validation_loss": loss.item(), "validation_error": error.item()}
 
@@ -182,7 +186,8 @@ class _Run:
     ) -> torch.Tensor:
         wrench = windows.wrench(rows)
         wrench = None if wrench is None else wrench.to(self.config.device)
-        return policy.loss(*self._take(windows, rows), generator, wrench)
+        is_pad = windows.action_is_pad[rows].to(self.config.device)
+        return policy.loss(*self._take(windows, rows), generator, wrench, is_pad)
 
     def _take(
         self, windows: SequenceDataset, rows: torch.Tensor
