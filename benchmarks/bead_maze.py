@@ -20,7 +20,8 @@ from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import Actor, collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
-from touchgoal.policies.acting import SHIPPED, Observation, Planner, PolicyActor, SavedPolicy
+from touchgoal.policies.acting import Observation, Planner, PolicyActor
+from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy
 from touchgoal.policies.evaluation import open_loop
 from touchgoal.policies.evaluation.bead_maze import MazeTrial, evaluate, trials_of
 from touchgoal.policies.evaluation.open_loop import OpenLoopErrors, Plan, open_loop_errors

@@ -17,7 +17,7 @@ from touchgoal.benchmarks.speed import one_core
 from touchgoal.control import features as ft
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.policies import checkpoint
-from touchgoal.policies.acting import SHIPPED, SavedPolicy
+from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy
 from touchgoal.policies.heads.diffusion import Diffusion, DiffusionConfig
 from touchgoal.policies.heads.samplers import SamplerConfig
 from touchgoal.policies.heads.unet import PRESETS

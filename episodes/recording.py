@@ -1,9 +1,12 @@
 """From acting in an environment to episodes on disk, on all cores."""
 
+import fcntl
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +26,7 @@ from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
 from touchgoal.sim_envs.config import TaskConfig
 from touchgoal.sim_envs.experts.pick_place import Outcome
 from touchgoal.sim_envs.scene.filming import SceneRecorder
-from touchgoal.sim_envs.tasks import make_env, make_expert
+from touchgoal.sim_envs.tasks import make_env, make_expert, task_name
 
 
 @runtime_checkable
@@ -123,6 +126,7 @@ def to_episode(
         task=env.instruction(),
         meta=env.episode_info()
         | {
+            "task": task_name(env.config),
             "seed": spec.seed,
             "outcome": spec.outcome if success or asked_to_fail else "failure",
             "success": success,
@@ -137,19 +141,23 @@ def collect(
     workers: int,
     roles: Roles = expert_alone,
 ) -> list[dict[str, MetaValue]]:
-    """Append demonstrations to the episode set in `root`, in their order.
+    """Append episodes to the set in `root`, in the order of their specs.
 
     Workers simulate and encode; this process alone writes, so that an interruption loses at most
     the episodes in progress. The roles must pickle.
 
     Returns:
         The `meta` of each episode, outcome and success included.
+
+    Raises:
+        UserError: nothing to record, the set cannot be continued, or another process records
+            into it.
     """
     if not specs:
         raise UserError("nothing to collect: ask for at least one episode")
-    writer = EpisodeWriter(root, fps=config.control_hz)
     metas = []
-    with one_core_workers(workers) as pool:
+    with recording_into(root), one_core_workers(workers) as pool:
+        writer = EpisodeWriter(root, fps=config.control_hz)
         encoded = pool.map(partial(_record, config, roles), specs)
         for episode in tqdm(encoded, total=len(specs), desc="record", unit="episode"):
             writer.append(episode)
@@ -157,15 +165,57 @@ def collect(
     return metas
 
 
-def one_core_workers(workers: int) -> ProcessPoolExecutor:
-    """Workers that use one core each; spawned, because OpenGL contexts do not survive a fork."""
-    return ProcessPoolExecutor(
-        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_use_one_core
+@contextmanager
+def recording_into(root: Path) -> Iterator[None]:
+    """Keeps a set for this process alone, so that two recorders do not meet after minutes of work.
+
+    Raises:
+        UserError: another process records into the set.
+    """
+    root.mkdir(parents=True, exist_ok=True)
+    folder = os.open(root, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(folder)
+        raise UserError(
+            f"another process records into {root}: wait for it, or choose another --out"
+        ) from error
+    try:
+        yield
+    finally:
+        os.close(folder)  # which lets go of the lock
+        if not any(root.iterdir()):
+            root.rmdir()
+
+
+@contextmanager
+def one_core_workers(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """Workers that use one core each; spawned, because OpenGL contexts do not survive a fork.
+
+    Should anything end the block early, Ctrl-C for example, the workers end at once: what they
+    have in hand is lost.
+    """
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(
+        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_work
     )
+    try:
+        yield pool
+    except BaseException:
+        for worker in set(multiprocessing.active_children()) - others:
+            worker.terminate()
+        pool.shutdown(cancel_futures=True)
+        raise
+    pool.shutdown()
 
 
-def _use_one_core() -> None:
-    """Keep OpenCV and software OpenGL from starting threads on the other workers' cores."""
+def _begin_work() -> None:
+    """Leave Ctrl-C to the process that started this one, and the other cores to the others.
+
+    OpenCV and software OpenGL would start threads there.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
     os.environ["LP_NUM_THREADS"] = "1"
 

@@ -13,7 +13,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.recording import Actor, EpisodeSpec, record_with_film
 from touchgoal.launch.run_folder import open_run, write_json
-from touchgoal.policies.acting import SHIPPED, SavedPolicy
+from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy
 from touchgoal.policies.evaluation import bead_maze as maze_trials
 from touchgoal.policies.evaluation import pick_place as rollout
 from touchgoal.policies.evaluation.bead_maze import MazeTrial

@@ -15,7 +15,7 @@ from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies import checkpoint
-from touchgoal.policies.acting import SavedPolicy
+from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.policies.actions import ActionRepresentation
 from touchgoal.policies.evaluation import bead_maze as maze_trials
 from touchgoal.policies.evaluation import pick_place as rollout

@@ -1,9 +1,7 @@
 """Acting by plans: the policy as an actor in an environment or on the arm."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -12,25 +10,16 @@ from torch import Tensor
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.control.tactile.sensor_models import find_sensor
-from touchgoal.policies import checkpoint
 from touchgoal.policies.perception.end_to_end import difference_images
-from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
-from touchgoal.policies.perception.state_estimation import StateEstimator, load_estimator
-from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
-from touchgoal.sim_envs.config import EnvConfig
-
-_WEIGHTS = Path(__file__).parent / "weights"
-Task = TypeVar("Task", bound=EnvConfig)
-SHIPPED = {"bead-maze": _WEIGHTS / "bead_maze", "pick-place": _WEIGHTS / "pick_place"}
-
+from touchgoal.policies.perception.frozen_touch import TouchEmbedder
+from touchgoal.policies.policy import ObservationBatch, Policy
 
 Observation = Mapping[str, np.ndarray]
 
 
 @runtime_checkable
 class Estimator(Protocol):
-    """Senses, or what stands for them."""
+    """A state estimator, or what stands for one."""
 
     def estimate(
         self, observation: Observation, first: Observation
@@ -57,11 +46,11 @@ class Planner:
         Args:
             policy: for inference.
             touch: embedder of the training; None for a policy without touch.
-            estimator: that read the columns which only a simulator knows; None if there are none.
+            estimator: reads the columns that only a simulator knows; None if there are none.
             seed: of the plans' noise.
 
         Raises:
-            UserError: the embedder is not the training's, or senses are missing.
+            UserError: the embedder is not the training's, or an estimator is missing.
         """
         self.config = config = policy.config
         if (touch.name if touch else "") != config.touch:
@@ -70,8 +59,12 @@ class Planner:
                 "load the touch encoder that it was trained with"
             )
         if config.estimated and estimator is None:
-            raise UserError(f"the policy acts on {config.estimated[0]}: give it senses to read it")
+            raise UserError(f"the policy acts on {config.estimated[0]}: give it a state estimator")
         self._policy, self.touch, self._estimator = policy, touch, estimator
+        self.reset(seed)
+
+    def reset(self, seed: int = 0) -> None:
+        """Begin another episode; `seed` is of its plans' noise."""
         self._generator = torch.Generator().manual_seed(seed)
         self._first: Observation = {}
         self._embedded: list[tuple[Observation, np.ndarray, np.ndarray]] = []
@@ -169,56 +162,3 @@ class PolicyActor:
         """Go on with the next plan where the present one is done."""
         if not self._todo:
             self._todo, self._next = self._next, []
-
-
-@dataclass(frozen=True)
-class SavedPolicy:
-    """Makes actors of a policy on disk, in any process.
-
-    Attributes:
-        directory: of the policy, with its touch encoder in `touch/`, its senses in `senses/`.
-        latency: see `PolicyActor`.
-    """
-
-    directory: Path
-    latency: int = 0
-
-    def __call__(self, env: object = None) -> PolicyActor:
-        """An actor for one episode, on one core; which environment does not matter."""
-        torch.set_num_threads(1)  # two lose badly when the other core is taken
-        return PolicyActor(self.planner(), self.latency)
-
-    def planner(self) -> Planner:
-        """What makes its plans in one episode."""
-        policy = checkpoint.load(self.directory)
-        return Planner(policy, self._touch(policy.config), self._estimator(policy.config))
-
-    def check_task(self, task: EnvConfig) -> "SavedPolicy":
-        """Itself; UserError if the policy cannot act in the task."""
-        policy = checkpoint.load(self.directory, control_hz=task.control_hz)
-        touch, estimator = self._touch(policy.config), self._estimator(policy.config)
-        sensor = find_sensor(task.sensor).name
-        for embedder in (touch, estimator and estimator.touch):
-            if embedder and embedder.sensor != sensor:
-                raise UserError(
-                    f"the policy in {self.directory} feels with {embedder.sensor}, the task has "
-                    f"{sensor}: add --env.sensor {embedder.sensor}"
-                )
-        PolicyActor(Planner(policy, touch, estimator), self.latency)
-        return self
-
-    def env_config(self, task: Task) -> Task:
-        """The task with the pictures that the policy looks at, and no others."""
-        config = checkpoint.load(self.directory).config
-        estimator = self._estimator(config)
-        keys = estimator.cameras if estimator else ()
-        needs_touch = config.touch_dim > 0 or config.end_to_end is not None or estimator is not None
-        cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key in keys)
-        task = replace(task, tactile=needs_touch, cameras=cameras)
-        return replace(task, camera_size=estimator.camera_size) if estimator else task
-
-    def _touch(self, config: PolicyConfig) -> TouchEmbedder | None:
-        return load_touch(self.directory / checkpoint.TOUCH) if config.touch_dim else None
-
-    def _estimator(self, config: PolicyConfig) -> StateEstimator | None:
-        return load_estimator(self.directory / checkpoint.ESTIMATOR) if config.estimated else None

@@ -61,6 +61,8 @@ class PolicyConfig:
             see `proprioception.py`.
         control_hz: ticks per second.
         head: what draws the chunk.
+        task: of the episodes learned from, such as "bead-maze"; "" if unknown.
+        sensor: of the fingertips in them; "" for a policy without touch.
     """
 
     touch_dim: int
@@ -77,6 +79,8 @@ class PolicyConfig:
     representation: ActionRepresentation = "chunk"
     control_hz: int = ft.CONTROL_HZ
     head: DiffusionConfig | RegressionConfig = field(default_factory=DiffusionConfig)
+    task: str = ""
+    sensor: str = ""
 
     def __post_init__(self) -> None:
         """Raises UserError for what makes no policy."""

@@ -5,7 +5,7 @@ from typing import Any, Literal, overload
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.bead_maze import BeadMaze
-from touchgoal.sim_envs.config import BeadMazeConfig, TaskConfig
+from touchgoal.sim_envs.config import BeadMazeConfig, EnvConfig, TaskConfig, TaskName
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.experts.pick_place import Outcome, PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace
@@ -43,6 +43,11 @@ def make(task: str, *, render_mode: str | None = None, **options: Any) -> Franka
 def make_env(config: TaskConfig) -> FrankaTactileEnv:
     """The environment of a task's config."""
     return BeadMaze(config) if isinstance(config, BeadMazeConfig) else PickPlace(config)
+
+
+def task_name(config: EnvConfig) -> TaskName:
+    """What the commands call the task of a config."""
+    return "bead-maze" if isinstance(config, BeadMazeConfig) else "pick-place"
 
 
 def make_expert(

@@ -3,7 +3,7 @@
 import pytest
 
 from touchgoal.episodes.recording import EpisodeSpec
-from touchgoal.policies.acting import SHIPPED, SavedPolicy
+from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy
 from touchgoal.policies.evaluation.pick_place import evaluate
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.sim_envs.config import PickPlaceConfig

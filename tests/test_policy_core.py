@@ -25,7 +25,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import FR3_ARM
 from touchgoal.control.motion.kinematics import Fr3Kinematics
 from touchgoal.episodes.schema import Episode
-from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter, validate
 from touchgoal.policies import checkpoint
 from touchgoal.policies.actions import (
     ActionRepresentation,
@@ -274,9 +274,12 @@ def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     frames = toy_observations(4)
     row = torch.from_numpy(embedder.embed_tick(frames[3], frames[0])).half()
     torch.testing.assert_close(first.touch[3], row, rtol=1e-2, atol=1e-2)
-    for path in tmp_path.glob("set/embeddings/toy/000000.npy"):
+    assert validate(tmp_path / "set/episodes") == []  # what is kept inside the set is no damage
+    kept = list((tmp_path / "set/episodes/.cache/embeddings/toy").iterdir())
+    assert len(kept) == 2
+    for path in kept:
         np.save(path, np.load(path)[1:])
-    with pytest.raises(UserError, match="does not fit episode 0"):
+    with pytest.raises(UserError, match="is damaged: delete"):
         load_recordings(episodes, [0], config, embedder)
     with pytest.raises(UserError, match='choose touch_reading "free"'):
         load_recordings(episodes, [0], replace(config, touch_reading="wrench"), embedder)
@@ -287,3 +290,18 @@ def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     Policy(replace(config, touch_dim=0)).plan(
         ObservationBatch(blind.touch[None, :2].float(), blind.state[None, :2]), torch_rng()
     )
+
+
+def test_two_sets_beside_each_other_share_no_embeddings(tmp_path: Path) -> None:
+    embedder = toy_touch_embedder()
+    config = replace(TOY, touch_dim=embedder.dim, touch_reading="free")
+    touches = []
+    for name, first in (("one", 0), ("two", 1)):
+        ticks = [{**tick, ft.ACTION: tick[ft.STATE][:8]} for tick in toy_observations(5)[first:][:4]]
+        frames = {k: np.stack([t[k] for t in ticks]) for k in ticks[0]}
+        EpisodeWriter(tmp_path / name).append(Episode(frames, "feel"))
+        episodes = EpisodeSet(tmp_path / name)
+        touches.append(load_recordings(episodes, [0], config, embedder).touch)
+        fresh = torch.from_numpy(embedder.embed(episodes, 0)).half()
+        assert torch.equal(touches[-1], fresh)
+    assert not torch.equal(*touches)

@@ -17,7 +17,8 @@ from toy_policies import (
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.policies.acting import SHIPPED, Planner, SavedPolicy
+from touchgoal.policies.acting import Planner
+from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy
 from touchgoal.policies.perception.placements import Placements
 from touchgoal.policies.perception.pose_estimator import PoseEstimatorConfig
 from touchgoal.policies.perception.proprioception import network_input

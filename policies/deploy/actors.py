@@ -10,7 +10,8 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import Safety
-from touchgoal.policies.acting import SHIPPED, Observation, SavedPolicy
+from touchgoal.policies.acting import Observation
+from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy
 from touchgoal.policies.deploy.control_loop import DeployedActor
 from touchgoal.policies.deploy.realtime import ChunkPlanner, RealTimeActor
 from touchgoal.policies.deploy.scripted import PickPlacePoses, pick_and_place

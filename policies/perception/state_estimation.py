@@ -1,7 +1,7 @@
-"""Senses: they read in touch and pictures what only a simulator knows for sure.
+"""State estimation: reads in touch and pictures what only a simulator knows for sure.
 
-A policy learns on those truths, and acts on what its senses say of them. So the senses can learn
-from far more than demonstrations, and the policy from demonstrations without pictures.
+A policy learns on those truths, and acts on the estimates. So the estimator can learn from far more
+than demonstrations, and the policy from demonstrations without pictures.
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,9 @@ from touchgoal.policies.actions import Normalizer
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
 from touchgoal.policies.perception.pose_estimator import PoseEstimator, PoseEstimatorConfig
 
-ESTIMATOR = WeightsFormat("senses", "senses", "train them with: touchgoal train-estimators")
+ESTIMATOR = WeightsFormat(
+    "estimator", "estimator", "train one with: touchgoal train-estimators"
+)
 ESTIMATED = (ft.TRUTH_CONTACT, ft.TRUTH_START)
 
 
@@ -71,8 +73,9 @@ class StateEstimator:
         """For inference; UserError if the embedder is not the training's."""
         if touch.name != network.config.touch:
             raise UserError(
-                f"these senses feel through {network.config.touch!r}, not {touch.name!r}: load the "
-                "touch encoder that they were trained with"
+                f"the state estimator was trained with the touch encoder {network.config.touch}, "
+                f"this is {touch.name}: put the former into `touch/` beside the estimator, or train "
+                "the estimator again (touchgoal train-estimators; what ships: make pick-place-policy)"
             )
         self.network, self.touch = network, touch
         self.camera_size = network.config.pose_estimator.size
@@ -101,7 +104,10 @@ class StateEstimator:
         size = self.camera_size
         if picture.shape[:2] != size:
             seen, wanted = (f"{rows} x {columns}" for rows, columns in (picture.shape[:2], size))
-            raise UserError(f"{key} is {seen}, the senses learned on {wanted}: set camera_size")
+            raise UserError(
+                f"{key} is {seen}, the policy was trained on {wanted}: make the environment with "
+                "load_policy(...).env_config(), or set camera_size"
+            )
         return torch.from_numpy(picture)[None]
 
 

@@ -1,15 +1,16 @@
-"""Demonstrations by laws of the present state, to a learner too that acts by itself."""
+"""Demonstrations by experts that can be asked in any state, also while a policy acts (DAgger)."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.episodes.recording import Actor, EpisodeSpec
 from touchgoal.policies import checkpoint
-from touchgoal.policies.acting import Planner, PolicyActor, SavedPolicy
+from touchgoal.policies.acting import Planner, PolicyActor
+from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import PickPlace
@@ -18,25 +19,28 @@ from touchgoal.sim_envs.tasks import make_expert
 
 @dataclass(frozen=True)
 class DaggerRoles:
-    """Roles (see `episodes/recording.py`) of an expert to be asked in any state, and its learner.
+    """Who acts and whose answers are recorded, see `Roles` in `episodes/recording.py`.
+
+    The expert can be asked what to do in any state.
 
     Attributes:
-        learner: directory of a policy that acts while the expert says what it should have done
-            (DAgger, Ross et al. 2011), on the simulator's truth in place of its senses, if it has
-            some; None: the expert itself acts.
+        policy: makes the policy that acts while the expert says what it should have done (DAgger,
+            Ross et al. 2011); one with a state estimator acts on the simulator's truth instead.
+            None: the expert itself acts.
     """
 
-    learner: Path | None = None
+    policy: Callable[[Any], Actor] | None = None
 
     def __call__(self, env: FrankaTactileEnv, spec: EpisodeSpec) -> tuple[Actor, Actor]:
         """Who acts, and whose answers are recorded."""
         expert = FeedbackExpert(env) if isinstance(env, PickPlace) else make_expert(env)
-        if self.learner is None:
+        if self.policy is None:
             return expert, expert
-        policy = checkpoint.load(self.learner, control_hz=env.config.control_hz)
-        if policy.config.estimated and isinstance(env, PickPlace):
-            return PolicyActor(Planner(policy, None, _TrueState(env))), expert
-        return SavedPolicy(self.learner).check_task(env.config)(), expert
+        if isinstance(self.policy, SavedPolicy) and isinstance(env, PickPlace):
+            policy = checkpoint.load(self.policy.directory)
+            if policy.config.estimated:
+                return PolicyActor(Planner(policy, None, _TrueState(env))), expert
+        return self.policy(env), expert
 
 
 class _TrueState:

@@ -1,8 +1,9 @@
 """Training windows over episodes: what was seen on the last ticks, and what was done on the next.
 
-Touch is embedded once, by a frozen encoder, and kept on disk beside what it was made from.
+Touch is embedded once, by a frozen encoder, and kept on disk inside the set that it was made from.
 """
 
+import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,6 +36,7 @@ class Recordings:
         lengths: ticks of each episode.
         pictures: for the end-to-end encoder; None without.
         wrench: what acted on both pads (N, Nm, pad frames); None unless the policy reads it.
+        checksum: of the episodes, in their order.
     """
 
     touch: Float16[Tensor, "n e"]
@@ -43,6 +45,7 @@ class Recordings:
     lengths: tuple[int, ...]
     pictures: UInt8[Tensor, "n k h w 3"] | None = None
     wrench: Float32[Tensor, "n 12"] | None = None
+    checksum: str = ""
 
 
 def load_recordings(
@@ -84,7 +87,14 @@ def load_recordings(
         lengths=tuple(len(rows) for rows in actions),
         pictures=torch.from_numpy(np.concatenate(pictures)) if config.end_to_end else None,
         wrench=torch.from_numpy(np.concatenate(wrench)) if wrench else None,
+        checksum=checksum_of(episodes, chosen),
     )
+
+
+def checksum_of(episodes: EpisodeSet, chosen: Sequence[int]) -> str:
+    """Tells the chosen episodes, in their order, from any others: SHA-256 in hexadecimal."""
+    each = "".join(episodes.episode_checksum(i) for i in chosen)
+    return hashlib.sha256(each.encode()).hexdigest()
 
 
 def _difference_images(
@@ -140,27 +150,27 @@ def embed_episodes(
 def cached_embeddings(
     episodes: EpisodeSet, i: int, embedder: TouchEmbedder
 ) -> Float16[np.ndarray, "t e"]:
-    """The embeddings that `read` kept of an episode; UserError if they are another episode's."""
-    path = _path(episodes, embedder, i)
+    """The embeddings that `embed_episodes` kept of an episode; UserError if they are damaged."""
+    path = _cache_path(episodes, embedder, i)
     rows = np.load(path)
     if rows.shape != (episodes.lengths[i], embedder.dim):
-        raise UserError(f"{path} does not fit episode {i} of {episodes.root}: delete {path.parent}")
+        raise UserError(f"{path} is damaged: delete {path.parent}, which is made again")
     return rows
 
 
-def _path(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> Path:
-    """Beside the episodes, so that every training on them shares it."""
-    folder = episodes.root.parent / "embeddings" / embedder.name.replace("/", "_")
-    return folder / f"{i:06d}.npy"
+def _cache_path(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> Path:
+    """Inside the set, where every training on it finds it; named by episode and encoder weights."""
+    folder = episodes.root / ".cache" / "embeddings" / embedder.name.replace("/", "_")
+    return folder / f"{episodes.episode_checksum(i)[:32]}.npy"
 
 
 def _fill_cache(
     episodes: EpisodeSet, chosen: Sequence[int], embedder: TouchEmbedder, workers: int
 ) -> None:
-    missing = [i for i in chosen if not _path(episodes, embedder, i).exists()]
+    missing = [i for i in chosen if not _cache_path(episodes, embedder, i).exists()]
     if not missing:
         return
-    _path(episodes, embedder, 0).parent.mkdir(parents=True, exist_ok=True)
+    _cache_path(episodes, embedder, 0).parent.mkdir(parents=True, exist_ok=True)
     make = partial(_embed, episodes, embedder)
     progress = partial(tqdm, total=len(missing), desc="embed", unit="episode")
     if workers == 1:
@@ -172,7 +182,7 @@ def _fill_cache(
 
 def _embed(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> None:
     torch.set_num_threads(1)
-    rows, path = embedder.embed(episodes, i).astype(np.float16), _path(episodes, embedder, i)
+    rows, path = embedder.embed(episodes, i).astype(np.float16), _cache_path(episodes, embedder, i)
     with open(temporary := path.with_suffix(".tmp"), "wb") as file:
         np.save(file, rows)
     os.replace(temporary, path)

@@ -199,8 +199,9 @@ class _Run:
         return seen, actions.to(device)
 
     def _setting(self) -> str:
-        lengths = self.windows.recorded.lengths
-        return json.dumps((asdict(self.config), asdict(self.policy.config), lengths))
+        recorded = self.windows.recorded
+        data = recorded.lengths, recorded.checksum
+        return json.dumps((asdict(self.config), asdict(self.policy.config), data))
 
 
 def _learning_rate(config: TrainConfig, step: int, steps: int) -> float:
