@@ -17,16 +17,16 @@ import torch
 from jaxtyping import Float
 
 from touchgoal.control.errors import UserError
-from touchgoal.episodes.recording import Actor, collect
+from touchgoal.episodes.recording import Actor, EpisodeSpec, collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import Observation, Planner, PolicyActor
+from touchgoal.policies.by_name import follower
 from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy
 from touchgoal.policies.evaluation import open_loop
-from touchgoal.policies.evaluation.bead_maze import MazeTrial, evaluate, trials_of
+from touchgoal.policies.evaluation.evaluate import Trial, run_trials
 from touchgoal.policies.evaluation.open_loop import OpenLoopErrors, Plan, open_loop_errors
 from touchgoal.policies.evaluation.success_rate import SuccessRate
-from touchgoal.policies.follower import WireFollower
 from touchgoal.policies.heads.diffusion import RegressionConfig
 from touchgoal.policies.perception.frozen_touch import load_touch
 from touchgoal.policies.policy import ObservationBatch, Policy
@@ -38,7 +38,7 @@ from touchgoal.policies.training.sequence_dataset import (
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
-from touchgoal.sim_envs.scene.wires import HELD_OUT, choose
+from touchgoal.sim_envs.scene.wires import HELD_OUT, Wire, choose
 
 FIRST_SEED = 4_000_000
 
@@ -65,15 +65,6 @@ class Config:
     """Processes that simulate."""
 
 
-@dataclass(frozen=True)
-class Follower:
-    """Makes the classical follower."""
-
-    def __call__(self, env: BeadMaze) -> Actor:
-        """For one episode."""
-        return WireFollower(env.config.control_hz)
-
-
 class ShuffledTouchPlanner(Planner):
     """A planner that feels, tick by tick, what was felt on another wire."""
 
@@ -91,7 +82,9 @@ class ShuffledTouchPlanner(Planner):
 
 @dataclass(frozen=True)
 class ShuffledTouch:
-    """Makes a policy whose touch was shuffled: it feels another episode, drawn by the trial's seed.
+    """Makes a policy whose touch was shuffled: it feels an episode on another wire.
+
+    Which one is drawn by the trial's seed.
 
     Attributes:
         policy: makes it, undisturbed.
@@ -107,9 +100,20 @@ class ShuffledTouch:
         loaded = checkpoint.load(self.policy.directory)
         touch = load_touch(self.policy.directory / checkpoint.TOUCH)
         planner = ShuffledTouchPlanner(loaded, touch)
-        chosen = int(env.np_random.integers(len(self.episodes)))
+        rows = other_wires(self.episodes, env.wire.name)
+        chosen = rows[int(env.np_random.integers(len(rows)))]
         planner.recorded_touch = cached_embeddings(self.episodes, chosen, touch).astype(np.float32)
         return PolicyActor(planner, self.policy.latency)
+
+
+def other_wires(episodes: EpisodeSet, wire: str) -> list[int]:
+    """Episodes that were not recorded on a wire."""
+    return [i for i in range(len(episodes)) if episodes.meta(i)["wire"] != wire]
+
+
+def _specs(wires: list[Wire], seed: int) -> list[EpisodeSpec]:
+    """One trial on each wire; the seeds, from `seed` on, place the maze and grip the bead."""
+    return [EpisodeSpec(seed + i, options={"wire": w.name}) for i, w in enumerate(wires)]
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -143,6 +147,8 @@ def _group_by_recipe(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
         inputs += ["end-to-end touch"] * (config.end_to_end is not None)
         episodes = checkpoint.POLICY.provenance(directory)["episodes"]
         name = f"{' and '.join(inputs) or 'state only'}, {episodes} demos"
+        if config.touch_dim and config.touch_reading == "free":
+            name += ", not taught by wrenches"
         if isinstance(config.head, RegressionConfig):
             name += ", regression"
         arms.setdefault(name, []).append(directory)
@@ -154,22 +160,22 @@ def _group_by_recipe(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
 
 def _closed_loop(
     config: Config, arms: dict[str, list[Path]], recorded: EpisodeSet
-) -> dict[str, list[MazeTrial]]:
+) -> dict[str, list[Trial]]:
     maze = config.maze
     blind = replace(maze, tactile=False)
-    jobs = trials_of(choose(maze.split, config.wires, maze.families), FIRST_SEED)
-    other = trials_of(choose(maze.split, config.held_out, (HELD_OUT,)), FIRST_SEED + 10_000)
-    results: dict[str, list[MazeTrial]] = {}
+    jobs = _specs(choose(maze.split, config.wires, maze.families), FIRST_SEED)
+    other = _specs(choose(maze.split, config.held_out, (HELD_OUT,)), FIRST_SEED + 10_000)
+    results: dict[str, list[Trial]] = {}
 
     def run_arm(name: str, env: BeadMazeConfig, makers: list[Callable], trials: list) -> None:
         if not trials:
             return
         print(f"{name}: {len(makers)} x {len(trials)} wires")
-        results[name] = [t for m in makers for t in evaluate(env, m, trials, config.workers)]
+        results[name] = [t for m in makers for t in run_trials(env, m, trials, config.workers)]
 
     run_arm("expert (sees the wire)", blind, [BeadMazeExpert], jobs)
-    run_arm("follower (force and first tangent)", blind, [Follower()], jobs)
-    run_arm(f"follower, {HELD_OUT}", blind, [Follower()], other)
+    run_arm("follower (force and first tangent)", blind, [follower], jobs)
+    run_arm(f"follower, {HELD_OUT}", blind, [follower], other)
     for name, directories in arms.items():
         makers = [SavedPolicy(d) for d in directories]
         env = makers[0].env_config(maze)
@@ -185,7 +191,7 @@ def _closed_loop(
     return results
 
 
-def _closed_table(results: dict[str, list[MazeTrial]]) -> str:
+def _closed_table(results: dict[str, list[Trial]]) -> str:
     width = max(len(name) for name in results) + 2
     lines = [
         f"{'closed loop, test wires':<{width}}{'success [95 % Wilson]':<24}"
@@ -196,7 +202,7 @@ def _closed_table(results: dict[str, list[MazeTrial]]) -> str:
         failures = [
             sum(t.failure == kind for t in trials) for kind in ("drop", "jam", "over_force")
         ]
-        low, high = bootstrap([(t.wire, t.progress) for t in trials])
+        low, high = bootstrap([(str(t.episode["wire"]), t.progress) for t in trials])
         done = f"{np.mean([t.progress for t in trials]):.0%} [{low:.0%}, {high:.0%}]"
         lines.append(
             f"{name:<{width}}{rate!s:<24}{done:<22}{failures[0]:>5}{failures[1]:>5}{failures[2]:>6}"
@@ -226,7 +232,7 @@ def _record(config: Config, root: Path) -> EpisodeSet:
     """Expert demonstrations, on test wires and undisturbed unless other options are chosen."""
     maze = config.maze
     wires = choose(maze.split, config.demonstrations, maze.families)
-    collect(root, maze, trials_of(wires, FIRST_SEED), config.workers)
+    collect(root, maze, _specs(wires, FIRST_SEED), config.workers)
     return EpisodeSet(root)
 
 

@@ -3,22 +3,19 @@
 import os
 import shlex
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.episodes.recording import CORRECTED
+from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies import checkpoint
 from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.policies.actions import ActionRepresentation
-from touchgoal.policies.evaluation import bead_maze as maze_trials
-from touchgoal.policies.evaluation import pick_place as rollout
+from touchgoal.policies.evaluation.evaluate import Evaluation, run_trials, trial_specs
 from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.heads.samplers import SamplerConfig
 from touchgoal.policies.heads.unet import PRESETS
@@ -29,9 +26,12 @@ from touchgoal.policies.policy import PolicyConfig, TouchReading
 from touchgoal.policies.training.model_selection import Score, add_parts, select
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
 from touchgoal.policies.training.train import POLICY, TrainConfig, train
-from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
-from touchgoal.sim_envs.scene.objects import CATALOGUE
-from touchgoal.sim_envs.scene.wires import choose
+from touchgoal.policies.training.training_data import (
+    choose_episodes,
+    common_sensor,
+    common_task,
+)
+from touchgoal.sim_envs.config import TASKS, BeadMazeConfig, PickPlaceConfig, TaskName
 
 Head = Literal["small", "published", "tiny", "regression"]
 _COLUMNS = ft.STATE, ft.TCP_POSE
@@ -43,29 +43,32 @@ class Config:
     """Options of train-policy."""
 
     data: Path
-    """Set of episodes to learn from: successful ones, and those in which a learner was corrected."""
+    """Set of episodes to learn from: those that succeeded, and those in which an expert corrected a
+    policy."""
     validation: Path
     """Set of other episodes, on which losses are measured."""
-    task: Literal["pick-place", "bead-maze"] = "bead-maze"
-    """Where snapshots are tried."""
+    include_unknown: bool = False
+    """Also learn from episodes that do not say whether they succeeded."""
+    task: Literal["pick-place", "bead-maze"] | None = None
+    """Task of the episodes, in which snapshots are tried; default: what the episodes say."""
     encoder: Path | None = None
     """Folder of a frozen touch encoder (train-encoder); without one the policy does not feel."""
     end_to_end: bool = False
     """Feel through a touch ViT that is trained along, instead of a frozen encoder."""
-    senses: Path | None = None
-    """Folder of senses (train-estimators): the policy acts on what they read of contact and of the
-    scene at the start, and learns on the truth, so that its episodes need no pictures."""
+    estimator: Path | None = None
+    """Folder of a state estimator (train-estimators): the policy acts on its estimates of contact and
+    of where things lie at the start, and learns on the truth, so its episodes need no pictures."""
     out: Path | None = None
     """Folder of the run; the policy goes to its `policy/`."""
     share: float = 1.0
-    """Of the episodes to learn from, the first so many."""
+    """Share of the episodes to learn from, counted from the first; 1 takes all."""
     head: Head = "small"
     """Size of the diffusion's U-Net, or regression instead."""
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     """How the diffusion is trained and sampled."""
     representation: ActionRepresentation = "body_twist"
     """Of the actions while learning; "body_twist" also sees along the hand's own axes, and does not go
-    with senses: choose "base_twist" there."""
+    with a state estimator: choose "base_twist" there."""
     touch_reading: TouchReading = "wrench"
     """What the policy makes of a frozen embedding: the wrench on the pads, or anything ("free")."""
     touch_projection_dim: int = 64
@@ -104,18 +107,25 @@ def main(config: Config) -> None:
         name: folder
         for name, folder in (
             (checkpoint.TOUCH, config.encoder),
-            (checkpoint.ESTIMATOR, config.senses),
+            (checkpoint.ESTIMATOR, config.estimator),
         )
         if folder
     }
-    if config.senses:
-        load_estimator(config.senses)
+    if config.estimator:
+        load_estimator(config.estimator)
     touch = load_touch(config.encoder) if config.encoder else None
     sets = EpisodeSet(config.data), EpisodeSet(config.validation)
-    policy = _policy_config(config, sets[0], touch)
-    out = open_run(config.out, "train-policy", config)
-    chosen = [_instructive(s) for s in sets]
+    found = [choose_episodes(s, config.include_unknown) for s in sets]
+    chosen = [f.rows for f in found]
     chosen[0] = chosen[0][: max(1, round(config.share * len(chosen[0])))]
+    task = _task(config, list(zip(sets, chosen, strict=True)))
+    feels = config.encoder or config.end_to_end or config.estimator
+    sensor = common_sensor(list(zip(sets, chosen, strict=True))) if feels else ""
+    if config.trials:
+        _check_sensor(config, task, sensor)
+    policy = replace(_policy_config(config, sets[0], touch), task=task, sensor=sensor)
+    out = open_run(config.out, "train-policy", config)
+    print(f"{task}: {found[0]} to learn from, {found[1]} for validation")
     windows, validation = (
         SequenceDataset(load_recordings(s, rows, policy, touch, config.workers), policy)
         for s, rows in zip(sets, chosen, strict=True)
@@ -129,7 +139,7 @@ def main(config: Config) -> None:
     train(policy, windows, validation, config.train, out, recipe, config.resume)
     add_parts(out / POLICY, parts)
     if config.trials:
-        scores = select(out, parts, lambda directory: _try(config, directory))
+        scores = select(out, parts, lambda directory: _try(config, task, directory))
         write_json(out / "metrics.json", {"snapshots": scores})
     print(f"policy: {out / POLICY}")
 
@@ -148,7 +158,7 @@ def _policy_config(
         touch_noise=config.touch_noise,
         position_noise=config.position_noise,
         end_to_end=EndToEndConfig() if config.end_to_end else None,
-        proprioception=_COLUMNS + (ft.WRENCH, *ESTIMATED) if config.senses else _COLUMNS,
+        proprioception=_COLUMNS + (ft.WRENCH, *ESTIMATED) if config.estimator else _COLUMNS,
         representation=config.representation,
         observation_horizon=config.observation_horizon,
         execution_horizon=config.execution_horizon,
@@ -157,21 +167,31 @@ def _policy_config(
     )
 
 
-def _instructive(episodes: EpisodeSet) -> list[int]:
-    metas = [episodes.meta(i) for i in range(len(episodes))]
-    return [
-        i for i, m in enumerate(metas) if m.get("success", True) or m.get("outcome") == CORRECTED
-    ]
+def _task(config: Config, chosen: list[tuple[EpisodeSet, list[int]]]) -> TaskName:
+    """What the data say; UserError if they are of several tasks, or of another than was asked for."""
+    found = common_task(chosen)
+    if config.task and found not in ("", config.task):
+        raise UserError(f"{config.data} is of {found}, not of {config.task}: leave out --task")
+    task = config.task or found
+    if task not in TASKS:
+        raise UserError(f"{config.data} does not say its task: add --task {' or '.join(TASKS)}")
+    return task  # pyright: ignore[reportReturnType]
 
 
-def _try(config: Config, directory: Path) -> Score:
-    maker = SavedPolicy(directory)
-    if config.task == "bead-maze":
-        wires = choose(config.maze.split, config.trials, config.maze.families)
-        jobs = maze_trials.trials_of(wires, _TRIALS)
-        trials = maze_trials.evaluate(maker.env_config(config.maze), maker, jobs, config.workers)
-    else:
-        jobs = rollout.demonstrations_of(list(CATALOGUE), config.trials, _TRIALS)
-        trials = rollout.evaluate(maker.env_config(config.env), maker, jobs, config.workers)
-    success = float(np.mean([t.success for t in trials]))
-    return success, float(np.mean([t.progress for t in trials]))
+def _check_sensor(config: Config, task: TaskName, sensor: str) -> None:
+    """UserError if snapshots would be tried with another sensor than the episodes'."""
+    tried = find_sensor((config.maze if task == "bead-maze" else config.env).sensor).name
+    if sensor and tried != sensor:
+        raise UserError(
+            f"{config.data} was recorded with {sensor}, snapshots would be tried with {tried}: add "
+            f"--env.sensor {sensor}"
+        )
+
+
+def _try(config: Config, task: TaskName, directory: Path) -> Score:
+    env = config.maze if task == "bead-maze" else config.env
+    policy = SavedPolicy(directory).check_task(env)
+    env = policy.env_config(env)
+    specs = trial_specs(env, config.trials, _TRIALS)
+    result = Evaluation(tuple(run_trials(env, policy, specs, config.workers)))
+    return result.rate.successes / result.rate.trials, result.progress
