@@ -1,6 +1,5 @@
 """From acting in an environment to episodes on disk, on all cores."""
 
-import fcntl
 import multiprocessing
 import os
 import signal
@@ -156,37 +155,16 @@ def collect(
     if not specs:
         raise UserError("nothing to collect: ask for at least one episode")
     metas = []
-    with recording_into(root), one_core_workers(workers) as pool:
-        writer = EpisodeWriter(root, fps=config.control_hz)
-        encoded = pool.map(partial(_record, config, roles), specs)
-        for episode in tqdm(encoded, total=len(specs), desc="record", unit="episode"):
-            writer.append(episode)
-            metas.append(episode.description.meta)
-    return metas
-
-
-@contextmanager
-def recording_into(root: Path) -> Iterator[None]:
-    """Keeps a set for this process alone, so that two recorders do not meet after minutes of work.
-
-    Raises:
-        UserError: another process records into the set.
-    """
-    root.mkdir(parents=True, exist_ok=True)
-    folder = os.open(root, os.O_RDONLY)
+    writer = EpisodeWriter(root, fps=config.control_hz)  # refuses a second recorder at once
     try:
-        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(folder)
-        raise UserError(
-            f"another process records into {root}: wait for it, or choose another --out"
-        ) from error
-    try:
-        yield
+        with one_core_workers(workers) as pool:
+            encoded = pool.map(partial(_record, config, roles), specs)
+            for episode in tqdm(encoded, total=len(specs), desc="record", unit="episode"):
+                writer.append(episode)
+                metas.append(episode.description.meta)
     finally:
-        os.close(folder)  # which lets go of the lock
-        if not any(root.iterdir()):
-            root.rmdir()
+        writer.close()
+    return metas
 
 
 @contextmanager

@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import EpisodeSpec, Roles, collect, expert_alone
-from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies.by_name import choose_policy, env_config_for
 from touchgoal.policies.checkpoint import SavedPolicy, load
 from touchgoal.policies.evaluation.success_rate import SuccessRate
@@ -138,6 +138,7 @@ def _roles(config: Config, task: TaskConfig) -> Roles:
         missing = [f"the {name} camera" for name in needed.cameras if name not in task.cameras]
         missing += ["the fingertips"] * (needed.tactile and not task.tactile)
         if missing:
-            raise UserError(f"the policy looks at {missing[0]}: record that too (--env.cameras, "
-                            "--env.tactile)")
+            raise UserError(
+                f"the policy looks at {missing[0]}: record that too (--env.cameras, --env.tactile)"
+            )
     return DaggerRoles(policy)

@@ -13,8 +13,8 @@ from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies import checkpoint
-from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.policies.actions import ActionRepresentation
+from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.policies.evaluation.evaluate import Evaluation, run_trials, trial_specs
 from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.heads.samplers import SamplerConfig

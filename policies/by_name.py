@@ -129,7 +129,9 @@ def choose_policy(name: str | Path, task: TaskConfig, latency: int = 0) -> Polic
         folder = find_policy(chosen)
     except UserError as error:
         if Path(chosen).is_dir():
-            raise UserError(f"no policy in {chosen}: train one with touchgoal train-policy") from error
+            raise UserError(
+                f"no policy in {chosen}: train one with touchgoal train-policy"
+            ) from error
         raise UserError(
             f"there is no policy {chosen!r}: {suggestion(chosen, tuple(BUILT_IN))}, or a class of your "
             "own as module:Class or file.py:Class"

@@ -9,7 +9,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.contact import detect_contact
 from touchgoal.episodes.recording import run
-from touchgoal.policies.evaluation.bead_maze import evaluate, trials_of
+from touchgoal.policies.evaluation.evaluate import run_trials, trial_specs
 from touchgoal.policies.follower import WireFollower
 from touchgoal.sim_envs.bead_maze import BeadMaze, add_wire, thread_bead
 from touchgoal.sim_envs.config import BeadMazeConfig
@@ -180,10 +180,10 @@ def test_bead_stays_on_the_wire_whatever_the_hand_does(maze: BeadMaze) -> None:
 
 
 def test_trials_depend_on_wire_and_seed_alone() -> None:
-    jobs = trials_of(choose("validation", 2), seed=7)
-    both = evaluate(BLIND, BeadMazeExpert, jobs, workers=2)
-    assert both[1:] == evaluate(BLIND, BeadMazeExpert, jobs[1:], workers=1)
-    assert [t.family for t in both] == ["fourier", "roller"] and both[0].failure == ""
+    jobs = trial_specs(replace(BLIND, split="validation"), 2, seed=7)
+    both = list(run_trials(BLIND, BeadMazeExpert, jobs, workers=2))
+    assert both[1:] == list(run_trials(BLIND, BeadMazeExpert, jobs[1:], workers=1))
+    assert [t.episode["family"] for t in both] == ["fourier", "roller"] and both[0].failure == ""
 
 
 def test_bad_requests_say_what_to_do(maze: BeadMaze) -> None:

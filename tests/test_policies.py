@@ -1,13 +1,29 @@
-"""How sure a success rate is, and that trials on several cores are the trials on one."""
+"""Judging policies, shipped and one's own; what is recorded for them and what they learn from."""
 
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
 import pytest
 
+from touchgoal.control import features as ft
+from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import EpisodeSpec
-from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy
-from touchgoal.policies.evaluation.pick_place import evaluate
+from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.launch import collect_demos
+from touchgoal.policies.by_name import choose_policy
+from touchgoal.policies.checkpoint import load_policy
+from touchgoal.policies.evaluation.evaluate import evaluate, run_trials
 from touchgoal.policies.evaluation.success_rate import SuccessRate
+from touchgoal.policies.training.training_data import (
+    choose_episodes,
+    common_sensor,
+    common_task,
+)
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
+from touchgoal.sim_envs.tasks import make_env
 
 
 @pytest.mark.parametrize(
@@ -22,15 +38,98 @@ def test_wilson_interval(successes: int, trials: int, low: float, high: float) -
 def test_trials_depend_on_their_seed_alone() -> None:
     config = PickPlaceConfig(cameras=(), tactile=False)
     jobs = [EpisodeSpec(seed, options={"object": "toy_brick"}) for seed in (1, 2)]
-    assert evaluate(config, PickPlaceExpert, jobs, workers=2) == [
-        *evaluate(config, PickPlaceExpert, jobs[:1], workers=1),
-        *evaluate(config, PickPlaceExpert, jobs[1:], workers=1),
+    apart = [run_trials(config, PickPlaceExpert, [job], workers=1) for job in jobs]
+    assert list(run_trials(config, PickPlaceExpert, jobs, workers=2)) == [
+        t for r in apart for t in r
     ]
 
 
 def test_what_ships_picks_and_places() -> None:
-    maker = SavedPolicy(SHIPPED["pick-place"])
-    config = maker.env_config(PickPlaceConfig())
-    assert config.cameras == ("front",) and config.tactile
-    (trial,) = evaluate(config, maker, [EpisodeSpec(2_000_000)], workers=1)
-    assert trial.success
+    """By name, and in an environment that shows it what it looks at."""
+    policy = load_policy("pick-place")
+    config = policy.env_config(PickPlaceConfig(objects=("glass_ball",)))
+    assert config.cameras == ("front",) and config.tactile and config.camera_size == (256, 256)
+    result = evaluate(policy, config, episodes=1, seed=2_000_000)
+    assert str(result) == "1/1 [0.21, 1.00]" and result.trials[0].episode["object"] == "glass_ball"
+    env = make_env(policy.env_config())
+    observation, _ = env.reset(seed=0)
+    plans = []
+    for _ in range(2):
+        policy.reset()
+        plans.append([policy.act(observation) for _ in range(3)])
+    np.testing.assert_array_equal(*plans)
+    assert env.action_space.shape == plans[0][0].shape
+    env.close()
+
+
+class Still:
+    """A policy of one's own that does nothing."""
+
+    episodes = 0
+
+    def reset(self) -> None:
+        Still.episodes += 1
+
+    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        assert ft.FRONT not in observation
+        return np.zeros(8)
+
+    def env_config(self, config: PickPlaceConfig) -> PickPlaceConfig:
+        return replace(config, cameras=(), tactile=False)
+
+
+def test_a_policy_of_ones_own_is_judged(tmp_path: Path) -> None:
+    config = PickPlaceConfig(objects=("glass_ball", "bottle_cap"), max_seconds=0.2)
+    for policy in (Still, Still(), f"{__file__}:Still"):
+        result = evaluate(policy, config, episodes=2)
+        assert result.rate.successes == 0 and [t.failure for t in result.trials] == ["time"] * 2
+        assert [t.episode["object"] for t in result.trials] == ["glass_ball", "bottle_cap"]
+    assert Still.episodes == 4  # the file was imported anew, as in a worker
+    for name, message in {
+        f"{__file__}:Stil": "has no Stil: did you mean Still",
+        f"{tmp_path}/none.py:Still": "no file",
+        "no_such_module:Policy": "cannot import no_such_module",
+        f"{__file__}:Path": "has no method reset",
+        "shiped": "did you mean shipped",
+        "pick-plac": "did you mean pick-place",
+        "bead-maze": "was trained for bead-maze, not for pick-place",
+        "follower": "add: --task bead-maze",
+        str(tmp_path): "train one with",
+    }.items():
+        with pytest.raises(UserError, match=message):
+            choose_policy(name, config)
+    with pytest.raises(UserError, match=r"add --env\.sensor gelsight_mini"):
+        choose_policy("shipped", replace(config, sensor="digit"))
+    with pytest.raises(UserError, match="there is no task 'pick'"):
+        evaluate("expert", "pick")
+
+
+def test_every_outcome_meets_every_object() -> None:
+    config = collect_demos.Config(episodes=3, outcomes=("success", "drop", "never_touch"))
+    options = [{"object": name} for name in ("glass_ball", "bottle_cap", "toy_brick")]
+    specs = collect_demos.specs_of(config, options)
+    met = {(spec.outcome, spec.options["object"]) for spec in specs}
+    assert len(specs) == 9 == len(met) and len({spec.seed for spec in specs}) == 9
+
+
+def test_only_what_is_known_to_be_good_is_learned_from(tmp_path: Path) -> None:
+    facts = [{"outcome": "success", "success": True}, {"outcome": "failure", "success": False},
+             {"outcome": "corrected", "success": False}, {"outcome": "unknown", "success": False}]  # fmt: skip
+    writer = EpisodeWriter(tmp_path / "set")
+    frames = {ft.STATE: np.zeros((3, 15), np.float32)}
+    for fact in facts:
+        writer.append(Episode(frames, "feel", fact | {"task": "bead-maze"}))
+    episodes = EpisodeSet(tmp_path / "set")
+    chosen = choose_episodes(episodes)
+    assert chosen.rows == [0, 2]
+    assert str(chosen) == "2 episodes (1 that failed, 1 of unknown success left out)"
+    assert choose_episodes(episodes, include_unknown=True).rows == [0, 2, 3]
+    writer = EpisodeWriter(tmp_path / "arm")
+    writer.append(Episode(frames, "feel", {"outcome": "stopped", "sensor": "digit"}))
+    arm = EpisodeSet(tmp_path / "arm")
+    with pytest.raises(UserError, match="1 of unknown success.*add --include-unknown"):
+        choose_episodes(arm)
+    assert common_task([(episodes, [0, 1]), (episodes, [2])]) == "bead-maze"
+    with pytest.raises(UserError, match="more than one task"):
+        common_task([(episodes, [0]), (arm, [0])])
+    assert common_sensor([(arm, [0])]) == "digit"

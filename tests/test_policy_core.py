@@ -24,8 +24,9 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import FR3_ARM
 from touchgoal.control.motion.kinematics import Fr3Kinematics
+from touchgoal.episodes.repair import validate
 from touchgoal.episodes.schema import Episode
-from touchgoal.episodes.store import EpisodeSet, EpisodeWriter, validate
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies import checkpoint
 from touchgoal.policies.actions import (
     ActionRepresentation,
@@ -297,7 +298,9 @@ def test_two_sets_beside_each_other_share_no_embeddings(tmp_path: Path) -> None:
     config = replace(TOY, touch_dim=embedder.dim, touch_reading="free")
     touches = []
     for name, first in (("one", 0), ("two", 1)):
-        ticks = [{**tick, ft.ACTION: tick[ft.STATE][:8]} for tick in toy_observations(5)[first:][:4]]
+        ticks = [
+            {**tick, ft.ACTION: tick[ft.STATE][:8]} for tick in toy_observations(5)[first:][:4]
+        ]
         frames = {k: np.stack([t[k] for t in ticks]) for k in ticks[0]}
         EpisodeWriter(tmp_path / name).append(Episode(frames, "feel"))
         episodes = EpisodeSet(tmp_path / name)

@@ -129,9 +129,7 @@ def trial_specs(config: TaskConfig, count: int, seed: int) -> list[EpisodeSpec]:
         wires = config.chosen_wires(count)
         return [EpisodeSpec(seed + i, options={"wire": w.name}) for i, w in enumerate(wires)]
     names = config.objects or list(CATALOGUE)
-    return [
-        EpisodeSpec(seed + i, options={"object": names[i % len(names)]}) for i in range(count)
-    ]
+    return [EpisodeSpec(seed + i, options={"object": names[i % len(names)]}) for i in range(count)]
 
 
 def run_trials(

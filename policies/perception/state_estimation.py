@@ -22,9 +22,7 @@ from touchgoal.policies.actions import Normalizer
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
 from touchgoal.policies.perception.pose_estimator import PoseEstimator, PoseEstimatorConfig
 
-ESTIMATOR = WeightsFormat(
-    "estimator", "estimator", "train one with: touchgoal train-estimators"
-)
+ESTIMATOR = WeightsFormat("estimator", "estimator", "train one with: touchgoal train-estimators")
 ESTIMATED = (ft.TRUTH_CONTACT, ft.TRUTH_START)
 
 

@@ -92,5 +92,7 @@ def _common(what: str, sets: Sequence[tuple[EpisodeSet, Sequence[int]]], fact: A
     found = {fact(s.meta(i)): s.root for s, rows in sets for i in rows}
     if len(found) > 1:
         kinds = "; ".join(f"{name or 'unknown'} in {root}" for name, root in found.items())
-        raise UserError(f"the episodes are of more than one {what} ({kinds}): train on one at a time")
+        raise UserError(
+            f"the episodes are of more than one {what} ({kinds}): train on one at a time"
+        )
     return next(iter(found), "")
