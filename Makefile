@@ -95,16 +95,16 @@ maze-policy: $(READY)
 	cp -r $(MAZE)/policy/policy policies/weights/bead_maze
 
 # How the shipped pick-and-place policy was made: about 45 minutes on 2 cores, most of them for its
-# sight. What its senses read they learn from the recordings of `make weights` and from pictures of
+# pose estimator. What its state estimator reads it learns from the recordings of `make weights` and from pictures of
 # placements; what it does, from an expert that answers what to do wherever the policy has got to.
 PICK := runs/pick_place
 BLIND := --env.no-tactile --env.cameras
 LEARN := --task pick-place --data $(PICK)/train/episodes --validation $(PICK)/val/episodes \
-	--senses $(PICK)/senses/senses --head regression --representation base_twist --position-noise 0 \
+	--estimator $(PICK)/estimator/estimator --head regression --representation base_twist --position-noise 0 \
 	--train.lr 1e-3 --train.epochs 16 --train.snapshot-epochs 16
 pick-place-policy: $(READY)
 	$(BIN)/touchgoal train-estimators --data runs/weights/train/episodes \
-		--validation runs/weights/val/episodes --out $(PICK)/senses
+		--validation runs/weights/val/episodes --out $(PICK)/estimator
 	$(BIN)/touchgoal collect-demos --feedback --episodes 20 --seed 120000 $(BLIND) --out $(PICK)/val
 	$(BIN)/touchgoal collect-demos --feedback --episodes 120 --seed 20000 $(BLIND) \
 		--out $(PICK)/train

@@ -92,7 +92,7 @@ def _missing(config: Config, specs: list[EpisodeSpec]) -> list[EpisodeSpec]:
     if not (config.out / "episodes").is_dir():
         return specs
     kept = EpisodeSet(config.out / "episodes")
-    seeds = {kept.meta(i)["seed"] for i in range(len(kept))}
+    seeds = [kept.meta(i)["seed"] for i in range(len(kept))]
     missing = [spec for spec in specs if spec.seed not in seeds]
     if not missing:
         raise UserError(f"all {len(specs)} episodes are in {config.out / 'episodes'} already")

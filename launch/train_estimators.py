@@ -1,7 +1,8 @@
-"""Train the senses of pick-and-place: contact in touch, the scene at the start in pictures."""
+"""Train the state estimator of pick-and-place: contact from touch, where things lie from pictures."""
 
 import os
 import shlex
+import shutil
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -42,14 +43,14 @@ class Config:
     validation: Path
     """Set of other episodes, on which contact is judged."""
     out: Path | None = None
-    """Folder of the run; the senses go to its `senses/`."""
+    """Folder of the run; the state estimator goes to its `estimator/`."""
     encoder: Path = pretrained.SHIPPED
-    """Folder of a frozen touch encoder (train-encoder). It is not copied: the shipped one is found
-    again, another one is to be put into the senses' `touch/`."""
+    """Folder of a frozen touch encoder (train-encoder), which is copied beside the estimator unless it
+    is the shipped one."""
     objects: int = 600
-    """Objects to look at, of random kind and size."""
+    """Number of objects to look at, of random kind and size."""
     placements: int = 20
-    """On the table, for each of them."""
+    """Number of places on the table for each object."""
     pose_estimator: PoseEstimatorConfig = PoseEstimatorConfig()
     """The network that looks."""
     train: EstimatorTrainConfig = EstimatorTrainConfig()
@@ -87,9 +88,11 @@ def main(config: Config) -> None:
     )
     errors |= pose_errors(network.sight, others)
     recipe = {"command": shlex.join(["touchgoal", *sys.argv[1:]]), "errors": errors}
-    save_estimator(network, out / "senses", recipe)
+    save_estimator(network, out / "estimator", recipe)
+    if config.encoder.resolve() != pretrained.SHIPPED.resolve():
+        shutil.copytree(config.encoder, out / "estimator" / "touch", dirs_exist_ok=True)
     write_json(out / "metrics.json", errors)
     print(f"contact: {errors['contact']:.2%} of ticks misread")
     for name, (middle, most) in list(errors.items())[1:]:
         print(f"{name.replace('_', ', ')}: {middle:.1f} (median), {most:.1f} (90 %)")
-    print(f"senses: {out / 'senses'}")
+    print(f"state estimator: {out / 'estimator'}")

@@ -27,6 +27,7 @@ from touchgoal.policies.training.model_selection import Score, add_parts, select
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
 from touchgoal.policies.training.train import POLICY, TrainConfig, train
 from touchgoal.policies.training.training_data import (
+    check_apart,
     choose_episodes,
     common_sensor,
     common_task,
@@ -120,6 +121,7 @@ def main(config: Config) -> None:
     chosen[0] = chosen[0][: max(1, round(config.share * len(chosen[0])))]
     task = _task(config, list(zip(sets, chosen, strict=True)))
     feels = config.encoder or config.end_to_end or config.estimator
+    check_apart(*zip(sets, chosen, strict=True))
     sensor = common_sensor(list(zip(sets, chosen, strict=True))) if feels else ""
     if config.trials:
         _check_sensor(config, task, sensor)

@@ -12,7 +12,7 @@ From Python::
 from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ from touchgoal.policies.perception.end_to_end import EndToEndConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
 from touchgoal.policies.perception.state_estimation import StateEstimator, load_estimator
 from touchgoal.policies.policy import Policy, PolicyConfig
-from touchgoal.sim_envs.config import TASKS, EnvConfig, TaskConfig
+from touchgoal.sim_envs.config import TASKS, EnvConfig, TaskConfig, TaskName
 from touchgoal.sim_envs.tasks import task_name
 
 TOUCH, ESTIMATOR = "touch", "estimator"  # folders beside a policy's weights
@@ -117,7 +117,7 @@ class SavedPolicy:
         for other in trained - {"", None, sensor}:
             raise UserError(
                 f"the policy in {self.directory} was trained with the sensor {other}, the task has "
-                f"{sensor}: add --env.sensor {other}"
+                f"{sensor}: choose {other} (--env.sensor {other}), or another policy"
             )
         PolicyActor(Planner(policy, touch, estimator), self.latency)
         return self
@@ -179,7 +179,7 @@ class LoadedPolicy:
         if config is None:
             if not self.config.task:
                 raise UserError(f"{self.saved.directory} does not say its task: give a config")
-            config = TASKS[self.config.task](control_hz=self.config.control_hz)
+            config = TASKS[cast(TaskName, self.config.task)](control_hz=self.config.control_hz)
             if self.config.sensor:
                 config = replace(config, sensor=self.config.sensor)
         return self.saved.check_task(config).env_config(config)

@@ -87,6 +87,20 @@ def test_a_late_plan_is_joined_where_it_should_be_by_now() -> None:
     assert len(actor.latencies) == len(planner.plans) - 1
 
 
+def test_one_tick_at_a_time_no_observation_is_planned_from_twice() -> None:
+    """A slow planner that is asked a tick early for single ticks must not spin on the same one."""
+    config = replace(TOY, touch_dim=0, touch="", execution_horizon=1)
+    planner = SlowPlanner(toy_policy(config, toy_dataset(config)).eval(), pause=0.02)
+    actor = RealTimeActor(planner, timeout=0.0)
+    for tick in toy_observations(2):
+        actor.act(tick)
+        while len(planner.plans) < actor._tick + 1:
+            time.sleep(0.01)
+    time.sleep(2 * actor.latencies[-1])  # no tick comes any more
+    actor.close()
+    assert len(planner.plans) == 2
+
+
 def test_a_quick_plan_is_done_from_the_tick_it_was_made_on() -> None:
     """So an arm does what was judged in simulation, where plans take no time."""
     touch = toy_touch_embedder()

@@ -153,7 +153,9 @@ def test_learning_the_bead_maze(
     one = ("--workers", 1)
     run("collect-demos", "--task", "bead-maze", "--episodes", 1, "--maze.disturbance", 0, *one,
         "--out", "demos")  # fmt: skip
-    both = ("--data", "demos/episodes", "--validation", "demos/episodes")
+    run("collect-demos", "--task", "bead-maze", "--episodes", 1, "--maze.disturbance", 0, *one,
+        "--seed", 1, "--maze.n-wires", 1, "--out", "val")  # fmt: skip
+    both = ("--data", "demos/episodes", "--validation", "val/episodes")
     run("train-encoder", "mae", *both, "--frames", 8, "--mae.vit", "tiny", "--mae.epochs", 1,
         "--mae.batch-size", 8, "--out", "mae")  # fmt: skip
     learn = ("train-policy", *both, *one, "--head", "tiny", "--train.epochs", 2, "--trials", 1,
@@ -172,16 +174,18 @@ def test_learning_the_bead_maze(
     run("benchmark", "policy-latency", "--policy", "policy/policy", "--repeats", 3,
         "--large-repeats", 0)  # fmt: skip
     assert "denoising" in capsys.readouterr().out
-    run("train-policy-paper", *both, *one, "--head", "tiny", "--sampler.plan-steps", 2, "--trials", 0,
+    run("train-policy-paper", *both, *one, "--head", "tiny", "--sampler.num-inference-steps", 2, "--trials", 0,
         "--encoder", "mae/encoder", "--train.epochs", 1, "--out", "paper")  # fmt: skip
     paper = checkpoint.load(Path("paper/policy")).config
     assert paper.representation == "delta" and paper.touch_reading == "free"
     assert Path("paper/policy/touch/encoder.json").is_file()
     missing = refused(capsys, "run-policy", "--task", "bead-maze", "--policy", "nowhere")
-    assert "no policy in nowhere" in missing
+    assert "there is no policy 'nowhere': choose from expert" in missing
     other = refused(capsys, "run-policy", "--task", "bead-maze", "--policy", "policy/policy",
                     "--maze.sensor", "gelsight_mini")  # fmt: skip
-    assert "feels with gelsight_mini_markers" in other
+    assert "trained with the sensor gelsight_mini_markers" in other
+    other = refused(capsys, "run-policy", "--policy", "policy/policy")
+    assert "was trained for bead-maze, not for pick-place" in other
 
 
 @pytest.mark.slow
@@ -192,10 +196,26 @@ def test_learning_to_pick_and_place(
     monkeypatch.chdir(tmp_path)
     one, blind = ("--workers", 1), ("--env.no-tactile", "--env.cameras", "--out", "demos")
     run("train-estimators", "--data", episodes, "--validation", episodes, *one, "--objects", 2,
-        "--placements", 2, "--train.steps", 2, "--train.contact-steps", 2, "--out", "senses")  # fmt: skip
+        "--placements", 2, "--train.steps", 2, "--train.contact-steps", 2, "--out", "est")  # fmt: skip
     run("collect-demos", "--feedback", "--episodes", 1, *one, *blind)
-    both = ("--data", "demos/episodes", "--validation", "demos/episodes")
-    run("train-policy", "--task", "pick-place", *both, *one, "--senses", "senses/senses", "--head",
+    run(
+        "collect-demos",
+        "--feedback",
+        "--episodes",
+        1,
+        "--seed",
+        1,
+        *one,
+        *blind[:2],
+        "--out",
+        "val",
+    )
+    both = ("--data", "demos/episodes", "--validation", "val/episodes")
+    same = refused(capsys, "train-policy", *both[:3], "demos/episodes", "--out", "policy")
+    assert "are both" in same or "also in" in same
+    other = refused(capsys, "train-policy", "--task", "bead-maze", *both, "--out", "policy")
+    assert "is of pick-place, not of bead-maze" in other and not Path("policy").exists()
+    run("train-policy", *both, *one, "--estimator", "est/estimator", "--head",
         "regression", "--representation", "base_twist", "--train.epochs", 1, "--trials", 1,
         "--env.max-seconds", 0.5, "--out", "policy")  # fmt: skip
     capsys.readouterr()

@@ -98,7 +98,7 @@ def test_a_policy_of_ones_own_is_judged(tmp_path: Path) -> None:
     }.items():
         with pytest.raises(UserError, match=message):
             choose_policy(name, config)
-    with pytest.raises(UserError, match=r"add --env\.sensor gelsight_mini"):
+    with pytest.raises(UserError, match=r"--env\.sensor gelsight_mini"):
         choose_policy("shipped", replace(config, sensor="digit"))
     with pytest.raises(UserError, match="there is no task 'pick'"):
         evaluate("expert", "pick")

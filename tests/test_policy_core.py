@@ -133,7 +133,7 @@ def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
     losses = []
     for chunk in (actions, other):
         loss = policy.loss(batch, chunk, torch_rng(), wrench, is_pad)
-        losses.append(torch.autograd.grad(loss, policy.head.parameters()))
+        losses.append(torch.autograd.grad(loss, list(policy.head.parameters())))
     if isinstance(head, RegressionConfig):  # a U-Net sees the padding, noised, beside the rest
         for one, two in zip(*losses, strict=True):
             torch.testing.assert_close(one, two)

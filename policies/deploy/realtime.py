@@ -174,4 +174,6 @@ class RealTimeActor:
         """Whether it is time for another plan, or will be in some ticks; or for the end."""
         if self._closed or self._plan is None:
             return self._closed or self._tick >= 0
-        return self._tick + ahead - self._plan.tick >= self._config.execution_horizon - self._slow
+        # At least one tick on: from the same observation the thread would plan again and again.
+        horizon = max(1, self._config.execution_horizon - self._slow)
+        return self._tick + ahead - self._plan.tick >= horizon

@@ -56,6 +56,19 @@ def choose_episodes(episodes: EpisodeSet, include_unknown: bool = False) -> Chos
     return chosen
 
 
+def check_apart(
+    data: tuple[EpisodeSet, Sequence[int]], validation: tuple[EpisodeSet, Sequence[int]]
+) -> None:
+    """UserError if an episode is both learned from and judged by, in one folder or in two."""
+    known = {data[0].episode_checksum(i) for i in data[1]}
+    for i in validation[1]:
+        if validation[0].episode_checksum(i) in known:
+            raise UserError(
+                f"episode {i} of {validation[0].root} is also in {data[0].root}: judge by episodes "
+                "that are not learned from"
+            )
+
+
 def succeeded(meta: Mapping[str, Any]) -> bool | None:
     """Whether an episode shows what to do; None if its facts do not tell."""
     if meta.get("outcome") == CORRECTED:
