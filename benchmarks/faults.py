@@ -274,8 +274,8 @@ class HangingPlanner:
     def __init__(self, width: float, mark_broken: Callable[[], None]) -> None:
         self._width, self._mark_broken, self._plans = width, mark_broken, 0
 
-    def sense(self, seen: Sequence[Observation]) -> None:
-        """It has no senses."""
+    def embed(self, seen: Sequence[Observation]) -> None:
+        """Nothing is embedded ahead."""
 
     def plan(self, seen: Sequence[Observation]) -> np.ndarray:
         """Three plans, then none."""
