@@ -37,6 +37,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     holds with `grasp_force` N on each finger, as the Franka Hand's `grasp` does.
     """
 
+    task: str  # the commands' and the episodes' name of it
     disturbance_rotation = 2.0  # rad of disturbance per m of it
     metadata = {"render_modes": ["rgb_array"], "render_fps": ft.CONTROL_HZ}  # noqa: RUF012
 
@@ -65,19 +66,19 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         """The episode's task in words."""
 
     @abstractmethod
-    def _sample_episode(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
+    def sample_episode(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
         """Choose the episode: set `bodies` and `grasp_force`, UserError on a bad option."""
 
     @abstractmethod
-    def _add_task_objects(self, spec: mujoco.MjSpec) -> None:
+    def add_task_objects(self, spec: mujoco.MjSpec) -> None:
         """Add the task's own parts to the scene."""
 
     @abstractmethod
-    def _place_objects(self, rng: np.random.Generator) -> None:
+    def place_objects(self, rng: np.random.Generator) -> None:
         """Put the objects where the episode starts."""
 
     @abstractmethod
-    def _evaluate(self) -> tuple[float, bool]:
+    def evaluate(self) -> tuple[float, bool]:
         """Progress in [0, 1] and success after a tick."""
 
     # Gymnasium.
@@ -88,9 +89,9 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         """Start an episode; the same seed and options give the same episode."""
         super().reset(seed=seed)
         rng = self.np_random
-        self._sample_episode(rng, dict(options or {}))
+        self.sample_episode(rng, dict(options or {}))
         self._compile_scene(rng)
-        self._place_objects(rng)
+        self.place_objects(rng)
         self.command = self.start_joints(rng)
         self._disturbance_state = np.zeros(6)
         self._finger_target = GRIPPER_MAX_WIDTH / 2
@@ -98,7 +99,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.data.qpos[self._fingers] = self._finger_target
         self._ticks = 0
         self._let_settle()
-        self._evaluate()
+        self.evaluate()
         return self._observe(), self._info(0.0, False)
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -154,7 +155,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     def scene(self, config: SceneConfig) -> mujoco.MjSpec:
         """The present episode's scene, built with these options."""
         spec = build(self.bodies, config)
-        self._add_task_objects(spec)
+        self.add_task_objects(spec)
         return spec
 
     def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
@@ -200,7 +201,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         The episode's clock stands still until it has `begun`.
         """
         self._ticks += begun
-        return self._evaluate()
+        return self.evaluate()
 
     def failures(self) -> list[str]:
         """Names of what has failed after the last tick; here nothing can."""

@@ -54,6 +54,7 @@ class BeadMaze(FrankaTactileEnv):
     ends when the bead is dropped, jams, or the hand presses too hard: `truth.failure`.
     """
 
+    task = "bead-maze"
     config: BeadMazeConfig
     disturbance_rotation = 20.0  # rad of disturbance per m of it: the hole turns with the hand
 
@@ -97,7 +98,8 @@ class BeadMaze(FrankaTactileEnv):
             "disturbance": self.config.disturbance,
         }
 
-    def _sample_episode(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
+    def sample_episode(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
+        """Draw the wire, where it stands, and the grasp force."""
         config = self.config
         wanted = with_options(BeadMazeReset(), options)
         if wanted.wire is not None:
@@ -112,11 +114,13 @@ class BeadMaze(FrankaTactileEnv):
         self._friction = rng.uniform(*config.wire_friction)
         self.bodies = [Body(BEADS[config.bead], _SIZES[config.bead], BEAD_MASS)]
 
-    def _add_task_objects(self, spec: mujoco.MjSpec) -> None:
+    def add_task_objects(self, spec: mujoco.MjSpec) -> None:
+        """Add the wire, and thread the bead on it."""
         add_wire(spec, self.wire, self._friction)
         thread_bead(spec, self.wire, self._friction)
 
-    def _place_objects(self, rng: np.random.Generator) -> None:
+    def place_objects(self, rng: np.random.Generator) -> None:
+        """The bead sits at the start, as the scene was built."""
         self.arc_length = START
         self.failure = np.zeros(3, bool)
         self._furthest, self._stalled_ticks = START, 0
@@ -141,7 +145,8 @@ class BeadMaze(FrankaTactileEnv):
     def _disturbance(self) -> Float[np.ndarray, " n"]:
         return np.zeros(self.n_joints) if self.grasping else super()._disturbance()
 
-    def _evaluate(self) -> tuple[float, bool]:
+    def evaluate(self) -> tuple[float, bool]:
+        """Progress along the wire in [0, 1] and success; updates `failure`."""
         bead = self.object_pose()[:3]
         self.arc_length = self.wire.project(bead, self.arc_length)
         if self.grasping or self.arc_length > self._furthest + 0.002:

@@ -29,6 +29,7 @@ class PickPlace(FrankaTactileEnv):
     grasped (0.35), carrying (to 0.85), lowering (to 0.95), success (1).
     """
 
+    task = "pick-place"
     config: PickPlaceConfig
 
     def __init__(
@@ -83,7 +84,8 @@ class PickPlace(FrankaTactileEnv):
         self._note_start()
         return self._observe(), self._info(0.0, False)
 
-    def _sample_episode(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
+    def sample_episode(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
+        """Draw the object, its mass, the grasp force, the distractors, and where all of them go."""
         config = self.config
         wanted = with_options(PickPlaceReset(), options)
         kind = self.kinds[rng.integers(len(self.kinds))]
@@ -100,7 +102,8 @@ class PickPlace(FrankaTactileEnv):
             )
         *self._positions, self.goal = _random_positions(rng, len(self.bodies) + 1)
 
-    def _add_task_objects(self, spec: mujoco.MjSpec) -> None:
+    def add_task_objects(self, spec: mujoco.MjSpec) -> None:
+        """Add the disc that marks the goal."""
         spec.worldbody.add_geom(
             name="goal",
             type=mujoco.mjtGeom.mjGEOM_CYLINDER,
@@ -112,7 +115,8 @@ class PickPlace(FrankaTactileEnv):
             group=VISUAL_GROUP,
         )
 
-    def _place_objects(self, rng: np.random.Generator) -> None:
+    def place_objects(self, rng: np.random.Generator) -> None:
+        """Put the objects on the table, turned at random."""
         for body, position in zip(self.bodies, self._positions, strict=True):
             yaw = rng.uniform(-np.pi, np.pi)
             joint = self.data.joint(body.name)
@@ -136,7 +140,8 @@ class PickPlace(FrankaTactileEnv):
     def _disturbance(self) -> Float[np.ndarray, " n"]:
         return np.zeros(self.n_joints) if self._put_down else super()._disturbance()
 
-    def _evaluate(self) -> tuple[float, bool]:
+    def evaluate(self) -> tuple[float, bool]:
+        """Progress in [0, 1] and success; takes note of what was lifted and put down."""
         position = self.object_pose()[:3]
         height = float(position[2] - self.start[2])
         self._lifted |= height > _LIFTED

@@ -10,7 +10,7 @@ from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.experts.pick_place import Outcome, PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 
-_ENVIRONMENTS = {"pick-place": PickPlace, "bead-maze": BeadMaze}
+_ENVIRONMENTS = {env.task: env for env in (PickPlace, BeadMaze)}
 
 
 @overload
