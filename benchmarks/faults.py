@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.control.cell.config import CellConfig, read_cell_file
+from touchgoal.control.cell.cell_file import cell_table, read_cell_file
+from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import cell_watchdogs, connect_cell
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import Safety
@@ -32,11 +33,11 @@ from touchgoal.episodes.repair import validate
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.acting import Observation
 from touchgoal.policies.deploy.actors import LearnedActor, make_actor
-from touchgoal.policies.deploy.control_loop import ControlLoop, DeployedActor
+from touchgoal.policies.deploy.control_loop import PLAN_ENDED, ControlLoop, DeployedActor
 from touchgoal.policies.deploy.session import Session
 from touchgoal.policies.policy import PolicyConfig
 from touchgoal.sim_envs.config import PickPlaceConfig
-from touchgoal.sim_envs.twin.faults import ask_twin
+from touchgoal.sim_envs.twin.control_port import ask_twin
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 
 _TIMEOUT = 300.0  # s for anything to happen, on a machine however loaded
@@ -151,11 +152,11 @@ def _run(case: FaultCase, folder: Path, lock_step: bool, number: int) -> FaultRo
     if report.exists():
         late, message = report.read_text().split("\n", 1)
     elif not hung:
-        message = "its process is gone; the driver's child brings the arm to rest"
+        message = "its process is gone; the driver's process brings the arm to rest"
     worst = after["worst"] if after else dict.fromkeys(("excess", "speed", "force"), float("nan"))
     if broken_at.exists():
         before = float(broken_at.read_text())
-    stops = message != "done" and (case.kills or case.control_line or broken_at.exists())
+    stops = message != PLAN_ENDED and (case.kills or case.control_line or broken_at.exists())
     rest = after["time"] - after["rest"] - before if after and stops else float("nan")
     finished = 1 if case.kills or case.full else 2
     episodes_whole = len(EpisodeSet(episodes)) == finished and not _damaged(episodes)
@@ -191,10 +192,9 @@ def _inject(
 
 def _serve(host: str, folder: Path, lock_step: bool) -> None:
     """The twin's process."""
-    task = PickPlaceConfig(cameras=("front",))
-    options = {"object": "wooden_block"}
-    twin = Twin(TwinConfig(task, "fr3", 3, options, host, 0, lock_step, folder))
-    write_file(folder / "cell.json", json.dumps(twin.description).encode())
+    task = PickPlaceConfig(cameras=("front",), objects=("wooden_block",))
+    twin = Twin(TwinConfig(task, "fr3", 3, host, 0, lock_step, folder))
+    write_file(folder / "cell.json", json.dumps(cell_table(twin.cell_config)).encode())
     twin.run()
 
 

@@ -3,7 +3,7 @@
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
 import pydantic.dataclasses
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, ValidationError
 
 from touchgoal.control.errors import UserError
 
@@ -17,6 +17,9 @@ CountOrNone = Annotated[int, Field(ge=0)]
 """A count that may be 0, for nothing of it."""
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Port = Annotated[int, Field(ge=0, le=65535)]
+
+STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+"""Of pydantic dataclasses that are read from a file: nothing is converted, every key is known."""
 
 RARE = "rarely needed"
 """Stands in the annotation of an option that only `--help-all` shows."""

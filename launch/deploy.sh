@@ -1,6 +1,11 @@
 #!/bin/sh
 # Run the task of a cell file on its arm: launch/deploy.sh launch/cells/fr3_two_minis.toml [--execute]
 set -eu
-cd "$(dirname "$0")/.."
-[ -x .venv/bin/touchgoal ] || { echo "set it up first: make test" >&2; exit 1; }
-exec .venv/bin/touchgoal deploy "$@"
+root=$(cd "$(dirname "$0")/.." && pwd)
+if [ -x "$root/.venv/bin/touchgoal" ]; then
+  exec "$root/.venv/bin/touchgoal" deploy "$@"
+elif command -v touchgoal >/dev/null; then
+  exec touchgoal deploy "$@"
+fi
+echo "touchgoal is not installed; in $root: python3 -m venv .venv && .venv/bin/pip install -c constraints.txt -e '.[towers,franka]'" >&2
+exit 1

@@ -11,10 +11,18 @@ import numpy as np
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import Mode
 from touchgoal.control.sensors.keyboard import Keyboard
-from touchgoal.policies.deploy.control_loop import TickStatus
+from touchgoal.policies.deploy.control_loop import Request, TickStatus
 
-HELP = "space or Ctrl-C stops the arm, Enter ends the task; neither is an emergency stop"
-_KEY_REQUESTS = {"\n": "done", "\r": "done", " ": "stop", "q": "stop"}
+HELP = (
+    "space or Ctrl-C stops the arm, Enter ends it as done, n as not done; none is an emergency stop"
+)
+_KEY_REQUESTS: dict[str, Request] = {
+    "\n": "done",
+    "\r": "done",
+    "n": "not done",
+    " ": "stop",
+    "q": "stop",
+}
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _TICKS_PER_LINE = 4  # ticks between lines
 
@@ -23,19 +31,20 @@ class Terminal:
     """Asked every tick what the operator wants; shows every few ticks what happens."""
 
     def __init__(self) -> None:
-        self._request, self._tick_count = "", 0
+        self._request: Request = ""
+        self._tick_count = 0
         self._keyboard = Keyboard(sys.stdin) if sys.stdin.isatty() else None
 
-    def operator_request(self) -> str:
+    def operator_request(self) -> Request:
         """See ControlLoop. A stop outweighs what was typed before it."""
         if self._keyboard is not None and self._request != "stop":
             try:
-                requests = {_KEY_REQUESTS.get(key, "") for key in self._keyboard.read_keys()}
+                typed = self._keyboard.read_keys()
             except (KeyboardInterrupt, UserError):  # Ctrl-C, or the terminal has gone
-                requests = {"stop"}
-            self._request = (
-                "stop" if "stop" in requests else max(requests, default="") or self._request
-            )
+                typed = " "
+            requests = [_KEY_REQUESTS[key] for key in typed if key in _KEY_REQUESTS]
+            if requests:
+                self._request = "stop" if "stop" in requests else requests[0]
         return self._request
 
     def show_tick(self, status: TickStatus) -> None:

@@ -5,35 +5,36 @@ Ctrl-C; where everything is stands in a table and in `cell.json`.
 """
 
 import signal
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
+from pydantic import Field
+
+from touchgoal.control.cell.cell_file import cell_table
+from touchgoal.control.cell.config import CellConfig
+from touchgoal.control.option_types import Seed, checked_dataclass
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.sim_envs.config import STREAM_SIZE, BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 
 
-@dataclass(frozen=True)
+@checked_dataclass
 class Config:
     """Options of twin."""
 
     task: Literal["pick-place", "bead-maze"] = "pick-place"
-    """What the cell is for."""
+    """Which task the cell is set up for."""
     arm: Literal["fr3", "ur5e"] = "fr3"
     """An FR3 with the Franka Hand, or a UR5e whose gripper talks as a Robotiq does."""
     lock_step: bool = False
     """Wait for the client that drives the arm, so that runs repeat (for tests)."""
     host: str = "127.0.0.1"
     """Loopback address; twins at different ones run side by side."""
-    port: int = 8080
-    """Of the pictures; the next one is for faults. 0: any that are free."""
-    seed: int = 1_000_000
-    """Of the first episode."""
-    object: str = ""
-    """pick-place: what to pick up; default: drawn from the catalogue."""
-    wire: str = ""
-    """bead-maze: which wire, such as helix-1; default: drawn."""
+    port: Annotated[int, Field(ge=0, le=65534)] = 8080
+    """TCP port of the pictures; the next one is the control port. 0: any that are free."""
+    seed: Seed = 1_000_000
+    """Random seed of the scene."""
     out: Path | None = None
     """Folder of the run: cell.json, serial devices."""
     env: PickPlaceConfig = field(default_factory=lambda: PickPlaceConfig(camera_size=STREAM_SIZE))
@@ -48,15 +49,12 @@ class Config:
 
 def main(config: Config) -> None:
     """Open the twin, say where it is, serve until told to stop."""
-    maze = config.task == "bead-maze"
-    chosen = {"wire": config.wire} if maze else {"object": config.object}
     out = open_run(config.out, "twin", config).resolve()
     twin = Twin(
         TwinConfig(
-            task=config.maze if maze else config.env,
+            task=config.maze if config.task == "bead-maze" else config.env,
             arm=config.arm,
             seed=config.seed,
-            options={name: value for name, value in chosen.items() if value},
             host=config.host,
             port=config.port,
             lock_step=config.lock_step,
@@ -69,9 +67,12 @@ def main(config: Config) -> None:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
-    write_json(out / "cell.json", twin.description)
+    cell_file = out / "cell.json"
+    write_json(cell_file, cell_table(twin.cell_config))
     print(
-        table(twin.description) + f"\n{'cell file':<18}{out / 'cell.json'}\nCtrl-C ends it.",
+        f"{table(twin.cell_config)}\n{'cell file':<18}{cell_file}\n"
+        f"The cell runs. In another terminal: touchgoal deploy {cell_file} --execute\n"
+        "Each deployment first puts the scene back. Ctrl-C ends the twin.",
         flush=True,
     )
     try:
@@ -81,10 +82,13 @@ def main(config: Config) -> None:
     print("\nstopped")
 
 
-def table(cell: dict) -> str:
+def table(cell: CellConfig) -> str:
     """Where everything is."""
-    lines = {"task": cell["instruction"], f"arm ({cell['arm']})": cell["address"]}
-    lines["gripper"] = cell["gripper"].get("port") or cell["gripper"]["address"]
-    lines |= {key.rpartition(".")[2]: address for key, address in cell["images"].items()}
-    lines |= {"load cell": cell["load_cell"]["port"], "faults": cell["faults"]}
+    assert cell.load_cell is not None
+    lines = {"task": cell.task.instruction, f"arm ({cell.arm})": cell.address}
+    lines["gripper"] = cell.gripper.port or cell.gripper.address
+    lines |= {name: camera.source for name, camera in cell.cameras.items()}
+    if cell.fingertips is not None:
+        lines |= {"left fingertip": cell.fingertips.left, "right fingertip": cell.fingertips.right}
+    lines |= {"load cell": cell.load_cell.port, "control port": cell.task.twin}
     return "\n".join(f"{name:<18}{where}" for name, where in lines.items())

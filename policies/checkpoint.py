@@ -104,6 +104,15 @@ class SavedPolicy:
 
     def check_task(self, task: EnvConfig) -> "SavedPolicy":
         """Itself; UserError if the policy cannot act in the task: before anything is simulated."""
+        self.planner_for(task)
+        return self
+
+    def planner_for(self, task: Task) -> tuple[Planner, Task]:
+        """A planner, and the task's config as `env_config` gives it; everything is loaded once.
+
+        Raises:
+            UserError: the policy cannot act in the task.
+        """
         policy = load(self.directory, control_hz=task.control_hz)
         config, name = policy.config, task_name(task)
         if config.task and config.task != name:
@@ -119,24 +128,29 @@ class SavedPolicy:
                 f"the policy in {self.directory} was trained with the sensor {other}, the task has "
                 f"{sensor}: choose {other} (--env.sensor {other}), or another policy"
             )
-        PolicyActor(Planner(policy, touch, estimator), self.latency)
-        return self
+        planner = Planner(policy, touch, estimator)
+        PolicyActor(planner, self.latency)
+        return planner, _observed(task, config, estimator)
 
     def env_config(self, task: Task) -> Task:
         """The task's config with the pictures that the policy looks at, and no others."""
         config = load(self.directory).config
-        estimator = self._estimator(config)
-        keys = estimator.cameras if estimator else ()
-        needs_touch = config.touch_dim > 0 or config.end_to_end is not None or estimator is not None
-        cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key in keys)
-        task = replace(task, tactile=needs_touch, cameras=cameras)
-        return replace(task, camera_size=estimator.camera_size) if estimator else task
+        return _observed(task, config, self._estimator(config))
 
     def _touch(self, config: PolicyConfig) -> TouchEmbedder | None:
         return load_touch(self.directory / TOUCH) if config.touch_dim else None
 
     def _estimator(self, config: PolicyConfig) -> StateEstimator | None:
         return load_estimator(self.directory / ESTIMATOR) if config.estimated else None
+
+
+def _observed(task: Task, config: PolicyConfig, estimator: StateEstimator | None) -> Task:
+    """The task's config with the pictures that a policy looks at, and no others."""
+    keys = estimator.cameras if estimator else ()
+    needs_touch = config.touch_dim > 0 or config.end_to_end is not None or estimator is not None
+    cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key in keys)
+    task = replace(task, tactile=needs_touch, cameras=cameras)
+    return replace(task, camera_size=estimator.camera_size) if estimator else task
 
 
 class LoadedPolicy:

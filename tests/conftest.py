@@ -16,7 +16,7 @@ torch.set_num_threads(1)
 # A shell that starts the tests in the background ignores Ctrl-C, for them and all their children.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-_CELL = ["--object", "wooden_block", "--seed", "3"]
+_CELL = ["--env.objects", "wooden_block", "--seed", "3"]
 
 
 @pytest.fixture(scope="module")

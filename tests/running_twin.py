@@ -17,14 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.sim_envs.twin import faults
+from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.sim_envs.twin import control_port
 
 
 class RunningTwin:
     """A twin at the n-th address of this process.
 
     Attributes:
-        description: what its cell.json says.
+        cell: what its cell.json says.
+        cell_file: that file.
     """
 
     def __init__(self, arguments: list[str], out: Path, n: int) -> None:
@@ -37,15 +39,16 @@ class RunningTwin:
             text=True,
         )
         deadline = time.monotonic() + 120
-        while not (out / "cell.json").exists():
+        self.cell_file = out / "cell.json"
+        while not self.cell_file.exists():
             alive = self._process.poll() is None and time.monotonic() < deadline
             assert alive, self._process.communicate()[1]
             time.sleep(0.05)
-        self.description: dict[str, Any] = json.loads((out / "cell.json").read_text())
+        self.cell = read_cell_file(self.cell_file)
 
     def ask(self, line: str) -> dict[str, Any]:
         """What the twin answers to an order or a question."""
-        return faults.ask_twin(self.description["faults"], line)
+        return control_port.ask_twin(self.cell.task.twin, line)
 
     def at_rest(self) -> dict[str, Any]:
         """The truth once the arm is at rest."""

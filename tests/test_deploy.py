@@ -12,24 +12,26 @@ import pytest
 from running_twin import RunningTwin
 
 from touchgoal.control import features as ft
-from touchgoal.control.cell.config import CellConfig, read_cell_file
-from touchgoal.control.cell.connection import cell_watchdogs
+from touchgoal.control.cell.cell_file import cell_table, read_cell_file
+from touchgoal.control.cell.config import CellConfig
+from touchgoal.control.cell.connection import cell_limits, cell_watchdogs
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import Safety
 from touchgoal.episodes.repair import validate
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.launch import deploy
 from touchgoal.launch.__main__ import main
-from touchgoal.policies.deploy.control_loop import ControlLoop, RunLog, TickStatus
+from touchgoal.launch.deploy import EXAMPLES, NOT_DONE, STOPPED, find_cell_file
+from touchgoal.policies import checkpoint
+from touchgoal.policies.deploy.control_loop import ControlLoop, Request, RunLog, TickStatus
+from touchgoal.policies.deploy.session import Session
 from touchgoal.sim_envs.twin.in_process import simulate_cell
 
 _PATIENCE = 300  # s for a loop, on a machine however loaded
-CELL_FILES = Path(deploy.__file__).parent / "cells"  # of the wheel, where that is tested
 SIM = """
 arm = "sim"
 gripper = { kind = "franka_hand" }
 cameras.front = { source = "simulated" }
-task = { name = "pick-place", policy = "expert", object = "wooden_block", seed = 3 }
+task = { name = "pick-place", policy = "expert", objects = ["wooden_block"], seed = 3 }
 """
 
 
@@ -40,7 +42,7 @@ def run(*arguments: object) -> None:
 @pytest.fixture(scope="module")
 def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningTwin]:
     pytest.importorskip("franky", reason="pip install 'touchgoal[franka]'")
-    cell = ["--lock-step", "--object", "wooden_block", "--seed", "3", "--env.cameras", "front"]
+    cell = ["--lock-step", "--env.objects", "wooden_block", "--seed", "3", "--env.cameras", "front"]
     twin = RunningTwin(cell, tmp_path_factory.mktemp("twin"), 2)
     yield twin
     twin.close()
@@ -48,19 +50,9 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningTwin]:
 
 def deploying(twin: RunningTwin, out: Path) -> "subprocess.Popen[str]":
     """`touchgoal deploy --execute` as a person runs it: in here its types would be checked meanwhile."""
-    cell_file = out / "cell.json"
-    cell_file.write_text(json.dumps(twin.description))
-    command = [
-        sys.executable,
-        "-m",
-        "touchgoal.launch",
-        "deploy",
-        str(cell_file),
-        "--execute",
-        "--yes",
-    ]
+    command = [sys.executable, "-m", "touchgoal.launch", "deploy", str(twin.cell_file)]
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen([*command, "--out", str(out / "run")], **pipes)
+    return subprocess.Popen([*command, "--execute", "--yes", "--out", str(out / "run")], **pipes)
 
 
 def touch_comes_nearer(out: Path) -> bool:
@@ -86,6 +78,7 @@ def test_picks_and_places_on_the_twin_and_the_episode_has_reward_curves(
     assert process.returncode == 0, complaint
     said = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert said["success"] and not said["stopped"] and said["episode"] == 0
+    assert 0.03 < said["held_width"] < 0.07
     worst = twin.ask("truth")["worst"]
     assert worst["excess"] == 0 and worst["speed"] < 1
     assert touch_comes_nearer(tmp_path)
@@ -94,7 +87,7 @@ def test_picks_and_places_on_the_twin_and_the_episode_has_reward_curves(
 @pytest.mark.realtime
 def test_the_shipped_policy_leads_a_bead_on_the_twin(tmp_path: Path) -> None:
     pytest.importorskip("franky", reason="pip install 'touchgoal[franka]'")
-    cell = ["--lock-step", "--task", "bead-maze", "--wire", "helix-3"]
+    cell = ["--lock-step", "--task", "bead-maze", "--env.wires", "helix-3"]
     small = ["--maze.cameras", "front", "--maze.camera-size", "128", "128"]
     twin = RunningTwin([*cell, *small], tmp_path, 3)
     _, complaint = deploying(twin, tmp_path).communicate(timeout=_PATIENCE)
@@ -109,25 +102,30 @@ def test_the_shipped_policy_leads_a_bead_on_the_twin(tmp_path: Path) -> None:
 def test_a_stalled_camera_stops_the_arm_and_the_episode_is_kept(
     twin: RunningTwin, tmp_path: Path
 ) -> None:
-    twin.begin("reset 3")
-    process = deploying(twin, tmp_path)
+    process = deploying(twin, tmp_path)  # the hand holds the block of the test before
     while np.abs(twin.ask("truth")["dq"]).max() < 0.1:
         assert process.poll() is None, process.communicate()[1]
         time.sleep(0.02)
     twin.ask("stall front 60")
     _, complaint = process.communicate(timeout=_PATIENCE)
     twin.ask("stall front 0")
-    assert process.returncode == 1 and "observation age" in complaint and "front" in complaint
+    assert process.returncode == STOPPED and "observation age" in complaint and "front" in complaint
     said = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert said["stopped"] and said["rest_seconds"] < 3 and "cable" in said["advice"]
     episodes = tmp_path / "run" / "episodes"
-    assert EpisodeSet(episodes).meta(0)["outcome"] == "stopped" and validate(episodes) == []
+    meta = EpisodeSet(episodes).meta(0)
+    assert meta["outcome"] == "stopped" and meta["success"] is False and validate(episodes) == []
 
 
-def test_a_simulated_arm_reaches_the_same_outcome(tmp_path: Path) -> None:
+def test_a_simulated_arm_reaches_the_same_outcome(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     run("deploy", write_cell_file(tmp_path, SIM), "--execute", "--yes", "--out", tmp_path / "run")
     said = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert said["success"] and EpisodeSet(tmp_path / "run" / "episodes").meta(0)["arm"] == "sim"
+    meta = EpisodeSet(tmp_path / "run" / "episodes").meta(0)
+    assert said["success"] and meta["arm"] == "sim" and meta["success"] is True
+    printed = capsys.readouterr().out
+    assert "the hand still holds something" in printed and "task: done" in printed
 
 
 def test_a_dry_run_moves_and_records_nothing(tmp_path: Path) -> None:
@@ -135,6 +133,57 @@ def test_a_dry_run_moves_and_records_nothing(tmp_path: Path) -> None:
     run("deploy", write_cell_file(tmp_path, text), "--out", tmp_path / "run")
     said = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert said["ticks"] > 10 and said["episode"] is None and not said["success"]
+
+
+def test_time_up_has_an_exit_status_and_is_recorded_as_no_success(tmp_path: Path) -> None:
+    text = SIM.replace("seed = 3", "seed = 3, seconds = 0.5")
+    with pytest.raises(SystemExit) as ended:
+        run("deploy", write_cell_file(tmp_path, text), "--execute", "--yes", "--out", tmp_path)
+    assert ended.value.code == NOT_DONE
+    meta = EpisodeSet(tmp_path / "episodes").meta(0)
+    assert meta["outcome"] == "failure" and meta["success"] is False
+
+
+@pytest.mark.parametrize(
+    ("request_", "success", "outcome"),
+    [("done", True, "success"), ("not done", False, "failure"), ("", None, "unknown")],
+)
+def test_without_a_simulator_the_operator_says_whether_it_is_done(
+    request_: Request, success: bool | None, outcome: str, bare: CellConfig, tmp_path: Path
+) -> None:
+    """A plan that ends by itself is no success: nobody has seen it."""
+    connection = simulate_cell(bare, ft.CONTROL_HZ)
+    safety = Safety(connection.robot, ft.CONTROL_HZ, cell_watchdogs(bare))
+    actor, ticks = Acts(0, 0.0), []
+
+    def on_tick(status: TickStatus) -> None:
+        ticks.append(status)
+        actor.done = len(ticks) > 5
+
+    def wanted() -> Request:
+        return request_ if len(ticks) > 2 else ""
+
+    session = Session(
+        bare, connection, safety, tmp_path, True, lambda _: actor, wanted, on_tick, truth=None
+    )
+    assert session.run().success is success
+    meta = EpisodeSet(tmp_path).meta(0)
+    assert meta["outcome"] == outcome and meta.get("success") is success
+
+
+def test_the_policy_is_loaded_once_and_before_anything_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded, load = [], checkpoint.load
+    monkeypatch.setattr(checkpoint, "load", lambda *a, **k: loaded.append(a) or load(*a, **k))
+    tips = 'fingertips = { sensor = "gelsight_mini", left = "", right = "" }\n'
+    text = tips + SIM.replace("seed = 3", "seed = 3, seconds = 0.3")
+    run("deploy", write_cell_file(tmp_path, text), "--policy", "shipped", "--out", tmp_path / "run")
+    assert len(loaded) == 1
+    with pytest.raises(SystemExit, match="the policy feels with fingertips"):
+        path = write_cell_file(tmp_path, SIM)
+        run("deploy", path, "--policy", "shipped", "--out", tmp_path / "none")
+    assert not (tmp_path / "none").exists()
 
 
 class Acts:
@@ -156,7 +205,7 @@ def deployed(cell: CellConfig, actor: Acts, stop_after: int = 10_000) -> tuple[s
     """How it ends, whether it was stopped, and the farthest that the first joint got (rad)."""
     connection, count = simulate_cell(cell, ft.CONTROL_HZ), 0
 
-    def wanted() -> str:
+    def wanted() -> Request:
         nonlocal count
         count += 1
         return "stop" if count > stop_after else ""
@@ -186,24 +235,61 @@ def test_a_policy_that_is_not_a_number_and_an_operator_stop_the_arm(bare: CellCo
     assert stopped and reason == "stopped by the operator"
 
 
-@pytest.mark.parametrize("path", sorted(CELL_FILES.glob("*.toml")), ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda p: p.stem)
 def test_example_cell_files_are_read(path: Path) -> None:
     assert read_cell_file(path).task.name == "pick-place"
 
 
+def test_an_example_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("sim", "sim.toml", "launch/cells/sim.toml"):
+        assert find_cell_file(Path(name)) == EXAMPLES / "sim.toml"
+    with pytest.raises(UserError, match="no cell file mine.toml.*fr3_two_minis, sim, twin, ur5e"):
+        find_cell_file(Path("mine.toml"))
+    (tmp_path / "sim.toml").write_text(SIM)
+    assert find_cell_file(Path("sim.toml")) == Path("sim.toml")
+
+
+def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
+    """What is written into its JSON by hand counts, or is refused."""
+    cell = read_cell_file(write_cell_file(tmp_path, SIM))
+    path, table = tmp_path / "cell.json", cell_table(cell)
+    path.write_text(json.dumps(table))
+    assert read_cell_file(path) == cell
+    path.write_text(json.dumps(table | {"safety": {"force": 25, "fingertips_lower": [0, 0, 0.1]}}))
+    limits = cell_limits(read_cell_file(path))
+    assert limits.force == 25 and limits.fingertips.lower[2] == 0.1
+    path.write_text(json.dumps(table | {"safty": {"force": 25}}))
+    with pytest.raises(UserError, match="cell.json: safty is unknown: did you mean safety?"):
+        read_cell_file(path)
+
+
 @pytest.mark.parametrize(
-    ("wrong", "says"),
+    ("wrong", "message"),
     [
         (SIM.replace('arm = "sim"', ""), "arm is missing"),
-        (SIM.replace('"sim"', '"fr4"'), "arm is to be fr3 or ur5e or sim"),
+        (SIM.replace('"sim"', '"fr4"'), "arm must be 'fr3', 'ur5e' or 'sim', not 'fr4'"),
         (SIM.replace('"sim"', '"fr3"'), "address is missing"),
-        (SIM + "speed = 3", "speed is unknown"),
-        (SIM.replace("cameras.front", "cameras.back"), "cameras.back is unknown"),
-        (SIM.replace("seed = 3", 'seed = "3"'), "task.seed is to be a number"),
-        (SIM + "safety = { force = true }", "safety.force is to be a number"),
+        (SIM + "speed = 3", "speed is unknown: There are: arm, "),
+        (SIM.replace("cameras.front", "cameras.back"), "cameras.back must be 'front' or 'wrist'"),
+        (SIM.replace("policy =", "polcy ="), "task.polcy is unknown: did you mean policy?"),
+        (SIM.replace("seed = 3", 'seed = "3"'), "task.seed must be a valid integer, not '3'"),
+        (SIM.replace("seed = 3", "start = [0.0]"), "task.start must be 7 joint positions"),
+        (SIM.replace('_hand"', '_hand", force = 90'), "gripper.force must lie between 0 and 70 N"),
+        (SIM + "safety = { force = true }", "safety.force must be a valid number, not True"),
+        (SIM + "safety = { force = nan }", "safety.force must be a finite number, not nan: Force"),
+        (SIM + "safety = { velocity_share = 20 }", "safety.velocity_share must be less than or eq"),
+        (SIM + "safety = { velocity_share = 0 }", "safety.velocity_share must be greater than 0"),
+        (SIM + "safety = { observation_age = inf }", "safety.observation_age must be a finite"),
+        (SIM + "safety = { flange_lower = [0, 0] }", "safety.flange_lower has too few values"),
+        (SIM + "safety = { flange_lower = [0, 0, 0, 0] }", "safety.flange_lower must have 3 val"),
+        (SIM + "safety = 3", "safety must be a section with keys of its own"),
+        (SIM + 'fingertips = { sensor = "digt", left = "", right = "" }', "fingertips.sensor: dig"),
         ("arm =", "is no TOML"),
     ],
 )
-def test_a_bad_cell_file_is_one_line(wrong: str, says: str, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=says):
+def test_a_bad_cell_file_is_one_line(wrong: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError) as error:
         read_cell_file(write_cell_file(tmp_path, wrong))
+    assert "cell.toml" in str(error.value) and message in str(error.value)
+    assert "\n" not in str(error.value)

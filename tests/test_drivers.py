@@ -14,7 +14,6 @@ from running_twin import RunningTwin
 from touchgoal.control.arms import franka, ur
 from touchgoal.control.arms.streaming import ArmConfig, ArmProcess, shift_wrench
 from touchgoal.control.errors import UserError
-from touchgoal.control.features import FRONT
 from touchgoal.control.grippers.franka_hand import FrankaHand
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
 from touchgoal.control.interfaces import (
@@ -25,7 +24,7 @@ from touchgoal.control.interfaces import (
     LoadCell,
 )
 from touchgoal.control.safety.limits import FR3, UR5E
-from touchgoal.control.sensors.load_cell import LoadCellConfig, SerialLoadCell
+from touchgoal.control.sensors.load_cell import SerialLoadCell
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 
 pytestmark = pytest.mark.realtime
@@ -67,18 +66,17 @@ class Twin(RunningTwin):
             "fr3": (franka.FrankaClient, franka.RATE, FR3),
             "ur5e": (ur.UrClient, ur.RATE, UR5E),
         }[name]
-        address = self.description["address"]
+        address = self.cell.address
         self.config = ArmConfig(address, robot, HZ, rate, state_timeout=0.5)
 
     def connect(self) -> ArmProcess:
         return ArmProcess(self.client, self.config)
 
     def gripper(self) -> Gripper:
-        gripper = self.description["gripper"]
-        if gripper["kind"] == "franka_hand":
-            return FrankaHand(gripper["address"])
-        widths = tuple(gripper["widths"])
-        return Robotiq(RobotiqConfig(gripper["port"], activate=True, widths=widths))
+        gripper = self.cell.gripper
+        if gripper.kind == "franka_hand":
+            return FrankaHand(gripper.address)
+        return Robotiq(RobotiqConfig(gripper.port, activate=True, widths=gripper.widths))
 
 
 def until(holds: Callable[[], bool], seconds: float = 60.0) -> None:
@@ -236,13 +234,14 @@ def test_a_gripper_opens_closes_and_is_clipped_to_its_stroke(twin: Twin) -> None
 
 
 def test_a_camera_and_a_load_cell_give_fresh_readings(twin: Twin) -> None:
-    address = twin.description["images"][FRONT]
+    address = twin.cell.cameras["front"].source
     camera = VideoCamera(VideoConfig(address, rate=10.0, frozen_after=np.inf))
     first = camera.read()
     until(lambda: camera.read().stamp > first.stamp + 0.3)
     assert isinstance(camera, Camera) and first.image.dtype == np.uint8
     camera.close()
-    cell = SerialLoadCell(LoadCellConfig(**twin.description["load_cell"], max_force=100.0))
+    assert twin.cell.load_cell is not None
+    cell = SerialLoadCell(twin.cell.load_cell)
     reading = cell.read()
     assert isinstance(cell, LoadCell) and abs(reading.force) < 5
     until(lambda: cell.read().stamp > reading.stamp)

@@ -26,7 +26,7 @@ def connect(address: str):
 
 
 def through_franky(function: Any, fr3: RunningTwin, *arguments: object) -> dict[str, Any]:
-    return client(function, fr3.description["address"], HOME, *arguments, using=connect)
+    return client(function, fr3.cell.address, HOME, *arguments, using=connect)
 
 
 def moves(address: str, home: list[float]) -> dict:

@@ -9,11 +9,11 @@ import serial
 from running_twin import RunningTwin
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.sensors.load_cell import LoadCellConfig, parse
+from touchgoal.control.sensors.load_cell import parse
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
-from touchgoal.sim_envs.twin import faults
+from touchgoal.sim_envs.twin import control_port
 from touchgoal.sim_envs.twin.cell import SimulatedCell
 
 pytestmark = pytest.mark.realtime
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.realtime
 
 @pytest.mark.parametrize("arm", ["fr3", "ur5e"])
 def test_arm_follows_without_lag(arm: Literal["fr3", "ur5e"]) -> None:
-    cell = SimulatedCell(PickPlace(PickPlaceConfig(cameras=(), tactile=False, arm=arm)), 3, {})
+    cell = SimulatedCell(PickPlace(PickPlaceConfig(cameras=(), tactile=False, arm=arm)), 3)
     start, error = cell.q_d.copy(), 0.0
     for _ in range(1500):
         phase = 4 * (cell.time + 1e-3)  # 0.8 rad/s and 3.2 rad/s^2 at most
@@ -37,7 +37,7 @@ def test_arm_follows_without_lag(arm: Literal["fr3", "ur5e"]) -> None:
 
 def test_fixture_waits_for_the_first_grasp() -> None:
     maze = BeadMazeConfig(split="validation", n_wires=20, tactile=False)
-    cell = SimulatedCell(BeadMaze(maze), 3, {})
+    cell = SimulatedCell(BeadMaze(maze), 3)
     for _ in range(2000):
         cell.step()
     fixture = cell.env.model.equality("fixture").id
@@ -51,7 +51,8 @@ def test_fixture_waits_for_the_first_grasp() -> None:
 
 def test_pictures_come_freeze_and_stop(fr3: RunningTwin) -> None:
     name = "tactile_left"
-    url = fr3.description["images"][f"observation.images.{name}"]
+    assert fr3.cell.fingertips is not None
+    url = fr3.cell.fingertips.left
     capture = cv2.VideoCapture(url)
     frames = [capture.read()[1] for _ in range(3)]
     assert frames[0].shape == (240, 320, 3) and not np.array_equal(frames[1], frames[2])
@@ -65,13 +66,14 @@ def test_pictures_come_freeze_and_stop(fr3: RunningTwin) -> None:
     assert not cv2.VideoCapture(url).isOpened()
     fr3.ask(f"lose {name} 0")
     assert cv2.VideoCapture(url).read()[0]
-    front = cv2.VideoCapture(fr3.description["images"]["observation.images.front"]).read()[1]
+    front = cv2.VideoCapture(fr3.cell.cameras["front"].source).read()[1]
     assert front.shape == (256, 256, 3) and front.std() > 10
 
 
 def test_load_cell_weighs_is_garbled_and_unplugged(fr3: RunningTwin) -> None:
     fr3.begin('reset 3 {"object": "wooden_block", "mass": 0.1}')
-    config = LoadCellConfig(**fr3.description["load_cell"], max_force=100.0)
+    config = fr3.cell.load_cell
+    assert config is not None
 
     def readings(n: int) -> list[float | None]:
         device.reset_input_buffer()
@@ -100,4 +102,4 @@ def test_mistakes_say_what_to_do(fr3: RunningTwin) -> None:
     with pytest.raises(UserError, match="unknown object 'teapot'"):
         fr3.ask('reset 0 {"object": "teapot"}')
     with pytest.raises(UserError, match="no twin answers at 127.0.0.1:9"):
-        faults.ask_twin("127.0.0.1:9", "truth")
+        control_port.ask_twin("127.0.0.1:9", "truth")

@@ -71,7 +71,7 @@ def drives(address: str) -> dict:
 
 
 def test_ur_moves_servoes_and_watches(ur5e: RunningTwin) -> None:
-    said = client(drives, ur5e.description["address"])
+    said = client(drives, ur5e.cell.address)
     assert said["move"] < 2e-3 and said["stop"] < 2e-3 and said["short"] > 0.1
     for taken, worst in said["servo"]:
         assert taken and worst < 0.1  # rad behind a goal at 0.2 rad/s, on a loaded machine
@@ -141,7 +141,7 @@ def protected(address: str, reset: str) -> dict:
 
 
 def test_ur_protective_stop_and_reconnection(ur5e: RunningTwin) -> None:
-    said = client(protected, ur5e.description["address"], ur5e.description["faults"])
+    said = client(protected, ur5e.cell.address, ur5e.cell.task.twin)
     assert said["refused"] and said["noticed"] and "5s" in said["early"] and said["unlocked"]
     assert said["emergency"] == [True, "Safetystatus: ROBOT_EMERGENCY_STOP"]
     assert said["anew"] < 2e-3
@@ -204,8 +204,8 @@ def test_ur_picks_and_places(ur5e: RunningTwin) -> None:
     pick, place = [*layout["object"][:2], height], [*layout["goal"], height]
     said = client(
         places,
-        ur5e.description["address"],
-        ur5e.description["gripper"]["port"],
+        ur5e.cell.address,
+        ur5e.cell.gripper.port,
         pick,
         place,
         yaw_of(layout["object"]),

@@ -1,148 +1,166 @@
-"""A cell file: which arm, gripper, sensors, task and limits belong together; read strictly."""
+"""The cell file's content: which arm, gripper, sensors, task and limits belong together.
 
-import json
-import tomllib
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
-from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+Every field says what it means and what is allowed; `cell_file` reads a file into these and puts both
+into its messages.
+"""
 
-from touchgoal.control import features as ft
+from dataclasses import field
+from typing import Annotated, Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
 from touchgoal.control.errors import UserError
+from touchgoal.control.grippers.robotiq import ROBOTIQ_FORCE_RANGE
+from touchgoal.control.option_types import STRICT, Seed
+from touchgoal.control.sensors.load_cell import LoadCellConfig
+from touchgoal.control.tactile.sensor_models import find_sensor
 
-_EXAMPLES = "see launch/cells/"
+STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+Coordinate = Annotated[float, Field(ge=-3, le=3)]  # m, base frame
+Corner = tuple[Coordinate, Coordinate, Coordinate]
+Angle = Annotated[float, Field(ge=-6.3, le=6.3)]  # rad
+Rate = Annotated[float, Field(gt=0, le=1000)]  # Hz
+Seconds = Annotated[float, Field(gt=0, le=5)]
+Pixels = Annotated[int, Field(ge=16, le=8192)]
+CameraName = Literal["front", "wrist"]
+
+# N, what a gripper can be set to. A real Franka Hand does no less than 30; a simulated one does.
+_FORCES = {"franka_hand": (0.0, 70.0), "robotiq": ROBOTIQ_FORCE_RANGE}
+_JOINTS = {"fr3": 7, "ur5e": 6, "sim": 7}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class GripperSection:
-    """A gripper.
-
-    Attributes:
-        kind: franka_hand needs `address`, robotiq needs `port`.
-        force: N of its grasp.
-        widths: m, open and closed, of a Robotiq; measure them with the fingertips mounted.
-        activate: whether a Robotiq may open and close fully once to become active.
-    """
+    """A gripper."""
 
     kind: Literal["franka_hand", "robotiq"]
+    """franka_hand needs `address`, robotiq needs `port`."""
     address: str = ""
+    """Network address of a Franka Hand: the arm's."""
     port: str = ""
-    force: float = 30.0
-    widths: tuple[float, float] = (0.085, 0.0)
+    """Serial port of a Robotiq, such as /dev/ttyUSB0."""
+    force: Annotated[float, Field(gt=0)] = 30.0
+    """Force of its grasp, N."""
+    widths: tuple[Annotated[float, Field(ge=0, le=0.2)], Annotated[float, Field(ge=0, le=0.2)]] = (
+        0.085,
+        0.0,
+    )
+    """Width of a Robotiq open and closed, m: measure them with the fingertips mounted."""
     activate: bool = False
+    """Whether a Robotiq may open and close fully once to become active."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class FingertipsSection:
-    """The two fingertip sensors.
-
-    Attributes:
-        sensor: which model both are.
-        left, right: USB serial number, or address of a stream.
-        rate: Hz; none: the model's.
-    """
+    """The two fingertip sensors."""
 
     sensor: str
+    """Which model both are, such as gelsight_mini."""
     left: str
+    """USB serial number, or address of a stream."""
     right: str
-    rate: float | None = None
+    """USB serial number, or address of a stream."""
+    rate: Rate | None = None
+    """Pictures a second, Hz; not given: the model's."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class CameraSection:
-    """A camera: device (`/dev/video2`), index or stream; its rate (Hz) and (width, height)."""
+    """A camera."""
 
     source: str
-    rate: float = 30.0
-    size: tuple[int, int] | None = None
+    """Device (/dev/video2), index, or address of a stream."""
+    rate: Rate = 30.0
+    """Pictures a second, Hz."""
+    size: tuple[Pixels, Pixels] | None = None
+    """Width and height to ask the camera for, pixels; not given: its default."""
 
 
-@dataclass(frozen=True)
-class LoadCellSection:
-    """A load cell: see `control.load_cell.LoadCellConfig`."""
-
-    port: str
-    newtons_per_count: float
-    zero: float
-    max_force: float = 200.0
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class TaskSection:
-    """What is to be done.
-
-    Attributes:
-        name: of the task.
-        policy: expert (pick-place, from known positions), follower (bead-maze), shipped, or a
-            folder that train-policy made.
-        instruction: in words; it is recorded.
-        seconds: after which it ends.
-        start: joint positions (rad) to begin from; none: from where the arm is.
-        grasp: for the expert, where to close the hand: x, y, z (m, base frame) and yaw (rad).
-        goal: for the expert, where on the table it is to go: x, y (m).
-        twin: control port of a twin, which is asked for both, and for success.
-        seed, object, wire: of a simulated arm's episode.
-        rewards: goals of the cost that is shown and recorded live, as those of reward-curves:
-            episode:ROOT#K, image:PATH, text:SENTENCE.
-    """
+    """What is to be done."""
 
     name: Literal["pick-place", "bead-maze"]
-    policy: str
+    """Which task."""
+    policy: Annotated[str, Field(min_length=1)]
+    """Who acts: expert (pick-place, from known positions), follower (bead-maze), shipped, or a folder
+    that train-policy made."""
     instruction: str = ""
-    seconds: float = 30.0
-    start: tuple[float, ...] | None = None
-    grasp: tuple[float, float, float, float] | None = None
-    goal: tuple[float, float] | None = None
+    """The task in words; it is recorded."""
+    seconds: Annotated[float, Field(gt=0, le=3600)] = 30.0
+    """After how many seconds the run ends."""
+    start: tuple[Angle, ...] | None = None
+    """Joint positions to begin from, rad; not given: from where the arm is."""
+    grasp: tuple[Coordinate, Coordinate, Coordinate, Angle] | None = None
+    """For the expert, where to close the hand: x, y, z (m, base frame) and yaw (rad)."""
+    goal: tuple[Coordinate, Coordinate] | None = None
+    """For the expert, where on the table the object is to go: x, y (m, base frame)."""
     twin: str = ""
-    seed: int = 1_000_000
-    object: str = ""
-    wire: str = ""
+    """Control port (host:port) of a twin: it puts its scene back before each run, and says where
+    things are and whether the task is done."""
+    seed: Seed = 1_000_000
+    """Random seed of the scene of a simulated arm or a twin."""
+    objects: tuple[str, ...] = ()
+    """pick-place on a simulated arm: names of objects to draw from; none: all."""
+    wires: tuple[str, ...] = ()
+    """bead-maze on a simulated arm: names of wires to draw from; none: all."""
     rewards: tuple[str, ...] = ()
+    """Goals whose distance is shown and recorded during the run, as those of reward-curves:
+    episode:FOLDER#K, image:PATH, text:SENTENCE."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class SafetySection:
-    """Tighter or looser than `control.limits`; what is not given stays as it is there.
+    """Limits for this cell; what is not given stays as in `control.safety.limits`."""
 
-    Attributes:
-        flange_lower, flange_upper, fingertips_lower, fingertips_upper: corners of the boxes, m.
-        velocity_share: of the maker's speed that a policy may use.
-        force, torque, touch: ceilings: N, Nm and m that a fingertip's gel is pressed in.
-        observation_age, state_age: s at which the arm holds; five times that stops it.
-        silence: s without news of the controller after which it is lost; none: the driver's own.
-    """
+    flange_lower: Corner | None = None
+    """Lower corner of the box that the flange stays in, m (base frame)."""
+    flange_upper: Corner | None = None
+    """Upper corner of the box that the flange stays in, m (base frame)."""
+    fingertips_lower: Corner | None = None
+    """Lower corner of the box that the fingertips stay in, m (base frame)."""
+    fingertips_upper: Corner | None = None
+    """Upper corner of the box that the fingertips stay in, m (base frame)."""
+    velocity_share: Annotated[float, Field(gt=0, le=1)] | None = None
+    """Share of the maker's joint speed that a policy may use."""
+    force: Annotated[float, Field(gt=0, le=100)] | None = None
+    """Force from outside at the hand that stops the arm, N."""
+    torque: Annotated[float, Field(gt=0, le=100)] | None = None
+    """Torque from outside in a joint that stops the arm, Nm."""
+    touch: Annotated[float, Field(gt=0, le=0.005)] | None = None
+    """Depth that a gel is pressed in at which the arm stops and the hand opens, m."""
+    observation_age: Seconds = 0.1
+    """Age of a picture at which the arm holds, s; five times that stops it."""
+    state_age: Seconds = 0.05
+    """Age of the arm's state at which the arm holds, s; five times that stops it."""
+    state_timeout: Seconds | None = None
+    """Seconds without news of the controller after which it counts as lost; not given: the driver's."""
 
-    flange_lower: tuple[float, float, float] | None = None
-    flange_upper: tuple[float, float, float] | None = None
-    fingertips_lower: tuple[float, float, float] | None = None
-    fingertips_upper: tuple[float, float, float] | None = None
-    velocity_share: float | None = None
-    force: float | None = None
-    torque: float | None = None
-    touch: float | None = None
-    observation_age: float = 0.1
-    state_age: float = 0.05
-    silence: float | None = None
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class CellConfig:
-    """Everything `deploy` needs to know.
-
-    Attributes:
-        arm: "sim" is a simulated FR3 in place of what is named.
-        lock_step: the arm is a twin that waits for its client, so the control loop goes by its clock.
-    """
+    """Everything `deploy` needs to know."""
 
     arm: Literal["fr3", "ur5e", "sim"]
+    """Which arm; sim is a simulated FR3 in place of what is named."""
     gripper: GripperSection
+    """The gripper."""
     task: TaskSection
+    """What is to be done."""
     address: str = ""
+    """Network address of the arm's controller, such as 172.16.0.2."""
     fingertips: FingertipsSection | None = None
-    cameras: dict[str, CameraSection] = field(default_factory=dict)
-    load_cell: LoadCellSection | None = None
+    """The two fingertip sensors."""
+    cameras: dict[CameraName, CameraSection] = field(default_factory=dict)
+    """The cameras by where they are."""
+    load_cell: LoadCellConfig | None = None
+    """A load cell under the table."""
     safety: SafetySection = field(default_factory=SafetySection)
+    """Limits for this cell."""
     lock_step: bool = False
+    """Whether the arm is a twin that waits for its client; the control loop then goes by its clock."""
 
     @property
     def sensor(self) -> str:
@@ -150,133 +168,50 @@ class CellConfig:
         return self.fingertips.sensor if self.fingertips else "gelsight_mini"
 
 
-def read_cell_file(path: Path, policy: str = "") -> CellConfig:
-    """Read a cell file (TOML), or the `cell.json` that a twin has written.
-
-    Args:
-        path: of the file.
-        policy: in place of the file's, if given.
-
-    Raises:
-        UserError: no such file, bad syntax, an unknown key, or a value that is missing or wrong.
-    """
-    if not path.is_file():
-        raise UserError(f"there is no cell file {path}: {_EXAMPLES}")
-    try:
-        text = path.read_text()
-        table = _of_twin(json.loads(text)) if path.suffix == ".json" else tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} is no TOML: {error}") from error
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(
-            f"{path} is no cell.json of a twin: start one with touchgoal twin"
-        ) from error
-    try:
-        cell = _read(CellConfig, table, "")
-        if policy:
-            cell = replace(cell, task=replace(cell.task, policy=policy))
-        _check(cell)
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from error
-    return cell
-
-
-def _check(cell: CellConfig) -> None:
-    """What a type does not say."""
-    gripper, task = cell.gripper, cell.task
+def check(cell: CellConfig) -> None:
+    """What no field says by itself; UserError with the key and what is meant."""
+    gripper, task, safety = cell.gripper, cell.task, cell.safety
     if cell.arm != "sim" and not cell.address:
         raise UserError("address is missing: give the arm's, such as 172.16.0.2")
     needed = {"franka_hand": "address", "robotiq": "port"}[gripper.kind]
     if cell.arm != "sim" and not getattr(gripper, needed):
         raise UserError(f"gripper.{needed} is missing: a {gripper.kind} needs it")
-    known = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.CAMERAS]
-    if unknown := cell.cameras.keys() - set(known):
-        raise UserError(f"cameras.{min(unknown)} is unknown: there are {', '.join(known)}")
+    least, most = _FORCES[gripper.kind]
+    if not least <= gripper.force <= most:
+        raise UserError(
+            f"gripper.force must lie between {least:g} and {most:g} N, what a {gripper.kind} can do, "
+            f"not {gripper.force:g}"
+        )
+    if gripper.widths[0] <= gripper.widths[1]:
+        raise UserError("gripper.widths must be the open width, then the closed one, in metres")
+    for box in ("flange", "fingertips"):
+        lower, upper = getattr(safety, f"{box}_lower"), getattr(safety, f"{box}_upper")
+        if lower and upper and any(a >= b for a, b in zip(lower, upper, strict=True)):
+            raise UserError(f"safety.{box}_lower is not below safety.{box}_upper: swap them")
+    if task.start is not None and len(task.start) != _JOINTS[cell.arm]:
+        raise UserError(
+            f"task.start must be {_JOINTS[cell.arm]} joint positions of the {cell.arm} in rad, "
+            f"not {len(task.start)}"
+        )
+    if cell.fingertips is not None:
+        try:
+            find_sensor(cell.fingertips.sensor)
+        except UserError as error:
+            raise UserError(f"fingertips.sensor: {error}") from error
+    if task.name == "pick-place" and task.wires or task.name == "bead-maze" and task.objects:
+        other = "wires" if task.wires else "objects"
+        raise UserError(f"task.{other} does nothing in {task.name}: leave it out")
+    _check_policy(cell)
+
+
+def _check_policy(cell: CellConfig) -> None:
+    task = cell.task
     if task.policy == "expert" and task.name == "bead-maze":
         raise UserError(
-            "task.policy: the maze's expert lives in the simulator; follower or shipped"
+            "task.policy: the maze's expert lives in the simulator; use follower or shipped"
         )
     if task.policy == "follower" and task.name != "bead-maze":
-        raise UserError("task.policy: the follower is for the bead-maze; expert or a folder")
+        raise UserError("task.policy: the follower is for the bead-maze; use expert or a folder")
     knows = task.twin or (task.grasp and task.goal)
     if task.policy == "expert" and cell.arm != "sim" and not knows:
         raise UserError("task.grasp and task.goal are missing: measure where they are, in metres")
-
-
-def _of_twin(cell: dict[str, Any]) -> dict[str, Any]:
-    """A twin's description of itself as a cell.
-
-    In lock-step time goes as slowly as the machine needs: by the clock on the wall, which drivers go
-    by, pictures may be rare and the link silent for longer.
-    """
-    images = {key.removeprefix(ft.IMAGE_PREFIX): url for key, url in cell["images"].items()}
-    sides = {key.removeprefix("tactile_"): images.pop(key) for key in list(images) if "tac" in key}
-    pick_place = cell["task"] == "pick-place"
-    slow = {"rate": 1.0} if cell["lock_step"] else {}
-    table = {
-        "arm": cell["arm"],
-        "address": cell["address"],
-        "gripper": cell["gripper"],
-        "cameras": {name: {"source": url, **slow} for name, url in images.items()},
-        "load_cell": cell["load_cell"],
-        "lock_step": cell["lock_step"],
-        "task": {
-            "name": cell["task"],
-            "policy": "expert" if pick_place else "shipped",
-            "instruction": cell["instruction"],
-            "twin": cell["faults"],
-            "seconds": 40.0,
-            "seed": cell["seed"],
-            **cell["options"],
-        },
-    }
-    table["safety"] = {"silence": 2.0} if cell["lock_step"] else {}
-    if not pick_place:
-        table["safety"]["force"] = 25.0  # a wire pushes back; the controller's reflex is at 30
-    if sides:
-        table["fingertips"] = {"sensor": cell["sensor"], **sides, **slow}
-    return table
-
-
-def _read(kind: Any, value: Any, where: str) -> Any:
-    """A TOML value as `kind`; UserError, with the key, if it is none."""
-    origin, arguments = get_origin(kind), get_args(kind)
-    if is_dataclass(kind):
-        return _read_table(kind, value, where)
-    if origin in (Union, UnionType):
-        return _read(next(a for a in arguments if a is not type(None)), value, where)
-    if origin is dict:
-        _require(isinstance(value, dict), where, "a table", value)
-        return {name: _read(arguments[1], v, f"{where}.{name}") for name, v in value.items()}
-    if origin is tuple:
-        _require(isinstance(value, list), where, "a list", value)
-        if arguments[-1] is ...:
-            return tuple(_read(arguments[0], item, where) for item in value)
-        _require(len(value) == len(arguments), where, f"a list of {len(arguments)}", value)
-        return tuple(_read(a, item, where) for a, item in zip(arguments, value, strict=True))
-    if origin is Literal:
-        _require(value in arguments, where, " or ".join(arguments), value)
-        return value
-    wanted = (int, float) if kind is float else kind
-    right = isinstance(value, wanted) and (kind is bool or not isinstance(value, bool))
-    _require(right, where, {str: "text", bool: "true or false"}.get(kind, "a number"), value)
-    return kind(value)
-
-
-def _read_table(kind: Any, table: Any, where: str) -> Any:
-    _require(isinstance(table, dict), where or "the file", "a table", table)
-    dot = f"{where}." if where else ""
-    known = {f.name: f for f in fields(kind)}
-    if unknown := [name for name in table if name not in known]:
-        raise UserError(f"{dot}{unknown[0]} is unknown: there are {', '.join(known)}")
-    for name, f in known.items():
-        needed = f.default is MISSING and f.default_factory is MISSING
-        if needed and name not in table:
-            raise UserError(f"{dot}{name} is missing: {_EXAMPLES}")
-    hints = get_type_hints(kind)
-    return kind(**{n: _read(hints[n], value, f"{dot}{n}") for n, value in table.items()})
-
-
-def _require(right: bool, where: str, wanted: str, value: Any) -> None:
-    if not right:
-        raise UserError(f"{where} is to be {wanted}, not {value!r}")

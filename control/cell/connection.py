@@ -25,7 +25,7 @@ from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
 from touchgoal.control.interfaces import Arm, Camera, Gripper, LoadCell
 from touchgoal.control.safety.action_filter import Deadline, Watchdogs
 from touchgoal.control.safety.limits import FR3, UR5E, Box, RobotLimits
-from touchgoal.control.sensors.load_cell import LoadCellConfig, SerialLoadCell
+from touchgoal.control.sensors.load_cell import SerialLoadCell
 from touchgoal.control.sensors.tactile_camera import (
     DIGIT_CROP,
     GELSIGHT_MINI_CROP,
@@ -153,7 +153,7 @@ def connect_cell(cell: CellConfig, hz: float) -> CellConnection:
                 ft.TACTILE, (cell.fingertips.left, cell.fingertips.right), strict=True
             ):
                 cameras[key] = keep(_tactile_camera(cell.fingertips, source))
-        load_cell = keep(SerialLoadCell(_load_cell(cell))) if cell.load_cell else None
+        load_cell = keep(SerialLoadCell(cell.load_cell)) if cell.load_cell else None
         gripper = keep(_gripper(cell.gripper))
         arm = keep(_arm(cell, robot, hz))
         undo.pop_all()
@@ -189,16 +189,19 @@ def _box(box: Box, own: SafetySection, name: str) -> Box:
         box.lower if lower is None else np.array(lower),
         box.upper if upper is None else np.array(upper),
     )
-    if (box.lower >= box.upper).any():
-        raise UserError(f"safety.{name}_lower is not below safety.{name}_upper: swap them")
+    if (box.lower >= box.upper).any():  # one given, the other as by default
+        raise UserError(
+            f"safety.{name}_lower {box.lower.tolist()} is not below safety.{name}_upper "
+            f"{box.upper.tolist()}: give both corners"
+        )
     return box
 
 
 def _arm(cell: CellConfig, robot: RobotLimits, hz: float) -> Arm:
     ur5e = cell.arm == "ur5e"
-    rate, silence = (ur.RATE, ur.STATE_TIMEOUT) if ur5e else (franka.RATE, franka.STATE_TIMEOUT)
-    silence = cell.safety.silence or silence
-    config = ArmConfig(cell.address, robot, hz, rate, silence)
+    rate, timeout = (ur.RATE, ur.STATE_TIMEOUT) if ur5e else (franka.RATE, franka.STATE_TIMEOUT)
+    timeout = cell.safety.state_timeout or timeout
+    config = ArmConfig(cell.address, robot, hz, rate, timeout)
     return ur.connect_ur(config) if ur5e else franka.connect_franka(config)
 
 
@@ -206,14 +209,6 @@ def _gripper(cell: GripperSection) -> Gripper:
     if cell.kind == "franka_hand":
         return NonBlockingGripper(FrankaHand(cell.address, cell.force))
     return Robotiq(RobotiqConfig(cell.port, cell.activate, force=cell.force, widths=cell.widths))
-
-
-def _load_cell(cell: CellConfig) -> LoadCellConfig:
-    assert cell.load_cell is not None
-    load_cell = cell.load_cell
-    return LoadCellConfig(
-        load_cell.port, load_cell.newtons_per_count, load_cell.zero, load_cell.max_force
-    )
 
 
 def _tactile_camera(cell: FingertipsSection, source: str) -> TactileCamera:

@@ -17,7 +17,7 @@ _PERIOD = 0.02  # s between exchanges; one takes 2 to 10 ms
 _ACTIVATION = 8.0  # s that opening and closing once may take
 _MISSES = 5  # unanswered exchanges in a row that mean it is lost
 _SPEED_RANGE = 0.020, 0.150  # m/s for 0 to 255
-_FORCE_RANGE = 20.0, 235.0  # N for 0 to 255
+ROBOTIQ_FORCE_RANGE = 20.0, 235.0  # N for 0 to 255
 _CONTACT = 1, 2  # object status: something stopped the fingers while opening, closing
 _SILENCE = 0x09  # a fault that is over as soon as it can be read: a second without messages
 _FAULTS = {
@@ -145,7 +145,7 @@ class Robotiq:
         if self._wanted is None:
             return
         speed = _count(self.config.speed, _SPEED_RANGE)
-        force = _count(self.config.force, _FORCE_RANGE)
+        force = _count(self.config.force, ROBOTIQ_FORCE_RANGE)
         self._modbus.write(_OUTPUT, bytes([_ACTIVATE | _GO, 0, 0, self._wanted, speed, force]))
 
 

@@ -11,10 +11,14 @@ import time
 from dataclasses import dataclass
 from functools import reduce
 from operator import xor
-from typing import Literal
+from typing import Annotated, Literal
+
+import pydantic.dataclasses
+from pydantic import Field
 
 from touchgoal.control.grippers.modbus import crc
 from touchgoal.control.interfaces import LoadReading
+from touchgoal.control.option_types import STRICT
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.control.sensors.serial_port import open_port
 
@@ -23,27 +27,26 @@ Checksum = Literal["none", "xor", "crc16"]
 _MAX_LINE_LENGTH = 256  # bytes of a line
 
 
-@dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True, config=STRICT)
 class LoadCellConfig:
-    """One load cell.
-
-    Attributes:
-        port, baud: such as /dev/ttyACM0, 115200.
-        newtons_per_count, zero: force = newtons_per_count * (value - zero).
-        max_force: N; a line beyond it, of either sign, is refused.
-        value_field: which comma-separated field holds the value, from 0.
-        time_field: which field holds the device's clock, whose steps must be positive; None: none.
-        checksum: what lines end in: see `with_checksum`.
-    """
+    """One load cell: force = newtons_per_count * (value - zero)."""
 
     port: str
+    """Serial port, such as /dev/ttyACM0."""
     newtons_per_count: float
+    """Newtons for each count of the value."""
     zero: float
-    max_force: float
-    baud: int = 115200
-    value_field: int = 1
-    time_field: int | None = 0
+    """The value without load, counts."""
+    max_force: Annotated[float, Field(gt=0)] = 200.0
+    """Force, N; a line beyond it, of either sign, is refused."""
+    baud: Annotated[int, Field(gt=0)] = 115200
+    """Speed of the serial port."""
+    value_field: Annotated[int, Field(ge=0)] = 1
+    """Which comma-separated field of a line holds the value, from 0."""
+    time_field: Annotated[int, Field(ge=0)] | None = 0
+    """Which field holds the device's clock, whose steps must be positive; None: none."""
     checksum: Checksum = "crc16"
+    """What lines end in: see `with_checksum`."""
 
 
 @dataclass(frozen=True)

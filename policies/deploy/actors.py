@@ -1,7 +1,7 @@
 """Who acts on a cell: the expert with known positions, the follower, or a policy on disk."""
 
 from collections.abc import Callable
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import Safety
 from touchgoal.policies.acting import Observation
-from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy
+from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy, find_policy
 from touchgoal.policies.deploy.control_loop import DeployedActor
 from touchgoal.policies.deploy.realtime import ChunkPlanner, RealTimeActor
 from touchgoal.policies.deploy.scripted import PickPlacePoses, pick_and_place
@@ -62,23 +62,30 @@ class LearnedActor(RealTimeActor):
         return np.append(step, action[-1])
 
 
-def load_policy(cell: CellConfig) -> SavedPolicy | None:
+@dataclass(frozen=True)
+class CellPolicy:
+    """A learned policy that fits the cell, loaded for one run: its planner, and the size (rows,
+    columns) of the cameras' pictures that it looks at."""
+
+    planner: ChunkPlanner
+    camera_size: tuple[int, int]
+
+
+def load_cell_policy(cell: CellConfig) -> CellPolicy | None:
     """The cell's policy on disk, None of an expert; UserError if it does not fit the cell."""
     if cell.task.policy in ("expert", "follower"):
         return None
-    shipped = cell.task.policy == "shipped"
-    directory = SHIPPED[cell.task.name] if shipped else Path(cell.task.policy)
-    task = env_config_of(cell)
-    maker = SavedPolicy(directory).check_task(task)
     if cell.arm == "ur5e":
         raise UserError("the policy commands the seven joints of an FR3, not a UR5e's: use expert")
-    needed = maker.env_config(task)
+    shipped = cell.task.policy == "shipped"
+    directory = SHIPPED[cell.task.name] if shipped else find_policy(cell.task.policy)
+    planner, needed = SavedPolicy(directory).planner_for(env_config_of(cell))
     if needed.tactile and cell.fingertips is None:
         raise UserError("the policy feels with fingertips, the cell has none: add [fingertips]")
     for camera in needed.cameras:
         if camera not in cell.cameras:
             raise UserError(f"the policy looks at the {camera} camera: add [cameras.{camera}]")
-    return maker
+    return CellPolicy(planner, needed.camera_size)
 
 
 def pick_place_poses(
@@ -96,15 +103,15 @@ def pick_place_poses(
 
 def make_actor(
     cell: CellConfig,
-    maker: SavedPolicy | None,
+    policy: CellPolicy | None,
     safety: Safety,
     truth: Callable[[], dict[str, Any]] | None,
     commanded: Callable[[], np.ndarray],
 ) -> DeployedActor:
     """The actor for one run, from where the arm is now."""
-    if maker is not None:
+    if policy is not None:
         # So a run on a simulated arm repeats on any machine.
-        return LearnedActor(maker.planner(), _SIMULATED_PLAN_TIMEOUT if cell.arm == "sim" else None)
+        return LearnedActor(policy.planner, _SIMULATED_PLAN_TIMEOUT if cell.arm == "sim" else None)
     if cell.task.policy == "follower":
         return FollowerActor(ft.CONTROL_HZ)
     return pick_and_place(pick_place_poses(cell, truth), safety, commanded)

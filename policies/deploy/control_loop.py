@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -31,7 +31,9 @@ ADVICE = {
     Limit.STALE_OBSERVATION: "a camera or fingertip is late: check its cable and the machine's load",
     Limit.STALE_ACTION: "the policy is too slow or hangs: make it smaller, or free the machine",
     Limit.STALE_STATE: "the arm's state is late: check the network to the controller",
-    Limit.FORCE: "something pressed on the hand: clear it, then start again",
+    Limit.FORCE: "something pressed on the hand: clear it, then start again; a task that presses by "
+    "itself (the shipped pick-and-place policy sets down with about 15 N) needs a higher safety.force "
+    "in the cell file, such as 25; an FR3 itself stops at 30",
     Limit.TORQUE: "something pressed on the arm: clear it, then start again",
     Limit.TOUCH: "a gel was pressed too deep, the hand let go: look at it, lower gripper.force",
     Limit.TRACKING: "the arm does not follow: look for what blocks it",
@@ -79,12 +81,14 @@ class Ending:
 
     Attributes:
         reason: what happened, for a person.
+        done: whether the task is done, as far as this ending tells; None: it does not tell.
         stopped: whether the arm was stopped, by a fault or a person, rather than came to its end.
         advice: what to do about it.
         rest_seconds: s from the decision to stop until the arm was at rest; infinite if it was not seen.
     """
 
     reason: str
+    done: bool | None = None
     stopped: bool = False
     advice: str = ""
     rest_seconds: float = 0.0
@@ -99,6 +103,16 @@ class Ending:
             else "NOT seen at rest"
         )
         return f"STOPPED: {self.reason}\n  the arm: {rest}\n  what to do: {self.advice}"
+
+
+Request = Literal["", "stop", "done", "not done", "success"]
+"""Of the operator: go on, stop the arm, end with the task done or not; success: of a simulator."""
+PLAN_ENDED = "the plan is through"
+_REQUESTED_ENDINGS: dict[Request, Ending] = {
+    "done": Ending("the operator says that the task is done", done=True),
+    "not done": Ending("the operator says that the task is not done", done=False),
+    "success": Ending("the simulator says that the task is done", done=True),
+}
 
 
 @dataclass
@@ -147,7 +161,7 @@ class ControlLoop:
         connection: CellConnection,
         safety: Safety,
         execute: bool,
-        operator_request: Callable[[], str],
+        operator_request: Callable[[], Request],
         on_tick: Callable[[TickStatus], None],
         cost: Callable[[Observation], float] | None = None,
         camera_size: tuple[int, int] = ft.CAMERA_SHAPE[:2],
@@ -158,7 +172,7 @@ class ControlLoop:
             connection: what is read and commanded.
             safety: its limits, and the control rate.
             execute: False: a dry run.
-            operator_request: asked every tick: "stop" (a person wants that), "done" (likewise), or "".
+            operator_request: asked every tick; what it answers stops or ends the run.
             on_tick: told of every tick; must not wait.
             cost: measures how far from its goal a tick is, for the view and the record.
             camera_size: rows and columns of cameras' pictures, as observed and recorded.
@@ -196,9 +210,9 @@ class ControlLoop:
             late = clock.now() - due
             ending = self._tick(actor, log, clock.now() - begin, late)
             if ending is None and actor.done:
-                ending = Ending("done")
+                ending = Ending(PLAN_ENDED)
             if ending is None and clock.now() - begin > seconds:
-                ending = Ending(f"time is up ({seconds:.0f} s)")
+                ending = Ending(f"time is up ({seconds:.0f} s)", done=False)
             if ending is not None:
                 return ending
             if not first:
@@ -212,7 +226,7 @@ class ControlLoop:
     def stop(self, reason: str, advice: str) -> Ending:
         """Stop the arm and watch it come to rest."""
         if not self._execute:
-            return Ending(reason, True, advice)
+            return Ending(reason, False, True, advice)
         arm, clock = self._connection.arm, self._connection.clock
         began, end = clock.now(), time.monotonic() + _REST_WALL_TIMEOUT
         arm.stop()
@@ -224,7 +238,7 @@ class ControlLoop:
                 rest = clock.now() - began
                 break
             last = reading.time
-        return Ending(reason, True, advice, rest)
+        return Ending(reason, False, True, advice, rest)
 
     def _tick(
         self, actor: DeployedActor, log: RunLog, seconds: float, late: float
@@ -235,9 +249,9 @@ class ControlLoop:
         if sensed.fault:
             return self.stop(sensed.fault, "see above; then start deploy again")
         if request := self._operator_request():
-            if request == "done":
-                return Ending("ended by the operator")
-            return self.stop("stopped by the operator", "start deploy again when you are ready")
+            if request == "stop":
+                return self.stop("stopped by the operator", "start deploy again when you are ready")
+            return _REQUESTED_ENDINGS[request]
         asked = time.perf_counter()
         action = np.asarray(actor.act(sensed.observation), np.float64)
         log.answer_times.append(time.perf_counter() - asked)

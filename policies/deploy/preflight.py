@@ -14,14 +14,13 @@ from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.checks import CheckResult
 from touchgoal.control.errors import UserError
-from touchgoal.control.interfaces import Camera, DriverError, TactileSensor
+from touchgoal.control.interfaces import Camera, DriverError, Gripper, TactileSensor
 from touchgoal.control.safety.action_filter import Safety
 from touchgoal.control.tactile.contact import contact_strength
 from touchgoal.control.tactile.markers import find_markers, without_markers
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.store import EpisodeWriter
-from touchgoal.policies.deploy.actors import load_policy
 
 _MIN_RATE_SHARE = 0.8  # of what the cell says of a camera
 # Counts by which a fingertip may differ from its sensor file's. Simulated units differ by 1 to 2, a
@@ -30,6 +29,11 @@ _TOUCHED_COUNTS = 12.0
 _WATCH_SECONDS = 1.0  # s for which cameras are watched
 _MIN_FREE_BYTES = 2e9  # bytes: a 40 s episode with both fingertips takes 0.4 GB at most
 _CLIENTS = {"fr3": "franky-control", "ur5e": "ur-rtde", "sim": "mujoco"}
+_INSTALL = {
+    "franky-control": "pip install 'franky-control>=2.0,<2.1'",
+    "ur-rtde": "pip install ur-rtde (it has no wheel for Python 3.13 yet: use 3.11 or 3.12)",
+    "mujoco": "pip install 'mujoco>=4.0,<4.1'",
+}
 
 
 def preflight(
@@ -38,19 +42,19 @@ def preflight(
     """Every check, in the order of the table."""
     rates = measure_rates(connection)
     checks: list[tuple[str, Callable[[], str]]] = [
-        ("client", lambda: _client(cell)),
+        ("client", lambda: check_client(cell)),
         ("arm", lambda: _arm(connection, safety)),
         ("limits", lambda: _limits(safety)),
         ("gripper", lambda: _gripper(connection)),
     ]
     for key, camera in connection.cameras.items():
         nominal = _nominal_rate(cell, key)
-        check = partial(_camera, camera, rates[key], nominal)
+        check = partial(_camera, camera, rates[key], nominal, connection.gripper)
         checks.append((key.removeprefix(ft.IMAGE_PREFIX), check))
     if connection.load_cell:
         checks.append(("load cell", lambda: _load_cell(connection)))
     checks += [
-        ("policy", lambda: _policy(cell)),
+        ("policy", lambda: f"{cell.task.policy}, at {ft.CONTROL_HZ} Hz"),
         ("disk", lambda: _disk(episodes)),
         ("episodes", lambda: _episodes(episodes)),
     ]
@@ -83,12 +87,13 @@ def _run_checks(checks: list[tuple[str, Callable[[], str]]]) -> Iterator[CheckRe
             yield CheckResult(what, False, "", str(error))
 
 
-def _client(cell: CellConfig) -> str:
+def check_client(cell: CellConfig) -> str:
+    """The maker's client library and its version; UserError if it is not installed."""
     name = _CLIENTS[cell.arm]
     try:
         return f"{name} {importlib.metadata.version(name)}"
     except importlib.metadata.PackageNotFoundError as error:
-        raise UserError(f"{name} is not installed: pip install {name}") from error
+        raise UserError(f"{name} is not installed: {_INSTALL[name]}") from error
 
 
 def _arm(connection: CellConnection, safety: Safety) -> str:
@@ -110,8 +115,9 @@ def _arm(connection: CellConnection, safety: Safety) -> str:
 def _limits(safety: Safety) -> str:
     limits, dogs = safety.limits, safety.watchdogs
     return (
-        f"{safety.joints.velocity.max():.2f} rad/s, {limits.force:g} N, {limits.torque:g} Nm, "
-        f"gel {1e3 * limits.touch:g} mm, pictures {1e3 * dogs.observation.hold:.0f} ms, state {1e3 * dogs.state.hold:.0f} ms"
+        f"joints up to {safety.joints.velocity.max():.2f} rad/s; stops above {limits.force:g} N, "
+        f"{limits.torque:g} Nm or {1e3 * limits.touch:g} mm into a gel; holds when pictures are older "
+        f"than {1e3 * dogs.observation.hold:.0f} ms or the arm's state than {1e3 * dogs.state.hold:.0f}"
     )
 
 
@@ -119,17 +125,19 @@ def _gripper(connection: CellConnection) -> str:
     reading = connection.gripper.read()
     if reading.fault:
         raise UserError(reading.fault)
-    return f"{1e3 * reading.width:.0f} mm"
+    holds = ", it holds something" if reading.grasped else ""
+    return f"{1e3 * reading.width:.0f} mm wide{holds}"
 
 
 def _nominal_rate(cell: CellConfig, key: str) -> float:
     if key in ft.TACTILE:
         assert cell.fingertips is not None
         return cell.fingertips.rate or find_sensor(cell.sensor).frame_rate
-    return cell.cameras[key.removeprefix(ft.IMAGE_PREFIX)].rate
+    name = key.removeprefix(ft.IMAGE_PREFIX)
+    return next(camera.rate for known, camera in cell.cameras.items() if known == name)
 
 
-def _camera(camera: Camera, rate: float, nominal: float) -> str:
+def _camera(camera: Camera, rate: float, nominal: float, gripper: Gripper) -> str:
     if camera.problem:
         raise UserError(camera.problem)
     untouched = ""
@@ -142,14 +150,23 @@ def _camera(camera: Camera, rate: float, nominal: float) -> str:
         # A unit differs from the sensor file's; a contact is told by far more than that.
         strength = float(contact_strength(frame[None], background)[0])
         if strength > _TOUCHED_COUNTS:
+            reading = gripper.read()
+            if reading.grasped:
+                raise UserError(
+                    f"it is touched: the hand holds something, {1e3 * reading.width:.0f} mm wide; open "
+                    "the hand (a Franka's in Desk) and take it out"
+                )
             raise UserError(
-                f"it looks touched ({strength:.0f} counts): clear it, or if it is not, fit your "
-                "own sensor file: touchgoal calibrate"
+                f"it looks touched ({strength:.0f} counts): clear it, or if nothing touches it, fit "
+                "your own sensor file: touchgoal calibrate"
             )
-        untouched = f", {strength:.1f} counts from the sensor file's untouched gel"
+        untouched = f", untouched ({strength:.1f} counts from its sensor file)"
     if rate < _MIN_RATE_SHARE * nominal:
-        raise UserError(f"{rate:.1f} of {nominal:g} pictures a second: check cable, light and load")
-    return f"{rate:.1f} Hz{untouched}"
+        raise UserError(
+            f"{rate:.1f} pictures a second instead of {nominal:g}: check its cable, the light and what "
+            "else this computer does"
+        )
+    return f"{rate:.1f} pictures a second{untouched}"
 
 
 def _load_cell(connection: CellConnection) -> str:
@@ -158,17 +175,12 @@ def _load_cell(connection: CellConnection) -> str:
     return f"{reading.force:.1f} N, {reading.rejected} lines refused"
 
 
-def _policy(cell: CellConfig) -> str:
-    load_policy(cell)
-    return f"{cell.task.policy}, at {ft.CONTROL_HZ} Hz"
-
-
 def _disk(episodes: Path) -> str:
     folder = next(p for p in (episodes, *episodes.resolve().parents) if p.exists())
     free = shutil.disk_usage(folder).free
     if free < _MIN_FREE_BYTES:
         raise UserError(
-            f"{free / 1e9:.1f} GB are free in {folder}: make room for {_MIN_FREE_BYTES / 1e9:g}"
+            f"{free / 1e9:.1f} GB are free in {folder}: make room for {_MIN_FREE_BYTES / 1e9:g} GB"
         )
     return f"{free / 1e9:.0f} GB free"
 

@@ -11,6 +11,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.errors import UserError
+from touchgoal.control.interfaces import DriverError
 from touchgoal.control.safety.action_filter import Safety
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeWriter
@@ -18,6 +19,7 @@ from touchgoal.policies.deploy.control_loop import (
     ControlLoop,
     DeployedActor,
     Ending,
+    Request,
     RunLog,
     TickStatus,
 )
@@ -38,7 +40,9 @@ class Result:
     Attributes:
         ending: how the run ended.
         log: what was recorded.
-        success: the simulator's judgement; None where nobody knows.
+        success: whether the task is done: by the simulator's truth, or as the ending tells; None
+            where nobody knows.
+        held_width: m, of what the hand still holds; None if nothing.
         episode: index of the recorded episode; None without one.
         recording_error: why there is none, if there should be one.
     """
@@ -46,6 +50,7 @@ class Result:
     ending: Ending
     log: RunLog
     success: bool | None
+    held_width: float | None
     episode: int | None
     recording_error: str = ""
 
@@ -67,7 +72,7 @@ class Session:
     episodes: Path
     execute: bool
     make_actor: MakeActor
-    operator_request: Callable[[], str]
+    operator_request: Callable[[], Request]
     on_tick: Callable[[TickStatus], None]
     truth: Callable[[], dict[str, Any]] | None
     cost: Callable[[Observation], float] | None = None
@@ -101,15 +106,13 @@ class Session:
                 recording_error = (
                     f"this episode could not be kept ({error}); those before it are whole"
                 )
-        return Result(ending, log, success, episode, recording_error)
+        return Result(ending, log, success, self._held_width(), episode, recording_error)
 
     def _move_to_start(self, loop: ControlLoop) -> Ending | None:
         """Why it does not go on; None if the arm is where the task begins."""
         if self.cell.task.start is None:
             return None
         start = np.array(self.cell.task.start)
-        if start.shape != loop.commanded().shape:
-            raise UserError(f"task.start has {start.size} joints: this arm has another number")
         if np.abs(start - loop.commanded()).max() > _CLOSE_TO_START:
             move = start_move(start, loop.width, self.safety, loop.commanded)
             ending = loop.run(move, 60.0, RunLog())
@@ -131,16 +134,26 @@ class Session:
             actor.close()
 
     def _success(self, ending: Ending) -> bool | None:
-        if self.truth is None or not self.execute:
+        """Of a run that was stopped it is False, whatever the task looks like."""
+        if not self.execute:
             return None
+        if ending.stopped or self.truth is None:
+            return ending.done
         clock = self.connection.clock
-        end = clock.now() + (0.0 if ending.stopped else _SETTLE_TIME)
+        end = clock.now() + _SETTLE_TIME
         try:
             while not (success := bool(self.truth()["success"])) and clock.now() < end:
                 clock.wait(clock.now() + self.safety.dt)
-        except UserError:  # the twin has ended; the ending says so
-            return None
+        except UserError:  # the twin has ended
+            return ending.done
         return success
+
+    def _held_width(self) -> float | None:
+        try:
+            reading = self.connection.gripper.read()
+        except DriverError:  # the ending says so
+            return None
+        return reading.width if reading.grasped else None
 
     def _record(self, log: RunLog, ending: Ending, success: bool | None) -> int:
         cell = self.cell
@@ -152,6 +165,8 @@ class Session:
             "outcome": "stopped" if ending.stopped else outcome,
             "ending": ending.reason,
         }
+        if success is not None:
+            meta["success"] = success
         task = cell.task.instruction or cell.task.name
         episode = Episode(frames=log.frames(), task=task, meta=meta)
         return EpisodeWriter(self.episodes, fps=ft.CONTROL_HZ).append(episode)

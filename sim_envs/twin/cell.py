@@ -62,12 +62,12 @@ class SimulatedCell:
         gripper_command: the gripper's orders.
     """
 
-    def __init__(self, env: FrankaTactileEnv, seed: int, options: dict[str, Any]) -> None:
+    def __init__(self, env: FrankaTactileEnv, seed: int) -> None:
         self.env = env
-        self.reset(seed, options)
+        self.reset(seed)
 
-    def reset(self, seed: int, options: dict[str, Any]) -> None:
-        """Begin an episode: arm and objects jump to where it starts."""
+    def reset(self, seed: int, options: dict[str, Any] | None = None) -> None:
+        """Begin an episode: arm and objects jump to where it starts, the hand is open."""
         env = self.env
         env.reset(seed=seed, options=options)
         n = env.n_joints

@@ -203,10 +203,8 @@ class SimulatedLoadCell:
 
 def simulate_cell(config: CellConfig, hz: float) -> CellConnection:
     """The connection of a cell file with `arm = "sim"`: its sensors, task and limits, in simulation."""
-    task = config.task
-    chosen = {"object": task.object, "wire": task.wire}
     env = make_env(env_config_of(config))
-    cell = SimulatedCell(env, task.seed, {name: value for name, value in chosen.items() if value})
+    cell = SimulatedCell(env, config.task.seed)
     env.update_contacts()
     arm = SimulatedArm(cell, hz)
     cameras: dict[str, Camera] = {
@@ -229,7 +227,9 @@ def simulate_cell(config: CellConfig, hz: float) -> CellConnection:
 
 def env_config_of(config: CellConfig) -> TaskConfig:
     """The task's own options with the cell's sensors, at the rate of a deployment."""
-    task = BeadMazeConfig() if config.task.name == "bead-maze" else PickPlaceConfig()
+    task: TaskConfig = PickPlaceConfig(objects=config.task.objects)
+    if config.task.name == "bead-maze":
+        task = BeadMazeConfig(wires=config.task.wires)
     return replace(
         task,
         cameras=tuple(config.cameras),

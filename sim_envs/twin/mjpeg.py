@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from touchgoal.control import features as ft
 from touchgoal.sim_envs.twin.cell import SimulatedCell
 
-_CAMERA_RATE = 30  # Hz, a webcam's
+CAMERA_RATE = 30  # Hz, a webcam's
 _CAMERA_NOISE = 1.5  # counts: by it a driver tells a still scene from a frozen camera
 _QUALITY = 95  # of JPEG; real GelSight Minis send MJPEG, too
 _POLL_INTERVAL = 0.2  # s between looks at whether the stream is to end
@@ -69,7 +69,7 @@ class Streams:
         self._noise = np.empty(0)
         env = cell.env
         self.streams = {
-            camera: Stream(_CAMERA_RATE, partial(self._picture, camera))
+            camera: Stream(CAMERA_RATE, partial(self._picture, camera))
             for camera in env.config.cameras
         }
         if env.config.tactile:
@@ -83,11 +83,9 @@ class Streams:
         threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True).start()
 
     def addresses(self) -> dict[str, str]:
-        """Address of each stream, by its key in the vocabulary."""
+        """Address of each stream, by its name."""
         port = self._server.server_address[1]
-        return {
-            ft.IMAGE_PREFIX + name: f"http://{self._host}:{port}/{name}" for name in self.streams
-        }
+        return {name: f"http://{self._host}:{port}/{name}" for name in self.streams}
 
     def receive(self) -> None:
         """Nobody says anything here."""

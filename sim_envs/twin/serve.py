@@ -4,18 +4,30 @@ import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, get_args, runtime_checkable
 
+from touchgoal.control.cell.config import (
+    CameraName,
+    CameraSection,
+    CellConfig,
+    FingertipsSection,
+    GripperSection,
+    SafetySection,
+    TaskSection,
+)
 from touchgoal.control.errors import UserError
-from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH
-from touchgoal.sim_envs.config import BeadMazeConfig, TaskConfig
+from touchgoal.control.grippers.robotiq import ROBOTIQ_FORCE_RANGE
+from touchgoal.control.sensors.load_cell import LoadCellConfig
+from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH, FrankaTactileEnv
+from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.config import TaskConfig
 from touchgoal.sim_envs.tactile.press_bench import warm_up
 from touchgoal.sim_envs.tasks import make_env
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
-from touchgoal.sim_envs.twin.faults import ControlPort
+from touchgoal.sim_envs.twin.control_port import ControlPort
 from touchgoal.sim_envs.twin.franka.controller import FrankaArm
 from touchgoal.sim_envs.twin.franka.hand import FrankaHand
-from touchgoal.sim_envs.twin.mjpeg import Streams
+from touchgoal.sim_envs.twin.mjpeg import CAMERA_RATE, Streams
 from touchgoal.sim_envs.twin.serial import devices as serial_ports
 from touchgoal.sim_envs.twin.ur.controller import UrController
 
@@ -23,6 +35,9 @@ _MAX_BACKLOG = 0.1  # s behind real time beyond which the twin stops trying to c
 # s to wait for a client that drives the arm. In lock-step for as long as a loaded machine needs; in
 # real time about as long as a busy one hiccups.
 _LOCK_STEP_TIMEOUT, _CLIENT_TIMEOUT = 2.0, 0.1
+_LOCK_STEP_PICTURE_RATE = 1.0  # Hz by the clock on the wall that a slow machine still manages
+_MAZE_FORCE = 25.0  # N
+_RUN_SECONDS = 40.0
 
 
 @dataclass(frozen=True)
@@ -32,9 +47,9 @@ class TwinConfig:
     Attributes:
         task: what the cell is for; its own `arm` is overruled by `arm`.
         arm: an FR3 with the Franka Hand, or a UR5e whose gripper talks as a Robotiq does.
-        seed, options: of the first episode.
+        seed: of the first episode.
         host: loopback address of everything; twins at different ones run side by side.
-        port: of the pictures; the next one is for faults. 0: any that are free.
+        port: of the pictures; the next one is the control port. 0: any that are free.
         lock_step: wait for the client that drives the arm, so that runs repeat.
         folder: where serial devices appear.
     """
@@ -42,7 +57,6 @@ class TwinConfig:
     task: TaskConfig
     arm: Literal["fr3", "ur5e"]
     seed: int
-    options: dict[str, Any]
     host: str
     port: int
     lock_step: bool
@@ -70,18 +84,15 @@ class Twin:
     with the clock.
 
     Attributes:
-        description: where everything is, for whoever deploys on it.
+        cell_config: where everything is, for whoever deploys on it.
         stopped: set it to end `run`.
     """
 
     def __init__(self, config: TwinConfig) -> None:
-        self.cell = SimulatedCell(
-            make_env(replace(config.task, arm=config.arm)), config.seed, dict(config.options)
-        )
+        self.cell = SimulatedCell(make_env(replace(config.task, arm=config.arm)), config.seed)
         env = self.cell.env
-        if (
-            env.config.tactile
-        ):  # a client would lose the arm while code is loaded at the first touch
+        if env.config.tactile:
+            # A client would lose the arm while code is loaded at the first touch.
             warm_up(env.bodies, env.sensor)
         self._lock_step, self._next_step_at = config.lock_step, time.monotonic()
         self.stopped = False
@@ -89,7 +100,7 @@ class Twin:
         with ExitStack() as undo:
             undo.callback(self.close)
             try:
-                self.description = self._open(config)
+                self.cell_config = self._open(config)
             except OSError as error:
                 raise UserError(
                     f"cannot serve at {config.host} ({error.strerror}); if another twin is there, "
@@ -124,43 +135,90 @@ class Twin:
         if self._next_step_at > now:
             time.sleep(self._next_step_at - now)
 
-    def _open(self, config: TwinConfig) -> dict[str, Any]:
-        """Open every service; returns the description."""
+    def _open(self, config: TwinConfig) -> CellConfig:
+        """Open every service; returns the cell file's content for whoever deploys here."""
         cell, host, folder = self.cell, config.host, config.folder
         folder.mkdir(parents=True, exist_ok=True)
         services = self._services
         services.append(load_cell := serial_ports.LoadCell(cell, folder / "load_cell"))
         ports = {"load_cell": load_cell.port}
+        force = cell.env.grasp_force  # with which the episode's object is to be held
         if config.arm == "fr3":
             timeout = _LOCK_STEP_TIMEOUT if config.lock_step else _CLIENT_TIMEOUT
             services.append(hand := FrankaHand(cell, host))
             services.append(arm := FrankaArm(cell, host, timeout, hand.link))
-            gripper: dict[str, Any] = {"kind": "franka_hand", "address": host}
+            gripper = GripperSection("franka_hand", address=host, force=force)
         else:
             services.append(arm := UrController(cell, host))
             services.append(robotiq := serial_ports.Robotiq(cell, folder / "gripper"))
             ports["gripper"] = robotiq.port
-            widths = [GRIPPER_MAX_WIDTH, 0.0]
-            gripper = {"kind": "robotiq", "port": str(robotiq.port.path), "widths": widths}
-        gripper["force"] = cell.env.grasp_force  # with which the episode's object is to be held
+            gripper = GripperSection(
+                "robotiq",
+                port=str(robotiq.port.path),
+                widths=(GRIPPER_MAX_WIDTH, 0.0),
+                force=max(force, ROBOTIQ_FORCE_RANGE[0]),
+            )
         services.append(streams := Streams(cell, host, config.port))
         control = config.port + 1 if config.port else 0
-        services.append(faults := ControlPort(cell, arm, streams.streams, ports, host, control))
-        return {
-            "arm": config.arm,
-            "address": host,
-            "gripper": gripper,
-            "images": streams.addresses(),
-            "sensor": config.task.sensor,
-            "load_cell": {
-                "port": str(load_cell.port.path),
-                "newtons_per_count": serial_ports.NEWTONS_PER_COUNT,
-                "zero": serial_ports.ZERO,
-            },
-            "faults": faults.address,
-            "task": "bead-maze" if isinstance(config.task, BeadMazeConfig) else "pick-place",
-            "seed": config.seed,
-            "options": config.options,
-            "instruction": cell.env.instruction(),
-            "lock_step": config.lock_step,
-        }
+        services.append(commands := ControlPort(cell, arm, streams.streams, ports, host, control))
+        return _cell_config(
+            config,
+            gripper,
+            streams.addresses(),
+            LoadCellConfig(
+                str(load_cell.port.path), serial_ports.NEWTONS_PER_COUNT, serial_ports.ZERO
+            ),
+            _task_section(config, cell.env, commands.address),
+        )
+
+
+def _cell_config(
+    config: TwinConfig,
+    gripper: GripperSection,
+    streams: dict[str, str],
+    load_cell: LoadCellConfig,
+    task: TaskSection,
+) -> CellConfig:
+    """What `deploy` is to know of this twin.
+
+    In lock-step time goes as slowly as the machine needs: by the clock on the wall, which drivers go
+    by, pictures may be rare and the link silent for longer.
+    """
+    rate = _LOCK_STEP_PICTURE_RATE if config.lock_step else None
+    cameras: dict[CameraName, CameraSection] = {}
+    for name in get_args(CameraName):
+        if name in streams:
+            cameras[name] = CameraSection(streams[name], rate or CAMERA_RATE)
+    fingertips = None
+    if "tactile_left" in streams:
+        sides = streams["tactile_left"], streams["tactile_right"]
+        fingertips = FingertipsSection(config.task.sensor, *sides, rate)
+    return CellConfig(
+        arm=config.arm,
+        address=config.host,
+        gripper=gripper,
+        task=task,
+        fingertips=fingertips,
+        cameras=cameras,
+        load_cell=load_cell,
+        safety=SafetySection(
+            # A wire pushes back; the arm's own reflex is at 30 N.
+            force=_MAZE_FORCE if task.name == "bead-maze" else None,
+            state_timeout=_LOCK_STEP_TIMEOUT if config.lock_step else None,
+        ),
+        lock_step=config.lock_step,
+    )
+
+
+def _task_section(config: TwinConfig, env: FrankaTactileEnv, control_port: str) -> TaskSection:
+    maze = isinstance(env, BeadMaze)
+    return TaskSection(
+        name="bead-maze" if maze else "pick-place",
+        policy="shipped" if maze else "expert",
+        instruction=env.instruction(),
+        seconds=_RUN_SECONDS,
+        twin=control_port,
+        seed=config.seed,
+        objects=() if maze else (env.bodies[0].kind.name,),
+        wires=(env.wire.name,) if maze else (),
+    )

@@ -125,6 +125,16 @@ class FrankaArm:
         if error in ("joint_reflex", "cartesian_reflex"):
             self.cell.give_way()
 
+    @property
+    def driven(self) -> bool:
+        """Whether a client's motion goes on."""
+        return self._motion is not None
+
+    def clear_error(self) -> None:
+        """End a reflex, as a person does in Desk."""
+        if self.mode == RobotMode.REFLEX:
+            self.mode, self.error = RobotMode.IDLE, ""
+
     def freeze(self, frozen: bool) -> None:
         """Let nothing through in either direction, or let it through again."""
         self.link.frozen = self._hand.frozen = frozen

@@ -113,6 +113,16 @@ class UrController:
             raise UserError(f"a UR has no error {error!r}; ask for protective_stop")
         self.protective_stop()
 
+    @property
+    def driven(self) -> bool:
+        """Whether a client's program moves the arm."""
+        return self._program.running and bool(self._clients)
+
+    def clear_error(self) -> None:
+        """End a protective stop, as a person does at the pendant."""
+        if self.safety is Safety.PROTECTIVE_STOP:
+            self.safety = Safety.NORMAL
+
     def freeze(self, frozen: bool) -> None:
         """Let nothing through in either direction, or let it through again."""
         self.frozen = frozen

@@ -1,7 +1,10 @@
-"""One line-based port by which another process breaks the twin, mends it and asks for the truth.
+"""One line-based port by which another process puts the twin's scene back, breaks the twin and asks
+for the truth.
 
     truth                         what only a simulator knows, and where the arm is
-    reset SEED [OPTIONS]          begin an episode; OPTIONS is a JSON object of the task's
+    reset SEED [OPTIONS]          put the scene, the arm and the open hand where an episode starts, and
+                                  clear an error as a person does in Desk; OPTIONS is a JSON object
+                                  of the task's
     freeze SECONDS                nothing passes between the arm (and its hand) and its clients, for
                                   so long simulated
     drop                          hang up on the arm's clients
@@ -31,10 +34,20 @@ from touchgoal.sim_envs.twin.mjpeg import Stream
 from touchgoal.sim_envs.twin.serial.devices import SerialPort
 from touchgoal.sim_envs.twin.tcp_ports import ListeningPort
 
+_REST_TIMEOUT, _POLL_INTERVAL = 10.0, 0.1  # s for the arm of the run before to come to rest
+
 
 @runtime_checkable
 class FaultyArm(Protocol):
     """What can go wrong with an arm's controller and its link."""
+
+    @property
+    def driven(self) -> bool:
+        """Whether a client drives the arm."""
+        ...
+
+    def clear_error(self) -> None:
+        """Clear an error, as a person does at the controller; the stop button stays as it is."""
 
     def freeze(self, frozen: bool) -> None:
         """Let nothing through in either direction, or let it through again."""
@@ -113,7 +126,10 @@ class ControlPort:
     def _reset(self, seed: str, options: str = "{}") -> None:
         if self._cell.moving:
             raise UserError("the arm moves; stop it first")
+        if self._arm.driven:
+            raise UserError("another program drives the arm; end that first")
         self._cell.reset(int(seed), json.loads(options))
+        self._arm.clear_error()
 
     def _freeze(self, seconds: float) -> None:
         self._arm.freeze(True)
@@ -145,3 +161,15 @@ def ask_twin(address: str, line: str) -> dict[str, Any]:
     if "error" in answer:
         raise UserError(answer["error"])
     return answer
+
+
+def put_scene_back(address: str, seed: int) -> None:
+    """Let a twin begin the episode of a seed, once its arm rests: arm, open hand and objects.
+
+    Raises:
+        UserError: the arm goes on moving, another program drives it, or there is no twin.
+    """
+    end = time.monotonic() + _REST_TIMEOUT
+    while ask_twin(address, "truth")["rest"] == 0 and time.monotonic() < end:
+        time.sleep(_POLL_INTERVAL)
+    ask_twin(address, f"reset {seed}")

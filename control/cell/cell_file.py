@@ -1,0 +1,103 @@
+"""Reading and writing cell files: TOML by a person or JSON by a twin, one set of keys."""
+
+import json
+import tomllib
+from dataclasses import is_dataclass, replace
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
+
+from touchgoal.control.cell.config import CellConfig, check
+from touchgoal.control.errors import UserError
+
+_CELL = TypeAdapter(CellConfig)
+
+
+def read_cell_file(path: Path, policy: str = "") -> CellConfig:
+    """Read a cell file: TOML, or the `cell.json` that a twin has written.
+
+    Args:
+        path: of the file.
+        policy: in place of the file's, if given.
+
+    Raises:
+        UserError: no such file, bad syntax, an unknown key, or a value that is missing or not
+            allowed; one line with file, key, what is allowed and what is meant.
+    """
+    try:
+        text = path.read_text()
+        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except OSError as error:
+        raise UserError(f"cannot read the cell file {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        form = "JSON" if path.suffix == ".json" else "TOML"
+        raise UserError(f"{path} is no {form}: {error}") from error
+    try:
+        # By way of JSON, in which lists pass for tuples and nothing else is converted.
+        cell = _CELL.validate_json(json.dumps(table, default=str), strict=True)
+        if policy:
+            cell = replace(cell, task=replace(cell.task, policy=policy))
+        check(cell)
+    except ValidationError as error:
+        raise UserError(f"{path}: {_explain(error)}") from error
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    return cell
+
+
+def cell_table(cell: CellConfig) -> dict[str, Any]:
+    """A cell as a cell file has it, ready for JSON; what is as by default is left out."""
+    return _CELL.dump_python(cell, mode="json", exclude_defaults=True)
+
+
+def _explain(error: ValidationError) -> str:
+    """The first mistake in one line; unknown keys first, as they are often missing ones misspelt."""
+    found = error.errors()
+    unknown = [e for e in found if e["type"] == "unexpected_keyword_argument"]
+    first = (unknown or found)[0]
+    *where, key = (str(part) for part in first["loc"] if part != "[key]")
+    name = ".".join((*where, key))
+    if unknown:
+        keys = list(_section(where).__pydantic_fields__)
+        near = get_close_matches(key, keys, 1)
+        meant = f"did you mean {near[0]}? " if near else ""
+        return f"{name} is unknown: {meant}There are: {', '.join(keys)}"
+    meaning = _meaning(first["loc"])
+    kind, value = first["type"], first["input"]
+    if isinstance(first["loc"][-1], int) and kind == "missing":
+        return f"{'.'.join(where)} has too few values, {value!r}: {meaning}"
+    if kind == "too_long" and "ctx" in first:
+        return f"{name} must have {first['ctx']['max_length']} values, not {value!r}: {meaning}"
+    if kind == "missing":
+        return f"{name} is missing: {meaning}"
+    rule = first["msg"].replace("Input should", "must")
+    if kind == "dataclass_type":
+        rule = "must be a section with keys of its own"
+    return f"{name} {rule}, not {value!r}: {meaning}"
+
+
+def _section(where: list[str]) -> Any:
+    """The dataclass that a section's keys belong to."""
+    kind: Any = CellConfig
+    for key in where:
+        kind = _dataclass_in(get_type_hints(kind).get(key)) or kind
+    return kind
+
+
+def _dataclass_in(hint: Any) -> Any:
+    """The dataclass that a hint names, if any: itself, or in an optional, or in a dictionary."""
+    if is_dataclass(hint):
+        return hint
+    return next((kind for part in get_args(hint) if (kind := _dataclass_in(part))), None)
+
+
+def _meaning(location: tuple[int | str, ...]) -> str:
+    """What the key stands for, from its field."""
+    keys = [str(part) for part in location]
+    for end in range(len(keys), 0, -1):
+        found = _section(keys[: end - 1]).__pydantic_fields__.get(keys[end - 1])
+        if found is not None and found.description:
+            return " ".join(found.description.split()).rstrip(".")
+    return "see docs/runbook.md"
