@@ -42,9 +42,9 @@ class Terminal:
                 typed = self._keyboard.read_keys()
             except (KeyboardInterrupt, UserError):  # Ctrl-C, or the terminal has gone
                 typed = " "
-            requests = [_KEY_REQUESTS[key] for key in typed if key in _KEY_REQUESTS]
-            if requests:
-                self._request = "stop" if "stop" in requests else requests[0]
+            for request in (_KEY_REQUESTS.get(key, "") for key in typed):
+                if request and (request == "stop" or not self._request):
+                    self._request = request
         return self._request
 
     def show_tick(self, status: TickStatus) -> None:

@@ -87,7 +87,7 @@ def test_picks_and_places_on_the_twin_and_the_episode_has_reward_curves(
 @pytest.mark.realtime
 def test_the_shipped_policy_leads_a_bead_on_the_twin(tmp_path: Path) -> None:
     pytest.importorskip("franky", reason="pip install 'touchgoal[franka]'")
-    cell = ["--lock-step", "--task", "bead-maze", "--env.wires", "helix-3"]
+    cell = ["--lock-step", "--task", "bead-maze", "--maze.wires", "helix-3"]
     small = ["--maze.cameras", "front", "--maze.camera-size", "128", "128"]
     twin = RunningTwin([*cell, *small], tmp_path, 3)
     _, complaint = deploying(twin, tmp_path).communicate(timeout=_PATIENCE)

@@ -16,8 +16,6 @@ from touchgoal.control.option_types import STRICT, Seed
 from touchgoal.control.sensors.load_cell import LoadCellConfig
 from touchgoal.control.tactile.sensor_models import find_sensor
 
-STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
-
 Coordinate = Annotated[float, Field(ge=-3, le=3)]  # m, base frame
 Corner = tuple[Coordinate, Coordinate, Coordinate]
 Angle = Annotated[float, Field(ge=-6.3, le=6.3)]  # rad
