@@ -1,7 +1,7 @@
 """What moves a deployed arm without learning: the start move, and picking and placing by plan."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -54,7 +54,10 @@ class PickPlacePoses:
 
 @dataclass(frozen=True)
 class Segment:
-    """A move (or, without one, a wait) with the gripper going to `width` (m); may end by feeling."""
+    """A move (or, without one, a wait) with the gripper going to `width` (m); may end by feeling.
+
+    It takes `seconds`, which is the path's own duration or longer.
+    """
 
     path: Trajectory | None
     width: float
@@ -111,10 +114,11 @@ class ScriptedActor:
                 if segment.path is None:  # seconds in which nothing moves
                     t = t + self._tick if self._gripper_still and lag < _HELD_ERROR else 0.0
                 else:
-                    at = segment.path.at(t)
+                    pace = segment.path.duration / segment.seconds
+                    at = segment.path.at(pace * t)
                     if np.abs(at - self._commanded()).max() < _HELD_ERROR and lag < _MAX_LAG:
                         t += self._tick
-                        at = segment.path.at(t)
+                        at = segment.path.at(pace * t)
                     wanted = at - self._commanded()
                 yield np.append(wanted, width)
         self.done = True
@@ -159,8 +163,7 @@ def pick_and_place(
         path = straight_line(kinematics, q, to, fingers_down(yaw), limits)
         require_inside_workspace(path, safety)
         q = path.at(path.duration)
-        path = replace(path, duration=max(path.duration, least))
-        return Segment(path, width, path.duration, until_supported)
+        return Segment(path, width, max(path.duration, least), until_supported)
 
     segments = [
         line(pick + up, opened),
