@@ -42,8 +42,9 @@ class Terminal:
                 typed = self._keyboard.read_keys()
             except (KeyboardInterrupt, UserError):  # Ctrl-C, or the terminal has gone
                 typed = " "
-            for request in (_KEY_REQUESTS.get(key, "") for key in typed):
-                if request and (request == "stop" or not self._request):
+            for key in typed:
+                request = _KEY_REQUESTS.get(key)
+                if request == "stop" or (request and not self._request):
                     self._request = request
         return self._request
 

@@ -82,7 +82,8 @@ def test_every_data_file_is_packaged() -> None:
         for path in (ROOT / "/".join(package.split(".")[1:])).glob(pattern)
     }
     there = {p.relative_to(ROOT) for f in ORDER for p in (ROOT / f).rglob("*") if p.is_file()}
-    assert {p for p in there if p.suffix not in (".py", ".pyc")} <= packaged
+    kept = {p for p in there if p.suffix != ".py" and "__pycache__" not in p.parts}
+    assert kept <= packaged
 
 
 def test_control_needs_no_torch() -> None:
