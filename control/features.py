@@ -1,4 +1,4 @@
-"""The one vocabulary: names, shapes and units of everything observed, commanded and recorded.
+"""Names, shapes and units of everything observed, commanded and recorded.
 
 The same keys name a quantity in the simulator, on the real arm, in an episode file and in a
 policy's input. SI units (metres, radians, newtons, seconds); quaternions are wxyz; the base frame
@@ -42,7 +42,7 @@ _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 
 @dataclass(frozen=True)
 class Feature:
-    """One column of the vocabulary: numpy dtype name, shape of one sample, component names."""
+    """One recorded or observed quantity: numpy dtype name, shape of one sample, component names."""
 
     dtype: str
     shape: tuple[int, ...]

@@ -25,7 +25,7 @@ from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
 from touchgoal.sim_envs.config import TaskConfig
 from touchgoal.sim_envs.experts.pick_place import Outcome
 from touchgoal.sim_envs.scene.filming import SceneRecorder
-from touchgoal.sim_envs.tasks import make_env, make_expert, task_name
+from touchgoal.sim_envs.tasks import make_env, make_expert
 
 
 @runtime_checkable
@@ -125,7 +125,7 @@ def to_episode(
         task=env.instruction(),
         meta=env.episode_info()
         | {
-            "task": task_name(env.config),
+            "task": env.task,
             "seed": spec.seed,
             "outcome": spec.outcome if success or asked_to_fail else "failure",
             "success": success,

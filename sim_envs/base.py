@@ -149,7 +149,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         }
 
     def scene_layout(self) -> dict[str, list[float]]:
-        """Where things are in the base frame, as plain numbers: the object's pose (m, wxyz)."""
+        """Positions in the base frame, as plain numbers: the object's pose (m, wxyz)."""
         return {"object": self.object_pose().tolist()}
 
     def scene(self, config: SceneConfig) -> mujoco.MjSpec:

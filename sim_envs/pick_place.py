@@ -63,9 +63,9 @@ class PickPlace(FrankaTactileEnv):
         return float((yaw + np.pi / 2) % np.pi - np.pi / 2)
 
     def rearrange(self) -> tuple[Observation, dict[str, Any]]:
-        """Another beginning with the same things, without the cost of a reset.
+        """Start again with the same objects, without the cost of a reset.
 
-        All things are moved over the table as they lie, to where they, the goal and the hand could
+        All objects are moved over the table as they lie, to where they, the goal and the hand could
         be after a reset, at rest.
         """
         rng, data = self.np_random, self.data

@@ -35,7 +35,9 @@ def run_programs(page: str) -> None:
 def test_a_task_of_ones_own(desk: Path) -> None:
     run_programs("own_task.md")
     episodes = EpisodeSet(desk / "my_episodes")
-    assert len(episodes) == 2 and all(episodes.meta(i)["success"] for i in range(2))
+    assert len(episodes) == 2
+    for i in range(2):
+        assert episodes.meta(i)["success"] and episodes.meta(i)["task"] == "lift"
 
 
 def test_a_sensor_of_ones_own(desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:

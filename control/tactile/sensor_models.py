@@ -34,7 +34,7 @@ class SensorModel:
         name: the id under which encoders and preprocessors know the sensor.
         image_shape: (rows, columns) of a frame.
         pixel_pitch: m of gel per pixel; square pixels.
-        pitch_range: m of gel per pixel, (least, most) that units and sources differ by.
+        pitch_range: m of gel per pixel, (least, most) among sensors of this model.
         gel_size: (along x, along y) of the gel, m.
         gel_thickness: m.
         case_size: (along x, along y, depth) of the housing, m.
@@ -44,7 +44,7 @@ class SensorModel:
         normal_stiffness: of the gel as a whole under a typical curved contact, N/m.
         shear_stiffness: of the gel as a whole, N/m.
         frame_rate: Hz.
-        sensor_file: folder with the colours of a typical unit (`control.tactile.sensor_calibration`).
+        sensor_file: folder with the calibration of a typical sensor (`control.tactile.sensor_calibration`).
         markers: dots printed on the gel, if any.
     """
 
@@ -141,7 +141,7 @@ SENSORS = {
 
 
 def find_sensor(name: str) -> SensorModel:
-    """A sensor model by name, or one unit of it by the folder that `touchgoal calibrate` wrote.
+    """A sensor model by name, or one sensor of it by the folder that `touchgoal calibrate` wrote.
 
     Raises:
         UserError: it is neither.
@@ -152,12 +152,12 @@ def find_sensor(name: str) -> SensorModel:
     if not folder.is_dir():
         known = ", ".join(SENSORS)
         raise UserError(f"{name} is no sensor and no folder; choose a sensor file or: {known}")
-    unit = load(folder)
-    if unit.sensor not in SENSORS:
-        raise UserError(f"{folder} is of an unknown sensor, {unit.sensor}")
-    pitch, shape = unit.pixel_pitch, unit.background.shape[:2]
+    own = load(folder)
+    if own.sensor not in SENSORS:
+        raise UserError(f"{folder} is of an unknown sensor, {own.sensor}")
+    pitch, shape = own.pixel_pitch, own.background.shape[:2]
     return replace(
-        SENSORS[unit.sensor],
+        SENSORS[own.sensor],
         image_shape=shape,
         pixel_pitch=pitch,
         pitch_range=(pitch, pitch),

@@ -1,4 +1,4 @@
-"""The bead maze's demonstrator: it sees the wire, and comes back to it when it is led astray."""
+"""The bead maze's demonstrator: it knows the wire, and comes back to it after a disturbance."""
 
 import numpy as np
 
@@ -36,9 +36,9 @@ class BeadMazeExpert:
         point, tangent = env.wire.at(s)
         off = bead - point
         turned = rotation_vector(fingers_across(tangent).T @ R)
-        astray = max(float(np.linalg.norm(off)), _LEVER * float(np.linalg.norm(turned)))
-        ahead = self._speed * tick * max(0.0, 1 - astray / _SLOW)
-        left = max(np.exp(-_RETURN * tick), 1 - _FASTEST * tick / max(astray, 1e-9))
+        deviation = max(float(np.linalg.norm(off)), _LEVER * float(np.linalg.norm(turned)))
+        ahead = self._speed * tick * max(0.0, 1 - deviation / _SLOW)
+        left = max(np.exp(-_RETURN * tick), 1 - _FASTEST * tick / max(deviation, 1e-9))
         point, tangent = env.wire.at(min(s + ahead, env.arc_length + _LEAD))
         R = fingers_across(tangent) @ rotation_matrix(left * turned)
         target = point + left * off - R @ grip

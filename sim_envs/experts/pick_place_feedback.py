@@ -1,4 +1,4 @@
-"""Pick and place as a law of the present state: what to do from wherever a learner has got to."""
+"""A pick-and-place expert that looks only at the current state: it can correct a policy anywhere."""
 
 import numpy as np
 from jaxtyping import Float
@@ -30,7 +30,7 @@ class FeedbackExpert:
 
     It follows a funnel over the object, and once it holds it, over the goal: the farther beside, the
     higher. What it does depends on nothing but how the episode began and what can be sensed of the
-    present tick and the one before, so a learner that sees as much can do the same. An object
+    present tick and the one before, so a policy that observes as much can do the same. An object
     that is pushed away it does not follow, and it never lets go.
     """
 
@@ -63,7 +63,7 @@ class FeedbackExpert:
         change = velocity - pace
         change *= min(1.0, _ACCELERATION / hz / max(float(np.linalg.norm(change)), 1e-9))
         turn = float(np.clip(_RETURN * turn, -_TURN, _TURN)) / hz
-        # A learner may have led the arm to where nothing is in reach: the nearest place will do.
+        # A policy may have led the arm to where nothing is in reach: the nearest place will do.
         solution = env.kinematics.solve_ik_near(
             here + (pace + change) / hz, fingers_down(yaw + turn), env.command
         )

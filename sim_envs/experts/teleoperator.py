@@ -1,14 +1,13 @@
-"""A person who leads the bead with keys, as one who leads a compliant arm by the hand does.
+"""A person who leads the bead with keys, as if guiding a compliant arm by hand.
 
-A key pushes the hand; the arm gives way to what the wire does to the bead. So the person says where
-to, and the wire where exactly.
+A key pushes the hand; the arm gives way to the forces of the wire on the bead. So the person gives the
+direction, and the wire the exact path.
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from touchgoal.control import features as ft
+from touchgoal.control.option_types import NotNegative, Positive, checked_dataclass
 from touchgoal.control.motion.rotations import rotation_matrix
 from touchgoal.sim_envs.base import Observation
 from touchgoal.sim_envs.bead_maze import BeadMaze
@@ -26,24 +25,21 @@ _PUSHES = {
 }
 
 
-@dataclass(frozen=True)
+@checked_dataclass
 class TeleoperatorConfig:
-    """How hand and keys respond.
+    """How the hand follows the keys, and gives way to what it meets."""
 
-    Attributes:
-        speed, turn_speed: m/s and rad/s at which a key moves and turns the free hand.
-        compliance: m/s by which the hand gives way to a force, per N.
-        rotational_compliance: rad/s by which it gives way to a torque, per N m.
-        hold_seconds: s for which a key counts as held after it was typed. A terminal tells of no releases; it
-            repeats a held key after some 0.4 s, and only the last one. Two keys typed in turn push
-            together.
-    """
-
-    speed: float = 0.025
-    turn_speed: float = 0.5
-    compliance: float = 2e-3
-    rotational_compliance: float = 2.0
-    hold_seconds: float = 0.5
+    speed: Positive = 0.025
+    """Speed at which a key moves the free hand, m/s."""
+    turn_speed: Positive = 0.5
+    """Speed at which a key turns the free hand, rad/s."""
+    compliance: NotNegative = 2e-3
+    """Speed by which the hand gives way to a force, m/s per N."""
+    rotational_compliance: NotNegative = 2.0
+    """Speed by which the hand gives way to a torque, rad/s per N m."""
+    hold_seconds: Positive = 0.5
+    """How long a typed key counts as held, s. A terminal does not report that a key was released; it
+    repeats a held one after about 0.4 s, and only the last of several."""
 
 
 class Teleoperator:

@@ -289,7 +289,7 @@ def _add_body(spec: mujoco.MjSpec, body: Body) -> None:
         assert body.hull is not None
         spec.add_mesh(name=body.name, uservert=body.hull.ravel().tolist())
         shape = {"meshname": body.name}
-    # Round things get rolling friction (condim 6), or they never come to rest on the table.
+    # Round objects get rolling friction (condim 6), or they never come to rest on the table.
     rolls = kind.shape in ("sphere", "capsule")
     soft = kind.material.foundation_modulus < FIRM
     item.add_geom(

@@ -1,4 +1,4 @@
-"""Pictures for people: the scene with the robot's full meshes, beside what the fingers feel."""
+"""Pictures for people: the scene with the robot's full meshes, beside the touch pictures."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Things to grasp: shapes, materials that the pads can feel, and the catalogue of both."""
+"""Objects to grasp: shapes, materials, and the catalogue of both."""
 
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -108,7 +108,7 @@ def _material(
 
 _S, _RI, _D, _RO, _W = Texture.SMOOTH, Texture.RIBBED, Texture.DOTTED, Texture.ROUGH, Texture.WOVEN
 
-# Each can be felt: no smooth flat face here, for one larger than the gel presses it evenly, and a
+# Each shows in touch: no smooth flat face here, for one larger than the gel presses it evenly, and a
 # GelSight, which sees slopes, shows nothing.
 CATALOGUE: dict[str, ObjectKind] = {
     kind.name: kind

@@ -1,7 +1,7 @@
 """From the gel's surface to what the sensor's camera sees.
 
-The colours change with the surface's slopes and shadows as the unit's calibration says. They are
-computed at half the image's resolution, where the surface is, and blended onto the unit's own
+The colours change with the surface's slopes and shadows as the sensor's calibration says. They are
+computed at half the image's resolution, where the surface is, and blended onto the sensor's own
 background and noise. Heights are metres into the gel.
 """
 

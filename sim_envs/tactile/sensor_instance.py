@@ -22,7 +22,7 @@ COUNT_STEP = 1 / 16  # counts: fine enough, and small enough numbers for the pro
 
 @dataclass(frozen=True)
 class SensorInstance:
-    """One sensor as it came from the factory.
+    """One simulated sensor: its sensor file, varied as two of a model differ.
 
     Attributes:
         calibration: what its lights make of its gel's shape.
@@ -49,7 +49,7 @@ class SensorInstance:
 def sample_instance(
     sensor: SensorModel, rng: np.random.Generator, randomization: SensorRandomization | None = None
 ) -> SensorInstance:
-    """A unit of a model, as the sensor file and the spread between units say.
+    """Draw one sensor of a model: its sensor file, varied by the randomization.
 
     Raises:
         UserError: if the model's sensor file is missing or damaged.
