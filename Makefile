@@ -48,7 +48,8 @@ build: $(READY)
 	.venv-wheel/bin/pip install -c constraints.txt "$$(echo dist/*.whl)[towers,franka,dev]"
 	tar -xzf dist/*.tar.gz -C dist
 	cd dist/touchgoal-*/ && rm -r src && ../../.venv-wheel/bin/python -m pytest -n auto \
-		-m "not slow and not realtime" --ignore tests/test_layout.py
+		-m "not slow and not realtime" --ignore tests/test_layout.py \
+		--ignore tests/test_results.py --ignore tests/test_documented_commands.py
 
 # How the shipped touch encoder was made: about 25 minutes on 2 cores.
 weights: $(READY)

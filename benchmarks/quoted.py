@@ -1,0 +1,117 @@
+"""What README and docs quote: the command of every figure, and its figure in one line."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from touchgoal.policies.evaluation.success_rate import SuccessRate
+
+Metrics = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Quoted:
+    """One measurement.
+
+    Attributes:
+        command: as a user types it.
+        claim: what README's table says was measured; "" keeps it out of that table.
+        headline: the figure of that row, from what the command wrote to metrics.json.
+    """
+
+    command: str
+    claim: str = ""
+    headline: Callable[[Metrics], str] = lambda metrics: ""
+
+
+def _successes(metrics: Metrics) -> str:
+    return f"{SuccessRate(metrics['successes'], metrics['trials'])} (95 % Wilson)"
+
+
+def _maze(metrics: Metrics) -> str:
+    trials = metrics["closed_loop"]
+    shuffled = next(name for name in trials if name.endswith(", shuffled"))
+    own, other = (
+        SuccessRate(sum(t["success"] for t in trials[name]), len(trials[name]))
+        for name in (shuffled.removesuffix(", shuffled"), shuffled)
+    )
+    return f"{own}; with the touch of another wire {other}"
+
+
+def _auc(metrics: Metrics) -> str:
+    drop = metrics["auc"]["drop"]
+    return f"{drop['image']:.2f} by image, {drop['image+tactile']:.2f} by image and touch"
+
+
+def _median_rate(start: str, unit: str) -> Callable[[Metrics], str]:
+    def headline(metrics: Metrics) -> str:
+        rates = [row["median"] for row in metrics["rows"] if row["what"].startswith(start)]
+        return f"{min(rates):,.0f} to {max(rates):,.0f} {unit}"
+
+    return headline
+
+
+def _plan(metrics: Metrics) -> str:
+    stage = next(s for s in metrics["stages"] if s["what"].startswith("a whole plan"))
+    return f"{stage['median']:.1f} ms, {stage['p95']:.1f} ms at the 95th percentile"
+
+
+def _realism(metrics: Metrics) -> str:
+    def median(sensor: str, method: str) -> float:
+        psnr = sorted(
+            row["psnr_near"]
+            for row in metrics["rows"]
+            if (row["sensor"], row["method"]) == (sensor, method)
+        )
+        return psnr[len(psnr) // 2]
+
+    ours, taxim = "ours, circles corrected", "taxim table, on our background"
+    return "; ".join(
+        f"{name} {median(sensor, ours):.1f} dB (Taxim's table {median(sensor, taxim):.1f})"
+        for name, sensor in (("GelSight", "gelsight"), ("Mini", "gelsight_mini"))
+    )
+
+
+QUOTED = {
+    "pick-place": Quoted(
+        "touchgoal run-policy --episodes 100",
+        "the shipped policy picks and places, of 100 scenes it has not seen",
+        _successes,
+    ),
+    "pick-place-expert": Quoted(
+        "touchgoal run-policy --episodes 100 --policy expert",
+        "the scripted expert, which sees the simulator's state",
+        _successes,
+    ),
+    "bead-maze": Quoted(
+        "touchgoal benchmark bead-maze --held-out 40",
+        "the shipped policy leads a bead along wires it has not seen, by touch alone",
+        _maze,
+    ),
+    "reward-quality": Quoted(
+        "touchgoal benchmark reward-quality",
+        "the last cost tells a success from a dropped object (area under ROC)",
+        _auc,
+    ),
+    "tactile-realism": Quoted(
+        "touchgoal benchmark tactile-realism",
+        "simulated pictures of real presses that the fit has not seen",
+        _realism,
+    ),
+    "tactile-speed": Quoted(
+        "touchgoal benchmark tactile-speed",
+        "tactile pictures of a ball, 240 x 320, all stages, one core",
+        _median_rate("240x320 ball", "frames/s"),
+    ),
+    "env-speed": Quoted(
+        "touchgoal benchmark env-speed",
+        "steps of the environment with both tactile pictures, one core",
+        _median_rate("env step (50 physics steps), two tactile images, holding", "per second"),
+    ),
+    "policy-latency": Quoted(
+        "touchgoal benchmark policy-latency",
+        "from an observation to the maze policy's plan, one core (a tick has 50 ms)",
+        _plan,
+    ),
+    "faults": Quoted("touchgoal benchmark faults"),
+}
