@@ -5,10 +5,9 @@ wires and the same starts. Open loop: see `policies/evaluation/open_loop.py`, al
 test wires that nothing disturbs unless asked.
 """
 
-import os
 import tempfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from touchgoal.control.errors import UserError
+from touchgoal.benchmarks.config import BeadMazeOptions
 from touchgoal.episodes.recording import Actor, EpisodeSpec, collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
@@ -41,28 +40,6 @@ from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.scene.wires import HELD_OUT, Wire, choose
 
 FIRST_SEED = 4_000_000
-
-
-@dataclass(frozen=True)
-class Config:
-    """Options of benchmark bead-maze."""
-
-    out: Path | None = None
-    """Folder of the run."""
-    policies: tuple[Path, ...] = (SHIPPED["bead-maze"],)
-    """Policies that train-policy made; those of one recipe count as seeds of one arm."""
-    wires: int = 100
-    """Test wires of the families trained on."""
-    held_out: int = 20
-    """Test wires of the family held out; none leaves it out."""
-    demonstrations: int = 20
-    """Test wires on which open-loop errors are measured."""
-    latencies: tuple[int, ...] = (1, 2)
-    """Ticks by which plans come late, tried besides 0 on the first policy."""
-    maze: BeadMazeConfig = field(default_factory=lambda: BeadMazeConfig(split="test"))
-    """Options of the maze, e.g. a disturbance; demonstrations are recorded with the same."""
-    workers: int = os.cpu_count() or 1
-    """Processes that simulate."""
 
 
 class ShuffledTouchPlanner(Planner):
@@ -116,16 +93,13 @@ def _specs(wires: list[Wire], seed: int) -> list[EpisodeSpec]:
     return [EpisodeSpec(seed + i, options={"wire": w.name}) for i, w in enumerate(wires)]
 
 
-def run(config: Config) -> dict[str, Any]:
+def run(config: BeadMazeOptions) -> dict[str, Any]:
     """Open loop, then closed loop.
 
     Returns:
         `table`, and the numbers behind it.
     """
-    if config.demonstrations < 2:
-        raise UserError("the baselines need at least 2 demonstrations")
-    if not config.policies:
-        raise UserError("name at least one policy folder with --policies")
+    config = replace(config, policies=config.policies or (SHIPPED["bead-maze"],))
     arms = _group_by_recipe(config.policies)
     with tempfile.TemporaryDirectory() as folder:
         recorded = _record(config, Path(folder) / "episodes")
@@ -159,9 +133,9 @@ def _group_by_recipe(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
 
 
 def _closed_loop(
-    config: Config, arms: dict[str, list[Path]], recorded: EpisodeSet
+    config: BeadMazeOptions, arms: dict[str, list[Path]], recorded: EpisodeSet
 ) -> dict[str, list[Trial]]:
-    maze = config.maze
+    maze = config.env
     blind = replace(maze, tactile=False)
     jobs = _specs(choose(maze.split, config.wires, maze.families), FIRST_SEED)
     other = _specs(choose(maze.split, config.held_out, (HELD_OUT,)), FIRST_SEED + 10_000)
@@ -228,9 +202,9 @@ def bootstrap(values: list[tuple[str, float]], draws: int = 5000) -> tuple[float
 # ---- open loop
 
 
-def _record(config: Config, root: Path) -> EpisodeSet:
+def _record(config: BeadMazeOptions, root: Path) -> EpisodeSet:
     """Expert demonstrations, on test wires and undisturbed unless other options are chosen."""
-    maze = config.maze
+    maze = config.env
     wires = choose(maze.split, config.demonstrations, maze.families)
     collect(root, maze, _specs(wires, FIRST_SEED), config.workers)
     return EpisodeSet(root)

@@ -1,14 +1,14 @@
 """How fast the simulated cell runs on one core: physics, and whole environment steps."""
 
 import os
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import mujoco
 import numpy as np
 
+from touchgoal.benchmarks.config import EnvSpeedOptions
 from touchgoal.benchmarks.speed import Row, measure, one_core, table
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
@@ -20,21 +20,7 @@ NO_MOTION = np.zeros(8)
 TICKS_UNTIL_HELD = 70  # ticks after which the expert holds the object in the air
 
 
-@dataclass(frozen=True)
-class Config:
-    """Options of env-speed."""
-
-    out: Path | None = None
-    """Folder of the run."""
-    repeats: int = 7
-    """Measurements of each figure; the median is printed."""
-    physics_steps: int = 5000
-    """Steps of one measurement of the physics."""
-    env_steps: int = 40
-    """Ticks of one measurement of the environment."""
-
-
-def run(config: Config) -> dict[str, Any]:
+def run(config: EnvSpeedOptions) -> dict[str, Any]:
     """Measure everything on one core; wall-clock time."""
     os.environ["LP_NUM_THREADS"] = "0"  # software OpenGL draws in this thread
     cv2.setNumThreads(1)
@@ -46,7 +32,7 @@ def run(config: Config) -> dict[str, Any]:
     }
 
 
-def _physics(config: Config) -> list[Row]:
+def _physics(config: EnvSpeedOptions) -> list[Row]:
     n = config.physics_steps
     peer = mujoco.MjModel.from_xml_string(_franky_sim_model())
     peer_data = mujoco.MjData(peer)
@@ -62,7 +48,7 @@ def _physics(config: Config) -> list[Row]:
     return rows
 
 
-def _env(config: Config) -> list[Row]:
+def _env(config: EnvSpeedOptions) -> list[Row]:
     n = config.env_steps
     rows = []
     both = ["soda_can", "pebble"]  # a primitive and a mesh
@@ -88,7 +74,7 @@ def _env(config: Config) -> list[Row]:
     return rows
 
 
-def _maze(config: Config) -> list[Row]:
+def _maze(config: EnvSpeedOptions) -> list[Row]:
     """The bead held on a wire."""
     rows = []
     for what, tactile in (("physics alone", False), ("two tactile images", True)):
@@ -125,5 +111,7 @@ def _franky_sim_model() -> str:
     return spec.to_xml()
 
 
-def _rate(what: str, config: Config, n: int, model: mujoco.MjModel, data: mujoco.MjData) -> Row:
+def _rate(
+    what: str, config: EnvSpeedOptions, n: int, model: mujoco.MjModel, data: mujoco.MjData
+) -> Row:
     return measure(what, config.repeats, n, lambda: mujoco.mj_step(model, data, nstep=n))

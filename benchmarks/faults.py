@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from touchgoal.benchmarks.config import FaultsOptions
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import CellConfig
@@ -44,18 +45,6 @@ _TIMEOUT = 300.0  # s for anything to happen, on a machine however loaded
 _UNLIMITED = resource.RLIM_INFINITY
 _FORKSERVER = multiprocessing.get_context("forkserver")  # one import of everything serves every row
 _FORKSERVER.set_forkserver_preload([__name__])
-
-
-@dataclass(frozen=True)
-class Config:
-    """Options of faults."""
-
-    out: Path | None = None
-    """Folder of the run."""
-    faults: tuple[str, ...] = ()
-    """Which rows; default: all."""
-    lock_step: bool = True
-    """Simulated time waits for the client: for a machine that is busy."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +104,7 @@ class FaultRow:
     late: float
 
 
-def run(config: Config) -> dict[str, Any]:
+def run(config: FaultsOptions) -> dict[str, Any]:
     """The table and its numbers."""
     names = [case.name for case in CASES]
     if unknown := [name for name in config.faults if name not in names]:

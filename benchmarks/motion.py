@@ -2,13 +2,13 @@
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from touchgoal.benchmarks.config import MotionOptions
 from touchgoal.benchmarks.speed import one_core
 from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import JointLimits
@@ -21,20 +21,6 @@ Joints = Float[np.ndarray, " n"]
 NEAR = 0.2  # rad, farthest that a joint is from the solution at the start
 _EDGE = 0.05  # rad from its limit in which a joint counts as near it
 _CANDIDATES = 50  # postures of which the one nearest to a singularity is taken
-
-
-@dataclass(frozen=True)
-class Config:
-    """Options of motion."""
-
-    out: Path | None = None
-    """Folder of the run."""
-    poses: int = 2000
-    """Poses for each arm's inverse kinematics."""
-    moves: int = 200
-    """Moves of each arm between random postures."""
-    seed: int = 0
-    """Random seed of poses and moves."""
 
 
 def near_tasks(
@@ -59,7 +45,7 @@ def near_tasks(
         yield q, np.clip(q + rng.uniform(-NEAR, NEAR, q.size), lower, upper)
 
 
-def run(config: Config) -> dict[str, Any]:
+def run(config: MotionOptions) -> dict[str, Any]:
     """Solve poses and time moves of both arms, on one core."""
     rows, lines = [], []
     with one_core():
@@ -71,7 +57,7 @@ def run(config: Config) -> dict[str, Any]:
     return {"rows": rows, "table": "\n".join(lines)}
 
 
-def _inverse(robot: RobotLimits, config: Config) -> dict[str, Any]:
+def _inverse(robot: RobotLimits, config: MotionOptions) -> dict[str, Any]:
     kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
     reached, seconds = 0, []
     for q, start in near_tasks(kinematics, config.poses, np.random.default_rng(config.seed)):
@@ -87,7 +73,7 @@ def _inverse(robot: RobotLimits, config: Config) -> dict[str, Any]:
     }
 
 
-def _moves(robot: RobotLimits, config: Config) -> list[dict[str, Any]]:
+def _moves(robot: RobotLimits, config: MotionOptions) -> list[dict[str, Any]]:
     """Our joint moves over ruckig's for the same constant limits."""
     rows = []
     for name, limits in (("maker's", robot.interface), ("policy's", robot.policy)):

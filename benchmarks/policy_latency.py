@@ -7,12 +7,12 @@ weights here: they are timed, not used.
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from touchgoal.benchmarks.config import PolicyLatencyOptions
 from touchgoal.benchmarks.speed import one_core
 from touchgoal.control import features as ft
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
@@ -33,22 +33,6 @@ _VITS = {
 
 
 @dataclass(frozen=True)
-class Config:
-    """Options of benchmark policy-latency."""
-
-    out: Path | None = None
-    """Folder of the run."""
-    policy: Path = SHIPPED["bead-maze"]
-    """A policy that train-policy made."""
-    repeats: int = 200
-    """Plans timed."""
-    large_repeats: int = 5
-    """Runs of each network of a published size; 0 leaves them out."""
-    control_hz: int = ft.CONTROL_HZ
-    """Ticks per second that the plan has to fit."""
-
-
-@dataclass(frozen=True)
 class Stage:
     """Times of one stage, ms."""
 
@@ -58,7 +42,7 @@ class Stage:
     slowest: float
 
 
-def run(config: Config) -> dict[str, Any]:
+def run(config: PolicyLatencyOptions) -> dict[str, Any]:
     """Time all stages on one core; `table` and the numbers behind it."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -74,10 +58,11 @@ def run(config: Config) -> dict[str, Any]:
     return {"table": "\n".join(lines), "stages": [asdict(s) for s in stages]}
 
 
-def _stages(config: Config) -> list[Stage]:
-    maker = SavedPolicy(config.policy)
+def _stages(config: PolicyLatencyOptions) -> list[Stage]:
+    folder = config.policy or SHIPPED["bead-maze"]
+    maker = SavedPolicy(folder)
     planner = maker.planner()
-    policy = checkpoint.load(config.policy)
+    policy = checkpoint.load(folder)
     ticks = _observations(policy.config, maker.env_config(EnvConfig()).camera_size)
     stages = []
     if planner.touch is not None:
@@ -115,7 +100,7 @@ def _stages(config: Config) -> list[Stage]:
     return stages
 
 
-def _published(config: Config) -> list[Stage]:
+def _published(config: PolicyLatencyOptions) -> list[Stage]:
     if config.large_repeats == 0:
         return []
     generator = torch.Generator().manual_seed(0)

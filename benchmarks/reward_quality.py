@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from touchgoal.benchmarks.config import RewardQualityOptions
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.recording import EpisodeSpec, collect
@@ -57,20 +58,6 @@ _GOALS, _TESTS = FIRST_SEED, FIRST_SEED + 100_000
 
 
 @dataclass(frozen=True)
-class Config:
-    """Options of reward-quality."""
-
-    out: Path | None = None
-    """Folder of the run."""
-    encoder: Path = pretrained.SHIPPED
-    """Folder of the touch encoder."""
-    episodes: int = 20
-    """Held-out episodes of each outcome."""
-    workers: int = 2
-    """Processes that simulate."""
-
-
-@dataclass(frozen=True)
 class HeldOutEpisode:
     """One held-out episode, measured against three kinds of goal.
 
@@ -86,11 +73,12 @@ class HeldOutEpisode:
     other: Curves
 
 
-def run(config: Config) -> dict[str, Any]:
+def run(config: RewardQualityOptions) -> dict[str, Any]:
     """Record, measure, judge."""
-    encoder = pretrained.load_aligned(config.encoder)
+    directory = config.encoder or pretrained.SHIPPED
+    encoder = pretrained.load_aligned(directory)
     embedder = EpisodeEmbedder(load_towers(encoder.config.towers), encoder)
-    scale = DistanceNormalizer.load(config.encoder / "scale.json")
+    scale = DistanceNormalizer.load(directory / "scale.json")
     with tempfile.TemporaryDirectory() as folder:
         tests = record_and_measure(config, embedder, scale, Path(folder))
     successes = [t for t in tests if t.outcome == "success"]
@@ -117,7 +105,7 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def record_and_measure(
-    config: Config, embedder: EpisodeEmbedder, scale: DistanceNormalizer, folder: Path
+    config: RewardQualityOptions, embedder: EpisodeEmbedder, scale: DistanceNormalizer, folder: Path
 ) -> list[HeldOutEpisode]:
     """Simulate goal and test episodes and measure each test."""
     names = [list(CATALOGUE)[i % len(CATALOGUE)] for i in range(config.episodes)]

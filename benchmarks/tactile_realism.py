@@ -6,21 +6,22 @@ of them. Everything about the model was chosen on the fitted presses of the firs
 """
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict
 from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Float32
-from tqdm import tqdm
 
+from touchgoal.benchmarks.config import TactileRealismOptions
 from touchgoal.benchmarks.taxim_peer import PIXEL_PITCH, TaximRenderer, has_jax, real_presses
 from touchgoal.control.calibration.calibrate import FittedCalibration, fit
 from touchgoal.control.calibration.picture_errors import mean_errors, picture_errors
 from touchgoal.control.calibration.pictures import side_by_side
 from touchgoal.control.calibration.press_fit import REGION
 from touchgoal.control.calibration.press_set import PressSet, split, write_presses
+from touchgoal.control.errors import install_extra
+from touchgoal.control.progress import track
 
 N_TEST_PRESSES = {"gelsight": 12, "gelsight_mini": 6}
 MAIN_METHOD = "ours, circles corrected"
@@ -42,21 +43,7 @@ _EXAMPLES_PER_SENSOR = 2  # of each sensor
 Colours = Float32[np.ndarray, "h w 3"]
 
 
-@dataclass(frozen=True)
-class Config:
-    """Options of tactile-realism."""
-
-    out: Path | None = None
-    """Folder of the run."""
-    splits: int = 5
-    """Ways to part the presses, by seed; the median over them is printed."""
-    sensors: tuple[str, ...] = ("gelsight", "gelsight_mini")
-    """Which of these."""
-    presses: Path | None = None
-    """Also write the real presses into this folder, as `touchgoal calibrate` reads them."""
-
-
-def run(config: Config) -> dict[str, Any]:
+def run(config: TactileRealismOptions) -> dict[str, Any]:
     """Fit, predict, compare."""
     cv2.setNumThreads(1)
     rows: list[dict[str, Any]] = []
@@ -67,7 +54,7 @@ def run(config: Config) -> dict[str, Any]:
         if config.presses is not None:
             write_presses(presses, config.presses / sensor)
         taxim = TaximRenderer(sensor) if has_jax() else None
-        for seed in tqdm(range(config.splits), desc=sensor, unit="split"):
+        for seed in track(range(config.splits), sensor, "split"):
             train, test = split(presses, N_TEST_PRESSES[sensor], seed)
             fitted = fit(train, PIXEL_PITCH, sensor)
             for method, simulated in _methods(sensor, fitted, train, test, taxim):
@@ -78,7 +65,7 @@ def run(config: Config) -> dict[str, Any]:
                     lights[sensor] = fitted.calibration.light_azimuths
     lines = [_table(rows), _LEGEND, "", _light_table(lights), "", *_verdicts(rows, lights)]
     if not has_jax():
-        lines.append("taxim's pictures are left out: pip install 'touchgoal[peers]'")
+        lines.append(f"taxim's pictures are left out; to compare: {install_extra('peers')}")
     return {
         "rows": rows,
         "light_azimuths": lights,

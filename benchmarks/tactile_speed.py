@@ -3,16 +3,17 @@
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any, no_type_check
 
 import cv2
 import numpy as np
 from numba import njit
 
+from touchgoal.benchmarks.config import TactileSpeedOptions
 from touchgoal.benchmarks.speed import Row, measure, one_core, table
 from touchgoal.benchmarks.taxim_peer import has_jax, has_taxim
+from touchgoal.control.errors import install_extra
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS, SensorModel
 from touchgoal.sim_envs.config import NO_RANDOMIZATION
 from touchgoal.sim_envs.scene.objects import CATALOGUE, HARD, Body, Material, ObjectKind, Texture
@@ -26,19 +27,7 @@ FRAME_BYTES = 19_200 * 4 * 45 + 76_800 * 3 * (2 + 1 + 1 + 2)
 _TEXTURED = Material(Texture.DOTTED, 40e-6, 1.5e-3, HARD, 0.8, (0.7, 0.7, 0.7, 1.0))
 
 
-@dataclass(frozen=True)
-class Config:
-    """Options of tactile-speed."""
-
-    out: Path | None = None
-    """Folder of the run."""
-    repeats: int = 7
-    """Measurements of each figure; the median is printed."""
-    frames: int = 100
-    """Frames of one measurement."""
-
-
-def run(config: Config) -> dict[str, Any]:
+def run(config: TactileSpeedOptions) -> dict[str, Any]:
     """Measure everything on one core. Processor time, which busy neighbours distort least."""
     cv2.setNumThreads(1)
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
@@ -48,7 +37,7 @@ def run(config: Config) -> dict[str, Any]:
     return {"rows": [vars(row) for row in rows], **limits, "table": _table(rows, limits)}
 
 
-def _ours(config: Config) -> list[Row]:
+def _ours(config: TactileSpeedOptions) -> list[Row]:
     full = GELSIGHT_MINI_MARKERS
     half = replace(full, image_shape=(120, 160), pixel_pitch=2 * full.pixel_pitch)
     rows = []
@@ -113,10 +102,10 @@ def _sphere_points(n: int) -> np.ndarray:
     return np.stack([across * np.cos(turn), across * np.sin(turn), z], 1)
 
 
-def _peer(config: Config) -> list[Row]:
+def _peer(config: TactileSpeedOptions) -> list[Row]:
     """Taxim's JAX port, where it is installed, with its own Mini calibration and a ball."""
     if not (has_taxim() and has_jax()):
-        print("no peer: pip install 'touchgoal[peers]' to measure taxim beside us")
+        print(f"no peer; to measure taxim beside us: {install_extra('peers')}")
         return []
     from taxim import CALIB_GELSIGHT_MINI, Taxim  # pyright: ignore[reportMissingImports]
 
@@ -138,7 +127,7 @@ def _peer(config: Config) -> list[Row]:
 
 def _measure(
     what: str,
-    config: Config,
+    config: TactileSpeedOptions,
     work: Callable[[], object],
     clock: Callable[[], float] = time.thread_time,
 ) -> Row:
@@ -151,7 +140,7 @@ def _measure(
     return measure(what, config.repeats, config.frames, frames, clock)
 
 
-def _limits(config: Config) -> dict[str, float]:
+def _limits(config: TactileSpeedOptions) -> dict[str, float]:
     """What this core can do at best, and how many frames a second that would be."""
     copied = max(_copy_rate(config, offset) for offset in (0, 16, 1024))
     flop = _measure("fma", replace(config, frames=20), _multiply_and_add).median * _FMA_FLOP
@@ -163,7 +152,7 @@ def _limits(config: Config) -> dict[str, float]:
     }
 
 
-def _copy_rate(config: Config, offset: int) -> float:
+def _copy_rate(config: TactileSpeedOptions, offset: int) -> float:
     """Bytes read and written a second by copies of 256 kB, as large as a frame's arrays.
 
     Where the two arrays lie to each other changes it tenfold on some machines: the best counts.

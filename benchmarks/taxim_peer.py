@@ -14,7 +14,7 @@ from jaxtyping import Float32, UInt8
 
 from touchgoal.control.calibration.ball import Circle
 from touchgoal.control.calibration.press_set import PressSet
-from touchgoal.control.errors import UserError
+from touchgoal.control.errors import UserError, install_extra
 
 PIXEL_PITCH = 0.059e-3
 """m per pixel of the presses here: half of the wheel's 640x480 at 0.0295 mm (its params.json)."""
@@ -33,7 +33,7 @@ def real_presses(sensor: str) -> PressSet:
     """
     spec = importlib.util.find_spec("taxim")
     if spec is None or spec.origin is None:
-        raise UserError("the real presses ship with a peer: pip install 'touchgoal[peers]'")
+        raise UserError(f"the real presses ship with a peer: {install_extra('peers')}")
     pack = np.load(Path(spec.origin).parent / "calib" / sensor / "dataPack.npz", allow_pickle=True)
     images = np.stack([_downsample(image) for image in pack["imgs"]])
     # The centre of pixel 0 is 0 at both sizes; two pixels 0 and 1 become one.

@@ -1,4 +1,6 @@
-"""The one exception a user's mistake raises."""
+"""The one exception a user's mistake raises, and what its messages advise."""
+
+from pathlib import Path
 
 
 class UserError(ValueError):
@@ -6,3 +8,15 @@ class UserError(ValueError):
 
     Commands print the message and exit with 1; anything else is a bug and keeps its traceback.
     """
+
+
+def install_extra(extra: str) -> str:
+    """The command that installs one of our optional parts, for messages.
+
+    touchgoal is on no package index, so it names the clone that this code runs from; an installed
+    wheel does not know its clone.
+    """
+    root = Path(__file__).resolve().parents[1]
+    if (root / "pyproject.toml").is_file():
+        return f"pip install -e '{root}[{extra}]'"
+    return f"in the clone of touchgoal: pip install '.[{extra}]'"

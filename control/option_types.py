@@ -68,7 +68,8 @@ def checked_dataclass(cls: Class) -> Class:
         try:
             initialise(self, *args, **kwargs)
         except ValidationError as error:
-            raise OptionError(cls.__name__, [_problem(e) for e in error.errors()]) from None
+            problems = dict(reversed([_problem(e) for e in error.errors()]))  # one a field
+            raise OptionError(cls.__name__, list(problems.items())) from None
 
     made.__init__ = checked
     return made

@@ -1,56 +1,114 @@
 """The `touchgoal` command: `touchgoal COMMAND --help`."""
 
 import importlib
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from difflib import get_close_matches
+from typing import Any
 
-import tyro
-
+from touchgoal import __version__
 from touchgoal.control.errors import UserError
+from touchgoal.control.interruption import Terminated, terminable
 
 COMMANDS = {
-    "demo": "the main job, end to end, on the shipped weights",
+    "demo": "pick an object up in simulation, and draw how near it comes to its goal",
     "doctor": "what this machine can do, and how to mend what is missing",
-    "collect-demos": "record expert episodes of a task, or failures to order",
+    "list": "objects, sensors, tasks, policies, encoders and benchmarks by name",
+    "collect-demos": "record an expert's episodes of a task, or failures on purpose",
     "teleop": "lead the bead along a wire with keys, and record it",
     "train-encoder": "train a touch encoder",
-    "train-estimators": "train what reads contact in touch and a scene in pictures",
+    "train-estimators": "train networks that tell contact from touch and poses from pictures",
     "train-policy": "train a policy on recorded episodes",
-    "train-policy-paper": "the same with the published network, sampler and actions",
+    "train-policy-paper": "the same with the network, sampler and actions that Sparsh publishes",
     "run-policy": "run a policy in a task: success rate, video",
-    "reward-curves": "dense cost and reward curves for episodes or plain videos",
-    "calibrate": "fit a sensor's light and gel to ball presses",
+    "reward-curves": "costs and rewards along episodes or plain videos",
+    "calibrate": "fit a sensor's light and gel to presses of a ball",
     "deploy": "run a policy on an arm or on the twin, with safety and recording",
     "twin": "serve the simulated cell over the wire protocols of real ones",
     "repair": "check a set of episodes and mend what an interruption left",
     "benchmark": "print one table of measured figures",
+    "completion": "print a script that completes commands and options in a shell",
 }
 
 
 def usage() -> str:
     """What `touchgoal --help` prints."""
     lines = [f"  {name:<20}{meaning}" for name, meaning in COMMANDS.items()]
-    return "usage: touchgoal COMMAND [options]\n\ncommands:\n" + "\n".join(lines)
+    return (
+        "usage: touchgoal COMMAND [options]\n       touchgoal COMMAND --help\n"
+        "       touchgoal --version\n\ncommands:\n" + "\n".join(lines)
+    )
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run one command; a user's mistake is one line on stderr and exit code 1."""
+    """Run one command.
+
+    A user's mistake is one line on stderr and exit code 1 (2 if tyro finds it); Ctrl-C exits with
+    130 and SIGTERM with 143, after a line that says what was kept.
+    """
     arguments = sys.argv[1:] if argv is None else argv
-    if not arguments or arguments[0] in ("-h", "--help"):
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(usage())
-        return
-    name, *rest = arguments
-    if name not in COMMANDS:
-        sys.exit(f"touchgoal: there is no command {name!r}\n\n{usage()}")
+    elif arguments[0] in ("-V", "--version", "version"):
+        print(f"touchgoal {__version__}")
+    elif arguments[0] not in COMMANDS:
+        sys.exit(_unknown(arguments[0]))
+    else:
+        with _recorded_as(arguments), terminable():
+            _run(*arguments)
+
+
+def _run(name: str, *options: str) -> None:
+    prog = f"touchgoal {name}"
     try:
-        module = importlib.import_module(f"touchgoal.launch.{name.replace('-', '_')}")
-        config = tyro.cli(
-            module.Config, args=rest, prog=f"touchgoal {name}", description=module.__doc__
-        )
+        module, config = read_options(name, list(options))
         module.main(config)
     except UserError as error:
-        sys.exit(f"touchgoal {name}: {error}")
-    except KeyboardInterrupt:
-        sys.exit(130)
+        sys.exit(f"{prog}: {error}")
+    except KeyboardInterrupt as interruption:
+        stopped = "; ".join(["stopped", *getattr(interruption, "__notes__", [])])
+        print(f"\n{prog}: {stopped}", file=sys.stderr)
+        stopped_by = signal.SIGTERM if isinstance(interruption, Terminated) else signal.SIGINT
+        sys.exit(128 + stopped_by)
+
+
+def read_options(name: str, options: list[str]) -> tuple[Any, Any]:
+    """A command's module and its Config. What can be checked before any work is checked here."""
+    from touchgoal.launch.command_line import parse
+    from touchgoal.launch.run_folder import check_writable
+
+    module = importlib.import_module(f"touchgoal.launch.{name.replace('-', '_')}")
+    config = parse(
+        module.Config,
+        options,
+        prog=f"touchgoal {name}",
+        description=module.__doc__ or "",
+        envs=getattr(module, "ENVS", None),
+    )
+    if hasattr(config, "out"):
+        check_writable(config.out)
+    return module, config
+
+
+def _unknown(name: str) -> str:
+    families = {command.split("-")[0] for command in COMMANDS}  # train of train-policy
+    close = get_close_matches(name, [*COMMANDS, *families], 1, cutoff=0.7)
+    meant = [command for command in COMMANDS if close and command.startswith(close[0])]
+    guess = f"; did you mean {' or '.join(meant)}?" if meant else ""
+    return f"touchgoal: there is no command {name!r}{guess}\n\n{usage()}"
+
+
+@contextmanager
+def _recorded_as(arguments: list[str]) -> Iterator[None]:
+    """Makes `arguments` the command that records of the run name."""
+    before = sys.argv
+    sys.argv = ["touchgoal", *arguments]
+    try:
+        yield
+    finally:
+        sys.argv = before
 
 
 if __name__ == "__main__":

@@ -1,71 +1,63 @@
 """Print one table of measured figures and keep its numbers."""
 
-import platform
+import importlib
+from pathlib import Path
 from typing import Annotated, Any
 
-import cv2
 import tyro
 
-from touchgoal.benchmarks import (
-    bead_maze,
-    env_speed,
-    faults,
-    motion,
-    policy_latency,
-    reward_quality,
-    tactile_realism,
-    tactile_speed,
-)
+from touchgoal.benchmarks import config as options
+from touchgoal.control.errors import UserError
+from touchgoal.control.provenance import hardware, provenance
 from touchgoal.launch.run_folder import open_run, write_json
 
-BENCHMARKS: dict[type, Any] = {
-    module.Config: module
-    for module in (
-        bead_maze,
-        env_speed,
-        faults,
-        motion,
-        policy_latency,
-        reward_quality,
-        tactile_realism,
-        tactile_speed,
-    )
+BENCHMARKS: dict[str, type[options.BenchmarkOptions]] = {
+    "bead-maze": options.BeadMazeOptions,
+    "env-speed": options.EnvSpeedOptions,
+    "faults": options.FaultsOptions,
+    "motion": options.MotionOptions,
+    "policy-latency": options.PolicyLatencyOptions,
+    "reward-quality": options.RewardQualityOptions,
+    "tactile-realism": options.TactileRealismOptions,
+    "tactile-speed": options.TactileSpeedOptions,
 }
+RESULTS = Path(__file__).resolve().parents[1] / "benchmarks" / "results"
+
 Config = (
-    Annotated[bead_maze.Config, tyro.conf.subcommand("bead-maze")]
-    | Annotated[env_speed.Config, tyro.conf.subcommand("env-speed")]
-    | Annotated[faults.Config, tyro.conf.subcommand("faults")]
-    | Annotated[motion.Config, tyro.conf.subcommand("motion")]
-    | Annotated[policy_latency.Config, tyro.conf.subcommand("policy-latency")]
-    | Annotated[reward_quality.Config, tyro.conf.subcommand("reward-quality")]
-    | Annotated[tactile_realism.Config, tyro.conf.subcommand("tactile-realism")]
-    | Annotated[tactile_speed.Config, tyro.conf.subcommand("tactile-speed")]
+    Annotated[options.BeadMazeOptions, tyro.conf.subcommand("bead-maze")]
+    | Annotated[options.EnvSpeedOptions, tyro.conf.subcommand("env-speed")]
+    | Annotated[options.FaultsOptions, tyro.conf.subcommand("faults")]
+    | Annotated[options.MotionOptions, tyro.conf.subcommand("motion")]
+    | Annotated[options.PolicyLatencyOptions, tyro.conf.subcommand("policy-latency")]
+    | Annotated[options.RewardQualityOptions, tyro.conf.subcommand("reward-quality")]
+    | Annotated[options.TactileRealismOptions, tyro.conf.subcommand("tactile-realism")]
+    | Annotated[options.TactileSpeedOptions, tyro.conf.subcommand("tactile-speed")]
 )
 
 
-def main(config: Any) -> None:
+def main(config: options.BenchmarkOptions) -> None:
     """Run the chosen benchmark."""
-    benchmark = BENCHMARKS[type(config)]
-    name = benchmark.__name__.rsplit(".", 1)[-1].replace("_", "-")
+    name = next(name for name, kind in BENCHMARKS.items() if type(config) is kind)
+    if config.save_result and not (RESULTS.parents[1] / "pyproject.toml").exists():
+        raise UserError("--save-result writes into a checkout, and this is an installed package")
+    benchmark = importlib.import_module(f"touchgoal.benchmarks.{name.replace('-', '_')}")
     out = open_run(config.out, f"benchmark-{name}", config)
     result = benchmark.run(config)
     print(result.pop("table"))
     if "picture" in result:
-        cv2.imwrite(str(out / "picture.png"), result.pop("picture")[..., ::-1])
-        print(f"picture: {out / 'picture.png'}")
+        _draw(result.pop("picture"), out / "picture.png")
     print(f"hardware: {hardware()}")
-    write_json(out / "metrics.json", {**result, "hardware": hardware()})
+    result = {**provenance(), "hardware": hardware(), **result}
+    write_json(out / "metrics.json", result)
     print(f"numbers: {out / 'metrics.json'}")
+    if config.save_result:
+        RESULTS.mkdir(exist_ok=True)
+        write_json(RESULTS / f"{name}.json", result)
+        print(f"to be committed: {RESULTS / f'{name}.json'}")
 
 
-def hardware() -> str:
-    """Processor of this machine."""
-    model = platform.processor() or platform.machine()
-    try:
-        with open("/proc/cpuinfo") as file:
-            names = [
-                line.split(":", 1)[1].strip() for line in file if line.startswith("model name")
-            ]
-    except FileNotFoundError:
-        return model
-    return f"{len(names)} cores, {names[0]}" if names else model
+def _draw(picture: Any, path: Path) -> None:
+    import cv2
+
+    cv2.imwrite(str(path), picture[..., ::-1])
+    print(f"picture: {path}")

@@ -60,7 +60,7 @@ def main(config: Config) -> None:
     specs = specs_of(config, options)
     if config.resume:
         specs = _missing(config, specs)
-    out = open_run(config.out, "collect-demos", config)
+    out = open_run(config.out, "collect-demos", config, adds=True)
     try:
         metas = collect(out / "episodes", task, specs, config.workers, roles)
     except KeyboardInterrupt:

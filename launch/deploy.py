@@ -74,7 +74,7 @@ def main(config: Config) -> None:
     cell = _read(config)
     policy, cost = load_cell_policy(cell), _load_cost(cell)
     check_client(cell)
-    out = open_run(config.out, "deploy", config)
+    out = open_run(config.out, "deploy", config, adds=True)
     print(_summary(cell, config), flush=True)
     if cell.task.twin and cell.arm != "sim":
         put_scene_back(cell.task.twin, cell.task.seed)

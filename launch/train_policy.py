@@ -126,7 +126,7 @@ def main(config: Config) -> None:
     if config.trials:
         _check_sensor(config, task, sensor)
     policy = replace(_policy_config(config, sets[0], touch), task=task, sensor=sensor)
-    out = open_run(config.out, "train-policy", config)
+    out = open_run(config.out, "train-policy", config, adds=config.resume)
     print(f"{task}: {found[0]} to learn from, {found[1]} for validation")
     windows, validation = (
         SequenceDataset(load_recordings(s, rows, policy, touch, config.workers), policy)

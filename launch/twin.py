@@ -49,7 +49,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Open the twin, say where it is, serve until told to stop."""
-    out = open_run(config.out, "twin", config).resolve()
+    out = open_run(config.out, "twin", config, adds=True).resolve()
     twin = Twin(
         TwinConfig(
             task=config.maze if config.task == "bead-maze" else config.env,

@@ -1,7 +1,8 @@
 """How sure a success rate is."""
 
 from dataclasses import dataclass
-from math import sqrt
+
+from scipy.stats import binomtest
 
 
 @dataclass(frozen=True)
@@ -14,11 +15,8 @@ class SuccessRate:
     @property
     def interval(self) -> tuple[float, float]:
         """95 % Wilson score interval (Wilson, 1927); honest at 0 and at 1, unlike p +- 2 sd."""
-        z, n = 1.959963984540054, self.trials
-        p = self.successes / n
-        centre = (p + z * z / (2 * n)) / (1 + z * z / n)
-        half = z * sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / (1 + z * z / n)
-        return max(0.0, centre - half), min(1.0, centre + half)
+        interval = binomtest(self.successes, self.trials).proportion_ci(0.95, method="wilson")
+        return float(interval.low), float(interval.high)
 
     def __str__(self) -> str:
         """Such as 49/50 [0.90, 1.00]."""

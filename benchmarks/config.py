@@ -1,0 +1,126 @@
+"""Options of every benchmark; light to import, for `touchgoal benchmark --help` shows them all."""
+
+import os
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from touchgoal.control import features as ft
+from touchgoal.control.option_types import Count, CountOrNone, Seed, checked_dataclass
+from touchgoal.sim_envs.config import BeadMazeConfig
+
+CORES = os.cpu_count() or 1
+
+
+@checked_dataclass
+class BenchmarkOptions:
+    """Options of every benchmark."""
+
+    out: Path | None = None
+    """Folder of the run; default: runs/<date>_benchmark-<name>."""
+    save_result: bool = False
+    """Also write the numbers to benchmarks/results/<name>.json of this checkout, to be committed."""
+
+
+@checked_dataclass
+class BeadMazeOptions(BenchmarkOptions):
+    """Does touch lead a bead along a wire never seen (TacBench T5, Sparsh Table 10)?"""
+
+    policies: tuple[Path, ...] = ()
+    """Folders of policies that train-policy made; those of one recipe count as training seeds of it.
+    Default: the shipped one."""
+    wires: Count = 100
+    """Number of test wires, of the families trained on."""
+    held_out: CountOrNone = 20
+    """Number of test wires of the family held out; 0 leaves it out."""
+    demonstrations: Annotated[int, Field(ge=2)] = 20
+    """Number of test wires on which open-loop errors are measured."""
+    latencies: tuple[CountOrNone, ...] = (1, 2)
+    """Control ticks by which plans come late, tried besides 0 on the first policy."""
+    env: BeadMazeConfig = BeadMazeConfig(split="test")
+    """Options of the maze, e.g. a disturbance; demonstrations are recorded with the same."""
+    workers: Count = CORES
+    """Processes that simulate."""
+
+
+@checked_dataclass
+class EnvSpeedOptions(BenchmarkOptions):
+    """How fast does the simulated cell run on one core?"""
+
+    repeats: Count = 7
+    """Measurements of each figure; the median is printed."""
+    physics_steps: Count = 5000
+    """Steps of the physics in one measurement."""
+    env_steps: Count = 40
+    """Control ticks of the environment in one measurement."""
+
+
+@checked_dataclass
+class FaultsOptions(BenchmarkOptions):
+    """Does a deployment survive every fault, on the twin through the makers' client libraries?"""
+
+    faults: tuple[str, ...] = ()
+    """Names of faults to try, as the table has them; default: all."""
+    lock_step: bool = True
+    """Simulated time waits for the client: for a machine that is busy."""
+
+
+@checked_dataclass
+class MotionOptions(BenchmarkOptions):
+    """How often is inverse kinematics solved, and how long do moves take beside ruckig's?"""
+
+    poses: Count = 2000
+    """Poses for each arm's inverse kinematics."""
+    moves: Count = 200
+    """Moves of each arm between random postures."""
+    seed: Seed = 0
+    """Random seed of poses and moves."""
+
+
+@checked_dataclass
+class PolicyLatencyOptions(BenchmarkOptions):
+    """How long does a plan take on one core, stage by stage?"""
+
+    policy: Path | None = None
+    """Folder of a policy that train-policy made; default: the shipped one of bead-maze."""
+    repeats: Count = 200
+    """Plans timed."""
+    large_repeats: CountOrNone = 5
+    """Runs of each network of a published size; 0 leaves them out."""
+    control_hz: Count = ft.CONTROL_HZ
+    """Control ticks per second; a plan should fit into one."""
+
+
+@checked_dataclass
+class RewardQualityOptions(BenchmarkOptions):
+    """Do the MMWand paper's claims about dense costs hold (section V-E, Figures 8 and 9)?"""
+
+    encoder: Path | None = None
+    """Folder of a touch encoder; default: the shipped one."""
+    episodes: Count = 20
+    """Number of held-out episodes of each outcome."""
+    workers: Count = CORES
+    """Processes that simulate."""
+
+
+@checked_dataclass
+class TactileRealismOptions(BenchmarkOptions):
+    """How close do simulated presses come to real ones that the fit has not seen?"""
+
+    splits: Count = 5
+    """Ways to part the presses into fitted and held-out ones; the median over them is printed."""
+    sensors: tuple[Literal["gelsight", "gelsight_mini"], ...] = ("gelsight", "gelsight_mini")
+    """Sensors whose presses are taken."""
+    presses: Path | None = None
+    """Also write the real presses into this folder, as `touchgoal calibrate` reads them."""
+
+
+@checked_dataclass
+class TactileSpeedOptions(BenchmarkOptions):
+    """How fast does a simulated pad make its pictures on one core?"""
+
+    repeats: Count = 7
+    """Measurements of each figure; the median is printed."""
+    frames: Count = 100
+    """Frames in one measurement."""

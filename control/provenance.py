@@ -1,0 +1,87 @@
+"""Where results come from: the command, the code's commit, versions, hardware."""
+
+import importlib.metadata
+import platform
+import shlex
+import subprocess
+import sys
+from datetime import datetime
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from touchgoal import __version__
+
+_PACKAGES = ("numpy", "torch", "mujoco", "opencv-contrib-python-headless")
+
+
+def command_line() -> str:
+    """The command that runs, as it can be typed again."""
+    return shlex.join(["touchgoal", *sys.argv[1:]])
+
+
+def provenance() -> dict[str, Any]:
+    """What every checkpoint and every folder of results records beside its numbers.
+
+    Returns:
+        `command`; `commit` and `dirty` (whether files differ from it), None for an installed
+        package; version `touchgoal`; `date`, local time.
+    """
+    commit, dirty = _commit()
+    return {
+        "command": command_line(),
+        "touchgoal": __version__,
+        "commit": commit,
+        "dirty": dirty,
+        "date": f"{datetime.now():%Y-%m-%d %H:%M:%S}",
+    }
+
+
+def versions() -> dict[str, str]:
+    """Of Python and of the packages that results depend on most."""
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def hardware() -> str:
+    """Processor of this machine, and its GPU if torch is in use and has one."""
+    torch = sys.modules.get("torch")
+    gpu = torch.cuda.get_device_name() if torch is not None and torch.cuda.is_available() else ""
+    return ", ".join(filter(None, (_processor(), gpu)))
+
+
+def _processor() -> str:
+    model = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return model
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return f"{len(names)} cores, {names[0]}" if names else model
+
+
+@cache
+def _commit() -> tuple[str | None, bool | None]:
+    """Commit of a checkout and whether its files differ from it; None twice for an installed one."""
+    here = Path(__file__).resolve()
+    # An installed package may lie in somebody else's repository: only a file of ours counts.
+    if _git("ls-files", "--error-unmatch", here.name) is None:
+        return None, None
+    return _git("rev-parse", "HEAD"), bool(_git("status", "--porcelain", "--untracked-files=no"))
+
+
+def _git(*arguments: str) -> str | None:
+    """What git answers, or None if it fails or is missing."""
+    folder = Path(__file__).resolve().parent
+    try:
+        answer = subprocess.run(
+            ["git", "-C", str(folder), *arguments], capture_output=True, text=True
+        )
+    except OSError:
+        return None
+    return answer.stdout.strip() if answer.returncode == 0 else None

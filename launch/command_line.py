@@ -1,0 +1,268 @@
+"""From what was typed to a command's `Config`: tyro parses, and a bad value is one line."""
+
+import ast
+import dataclasses
+import inspect
+import re
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+
+import annotated_types
+import tyro
+from pydantic.fields import FieldInfo
+from tyro.constructors import (
+    ConstructorRegistry,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.option_types import RARE, OptionError
+from touchgoal.sim_envs.config import EnvConfig
+
+SHOWN = 20  # options that --help shows; --help-all shows all of them
+
+
+def parse(
+    config_type: Any,
+    arguments: Sequence[str],
+    prog: str,
+    description: str,
+    envs: Mapping[str, EnvConfig] | None = None,
+) -> Any:
+    """A command's Config.
+
+    Args:
+        config_type: the dataclass, or a union of those that subcommands take.
+        arguments: what was typed after the command's name.
+        prog: the command, as it is called in messages.
+        description: what it does.
+        envs: for a command with `--task`, the default options of each task: `--env.*` are those
+            of the task that was typed.
+
+    Raises:
+        UserError: a value is out of range.
+        SystemExit: help was asked for (0), or something typed was not understood (2).
+    """
+    short = not {"--help", "-h"}.isdisjoint(arguments)  # what tyro hides it does not take either
+    typed = ["--help" if a == "--help-all" else a for a in arguments]
+    env = envs[_task(typed, envs)] if envs else None
+    hidden_of = {name: _hidden(kind, env) for name, kind in _members(config_type)}
+    hidden = set().union(*hidden_of.values()) if short else set()
+    registry = ConstructorRegistry()
+    registry.struct_rule(partial(_as_options, env=env, hidden=hidden))
+    try:
+        return tyro.cli(
+            config_type,
+            args=typed,
+            prog=prog,
+            description=description,
+            registry=registry,
+        )
+    except _OutOfRange as wrong:
+        raise UserError(_one_line(wrong.error, typed)) from None
+    except SystemExit as stop:
+        name = next((a for a in typed if a in hidden_of), "")
+        if stop.code == 0 and hidden & hidden_of.get(name, set()):
+            command = f"{prog} {name}".strip()
+            print(f"{len(hidden_of[name])} rarely needed options more: {command} --help-all")
+        if stop.code == 2 and env is not None and envs is not None:
+            _point_to_other_task(typed, env, envs)
+        raise
+
+
+class _OutOfRange(Exception):
+    """Takes an OptionError past tyro, which would print a ValueError in its own way."""
+
+    def __init__(self, error: UserError) -> None:
+        self.error = error
+
+
+def _as_options(
+    info: StructTypeInfo, env: EnvConfig | None, hidden: set[tuple[type, str]]
+) -> StructConstructorSpec | None:
+    """A dataclass as tyro is to offer it: with our help texts, without what is hidden."""
+    if not dataclasses.is_dataclass(info.type) or info.type.__module__.startswith("tyro"):
+        return None
+    fields = []
+    for field, annotation, text in _options(info.type):
+        offered: Any = annotation
+        default = _default(field, info.default)
+        if field.name == "env" and get_origin(annotation) in (Union, UnionType):
+            default = env or default
+            offered = type(default)  # options of the other task are refused
+        if (info.type, field.name) in hidden:
+            offered = Annotated[offered, tyro.conf.Suppress]
+        if default is None or default == ():  # the text says what that stands for
+            offered = Annotated[offered, tyro.conf.arg(help_behavior_hint="")]
+        fields.append(StructFieldSpec(field.name, offered, default, text))
+    return StructConstructorSpec(partial(_make, info.type), tuple(fields))
+
+
+def _make(config_type: type, **values: Any) -> Any:
+    try:
+        return config_type(**values)
+    except UserError as error:
+        raise _OutOfRange(error) from None
+
+
+def _default(field: dataclasses.Field, parent: Any) -> Any:
+    if dataclasses.is_dataclass(parent):
+        return getattr(parent, field.name)
+    if field.default is not dataclasses.MISSING:
+        return field.default
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return tyro.MISSING
+
+
+def _options(config_type: type) -> list[tuple[dataclasses.Field, Any, str]]:
+    """Fields of a dataclass with their annotations and help texts, which say the ranges."""
+    hints, texts = (
+        get_type_hints(config_type, include_extras=True),
+        docstrings(config_type),
+    )
+    return [
+        (f, hints[f.name], _with_range(texts.get(f.name, ""), hints[f.name]))
+        for f in dataclasses.fields(config_type)
+    ]
+
+
+def docstrings(config_type: type) -> dict[str, str]:
+    """The string below each field of a dataclass and of those it extends."""
+    texts = {}
+    for cls in reversed(config_type.__mro__):
+        if not dataclasses.is_dataclass(cls):
+            continue
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
+        assert isinstance(definition, ast.ClassDef)
+        for field, text in zip(definition.body, definition.body[1:], strict=False):
+            if (
+                isinstance(field, ast.AnnAssign)
+                and isinstance(field.target, ast.Name)
+                and isinstance(text, ast.Expr)
+                and isinstance(text.value, ast.Constant)
+            ):
+                texts[field.target.id] = " ".join(str(text.value.value).split())
+    return texts
+
+
+def _with_range(text: str, annotation: Any) -> str:
+    bounds = list(_bounds(annotation))
+    return f"{text.removesuffix('.')} ({', '.join(dict.fromkeys(bounds))})." if bounds else text
+
+
+def _bounds(annotation: Any) -> Iterator[str]:
+    """What the annotation demands, in words."""
+    for extra in getattr(annotation, "__metadata__", ()):
+        for rule in extra.metadata if isinstance(extra, FieldInfo) else (extra,):
+            match rule:
+                case annotated_types.Gt(gt=bound):
+                    yield f"above {bound}"
+                case annotated_types.Ge(ge=bound):
+                    yield f"at least {bound}"
+                case annotated_types.Lt(lt=bound):
+                    yield f"below {bound}"
+                case annotated_types.Le(le=bound):
+                    yield f"at most {bound}"
+    for part in get_args(annotation):
+        yield from _bounds(part)
+
+
+def _hidden(config_type: type, env: EnvConfig | None) -> set[tuple[type, str]]:
+    """Options that --help leaves out: those marked RARE, and what comes after the first SHOWN."""
+    options = list(_all_options(config_type, env))
+    common = [key for key, is_rare in options if not is_rare]
+    return {key for key, is_rare in options if is_rare} | set(common[SHOWN:])
+
+
+def _all_options(
+    config_type: type, env: EnvConfig | None, rare: bool = False
+) -> Iterator[tuple[tuple[type, str], bool]]:
+    """Every option and whether it is marked RARE, or in a group that is; groups come last."""
+    groups = []
+    for field, annotation, _ in _options(config_type):
+        is_rare = rare or RARE in getattr(annotation, "__metadata__", ())
+        of_task = field.name == "env" and env is not None
+        inner = type(env) if of_task else _bare(annotation)
+        if dataclasses.is_dataclass(inner):
+            groups.append((inner, is_rare))
+        else:
+            yield (config_type, field.name), is_rare
+    for inner, is_rare in groups:
+        assert isinstance(inner, type)
+        yield from _all_options(inner, env, is_rare)
+
+
+def _members(config_type: Any) -> Iterator[tuple[str, type]]:
+    """Names and dataclasses of a union of subcommands; without a name the one that it is."""
+    if get_origin(config_type) in (Union, UnionType):
+        for member in get_args(config_type):
+            yield member.__metadata__[0].name, _bare(member)
+    else:
+        yield "", config_type
+
+
+def _bare(annotation: Any) -> Any:
+    return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
+
+
+def _task(arguments: Sequence[str], envs: Mapping[str, EnvConfig]) -> str:
+    """The task that was typed, the first if none was; tyro refuses one that does not exist."""
+    typed = [value for value in _values(arguments, "--task") if value in envs]
+    return typed[-1] if typed else next(iter(envs))
+
+
+def _values(arguments: Sequence[str], option: str) -> Iterator[str]:
+    for i, argument in enumerate(arguments):
+        if argument == option and i + 1 < len(arguments):
+            yield arguments[i + 1]
+        elif argument.startswith(f"{option}="):
+            yield argument.removeprefix(f"{option}=")
+
+
+def _one_line(error: UserError, arguments: Sequence[str]) -> str:
+    """The error with the options as they were typed in place of the fields."""
+    if not isinstance(error, OptionError):
+        return str(error)
+    return "; ".join(f"{_typed(field, arguments)} {what}".strip() for field, what in error.problems)
+
+
+def _typed(field: str, arguments: Sequence[str]) -> str:
+    if not field:
+        return ""
+    name = field.replace("_", "-")
+    pattern = re.compile(rf"--(?:no-)?(?:[\w.-]+\.)?{re.escape(name)}(?:=.*)?")
+    typed = [a.split("=")[0] for a in arguments if pattern.fullmatch(a.replace("_", "-"))]
+    return typed[0] if typed else f"--{name}"
+
+
+def _point_to_other_task(
+    arguments: Sequence[str], env: EnvConfig, envs: Mapping[str, EnvConfig]
+) -> None:
+    """Say to which task an option belongs that this one does not have."""
+    for argument in arguments:
+        field = argument.removeprefix("--env.").split("=")[0].replace("-", "_")
+        owners = [task for task, other in envs.items() if hasattr(other, field)]
+        if argument.startswith("--env.") and owners and not hasattr(env, field):
+            raise UserError(f"{argument} is an option of the task {owners[0]}: --task {owners[0]}")
+
+
+def print_completion(config_type: Any, shell: str) -> None:
+    """A script for a shell that completes what is typed after `touchgoal`."""
+    registry = ConstructorRegistry()
+    registry.struct_rule(partial(_as_options, env=None, hidden=set()))
+    try:
+        tyro.cli(
+            config_type,
+            args=["--tyro-write-completion", shell, "-"],
+            prog="touchgoal",
+            registry=registry,
+        )
+    except SystemExit as stop:
+        if stop.code:
+            raise

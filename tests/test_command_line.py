@@ -1,0 +1,208 @@
+"""What every command shares: help, options, one line for a mistake, the run's folder, Ctrl-C."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from touchgoal import __version__
+from touchgoal.control.errors import UserError
+from touchgoal.control.interruption import Terminated, kept, terminable
+from touchgoal.control.option_types import checked_dataclass
+from touchgoal.control.progress import track
+from touchgoal.launch.__main__ import COMMANDS, main
+from touchgoal.launch.command_line import SHOWN, _all_options, _members, docstrings, parse
+from touchgoal.launch.list import KINDS
+from touchgoal.launch.run_folder import check_writable, open_run
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
+
+ENVS = {"pick-place": PickPlaceConfig(), "bead-maze": BeadMazeConfig(split="validation")}
+
+
+@checked_dataclass
+class Toy:
+    """A command with a task."""
+
+    out: Path | None = None
+    """Folder."""
+    task: TaskName = "pick-place"
+    """Task."""
+    env: TaskConfig = PickPlaceConfig()
+    """Options of the task."""
+
+
+def options(*arguments: str) -> Any:
+    return parse(Toy, arguments, "touchgoal toy", "A toy.", ENVS)
+
+
+def test_env_options_are_those_of_the_task(capsys: pytest.CaptureFixture) -> None:
+    maze = options("--task", "bead-maze", "--env.bead", "cylinder")
+    assert maze.env == BeadMazeConfig(split="validation", bead="cylinder")
+    assert options("--env.mass", "0.1", "0.2").env.mass == (0.1, 0.2)
+    with pytest.raises(UserError, match="--env.bead is an option of the task bead-maze: --task be"):
+        options("--env.bead", "cylinder")
+    with pytest.raises(UserError, match="--env.mass is an option of the task pick-place"):
+        options("--task=bead-maze", "--env.mass", "0.1", "0.2")
+    capsys.readouterr()
+    with pytest.raises(SystemExit):
+        options("--task", "bead-maze", "--help")
+    assert "--env.bead" in capsys.readouterr().out
+
+
+def test_a_bad_value_names_the_option_as_it_was_typed() -> None:
+    with pytest.raises(
+        UserError, match="^--env.control-hz must be greater than or equal to 1, not 0"
+    ):
+        options("--env.control-hz", "0")
+    with pytest.raises(UserError, match="^--env.mass must be a finite number, not nan$"):
+        options("--env.mass", "nan", "nan")
+
+
+def test_help_shows_the_first_options_and_help_all_shows_all(
+    capsys: pytest.CaptureFixture,
+) -> None:
+    with pytest.raises(SystemExit):
+        options("--help")
+    short = capsys.readouterr().out
+    assert "--env.timestep" not in short and "rarely needed options more" in short
+    assert short.count(" --") <= SHOWN + 10  # a switch is named twice, and texts name options
+    with pytest.raises(SystemExit):
+        options("--help-all")
+    assert "--env.timestep" in capsys.readouterr().out
+
+
+def test_a_mistyped_option_or_command_is_guessed(capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit):
+        options("--env.mas", "1", "2")
+    assert "Perhaps you meant" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="no command 'run-polcy'; did you mean run-policy?"):
+        main(["run-polcy"])
+
+
+def test_version_and_lists(capsys: pytest.CaptureFixture) -> None:
+    main(["--version"])
+    assert capsys.readouterr().out == f"touchgoal {__version__}\n"
+    main(["list"])
+    assert all(kind in capsys.readouterr().out.split() for kind in ("objects",))
+    for kind, entries in KINDS.items():
+        main(["list", kind])
+        printed = capsys.readouterr().out.splitlines()
+        assert [line.split()[0] for line in printed] == list(entries()) != []
+
+
+def test_completion(capsys: pytest.CaptureFixture) -> None:
+    main(["completion", "bash"])
+    script = capsys.readouterr().out
+    assert "complete -F" in script and all(name in script for name in COMMANDS)
+
+
+def test_out_is_probed_before_any_work(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(UserError, match="is a file; name a folder"):
+        check_writable(file / "deeper")
+    with pytest.raises(SystemExit, match="--out: .*file is a file"):
+        main(["demo", "--out", str(file)])
+    with pytest.raises(UserError, match="cannot write in /proc"):
+        check_writable(Path("/proc/run"))
+    check_writable(tmp_path / "new" / "run")
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_folder_keeps_the_record_of_every_run(tmp_path: Path) -> None:
+    one, other = Toy(out=tmp_path), Toy(out=tmp_path, task="bead-maze")
+    assert open_run(tmp_path, "toy", one) == tmp_path
+    record = json.loads((tmp_path / "config.json").read_text())
+    assert record["config"]["task"] == "pick-place" and record["touchgoal"] == __version__
+    assert {"command", "commit", "dirty", "date", "versions", "hardware"} <= record.keys()
+    open_run(tmp_path, "toy", other)  # nothing came of the first one
+    (tmp_path / "metrics.json").touch()
+    open_run(tmp_path, "toy", other, adds=True)
+    names = ["config.json", "config_2.json", "config_3.json"]
+    assert sorted(p.name for p in tmp_path.glob("config*")) == names
+    with pytest.raises(UserError, match="holds the results of .*; choose another --out"):
+        open_run(tmp_path, "toy", one)
+
+
+def test_the_same_run_may_be_repeated(tmp_path: Path) -> None:
+    for _ in range(2):
+        open_run(tmp_path, "toy", Toy(out=tmp_path))
+        (tmp_path / "metrics.json").touch()
+    with pytest.raises(UserError, match="holds the results"):
+        open_run(tmp_path, "another", Toy(out=tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["Ctrl-C", "SIGTERM"]
+)
+def test_an_interrupted_command_says_what_was_kept(
+    number: int, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    from touchgoal.launch import list as command
+
+    def work(_: object) -> None:
+        with kept(lambda: "kept 1 of 2"):
+            os.kill(os.getpid(), number)
+            time.sleep(5)
+
+    monkeypatch.setattr(command, "main", work)
+    with pytest.raises(SystemExit) as stopped:
+        main(["list"])
+    assert stopped.value.code == code
+    assert capsys.readouterr().err == "\ntouchgoal list: stopped; kept 1 of 2\n"
+
+
+def test_sigterm_is_taken_in_the_main_thread_alone() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    errors: list[BaseException] = []
+
+    def other() -> None:
+        try:
+            with terminable():
+                pass
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    thread.join()
+    assert not errors
+    with pytest.raises(Terminated), terminable():
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(5)
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_progress_in_a_pipe_is_a_line_now_and_then(capsys: pytest.CaptureFixture) -> None:
+    assert list(track(range(200), "embedding", "frame")) == list(range(200))
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 10 and lines[0].startswith("embedding: 20 of 200 frames, 0 s")
+    assert list(track(iter("ab"), "reading", "file")) == ["a", "b"]
+    assert capsys.readouterr().err == ""  # neither a tenth nor half a minute has passed
+
+
+LIGHT = ["demo", "doctor", "list", "calibrate", "repair", "benchmark", "completion"]
+
+
+def test_help_imports_nothing_heavy() -> None:
+    modules = [f"touchgoal.launch.{name.replace('-', '_')}" for name in LIGHT]
+    program = f"""
+import sys, touchgoal.launch.__main__, touchgoal.launch.command_line, {", ".join(modules)}
+heavy = {{"torch", "mujoco", "casadi", "numba", "gymnasium", "matplotlib", "scipy"}} & set(sys.modules)
+assert not heavy, heavy"""
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+@pytest.mark.parametrize("name", LIGHT)
+def test_every_option_is_described(name: str) -> None:
+    module = __import__(f"touchgoal.launch.{name.replace('-', '_')}", fromlist=["Config"])
+    for _, member in _members(module.Config):
+        for (owner, field), _ in _all_options(member, None):
+            assert docstrings(owner).get(field), f"{owner.__name__}.{field}"
