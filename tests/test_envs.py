@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+import touchgoal
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import EpisodeSpec, record_episode
@@ -20,7 +21,7 @@ from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import OUTCOMES, PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE, SHAPES
-from touchgoal.sim_envs.tasks import TaskConfig, make, make_env
+from touchgoal.sim_envs.tasks import TaskConfig, make_env
 
 ENVS = ["touchgoal/PickPlace-v0", "touchgoal/BeadMaze-v0"]
 BLIND = PickPlaceConfig(cameras=(), tactile=False)
@@ -101,18 +102,18 @@ def test_environments_are_registered_on_import() -> None:
 def test_options_by_name() -> None:
     env = gym.make("touchgoal/PickPlace-v0", camera_size=(96, 90), cameras=("front",))
     assert env.observation_space[ft.FRONT].shape == (96, 90, 3)  # type: ignore[index]
-    maze = make("bead-maze", tactile=False, randomization={"gain": 0.0})
+    maze = touchgoal.make("bead-maze", tactile=False, randomization={"gain": 0.0})
     assert isinstance(maze, BeadMaze) and not maze.config.tactile
     assert maze.config.randomization == replace(BeadMazeConfig().randomization, gain=0.0)
-    assert isinstance(make("pick-place", render_mode="rgb_array"), PickPlace)
+    assert isinstance(touchgoal.make("pick-place", render_mode="rgb_array"), PickPlace)
     with pytest.raises(UserError, match="no option 'camera_sise'; did you mean camera_size"):
         gym.make("touchgoal/PickPlace-v0", camera_sise=(96, 96))
     with pytest.raises(UserError, match="has no option 'blurr'; did you mean blur"):
-        make("pick-place", randomization={"blurr": 0.0})
+        touchgoal.make("pick-place", randomization={"blurr": 0.0})
     with pytest.raises(UserError, match="unknown task 'place'; choose from: pick-place, bead-maze"):
-        make("place")  # type: ignore[call-overload]
+        touchgoal.make("place")  # type: ignore[call-overload]
     with pytest.raises(UserError, match="'rgb_array' or none, not 'human'"):
-        make("pick-place", render_mode="human")
+        touchgoal.make("pick-place", render_mode="human")
 
 
 @pytest.mark.parametrize("context", ["fork", "forkserver"])

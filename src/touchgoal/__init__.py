@@ -3,6 +3,13 @@
 import ctypes
 import os
 import sys
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from touchgoal.policies.checkpoint import load_policy as load_policy
+    from touchgoal.policies.evaluation.evaluate import evaluate as evaluate
+    from touchgoal.sim_envs.tasks import make as make
 
 __version__ = "0.1.0"
 
@@ -28,3 +35,20 @@ if sys.platform == "linux" and "DISPLAY" not in os.environ and "MUJOCO_GL" not i
 from touchgoal.sim_envs.registration import register_environments  # noqa: E402
 
 register_environments()
+
+# One call a job. Each is imported when it is first used: `import touchgoal` stays light.
+_INTERFACE = {
+    "evaluate": "touchgoal.policies.evaluation.evaluate",
+    "load_policy": "touchgoal.policies.checkpoint",
+    "make": "touchgoal.sim_envs.tasks",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _INTERFACE:
+        return getattr(import_module(_INTERFACE[name]), name)
+    raise AttributeError(f"module 'touchgoal' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_INTERFACE})
