@@ -55,8 +55,8 @@ class Config:
     cell: Annotated[Path, tyro.conf.Positional]
     """Cell file: your own (.toml), the cell.json of a twin, or a shipped example by name, such as sim."""
     policy: str = ""
-    """Who acts, in place of the cell file's: expert, follower, shipped, or a folder that train-policy
-    made."""
+    """Who acts, in place of the cell file's: expert, follower, shipped, a folder that train-policy
+    made, or a class of your own as module:Class or file.py:Class."""
     execute: bool = False
     """Move the arm. Without it this is a dry run."""
     yes: bool = False

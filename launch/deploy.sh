@@ -7,5 +7,5 @@ if [ -x "$root/.venv/bin/touchgoal" ]; then
 elif command -v touchgoal >/dev/null; then
   exec touchgoal deploy "$@"
 fi
-echo "touchgoal is not installed; in $root: python3 -m venv .venv && .venv/bin/pip install -c constraints.txt -e '.[towers,franka]'" >&2
+echo "touchgoal is not set up: (cd $root && make setup), or pip install it" >&2
 exit 1

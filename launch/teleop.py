@@ -7,14 +7,14 @@ on disk.
 import shutil
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
+from touchgoal.control.option_types import Count, Seed, checked_dataclass
 from touchgoal.control.sensors.keyboard import Keyboard
 from touchgoal.episodes.recording import EpisodeSpec, run, to_episode
 from touchgoal.episodes.schema import Episode
@@ -28,21 +28,21 @@ from touchgoal.sim_envs.scene.wires import choose, find
 _GIVE_UP_KEY = "q"
 
 
-@dataclass(frozen=True)
+@checked_dataclass
 class Config:
     """Options of teleop."""
 
     task: Literal["bead-maze"] = "bead-maze"
-    """What is demonstrated."""
+    """Which task is demonstrated."""
     out: Path | None = None
     """Folder of the run; the episodes go to its `episodes/`, after those already there."""
-    episodes: int = 1
-    """How many times to lead the bead; those given up count."""
+    episodes: Count = 1
+    """Number of attempts to lead the bead along a wire; those given up count."""
     wires: tuple[str, ...] = ()
     """Names such as helix-2000003, taken in turn; default: those of `maze`. The straightest of the
     first ones is arc-2000009."""
-    seed: int = 0
-    """Of the first episode; each further one adds one."""
+    seed: Seed = 0
+    """Random seed of the first episode; each further one adds one."""
     hand: TeleoperatorConfig = field(default_factory=TeleoperatorConfig)
     """How hand and keys respond."""
     maze: BeadMazeConfig = field(
@@ -53,8 +53,6 @@ class Config:
 
 def main(config: Config) -> None:
     """Offer the wires one by one, keep what is finished, say what came of it."""
-    if config.episodes < 1:
-        raise UserError("nothing to lead: ask for at least one episode")
     maze, names = config.maze, [find(name).name for name in config.wires]
     names = names or [w.name for w in choose(maze.split, maze.n_wires, maze.families)]
     with Keyboard(sys.stdin) as keyboard:

@@ -118,10 +118,7 @@ def choose_policy(name: str | Path, task: TaskConfig, latency: int = 0) -> Polic
         if where != "bead-maze":
             raise UserError("the follower is for the bead maze; add: --task bead-maze")
         return follower
-    module, colon, attribute = chosen.rpartition(":")
-    if colon and attribute.isidentifier():
-        own = ImportedPolicy(module, attribute)
-        own.load()
+    if (own := find_own(chosen)) is not None:
         return own
     if chosen == "shipped":
         return SavedPolicy(SHIPPED[where], latency).check_task(task)
@@ -137,6 +134,19 @@ def choose_policy(name: str | Path, task: TaskConfig, latency: int = 0) -> Polic
             "own as module:Class or file.py:Class"
         ) from error
     return SavedPolicy(folder, latency).check_task(task)
+
+
+def find_own(name: str) -> ImportedPolicy | None:
+    """A policy of one's own, named `module:Class` or `file.py:Class`; None of any other name.
+
+    UserError if the class is not there, or lacks a method.
+    """
+    module, colon, attribute = name.rpartition(":")
+    if not colon or not attribute.isidentifier():
+        return None
+    own = ImportedPolicy(module, attribute)
+    own.load()
+    return own
 
 
 def env_config_for(policy: PolicyMaker, config: TaskConfig) -> TaskConfig:

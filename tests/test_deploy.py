@@ -171,6 +171,28 @@ def test_without_a_simulator_the_operator_says_whether_it_is_done(
     assert meta["outcome"] == outcome and meta.get("success") is success
 
 
+OWN = """
+import numpy as np
+
+class Turns:
+    def reset(self): self.ticks = 0
+    def act(self, observation):
+        self.ticks += 1
+        return np.array([0.004, *np.zeros(6), 0.08])
+"""
+
+
+def test_a_policy_of_ones_own_moves_the_arm(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(OWN)
+    path = write_cell_file(tmp_path, SIM.replace("seed = 3", "seed = 3, seconds = 1.0"))
+    with pytest.raises(SystemExit) as ended:
+        run("deploy", path, "--policy", f"{tmp_path / 'own.py'}:Turns", "--execute", "--yes",
+            "--out", tmp_path)  # fmt: skip
+    assert ended.value.code == NOT_DONE
+    q = EpisodeSet(tmp_path / "episodes").read(0).frames[ft.STATE][:, 0]
+    assert 0.04 < q[-1] - q[0] < 0.1  # 20 ticks, less the lag of the arm that it would learn on
+
+
 def test_the_policy_is_loaded_once_and_before_anything_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -83,8 +83,8 @@ class TaskSection:
     name: Literal["pick-place", "bead-maze"]
     """Which task."""
     policy: Annotated[str, Field(min_length=1)]
-    """Who acts: expert (pick-place, from known positions), follower (bead-maze), shipped, or a folder
-    that train-policy made."""
+    """Who acts: expert (pick-place, from known positions), follower (bead-maze), shipped, a folder that
+    train-policy made, or a class of your own (file.py:Class)."""
     instruction: str = ""
     """The task in words; it is recorded."""
     seconds: Annotated[float, Field(gt=0, le=3600)] = 30.0

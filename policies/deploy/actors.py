@@ -1,16 +1,18 @@
 """Who acts on a cell: the expert with known positions, the follower, or a policy on disk."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import Safety
 from touchgoal.policies.acting import Observation
+from touchgoal.policies.by_name import OwnPolicy, find_own
 from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy, find_policy
 from touchgoal.policies.deploy.control_loop import DeployedActor
 from touchgoal.policies.deploy.realtime import ChunkPlanner, RealTimeActor
@@ -63,6 +65,37 @@ class LearnedActor(RealTimeActor):
 
 
 @dataclass(frozen=True)
+class _EveryTick:
+    """Horizons of what answers every tick anew."""
+
+    observation_horizon: int = 1
+    execution_horizon: int = 1
+    control_hz: int = ft.CONTROL_HZ
+
+
+class OwnPlanner:
+    """A policy of one's own as plans of one tick, so that the loop never waits for a slow one."""
+
+    config = _EveryTick()
+
+    def __init__(self, policy: OwnPolicy) -> None:
+        self._policy = policy
+
+    def embed(self, seen: Sequence[Observation]) -> None:
+        """Nothing is embedded ahead."""
+
+    def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "1 8"]:
+        """The action for the next tick; UserError if it has another shape."""
+        action = np.asarray(self._policy.act(dict(seen[-1])), np.float32)
+        if action.shape != (ft.N_JOINTS + 1,):
+            raise UserError(
+                f"the policy's action has the shape {action.shape}: give {ft.N_JOINTS} joint changes "
+                "(rad) and the gripper's width (m)"
+            )
+        return action[None]
+
+
+@dataclass(frozen=True)
 class CellPolicy:
     """A learned policy that fits the cell, loaded for one run: its planner, and the size (rows,
     columns) of the cameras' pictures that it looks at."""
@@ -72,14 +105,18 @@ class CellPolicy:
 
 
 def load_cell_policy(cell: CellConfig) -> CellPolicy | None:
-    """The cell's policy on disk, None of an expert; UserError if it does not fit the cell."""
+    """The cell's policy on disk or of one's own, None of an expert; UserError if it does not fit."""
     if cell.task.policy in ("expert", "follower"):
         return None
     if cell.arm == "ur5e":
         raise UserError("the policy commands the seven joints of an FR3, not a UR5e's: use expert")
-    shipped = cell.task.policy == "shipped"
-    directory = SHIPPED[cell.task.name] if shipped else find_policy(cell.task.policy)
-    planner, needed = SavedPolicy(directory).planner_for(env_config_of(cell))
+    task = env_config_of(cell)
+    if (own := find_own(cell.task.policy)) is not None:
+        planner, needed = OwnPlanner(own()), own.env_config(task)
+    else:
+        shipped = cell.task.policy == "shipped"
+        directory = SHIPPED[cell.task.name] if shipped else find_policy(cell.task.policy)
+        planner, needed = SavedPolicy(directory).planner_for(task)
     if needed.tactile and cell.fingertips is None:
         raise UserError("the policy feels with fingertips, the cell has none: add [fingertips]")
     for camera in needed.cameras:
