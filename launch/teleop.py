@@ -23,7 +23,6 @@ from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.experts.teleoperator import HELP, Teleoperator, TeleoperatorConfig
-from touchgoal.sim_envs.scene.wires import choose, find
 
 _GIVE_UP_KEY = "q"
 
@@ -38,32 +37,26 @@ class Config:
     """Folder of the run; the episodes go to its `episodes/`, after those already there."""
     episodes: Count = 1
     """Number of attempts to lead the bead along a wire; those given up count."""
-    wires: tuple[str, ...] = ()
-    """Names such as helix-2000003, taken in turn; default: those of `maze`. The straightest of the
-    first ones is arc-2000009."""
     seed: Seed = 0
     """Random seed of the first episode; each further one adds one."""
     hand: TeleoperatorConfig = field(default_factory=TeleoperatorConfig)
     """How hand and keys respond."""
-    maze: BeadMazeConfig = field(
-        default_factory=lambda: BeadMazeConfig(max_seconds=300.0, stall_seconds=60.0)
-    )
-    """Options of bead-maze; a person is given time to think."""
+    env: BeadMazeConfig = BeadMazeConfig(max_seconds=300.0, stall_seconds=60.0)
+    """Options of the task; a person is given time to think. The straightest of the first wires is
+    arc-2000009."""
 
 
 def main(config: Config) -> None:
     """Offer the wires one by one, keep what is finished, say what came of it."""
-    maze, names = config.maze, [find(name).name for name in config.wires]
-    names = names or [w.name for w in choose(maze.split, maze.n_wires, maze.families)]
+    wires = config.env.chosen_wires(config.episodes)
     with Keyboard(sys.stdin) as keyboard:
         out = open_run(config.out, "teleop", config, adds=True)
-        writer, metas = EpisodeWriter(out / "episodes", fps=maze.control_hz), []
-        env = BeadMaze(maze)
+        writer, metas = EpisodeWriter(out / "episodes", fps=config.env.control_hz), []
+        env = BeadMaze(config.env)
         try:
-            for i in range(config.episodes):
-                wire = names[i % len(names)]
-                print(f"{wire}, {i + 1} of {config.episodes}: {HELP}  q give up  Ctrl-C end")
-                job = EpisodeSpec(config.seed + i, options={"wire": wire})
+            for i, wire in enumerate(wires):
+                print(f"{wire.name}, {i + 1} of {config.episodes}: {HELP}  q give up  Ctrl-C end")
+                job = EpisodeSpec(config.seed + i, options={"wire": wire.name})
                 episode = record_attempt(env, job, keyboard, config.hand)
                 if episode is None:
                     print("\ngiven up: not kept")

@@ -5,7 +5,6 @@ Ctrl-C; where everything is stands in a table and in `cell.json`.
 """
 
 import signal
-from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -15,15 +14,28 @@ from touchgoal.control.cell.cell_file import cell_table
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.option_types import Seed, checked_dataclass
 from touchgoal.launch.run_folder import open_run, write_json
-from touchgoal.sim_envs.config import STREAM_SIZE, BeadMazeConfig, PickPlaceConfig
+from touchgoal.sim_envs.config import (
+    STREAM_SIZE,
+    BeadMazeConfig,
+    PickPlaceConfig,
+    TaskConfig,
+    TaskName,
+)
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
+
+ENVS: dict[TaskName, TaskConfig] = {
+    "pick-place": PickPlaceConfig(camera_size=STREAM_SIZE),
+    "bead-maze": BeadMazeConfig(
+        cameras=("front", "wrist"), camera_size=STREAM_SIZE, split="validation", n_wires=20
+    ),
+}
 
 
 @checked_dataclass
 class Config:
     """Options of twin."""
 
-    task: Literal["pick-place", "bead-maze"] = "pick-place"
+    task: TaskName = "pick-place"
     """Which task the cell is set up for."""
     arm: Literal["fr3", "ur5e"] = "fr3"
     """An FR3 with the Franka Hand, or a UR5e whose gripper talks as a Robotiq does."""
@@ -37,14 +49,8 @@ class Config:
     """Random seed of the scene."""
     out: Path | None = None
     """Folder of the run: cell.json, serial devices."""
-    env: PickPlaceConfig = field(default_factory=lambda: PickPlaceConfig(camera_size=STREAM_SIZE))
-    """Options of pick-place."""
-    maze: BeadMazeConfig = field(
-        default_factory=lambda: BeadMazeConfig(
-            cameras=("front", "wrist"), camera_size=STREAM_SIZE, split="validation", n_wires=20
-        )
-    )
-    """Options of bead-maze."""
+    env: TaskConfig = ENVS["pick-place"]
+    """Options of the task."""
 
 
 def main(config: Config) -> None:
@@ -52,7 +58,7 @@ def main(config: Config) -> None:
     out = open_run(config.out, "twin", config, adds=True).resolve()
     twin = Twin(
         TwinConfig(
-            task=config.maze if config.task == "bead-maze" else config.env,
+            task=config.env,
             arm=config.arm,
             seed=config.seed,
             host=config.host,

@@ -140,7 +140,7 @@ def test_teleop_needs_a_terminal(
     out = tmp_path / "out"
     monkeypatch.setattr("sys.stdin", open(os.devnull))
     assert "in a terminal" in refused(capsys, "teleop", "--out", out)
-    assert "unknown wire" in refused(capsys, "teleop", "--wires", "knot-1", "--out", out)
+    assert "unknown wire" in refused(capsys, "teleop", "--env.wires", "knot-1", "--out", out)
     assert not out.exists()
 
 

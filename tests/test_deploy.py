@@ -87,8 +87,8 @@ def test_picks_and_places_on_the_twin_and_the_episode_has_reward_curves(
 @pytest.mark.realtime
 def test_the_shipped_policy_leads_a_bead_on_the_twin(tmp_path: Path) -> None:
     pytest.importorskip("franky", reason="pip install 'touchgoal[franka]'")
-    cell = ["--lock-step", "--task", "bead-maze", "--maze.wires", "helix-3"]
-    small = ["--maze.cameras", "front", "--maze.camera-size", "128", "128"]
+    cell = ["--lock-step", "--task", "bead-maze", "--env.wires", "helix-3"]
+    small = ["--env.cameras", "front", "--env.camera-size", "128", "128"]
     twin = RunningTwin([*cell, *small], tmp_path, 3)
     _, complaint = deploying(twin, tmp_path).communicate(timeout=_PATIENCE)
     worst = twin.ask("truth")["worst"]
@@ -255,6 +255,12 @@ def test_a_policy_that_is_not_a_number_and_an_operator_stop_the_arm(bare: CellCo
     assert stopped and "not a number" in reason
     reason, stopped, _ = deployed(bare, Acts(10_000, 0.0), stop_after=15)
     assert stopped and reason == "stopped by the operator"
+
+
+def test_a_port_that_cannot_be_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="touchgoal twin: --port must be .* 65534, not 99999"):
+        run("twin", "--port", 99999, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda p: p.stem)

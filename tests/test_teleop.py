@@ -101,7 +101,7 @@ def test_a_person_leads_the_bead(tmp_path: Path) -> None:
     end, terminal = os.openpty()
     settings = termios.tcgetattr(terminal)
     command = [sys.executable, "-m", "touchgoal.launch", "teleop", "--episodes", "3"]
-    options = ["--wires", STRAIGHT, "--maze.max-seconds", "3", "--hand.speed", "0.05"]
+    options = ["--env.wires", STRAIGHT, "--env.max-seconds", "3", "--hand.speed", "0.05"]
     program = subprocess.Popen(
         [*command, *options, "--out", str(tmp_path)], stdin=terminal, stdout=terminal
     )
