@@ -1,7 +1,7 @@
 """Who acts on a cell: the expert with known positions, the follower, or a policy on disk."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -110,7 +110,8 @@ def load_cell_policy(cell: CellConfig) -> CellPolicy | None:
         return None
     if cell.arm == "ur5e":
         raise UserError("the policy commands the seven joints of an FR3, not a UR5e's: use expert")
-    task = env_config_of(cell)
+    # Cameras send larger pictures than are recorded and, if a policy asks for nothing else, observed.
+    task = replace(env_config_of(cell), camera_size=ft.CAMERA_SHAPE[:2])
     if (own := find_own(cell.task.policy)) is not None:
         planner, needed = OwnPlanner(own()), own.env_config(task)
     else:
