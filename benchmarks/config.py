@@ -96,8 +96,8 @@ class PolicyLatencyOptions(BenchmarkOptions):
 class RewardQualityOptions(BenchmarkOptions):
     """Do the MMWand paper's claims about dense costs hold (section V-E, Figures 8 and 9)?"""
 
-    encoder: Path | None = None
-    """Folder of a touch encoder; default: the shipped one."""
+    encoder: str = "gelsight_mini"
+    """Touch encoder, by name or folder; the simulated sensor is the one that it was trained on."""
     episodes: Count = 20
     """Number of held-out episodes of each outcome."""
     workers: Count = CORES

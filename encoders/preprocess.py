@@ -70,6 +70,32 @@ class TactilePreprocessor:
             )
 
 
+def check_pictures(name: str, pictures: object, ndim: tuple[int, ...]) -> None:
+    """Raises UserError, in one line, unless these are RGB pictures as cameras give them.
+
+    Args:
+        name: what they are called in the message.
+        pictures: to be uint8 numpy arrays, (height, width, 3) or (n, height, width, 3).
+        ndim: the numbers of axes allowed: 3, 4 or both.
+    """
+    shapes = " or ".join({3: "(height, width, 3)", 4: "(n, height, width, 3)"}[n] for n in ndim)
+    wanted = f"{name} must be RGB pictures as a numpy array of uint8 (0 to 255), {shapes}"
+    if not isinstance(pictures, np.ndarray):
+        kind = type(pictures)
+        hint = ": tensor.cpu().numpy()" if kind.__module__ == "torch" else ""
+        raise UserError(f"{wanted}, not a {kind.__module__}.{kind.__qualname__}{hint}")
+    if pictures.dtype != np.uint8:
+        unit = np.issubdtype(pictures.dtype, np.floating)
+        hint = ": values of 0 to 1 become (255 * images).round().astype(np.uint8)" if unit else ""
+        raise UserError(f"{wanted}, not of {pictures.dtype}{hint}")
+    if pictures.ndim not in ndim or pictures.shape[-1] != 3:
+        first = pictures.ndim in (3, 4) and pictures.shape[-3] == 3
+        hint = ": put the colours last, np.moveaxis(images, -3, -1)" if first else ""
+        raise UserError(f"{wanted}, not of shape {pictures.shape}{hint}")
+    if 0 in pictures.shape:
+        raise UserError(f"{wanted}, and at least one: these have shape {pictures.shape}")
+
+
 PREPROCESSORS: dict[str, TactilePreprocessor] = {
     sensor: TactilePreprocessor(sensor, version=1, size=(120, 160), scale=16.0)
     for sensor in ("gelsight_mini", "gelsight_mini_markers")

@@ -85,8 +85,43 @@ def load_touch_backbone(directory: Path, sensor: str | None = None) -> TouchBack
     return encoder
 
 
-def load_encoder(directory: Path) -> TouchEncoder | TouchBackbone:
-    """Reads an encoder of either kind for inference; UserError as `load_aligned`."""
+def encoder_names() -> list[str]:
+    """Names of the encoders that ship, for `load_encoder` and `--encoder`."""
+    return sorted(path.parent.name for path in _WEIGHTS.glob("*/encoder.json"))
+
+
+def find_encoder(name_or_path: str | Path) -> Path:
+    """The folder of an encoder: one that `save` wrote, or a shipped one by its name.
+
+    Args:
+        name_or_path: a folder; a name of `encoder_names`; or a sensor, for the one that ships for
+            it on the offline towers.
+
+    Raises:
+        UserError: neither a folder nor a name.
+    """
+    name = str(name_or_path)
+    for directory in (Path(name), _WEIGHTS / name, _WEIGHTS / f"{name}_offline"):
+        if (directory / "encoder.json").is_file():
+            return directory
+    if Path(name).is_dir():
+        raise UserError(f"no touch encoder in {name}: {ENCODER.remedy}")
+    raise UserError(
+        f"there is no touch encoder '{name}': give the folder of one, or a name of those that "
+        f"ship: {', '.join(encoder_names())}"
+    )
+
+
+def load_encoder(name_or_path: str | Path) -> TouchEncoder | TouchBackbone:
+    """A touch encoder of either kind, on the CPU, ready for `embed`; see `find_encoder`.
+
+        encoder = load_encoder("gelsight_mini")
+        embeddings = encoder.embed(pictures)  # uint8 (n, 240, 320, 3); the first one untouched
+
+    Raises:
+        UserError: no such encoder, or as `load_aligned`.
+    """
+    directory = find_encoder(name_or_path)
     aligned = "towers" in ENCODER.read_json(directory).get("config", {})
     return load_aligned(directory) if aligned else load_touch_backbone(directory)
 

@@ -24,6 +24,7 @@ COMMANDS = {
     "train-policy-paper": "the same with the network, sampler and actions that Sparsh publishes",
     "run-policy": "run a policy in a task: success rate, video",
     "reward-curves": "costs and rewards along episodes or plain videos",
+    "fit-scale": "fit what normalises the distances of reward-curves to your own episodes",
     "calibrate": "fit a sensor's light and gel to presses of a ball",
     "deploy": "run a policy on an arm or on the twin, with safety and recording",
     "twin": "serve the simulated cell over the wire protocols of real ones",

@@ -4,6 +4,7 @@ A Franka FR3 with a GelSight Mini on each finger picks an object up and places i
 goal is drawn along the episode: in the camera's image, in touch, in both, and towards a sentence.
 """
 
+from dataclasses import asdict
 from pathlib import Path
 
 from touchgoal.control.errors import UserError
@@ -41,9 +42,9 @@ def main(config: Config) -> None:
     from touchgoal.episodes.store import EpisodeWriter
     from touchgoal.launch.reward_curves import report_all
     from touchgoal.launch.run_folder import open_run
-    from touchgoal.rewards.curves import DistanceNormalizer
     from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
     from touchgoal.rewards.goals import assign_goals, parse_goal
+    from touchgoal.rewards.normalizer import DistanceNormalizer
     from touchgoal.rewards.report.report import write_report
     from touchgoal.sim_envs.pick_place import PickPlace
 
@@ -65,7 +66,7 @@ def main(config: Config) -> None:
     specs = [parse_goal("last"), parse_goal(f"text:{config.words}")]
     goal = embedder.embed_goal(assign_goals(specs, embedded.modalities), embedded)
     curves = compute_curves(embedded, goal, scale)
-    write_report(curves, out, "curves", {"encoder": directory.name, **embedder.space})
+    write_report(curves, out, "curves", {"encoder": directory.name, **asdict(embedder.made_with)})
     print(f"\n{episode.task}: {episode.meta['outcome']} in {len(episode) - 1} ticks")
     report_all([curves], out)
     print(f"video: {out / 'episode.mp4'}\ncurves: {out / 'curves.png'}\n\n{what_next(out)}")

@@ -36,8 +36,8 @@ from touchgoal.policies.deploy.actors import CellPolicy, load_cell_policy, make_
 from touchgoal.policies.deploy.control_loop import Request
 from touchgoal.policies.deploy.preflight import check_client, preflight
 from touchgoal.policies.deploy.session import Result, Session
-from touchgoal.rewards.curves import DistanceNormalizer
 from touchgoal.rewards.goals import parse_goal
+from touchgoal.rewards.normalizer import DistanceNormalizer
 from touchgoal.rewards.online import OnlineCost
 from touchgoal.sim_envs.config import EnvConfig
 from touchgoal.sim_envs.twin.control_port import ask_twin, put_scene_back

@@ -81,7 +81,7 @@ def towers() -> CheckResult:
 def weights() -> CheckResult:
     """The shipped touch encoder and the scale of its costs."""
     from touchgoal.encoders.pretrained import ENCODER, SHIPPED, load_aligned
-    from touchgoal.rewards.curves import DistanceNormalizer
+    from touchgoal.rewards.normalizer import DistanceNormalizer
 
     try:
         encoder = load_aligned(SHIPPED)

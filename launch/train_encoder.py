@@ -17,7 +17,9 @@ from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import collect_touches
 from touchgoal.launch.run_folder import open_run
-from touchgoal.rewards.embedding_distance import EpisodeEmbedder, fit_normalizer
+from touchgoal.rewards.embedding_distance import EpisodeEmbedder
+from touchgoal.rewards.fit_normalizer import fit_normalizer
+from touchgoal.rewards.normalizer import scene_of
 
 
 @dataclass(frozen=True)
@@ -123,8 +125,9 @@ def _align(config: Align) -> None:
     embedder = EpisodeEmbedder(towers, encoder)
     chosen = [i for i in range(len(episodes)) if episodes.meta(i).get("success", True)]
     embedded = [
-        embedder.embed_episode(episodes.read(i), episodes.fps, f"{episodes.root}#{i}")
+        embedder.embed_episode(episodes.read(i), episodes.fps, f"{episodes.root}#{i}", True)
         for i in tqdm(chosen[: config.scale_episodes], desc="scale", unit="episode")
     ]
-    fit_normalizer(embedded, ("image", "tactile", "text")).save(out / "encoder" / "scale.json")
+    scale = fit_normalizer(embedded, ("image", "tactile", "text"), scene_of(episodes.features))
+    scale.save(out / "encoder" / "scale.json")
     print(f"encoder and scale: {out / 'encoder'}")

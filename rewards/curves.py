@@ -1,29 +1,41 @@
-"""Cost curves of one trajectory: a distance to the goal per frame and modality, and its rewards.
+"""Cost and reward curves of one trajectory: per frame and modality, a distance to the goal.
 
 Names of curves: "image", "tactile" and "text" are single modalities (`rewards/goals.py`);
-"image+tactile" and "image+text" are the fused ones, each the mean of two normalised curves. Raw
-cosine distances are never averaged: the modality with the larger range would win.
+"image+tactile" and "image+text" are fused, each the mean of two normalised costs. Raw cosine
+distances are never averaged: the modality with the larger range would win.
+
+What a reader may rely on, for every curve:
+
+- cost: small at the goal and never below 0. Normalised (`rewards/normalizer.py`), 1 is the usual
+  start and 0 the usual end of successful episodes; a frame nearer than their usual end costs 0 too.
+  Without a normalizer it is the cosine distance itself, between 0 and 2.
+- state reward: -cost. At most 0, at the goal; about -1 at the usual start where it is normalised,
+  -2 to 0 where it is not. Every frame away from the goal costs.
+- potential-based reward of the step into frame t: F_t = gamma Phi_t - Phi_{t-1} with the state
+  reward as potential Phi (Ng, Harada and Russell 1999): added to a task's own reward of the same
+  gamma it leaves the best policy unchanged. Phi is 0 at the goal, as it must be where an episode
+  ends. No step leads into the first frame: F_0 = 0.
+- causal: the values of frame t depend on frames up to t alone. There are two exceptions, both said
+  in the reports: the untouched fingertip is the median of the first 5 frames, so touch before the
+  fifth looks ahead to it; and a goal taken from the episode itself is known at its end alone.
 """
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import TACTILE, TRUTH_CONTACT
-from touchgoal.episodes.metadata import write_file
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.touches import contact_per_frame
 from touchgoal.rewards.metrics import CurveMetrics, measure_curve
 
 FUSED = {"image+tactile": ("image", "tactile"), "image+text": ("image", "text")}
 
-RewardForm = Literal["state", "difference"]
+GAMMA = 0.99
+"""Discount of the potential-based reward, where none is given."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +62,9 @@ class Curves:
         fps: frames per second.
         contact: first contact.
         raw: cosine distance 1 - cos in [0, 2] per frame, by modality.
-        normalised: distance on the scale of the training episodes (1 their usual start, 0 their
-            usual end; a frame may lie outside [0, 1]), by modality and fused; empty where no scale
-            was given.
+        normalised: distance in units of the normalizer (1 the usual start, 0 the usual end, below
+            0 nearer than that), by modality; empty without one.
+        own_goal: modalities whose goal is a frame of this trajectory, known at its end alone.
     """
 
     source: str
@@ -61,130 +73,69 @@ class Curves:
     contact: Contact
     raw: Mapping[str, Float[np.ndarray, " n"]]
     normalised: Mapping[str, Float[np.ndarray, " n"]]
+    own_goal: frozenset[str] = frozenset()
 
     def __len__(self) -> int:
         """Number of frames."""
         return len(next(iter(self.raw.values())))
 
     @property
-    def values(self) -> Mapping[str, Float[np.ndarray, " n"]]:
-        """The curves to judge and to draw: normalised ones, raw ones where there is no scale."""
-        return self.normalised or self.raw
+    def costs(self) -> dict[str, Float[np.ndarray, " n"]]:
+        """The curves to judge and to draw: normalised and fused; raw ones without a normalizer."""
+        if not self.normalised:
+            return {name: np.maximum(d, 0) for name, d in self.raw.items()}  # rounding: -1e-7
+        return add_fused_curves({name: np.maximum(d, 0) for name, d in self.normalised.items()})
+
+    @property
+    def unclipped(self) -> dict[str, Float[np.ndarray, " n"]]:
+        """The same, below 0 where nearer than the usual end: to rank what costs 0."""
+        return add_fused_curves(self.normalised) if self.normalised else dict(self.raw)
+
+    @property
+    def rewards(self) -> dict[str, Float[np.ndarray, " n"]]:
+        """State reward -cost per frame, of every cost curve."""
+        return {name: state_reward(d) for name, d in self.costs.items()}
+
+    def potential_rewards(self, gamma: float = GAMMA) -> dict[str, Float[np.ndarray, " n"]]:
+        """Potential-based reward of the step into each frame, of every cost curve."""
+        return {name: potential_reward(d, gamma) for name, d in self.costs.items()}
 
     @property
     def unit(self) -> str:
-        """What `values` are, as an axis label."""
+        """What `costs` are, as an axis label."""
         return "distance to goal (normalised)" if self.normalised else "cosine distance to goal"
 
     def metrics(self) -> dict[str, CurveMetrics]:
-        """Metrics of each curve in `values`."""
-        return {name: measure_curve(d, self.contact.frame) for name, d in self.values.items()}
-
-
-def median_name(modality: str, own: bool) -> str:
-    """Name of what a distance is scaled by: "image", or "own image" for a goal in the episode."""
-    return f"own {modality}" if own else modality
-
-
-@dataclass(frozen=True)
-class DistanceNormalizer:
-    """Where successful training episodes start and end, in raw cosine distance.
-
-    n(d) = (d - goal) / (start - goal): 1 at the usual start, 0 at the usual end. There is one pair
-    of medians for each `median_name`: a modality, with goals from elsewhere or from the own episode.
-
-    Attributes:
-        start: median raw distance of the start of a training episode to a goal.
-        goal: the same for its end.
-        separated: share of (episode, goal) pairs whose end is nearer the goal than its start.
-        space: what made the embeddings, by modality.
-        episodes: number of training episodes.
-    """
-
-    start: dict[str, float]
-    goal: dict[str, float]
-    separated: dict[str, float]
-    space: dict[str, str]
-    episodes: int
-
-    def normalise(
-        self,
-        raw: Mapping[str, Float[np.ndarray, " n"]],
-        space: Mapping[str, str],
-        own: frozenset[str],
-    ) -> dict[str, Float[np.ndarray, " n"]]:
-        """Raw distances by modality -> normalised ones.
-
-        Args:
-            raw: distances by modality.
-            space: what made the embeddings, by modality.
-            own: modalities whose goal is a frame of the measured episode itself.
-
-        Raises:
-            UserError: a modality that was not fitted, or was fitted for other encoders.
-        """
-        normalised = {}
-        for m, d in raw.items():
-            name = median_name(m, m in own)
-            if name not in self.start:
-                raise UserError(f"the scale has no '{name}', only {list(self.start)}; fit it again")
-            if self.space[m] != space[m]:
-                raise UserError(
-                    f"the scale of '{m}' was fitted for {self.space[m]}, these curves come from "
-                    f"{space[m]}; fit it again with these encoders and this camera"
-                )
-            normalised[m] = (d - self.goal[name]) / (self.start[name] - self.goal[name])
-        return normalised
-
-    def save(self, path: Path) -> None:
-        """Write JSON, atomically."""
-        write_file(path, (json.dumps(asdict(self), indent=2) + "\n").encode())
-
-    @classmethod
-    def load(cls, path: Path) -> "DistanceNormalizer":
-        """Read what `save` wrote.
-
-        Raises:
-            UserError: no such file, or not a scale.
-        """
-        if not path.is_file():
-            raise UserError(f"there is no scale at {path}; fit one on successful episodes")
-        try:
-            content = json.loads(path.read_text())
-        except json.JSONDecodeError:
-            content = None
-        if not isinstance(content, dict) or content.keys() != {f.name for f in fields(cls)}:
-            raise UserError(f"{path} is not a scale; fit one on successful episodes")
-        return cls(**content)
+        """Metrics of each cost curve."""
+        return {name: measure_curve(d, self.contact.frame) for name, d in self.costs.items()}
 
 
 def add_fused_curves(
-    normalised: Mapping[str, Float[np.ndarray, " n"]],
+    single: Mapping[str, Float[np.ndarray, " n"]],
 ) -> dict[str, Float[np.ndarray, " n"]]:
     """Normalised single curves and, for each pair of `FUSED` that is there, their mean."""
     fused = {
-        name: (normalised[a] + normalised[b]) / 2
+        name: (single[a] + single[b]) / 2
         for name, (a, b) in FUSED.items()
-        if a in normalised and b in normalised
+        if a in single and b in single
     }
-    return dict(normalised) | fused
+    return dict(single) | fused
 
 
-def reward(d: Float[np.ndarray, " n"], form: RewardForm) -> Float[np.ndarray, " n"]:
-    """Reward per frame from a cost curve.
+def state_reward(cost: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """r_t = -cost_t: highest, 0, at the goal."""
+    return 0.0 - cost  # no negative zeros in the files
 
-    Args:
-        d: distance to the goal per frame.
-        form: "state": r_t = -d_t, so every frame away from the goal costs; this form can be
-            compared with other rewards by EPIC. "difference":
-            r_t = d_{t-1} - d_t with r_0 = 0, a reward for coming nearer (VIP, LIV); it sums to
-            d_0 - d_T over any path, so detours earn nothing and standing still costs nothing. It
-            is a shaping potential: added to an undiscounted task reward it leaves the best policy
-            unchanged, and EPIC, which removes potentials, sees nothing in it.
+
+def potential_reward(
+    cost: Float[np.ndarray, " n"], gamma: float = GAMMA
+) -> Float[np.ndarray, " n"]:
+    """F_t = gamma Phi_t - Phi_{t-1} with Phi = -cost, and F_0 = 0 (Ng et al. 1999, equation 2).
+
+    With gamma = 1 it sums to cost_0 - cost_T over any path: detours earn nothing.
     """
-    if form == "state":
-        return -d
-    return np.concatenate([np.zeros(1, d.dtype), d[:-1] - d[1:]])
+    potential = state_reward(cost)
+    return np.concatenate([np.zeros(1), gamma * potential[1:] - potential[:-1]])
 
 
 def first_contact(episode: Episode) -> Contact:

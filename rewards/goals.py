@@ -13,15 +13,17 @@ There are three modalities, each a distance of its own: "image" (camera against 
 speaks for image and tactile, a picture for image, a sentence for text. Several goals may be given:
 each modality takes the first goal that speaks for it, and a goal left without a modality is an
 error, so `last` and `text:a hard smooth ball` together give all curves of Figures 8 and 9. A
-sentence is a goal for touch alone: the camera sees the object from the first frame on, so the
-distance of the picture to how it feels says nothing about how far the task has come.
+sentence is a goal for touch: the camera sees the object from the first frame on, so the distance of
+the picture to how it feels says nothing about how far the task has come. Where there is no touch
+and the towers were trained together (a CLIP), a sentence is a goal for pictures, and says what is
+to be seen; the offline image tower knows no words.
 
 The own last frame flatters: every episode, a failed one too, ends at distance 0 of it. To judge
 episodes, give the end of another, successful one.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -91,6 +93,40 @@ class PictureFile:
             raise UserError(f"goal picture {self.path} cannot be read as an image") from None
 
 
+@dataclass(frozen=True, eq=False)
+class PictureArray:
+    """A picture of the goal, as the measured camera would see it, from a script."""
+
+    picture: UInt8[np.ndarray, "h w 3"]
+    modalities: ClassVar[tuple[Modality, ...]] = ("image",)
+
+    def __str__(self) -> str:
+        """For people; it has no form that a user writes."""
+        return "image: an array"
+
+    def read(self) -> UInt8[np.ndarray, "1 h w 3"]:
+        """The picture, RGB."""
+        return self.picture[None]
+
+
+@dataclass(frozen=True, eq=False)
+class TouchArrays:
+    """Fingertip pictures of the goal, from a script.
+
+    Attributes:
+        pictures: by vocabulary key of the fingertip, in the goal state.
+        backgrounds: the same fingertips untouched.
+    """
+
+    pictures: Mapping[str, UInt8[np.ndarray, "h w 3"]]
+    backgrounds: Mapping[str, UInt8[np.ndarray, "h w 3"]]
+    modalities: ClassVar[tuple[Modality, ...]] = ("tactile",)
+
+    def __str__(self) -> str:
+        """For people; it has no form that a user writes."""
+        return "touch: arrays"
+
+
 @dataclass(frozen=True)
 class EpisodeEnd:
     """The last frame of episode `index` of the episode set in `root`."""
@@ -135,15 +171,19 @@ class Sentence:
         return f"text:{self.text}"
 
 
-GoalSpec = LastFrame | FrameNumber | PictureFile | EpisodeEnd | Sentence
+GoalSpec = (
+    LastFrame | FrameNumber | PictureFile | PictureArray | TouchArrays | EpisodeEnd | Sentence
+)
 
 
 @dataclass(frozen=True)
 class Goal:
     """What to be near, per modality; None where no goal speaks for a modality."""
 
-    image: LastFrame | FrameNumber | PictureFile | EpisodeEnd | None = None
-    tactile: LastFrame | FrameNumber | EpisodeEnd | None = None
+    image: LastFrame | FrameNumber | PictureFile | PictureArray | EpisodeEnd | Sentence | None = (
+        None
+    )
+    tactile: LastFrame | FrameNumber | TouchArrays | EpisodeEnd | None = None
     text: Sentence | None = None
 
     @property
@@ -181,12 +221,16 @@ def parse_goal(text: str) -> GoalSpec:
     raise UserError(f"goal '{text}' is not understood; write {FORMS}")
 
 
-def assign_goals(specs: Sequence[GoalSpec], available: Sequence[Modality]) -> Goal:
+def assign_goals(
+    specs: Sequence[GoalSpec], available: Sequence[Modality], picture_words: bool = False
+) -> Goal:
     """Give each available modality the first goal that speaks for it.
 
     Args:
         specs: goals in the order given.
         available: modalities of the measured source; a plain video has "image" alone.
+        picture_words: whether the towers can compare pictures with sentences; then a sentence is a
+            goal for pictures where there is no touch.
 
     Raises:
         UserError: no goal, or one that no modality takes.
@@ -196,6 +240,10 @@ def assign_goals(specs: Sequence[GoalSpec], available: Sequence[Modality]) -> Go
     taken: dict[str, GoalSpec] = {}
     for spec in specs:
         wanted = [m for m in spec.modalities if m in available]
+        if isinstance(spec, Sentence) and not wanted:
+            if not picture_words:
+                raise UserError(_no_words(spec))
+            wanted = ["image"]
         if not wanted:
             raise UserError(
                 f"goal '{spec}' speaks for {' and '.join(spec.modalities)}, but this source has "
@@ -209,3 +257,44 @@ def assign_goals(specs: Sequence[GoalSpec], available: Sequence[Modality]) -> Go
             )
         taken |= dict.fromkeys(free, spec)
     return Goal(**taken)  # pyright: ignore[reportArgumentType]  modalities fixes the types
+
+
+def check_goal(goal: Goal, length: int, source: str, camera: str, sides: Sequence[str]) -> None:
+    """Find out before any work whether a goal can be read.
+
+    Args:
+        goal: of one trajectory.
+        length: its number of frames.
+        source: its name, for people.
+        camera: vocabulary key of its camera.
+        sides: vocabulary keys of its fingertips.
+
+    Raises:
+        UserError: a frame beyond the trajectory; no such picture, set, episode, camera or fingertip.
+    """
+    for spec in (goal.image, goal.tactile):
+        if isinstance(spec, LastFrame | FrameNumber):
+            frame_index(spec, length, source)
+    if isinstance(goal.image, PictureFile):
+        goal.image.read()
+    if isinstance(goal.image, EpisodeEnd):
+        goal.image.read([camera])
+    if isinstance(goal.tactile, EpisodeEnd):
+        goal.tactile.read(sides)
+
+
+def frame_index(spec: LastFrame | FrameNumber, length: int, source: str) -> int:
+    """The frame that a goal in the episode itself means; UserError if there is none."""
+    if isinstance(spec, LastFrame):
+        return length - 1
+    if spec.index >= length:
+        raise UserError(f"goal '{spec}' lies beyond {source}, whose frames are 0 to {length - 1}")
+    return spec.index
+
+
+def _no_words(spec: Sentence) -> str:
+    return (
+        f"goal '{spec}' is a sentence, and there is no touch to compare it with; the offline image "
+        "tower knows no words: give --towers with a CLIP (Hugging Face id or folder) to compare it "
+        "with the pictures, or a goal of pictures: last, frame:K, image:PATH or episode:ROOT#K"
+    )

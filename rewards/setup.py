@@ -1,0 +1,129 @@
+"""Everything that a measurement needs: checked first, and the encoders loaded last."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from touchgoal.control.errors import UserError
+from touchgoal.encoders import pretrained
+from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
+from touchgoal.encoders.towers.towers import OfflineTowers, load_towers
+from touchgoal.rewards.curves import Curves
+from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
+from touchgoal.rewards.goals import Goal, parse_goal
+from touchgoal.rewards.normalizer import REMEDY, DistanceNormalizer
+from touchgoal.rewards.sources import EpisodeSource, VideoSource
+
+SCALE = "scale.json"
+"""The normalizer in an encoder's folder: of the episodes that the encoder was trained on."""
+
+Source = EpisodeSource | VideoSource
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What to measure, with what, against what.
+
+    Attributes:
+        source: what to measure.
+        goal: what to be near.
+        embedder: the encoders.
+        normalizer: what normalises the distances; None for raw ones.
+        note: for people: which normalizer, or why there is none.
+    """
+
+    source: Source
+    goal: Goal
+    embedder: EpisodeEmbedder
+    normalizer: DistanceNormalizer | None
+    note: str
+
+    def measure(self) -> Iterator[tuple[str, Curves]]:
+        """Name and curves of each trajectory."""
+        for name, one in zip(self.source.names, self.source.embed(self.embedder), strict=True):
+            goal = self.embedder.embed_goal(self.goal, one)
+            yield name, compute_curves(one, goal, self.normalizer)
+
+
+def prepare(
+    source: Source, goals: Sequence[str], encoder: str | None, towers: str | None, scale: str | None
+) -> Setup:
+    """Check goals and scale, then load the encoders.
+
+    Args:
+        source: what to measure.
+        goals: in the forms of rewards/goals.py.
+        encoder, towers: see `load_encoders`.
+        scale: a file of `fit-scale`, "none", or None for the one beside the encoder where it
+            applies.
+
+    Raises:
+        UserError: whatever would stop the measurement.
+    """
+    picture_words = towers not in (None, OfflineTowers.name)
+    goal = source.check_goals([parse_goal(text) for text in goals], picture_words)
+    given = DistanceNormalizer.load(Path(scale)) if scale not in (None, "none") else None
+    embedder, folder = load_encoders(source, encoder, towers)
+    made_with = source.made_with(embedder)
+    if given is not None:
+        reason = given.mismatch(made_with, goal.as_dict(), goal.own)
+        if reason:
+            raise UserError(f"{scale} does not apply here: {reason}; {REMEDY}")
+        return Setup(source, goal, embedder, given, f"scale: {scale}")
+    if scale == "none":
+        return Setup(source, goal, embedder, None, "scale: none, raw cosine distances")
+    path = (folder or pretrained.SHIPPED) / SCALE
+    if not path.is_file():
+        note = f"raw cosine distances, for there is no {path}; to normalise them: {_FIT}"
+        return Setup(source, goal, embedder, None, note)
+    beside = DistanceNormalizer.load(path)
+    reason = beside.mismatch(made_with, goal.as_dict(), goal.own)
+    if beside.scene != source.scene:
+        reason = f"it was fitted on episodes ({beside.scene}), not on such ({source.scene})"
+    if reason:
+        note = f"raw cosine distances, for {path} does not apply: {reason}; to normalise: {_FIT}"
+        return Setup(source, goal, embedder, None, note)
+    return Setup(source, goal, embedder, beside, f"scale: {path}")
+
+
+_FIT = "touchgoal fit-scale, on successful episodes of your own"
+
+
+def load_encoders(
+    source: Source, encoder: str | None, towers: str | None
+) -> tuple[EpisodeEmbedder, Path | None]:
+    """The encoders for a source, and the folder of the touch encoder (None without touch).
+
+    Args:
+        source: what to embed.
+        encoder: name or folder of a touch encoder; None for the one that ships for the sensor.
+        towers: "offline" or a CLIP; None for those of the touch encoder, "offline" without touch.
+
+    Raises:
+        UserError: nothing ships for the sensor, or the encoder is for other towers.
+    """
+    folder = _encoder_folder(source, encoder)
+    touch: TouchEncoder | None = None
+    if folder is not None:
+        touch = pretrained.load_aligned(folder, sensor=source.sensor)
+    towers = towers or (touch.config.towers if touch else OfflineTowers.name)
+    return EpisodeEmbedder(load_towers(towers), touch, source.camera), folder
+
+
+def _encoder_folder(source: Source, encoder: str | None) -> Path | None:
+    if not source.sides:
+        if encoder is not None:
+            raise UserError(f"{source.path} has no touch: leave --encoder out")
+        return None
+    if encoder is not None:
+        return pretrained.find_encoder(encoder)
+    pictures_alone = "or measure the pictures alone: --towers offline"
+    if source.sensor is None:
+        raise UserError(
+            f"the episodes in {source.path} do not name their sensor: give --encoder, "
+            + pictures_alone
+        )
+    try:
+        return pretrained.shipped_encoder_for(source.sensor)
+    except UserError as error:
+        raise UserError(f"{error}; {pictures_alone}") from None

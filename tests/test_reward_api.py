@@ -1,0 +1,229 @@
+"""Curves from arrays in one call, and what is checked before any encoder is loaded."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from test_rewards import PaintTowers, recorded
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT
+from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
+from touchgoal.encoders.backbones.vit import PRESETS
+from touchgoal.episodes.media import write_video
+from touchgoal.episodes.store import EpisodeWriter
+from touchgoal.launch.__main__ import main
+from touchgoal.rewards.api import reward_curve
+from touchgoal.rewards.normalizer import DistanceNormalizer
+from touchgoal.rewards.sources import open_source
+
+EPISODE = recorded()
+IMAGES = EPISODE.frames[FRONT]
+TOUCH = {"left": EPISODE.frames[TACTILE_LEFT], "right": EPISODE.frames[TACTILE_RIGHT]}
+
+
+class TogetherTowers(PaintTowers):
+    """Towers whose pictures and sentences share a space, as a CLIP's."""
+
+    text_dim = 48
+    pretrained_together = True
+
+    def embed_texts(self, texts: list[str]) -> torch.Tensor:
+        return torch.tensor([[text.count(c) + 0.5 for c in "redblu"] * 8 for text in texts])
+
+
+@pytest.fixture(scope="module")
+def encoder() -> TouchEncoder:
+    torch.manual_seed(0)
+    config = TouchEncoderConfig.for_towers(PRESETS["tiny"], PaintTowers(), "gelsight_mini", 16)
+    return TouchEncoder(config)
+
+
+def test_curve_of_arrays(encoder: TouchEncoder) -> None:
+    both = {"encoder": encoder, "towers": PaintTowers()}
+    curves = reward_curve(IMAGES, TOUCH, ("last", "a hard ball"), **both)
+    assert curves.costs.keys() == {"image", "tactile", "text"}
+    for name, cost in curves.costs.items():
+        assert cost.shape == (12,) and curves.rewards[name] == pytest.approx(-cost)
+        assert curves.potential_rewards(0.9)[name].shape == (12,)
+    for name in ("image", "tactile"):
+        assert curves.costs[name][0] > 1e-4 and curves.costs[name][-1] == pytest.approx(0, abs=1e-6)
+    third = reward_curve(IMAGES, TOUCH, 3, **both)
+    assert third.costs["image"].argmin() == 3 and third.own_goal == {"image", "tactile"}
+
+
+def test_goals_as_arrays_are_those_of_the_same_frame(encoder: TouchEncoder) -> None:
+    both = {"encoder": encoder, "towers": PaintTowers()}
+    frame = reward_curve(IMAGES, TOUCH, 9, **both)
+    arrays = {"image": IMAGES[9], **{side: pictures[9] for side, pictures in TOUCH.items()}}
+    given = reward_curve(IMAGES, TOUCH, arrays, **both)
+    for name in ("image", "tactile"):
+        assert given.costs[name] == pytest.approx(frame.costs[name], abs=1e-6)
+    assert not given.own_goal
+    picture = reward_curve(IMAGES, goal=IMAGES[9], towers=PaintTowers())
+    assert picture.costs["image"] == pytest.approx(frame.costs["image"], abs=1e-6)
+    touch = reward_curve(None, {"left": TOUCH["left"]}, "last", **both)
+    assert touch.costs.keys() == {"tactile"}
+
+
+def test_a_sentence_is_a_goal_for_pictures_with_towers_that_know_words() -> None:
+    curves = reward_curve(IMAGES, goal="a red ball", towers=TogetherTowers())
+    assert curves.costs.keys() == {"image"} and np.ptp(curves.costs["image"]) > 0
+    with pytest.raises(UserError, match="knows no words: give --towers"):
+        reward_curve(IMAGES, goal="a red ball", towers=PaintTowers())
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: reward_curve(), "nothing to measure"),
+        (lambda: reward_curve(IMAGES / 255), "images must be RGB .* not of float64"),
+        (lambda: reward_curve(IMAGES[0]), "images must be RGB"),
+        (lambda: reward_curve(IMAGES[:1]), "at least 2 frames"),
+        (lambda: reward_curve(IMAGES, {"thumb": IMAGES}), "tactile has no 'thumb'"),
+        (lambda: reward_curve(IMAGES, {"left": IMAGES[:3]}), "images 12, left 3"),
+        (lambda: reward_curve(IMAGES, goal=-1), "goal -1 is no frame"),
+        (lambda: reward_curve(IMAGES, goal="frame:99"), "frames are 0 to 11"),
+        (lambda: reward_curve(IMAGES, goal=IMAGES), "the goal must be RGB"),
+        (lambda: reward_curve(IMAGES, goal={"left": IMAGES[0]}), "must be the trajectory's"),
+        (lambda: reward_curve(IMAGES, TOUCH, encoder="nobody"), "no touch encoder 'nobody'"),
+        (lambda: reward_curve(IMAGES, scale="none.json"), "there is no scale at none.json"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(call: Callable[[], Any], message: str) -> None:
+    with pytest.raises(UserError, match=message) as error:
+        call()
+    assert "\n" not in str(error.value)
+
+
+def test_shipped_encoder_by_name() -> None:
+    pytest.importorskip("transformers")
+    curves = reward_curve(IMAGES, TOUCH, ("last", "a hard smooth round object"))
+    assert curves.costs.keys() == {"image", "tactile", "text"}
+    assert curves.costs["tactile"][0] > 0.1
+
+
+# ---- sources
+
+
+def _stripes(shift: int) -> np.ndarray:
+    """Thin upright stripes that turn into broad level ones."""
+    rows, columns = np.mgrid[:64, :64]
+    thin, broad = 200.0 * (columns // 2 % 2), 200.0 * ((rows + shift) // 16 % 2)
+    share = np.linspace(0, 1, 12)[:, None, None]
+    frames = ((1 - share) * thin + share * broad).astype(np.uint8)
+    return np.repeat(frames[..., None], 3, axis=3)
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with episodes as an arm records them (no truth), and videos."""
+    folder = tmp_path_factory.mktemp("run")
+    writer = EpisodeWriter(folder / "episodes")
+    frames = {k: v for k, v in EPISODE.frames.items() if k != TRUTH_CONTACT}
+    for success in (True, True, False):
+        meta = {"sensor": "gelsight_mini", "success": success, "object": "cup"}
+        writer.append(replace(EPISODE, frames=frames, meta=meta))
+    for i in range(2):
+        write_video(folder / f"{i}.mp4", _stripes(i), 20)
+    write_video(folder / "one.mp4", IMAGES[:1], 20)
+    (folder / "goal.png").write_text("no picture")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["0.mp4", "--goal", "text:soft"], "knows no words: give --towers"),
+        (["0.mp4", "--goal", "frame:12"], "whose frames are 0 to 11"),
+        (["0.mp4", "--goal", "image:goal.png"], "goal.png cannot be read"),
+        (["0.mp4", "--goal", "episode:episodes#3"], "has episodes 0 to 2"),
+        (["0.mp4", "--goal", "last", "--goal", "frame:1"], "is never used"),
+        (["0.mp4", "--index", "0"], "is no set of episodes: leave --index out"),
+        (["0.mp4", "--encoder", "gelsight_mini"], "has no touch: leave --encoder out"),
+        (["0.mp4", "--gamma", "1.5"], "gamma"),
+        (["0.mp4", "--scale", "none.json"], "there is no scale at none.json"),
+        (["one.mp4"], "has one frame: a curve needs at least 2"),
+        (["episodes", "--camera", "wrist"], "choose --camera observation.images.front"),
+        (["episodes", "--camera", "top"], "there is no camera 'top'"),
+        (["episodes", "--index", "7"], "has no episode 7; it has 0 to 2"),
+        (["episodes", "--goal", "frame:99"], "whose frames are 0 to 11"),
+        (["episodes", "--encoder", "nobody"], "there is no touch encoder 'nobody'"),
+    ],
+)
+def test_told_before_any_encoder_is_loaded(
+    run_folder: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
+) -> None:
+    def loaded(*_: Any) -> None:
+        raise AssertionError("the encoders were loaded first")
+
+    monkeypatch.chdir(run_folder)
+    monkeypatch.setattr("touchgoal.encoders.pretrained.load_aligned", loaded)
+    monkeypatch.setattr("touchgoal.rewards.setup.load_towers", loaded)
+    with pytest.raises(SystemExit, match=message):
+        main(["reward-curves", *arguments, "--out", "out"])
+    assert not (run_folder / "out").exists()
+
+
+def test_a_run_folder_stands_for_its_episodes(run_folder: Path) -> None:
+    source = open_source(run_folder, "front")
+    assert source.path == run_folder / "episodes" and len(source.names) == 3
+
+
+def test_foreign_data_are_drawn_raw_until_a_scale_is_fitted(
+    run_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """The shipped scale is of the simulated scene; fit-scale makes one of any successes."""
+    pytest.importorskip("transformers")
+    monkeypatch.chdir(run_folder)
+    for source in ("episodes", "0.mp4"):
+        main(["reward-curves", source, "--out", f"raw-{source}"])
+        assert "raw cosine distances, for" in capsys.readouterr().out
+    raw = json.loads(Path("raw-0.mp4/0.json").read_text())
+    assert raw["unit"] == "cosine distance to goal" and min(raw["cost"]["values"]["image"]) >= 0
+    assert set(json.loads(Path("raw-episodes/episode_000.json").read_text())["metrics"]) == {
+        "image",
+        "tactile",
+    }
+
+    main(["fit-scale", "episodes", "--modalities", "tactile", "--out", "touch"])
+    fitted = DistanceNormalizer.load(Path("touch/scale.json"))
+    assert fitted.episodes == 2 and fitted.scene == "recorded, not simulated"
+    assert fitted.source.sensor == "gelsight_mini" and set(fitted.start) == {
+        "tactile",
+        "own tactile",
+    }
+    with pytest.raises(SystemExit, match="does not apply here: it has no 'own image'"):
+        main(["reward-curves", "episodes", "--scale", "touch/scale.json", "--out", "x"])
+
+    main(["fit-scale", "0.mp4", "1.mp4", "--out", "videos"])
+    main(["reward-curves", "0.mp4", "--scale", "videos/scale.json", "--out", "scaled"])
+    scaled = json.loads(Path("scaled/0.json").read_text())
+    assert scaled["unit"] == "distance to goal (normalised)"
+    assert scaled["metrics"]["image"]["start"] == pytest.approx(1, abs=0.2)
+
+
+def test_fit_scale_wants_successes(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(run_folder)
+    with pytest.raises(SystemExit, match="at least two successful videos"):
+        main(["fit-scale", "0.mp4", "--out", "y"])
+    with pytest.raises(SystemExit, match="one set of episodes, or several videos"):
+        main(["fit-scale", "0.mp4", "episodes", "--out", "y"])
+    meta = {"sensor": "gelsight_mini"}
+    for _ in range(2):
+        EpisodeWriter(Path("unknown")).append(replace(EPISODE, meta=meta))
+    with pytest.raises(SystemExit, match="nobody recorded whether 2 of 2 episodes"):
+        main(["fit-scale", "unknown", "--out", "y"])
+
+
+def test_goal_picture_from_a_file(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(run_folder)
+    Image.fromarray(IMAGES[9]).save("end.png")
+    curves = reward_curve(IMAGES, goal="image:end.png", towers=PaintTowers())
+    assert curves.costs["image"].argmin() == 9
