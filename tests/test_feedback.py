@@ -10,6 +10,7 @@ from toy_policies import TOY, toy_dataset, toy_policy
 from touchgoal.control import features as ft
 from touchgoal.episodes.recording import CORRECTED, EpisodeSpec, record_episode
 from touchgoal.policies import checkpoint
+from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.policies.perception.state_estimation import ESTIMATED
 from touchgoal.policies.training.dagger import DaggerRoles
 from touchgoal.sim_envs.config import PickPlaceConfig
@@ -51,7 +52,10 @@ def test_a_learner_acts_and_is_corrected(tmp_path: Path) -> None:
         position_noise=0.0,
     )
     checkpoint.save(toy_policy(config, toy_dataset(config)), tmp_path / "learner", {})
-    roles, env = DaggerRoles(tmp_path / "learner"), PickPlace(replace(BLIND, max_seconds=1.0))
+    roles, env = (
+        DaggerRoles(SavedPolicy(tmp_path / "learner")),
+        PickPlace(replace(BLIND, max_seconds=1.0)),
+    )
     episode = record_episode(env, JOB, roles)
     assert episode.meta["outcome"] == CORRECTED
     observation, _ = env.reset(seed=JOB.seed, options=JOB.options)
