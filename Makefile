@@ -79,8 +79,8 @@ FEEL := --data $(MAZE)/train/episodes --validation $(MAZE)/val/episodes \
 	--encoder $(MAZE)/mae/encoder --representation body_twist --train.lr 1e-3
 maze-policy: $(READY)
 	$(BIN)/touchgoal collect-demos --task bead-maze --episodes 16 --seed 20000 \
-		--maze.split validation --maze.n-wires 16 --out $(MAZE)/val
-	$(BIN)/touchgoal collect-demos --task bead-maze --episodes 260 --seed 0 --maze.n-wires 260 \
+		--env.split validation --env.n-wires 16 --out $(MAZE)/val
+	$(BIN)/touchgoal collect-demos --task bead-maze --episodes 260 --seed 0 --env.n-wires 260 \
 		--out $(MAZE)/train
 	$(BIN)/touchgoal train-encoder mae --data $(MAZE)/train/episodes \
 		--validation $(MAZE)/val/episodes --frames 30 --mae.epochs 12 --out $(MAZE)/mae
@@ -88,10 +88,10 @@ maze-policy: $(READY)
 		$(BIN)/touchgoal train-policy $(FEEL) --head regression --trials 0 \
 			--train.epochs $$((6 + 2 * round)) --out $(MAZE)/round-$$round && \
 		$(BIN)/touchgoal collect-demos --task bead-maze --policy $(MAZE)/round-$$round/policy \
-			--episodes 120 --seed 5$${round}000 --maze.n-wires 260 --out $(MAZE)/train || exit 1; \
+			--episodes 120 --seed 5$${round}000 --env.n-wires 260 --out $(MAZE)/train || exit 1; \
 	done
 	$(BIN)/touchgoal train-policy $(FEEL) --train.epochs 10 \
-		--train.snapshot-epochs 5 --trials 48 --maze.disturbance 0.003 --out $(MAZE)/policy
+		--train.snapshot-epochs 5 --trials 48 --env.disturbance 0.003 --out $(MAZE)/policy
 	rm -rf policies/weights/bead_maze && mkdir -p policies/weights
 	cp -r $(MAZE)/policy/policy policies/weights/bead_maze
 

@@ -4,11 +4,11 @@ import os
 import shlex
 import sys
 from collections import Counter
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from touchgoal.control.errors import UserError
+from touchgoal.control.option_types import Count, Seed, checked_dataclass
 from touchgoal.episodes.recording import EpisodeSpec, Roles, collect, expert_alone
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.run_folder import open_run, write_json
@@ -16,53 +16,54 @@ from touchgoal.policies.by_name import choose_policy, env_config_for
 from touchgoal.policies.checkpoint import SavedPolicy, load
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.training.dagger import DaggerRoles
-from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 from touchgoal.sim_envs.experts.pick_place import Outcome
-from touchgoal.sim_envs.scene.objects import CATALOGUE, find
+from touchgoal.sim_envs.scene.objects import CATALOGUE
+
+ENVS: dict[TaskName, TaskConfig] = {
+    "pick-place": PickPlaceConfig(),
+    "bead-maze": BeadMazeConfig(disturbance=0.004),  # shows how to come back
+}
+"""Options of the environment of each task, unless others are typed."""
 
 
-@dataclass(frozen=True)
+@checked_dataclass
 class Config:
     """Options of collect-demos."""
 
-    task: Literal["pick-place", "bead-maze"] = "pick-place"
-    """What is demonstrated."""
+    task: TaskName = "pick-place"
+    """Task that is demonstrated."""
     out: Path | None = None
     """Folder of the run; the episodes go to its `episodes/`, after those already there."""
-    episodes: int = 10
+    episodes: Count = 10
     """Number of episodes of each outcome."""
     outcomes: tuple[Outcome, ...] = ("success",)
     """What the expert shall do: succeed, or (pick-place) fail in one of four ways."""
-    objects: tuple[str, ...] = ()
-    """pick-place: catalogue names, taken in turn; default: all."""
     feedback: bool = False
     """pick-place: the expert decides anew at every tick instead of following a planned path; a policy
     learns better from that."""
     policy: str | None = None
     """A policy that acts in the expert's place, while what the expert would have done is recorded
     (DAgger): named as for run-policy."""
-    seed: int = 0
+    seed: Seed = 0
     """Random seed of the first episode; each further one adds one."""
     resume: bool = False
     """Go on with an interrupted recording in `out`: leave out the seeds that it holds already."""
-    workers: int = os.cpu_count() or 1
+    workers: Count = os.cpu_count() or 1
     """Processes that simulate."""
-    env: PickPlaceConfig = field(default_factory=PickPlaceConfig)
-    """Options of pick-place."""
-    maze: BeadMazeConfig = field(default_factory=lambda: BeadMazeConfig(disturbance=0.004))
-    """Options of bead-maze; its wires are taken in turn. The disturbance shows recoveries."""
+    env: PickPlaceConfig | BeadMazeConfig = ENVS["pick-place"]
+    """Options of the task; its objects or wires are taken in turn."""
 
 
 def main(config: Config) -> None:
     """Record the episodes and say what came of them."""
-    task, options = _task(config)
-    roles = _roles(config, task)
-    specs = specs_of(config, options)
+    roles = _roles(config)
+    specs = specs_of(config)
     if config.resume:
         specs = _missing(config, specs)
     out = open_run(config.out, "collect-demos", config, adds=True)
     try:
-        metas = collect(out / "episodes", task, specs, config.workers, roles)
+        metas = collect(out / "episodes", config.env, specs, config.workers, roles)
     except KeyboardInterrupt:
         _stopped(out, config)
         sys.exit(130)
@@ -76,9 +77,9 @@ def main(config: Config) -> None:
         print(f"the policy succeeded in {rate}")
 
 
-def specs_of(config: Config, options: list[dict[str, Any]]) -> list[EpisodeSpec]:
+def specs_of(config: Config) -> list[EpisodeSpec]:
     """The episodes to record: with each object (or wire) in turn, every outcome once."""
-    kinds = config.outcomes
+    kinds, options = config.outcomes, _reset_options(config.env)
     return [
         EpisodeSpec(config.seed + i, kinds[i % len(kinds)], options[i // len(kinds) % len(options)])
         for i in range(len(kinds) * config.episodes)
@@ -106,25 +107,28 @@ def _stopped(out: Path, config: Config) -> None:
         print("\nstopped before the first episode was recorded: nothing to keep")
         return
     kept = len(EpisodeSet(root))
-    print(f"\nstopped: {kept} episodes are kept in {root}, whole and sound. To go on:")
+    many = "1 episode is" if kept == 1 else f"{kept} episodes are"
+    print(f"\nstopped: {many} kept in {root}, whole and sound. To go on:")
     rest = [] if config.out else ["--out", str(out)]
     rest += [] if config.resume else ["--resume"]
     print("  " + shlex.join(["touchgoal", *sys.argv[1:], *rest]))
 
 
-def _task(config: Config) -> tuple[TaskConfig, list[dict[str, Any]]]:
-    """The task's own config, and the reset options that the episodes take in turn."""
-    if config.task == "bead-maze":
-        return config.maze, [{"wire": wire.name} for wire in config.maze.chosen_wires()]
-    names = [find(name).name for name in config.objects or config.env.objects] or list(CATALOGUE)
-    return config.env, [{"object": name} for name in names]
+def _reset_options(env: TaskConfig) -> list[dict[str, Any]]:
+    """The reset options that the episodes take in turn."""
+    if isinstance(env, BeadMazeConfig):
+        return [{"wire": wire.name} for wire in env.chosen_wires()]
+    return [{"object": name} for name in env.objects or CATALOGUE]
 
 
-def _roles(config: Config, task: TaskConfig) -> Roles:
+def _roles(config: Config) -> Roles:
     """Who acts and who answers; UserError for a policy that cannot act in the task."""
+    task = config.env
+    if isinstance(task, BeadMazeConfig) and config.feedback:
+        raise UserError("--feedback is for pick-place: the bead maze's expert always decides anew")
     if not config.feedback and config.policy is None:
         return expert_alone
-    if config.outcomes != ("success",) or config.env.release:
+    if config.outcomes != ("success",) or (isinstance(task, PickPlaceConfig) and task.release):
         raise UserError(
             "an expert that is asked at every tick neither fails on purpose nor lets go: leave out "
             "--outcomes, --env.release, or --feedback and --policy"

@@ -4,61 +4,60 @@ import json
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from touchgoal.control.errors import UserError
+from touchgoal.control.option_types import Count, CountOrNone, Seed, checked_dataclass
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.recording import Actor, EpisodeSpec, record_with_film
 from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies.by_name import choose_policy, env_config_for
 from touchgoal.policies.evaluation.evaluate import Evaluation, Trial, run_trials, trial_specs
 from touchgoal.policies.evaluation.table import table, worst_first
-from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig
-from touchgoal.sim_envs.scene.objects import find
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 from touchgoal.sim_envs.tasks import make_env
 
 TRIALS = "trials.jsonl"
 
 
-@dataclass(frozen=True)
+ENVS: dict[TaskName, TaskConfig] = {
+    "pick-place": PickPlaceConfig(),
+    "bead-maze": BeadMazeConfig(split="validation"),
+}
+"""Options of the environment of each task, unless others are typed."""
+
+
+@checked_dataclass
 class Config:
     """Options of run-policy."""
 
-    task: Literal["pick-place", "bead-maze"] = "pick-place"
-    """Where to run it."""
+    task: TaskName = "pick-place"
+    """Task to run it in."""
     policy: str = "shipped"
     """Which policy: shipped; a folder that train-policy made; expert, which sees the simulator's
     state; follower (bead-maze), the classical one, which feels the force on the hand; or a class of
     your own, as module:Class or file.py:Class (docs: policies/by_name.py)."""
-    latency: int = 0
+    latency: CountOrNone = 0
     """Control ticks by which a learned policy's plans come late, to try what a slow computer does."""
     out: Path | None = None
     """Folder of the run."""
-    episodes: int = 20
+    episodes: Count = 20
     """Number of episodes; objects are taken in turn, wires one each."""
-    objects: tuple[str, ...] = ()
-    """pick-place: catalogue names; default: all."""
-    seed: int = 1_000_000
+    seed: Seed = 1_000_000
     """Random seed of the first episode; each further one adds one."""
-    workers: int = os.cpu_count() or 1
+    workers: Count = os.cpu_count() or 1
     """Processes that simulate."""
     video: bool = True
     """Film the worst, the median and the best episode."""
-    env: PickPlaceConfig = field(default_factory=PickPlaceConfig)
-    """Options of pick-place; what the policy does not look at is not rendered."""
-    maze: BeadMazeConfig = field(default_factory=lambda: BeadMazeConfig(split="validation"))
-    """Options of bead-maze; what the policy does not look at is not rendered."""
+    env: PickPlaceConfig | BeadMazeConfig = ENVS["pick-place"]
+    """Options of the task; what the policy does not look at is not rendered."""
 
 
 def main(config: Config) -> None:
     """Run the episodes, print the table, film three of them."""
-    if config.episodes < 1:
-        raise UserError("nothing to run: ask for at least one episode")
-    task = _task(config)
-    policy = choose_policy(config.policy, task, config.latency)
-    env = env_config_for(policy, task)
+    policy = choose_policy(config.policy, config.env, config.latency)
+    env = env_config_for(policy, config.env)
     specs = trial_specs(env, config.episodes, config.seed)
     out = open_run(config.out, "run-policy", config)
     trials: list[Trial] = []
@@ -75,13 +74,6 @@ def main(config: Config) -> None:
     print(f"{table(trials)}\nall trials: {out / 'metrics.json'}")
     if config.video:
         _film(out, env, [specs[i] for i in worst_first(trials)], policy)
-
-
-def _task(config: Config) -> TaskConfig:
-    if config.task == "bead-maze":
-        return config.maze
-    names = tuple(find(name).name for name in config.objects)
-    return replace(config.env, objects=names or config.env.objects)
 
 
 def _stopped(out: Path, trials: list[Trial], asked: int) -> None:

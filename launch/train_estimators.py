@@ -4,12 +4,13 @@ import os
 import shlex
 import shutil
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 
 import torch
 
 from touchgoal.control import features as ft
+from touchgoal.control.option_types import Count, checked_dataclass
 from touchgoal.encoders import pretrained
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.run_folder import open_run, write_json
@@ -34,7 +35,7 @@ from touchgoal.sim_envs.config import PickPlaceConfig
 _SEED, _VALIDATION_SEED = 4_000_000, 4_900_000  # of the things placed
 
 
-@dataclass(frozen=True)
+@checked_dataclass
 class Config:
     """Options of train-estimators."""
 
@@ -47,9 +48,9 @@ class Config:
     encoder: Path = pretrained.SHIPPED
     """Folder of a frozen touch encoder (train-encoder), which is copied beside the estimator unless it
     is the shipped one."""
-    objects: int = 600
+    objects: Count = 600
     """Number of objects to look at, of random kind and size."""
-    placements: int = 20
+    placements: Count = 20
     """Number of places on the table for each object."""
     pose_estimator: PoseEstimatorConfig = PoseEstimatorConfig()
     """The network that looks."""
@@ -57,7 +58,7 @@ class Config:
     """The training."""
     env: PickPlaceConfig = field(default_factory=PickPlaceConfig)
     """Options of the task."""
-    workers: int = os.cpu_count() or 1
+    workers: Count = os.cpu_count() or 1
     """Processes that render and embed."""
 
 

@@ -3,12 +3,13 @@
 import os
 import shlex
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Literal
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
+from touchgoal.control.option_types import Count, CountOrNone, Fraction, checked_dataclass
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.run_folder import open_run, write_json
@@ -32,14 +33,22 @@ from touchgoal.policies.training.training_data import (
     common_sensor,
     common_task,
 )
-from touchgoal.sim_envs.config import TASKS, BeadMazeConfig, PickPlaceConfig, TaskName
+from touchgoal.sim_envs.config import TASKS, BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
+from touchgoal.sim_envs.tasks import task_name
 
 Head = Literal["small", "published", "tiny", "regression"]
 _COLUMNS = ft.STATE, ft.TCP_POSE
 _TRIALS = 2_000_000  # seed of the first trial
 
 
-@dataclass(frozen=True)
+ENVS: dict[TaskName, TaskConfig] = {
+    "bead-maze": BeadMazeConfig(split="validation"),
+    "pick-place": PickPlaceConfig(),
+}
+"""Options of the environment of each task, unless others are typed."""
+
+
+@checked_dataclass
 class Config:
     """Options of train-policy."""
 
@@ -50,7 +59,7 @@ class Config:
     """Set of other episodes, on which losses are measured."""
     include_unknown: bool = False
     """Also learn from episodes that do not say whether they succeeded."""
-    task: Literal["pick-place", "bead-maze"] | None = None
+    task: TaskName | None = None
     """Task of the episodes, in which snapshots are tried; default: what the episodes say."""
     encoder: Path | None = None
     """Folder of a frozen touch encoder (train-encoder); without one the policy does not feel."""
@@ -61,7 +70,7 @@ class Config:
     of where things lie at the start, and learns on the truth, so its episodes need no pictures."""
     out: Path | None = None
     """Folder of the run; the policy goes to its `policy/`."""
-    share: float = 1.0
+    share: Fraction = 1.0
     """Share of the episodes to learn from, counted from the first; 1 takes all."""
     head: Head = "small"
     """Size of the diffusion's U-Net, or regression instead."""
@@ -84,13 +93,11 @@ class Config:
     """Ticks of a plan that are done before the next one."""
     train: TrainConfig = TrainConfig()
     """The training."""
-    trials: int = 24
-    """Validation wires or placements on which every snapshot is tried; 0 keeps the last one."""
-    env: PickPlaceConfig = field(default_factory=PickPlaceConfig)
-    """Options of pick-place, when snapshots are tried."""
-    maze: BeadMazeConfig = field(default_factory=lambda: BeadMazeConfig(split="validation"))
-    """Options of bead-maze, when snapshots are tried."""
-    workers: int = os.cpu_count() or 1
+    trials: CountOrNone = 24
+    """Number of validation episodes in which every snapshot is tried; 0 keeps the last snapshot."""
+    env: PickPlaceConfig | BeadMazeConfig = ENVS["bead-maze"]
+    """Options of the task when snapshots are tried; they go with --task."""
+    workers: Count = os.cpu_count() or 1
     """Processes that simulate."""
     resume: bool = False
     """Go on with an interrupted run in `out`."""
@@ -100,8 +107,6 @@ def main(config: Config) -> None:
     """Embed, train, choose."""
     if config.resume and config.out is None:
         raise UserError("to resume a run, name its folder with --out")
-    if not 0 < config.share <= 1:
-        raise UserError("share must be above 0 and at most 1")
     if config.end_to_end and config.encoder:
         raise UserError("end-to-end touch takes no frozen encoder: leave it out")
     parts = {
@@ -180,9 +185,18 @@ def _task(config: Config, chosen: list[tuple[EpisodeSet, list[int]]]) -> TaskNam
     return task  # pyright: ignore[reportReturnType]
 
 
+def _env(config: Config, task: TaskName) -> TaskConfig:
+    """Options of the task in which snapshots are tried."""
+    if task_name(config.env) == task:
+        return config.env
+    if config.env not in ENVS.values():
+        raise UserError(f"the episodes are of {task}: add --task {task}, whose options --env.* are")
+    return ENVS[task]
+
+
 def _check_sensor(config: Config, task: TaskName, sensor: str) -> None:
     """UserError if snapshots would be tried with another sensor than the episodes'."""
-    tried = find_sensor((config.maze if task == "bead-maze" else config.env).sensor).name
+    tried = find_sensor(_env(config, task).sensor).name
     if sensor and tried != sensor:
         raise UserError(
             f"{config.data} was recorded with {sensor}, snapshots would be tried with {tried}: add "
@@ -191,7 +205,7 @@ def _check_sensor(config: Config, task: TaskName, sensor: str) -> None:
 
 
 def _try(config: Config, task: TaskName, directory: Path) -> Score:
-    env = config.maze if task == "bead-maze" else config.env
+    env = _env(config, task)
     policy = SavedPolicy(directory).check_task(env)
     env = policy.env_config(env)
     specs = trial_specs(env, config.trials, _TRIALS)

@@ -1,13 +1,14 @@
 """Train the bead-maze policy as Sparsh (C.7) and diffusion_policy say: U-Net of 87 M, DDPM, deltas.
 
 The paper's 30 demonstrations of about 34,000 pairs are
-`touchgoal collect-demos --task bead-maze --episodes 30 --maze.control-hz 50`. It leaves open how many
+`touchgoal collect-demos --task bead-maze --episodes 30 --env.control-hz 50`. It leaves open how many
 ticks of a plan are done (here all 8), at what rate, and for how long to train (here the 600 epochs of
 diffusion_policy's real-robot tasks). On a CPU this is a matter of days.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
+from touchgoal.control.option_types import checked_dataclass
 from touchgoal.launch import train_policy
 from touchgoal.policies.actions import ActionRepresentation
 from touchgoal.policies.heads.samplers import SamplerConfig
@@ -15,7 +16,7 @@ from touchgoal.policies.policy import TouchReading
 from touchgoal.policies.training.train import TrainConfig
 
 
-@dataclass(frozen=True)
+@checked_dataclass
 class Config(train_policy.Config):
     """Options of train-policy, with the published ones as defaults."""
 

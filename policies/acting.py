@@ -55,8 +55,8 @@ class Planner:
         self.config = config = policy.config
         if (touch.name if touch else "") != config.touch:
             raise UserError(
-                f"the policy feels through {config.touch!r}, not {touch.name if touch else ''!r}: "
-                "load the touch encoder that it was trained with"
+                f"the policy was trained with the touch encoder {config.touch or 'none'}, this is "
+                f"{touch.name if touch else 'none'}: load the one that it was trained with"
             )
         if config.estimated and estimator is None:
             raise UserError(f"the policy acts on {config.estimated[0]}: give it a state estimator")

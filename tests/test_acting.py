@@ -48,9 +48,9 @@ def test_an_actor_does_its_plans_in_order_and_on_time(latency: int) -> None:
 def test_an_actor_refuses_what_it_cannot_do() -> None:
     touch = toy_touch_embedder()
     policy = Policy(replace(TOY, touch_dim=touch.dim))
-    with pytest.raises(UserError, match="load the touch encoder"):
+    with pytest.raises(UserError, match="this is none: load the one"):
         Planner(policy, None)
-    with pytest.raises(UserError, match="feels through 'toy', not 'another'"):
+    with pytest.raises(UserError, match="encoder toy, this is another"):
         Planner(policy, TouchEmbedder(touch.encoder, "another"))
     with pytest.raises(UserError, match="5 ticks late"):
         PolicyActor(Planner(policy, touch), latency=5)

@@ -35,7 +35,7 @@ def refused(capsys: pytest.CaptureFixture, *arguments: object) -> str:
 def episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two picks of a ball."""
     out = tmp_path_factory.mktemp("demos")
-    run(*"collect-demos --episodes 2 --objects glass_ball --workers 2".split(), "--out", out)
+    run(*"collect-demos --episodes 2 --env.objects glass_ball --workers 2".split(), "--out", out)
     return out / "episodes"
 
 
@@ -114,7 +114,7 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
 
 
 def test_run_policy(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    run("run-policy", "--episodes", 2, "--objects", "toy_brick", "--policy", "expert", "--no-video",
+    run("run-policy", "--episodes", 2, "--env.objects", "toy_brick", "--policy", "expert", "--no-video",
         "--out", tmp_path)  # fmt: skip
     assert "2/2 [0.34, 1.00]" in capsys.readouterr().out
     assert json.loads((tmp_path / "metrics.json").read_text())["successes"] == 2
@@ -122,7 +122,7 @@ def test_run_policy(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
 
 def test_bead_maze(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     maze = "--task bead-maze --workers 1".split()
-    run("collect-demos", *maze, "--episodes", 1, "--maze.max-seconds", 1, "--out", tmp_path / "a")
+    run("collect-demos", *maze, "--episodes", 1, "--env.max-seconds", 1, "--out", tmp_path / "a")
     found = EpisodeSet(tmp_path / "a" / "episodes")
     assert found.lengths[0] == 21 and found.meta(0)["wire"] == "fourier-2000000"
     assert found.meta(0)["outcome"] == "failure" and found.meta(0)["disturbance"] == 0.004
@@ -151,24 +151,24 @@ def test_learning_the_bead_maze(
     """From demonstrations to a policy that runs; too little of everything to be any good."""
     monkeypatch.chdir(tmp_path)
     one = ("--workers", 1)
-    run("collect-demos", "--task", "bead-maze", "--episodes", 1, "--maze.disturbance", 0, *one,
+    run("collect-demos", "--task", "bead-maze", "--episodes", 1, "--env.disturbance", 0, *one,
         "--out", "demos")  # fmt: skip
-    run("collect-demos", "--task", "bead-maze", "--episodes", 1, "--maze.disturbance", 0, *one,
-        "--seed", 1, "--maze.n-wires", 1, "--out", "val")  # fmt: skip
+    run("collect-demos", "--task", "bead-maze", "--episodes", 1, "--env.disturbance", 0, *one,
+        "--seed", 1, "--env.n-wires", 1, "--out", "val")  # fmt: skip
     both = ("--data", "demos/episodes", "--validation", "val/episodes")
     run("train-encoder", "mae", *both, "--frames", 8, "--mae.vit", "tiny", "--mae.epochs", 1,
         "--mae.batch-size", 8, "--out", "mae")  # fmt: skip
     learn = ("train-policy", *both, *one, "--head", "tiny", "--train.epochs", 2, "--trials", 1,
-             "--train.snapshot-epochs", 1, "--maze.max-seconds", 1)  # fmt: skip
+             "--train.snapshot-epochs", 1, "--env.max-seconds", 1)  # fmt: skip
     run(*learn, "--encoder", "mae/encoder", "--out", "policy")
     tried = json.loads(Path("policy/metrics.json").read_text())["snapshots"]
     assert set(tried) == {"epoch-0001", "epoch-0002"}
     capsys.readouterr()
     run("run-policy", "--task", "bead-maze", "--policy", "policy/policy", "--episodes", 1, *one,
-        "--latency", 2, "--no-video", "--maze.max-seconds", 1)  # fmt: skip
+        "--latency", 2, "--no-video", "--env.max-seconds", 1)  # fmt: skip
     assert "0/1" in capsys.readouterr().out
     run("benchmark", "bead-maze", "--policies", "policy/policy", "--wires", 1, "--held-out", 0,
-        "--demonstrations", 2, "--latencies", "--maze.max-seconds", 3, *one)  # fmt: skip
+        "--demonstrations", 2, "--latencies", "--env.max-seconds", 3, *one)  # fmt: skip
     printed = capsys.readouterr().out
     assert "frozen touch, 1 demos, shuffled" in printed and "zero motion" in printed
     run("benchmark", "policy-latency", "--policy", "policy/policy", "--repeats", 3,
@@ -182,7 +182,7 @@ def test_learning_the_bead_maze(
     missing = refused(capsys, "run-policy", "--task", "bead-maze", "--policy", "nowhere")
     assert "there is no policy 'nowhere': choose from expert" in missing
     other = refused(capsys, "run-policy", "--task", "bead-maze", "--policy", "policy/policy",
-                    "--maze.sensor", "gelsight_mini")  # fmt: skip
+                    "--env.sensor", "gelsight_mini")  # fmt: skip
     assert "trained with the sensor gelsight_mini_markers" in other
     other = refused(capsys, "run-policy", "--policy", "policy/policy")
     assert "was trained for bead-maze, not for pick-place" in other
@@ -247,7 +247,7 @@ def test_mistakes_leave_nothing(
 ) -> None:
     out = tmp_path / "out"
     curves = ("reward-curves", episodes, "--out", out)
-    message = refused(capsys, "collect-demos", "--objects", "teapot", "--out", out)
+    message = refused(capsys, "collect-demos", "--env.objects", "teapot", "--out", out)
     assert "unknown object 'teapot'; choose from: glass_ball" in message
     assert "does not exist" in refused(capsys, "reward-curves", tmp_path / "none", "--out", out)
     assert "is not understood" in refused(capsys, *curves, "--goal", "lst")

@@ -1,5 +1,7 @@
 """Judging policies, shipped and one's own; what is recorded for them and what they learn from."""
 
+import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,12 +10,14 @@ import pytest
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.episodes.recording import EpisodeSpec
+from touchgoal.episodes.recording import EpisodeSpec, collect
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch import collect_demos
+from touchgoal.launch.__main__ import main
 from touchgoal.policies.by_name import choose_policy
 from touchgoal.policies.checkpoint import load_policy
+from touchgoal.policies.evaluation import evaluate as evaluation
 from touchgoal.policies.evaluation.evaluate import evaluate, run_trials
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.training.training_data import (
@@ -105,11 +109,70 @@ def test_a_policy_of_ones_own_is_judged(tmp_path: Path) -> None:
 
 
 def test_every_outcome_meets_every_object() -> None:
-    config = collect_demos.Config(episodes=3, outcomes=("success", "drop", "never_touch"))
-    options = [{"object": name} for name in ("glass_ball", "bottle_cap", "toy_brick")]
-    specs = collect_demos.specs_of(config, options)
+    env = PickPlaceConfig(objects=("glass_ball", "bottle_cap", "toy_brick"))
+    outcomes = ("success", "drop", "never_touch")
+    specs = collect_demos.specs_of(collect_demos.Config(episodes=3, outcomes=outcomes, env=env))
     met = {(spec.outcome, spec.options["object"]) for spec in specs}
     assert len(specs) == 9 == len(met) and len({spec.seed for spec in specs}) == 9
+
+
+BLIND = ("--env.objects", "glass_ball", "--env.no-tactile", "--env.cameras", "--workers", "1")
+
+
+def test_ctrl_c_keeps_the_trials_that_ended(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_trial, done = evaluation.run_trial, []
+
+    def stopped(*arguments):
+        if done:
+            raise KeyboardInterrupt
+        done.append(run_trial(*arguments))
+        return done[0]
+
+    monkeypatch.setattr(evaluation, "run_trial", stopped)
+    with pytest.raises(SystemExit) as end:
+        main(["run-policy", "--policy", "expert", "--out", str(tmp_path), *BLIND])
+    assert end.value.code == 130
+    assert "stopped after 1 of 20 episodes: 1/1 [0.21, 1.00]" in capsys.readouterr().out
+    (line,) = (tmp_path / "trials.jsonl").read_text().splitlines()
+    assert json.loads(line)["seed"] == 1_000_000
+    assert json.loads((tmp_path / "metrics.json").read_text())["trials"] == 1
+
+
+def test_ctrl_c_keeps_what_is_recorded_and_says_how_to_go_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    append = EpisodeWriter.append
+
+    def stopped(writer: EpisodeWriter, episode):
+        if len(writer) == 1:
+            raise KeyboardInterrupt
+        return append(writer, episode)
+
+    command = ["collect-demos", "--episodes", "2", *BLIND, "--out", str(tmp_path)]
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setattr(EpisodeWriter, "append", stopped)
+        patch.setattr("sys.argv", ["touchgoal", *command])
+        main(command)
+    assert end.value.code == 130
+    printed = capsys.readouterr().out
+    assert "1 episode is kept in" in printed
+    typed = shlex.split(printed.splitlines()[-1])[1:]
+    assert typed == [*command, "--resume"]
+    main(typed)
+    episodes = EpisodeSet(tmp_path / "episodes")
+    assert [episodes.meta(i)["seed"] for i in range(len(episodes))] == [0, 1]
+    assert episodes.meta(0)["task"] == "pick-place"
+    with pytest.raises(SystemExit, match="all 2 episodes are in"):
+        main(typed)
+
+
+def test_a_ur5e_is_recorded(tmp_path: Path) -> None:
+    env = PickPlaceConfig(arm="ur5e", cameras=(), tactile=False, max_seconds=0.2)
+    collect(tmp_path / "set", env, [EpisodeSpec(1)], workers=1)
+    frames = EpisodeSet(tmp_path / "set").read(0).frames
+    assert frames[ft.ACTION].shape == (5, 7) and frames[ft.STATE].shape == (5, 13)
 
 
 def test_only_what_is_known_to_be_good_is_learned_from(tmp_path: Path) -> None:
