@@ -1,4 +1,4 @@
-"""The pages on a task and a sensor of one's own: their programs run as printed."""
+"""The pages on a task, a sensor and a policy of one's own: their programs run as printed."""
 
 import re
 import runpy
@@ -43,3 +43,8 @@ def test_a_task_of_ones_own(desk: Path) -> None:
 def test_a_sensor_of_ones_own(desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("touchgoal.control.tactile.sensor_models.SENSORS", dict(SENSORS))
     run_programs("own_sensor.md")
+
+
+def test_a_policy_of_ones_own(desk: Path, capsys: pytest.CaptureFixture) -> None:
+    run_programs("own_policy.md")
+    assert "0/2 [0.00, 0.66]" in capsys.readouterr().out
