@@ -66,7 +66,7 @@ def main(config: Config) -> None:
         metas = collect(out / "episodes", config.env, specs, config.workers, roles)
     except KeyboardInterrupt:
         _stopped(out, config)
-        sys.exit(130)
+        raise
     outcomes = Counter(str(meta["outcome"]) for meta in metas)
     write_json(out / "metrics.json", {"outcomes": outcomes, "episodes": metas})
     print(f"{len(metas)} episodes in {out / 'episodes'}")

@@ -2,7 +2,6 @@
 
 import json
 import os
-import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -69,7 +68,7 @@ def main(config: Config) -> None:
                 file.flush()
     except KeyboardInterrupt:
         _stopped(out, trials, len(specs))
-        sys.exit(130)
+        raise
     write_json(out / "metrics.json", summary(trials))
     print(f"{table(trials)}\nall trials: {out / 'metrics.json'}")
     if config.video:
