@@ -22,8 +22,7 @@ from touchgoal.episodes.encoding import EncodedEpisode, encode
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
-from touchgoal.sim_envs.config import TaskConfig
-from touchgoal.sim_envs.experts.pick_place import Outcome
+from touchgoal.sim_envs.config import Outcome, TaskConfig
 from touchgoal.sim_envs.scene.filming import SceneRecorder
 from touchgoal.sim_envs.tasks import make_env, make_expert
 

@@ -16,8 +16,13 @@ from touchgoal.policies.by_name import choose_policy, env_config_for
 from touchgoal.policies.checkpoint import SavedPolicy, load
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.training.dagger import DaggerRoles
-from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
-from touchgoal.sim_envs.experts.pick_place import Outcome
+from touchgoal.sim_envs.config import (
+    BeadMazeConfig,
+    Outcome,
+    PickPlaceConfig,
+    TaskConfig,
+    TaskName,
+)
 from touchgoal.sim_envs.scene.objects import CATALOGUE
 
 ENVS: dict[TaskName, TaskConfig] = {

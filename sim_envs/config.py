@@ -18,6 +18,8 @@ from touchgoal.sim_envs.scene.objects import find as find_object
 from touchgoal.sim_envs.scene.wires import TRAINED, Family, Split, Wire, choose
 from touchgoal.sim_envs.scene.wires import find as find_wire
 
+Outcome = Literal["success", "never_touch", "drop", "wrong_object", "freeze"]
+"""How an expert of pick-place ends: it succeeds, or fails in one of four ways."""
 TaskName = Literal["pick-place", "bead-maze"]
 Camera = Literal["front", "wrist"]
 ObjectName = Annotated[str, AfterValidator(lambda name: find_object(name).name)]
@@ -220,3 +222,20 @@ TASKS: dict[TaskName, type[PickPlaceConfig] | type[BeadMazeConfig]] = {
     "pick-place": PickPlaceConfig,
     "bead-maze": BeadMazeConfig,
 }
+
+
+@checked_dataclass
+class TeleoperatorConfig:
+    """How the hand follows the keys, and gives way to what it meets."""
+
+    speed: Positive = 0.025
+    """Speed at which a key moves the free hand, m/s."""
+    turn_speed: Positive = 0.5
+    """Speed at which a key turns the free hand, rad/s."""
+    compliance: NotNegative = 2e-3
+    """Speed by which the hand gives way to a force, m/s per N."""
+    rotational_compliance: NotNegative = 2.0
+    """Speed by which the hand gives way to a torque, rad/s per N m."""
+    hold_seconds: Positive = 0.5
+    """How long a typed key counts as held, s. A terminal does not report that a key was released; it
+    repeats a held one after about 0.4 s, and only the last of several."""

@@ -5,9 +5,9 @@ from typing import Any, Literal, overload
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.bead_maze import BeadMaze
-from touchgoal.sim_envs.config import BeadMazeConfig, EnvConfig, TaskConfig, TaskName
+from touchgoal.sim_envs.config import BeadMazeConfig, EnvConfig, Outcome, TaskConfig, TaskName
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
-from touchgoal.sim_envs.experts.pick_place import Outcome, PickPlaceExpert
+from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 
 _ENVIRONMENTS = {env.task: env for env in (PickPlace, BeadMaze)}

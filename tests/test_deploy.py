@@ -20,7 +20,7 @@ from touchgoal.control.safety.action_filter import Safety
 from touchgoal.episodes.repair import validate
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.__main__ import main
-from touchgoal.launch.deploy import EXAMPLES, NOT_DONE, STOPPED, find_cell_file
+from touchgoal.launch.commands.deploy import EXAMPLES, NOT_DONE, STOPPED, find_cell_file
 from touchgoal.policies import checkpoint
 from touchgoal.policies.deploy.control_loop import ControlLoop, Request, RunLog, TickStatus
 from touchgoal.policies.deploy.session import Session

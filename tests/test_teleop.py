@@ -16,8 +16,8 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.sensors.keyboard import Keyboard
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.sim_envs.bead_maze import BeadMaze
-from touchgoal.sim_envs.config import BeadMazeConfig
-from touchgoal.sim_envs.experts.teleoperator import Teleoperator, TeleoperatorConfig
+from touchgoal.sim_envs.config import BeadMazeConfig, TeleoperatorConfig
+from touchgoal.sim_envs.experts.teleoperator import Teleoperator
 
 STRAIGHT = "arc-2000009"  # nearly: it turns by 7 degrees
 UP, TICK = np.array([0.0, 0.0, 1.0]), 0.05

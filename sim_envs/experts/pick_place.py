@@ -2,16 +2,16 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH, Observation
+from touchgoal.sim_envs.config import Outcome
 from touchgoal.sim_envs.pick_place import PickPlace
 
-Outcome = Literal["success", "never_touch", "drop", "wrong_object", "freeze"]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 
 CLEARANCE = 0.12  # m above the object before and after the grasp

@@ -8,9 +8,9 @@ import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.control.motion.rotations import rotation_matrix
-from touchgoal.control.option_types import NotNegative, Positive, checked_dataclass
 from touchgoal.sim_envs.base import Observation
 from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.config import TeleoperatorConfig
 
 STOP = " "
 HELP = "w/s on/back  a/d left/right  r/f up/down  j/l yaw  i/k pitch  u/o roll  space stop"
@@ -23,23 +23,6 @@ _PUSHES = {
     for pair, axis in zip(_PAIRS, np.eye(6), strict=True)
     for key, sign in zip(pair, (1, -1), strict=True)
 }
-
-
-@checked_dataclass
-class TeleoperatorConfig:
-    """How the hand follows the keys, and gives way to what it meets."""
-
-    speed: Positive = 0.025
-    """Speed at which a key moves the free hand, m/s."""
-    turn_speed: Positive = 0.5
-    """Speed at which a key turns the free hand, rad/s."""
-    compliance: NotNegative = 2e-3
-    """Speed by which the hand gives way to a force, m/s per N."""
-    rotational_compliance: NotNegative = 2.0
-    """Speed by which the hand gives way to a torque, rad/s per N m."""
-    hold_seconds: Positive = 0.5
-    """How long a typed key counts as held, s. A terminal does not report that a key was released; it
-    repeats a held one after about 0.4 s, and only the last of several."""
 
 
 class Teleoperator:

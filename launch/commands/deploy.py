@@ -1,0 +1,234 @@
+"""What `touchgoal deploy` does."""
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from touchgoal.control import features as ft
+from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.cell.config import CellConfig
+from touchgoal.control.cell.connection import CellConnection, cell_watchdogs, connect_cell
+from touchgoal.control.checks import require_all_ok
+from touchgoal.control.errors import UserError
+from touchgoal.control.interfaces import DriverError
+from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.sensors.latest_value import LatestValue
+from touchgoal.encoders import pretrained
+from touchgoal.encoders.towers.towers import load_towers
+from touchgoal.launch.deploy import Config
+from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.launch.terminal import HELP, Terminal
+from touchgoal.policies.deploy.actors import CellPolicy, load_cell_policy, make_actor
+from touchgoal.policies.deploy.control_loop import Request
+from touchgoal.policies.deploy.preflight import check_client, preflight
+from touchgoal.policies.deploy.session import Result, Session
+from touchgoal.rewards.goals import parse_goal
+from touchgoal.rewards.normalizer import DistanceNormalizer
+from touchgoal.rewards.online import OnlineCost
+from touchgoal.sim_envs.config import EnvConfig
+from touchgoal.sim_envs.twin.control_port import ask_twin, put_scene_back
+from touchgoal.sim_envs.twin.in_process import simulate_cell
+
+EXAMPLES = Path(__file__).parents[1] / "cells"
+
+
+NOT_DONE, STOPPED = 3, 4  # exit status
+
+
+_ASKING = 0.2  # s between questions to a twin
+
+
+def run_command(config: Config) -> None:
+    """Check, connect, ask, run, record, report; the exit status says how it ended."""
+    cell = _read(config)
+    policy, cost = load_cell_policy(cell), _load_cost(cell)
+    check_client(cell)
+    out = open_run(config.out, "deploy", config, adds=True)
+    print(_summary(cell, config), flush=True)
+    if cell.task.twin and cell.arm != "sim":
+        put_scene_back(cell.task.twin, cell.task.seed)
+        print(f"the twin has put its scene back (seed {cell.task.seed})", flush=True)
+    try:
+        connection = _connect(cell)
+    except DriverError as error:
+        raise UserError(str(error)) from error
+    try:
+        result = _deploy(config, cell, policy, cost, connection, out)
+    finally:
+        connection.close()
+        if cost is not None:
+            cost.close()
+    _report(result, out)
+
+
+def find_cell_file(path: Path) -> Path:
+    """The path, or the shipped example of that name; UserError if there is neither."""
+    if path.is_file():
+        return path
+    names = sorted(example.stem for example in EXAMPLES.glob("*.toml"))
+    example = EXAMPLES / f"{path.name.removesuffix('.toml')}.toml"
+    if path.parent in (Path("."), Path("launch/cells")) and example.is_file():
+        return example
+    raise UserError(
+        f"there is no cell file {path}; a twin writes its own (touchgoal twin), and these examples "
+        f"can be named: {', '.join(names)} (in {EXAMPLES})"
+    )
+
+
+def _read(config: Config) -> CellConfig:
+    path = find_cell_file(config.cell)
+    cell = read_cell_file(path, config.policy)
+    if config.sim:
+        cell = replace(cell, arm="sim")
+    if config.seed is not None:
+        if cell.arm != "sim" and not cell.task.twin:
+            raise UserError("--seed is of a simulated arm or a twin: nobody can set a real scene")
+        cell = replace(cell, task=replace(cell.task, seed=config.seed))
+    return cell
+
+
+def _connect(cell: CellConfig) -> CellConnection:
+    if cell.arm == "sim":
+        return simulate_cell(cell, ft.CONTROL_HZ)
+    return connect_cell(cell, ft.CONTROL_HZ)
+
+
+def _summary(cell: CellConfig, config: Config) -> str:
+    """What is going to happen, in one line."""
+    where = "a simulated FR3 in this program" if cell.arm == "sim" else f"{cell.arm} {cell.address}"
+    moves = "it moves" if config.execute else "a dry run, nothing moves"
+    return f"{cell.task.name} by {cell.task.policy} on {where}, {cell.task.seconds:g} s at most: {moves}"
+
+
+def _deploy(
+    config: Config,
+    cell: CellConfig,
+    policy: CellPolicy | None,
+    cost: OnlineCost | None,
+    connection: CellConnection,
+    out: Path,
+) -> Result:
+    safety = Safety(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
+    print("checks before anything moves:", flush=True)
+    results = preflight(cell, connection, safety, out / "episodes")
+    print("\n".join(str(f) for f in results), flush=True)
+    require_all_ok(results)
+    if config.execute and not config.yes:
+        _confirm(cell)
+    terminal = Terminal()
+    truth = connection.truth or (
+        partial(ask_twin, cell.task.twin, "truth") if cell.task.twin else None
+    )
+    # Scripts end by themselves; of others only a simulator knows when the task is done.
+    endless = cell.task.policy != "expert"
+    watcher = LatestValue("simulator", partial(_success, truth)) if endless and truth else None
+
+    def request() -> Request:
+        return terminal.operator_request() or (watcher.read() if watcher else "")
+
+    print(f"{'MOVING' if config.execute else 'dry run'}: {HELP}", flush=True)
+    with terminal.watching():
+        session = Session(
+            cell=cell,
+            connection=connection,
+            safety=safety,
+            episodes=out / "episodes",
+            execute=config.execute,
+            make_actor=lambda loop: make_actor(cell, policy, safety, truth, loop.commanded),
+            operator_request=request,
+            on_tick=terminal.show_tick,
+            truth=truth,
+            cost=cost.latest_cost if cost else None,
+            camera_size=policy.camera_size if policy else EnvConfig().camera_size,
+        )
+        try:
+            return session.run()
+        finally:
+            if watcher is not None:
+                watcher.close()
+
+
+def _load_cost(cell: CellConfig) -> OnlineCost | None:
+    """What measures the distance to the cell's goals, on the shipped encoder."""
+    if not cell.task.rewards:
+        return None
+    goals = [parse_goal(text) for text in cell.task.rewards]
+    directory = pretrained.shipped_encoder_for(cell.sensor)
+    encoder = pretrained.load_aligned(directory, sensor=cell.sensor)
+    normalizer = DistanceNormalizer.load(directory / "scale.json")
+    return OnlineCost(load_towers(encoder.config.towers), encoder, normalizer, goals)
+
+
+def _success(truth: Callable[[], dict[str, Any]]) -> Request:
+    """What a simulator asks for: an end once the task is done."""
+    time.sleep(_ASKING)
+    return "success" if truth()["success"] else ""
+
+
+def _confirm(cell: CellConfig) -> None:
+    """UserError unless the operator types which arm is to move."""
+    name = f"{cell.arm} {cell.address}".strip()
+    if not sys.stdin.isatty():
+        raise UserError("nobody is there to confirm: run it in a terminal, or add --yes")
+    print(f"The arm will move. One hand on its stop, nobody in reach? Type: {name}")
+    if input("> ").strip() != name:
+        raise UserError("not confirmed; nothing has moved")
+
+
+def _report(result: Result, out: Path) -> None:
+    """Numbers, table and exit status."""
+    ending, log = result.ending, result.log
+    late = np.array(log.lateness) if log.lateness else np.zeros(1)
+    forces = [np.linalg.norm(row[ft.WRENCH][:3]) for row in log.rows]
+    numbers = {
+        "reason": ending.reason,
+        "stopped": ending.stopped,
+        "advice": ending.advice,
+        "rest_seconds": ending.rest_seconds,
+        "success": result.success,
+        "held_width": result.held_width,
+        "episode": result.episode,
+        "recording_error": result.recording_error,
+        "ticks": len(log.rows),
+        "late_p99_ms": 1e3 * float(np.percentile(late, 99)),
+        "answered_p95_ms": 1e3 * float(np.percentile(log.answer_times or [0.0], 95)),
+        "force_max_newtons": float(max(forces, default=0.0)),
+        "clamped": log.limit_counts,
+    }
+    write_json(out / "metrics.json", numbers)
+    clamped = ", ".join(f"{name} {n}" for name, n in log.limit_counts.items()) or "never"
+    print(f"{len(log.rows)} ticks of the control loop; 99 % began at most {numbers['late_p99_ms']:.1f} ms late, "
+          f"95 % were answered within {numbers['answered_p95_ms']:.1f} ms")  # fmt: skip
+    print(
+        f"largest force on the hand: {numbers['force_max_newtons']:.1f} N; commands limited: {clamped}"
+    )
+    if result.held_width is not None:
+        print(f"the hand still holds something, {1e3 * result.held_width:.0f} mm wide")
+    if result.episode is not None:
+        episodes = out / "episodes"
+        print(
+            f"episode {result.episode} is in {episodes}; its curves: touchgoal reward-curves {episodes}"
+        )
+    print(ending if ending.stopped else f"ended: {ending}")
+    verdict = {True: "done", False: "not done", None: "nobody can tell whether it is done"}
+    if not ending.stopped and (result.episode is not None or result.success is not None):
+        print(f"task: {verdict[result.success]}")
+    _exit(result)
+
+
+def _exit(result: Result) -> None:
+    """Status and one line on stderr, unless all is well."""
+    if result.ending.stopped:
+        print(f"touchgoal deploy: stopped: {result.ending.reason}", file=sys.stderr)
+        sys.exit(STOPPED)
+    if result.recording_error:
+        raise UserError(result.recording_error)
+    if result.success is False:
+        print("touchgoal deploy: the task is not done", file=sys.stderr)
+        sys.exit(NOT_DONE)

@@ -1,0 +1,56 @@
+"""What `touchgoal twin` does."""
+
+import signal
+
+from touchgoal.control.cell.cell_file import cell_table
+from touchgoal.control.cell.config import CellConfig
+from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.launch.twin import Config
+from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
+
+
+def run_command(config: Config) -> None:
+    """Open the twin, say where it is, serve until told to stop."""
+    out = open_run(config.out, "twin", config, adds=True).resolve()
+    twin = Twin(
+        TwinConfig(
+            task=config.env,
+            arm=config.arm,
+            seed=config.seed,
+            host=config.host,
+            port=config.port,
+            lock_step=config.lock_step,
+            folder=out,
+        )
+    )
+
+    def stop(*_: object) -> None:
+        twin.stopped = True
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    cell_file = out / "cell.json"
+    write_json(cell_file, cell_table(twin.cell_config))
+    print(
+        f"{table(twin.cell_config)}\n{'cell file':<18}{cell_file}\n"
+        f"The cell runs. In another terminal: touchgoal deploy {cell_file} --execute\n"
+        "Each deployment first puts the scene back. Ctrl-C ends the twin.",
+        flush=True,
+    )
+    try:
+        twin.run()
+    finally:
+        twin.close()
+    print("\nstopped")
+
+
+def table(cell: CellConfig) -> str:
+    """Where everything is."""
+    assert cell.load_cell is not None
+    lines = {"task": cell.task.instruction, f"arm ({cell.arm})": cell.address}
+    lines["gripper"] = cell.gripper.port or cell.gripper.address
+    lines |= {name: camera.source for name, camera in cell.cameras.items()}
+    if cell.fingertips is not None:
+        lines |= {"left fingertip": cell.fingertips.left, "right fingertip": cell.fingertips.right}
+    lines |= {"load cell": cell.load_cell.port, "control port": cell.task.twin}
+    return "\n".join(f"{name:<18}{where}" for name, where in lines.items())
