@@ -1,0 +1,105 @@
+"""What README, docs/ and CONTRIBUTING tell a person to type, and how the tests type it smaller."""
+
+import re
+import shlex
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+# What a command is given, or given instead, so that it ends within seconds. The first line whose
+# words begin the command counts. An option that is there gets the new value, another one is added.
+TOY = {
+    "run-policy --task bead-maze": "--episodes 1 --workers 1 --no-video --env.max-seconds 1",
+    "run-policy": "--episodes 1 --workers 1 --no-video --env.max-seconds 1",
+    "collect-demos --task bead-maze --policy": "--episodes 1 --workers 1 --env.max-seconds 1",
+    "collect-demos --task bead-maze": "--episodes 1 --workers 1 --env.disturbance 0",
+    "collect-demos": "--episodes 4 --workers 2 --env.objects glass_ball",
+    "train-encoder align": "--align.vit tiny --align.epochs 1 --align.batch-size 8 --scale-episodes 2",
+    "train-encoder mae": "--frames 8 --mae.vit tiny --mae.epochs 1 --mae.batch-size 8",
+    "train-policy": "--head tiny --train.epochs 1 --trials 0 --workers 1",
+    "twin": "--port 0 --lock-step",
+    "deploy": "--yes",
+}
+# What is not run here, and where it is, or why not.
+NOT_RUN = {
+    "calibrate": "needs presses of a real sensor: test_calibration.py",
+    "teleop": "needs a terminal and a person: test_teleop.py",
+    "benchmark": "test_commands.py runs each at toy size",
+    "demo": "test_commands.py",
+}
+
+
+@dataclass(frozen=True)
+class Command:
+    """One line to type.
+
+    Attributes:
+        page: where it is printed.
+        line: as it is printed, without its comment.
+        whole: it stands in a block, to be typed as it is; else in the text, perhaps in part.
+    """
+
+    page: str
+    line: str
+    whole: bool
+
+    @property
+    def words(self) -> list[str]:
+        return shlex.split(self.line)
+
+    @property
+    def small(self) -> list[str]:
+        """Its words after `touchgoal`, at toy size."""
+        words = self.words[1:]
+        name = next((n for n in TOY if words[: len(n.split())] == n.split()), None)
+        for option in re.findall(r"--\S+(?: [^-]\S*)*", TOY[name]) if name else []:
+            option, *values = option.split()
+            if option in words:
+                start = words.index(option) + 1
+                words[start : start + len(values)] = values
+            else:
+                words += [option, *values]
+        return words
+
+
+def commands() -> Iterator[Command]:
+    """All of them, in the order in which a person meets them; each line once."""
+    met = set()
+    for page in PAGES:
+        text = page.read_text()
+        for line, whole in _lines(text):
+            if line not in met and line.split()[0] in ("touchgoal", "launch/deploy.sh", "make"):
+                met.add(line)
+                yield Command(page.name, line, whole)
+
+
+def _lines(text: str) -> Iterator[tuple[str, bool]]:
+    for block in re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+        if block[1] in ("", "sh", "bash"):
+            for line in block[2].replace("\\\n", " ").splitlines():
+                if command := re.sub(r"\s+#.*", "", line).strip():
+                    yield command, True
+    prose = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    for span in re.finditer(r"`([^`]+)`", prose):
+        line = " ".join(span[1].split())
+        if re.match(r"(touchgoal [a-z]|launch/deploy\.sh|make [a-z])", line):
+            yield line, False
+
+
+def snippets(page: Path) -> list[str]:
+    """The Python blocks of a page, in order."""
+    return re.findall(r"^```python\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+
+
+def recipes(target: str) -> list[list[str]]:
+    """Words of the commands that a target of the Makefile runs, in the first round of its loops."""
+    asked = ["make", "-n", "-s", "-C", str(ROOT), target]
+    told = subprocess.run(asked, check=True, capture_output=True, text=True).stdout
+    told = re.sub(r"\$\(\(.*?\)\)", "1", told.replace("\\\n", " "))
+    told = re.sub(r"\$\{?round\}?", "1", told)
+    found = re.findall(r"\.venv/bin/touchgoal ([^;&|\n]*)", told)
+    return [shlex.split(line) for line in found]
