@@ -84,6 +84,8 @@ def _lines(text: str) -> Iterator[tuple[str, bool]]:
                 if command := re.sub(r"\s+#.*", "", line).strip():
                     yield command, True
     prose = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    for line in re.findall(r"^    (touchgoal .*?)(?:\s+#.*)?$", prose, re.MULTILINE):
+        yield line, False
     for span in re.finditer(r"`([^`]+)`", prose):
         line = " ".join(span[1].split())
         if re.match(r"(touchgoal [a-z]|launch/deploy\.sh|make [a-z])", line):
