@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from touchgoal.control.features import N_JOINTS
-from touchgoal.control.motion.kinematics import Fr3Kinematics
+from touchgoal.control.motion.kinematics import DAMPING, Fr3Kinematics
 
 ACTION_DIM = N_JOINTS + 1
 ActionRepresentation = Literal["delta", "chunk", "absolute", "base_twist", "body_twist"]
@@ -24,7 +24,6 @@ these changes lead to from the measured ones; the hand's displacement and turn s
 same wherever on the table the hand does the same; the hand's displacement and turn along its own axes,
 the elbow going where the joints move least. The gripper's width is a target in all five."""
 
-_DAMPING = 1e-6  # m^2, as in inverse kinematics
 _MIN_RANGE = 1e-6  # in SI units: smaller than anything that a policy should learn to vary
 
 
@@ -76,7 +75,7 @@ def body_jacobian(joints: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 6 7"]:
 
 def _damped_pseudoinverse(J: Float[Tensor, "b 6 7"]) -> Float[Tensor, "b 7 6"]:
     """From a displacement and turn to the least change of the joints, damped where none will do."""
-    return J.mT @ torch.linalg.inv(J @ J.mT + _DAMPING * torch.eye(6).to(J))
+    return J.mT @ torch.linalg.inv(J @ J.mT + DAMPING * torch.eye(6).to(J))
 
 
 @cache

@@ -12,6 +12,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down
+from touchgoal.control.motion.tool import FRANKA_HAND
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.sim_envs.config import SETPOINT_PERIOD, EnvConfig, SceneConfig
 from touchgoal.sim_envs.scene.build import ROBOTS, SIDES, arm_joints, build
@@ -21,9 +22,9 @@ from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
-GRIPPER_MAX_WIDTH = 0.08  # m, Franka Hand
+GRIPPER_MAX_WIDTH = FRANKA_HAND.stroke[1]  # m, to which experts open
 DISTURBANCE_SECONDS = 0.5  # for which a disturbance keeps its direction
-GRIPPER_SPEED = 0.1  # m/s of width, Franka Hand's datasheet maximum
+GRIPPER_SPEED = FRANKA_HAND.speed  # m/s of width
 
 Observation = dict[str, np.ndarray]
 
@@ -94,7 +95,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.place_objects(rng)
         self.command = self.start_joints(rng)
         self._disturbance_state = np.zeros(6)
-        self._finger_target = GRIPPER_MAX_WIDTH / 2
+        self._finger_target = self.robot.tool.stroke[1] / 2
         self.data.qpos[self.arm_positions] = self.command
         self.data.qpos[self._fingers] = self._finger_target
         self._ticks = 0
@@ -245,7 +246,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
 
     def _let_settle(self) -> None:
         """Physics before the first observation: objects come to rest, the hand is open."""
-        self._run_tick(np.zeros(self.n_joints), GRIPPER_MAX_WIDTH, seconds=0.3)
+        self._run_tick(np.zeros(self.n_joints), self.robot.tool.stroke[1], seconds=0.3)
 
     def _disturbance(self) -> Float[np.ndarray, " n"]:
         """Joint change (rad) that nobody commanded: a random walk of the hand's velocity."""
@@ -259,7 +260,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
             * np.repeat([1.0, self.disturbance_rotation], 3)
             * self._disturbance_state
         )
-        return np.linalg.pinv(self.kinematics.jacobian(self.command)) @ (twist * tick)
+        return self.kinematics.joint_change(self.command, twist * tick)
 
     def _compile_scene(self, rng: np.random.Generator) -> None:
         self.close()
@@ -292,7 +293,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.command = np.clip(start + delta, limits[:, 0], limits[:, 1])
         for k in range(1, setpoints + 1):
             joints = start + (self.command - start) * (k / setpoints)
-            self.step_physics(joints, width, GRIPPER_SPEED, steps)
+            self.step_physics(joints, width, self.robot.tool.speed, steps)
         self.update_contacts()
 
     def _observe(self) -> Observation:
@@ -346,7 +347,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         step = self.robot.hardware.velocity / self.config.control_hz
         return gym.spaces.Box(
             np.append(-step, 0.0).astype(np.float32),
-            np.append(step, GRIPPER_MAX_WIDTH).astype(np.float32),
+            np.append(step, self.robot.tool.stroke[1]).astype(np.float32),
             dtype=np.float32,
         )
 

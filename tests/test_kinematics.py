@@ -10,7 +10,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import FR3_ARM
 from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics, Ur5eKinematics
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
-from touchgoal.sim_envs.scene.build import build
+from touchgoal.sim_envs.scene.build import SceneConfig, build
 
 if TYPE_CHECKING:
     import mujoco
@@ -61,6 +61,15 @@ def test_inverse_reaches_the_workspace_within_limits() -> None:
         assert np.linalg.norm(rotation_vector(turned @ rotation.T)) < 1e-3
 
 
+def test_at_a_singularity_the_joints_change_little() -> None:
+    """A UR5e with its wrist stretched, asked for what no change of its joints gives."""
+    arm = Ur5eKinematics()
+    stretched = arm.arm.home * [1, 1, 1, 1, 0, 1] + [0, 0, 0, 0, 1e-6, 0]
+    lost = np.linalg.svd(arm.jacobian(stretched))[0][:, -1]  # direction of the least displacement
+    assert np.abs(np.linalg.pinv(arm.jacobian(stretched)) @ (1e-3 * lost)).max() > 100
+    assert np.abs(arm.joint_change(stretched, 1e-3 * lost)).max() < 1
+
+
 def test_out_of_reach_is_said() -> None:
     with pytest.raises(UserError, match="cannot reach"):
         Fr3Kinematics().solve_ik(np.array([1.5, 0, 0.2]), fingers_down(0), FR3_ARM.home)
@@ -98,6 +107,33 @@ def _ur5e_in_mujoco() -> "mujoco.MjModel":
     flange = body.add_site(name="flange", pos=[0, -0.0996, 0])
     flange.quat = np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0])  # z out of the flange, along -y
     return spec.compile()
+
+
+def test_the_simulated_ur5e_is_the_makers() -> None:
+    """Masses; centres of mass where Universal Robots' ROS description has them; a 2F-85's length.
+
+    Its link frames are at the joints, moved along their axes by the table's d.
+    """
+    model = build([], SceneConfig(arm="ur5e")).compile()
+    centres = [
+        (0, -0.00193, 0.1625 - 0.02561),
+        (-0.2125, 0, 0.11336),
+        (-0.2422, 0, 0.0265),
+        (0, -0.01634, 0.1333 - 0.0018),
+        (0, 0.01634, 0.0997 - 0.0018),
+        (0, 0, 0.0996 - 0.001159),
+    ]
+    masses = (3.761, 8.058, 2.846, 1.37, 1.3, 0.365)
+    for i, (mass, centre) in enumerate(zip(masses, centres, strict=True), 1):
+        link = model.body(f"ur5e_link{i}")
+        assert link.mass[0] == pytest.approx(mass)
+        np.testing.assert_allclose(link.ipos, centre, atol=1e-6)
+    gels = model.body("left_gel").mass[0] + model.body("right_gel").mass[0]
+    assert model.body("hand").subtreemass[0] - gels == pytest.approx(0.925)
+    assert model.site("tcp").pos[2] == pytest.approx(0.0108 + 0.1628 - 0.01875)
+    assert 2 * model.joint("finger_joint1").range[1] == pytest.approx(0.085)
+    dofs = [int(model.joint(f"ur5e_joint{i}").dofadr[0]) for i in range(1, 7)]
+    check_against_mujoco(model, Ur5eKinematics(), "tcp", dofs)
 
 
 def test_ur5e_matches_mujoco() -> None:

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.grippers.modbus import crc
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.sensors.load_cell import (
@@ -23,6 +22,7 @@ from touchgoal.control.sensors.load_cell import (
     parse,
     with_checksum,
 )
+from touchgoal.control.sensors.serial_port import modbus_crc
 
 
 @pytest.fixture
@@ -179,7 +179,7 @@ class Gripper2F85(threading.Thread):
         head = self._take(6)
         slave, code, register, count = struct.unpack(">BBHH", head)
         body = self._take(1 + 2 * count) if code == 16 else b""
-        assert crc(head + body) == self._take(2)
+        assert modbus_crc(head + body) == self._take(2)
         if code == 16:
             assert register == 0x03E8
             self.output = body[1:]
@@ -187,7 +187,7 @@ class Gripper2F85(threading.Thread):
         else:
             assert (code, register) == (4, 0x07D0)
             answer = bytes([slave, code, 2 * count]) + self._input()
-        answer += crc(answer)
+        answer += modbus_crc(answer)
         if self.garble:
             self.garble -= 1
             answer = answer[:-1] + bytes([answer[-1] ^ 1])
@@ -209,8 +209,8 @@ class Gripper2F85(threading.Thread):
 
 def test_the_check_is_that_of_the_grippers_manual() -> None:
     """Its examples: clear the activation, read the status while active."""
-    assert crc(bytes.fromhex("091003E8000306000000000000")) == bytes.fromhex("7330")
-    assert crc(bytes.fromhex("090407D00003")) == bytes.fromhex("B1CE")
+    assert modbus_crc(bytes.fromhex("091003E8000306000000000000")) == bytes.fromhex("7330")
+    assert modbus_crc(bytes.fromhex("090407D00003")) == bytes.fromhex("B1CE")
 
 
 def test_the_robotiq_opens_closes_and_holds(line: tuple[int, str]) -> None:

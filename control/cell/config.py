@@ -11,7 +11,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.grippers.robotiq import ROBOTIQ_FORCE_RANGE
+from touchgoal.control.motion.tool import ROBOTIQ_2F85
 from touchgoal.control.option_types import STRICT, Seed
 from touchgoal.control.sensors.load_cell import LoadCellConfig
 from touchgoal.control.tactile.sensor_models import find_sensor
@@ -25,7 +25,7 @@ Pixels = Annotated[int, Field(ge=16, le=8192)]
 CameraName = Literal["front", "wrist"]
 
 # N, what a gripper can be set to. A real Franka Hand does no less than 30; a simulated one does.
-_FORCES = {"franka_hand": (0.0, 70.0), "robotiq": ROBOTIQ_FORCE_RANGE}
+_FORCES = {"franka_hand": (0.0, 70.0), "robotiq": ROBOTIQ_2F85.force}
 _JOINTS = {"fr3": 7, "ur5e": 6, "sim": 7}
 
 

@@ -1,25 +1,22 @@
 """Robotiq 2F-85 gripper over serial (Modbus RTU), registers as in its instruction manual."""
 
+import struct
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import minimalmodbus
+
 from touchgoal.control.errors import UserError
-from touchgoal.control.grippers.modbus import Modbus
+from touchgoal.control.grippers import robotiq_registers as registers
 from touchgoal.control.interfaces import DriverError, GripperReading
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.control.sensors.serial_port import open_port
 
-_SLAVE, _OUTPUT, _INPUT = 9, 0x03E8, 0x07D0
-_ACTIVATE, _GO = 0x01, 0x08  # bits of the first output byte
-_ACTIVE = 3  # gripper status of a finished activation
 _PERIOD = 0.02  # s between exchanges; one takes 2 to 10 ms
 _ACTIVATION = 8.0  # s that opening and closing once may take
 _MISSES = 5  # unanswered exchanges in a row that mean it is lost
-_SPEED_RANGE = 0.020, 0.150  # m/s for 0 to 255
-ROBOTIQ_FORCE_RANGE = 20.0, 235.0  # N for 0 to 255
-_CONTACT = 1, 2  # object status: something stopped the fingers while opening, closing
-_SILENCE = 0x09  # a fault that is over as soon as it can be read: a second without messages
 _FAULTS = {
     0x05: "it must finish its activation first",
     0x07: "it is not activated",
@@ -52,16 +49,13 @@ class RobotiqConfig:
     widths: tuple[float, float] = (0.085, 0.0)
 
 
-_POSITIONS = 3, 230
-
-
 class Robotiq:
     """The Gripper protocol over a 2F-85; a thread talks to it, commands never wait."""
 
     def __init__(self, config: RobotiqConfig) -> None:
         self.config = config
         self._port = open_port(config.port, 115200, timeout=0.1)
-        self._modbus = Modbus(self._port, _SLAVE)
+        self._modbus = minimalmodbus.Instrument(self._port, registers.SLAVE)
         self._lock = threading.Lock()
         self._wanted: int | None = None
         self._misses = 0
@@ -83,13 +77,15 @@ class Robotiq:
         opened, closed = self.config.widths
         share = min(max((opened - width) / (opened - closed), 0.0), 1.0)
         with self._lock:
-            self._wanted = round(_POSITIONS[0] + share * (_POSITIONS[1] - _POSITIONS[0]))
+            self._wanted = round(
+                registers.POSITIONS[0] + share * (registers.POSITIONS[1] - registers.POSITIONS[0])
+            )
 
     def stop(self) -> None:
         """See Gripper: without the go bit the fingers halt, and what is held stays held."""
         with self._lock:
             self._wanted = None
-            self._modbus.write(_OUTPUT, bytes([_ACTIVATE, 0, 0, 0, 0, 0]))
+            self._write(bytes([registers.ACTIVATE, 0, 0, 0, 0, 0]))
 
     def close(self) -> None:
         """See Gripper."""
@@ -98,17 +94,17 @@ class Robotiq:
 
     def _start(self) -> None:
         """Finds the gripper activated, or activates it if that is allowed."""
-        if self._status()[0] >> 4 & 3 == _ACTIVE:
+        if self._status()[0] >> 4 & 3 == registers.ACTIVE:
             return
         if not self.config.activate:
             raise UserError(
                 "the gripper is not activated: set `activate = true`, and keep hands away, it opens "
                 "and closes fully"
             )
-        self._modbus.write(_OUTPUT, bytes(6))
-        self._modbus.write(_OUTPUT, bytes([_ACTIVATE, 0, 0, 0, 0, 0]))
+        self._write(bytes(6))
+        self._write(bytes([registers.ACTIVATE, 0, 0, 0, 0, 0]))
         end = time.monotonic() + _ACTIVATION
-        while self._status()[0] >> 4 & 3 != _ACTIVE:
+        while self._status()[0] >> 4 & 3 != registers.ACTIVE:
             if time.monotonic() > end:
                 raise DriverError(
                     "the gripper does not become active: clear its fingers, cycle power"
@@ -116,7 +112,14 @@ class Robotiq:
             time.sleep(0.1)
 
     def _status(self) -> bytes:
-        return self._modbus.read(_INPUT, 3)
+        """The six bytes of its status."""
+        read = self._modbus.read_registers
+        return struct.pack(">3H", *_exchange(lambda: read(registers.STATUS, 3, functioncode=4)))
+
+    def _write(self, command: bytes) -> None:
+        """Write the six bytes of a command."""
+        values = list(struct.unpack(">3H", command))
+        _exchange(lambda: self._modbus.write_registers(registers.COMMAND, values))
 
     def _take(self) -> GripperReading | None:
         time.sleep(_PERIOD)
@@ -131,12 +134,16 @@ class Robotiq:
             return None
         self._misses = 0
         first, last = self.config.widths
-        share = (status[4] - _POSITIONS[0]) / (_POSITIONS[1] - _POSITIONS[0])
+        share = (status[4] - registers.POSITIONS[0]) / (
+            registers.POSITIONS[1] - registers.POSITIONS[0]
+        )
         code = status[2] & 0x0F
         return GripperReading(
             width=first + min(max(share, 0.0), 1.0) * (last - first),
-            grasped=status[0] >> 6 in _CONTACT,
-            fault=_FAULTS.get(code, f"fault {code:#04x}") if code not in (0, _SILENCE) else "",
+            grasped=status[0] >> 6 in (registers.STOPPED_OPENING, registers.STOPPED_CLOSING),
+            fault=_FAULTS.get(code, f"fault {code:#04x}")
+            if code not in (0, registers.SILENCE)
+            else "",
             stamp=time.monotonic(),
         )
 
@@ -144,10 +151,21 @@ class Robotiq:
         """Every time, not only news: after a second of silence the gripper reports a fault."""
         if self._wanted is None:
             return
-        speed = _count(self.config.speed, _SPEED_RANGE)
-        force = _count(self.config.force, ROBOTIQ_FORCE_RANGE)
-        self._modbus.write(_OUTPUT, bytes([_ACTIVATE | _GO, 0, 0, self._wanted, speed, force]))
+        speed = registers.to_count(self.config.speed, registers.SPEEDS)
+        force = registers.to_count(self.config.force, registers.FORCES)
+        self._write(bytes([registers.ACTIVATE | registers.GO, 0, 0, self._wanted, speed, force]))
 
 
-def _count(value: float, span: tuple[float, float]) -> int:
-    return round(255 * min(max((value - span[0]) / (span[1] - span[0]), 0.0), 1.0))
+def _exchange(call: Callable[[], list[int] | None]) -> list[int]:
+    """One request and its answer; a missing or garbled answer raises DriverError.
+
+    An unplugged port raises serial.SerialException.
+    """
+    try:
+        return call() or []
+    except minimalmodbus.NoResponseError as error:
+        raise DriverError("no answer: check its supply and cable") from error
+    except minimalmodbus.SlaveReportedException as error:
+        raise DriverError(f"it refuses: {error}") from error
+    except minimalmodbus.ModbusException as error:
+        raise DriverError("a garbled answer: check the cable") from error

@@ -14,11 +14,11 @@ from jaxtyping import Float
 from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import FR3_ARM, UR5E_ARM, ArmModel, Joints
 from touchgoal.control.motion.rotations import Matrix3, Vector3
-from touchgoal.control.motion.tool import FRANKA_HAND
+from touchgoal.control.motion.tool import FRANKA_HAND, ROBOTIQ_2F85
 
 # m^2: makes steps finite at a singularity. The squared error is added to it, so that a step from afar
 # goes no farther than the linearisation holds (Sugihara 2011).
-_DAMPING = 1e-6
+DAMPING = 1e-6
 _TASK_STEP = 0.1, 0.5  # m and rad, farthest that a step goes
 _MARGIN = 1e-4  # rad that solutions keep from the joints' limits
 _ITERATIONS = 50
@@ -75,7 +75,7 @@ def _step(arm: ArmModel, tcp_offset: float) -> casadi.Function:
     )
     bound = casadi.DM([*[_TASK_STEP[0]] * 3, *[_TASK_STEP[1]] * 3])
     task = casadi.fmin(casadi.fmax(error, -bound), bound)
-    damping = _DAMPING + casadi.dot(casadi.DM(_ERROR_WEIGHTS), error**2)
+    damping = DAMPING + casadi.dot(casadi.DM(_ERROR_WEIGHTS), error**2)
     given = free * posture * (arm.home - q) + (1 - free) * held
     # Least squares for what the pull leaves to do is the pull's part in the null space, and the task.
     Jf = J @ casadi.diag(free)
@@ -136,6 +136,14 @@ class Kinematics:
     def jacobian(self, q: Joints) -> Float[np.ndarray, "6 n"]:
         """Geometric Jacobian of the TCP, base frame: linear rows (m/rad), then angular."""
         return self._chain(q)[2].full()
+
+    def joint_change(self, q: Joints, change: Float[np.ndarray, "6"]) -> Joints:
+        """Least change of the joints (rad) for a small displacement (m) and turn (rad) of the TCP.
+
+        Base frame; damped at singularities, where none would do.
+        """
+        J = self.jacobian(q)
+        return J.T @ np.linalg.solve(J @ J.T + DAMPING * np.eye(6), change)
 
     def jacobians(
         self, q: Float[np.ndarray, "b n"]
@@ -231,7 +239,7 @@ class Fr3Kinematics(Kinematics):
 
 
 class Ur5eKinematics(Kinematics):
-    """The UR5e with a gripper on its flange."""
+    """The UR5e with a Robotiq 2F-85."""
 
-    def __init__(self, tcp_offset: float = FRANKA_HAND.tcp_offset) -> None:
+    def __init__(self, tcp_offset: float = ROBOTIQ_2F85.tcp_offset) -> None:
         super().__init__(UR5E_ARM, tcp_offset)

@@ -44,10 +44,11 @@ def _corners(tcp_offset: float, half_stroke: float) -> tuple[Point, ...]:
     return (0.0, side, down), (0.0, -side, down)
 
 
-# Finger carriage 58.4 mm below the hand frame (fr3.xml), the adapter's bolt axis 12 mm below that
-# (read off the finger mesh's bolt recess), the sensor's centre 67 mm below the bolts (GelSight's Panda
-# adapter STEP file).
-_FRANKA_TCP = 0.0584 + 0.012 + 0.067
+# m from a finger's carriage to the sensor's centre: the adapter's bolt axis is 12 mm below the carriage
+# (read off the Franka finger mesh's bolt recess), the sensor's centre 67 mm below the bolts (GelSight's
+# Panda adapter STEP file).
+SENSOR_BELOW_CARRIAGE = 0.012 + 0.067
+_FRANKA_TCP = 0.0584 + SENSOR_BELOW_CARRIAGE  # carriage 58.4 mm below the hand frame: fr3.xml
 
 FRANKA_HAND = Tool(
     "Franka Hand with two GelSight Minis",

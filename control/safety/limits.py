@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 
 from touchgoal.control.motion.arm_models import FR3_ARM, UR5E_ARM, ArmModel, JointLimits
 from touchgoal.control.motion.rotations import Vector3
-from touchgoal.control.motion.tool import FRANKA_HAND, Tool
+from touchgoal.control.motion.tool import FRANKA_HAND, ROBOTIQ_2F85, Tool
 
 
 @dataclass(frozen=True)
@@ -78,4 +78,4 @@ _FLANGE = Box(np.array([0.15, -0.5, 0.12]), np.array([0.75, 0.5, 0.9]))
 _FINGERTIPS = Box(np.array([0.15, -0.5, 0.0]), np.array([0.8, 0.5, 0.75]))
 
 FR3 = RobotLimits(FR3_ARM, FRANKA_HAND, _FLANGE, _FINGERTIPS)
-UR5E = RobotLimits(UR5E_ARM, FRANKA_HAND, _FLANGE, _FINGERTIPS)
+UR5E = RobotLimits(UR5E_ARM, ROBOTIQ_2F85, _FLANGE, _FINGERTIPS)

@@ -16,11 +16,10 @@ from typing import Annotated, Literal
 import pydantic.dataclasses
 from pydantic import Field
 
-from touchgoal.control.grippers.modbus import crc
 from touchgoal.control.interfaces import LoadReading
 from touchgoal.control.option_types import STRICT
 from touchgoal.control.sensors.latest_value import LatestValue
-from touchgoal.control.sensors.serial_port import open_port
+from touchgoal.control.sensors.serial_port import modbus_crc, open_port
 
 Checksum = Literal["none", "xor", "crc16"]
 
@@ -84,7 +83,7 @@ def with_checksum(text: bytes, checksum: Checksum) -> bytes:
     if checksum == "xor":
         return text + b"*%02X" % reduce(xor, text, 0)
     if checksum == "crc16":
-        return text + b"*%04X" % int.from_bytes(crc(text), "little")
+        return text + b"*%04X" % int.from_bytes(modbus_crc(text), "little")
     return text
 
 

@@ -1,4 +1,6 @@
-"""Serial ports, opened with one message for what usually goes wrong."""
+"""Serial ports, opened with one message for what usually goes wrong; the checksum of Modbus."""
+
+import struct
 
 import serial
 
@@ -18,3 +20,13 @@ def open_port(device: str, baud: int, timeout: float) -> serial.Serial:
             f"cannot open {device}: check the cable and that nothing else uses it, and that you are "
             f"in the group dialout ({error})"
         ) from error
+
+
+def modbus_crc(message: bytes) -> bytes:
+    """CRC-16 of a message, low byte first: polynomial 0xA001 (reflected 0x8005), from 0xFFFF."""
+    value = 0xFFFF
+    for byte in message:
+        value ^= byte
+        for _ in range(8):
+            value = (value >> 1) ^ (0xA001 if value & 1 else 0)
+    return struct.pack("<H", value)

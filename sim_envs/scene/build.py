@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.motion.tool import FRANKA_HAND
+from touchgoal.control.motion.tool import FRANKA_HAND, SENSOR_BELOW_CARRIAGE, Tool
 from touchgoal.control.safety import limits
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.sim_envs.config import MAX_CAMERA_SIZE, SceneConfig
@@ -29,7 +29,6 @@ _STIFFNESS = {
     "ur5e": (4500.0, 4500.0, 4500.0, 2000.0, 2000.0, 2000.0),
 }
 SERVO_DAMPING = 0.1  # s: N m s/rad for each N m/rad of stiffness, fr3.xml
-_SENSOR_DEPTH_IN_FINGER = FRANKA_HAND.tcp_offset - 0.0584  # finger frame to sensor centre, along z
 
 
 def robot_model() -> Path:
@@ -58,7 +57,7 @@ def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpe
     for side in SIDES:
         _add_fingertip(spec, side, find_sensor(config.sensor))
     _add_actuators(spec, config.arm)
-    _add_cameras_and_table(spec)
+    _add_cameras_and_table(spec, ROBOTS[config.arm].tool)
     for body in bodies:
         _add_body(spec, body)
     return spec
@@ -133,7 +132,7 @@ def _add_fingertip(spec: mujoco.MjSpec, side: str, sensor: SensorModel) -> None:
     """
     finger = spec.body(f"{side}_finger")
     box = mujoco.mjtGeom.mjGEOM_BOX
-    z = _SENSOR_DEPTH_IN_FINGER
+    z = SENSOR_BELOW_CARRIAGE
     length, width, depth = sensor.case_size
     protrusion = sensor.gel_thickness + 0.0005  # the case must never take the load
     grey, black = [0.3, 0.3, 0.32, 1], [0.12, 0.12, 0.13, 1]
@@ -237,12 +236,15 @@ def _add_actuators(spec: mujoco.MjSpec, arm: str) -> None:
     )
 
 
-def _add_cameras_and_table(spec: mujoco.MjSpec) -> None:
+def _add_cameras_and_table(spec: mujoco.MjSpec, tool: Tool) -> None:
     world = spec.worldbody
     hand = spec.body("hand")
-    hand.add_site(name="tcp", pos=[0, 0, FRANKA_HAND.tcp_offset], group=HIDDEN_GROUP)
-    eye = [0.075, 0.0, 0.02]
-    hand.add_camera(name="wrist", pos=eye, quat=_look(eye, [0.012, 0, 0.17], [1, 0, 0]), fovy=62)
+    hand.add_site(name="tcp", pos=[0, 0, tool.tcp_offset], group=HIDDEN_GROUP)
+    longer = tool.tcp_offset - FRANKA_HAND.tcp_offset  # the camera sees every tool's fingers alike
+    eye = [0.075, 0.0, 0.02 + longer]
+    hand.add_camera(
+        name="wrist", pos=eye, quat=_look(eye, [0.012, 0, 0.17 + longer], [1, 0, 0]), fovy=62
+    )
     for name, eye, target, fovy in (
         ("front", [1.15, 0.0, 0.55], [0.46, 0.0, 0.10], 40),
         ("side", [0.62, -0.95, 0.42], [0.45, 0.0, 0.17], 40),

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control.safety.braking import braked_velocity
-from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH, GRIPPER_SPEED, FrankaTactileEnv
+from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE, SERVO_DAMPING
 
 DT = 1e-3  # s, of the Franka control interface and of the physics
@@ -83,7 +83,9 @@ class SimulatedCell:
         self.time, self._steps = 0.0, 0
         self.q_d, self.dq_d, self.tau_ext = env.command.copy(), np.zeros(n), np.zeros(n)
         self.q, self.dq = env.joints()
-        self.gripper_command = GripperCommand(env.width_target(), GRIPPER_SPEED, env.grasp_force)
+        self.gripper_command = GripperCommand(
+            env.width_target(), env.robot.tool.speed, env.grasp_force
+        )
         self.worst = WorstCase()
         self.progress, self.success, self.failures = 0.0, False, set[str]()
         self._grasp_begun = (
@@ -118,10 +120,11 @@ class SimulatedCell:
 
     def command_gripper(self, width: float, speed: float, force: float) -> None:
         """Send the gripper to `width` (m) at `speed` (m/s), pressing with `force` (N) a finger."""
-        width = float(np.clip(width, 0.0, GRIPPER_MAX_WIDTH))
+        tool = self.env.robot.tool
+        width = float(np.clip(width, *tool.stroke))
         self._grasp_begun |= width < self.gripper_command.width
         self.gripper_command = GripperCommand(
-            width, min(speed, GRIPPER_SPEED), min(force, GRIPPER_MAX_FORCE / 2)
+            width, min(speed, tool.speed), min(force, GRIPPER_MAX_FORCE / 2)
         )
 
     def nudge(self, force: Float[np.ndarray, "3"], seconds: float) -> None:

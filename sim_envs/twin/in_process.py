@@ -25,7 +25,6 @@ from touchgoal.control.interfaces import (
 )
 from touchgoal.control.motion.tracker import Tracker, TrackerState
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
-from touchgoal.sim_envs.base import GRIPPER_SPEED
 from touchgoal.sim_envs.config import STREAM_SIZE, BeadMazeConfig, PickPlaceConfig, TaskConfig
 from touchgoal.sim_envs.tasks import make_env
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
@@ -135,7 +134,7 @@ class SimulatedGripper:
 
     def command(self, width: float) -> None:
         """See Gripper."""
-        self._cell.command_gripper(width, GRIPPER_SPEED, self._force)
+        self._cell.command_gripper(width, self._cell.env.robot.tool.speed, self._force)
 
     def stop(self) -> None:
         """See Gripper."""

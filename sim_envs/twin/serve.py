@@ -16,9 +16,8 @@ from touchgoal.control.cell.config import (
     TaskSection,
 )
 from touchgoal.control.errors import UserError
-from touchgoal.control.grippers.robotiq import ROBOTIQ_FORCE_RANGE
 from touchgoal.control.sensors.load_cell import LoadCellConfig
-from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH, FrankaTactileEnv
+from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import TaskConfig
 from touchgoal.sim_envs.tactile.press_bench import warm_up
@@ -152,11 +151,12 @@ class Twin:
             services.append(arm := UrController(cell, host))
             services.append(robotiq := serial_ports.Robotiq(cell, folder / "gripper"))
             ports["gripper"] = robotiq.port
+            tool = cell.env.robot.tool
             gripper = GripperSection(
                 "robotiq",
                 port=str(robotiq.port.path),
-                widths=(GRIPPER_MAX_WIDTH, 0.0),
-                force=max(force, ROBOTIQ_FORCE_RANGE[0]),
+                widths=(tool.stroke[1], tool.stroke[0]),
+                force=max(force, tool.force[0]),
             )
         services.append(streams := Streams(cell, host, config.port))
         control = config.port + 1 if config.port else 0

@@ -7,24 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from touchgoal.control.grippers.modbus import crc
+from touchgoal.control.grippers import robotiq_registers as registers
 from touchgoal.control.sensors.load_cell import with_checksum
-from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH
+from touchgoal.control.sensors.serial_port import modbus_crc
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 
 _LOAD_RATE = 80  # Hz, an HX711's faster rate
 NEWTONS_PER_COUNT, ZERO = 2e-4, 84_213  # of the load cell; a bridge is never balanced
 _LOAD_NOISE = 25.0  # counts
 
-_SLAVE, _OUTPUT_REGISTERS, _INPUT_REGISTERS = (
-    9,
-    1000,
-    2000,
-)  # Robotiq 2F manual: Modbus slave, first registers
-_POSITIONS = 3, 230  # fully open and closed: where the stroke is linear
-_SPEEDS = 0.020, 0.150  # m/s at 0 and 255
-_FORCES = 20.0, 235.0  # N at 0 and 255
-_MOVING, _STOPPED_OPENING, _STOPPED_CLOSING, _THERE = range(4)  # object detection
 _STILL, _SETTLED = 1e-3, 0.05  # m/s, s
 
 
@@ -113,11 +104,12 @@ class LoadCell:
 class Robotiq:
     """A 2F gripper's Modbus registers in front of the cell's gripper; it begins activated.
 
-    Position 3 is the cell's 80 mm between the pads, 230 is closed.
+    Position 3 is the tool's stroke between the pads, 230 is closed.
     """
 
     def __init__(self, cell: SimulatedCell, path: Path) -> None:
         self.cell, self.port = cell, SerialPort(path)
+        self._stroke = cell.env.robot.tool.stroke[1]
         self._unread = b""
         self._output_registers = bytearray([0x01, 0, 0, 0, 0, 0])
         self._ready_in = 0.0  # s of activation left
@@ -129,11 +121,11 @@ class Robotiq:
         self._unread += self.port.read()
         while (length := _request_length(self._unread)) and len(self._unread) >= length:
             frame, self._unread = self._unread[:length], self._unread[length:]
-            if frame[0] != _SLAVE or crc(frame[:-2]) != frame[-2:]:
+            if frame[0] != registers.SLAVE or modbus_crc(frame[:-2]) != frame[-2:]:
                 self._unread = b""  # the next frame begins after a silence
                 return
             answer = self._serve(frame)
-            self.port.write(answer + crc(answer))
+            self.port.write(answer + modbus_crc(answer))
 
     def send(self) -> None:
         """See how far the fingers are."""
@@ -143,7 +135,9 @@ class Robotiq:
         if self._ready_in > 0:
             self._ready_in -= DT
             opening = self._ready_in > 1.0  # it opens, then closes
-            self.cell.command_gripper(GRIPPER_MAX_WIDTH if opening else 0.0, _SPEEDS[1], _FORCES[0])
+            self.cell.command_gripper(
+                self._stroke if opening else 0.0, registers.SPEEDS[1], registers.FORCES[0]
+            )
 
     def close(self) -> None:
         """Pull the plug."""
@@ -152,33 +146,35 @@ class Robotiq:
     def _serve(self, frame: bytes) -> bytes:
         function, register = struct.unpack_from(">xBH", frame)
         head = frame[:2]
-        if function == 16 and register >= _OUTPUT_REGISTERS:
-            first = 2 * (register - _OUTPUT_REGISTERS)
+        if function == 16 and register >= registers.COMMAND:
+            first = 2 * (register - registers.COMMAND)
             data = frame[7:-2]
             self._output_registers[first : first + len(data)] = data
             self._apply_registers()
             return frame[:6]
-        if function in (3, 4) and register >= _INPUT_REGISTERS:
+        if function in (3, 4) and register >= registers.STATUS:
             (count,) = struct.unpack_from(">H", frame, 4)
-            first = 2 * (register - _INPUT_REGISTERS)
+            first = 2 * (register - registers.STATUS)
             data = self._status()[first : first + 2 * count]
             return head + bytes([len(data)]) + data
         return bytes([frame[0], function | 0x80, 1])  # illegal function
 
     def _apply_registers(self) -> None:
         action, _, _, position, speed, force = self._output_registers[:6]
-        if not action & 0x01:
+        if not action & registers.ACTIVATE:
             self._ready_in, self._goal = -1.0, None  # reset
         elif self._ready_in < 0:
             self._ready_in = 2.0
-        elif action & 0x08 and self._ready_in == 0:
-            opened, closed = _POSITIONS
+        elif action & registers.GO and self._ready_in == 0:
+            opened, closed = registers.POSITIONS
             share = min(max((position - opened) / (closed - opened), 0.0), 1.0)
-            goal = (1 - share) * GRIPPER_MAX_WIDTH
+            goal = (1 - share) * self._stroke
             if goal != self._goal:
                 self._goal, self._still = goal, 0.0
             self.cell.command_gripper(
-                goal, _interpolate(_SPEEDS, speed), _interpolate(_FORCES, force)
+                goal,
+                registers.from_count(speed, registers.SPEEDS),
+                registers.from_count(force, registers.FORCES),
             )
         elif self._ready_in == 0 and self._goal is not None:
             self._goal = None  # without the go bit it stays where it is
@@ -189,13 +185,15 @@ class Robotiq:
             state = 1
         else:
             self._ready_in, state = (0.0, 3) if self._ready_in >= 0 else (-1.0, 0)
-        going, found = self._goal is not None, _THERE
+        going, found = self._goal is not None, registers.ARRIVED
         if self._goal is not None and abs(self._width - self._goal) > 2e-3:
-            blocked = _STOPPED_CLOSING if self._width > self._goal else _STOPPED_OPENING
-            found = blocked if self._still > _SETTLED else _MOVING
+            blocked = (
+                registers.STOPPED_CLOSING if self._width > self._goal else registers.STOPPED_OPENING
+            )
+            found = blocked if self._still > _SETTLED else registers.MOVING
         first = (self._output_registers[0] & 1) | going << 3 | state << 4 | found << 6
-        opened, closed = _POSITIONS
-        share = min(max(1 - self._width / GRIPPER_MAX_WIDTH, 0.0), 1.0)
+        opened, closed = registers.POSITIONS
+        share = min(max(1 - self._width / self._stroke, 0.0), 1.0)
         position = round(opened + share * (closed - opened))
         return bytes([first, 0, 0, self._output_registers[3], position, 0])
 
@@ -205,7 +203,3 @@ def _request_length(unread: bytes) -> int:
     if len(unread) < 8:
         return 0
     return 9 + unread[6] if unread[1] == 16 else 8
-
-
-def _interpolate(span: tuple[float, float], count: int) -> float:
-    return span[0] + (span[1] - span[0]) * count / 255
