@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from touchgoal.control.arms import franka, ur
 from touchgoal.control.checks import CheckResult, require_all_ok
 from touchgoal.control.errors import UserError, install_extra
 from touchgoal.control.option_types import checked_dataclass
@@ -103,11 +104,11 @@ def cameras() -> CheckResult:
 
 def arms() -> CheckResult:
     """Client libraries of real arms."""
-    clients = {"franky-control": "Franka", "ur-rtde": "UR"}
-    found = [f"{arm} by {name} {_version(name)}" for name, arm in clients.items() if _version(name)]
-    return CheckResult(
-        "arm clients", bool(found) or None, ", ".join(found) or "none (not needed in sim)"
-    )
+    clients = (("franky-control", "Franka", franka.INSTALL), ("ur-rtde", "UR", ur.INSTALL))
+    found = [f"{arm} by {name} {_version(name)}" for name, arm, _ in clients if _version(name)]
+    missing = [f"for a {arm}: {install}" for name, arm, install in clients if not _version(name)]
+    detail = ", ".join(found) or "none (not needed in sim)"
+    return CheckResult("arm clients", None if missing else True, detail, "; ".join(missing))
 
 
 CHECKS: tuple[Callable[[], CheckResult], ...] = (

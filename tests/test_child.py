@@ -11,8 +11,12 @@ from pathlib import Path
 import pytest
 
 from touchgoal.control.arms.driver_process import DriverProcess
+from touchgoal.control.arms.franka import FrankaClient
+from touchgoal.control.arms.streaming import ArmClient, ArmConfig
+from touchgoal.control.arms.ur import UrClient
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError
+from touchgoal.control.safety.limits import FR3
 
 pytestmark = pytest.mark.realtime  # time-outs of children, which must get a core
 
@@ -167,3 +171,14 @@ def test_ctrl_c_is_for_the_parent_alone(log: Path) -> None:
     process.wait(20)
     until(lambda: not running(pid(log)))
     assert log.read_text().endswith("at rest\n")
+
+
+@pytest.mark.parametrize(
+    ("client", "module"), [(FrankaClient, "franky"), (UrClient, "rtde_receive")]
+)
+def test_a_missing_client_library_is_said_in_a_line(
+    client: type[ArmClient], module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UserError, match=f"{module} is missing: pip install"):
+        client(ArmConfig("127.0.0.1", FR3, 20.0, 100.0, 0.5), False)

@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from touchgoal.control.arms.streaming import ArmClient, ArmConfig, ArmProcess, shift_wrench
+from touchgoal.control.arms.streaming import (
+    ArmClient,
+    ArmConfig,
+    ArmProcess,
+    import_client,
+    shift_wrench,
+)
 from touchgoal.control.interfaces import ArmReading, DriverError, Joints
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.kinematics import Kinematics
@@ -18,6 +24,7 @@ if TYPE_CHECKING:
     import franky
 
 RATE = 200.0  # Hz of velocity commands
+INSTALL = "pip install franky-control"
 STATE_TIMEOUT = 0.5  # s; libfranka itself gives up after 1 s
 _COMMAND_MS = 100  # of each
 _POSITION_GAIN = 10.0  # 1/s towards the commanded position
@@ -29,21 +36,21 @@ class FrankaClient(ArmClient):
     """In the child: one FR3."""
 
     def _connect(self, recover: bool) -> JointLimits:
-        import franky
-
-        self._franky, self._aborted = franky, ""
+        self._franky = client = import_client("franky", INSTALL)
+        self._aborted = ""
         robot = self.config.robot
         self._kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
         # No real-time kernel is asked for: firmware 5.9 and later does without.
-        self._robot: franky.Robot | None = franky.Robot(
+        self._robot: franky.Robot | None = client.Robot(
             self.config.address,
             default_torque_threshold=_TORQUE_REFLEX,
             default_force_threshold=_FORCE_REFLEX,
-            realtime_config=franky.RealtimeConfig.Ignore,
+            realtime_config=client.RealtimeConfig.Ignore,
         )
-        if recover and self._robot.state.robot_mode == franky.RobotMode.Reflex:
-            self._robot.recover_from_errors()
-        return self._limits(self._robot)
+        robot = self._require()
+        if recover and robot.state.robot_mode == client.RobotMode.Reflex:
+            robot.recover_from_errors()
+        return self._limits(robot)
 
     def _limits(self, robot: "franky.Robot") -> JointLimits:
         """Sets franky's limits and returns the stream's.

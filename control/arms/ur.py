@@ -10,12 +10,19 @@ import time
 
 import numpy as np
 
-from touchgoal.control.arms.streaming import ArmClient, ArmConfig, ArmProcess, shift_wrench
+from touchgoal.control.arms.streaming import (
+    ArmClient,
+    ArmConfig,
+    ArmProcess,
+    import_client,
+    shift_wrench,
+)
 from touchgoal.control.interfaces import ArmReading, DriverError, Joints
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.kinematics import Kinematics
 
 RATE = 125.0  # Hz of servoJ; 20 to 500
+INSTALL = "pip install ur-rtde, with Python 3.12 or earlier (there is no wheel for later ones)"
 STATE_TIMEOUT = 0.05  # s
 _GAIN = 300.0  # of servoJ, 100 to 2000; URScript's default
 _LOOKAHEAD = 0.03, 0.2  # s, servoJ's range; the arm lags by about this much
@@ -28,27 +35,26 @@ class UrClient(ArmClient):
     """In the child: one UR."""
 
     def _connect(self, recover: bool) -> JointLimits:
-        from rtde_control import RTDEControlInterface
-        from rtde_receive import RTDEReceiveInterface
-
         robot = self.config.robot
         self._kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
         self._refused = False
-        self._receive = RTDEReceiveInterface(self.config.address)
+        self._receive = import_client("rtde_receive", INSTALL).RTDEReceiveInterface(
+            self.config.address
+        )
         if recover and self._receive.isProtectiveStopped():
             self._unlock()
         if self._stopped():
             raise DriverError(self._stopped())
-        self._control = RTDEControlInterface(self.config.address)
+        self._control = import_client("rtde_control", INSTALL).RTDEControlInterface(
+            self.config.address
+        )
         self._control.setWatchdog(_WATCHDOG)
         self._lookahead = float(np.clip(2 * self.period, *_LOOKAHEAD))
         return self.config.robot.interface
 
     def _unlock(self) -> None:
         """As a person does it at the pendant; the controller refuses for the first 5 s."""
-        from dashboard_client import DashboardClient
-
-        dashboard = DashboardClient(self.config.address)
+        dashboard = import_client("dashboard_client", INSTALL).DashboardClient(self.config.address)
         dashboard.connect(int(1e3 * _UNLOCKING))
         dashboard.closeSafetyPopup()
         dashboard.unlockProtectiveStop()

@@ -8,10 +8,16 @@ on its way in grasps that.
 """
 
 import time
+from typing import TYPE_CHECKING
 
 from touchgoal.control.arms.driver_process import DriverProcess
+from touchgoal.control.arms.franka import INSTALL
+from touchgoal.control.arms.streaming import import_client
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError, GripperReading
+
+if TYPE_CHECKING:
+    import franky
 
 _STEP = 2e-3  # m between commands that differ, and up to which a width is shut
 _SPEED = 0.1  # m/s; the hand's fastest
@@ -23,10 +29,8 @@ class FrankaHandClient:
     period = 0.05
 
     def __init__(self, address: str, force: float) -> None:
-        import franky
-
-        self._franky, self._force = franky, force
-        self._hand = franky.Gripper(address)
+        self._franky, self._force = import_client("franky", INSTALL), force
+        self._hand = self._franky.Gripper(address)
         self._max_width = self._hand.state.max_width
         if self._max_width <= 0:
             raise UserError("the Franka Hand does not know its stroke: home it in Desk first")
