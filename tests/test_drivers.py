@@ -224,8 +224,8 @@ def rests_at(gripper: Gripper, width: float) -> bool:
 def test_a_gripper_opens_closes_and_is_clipped_to_its_stroke(twin: Twin) -> None:
     gripper = twin.gripper()
     assert isinstance(gripper, Gripper)
-    stamp = gripper.read().stamp
-    for asked, width in ((0.06, 0.06), (0.03, 0.03), (9.0, 0.08)):
+    stamp, widest = gripper.read().stamp, twin.config.robot.tool.stroke[1]
+    for asked, width in ((0.06, 0.06), (0.03, 0.03), (9.0, widest)):
         gripper.command(asked)
         until(lambda w=width: rests_at(gripper, w))
     assert gripper.read().fault == "" and gripper.read().stamp > stamp

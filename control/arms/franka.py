@@ -38,8 +38,8 @@ class FrankaClient(ArmClient):
     def _connect(self, recover: bool) -> JointLimits:
         self._franky = client = import_client("franky", INSTALL)
         self._aborted = ""
-        robot = self.config.robot
-        self._kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
+        model = self.config.robot
+        self._kinematics = Kinematics(model.arm, model.tool.tcp_offset)
         # No real-time kernel is asked for: firmware 5.9 and later does without.
         self._robot: franky.Robot | None = client.Robot(
             self.config.address,
