@@ -188,18 +188,7 @@ def test_progress_in_a_pipe_is_a_line_now_and_then(capsys: pytest.CaptureFixture
     assert capsys.readouterr().err == ""  # neither a tenth nor half a minute has passed
 
 
-LIGHT = [
-    "demo",
-    "doctor",
-    "list",
-    "calibrate",
-    "repair",
-    "benchmark",
-    "completion",
-    "twin",
-    "teleop",
-    "deploy",
-]
+LIGHT = [name for name in COMMANDS if not name.startswith("train-")]
 
 
 def test_help_imports_nothing_heavy() -> None:

@@ -13,8 +13,9 @@ from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import EpisodeSpec, collect
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.launch import collect_demos
 from touchgoal.launch.__main__ import main
+from touchgoal.launch.collect_demos import Config as CollectConfig
+from touchgoal.launch.commands import collect_demos
 from touchgoal.policies.by_name import choose_policy
 from touchgoal.policies.checkpoint import load_policy
 from touchgoal.policies.evaluation import evaluate as evaluation
@@ -111,7 +112,7 @@ def test_a_policy_of_ones_own_is_judged(tmp_path: Path) -> None:
 def test_every_outcome_meets_every_object() -> None:
     env = PickPlaceConfig(objects=("glass_ball", "bottle_cap", "toy_brick"))
     outcomes = ("success", "drop", "never_touch")
-    specs = collect_demos.specs_of(collect_demos.Config(episodes=3, outcomes=outcomes, env=env))
+    specs = collect_demos.specs_of(CollectConfig(episodes=3, outcomes=outcomes, env=env))
     met = {(spec.outcome, spec.options["object"]) for spec in specs}
     assert len(specs) == 9 == len(met) and len({spec.seed for spec in specs}) == 9
 
