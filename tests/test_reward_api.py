@@ -12,15 +12,19 @@ import torch
 from PIL import Image
 from test_rewards import PaintTowers, recorded
 
+import touchgoal
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT
+from touchgoal.control.interfaces import DriverError
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.rewards.api import reward_curve
+from touchgoal.rewards.goals import PictureFile, Sentence
 from touchgoal.rewards.normalizer import DistanceNormalizer
+from touchgoal.rewards.online import OnlineCost
 from touchgoal.rewards.sources import open_source
 
 EPISODE = recorded()
@@ -104,7 +108,7 @@ def test_mistakes_are_told_in_one_line(call: Callable[[], Any], message: str) ->
 
 def test_shipped_encoder_by_name() -> None:
     pytest.importorskip("transformers")
-    curves = reward_curve(IMAGES, TOUCH, ("last", "a hard smooth round object"))
+    curves = touchgoal.reward_curve(IMAGES, TOUCH, ("last", "a hard smooth round object"))
     assert curves.costs.keys() == {"image", "tactile", "text"}
     assert curves.costs["tactile"][0] > 0.1
 
@@ -227,3 +231,19 @@ def test_goal_picture_from_a_file(run_folder: Path, monkeypatch: pytest.MonkeyPa
     Image.fromarray(IMAGES[9]).save("end.png")
     curves = reward_curve(IMAGES, goal="image:end.png", towers=PaintTowers())
     assert curves.costs["image"].argmin() == 9
+
+
+def test_cost_during_a_run_is_raw_where_no_scale_applies(
+    encoder: TouchEncoder, tmp_path: Path
+) -> None:
+    Image.fromarray(IMAGES[9]).save(tmp_path / "end.png")
+    picture, words = PictureFile(tmp_path / "end.png"), Sentence("soft")
+    tick = {FRONT: IMAGES[0], TACTILE_LEFT: TOUCH["left"][0], TACTILE_RIGHT: TOUCH["right"][0]}
+    cost = OnlineCost(PaintTowers(), encoder, None, [picture])
+    expected = reward_curve(IMAGES, goal=IMAGES[9], towers=PaintTowers()).costs["image"][0]
+    assert cost.latest_cost(tick) == pytest.approx(expected, abs=1e-6)
+    cost.close()
+    both = OnlineCost(PaintTowers(), encoder, None, [picture, words])
+    with pytest.raises(DriverError, match="raw distances of several modalities"):
+        both.latest_cost(tick)
+    both.close()

@@ -107,6 +107,13 @@ def test_image_embedding_does_not_depend_on_the_batch(
     alone = torch.cat([offline.embed_images(crop[None]) for crop in crops])
     torch.testing.assert_close(together, alone, rtol=1e-4, atol=1e-4)
     assert F.cosine_similarity(together[0], together[3], dim=0) < 0.99
+    # More pictures than a batch go to threads of one core each; this thread's number stays.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    repeated = offline.embed_images(np.concatenate([crops] * 3))
+    assert torch.get_num_threads() == 2 and not repeated.requires_grad
+    torch.set_num_threads(threads)
+    torch.testing.assert_close(repeated, together.repeat(3, 1), rtol=1e-4, atol=1e-4)
 
 
 def test_text_tower_knows_what_words_mean(offline: OfflineTowers) -> None:

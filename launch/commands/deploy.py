@@ -161,7 +161,9 @@ def _load_cost(cell: CellConfig) -> OnlineCost | None:
     goals = [parse_goal(text) for text in cell.task.rewards]
     directory = pretrained.shipped_encoder_for(cell.sensor)
     encoder = pretrained.load_aligned(directory, sensor=cell.sensor)
-    normalizer = DistanceNormalizer.load(directory / "scale.json")
+    simulated = cell.arm == "sim" or bool(cell.task.twin)
+    scale = Path(cell.task.scale) if cell.task.scale else directory / "scale.json"
+    normalizer = DistanceNormalizer.load(scale) if simulated or cell.task.scale else None
     return OnlineCost(load_towers(encoder.config.towers), encoder, normalizer, goals)
 
 

@@ -244,7 +244,13 @@ def _label_lines(axes: Axes, values: Mapping[str, np.ndarray], gap: float) -> No
             fontweight="bold" if "+" in name else "normal",
             color=color,
             annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.8, "shrinkA": 1},
+            arrowprops={
+                "arrowstyle": "-",
+                "color": color,
+                "linewidth": 0.8,
+                "shrinkA": 1,
+                "relpos": (0, 0.5),
+            },
         )
 
 

@@ -39,8 +39,10 @@ register_environments()
 # One call a job. Each is imported when it is first used: `import touchgoal` stays light.
 _INTERFACE = {
     "evaluate": "touchgoal.policies.evaluation.evaluate",
+    "load_encoder": "touchgoal.encoders.pretrained",
     "load_policy": "touchgoal.policies.checkpoint",
     "make": "touchgoal.sim_envs.tasks",
+    "reward_curve": "touchgoal.rewards.api",
 }
 
 
