@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 from scipy import stats
-from tqdm import tqdm
 
 from touchgoal.benchmarks.config import RewardQualityOptions
 from touchgoal.control.errors import UserError
+from touchgoal.control.progress import track
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.recording import EpisodeSpec, collect
@@ -127,7 +127,7 @@ def record_and_measure(
         jobs = [EpisodeSpec(first + i, outcome, {"object": n}) for i, n in enumerate(names)]
         collect(folder / outcome, env, jobs, config.workers)
         episodes = EpisodeSet(folder / outcome)
-        for i in tqdm(range(len(episodes)), desc=outcome, unit="episode"):
+        for i in track(range(len(episodes)), f"measuring {outcome}", "episode"):
             episode = embedder.embed_episode(episodes.read(i), episodes.fps, f"{outcome}#{i}")
             sentence = Sentence(SENTENCES[names[i]])
             own, words, other = (

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 _PERIOD = 30.0  # s between two lines in a pipe, at most
 _SHARE = 0.1  # of the work between two lines in a pipe
+_QUICK = 2.0  # s: no lines of work that is done sooner, nor lines closer together
 Item = TypeVar("Item")
 
 
@@ -38,15 +39,17 @@ class Progress:
             self._bar.update(units)
             return
         now = time.monotonic()
+        quiet = now - self._said_at
         enough = self._total and self._count - self._said >= _SHARE * self._total
-        if enough or now - self._said_at >= _PERIOD or self._count == self._total:
+        if quiet >= _PERIOD or (quiet >= _QUICK and (enough or self._count == self._total)):
             self._said, self._said_at = self._count, now
             print(self._line(now - self._start), file=sys.stderr, flush=True)
 
     def _line(self, seconds: float) -> str:
         done = f"{self._count}" if self._total is None else f"{self._count} of {self._total}"
         rate = f", {seconds / self._count:.2g} s each" if self._count and seconds >= 1 else ""
-        return f"{self._what}: {done} {self._unit}s, {seconds:.0f} s{rate}"
+        units = self._unit.removesuffix("y") + ("ies" if self._unit.endswith("y") else "s")
+        return f"{self._what}: {done} {units}, {seconds:.0f} s{rate}"
 
     def __enter__(self) -> "Progress":
         """Itself."""

@@ -14,10 +14,10 @@ from typing import Any, Protocol, runtime_checkable
 import cv2
 import numpy as np
 from jaxtyping import UInt8
-from tqdm import tqdm
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
+from touchgoal.control.progress import track
 from touchgoal.episodes.encoding import EncodedEpisode, encode
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeWriter
@@ -106,7 +106,8 @@ def record_with_film(
     actor = policy(env) if policy else make_expert(env, spec.outcome)
     film = SceneRecorder(env)
     ticks = []
-    for tick in tqdm(run(env, actor, observation, info), desc="filming", unit="frame"):
+    at_most = round(env.config.max_seconds * env.config.control_hz)
+    for tick in track(run(env, actor, observation, info), "filming", "frame", total=at_most):
         ticks.append(tick)
         film.capture()
     film.close()
@@ -158,7 +159,7 @@ def collect(
     try:
         with one_core_workers(workers) as pool:
             encoded = pool.map(partial(_record, config, roles), specs)
-            for episode in tqdm(encoded, total=len(specs), desc="record", unit="episode"):
+            for episode in track(encoded, "recording", "episode", total=len(specs)):
                 writer.append(episode)
                 metas.append(episode.description.meta)
     finally:

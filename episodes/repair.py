@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
+from touchgoal.control.progress import track
 from touchgoal.episodes import metadata
 from touchgoal.episodes.encoding import (
     Description,
@@ -121,7 +121,7 @@ def validate(root: str | os.PathLike[str]) -> list[str]:
         return [str(error)]
     problems = contradictions_in_meta(root, set_metadata)
     rebuilt = SetMetadata(set_metadata.fps, set_metadata.features)
-    for file_number in tqdm(_file_numbers(set_metadata), desc="validate", unit="episode"):
+    for file_number in track(_file_numbers(set_metadata), "checking", "file"):
         try:
             description, table = _read_episode(root, file_number)
             if differing := _wrong_index_columns(table, rebuilt.index_columns_for(description)):
@@ -163,7 +163,7 @@ def repair(root: str | os.PathLike[str]) -> list[str]:
 def _repair(root: Path) -> list[str]:
     done: list[str] = []
     set_metadata: SetMetadata | None = None
-    for path in tqdm(sorted((root / "data").glob(_DATA_FILES)), desc="repair", unit="episode"):
+    for path in track(sorted((root / "data").glob(_DATA_FILES)), "reading", "file"):
         file_number = int(path.parent.name[-3:]) * metadata.CHUNK + int(path.stem[-3:])
         try:
             description, table = _read_episode(root, file_number)

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt8
-from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import TACTILE, TRUTH_CONTACT, WRIST
+from touchgoal.control.progress import track
 from touchgoal.control.tactile.contact import detect_contact, threshold_for
 from touchgoal.episodes.store import EpisodeSet
 
@@ -72,7 +72,7 @@ def collect_touches(
     most = len(episodes) * (contact_frames_per_episode + no_contact_frames_per_episode)
     frames = np.empty((most, *episodes.features[TACTILE[sides[0]]]["shape"]), np.uint8)
     sampled, backgrounds, views, filled = [], [], [], 0
-    for i in tqdm(range(len(episodes)), desc="touches", unit="episode"):
+    for i in track(range(len(episodes)), "taking touches from", "episode"):
         background = [_background(episodes, i, side) for side in sides]
         contact = _contact(episodes, i, sides)
         rng = np.random.default_rng([seed, i])

@@ -38,8 +38,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Check, embed, fit."""
-    from tqdm import tqdm
-
+    from touchgoal.control.progress import track
     from touchgoal.launch.run_folder import open_run
     from touchgoal.rewards.fit_normalizer import fit_normalizer
     from touchgoal.rewards.setup import SCALE, load_encoders
@@ -51,7 +50,7 @@ def main(config: Config) -> None:
     out = open_run(config.out, "fit-scale", config)
     total = sum(len(source.names) for source in sources)
     trajectories = (one for source in sources for one in source.embed(embedder, descriptions=True))
-    embedded = list(tqdm(trajectories, desc="embedding", unit="trajectory", total=total))
+    embedded = list(track(trajectories, "embedding", "trajectory", total=total))
     has_words = all(one.descriptions is not None for one in embedded)
     modalities = config.modalities or tuple(
         m for m in embedded[0].modalities if m != "text" or has_words

@@ -48,8 +48,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Check, embed, measure, and write a plot, a CSV and a JSON for each trajectory."""
-    from tqdm import tqdm
-
+    from touchgoal.control.progress import track
     from touchgoal.launch.run_folder import open_run
     from touchgoal.rewards.report.report import write_report
     from touchgoal.rewards.setup import prepare
@@ -69,7 +68,7 @@ def main(config: Config) -> None:
     measured: list[Curves] = []
     total = len(source.names)
     try:
-        for name, curves in tqdm(setup.measure(), desc="curves", unit="trajectory", total=total):
+        for name, curves in track(setup.measure(), "drawing curves of", "trajectory", total=total):
             write_report(curves, out, name, provenance, config.gamma)
             measured.append(curves)
     except KeyboardInterrupt as interruption:

@@ -1,5 +1,6 @@
 """What every command shares: help, options, one line for a mistake, the run's folder, Ctrl-C."""
 
+import itertools
 import json
 import os
 import signal
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 
 from touchgoal import __version__
+from touchgoal.control import progress
 from touchgoal.control.errors import UserError
 from touchgoal.control.interruption import Terminated, kept, terminable
 from touchgoal.control.option_types import checked_dataclass
@@ -180,12 +182,18 @@ def test_sigterm_is_taken_in_the_main_thread_alone() -> None:
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_progress_in_a_pipe_is_a_line_now_and_then(capsys: pytest.CaptureFixture) -> None:
+def test_progress_in_a_pipe_is_a_line_now_and_then(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert list(track(range(200), "embedding", "frame")) == list(range(200))
+    assert capsys.readouterr().err == ""  # work that is done at once needs no words
+    clock = itertools.count(step=1.0)
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
     assert list(track(range(200), "embedding", "frame")) == list(range(200))
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 10 and lines[0].startswith("embedding: 20 of 200 frames, 0 s")
+    assert lines == [f"embedding: {n} of 200 frames, {n} s, 1 s each" for n in range(20, 201, 20)]
     assert list(track(iter("ab"), "reading", "file")) == ["a", "b"]
-    assert capsys.readouterr().err == ""  # neither a tenth nor half a minute has passed
+    assert capsys.readouterr().err == ""  # no total, and half a minute has not passed
 
 
 LIGHT = [name for name in COMMANDS if not name.startswith("train-")]

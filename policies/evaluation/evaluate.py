@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
+from touchgoal.control.progress import track
 from touchgoal.episodes.recording import EpisodeSpec, one_core_workers, run
 from touchgoal.policies.by_name import (
     OwnPolicy,
@@ -144,13 +144,13 @@ def run_trials(
         workers: processes; one: in this process.
     """
     if workers == 1:
-        for spec in tqdm(specs, desc="trials", unit="episode"):
+        for spec in track(specs, "trials", "episode"):
             yield run_trial(config, policy, spec)
         return
     n = len(specs)
     with one_core_workers(min(workers, n)) as pool:
         results = pool.map(run_trial, [config] * n, [policy] * n, specs)
-        yield from tqdm(results, total=n, desc="trials", unit="episode")
+        yield from track(results, "trials", "episode", total=n)
 
 
 def run_trial(config: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec) -> Trial:

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from jaxtyping import Float32, UInt8
 from torch import Tensor
-from tqdm import tqdm
 
 from touchgoal.control import features as ft
+from touchgoal.control.progress import track
 from touchgoal.episodes.recording import one_core_workers
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
@@ -48,7 +48,9 @@ def render_placements(
     seeds = range(seed, seed + objects)
     with one_core_workers(workers) as pool:
         rendered = pool.map(_render_object, [config] * objects, [placements_each] * objects, seeds)
-        rows = [row for some in tqdm(rendered, total=objects, desc="objects") for row in some]
+        rows = [
+            row for some in track(rendered, "rendering", "object", total=objects) for row in some
+        ]
     keys = [key for key in ft.CAMERAS if key in rows[0]]
     columns = {
         key: torch.from_numpy(np.stack([row[key] for row in rows]))

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float16, Float32, Int, UInt8
 from torch import Tensor
-from tqdm import tqdm
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
+from touchgoal.control.progress import track
 from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, difference_images
@@ -72,7 +72,7 @@ def load_recordings(
     embedded = embed_episodes(episodes, chosen, embedder, workers) if embedder else None
     keys = [*config.proprioception, ft.ACTION, *[ft.TRUTH_PAD_WRENCH] * config.reads_wrench]
     touch, state, actions, pictures, wrench = [], [], [], [], []
-    for n, i in enumerate(tqdm(chosen, desc="episodes", unit="episode")):
+    for n, i in enumerate(track(chosen, "reading", "episode")):
         frames = episodes.read(i, keys).frames
         state.append(np.concatenate([frames[key] for key in config.proprioception], 1))
         actions.append(frames[ft.ACTION])
@@ -172,7 +172,7 @@ def _fill_cache(
         return
     _cache_path(episodes, embedder, 0).parent.mkdir(parents=True, exist_ok=True)
     make = partial(_embed, episodes, embedder)
-    progress = partial(tqdm, total=len(missing), desc="embed", unit="episode")
+    progress = partial(track, what="embedding touch", unit="episode", total=len(missing))
     if workers == 1:
         list(progress(map(make, missing)))
         return
