@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from touchgoal.control.arms import franka, ur
 from touchgoal.control.checks import CheckResult, require_all_ok
 from touchgoal.control.errors import UserError, install_extra
 from touchgoal.control.option_types import checked_dataclass
@@ -104,6 +103,8 @@ def cameras() -> CheckResult:
 
 def arms() -> CheckResult:
     """Client libraries of real arms."""
+    from touchgoal.control.arms import franka, ur
+
     clients = (("franky-control", "Franka", franka.INSTALL), ("ur-rtde", "UR", ur.INSTALL))
     found = [f"{arm} by {name} {_version(name)}" for name, arm, _ in clients if _version(name)]
     missing = [f"for a {arm}: {install}" for name, arm, install in clients if not _version(name)]
