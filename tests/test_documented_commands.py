@@ -18,7 +18,7 @@ from documented_commands import NOT_RUN, PAGES, ROOT, Command, commands, recipes
 from touchgoal.control.tactile import sensor_models
 from touchgoal.episodes.media import write_video
 from touchgoal.launch.__main__ import COMMANDS, main, read_options
-from touchgoal.launch.deploy import NOT_DONE
+from touchgoal.launch.commands.deploy import NOT_DONE
 
 ALL = list(commands())
 # own_*.md: test_own_pages.py
