@@ -53,7 +53,7 @@ build: $(READY)
 
 # How the shipped touch encoder was made: about 25 minutes on 2 cores.
 weights: $(READY)
-	$(BIN)/touchgoal collect-demos --episodes 40 --seed 100000 --out runs/weights/val
+	$(BIN)/touchgoal collect-demos --episodes 80 --seed 100000 --out runs/weights/val
 	$(BIN)/touchgoal collect-demos --episodes 240 --seed 0 --out runs/weights/train
 	$(BIN)/touchgoal train-encoder align --data runs/weights/train/episodes \
 		--validation runs/weights/val/episodes --scale-episodes 60 --out runs/weights/run
@@ -62,11 +62,10 @@ weights: $(READY)
 # The same for the Mini with markers.
 MARKERS := --env.sensor gelsight_mini_markers
 weights-markers: $(READY)
-	$(BIN)/touchgoal collect-demos $(MARKERS) --episodes 40 --seed 100000 --out runs/markers/val
+	$(BIN)/touchgoal collect-demos $(MARKERS) --episodes 80 --seed 100000 --out runs/markers/val
 	$(BIN)/touchgoal collect-demos $(MARKERS) --episodes 240 --seed 0 --out runs/markers/train
 	$(BIN)/touchgoal train-encoder align --data runs/markers/train/episodes \
-		--validation runs/markers/val/episodes --scale-episodes 60 \
-		--align.sensor gelsight_mini_markers --out runs/markers/run
+		--validation runs/markers/val/episodes --scale-episodes 60 --out runs/markers/run
 	cp runs/markers/run/encoder/* encoders/weights/gelsight_mini_markers_offline/
 
 # How the shipped bead-maze policy and its touch encoder were made: hours on 2 cores, most of them

@@ -1,73 +1,75 @@
 """Train a touch encoder on recorded episodes: align it with frozen towers, or by masking alone."""
 
-import shlex
-import sys
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
+from touchgoal.control.option_types import Count, CountOrNone, checked_dataclass
 from touchgoal.encoders.alignment.align import PRESETS, AlignConfig, align
-from touchgoal.encoders.ssl import frames as touch_frames
+from touchgoal.encoders.preprocess import preprocessor_for
+from touchgoal.encoders.ssl.frames import check_sensor, sample_frames
 from touchgoal.encoders.ssl.mae import MaeConfig, train_mae
 from touchgoal.encoders.towers.towers import load_towers
+from touchgoal.encoders.training.trainer import is_first_process
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import collect_touches
-from touchgoal.launch.run_folder import open_run
+from touchgoal.launch.training_run import (
+    TrainingOptions,
+    check_training,
+    open_sets,
+    open_training,
+    recipe,
+)
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder
 from touchgoal.rewards.fit_normalizer import fit_normalizer
 from touchgoal.rewards.normalizer import scene_of
 
 
-@dataclass(frozen=True)
-class Align:
+@checked_dataclass
+class Align(TrainingOptions):
     """Options of train-encoder align."""
 
-    data: Path
-    """Set of episodes to learn from."""
     validation: Path
-    """Set of other episodes, by which the best epoch is chosen."""
+    """Set of other episodes, four or more of each object. Retrieval on one half of them chooses the
+    best epoch, and is reported on the other half."""
     out: Path | None = None
     """Folder of the run; the encoder goes to its `encoder/`."""
+    sensor: str | None = None
+    """Fingertip sensor, for episodes that do not name theirs."""
     towers: str = "offline"
     """Frozen image and text towers: offline, or a CLIP as Hugging Face id or local directory."""
-    contact_frames: int = 24
+    contact_frames: Count = 24
     """Frames in contact taken from each episode."""
-    no_contact_frames: int = 8
+    no_contact_frames: CountOrNone = 8
     """Frames without contact taken from each episode."""
-    scale_episodes: int = 40
-    """Successful training episodes that fix the scale of the costs (encoder/scale.json)."""
-    resume: bool = False
-    """Go on with an interrupted run in `out`."""
+    scale_episodes: Count = 40
+    """Successful training episodes whose distances to their goals fix what counts as far and as near
+    in reward curves (encoder/scale.json)."""
     align: AlignConfig = PRESETS["default"]
     """The training."""
 
 
-@dataclass(frozen=True)
+@checked_dataclass
 class AlignPaper(Align):
-    """The same with the paper's training: ViT-H, 100 epochs, temperature 0.2, lambda 1."""
+    """The same with the training of the MMWand paper: ViT-H, 100 epochs, temperature 0.2, lambda 1."""
 
     align: AlignConfig = PRESETS["paper"]
     """The training."""
 
 
-@dataclass(frozen=True)
-class Mae:
+@checked_dataclass
+class Mae(TrainingOptions):
     """Options of train-encoder mae."""
 
-    data: Path
-    """Set of episodes to learn from."""
-    validation: Path
-    """Set of other episodes, on which losses are measured."""
     out: Path | None = None
-    """Folder of the run; the backbone goes to its `encoder/`."""
-    frames: int = 40
-    """Ticks drawn from each episode, both fingertips of each."""
-    resume: bool = False
-    """Go on with an interrupted run in `out`."""
+    """Folder of the run; the encoder goes to its `encoder/`."""
+    sensor: str | None = None
+    """Fingertip sensor, for episodes that do not name theirs."""
+    frames: Count = 40
+    """Moments drawn from each episode, both fingertips of each."""
     mae: MaeConfig = MaeConfig()
     """The training."""
 
@@ -81,53 +83,57 @@ Config = (
 
 def main(config: Align | Mae) -> None:
     """Train one kind of encoder."""
-    if config.resume and config.out is None:
-        raise UserError("to resume a run, name its folder with --out")
+    check_training(config.run, config.out)
+    sets = open_sets(config.data, config.validation)
+    sensor = _sensor_of(config.sensor, *sets)
     if isinstance(config, Mae):
-        _train_mae(config)
+        _train_mae(config, sensor, *sets)
     else:
-        _align(config)
+        _align(config, sensor, *sets)
 
 
-def _train_mae(config: Mae) -> None:
-    sets = EpisodeSet(config.data), EpisodeSet(config.validation)
-    out = open_run(config.out, "train-encoder", config, adds=config.resume)
-    mae = config.mae
-    train, val = (touch_frames.sample_frames(s, mae.sensor, config.frames, mae.seed) for s in sets)
-    train_mae(train, val, mae, out, _recipe(*sets), config.resume)
-    print(f"backbone: {out / 'encoder'}")
+def _sensor_of(named: str | None, *sets: EpisodeSet) -> str:
+    """The sensor of all episodes; UserError if it is unknown, or not the one that was named."""
+    sensor = named or str(sets[0].meta(0).get("sensor", ""))
+    if not sensor:
+        raise UserError(f"{sets[0].root} does not name its fingertip sensor: name it with --sensor")
+    preprocessor_for(sensor)
+    for episodes in sets:
+        for i in range(len(episodes)):
+            check_sensor(episodes, i, sensor)
+    return sensor
 
 
-def _recipe(episodes: EpisodeSet, validation: EpisodeSet) -> dict[str, Any]:
-    return {
-        "command": shlex.join(["touchgoal", *sys.argv[1:]]),
-        "data": "simulated: touchgoal collect-demos",
-        "episodes": len(episodes),
-        "validation_episodes": len(validation),
-    }
-
-
-def _align(config: Align) -> None:
-    """Cut touches from the episodes, train, fit the scale of the costs."""
-    episodes, validation = EpisodeSet(config.data), EpisodeSet(config.validation)
-    for s in (episodes, validation):
-        for i in range(len(s)):
-            touch_frames.check_sensor(s, i, config.align.sensor)
-    towers = load_towers(config.towers)
-    out = open_run(config.out, "train-encoder", config, adds=config.resume)
+def _train_mae(config: Mae, sensor: str, data: EpisodeSet, validation: EpisodeSet) -> None:
+    out = open_training(config, "train-encoder")
     train, val = (
-        collect_touches(s, config.contact_frames, config.no_contact_frames, config.align.seed)
-        for s in (episodes, validation)
+        sample_frames(episodes, sensor, config.frames, config.seed)
+        for episodes in (data, validation)
+    )
+    train_mae(train, val, config.mae, out, config.run, recipe(data, validation))
+    print(f"encoder: {out / 'encoder'}")
+
+
+def _align(config: Align, sensor: str, data: EpisodeSet, validation: EpisodeSet) -> None:
+    """Cut touches from the episodes, train, fit what counts as far."""
+    towers = load_towers(config.towers)
+    out = open_training(config, "train-encoder")
+    train, val = (
+        collect_touches(episodes, config.contact_frames, config.no_contact_frames, config.seed)
+        for episodes in (data, validation)
     )
     print(f"{len(train)} touches of {len(train.descriptions)} objects; {len(val)} for validation")
-    recipe = _recipe(episodes, validation)
-    encoder = align(train, val, towers, config.align, out, recipe, config.resume)
+    encoder = align(
+        train, val, towers, config.align, sensor, out, config.run, recipe(data, validation)
+    )
+    if not is_first_process():
+        return
     embedder = EpisodeEmbedder(towers, encoder)
-    chosen = [i for i in range(len(episodes)) if episodes.meta(i).get("success", True)]
+    chosen = [i for i in range(len(data)) if data.meta(i).get("success", True)]
     embedded = [
-        embedder.embed_episode(episodes.read(i), episodes.fps, f"{episodes.root}#{i}", True)
+        embedder.embed_episode(data.read(i), data.fps, f"{data.root}#{i}", True)
         for i in tqdm(chosen[: config.scale_episodes], desc="scale", unit="episode")
     ]
-    scale = fit_normalizer(embedded, ("image", "tactile", "text"), scene_of(episodes.features))
+    scale = fit_normalizer(embedded, ("image", "tactile", "text"), scene_of(data.features))
     scale.save(out / "encoder" / "scale.json")
     print(f"encoder and scale: {out / 'encoder'}")

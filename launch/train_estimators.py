@@ -1,9 +1,7 @@
 """Train the state estimator of pick-and-place: contact from touch, where things lie from pictures."""
 
 import os
-import shlex
 import shutil
-import sys
 from dataclasses import field, replace
 from pathlib import Path
 
@@ -12,8 +10,16 @@ import torch
 from touchgoal.control import features as ft
 from touchgoal.control.option_types import Count, checked_dataclass
 from touchgoal.encoders import pretrained
-from touchgoal.episodes.store import EpisodeSet
-from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.encoders.training.checkpoint import has_checkpoint
+from touchgoal.encoders.training.trainer import is_first_process
+from touchgoal.launch.run_folder import write_json
+from touchgoal.launch.training_run import (
+    TrainingOptions,
+    check_training,
+    open_sets,
+    open_training,
+    recipe,
+)
 from touchgoal.policies.perception.frozen_touch import load_touch
 from touchgoal.policies.perception.placements import render_placements
 from touchgoal.policies.perception.pose_estimator import PoseEstimatorConfig
@@ -32,11 +38,12 @@ from touchgoal.policies.perception.training import (
 )
 from touchgoal.sim_envs.config import PickPlaceConfig
 
+_CONTACT, _POSE = "contact", "pose"  # folders of the two trainings in that of the run
 _SEED, _VALIDATION_SEED = 4_000_000, 4_900_000  # of the things placed
 
 
 @checked_dataclass
-class Config:
+class Config(TrainingOptions):
     """Options of train-estimators."""
 
     data: Path
@@ -64,17 +71,20 @@ class Config:
 
 def main(config: Config) -> None:
     """Place, embed, train, judge."""
+    check_training(config.run, config.out, _CONTACT)
+    sets = open_sets(config.data, config.validation)
     touch = load_touch(config.encoder)
-    out = open_run(config.out, "train-estimators", config)
-    torch.manual_seed(config.train.seed)
+    out = open_training(config, "train-estimators")
+    torch.manual_seed(config.seed)
     network = StateEstimatorNetwork(
         StateEstimatorConfig(touch.name, touch.dim, config.pose_estimator)
     )
-    sets = EpisodeSet(config.data), EpisodeSet(config.validation)
+    provenance = recipe(*sets)
     rows, validation = (
         embed_touch_and_contact(episodes, touch, config.workers) for episodes in sets
     )
-    train_contact_estimator(network, *rows, config.train)
+    contact_out, pose_out = out / _CONTACT, out / _POSE
+    train_contact_estimator(network, *rows, config.train, contact_out, config.run, provenance)
     errors: dict = {"contact": contact_error_rate(network, *validation)}
     cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key, _ in config.pose_estimator.crops)
     size = config.pose_estimator.size
@@ -83,13 +93,17 @@ def main(config: Config) -> None:
         network.sight,
         render_placements(env, config.objects, config.placements, _SEED, config.workers),
         config.train,
+        pose_out,
+        replace(config.run, resume=config.resume and has_checkpoint(pose_out)),
+        provenance,
     )
+    if not is_first_process():
+        return
     others = render_placements(
         env, max(1, config.objects // 8), 5, _VALIDATION_SEED, config.workers
     )
     errors |= pose_errors(network.sight, others)
-    recipe = {"command": shlex.join(["touchgoal", *sys.argv[1:]]), "errors": errors}
-    save_estimator(network, out / "estimator", recipe)
+    save_estimator(network, out / "estimator", provenance | {"errors": errors})
     if config.encoder.resolve() != pretrained.SHIPPED.resolve():
         shutil.copytree(config.encoder, out / "estimator" / "touch", dirs_exist_ok=True)
     write_json(out / "metrics.json", errors)

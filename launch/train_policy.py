@@ -1,8 +1,6 @@
 """Train a policy on recorded episodes; choose among its snapshots by trials in the task."""
 
 import os
-import shlex
-import sys
 from dataclasses import field, replace
 from pathlib import Path
 from typing import Literal
@@ -11,8 +9,16 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.control.option_types import Count, CountOrNone, Fraction, checked_dataclass
 from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.encoders.training.trainer import is_first_process
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.launch.run_folder import write_json
+from touchgoal.launch.training_run import (
+    TrainingOptions,
+    check_training,
+    open_sets,
+    open_training,
+    recipe,
+)
 from touchgoal.policies import checkpoint
 from touchgoal.policies.actions import ActionRepresentation
 from touchgoal.policies.checkpoint import SavedPolicy
@@ -49,7 +55,7 @@ ENVS: dict[TaskName, TaskConfig] = {
 
 
 @checked_dataclass
-class Config:
+class Config(TrainingOptions):
     """Options of train-policy."""
 
     data: Path
@@ -99,14 +105,11 @@ class Config:
     """Options of the task when snapshots are tried; they go with --task."""
     workers: Count = os.cpu_count() or 1
     """Processes that simulate."""
-    resume: bool = False
-    """Go on with an interrupted run in `out`."""
 
 
 def main(config: Config) -> None:
     """Embed, train, choose."""
-    if config.resume and config.out is None:
-        raise UserError("to resume a run, name its folder with --out")
+    check_training(config.run, config.out)
     if config.end_to_end and config.encoder:
         raise UserError("end-to-end touch takes no frozen encoder: leave it out")
     parts = {
@@ -120,7 +123,7 @@ def main(config: Config) -> None:
     if config.estimator:
         load_estimator(config.estimator)
     touch = load_touch(config.encoder) if config.encoder else None
-    sets = EpisodeSet(config.data), EpisodeSet(config.validation)
+    sets = open_sets(config.data, config.validation)
     found = [choose_episodes(s, config.include_unknown) for s in sets]
     chosen = [f.rows for f in found]
     chosen[0] = chosen[0][: max(1, round(config.share * len(chosen[0])))]
@@ -131,19 +134,17 @@ def main(config: Config) -> None:
     if config.trials:
         _check_sensor(config, task, sensor)
     policy = replace(_policy_config(config, sets[0], touch), task=task, sensor=sensor)
-    out = open_run(config.out, "train-policy", config, adds=config.resume)
+    out = open_training(config, "train-policy")
     print(f"{task}: {found[0]} to learn from, {found[1]} for validation")
     windows, validation = (
         SequenceDataset(load_recordings(s, rows, policy, touch, config.workers), policy)
         for s, rows in zip(sets, chosen, strict=True)
     )
     print(f"{len(windows)} windows of {len(chosen[0])} episodes; {len(validation)} for validation")
-    recipe = {
-        "command": shlex.join(["touchgoal", *sys.argv[1:]]),
-        "data": "simulated: touchgoal collect-demos",
-        "episodes": len(chosen[0]),
-    }
-    train(policy, windows, validation, config.train, out, recipe, config.resume)
+    provenance = recipe(*sets) | {"episodes": len(chosen[0])}
+    train(policy, windows, validation, config.train, out, config.run, provenance)
+    if not is_first_process():
+        return
     add_parts(out / POLICY, parts)
     if config.trials:
         scores = select(out, parts, lambda directory: _try(config, task, directory))

@@ -20,9 +20,20 @@ from touchgoal.encoders.alignment.align import (
     align,
     batch_losses,
 )
-from touchgoal.encoders.alignment.data import Augmentation, TouchData, prepare_touch_data
-from touchgoal.encoders.alignment.retrieval import mean_average_precision, top1
-from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
+from touchgoal.encoders.alignment.data import (
+    Augmentation,
+    TouchData,
+    prepare_touch_data,
+    split_by_episode,
+)
+from touchgoal.encoders.alignment.retrieval import (
+    evaluate_retrieval,
+    mean_average_precision,
+    top1,
+)
+from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
+from touchgoal.encoders.backbones.vit import PRESETS as PRESETS_VIT
+from touchgoal.encoders.training.trainer import RunOptions
 from touchgoal.episodes.touches import Touches
 
 DESCRIPTIONS = {
@@ -57,28 +68,43 @@ class FakeTowers:
         return torch.tensor([[float(t.count(letter)) for letter in letters] for t in texts])
 
 
-def make_touches(per_object: int, seed: int) -> Touches:
-    """One episode of each object; a third of the touches is without contact; each object has its own dent."""
+SENSOR, FRESH = "gelsight_mini", RunOptions()
+
+
+def run_align(
+    train: Touches,
+    val: Touches,
+    towers: FakeTowers,
+    config: AlignConfig,
+    out_dir: Path,
+    recipe: dict,
+    options: RunOptions = FRESH,
+) -> TouchEncoder:
+    return align(train, val, towers, config, SENSOR, out_dir, options, recipe)
+
+
+def make_touches(per_episode: int, seed: int, per_object: int = 1) -> Touches:
+    """Episodes of each object; a third of the touches is without contact; each has its own dent."""
     rng = np.random.default_rng(seed)
-    names = list(DESCRIPTIONS)
+    names = [name for name in DESCRIPTIONS for _ in range(per_object)]
     frames, objects, episode = [], [], []
     background = np.full((60, 80, 3), 100, np.uint8)
     y, x = np.mgrid[:60, :80]
     for e in range(len(names)):
-        for i in range(per_object):
+        for i in range(per_episode):
             frame = background + rng.normal(0, 1, (60, 80, 3))
             if i % 3:
-                place, radius = rng.uniform((15, 15), (45, 65)), (4, 8, 16)[e]
+                place, radius = rng.uniform((15, 15), (45, 65)), (4, 8, 16)[e // per_object]
                 distance2 = (y - place[0]) ** 2 + (x - place[1]) ** 2
-                frame[:, :, e] += 60 * np.exp(-distance2 / radius**2)
+                frame[:, :, e // per_object] += 60 * np.exp(-distance2 / radius**2)
             frames.append(frame.round().astype(np.uint8))
             objects.append(names[e] if i % 3 else "")
             episode.append(e)
-    colours = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200]])
-    view = np.broadcast_to(colours[:, None, None], (3, 16, 16, 3)).astype(np.uint8)
+    colours = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200]]).repeat(per_object, 0)
+    view = np.broadcast_to(colours[:, None, None], (len(names), 16, 16, 3)).astype(np.uint8)
     return Touches(
         frames=np.stack(frames),
-        background=np.stack([background] * 3),
+        background=np.stack([background] * len(names)),
         background_index=np.array(episode),
         view=view,
         view_index=np.array(episode),
@@ -89,7 +115,7 @@ def make_touches(per_object: int, seed: int) -> Touches:
     )
 
 
-TRAIN, VAL = make_touches(12, 0), make_touches(6, 1)
+TRAIN, VAL = make_touches(12, 0), make_touches(6, 1, per_object=4)
 
 
 def weights(encoder: TouchEncoder) -> torch.Tensor:
@@ -97,7 +123,7 @@ def weights(encoder: TouchEncoder) -> torch.Tensor:
 
 
 def final_weights(out_dir: Path) -> torch.Tensor:
-    state = torch.load(out_dir / "checkpoint.pt", weights_only=True)["encoder"]
+    state = torch.load(out_dir / "checkpoint.pt", weights_only=True)["model"]
     return torch.cat([w.flatten() for w in state.values()])
 
 
@@ -202,10 +228,10 @@ def test_paper_preset_is_equation_2() -> None:
 
 
 def test_one_batch_can_be_learned_by_heart(tmp_path: Path) -> None:
-    # 15 touches: every epoch is a single step
-    touches = make_touches(5, 0)
-    config = replace(CONFIG, epochs=40, batch_size=64, augmentation=Augmentation(), token_share=1.0)
-    encoder = align(touches, touches, FakeTowers(), config, tmp_path, {})
+    # 60 touches: every epoch is a single step
+    touches = make_touches(5, 0, per_object=4)
+    config = replace(CONFIG, epochs=40, batch_size=64, augmentation=Augmentation(), mask_ratio=0.0)
+    encoder = run_align(touches, touches, FakeTowers(), config, tmp_path, {})
     history = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     best = max(m["touch_to_text_map"] + m["touch_to_image_map"] for m in history)
     assert best > 1.98
@@ -221,23 +247,26 @@ def test_one_batch_can_be_learned_by_heart(tmp_path: Path) -> None:
 
 
 def test_what_is_returned_is_what_is_saved(tmp_path: Path) -> None:
-    encoder = align(TRAIN, VAL, FakeTowers(), replace(CONFIG, epochs=1), tmp_path, {"data": "toy"})
+    encoder = run_align(
+        TRAIN, VAL, FakeTowers(), replace(CONFIG, epochs=1), tmp_path, {"data": "toy"}
+    )
     saved = pretrained.load_aligned(tmp_path / "encoder", sensor="gelsight_mini", towers="fake")
     assert torch.equal(weights(saved), weights(encoder))
     provenance = pretrained.ENCODER.provenance(tmp_path / "encoder")
     assert (
         provenance["data"] == "toy"
-        and provenance["align"]["seed"] == 0
+        and provenance["seed"] == 0
         and provenance["touches"]["train"] == 36
     )
     assert provenance["metrics"]["chance_top1"] == pytest.approx(1 / 3)
+    assert provenance["test_metrics"]["chance_top1"] == pytest.approx(1 / 3)
 
 
 def test_same_seed_same_weights(tmp_path: Path) -> None:
     config = replace(CONFIG, epochs=1)
     finals = []
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        align(TRAIN, VAL, FakeTowers(), replace(config, seed=seed), tmp_path / name, {})
+        run_align(TRAIN, VAL, FakeTowers(), config, tmp_path / name, {}, RunOptions(seed))
         finals.append(final_weights(tmp_path / name))
         torch.rand(1)  # what others draw in between must not matter
     assert torch.equal(finals[0], finals[1]) and not torch.equal(finals[0], finals[2])
@@ -246,11 +275,11 @@ def test_same_seed_same_weights(tmp_path: Path) -> None:
 def test_killed_and_resumed_is_bit_identical(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "whole", {})
-    evaluate_retrieval = align_module.evaluate_retrieval
-    calls = iter([evaluate_retrieval])
+    run_align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "whole", {})
+    evaluate = align_module.evaluate_retrieval
+    calls = iter([evaluate])
 
-    def killed_in_second_epoch(encoder: TouchEncoder, data: TouchData) -> dict[str, float]:
+    def killed_in_second_epoch(encoder: TouchEncoder, data: TouchData) -> dict[str, float | None]:
         step = next(calls, None)
         if step is None:
             raise KeyboardInterrupt
@@ -258,18 +287,18 @@ def test_killed_and_resumed_is_bit_identical(
 
     monkeypatch.setattr(align_module, "evaluate_retrieval", killed_in_second_epoch)
     with pytest.raises(KeyboardInterrupt):
-        align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "parts", {})
+        run_align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "parts", {})
     monkeypatch.undo()
     torch.set_num_threads(1)
-    align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "parts", {}, resume=True)
+    run_align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "parts", {}, RunOptions(resume=True))
     assert torch.equal(final_weights(tmp_path / "parts"), final_weights(tmp_path / "whole"))
     for name in ("metrics.jsonl", "encoder/encoder.safetensors", "encoder/encoder.json"):
         assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
 def test_paper_preset_runs_with_towers_pretrained_together(tmp_path: Path) -> None:
-    paper = replace(PRESETS["paper"], vit="tiny", epochs=1, batch_size=8, device="cpu")
-    encoder = align(TRAIN, VAL, FakeTowers(pretrained_together=True), paper, tmp_path, {})
+    paper = replace(PRESETS["paper"], vit="tiny", epochs=1, batch_size=8)
+    encoder = run_align(TRAIN, VAL, FakeTowers(pretrained_together=True), paper, tmp_path, {})
     assert encoder.config.embedding_dim == 26 and encoder.image_head is None
     (line,) = (tmp_path / "metrics.jsonl").read_text().splitlines()
     metrics = json.loads(line)
@@ -278,13 +307,19 @@ def test_paper_preset_runs_with_towers_pretrained_together(tmp_path: Path) -> No
 
 
 def test_bad_directories_and_configs_are_refused(tmp_path: Path) -> None:
-    def start(config: AlignConfig = CONFIG, resume: bool = False) -> Callable[[], TouchEncoder]:
-        return lambda: align(TRAIN, VAL, FakeTowers(), config, tmp_path, {}, resume)
+    def start(
+        config: AlignConfig = CONFIG, resume: bool = False, train: Touches = TRAIN
+    ) -> Callable[[], TouchEncoder]:
+        options = RunOptions(resume=resume)
+        return lambda: run_align(train, VAL, FakeTowers(), config, tmp_path, {}, options)
+
+    def nose() -> TouchEncoder:
+        return align(TRAIN, VAL, FakeTowers(), CONFIG, "nose", tmp_path, RunOptions(), {})
 
     for message, call in (
         ("nothing to resume", start(resume=True)),
-        ("unknown sensor 'nose'", start(replace(CONFIG, sensor="nose"))),
-        ("at least 1 epoch", start(replace(CONFIG, epochs=0))),
+        ("unknown sensor 'nose'", nose),
+        ("epochs must be", lambda: start(replace(CONFIG, epochs=0))()),
     ):
         with pytest.raises(UserError, match=message):
             call()
@@ -293,9 +328,51 @@ def test_bad_directories_and_configs_are_refused(tmp_path: Path) -> None:
         start(replace(CONFIG, epochs=1))()
     with pytest.raises(UserError, match="of another data set, encoder or config"):
         start(replace(CONFIG, epochs=1, lr=1e-5), resume=True)()
+    other = make_touches(12, seed=5)  # as many of the same objects
+    with pytest.raises(UserError, match=r"of another data set.*\(data"):
+        start(replace(CONFIG, epochs=1), resume=True, train=other)()
 
 
 # ---- retrieval metrics
+
+
+def as_felt(view: torch.Tensor, label: torch.Tensor) -> tuple[TouchEncoder, TouchData]:
+    """One touch an episode, embedded as the view of its own episode; one sentence an object."""
+    n, names = len(view), ("a", "b")
+    data = TouchData(
+        touch=torch.zeros(n, 3, 1, 1).half(),
+        label=label,
+        contact=torch.ones(n, dtype=torch.bool),
+        view_index=torch.arange(n),
+        images=view,
+        texts=torch.eye(2, view.shape[1]),
+        describes=torch.eye(2, dtype=torch.bool),
+        names=names,
+    )
+    config = TouchEncoderConfig.for_towers(PRESETS_VIT["tiny"], FakeTowers(), SENSOR, 16)
+    encoder = TouchEncoder(config)
+    encoder.embed_touch = lambda touch, ids_keep=None: view
+    encoder.project_text = encoder.project_image = lambda embeddings: embeddings
+    return encoder, data
+
+
+def test_a_touch_does_not_find_the_view_of_its_own_episode() -> None:
+    """Every touch knows its own episode again, and nothing of its object."""
+    view, label = torch.eye(6), torch.tensor([0, 0, 0, 1, 1, 1])
+    metrics = evaluate_retrieval(*as_felt(view, label))
+    assert metrics["touch_to_image_map"] == pytest.approx(metrics["chance_image_map"])
+    top1_image = metrics["touch_to_image_top1"]
+    assert top1_image is not None and top1_image <= 0.5
+    assert evaluate_retrieval(*as_felt(view[:2], label[2:4]))["touch_to_image_map"] is None
+
+
+def test_halves_share_objects_but_no_episodes() -> None:
+    data = prepare_touch_data(VAL, FakeTowers(), SENSOR, CONFIG.no_contact_texts)
+    one, other = split_by_episode(data, seed=0)
+    assert len(one) + len(other) == len(data)
+    assert not set(one.view_index.tolist()) & set(other.view_index.tolist())
+    assert one.label.unique().tolist() == other.label.unique().tolist() == [0, 1, 2, 3]
+    assert torch.equal(split_by_episode(data, seed=0)[0].view_index, one.view_index)
 
 
 def test_average_precision_by_hand() -> None:

@@ -93,10 +93,11 @@ def test_reward_curves_of_a_video_and_of_a_folder(episodes: Path, tmp_path: Path
 @pytest.mark.slow
 def test_train_encoder_then_use_it(episodes: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    run("train-encoder", "align", "--data", episodes, "--validation", episodes, "--out", out,
+    validation = shutil.copytree(episodes, tmp_path / "validation")
+    run("train-encoder", "align", "--data", episodes, "--validation", validation, "--out", out,
         "--align.vit", "tiny", "--align.epochs", 12, "--align.batch-size", 32)  # fmt: skip
     kept = pretrained.ENCODER.provenance(out / "encoder")
-    assert kept["episodes"] == 2 and kept["command"].startswith("touchgoal")
+    assert kept["data"]["train"]["episodes"] == 2 and kept["command"].startswith("touchgoal")
     run("reward-curves", episodes, "--encoder", out / "encoder", "--out", tmp_path / "curves")
     report = json.loads((tmp_path / "curves" / "episode_001.json").read_text())
     assert report["metrics"]["tactile"]["contact_lag"] is not None
@@ -195,8 +196,9 @@ def test_learning_to_pick_and_place(
     """From placements and demonstrations to a policy that is corrected; too little of everything."""
     monkeypatch.chdir(tmp_path)
     one, blind = ("--workers", 1), ("--env.no-tactile", "--env.cameras", "--out", "demos")
-    run("train-estimators", "--data", episodes, "--validation", episodes, *one, "--objects", 2,
-        "--placements", 2, "--train.steps", 2, "--train.contact-steps", 2, "--out", "est")  # fmt: skip
+    other = shutil.copytree(episodes, tmp_path / "other")
+    run("train-estimators", "--data", episodes, "--validation", other, *one, "--objects", 2,
+        "--placements", 2, "--train.epochs", 1, "--train.contact-epochs", 1, "--out", "est")  # fmt: skip
     run("collect-demos", "--feedback", "--episodes", 1, *one, *blind)
     run(
         "collect-demos",
@@ -276,10 +278,15 @@ def test_wrong_encoder_for_the_sensor(
 def test_wrong_sensor_for_the_encoder(
     episodes: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    both = ("--data", episodes, "--validation", episodes)
-    out, sensor = tmp_path / "out", ("--align.sensor", "gelsight_mini_markers")
+    validation = shutil.copytree(episodes, tmp_path / "validation")
+    both = ("--data", episodes, "--validation", validation)
+    out, sensor = tmp_path / "out", ("--sensor", "gelsight_mini_markers")
     message = refused(capsys, "train-encoder", "align", *both, *sensor, "--out", out)
     assert "was recorded with gelsight_mini, not" in message and not out.exists()
+    same = ("--data", episodes, "--validation", episodes)
+    assert "judge by episodes" in refused(capsys, "train-encoder", "mae", *same, "--out", out)
+    nothing = refused(capsys, "train-encoder", "mae", *both, "--resume", "--out", out)
+    assert "nothing to resume" in nothing and not out.exists()
 
 
 def test_corrupt_episode_is_named(

@@ -17,7 +17,7 @@ from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, GELSIGHT_MINI
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.infonce import info_nce, loss_floor, symmetric_info_nce
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
-from touchgoal.encoders.backbones.vit import PRESETS, ViT, ViTConfig, random_patches
+from touchgoal.encoders.backbones.vit import PRESETS, ViT, ViTConfig, random_masking
 from touchgoal.encoders.preprocess import PREPROCESSORS, check_pictures
 
 MINI = PREPROCESSORS["gelsight_mini"]
@@ -129,9 +129,9 @@ def test_position_matters() -> None:
     assert not torch.allclose(first, second, atol=1e-4)
 
 
-def test_random_patches_are_distinct_and_seeded() -> None:
+def test_random_masking_are_distinct_and_seeded() -> None:
     drawn = [
-        random_patches(PRESETS["tiny"], 50, 0.5, torch.Generator().manual_seed(1)) for _ in range(2)
+        random_masking(PRESETS["tiny"], 50, 0.5, torch.Generator().manual_seed(1)) for _ in range(2)
     ]
     assert drawn[0].shape == (50, 6) and torch.equal(drawn[0], drawn[1])
     assert all(len(set(row)) == 6 for row in drawn[0].tolist())

@@ -9,12 +9,14 @@ import torch
 
 from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.backbones.vit import random_patches
+from touchgoal.encoders.backbones.vit import random_masking
 from touchgoal.encoders.probes.ridge import ridge_r2
-from touchgoal.encoders.ssl import mae as mae_module
 from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.mae import MaeConfig, MaskedAutoencoder, patchify, train_mae
+from touchgoal.encoders.training import trainer
+from touchgoal.encoders.training.trainer import RunOptions
 
+SENSOR = "gelsight_mini_markers"
 TOY = MaeConfig(vit="tiny", decoder_width=16, decoder_depth=1, epochs=3, batch_size=16, lr=3e-3)
 
 
@@ -28,15 +30,15 @@ def blobs(count: int, seed: int) -> TouchFrames:
     blob = strength[:, None, None] * np.exp(-distance2 / 20**2)
     touch = torch.from_numpy(np.repeat(blob[:, None], 3, 1)).half()
     wrench = np.column_stack([place / 100, strength, np.zeros((count, 3))])
-    return TouchFrames(touch, torch.from_numpy(wrench).float())
+    return TouchFrames(touch, torch.from_numpy(wrench).float(), SENSOR)
 
 
 def test_the_mean_of_the_tokens_learns_where_and_how_strong(tmp_path: Path) -> None:
     train, val = blobs(256, 0), blobs(64, 1)
     config = replace(TOY, epochs=8)
-    backbone = train_mae(train, val, config, tmp_path, {"data": "toy"})
+    backbone = train_mae(train, val, config, tmp_path, RunOptions(), {"data": "toy"})
     metrics = pretrained.ENCODER.provenance(tmp_path / "encoder")["metrics"]
-    assert metrics["validation_loss"] < metrics["validation_power"]
+    assert metrics["validation_loss"] < metrics["validation_loss_of_blank"]
     assert min(metrics[f"force_{axis}_r2"] for axis in "xyz") > 0.8
     frames = np.full((2, 120, 160, 3), 100, np.uint8)
     assert np.allclose(*backbone.embed_frames(frames, frames[0]))  # the same touch, twice
@@ -47,33 +49,50 @@ def test_a_killed_training_ends_with_the_same_weights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bottleneck: bool
 ) -> None:
     data, config = blobs(32, 0), replace(TOY, bottleneck=bottleneck)
-    whole = train_mae(data, data, config, tmp_path / "whole", {})
+    whole = train_mae(data, data, config, tmp_path / "whole", RunOptions(), {})
     with monkeypatch.context() as patch:
-        epoch = mae_module._Run.train_epoch
+        train_epoch = trainer._train_epoch
 
-        def dies(run, number):
-            if number == 2:
+        def dies(*args):
+            if args[-1] == 2:
                 raise KeyboardInterrupt
-            return epoch(run, number)
+            return train_epoch(*args)
 
-        patch.setattr(mae_module._Run, "train_epoch", dies)
+        patch.setattr(trainer, "_train_epoch", dies)
         with pytest.raises(KeyboardInterrupt):
-            train_mae(data, data, config, tmp_path / "killed", {})
-    resumed = train_mae(data, data, config, tmp_path / "killed", {}, resume=True)
+            train_mae(data, data, config, tmp_path / "killed", RunOptions(), {})
+    go_on = RunOptions(resume=True)
+    resumed = train_mae(data, data, config, tmp_path / "killed", go_on, {})
     for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(a, b)
     with pytest.raises(UserError, match="holds a run already"):
-        train_mae(data, data, config, tmp_path / "killed", {})
-    with pytest.raises(UserError, match="of another data set, encoder or config"):
-        train_mae(data, data, replace(config, lr=1e-3), tmp_path / "killed", {}, resume=True)
+        train_mae(data, data, config, tmp_path / "killed", RunOptions(), {})
+    with pytest.raises(UserError, match=r"of another data set.*mae.lr was 0.003, is 0.001"):
+        train_mae(data, data, replace(config, lr=1e-3), tmp_path / "killed", go_on, {})
+    with pytest.raises(UserError, match=r"of another data set.*\(data was"):
+        train_mae(blobs(32, 1), data, config, tmp_path / "killed", go_on, {})
 
 
-def test_only_unseen_patches_count_where_tokens_are_seen() -> None:
+def test_one_visible_patch_is_enough(tmp_path: Path) -> None:
+    """Eleven of twelve masked, the twelfth kept; and all of them kept, where that can be learned."""
+    data, rng = blobs(16, 0), torch.Generator().manual_seed(0)
+    for mask_ratio, bottleneck, seen in ((0.99, True, 1), (0.99, False, 1), (0.0, True, 12)):
+        config = replace(TOY, mask_ratio=mask_ratio, bottleneck=bottleneck, epochs=1)
+        model = MaskedAutoencoder(config, SENSOR)
+        ids_keep = random_masking(model.backbone.config.vit, 16, mask_ratio, rng)
+        assert ids_keep.shape == (16, seen)
+        assert model.loss(data.touch.float(), ids_keep).isfinite()
+    nothing_masked = replace(TOY, mask_ratio=0.01, bottleneck=False)
+    with pytest.raises(UserError, match="masks none of 12 patches"):
+        train_mae(data, data, nothing_masked, tmp_path, RunOptions(), {})
+
+
+def test_only_masked_patches_count_where_tokens_are_seen() -> None:
     torch.manual_seed(0)
-    model = MaskedAutoencoder(replace(TOY, bottleneck=False))
+    model = MaskedAutoencoder(replace(TOY, bottleneck=False), SENSOR)
     vit = model.backbone.config.vit
     touch = torch.randn(2, 3, 120, 160)
-    ids_keep = random_patches(vit, 2, 0.5, torch.Generator().manual_seed(0))
+    ids_keep = random_masking(vit, 2, 0.5, torch.Generator().manual_seed(0))
     reconstructed, real = model.reconstruct(touch, ids_keep), patchify(touch, vit)
     seen = torch.zeros(reconstructed.shape[:2], dtype=torch.bool).scatter(1, ids_keep, True)
     expected = ((reconstructed - real) ** 2)[~seen].mean()
@@ -81,7 +100,7 @@ def test_only_unseen_patches_count_where_tokens_are_seen() -> None:
 
 
 def test_patches_are_where_the_backbone_sees_them() -> None:
-    vit = MaskedAutoencoder(TOY).backbone.config.vit
+    vit = MaskedAutoencoder(TOY, SENSOR).backbone.config.vit
     image = torch.arange(120 * 160.0).view(1, 1, 120, 160).expand(1, 3, -1, -1)
     first = patchify(image, vit)[0, 1].view(3, vit.patch_size, vit.patch_size)
     size = vit.patch_size
@@ -97,7 +116,7 @@ def test_ridge_reads_what_is_linear_and_nothing_else() -> None:
 
 
 def test_an_encoder_of_the_other_kind_is_refused(tmp_path: Path) -> None:
-    pretrained.save(MaskedAutoencoder(TOY).backbone, tmp_path, {})
+    pretrained.save(MaskedAutoencoder(TOY, SENSOR).backbone, tmp_path, {})
     assert pretrained.load_encoder(tmp_path).config.sensor == "gelsight_mini_markers"
     with pytest.raises(UserError, match="is damaged"):
         pretrained.load_aligned(tmp_path)

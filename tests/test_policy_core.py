@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from torch.optim.swa_utils import AveragedModel
 from toy_policies import (
     DIFFUSION,
     FLOW,
@@ -24,6 +25,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import FR3_ARM
 from touchgoal.control.motion.kinematics import Fr3Kinematics
+from touchgoal.encoders.training.trainer import RunOptions
 from touchgoal.episodes.repair import validate
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
@@ -37,10 +39,9 @@ from touchgoal.policies.actions import (
 from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.perception.proprioception import network_input
 from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
-from touchgoal.policies.training import ema
 from touchgoal.policies.training import train as train_module
 from touchgoal.policies.training.sequence_dataset import load_recordings
-from touchgoal.policies.training.train import TrainConfig, train
+from touchgoal.policies.training.train import TrainConfig, ema_decay, train
 
 import mujoco  # isort: skip - after touchgoal, which chooses the OpenGL platform
 
@@ -98,10 +99,19 @@ def test_scales_round_trip_and_keep_constants() -> None:
 
 
 def test_average_follows_its_schedule() -> None:
-    network, average = torch.nn.Linear(1, 1), torch.nn.Linear(1, 1)
-    ema.update(average, network, 0)
-    assert torch.equal(average.weight, network.weight)  # nothing to remember yet
-    assert ema.decay(15) == pytest.approx(1 - 16**-0.75) and ema.decay(10**9) == 0.9999
+    """Power schedule of diffusion_policy, in torch's AveragedModel."""
+    network = torch.nn.Linear(1, 1)
+    average = AveragedModel(network, multi_avg_fn=train_module._update_average)
+    network.weight.data += 1
+    average.update_parameters(network)
+    (mean,) = list(average.module.parameters())[:1]
+    assert torch.equal(mean, network.weight)  # nothing to remember yet
+    before = network.weight.item()
+    network.weight.data += 1
+    average.update_parameters(network)
+    expected = before + (1 - ema_decay(1))
+    assert mean.item() == pytest.approx(expected)
+    assert ema_decay(15) == pytest.approx(1 - 16**-0.75) and ema_decay(10**9) == 0.9999
 
 
 def test_windows_stay_inside_their_episode() -> None:
@@ -176,36 +186,45 @@ def test_a_toy_batch_is_learned_by_heart(config: PolicyConfig) -> None:
     assert torch.equal(plan, policy.plan(condition, torch_rng(3)))
 
 
-CONFIG = TrainConfig(epochs=3, batch_size=8, lr=1e-3, snapshot_epochs=2, seed=4)
+CONFIG = TrainConfig(epochs=3, batch_size=8, lr=1e-3, snapshot_epochs=2)
+
+
+SEED = RunOptions(seed=4)
 
 
 def test_a_killed_training_ends_as_an_uninterrupted_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     windows, other = toy_dataset(TOY), toy_dataset(TOY, seed=1)
-    whole = train(TOY, windows, other, CONFIG, tmp_path / "whole", {"data": "toy"})
-    validate = train_module._Run.validate
+    whole = train(TOY, windows, other, CONFIG, tmp_path / "whole", SEED, {"data": "toy"})
+    validate, calls = train_module._validate, iter(range(3))
 
-    def killed(run, windows):
-        if len(run.history) == 2:
+    def killed(*args):
+        if next(calls) == 2:
             raise KeyboardInterrupt
-        return validate(run, windows)
+        return validate(*args)
 
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(train_module._Run, "validate", killed)
-        train(TOY, windows, other, CONFIG, tmp_path / "killed", {})
+    killed_run = tmp_path / "killed"
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt) as stop:
+        patch.setattr(train_module, "_validate", killed)
+        train(TOY, windows, other, CONFIG, killed_run, SEED, {})
+    (note,) = stop.value.__notes__
+    assert "kept 2 of 3 epochs" in note and "--resume" in note
     with pytest.raises(UserError, match="resume it"):
-        train(TOY, windows, other, CONFIG, tmp_path / "killed", {})
-    with pytest.raises(UserError, match="resume with its own"):
-        train(TOY, windows, other, replace(CONFIG, seed=5), tmp_path / "killed", {}, resume=True)
-    resumed = train(TOY, windows, other, CONFIG, tmp_path / "killed", {}, resume=True)
+        train(TOY, windows, other, CONFIG, killed_run, SEED, {})
+    go_on = replace(SEED, resume=True)
+    with pytest.raises(UserError, match=r"seed was 4, is 5\): resume with its own"):
+        train(TOY, windows, other, CONFIG, killed_run, replace(go_on, seed=5), {})
+    with pytest.raises(UserError, match=r"\(data was"):  # as many other ticks
+        train(TOY, other, other, CONFIG, killed_run, go_on, {})
+    resumed = train(TOY, windows, other, CONFIG, killed_run, go_on, {})
     for name, weight in whole.state_dict().items():
         assert torch.equal(weight, resumed.state_dict()[name]), name
     assert (tmp_path / "whole/snapshots/epoch-0002/policy.json").is_file()
     lines = [(tmp_path / run / "metrics.jsonl").read_text() for run in ("whole", "killed")]
     assert lines[0] == lines[1] and len(lines[0].splitlines()) == 3
     provenance = checkpoint.POLICY.provenance(tmp_path / "whole/policy")
-    assert provenance["data"] == "toy" and provenance["train"]["seed"] == 4
+    assert provenance["data"] == "toy" and provenance["seed"] == 4
     assert math.isfinite(provenance["metrics"]["validation_error"])
 
 

@@ -17,6 +17,7 @@ from toy_policies import (
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
+from touchgoal.encoders.training.trainer import RunOptions
 from touchgoal.policies.acting import Planner
 from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy
 from touchgoal.policies.perception.placements import Placements
@@ -74,17 +75,23 @@ def test_the_start_is_seen_from_the_hand() -> None:
         np.testing.assert_allclose(seen, expected, atol=1e-6)
 
 
-def test_contact_is_learnt() -> None:
-    touch = torch.randn(400, 6, generator=torch_rng())
+def test_contact_is_learnt(tmp_path: Path) -> None:
+    touch = torch.randn(4000, 6, generator=torch_rng())
     contact = torch.stack([touch[:, 0] > 0, touch[:, 3] > 0], 1)  # one number of each fingertip
     network = StateEstimatorNetwork(StateEstimatorConfig("toy", 6, SMALL))
     train_contact_estimator(
-        network, touch, contact, EstimatorTrainConfig(contact_steps=1500, touch_noise=0.1)
+        network,
+        touch,
+        contact,
+        EstimatorTrainConfig(contact_epochs=100, touch_noise=0.1),
+        tmp_path,
+        RunOptions(),
+        {},
     )
     assert ((network.contact(touch) > 0) == contact).float().mean() > 0.9
 
 
-def test_a_place_is_learnt() -> None:
+def test_a_place_is_learnt(tmp_path: Path) -> None:
     """A bright spot on grey, where it is to be found again."""
     torch.manual_seed(0)
     spots = torch.randint(0, 14, (256, 2), generator=torch_rng())
@@ -96,7 +103,8 @@ def test_a_place_is_learnt() -> None:
     start[:, :2] = spots / 100
     placements = Placements({ft.FRONT: pictures}, torch.randn(256, 7, generator=torch_rng()), start)
     sight = StateEstimatorNetwork(StateEstimatorConfig("toy", 6, SMALL)).sight
-    train_pose_estimator(sight, placements, EstimatorTrainConfig(steps=300, lr=1e-2))
+    config = EstimatorTrainConfig(epochs=75, lr=1e-2)
+    train_pose_estimator(sight, placements, config, tmp_path, RunOptions(), {})
     assert pose_errors(sight, placements)["object_mm"][0] < 15  # 60 by chance
 
 

@@ -1,90 +1,100 @@
 """Alignment of touch with frozen image and text towers (the MMWand paper, after ImageBind)."""
 
 import copy
-import json
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
+from accelerate.utils import send_to_device
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
-from tqdm import tqdm
+from pydantic import Field
+from torch import Tensor, nn
 
-from touchgoal.control.errors import UserError
+from touchgoal.control.option_types import (
+    Count,
+    Fraction,
+    NotNegative,
+    Positive,
+    checked_dataclass,
+)
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.alignment.data import Augmentation, TouchData, prepare_touch_data
+from touchgoal.encoders.alignment.data import (
+    Augmentation,
+    TouchData,
+    prepare_touch_data,
+    split_by_episode,
+)
 from touchgoal.encoders.alignment.infonce import info_nce, loss_floor, symmetric_info_nce
 from touchgoal.encoders.alignment.retrieval import evaluate_retrieval
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS as VIT_PRESETS
-from touchgoal.encoders.backbones.vit import random_patches
+from touchgoal.encoders.backbones.vit import MaskRatio, random_masking
 from touchgoal.encoders.towers.towers import Towers
-from touchgoal.encoders.training import checkpoint as resumable
+from touchgoal.encoders.training.checkpoint import checksum
+from touchgoal.encoders.training.trainer import (
+    OptimizerConfig,
+    RunOptions,
+    Training,
+    fit,
+    gather_batch,
+    on_first_process,
+)
 from touchgoal.episodes.touches import Touches
 
 _ENCODER = "encoder"
 
 
-@dataclass(frozen=True)
+@checked_dataclass
 class AlignConfig:
-    """How to train a touch encoder.
+    """How to train a touch encoder."""
 
-    Attributes:
-        sensor: Name of the fingertip sensor.
-        vit: Size of the touch backbone: "tiny", "small" or "huge".
-        embedding_dim: Width of the shared space, when heads are trained into one.
-        epochs: Passes over the touches.
-        batch_size: Touches a step; all of them if there are fewer.
-        optimiser: "adam" (weight decay as L2 in the gradient) or "adamw" (decoupled).
-        lr: Highest learning rate.
-        weight_decay: Of matrices; biases, norms and tokens have none.
-        warmup: Share of the steps in which the rate rises from 0.
-        final_lr: Rate at the end over `lr`, reached by a cosine; 1 keeps it constant.
-        temperature: Fixed, of every term.
-        text_weight: Of touch-text against touch-image, the paper's lambda.
-        image_text_weight: Of image-text; only for towers not pretrained together, as it trains
-            nothing but their heads.
-        symmetric: Both directions of each term; otherwise touch picks images and texts.
-        multi_positive: Everything of the same object (or with the same sentence) is right;
-            otherwise only the partner is.
-        no_contact_texts: Said of touches without contact; if empty these are left out.
-        token_share: Patches of each touch seen in training. Half of them costs half and does not
-            harm (FLIP, Li et al. 2023).
-        augmentation: Of the touches.
-        bfloat16: Autocast of the backbone. Measured: 20 times slower on a CPU without AVX-512.
-        device: Of the training.
-        seed: Of everything random.
-    """
-
-    sensor: str = "gelsight_mini"
     vit: Literal["tiny", "small", "huge"] = "small"
-    embedding_dim: int = 256
-    epochs: int = 10
-    batch_size: int = 128
-    optimiser: Literal["adam", "adamw"] = "adamw"
-    lr: float = 1e-3
-    weight_decay: float = 0.05
-    warmup: float = 0.1
-    final_lr: float = 0.01
-    temperature: float = 0.1
-    text_weight: float = 1.0
-    image_text_weight: float = 1.0
+    """Size of the touch backbone: "tiny", "small" or "huge"."""
+    embedding_dim: Count = 256
+    """Width of the shared space, when heads are trained into one."""
+    epochs: Count = 10
+    """Passes over the touches."""
+    batch_size: Annotated[int, Field(ge=2)] = 128
+    """Touches a step; all of them if there are fewer."""
+    optimizer: Literal["adam", "adamw"] = "adamw"
+    """"adam" (weight decay as L2 in the gradient) or "adamw" (decoupled)."""
+    lr: Positive = 1e-3
+    """Highest learning rate."""
+    weight_decay: NotNegative = 0.05
+    """Of weight matrices and convolutions."""
+    warmup: Fraction = 0.1
+    """Share of the steps in which the rate rises from 0."""
+    final_lr: Fraction = 0.01
+    """Rate at the end over `lr`, reached by a cosine; 1 keeps it constant."""
+    temperature: Positive = 0.1
+    """Fixed, of every term."""
+    text_weight: NotNegative = 1.0
+    """Of touch-text against touch-image, the paper's lambda."""
+    image_text_weight: NotNegative = 1.0
+    """Of image-text; only for towers not pretrained together, as it trains nothing but their
+    heads."""
     symmetric: bool = True
+    """Both directions of each term; otherwise touch picks images and texts."""
     multi_positive: bool = True
+    """Everything of the same object (or with the same sentence) is right; otherwise only the
+    partner is."""
     no_contact_texts: tuple[str, ...] = (
         "nothing touches the sensor",
         "an untouched gel, no contact",
         "the fingertip feels nothing",
         "free in the air, touching no object",
     )
-    token_share: float = 0.5
+    """Said of touches without contact; if empty these are left out."""
+    mask_ratio: MaskRatio = 0.5
+    """Share of the patches of each touch that are left out in training. Half of them costs half
+    and does not harm (FLIP, Li et al. 2023)."""
     augmentation: Augmentation = field(
         default_factory=lambda: Augmentation(shift=8, gain=0.2, offset=0.1, noise=0.03)
     )
-    bfloat16: bool = False
-    device: str = "cpu"
-    seed: int = 0
+    """Random changes of the touches."""
 
 
 PRESETS: dict[str, AlignConfig] = {
@@ -96,7 +106,7 @@ PRESETS: dict[str, AlignConfig] = {
         vit="huge",
         epochs=100,
         batch_size=64,
-        optimiser="adam",
+        optimizer="adam",
         lr=1e-4,
         weight_decay=0.05,
         warmup=0.0,
@@ -106,9 +116,8 @@ PRESETS: dict[str, AlignConfig] = {
         symmetric=False,
         multi_positive=False,
         no_contact_texts=(),
-        token_share=1.0,
+        mask_ratio=0.0,
         augmentation=Augmentation(),
-        device="cuda",
     ),
 }
 
@@ -118,138 +127,104 @@ def align(
     val: Touches,
     towers: Towers,
     config: AlignConfig,
+    sensor: str,
     out_dir: Path,
+    options: RunOptions,
     recipe: dict[str, Any],
-    resume: bool = False,
 ) -> TouchEncoder:
     """Trains a touch encoder.
 
-    Writes `metrics.jsonl` (a line an epoch) and `checkpoint.pt` (after every epoch), and at the end
-    the epoch with the best mean of both validation mAPs to `encoder/`. Killed and resumed, it ends
-    with the same weights as uninterrupted.
+    Writes what `trainer.fit` does, and at the end the epoch with the best retrieval (mean of both
+    mAPs) on one half of the validation episodes to `encoder/`; its retrieval on the other half, which
+    chose nothing, is kept beside as `test_metrics`. Killed and resumed, it ends with the same weights
+    as uninterrupted.
 
     Args:
         train: Touches to learn from.
-        val: Touches to choose the epoch by.
+        val: Touches of other episodes.
         towers: Frozen towers, run once over all pictures and sentences.
         config: How to train.
-        out_dir: A new run's directory, or with `resume` the one to go on with.
+        sensor: Name of the fingertip sensor.
+        out_dir: A new run's directory, or one to go on with.
+        options: Seed, device, precision, whether to go on.
         recipe: JSON-able; where the touches come from, kept with the weights.
-        resume: Go on after the last finished epoch.
 
     Returns:
         The encoder as saved in `out_dir/encoder`, in evaluation mode, on the CPU.
 
     Raises:
-        UserError: Unfit data, no such device, or a directory that does not fit `resume`.
+        UserError: Unfit data, no such device, or a directory that does not fit `options.resume`.
     """
-    resumable.check(out_dir, resume, config.device)
-    if config.epochs < 1 or config.batch_size < 2:
-        raise UserError("training needs at least 1 epoch and batches of at least 2 touches")
     data, val_data = (
-        prepare_touch_data(t, towers, config.sensor, config.no_contact_texts) for t in (train, val)
+        prepare_touch_data(t, towers, sensor, config.no_contact_texts) for t in (train, val)
     )
-    run = _Run(config, towers, data)
-    if resume:
-        run.restore(out_dir)
-    out_dir.mkdir(parents=True, exist_ok=True)
-    for epoch in range(len(run.history), config.epochs):
-        metrics = run.train_epoch(epoch) | evaluate_retrieval(run.encoder, val_data)
-        run.note({"epoch": epoch + 1} | metrics)
-        run.checkpoint(out_dir)
-        tqdm.write(_progress_line(metrics, epoch + 1, config.epochs))
-    run.encoder.load_state_dict(run.best)
-    provenance = {
-        **recipe,
+    choosing, test = split_by_episode(val_data, options.seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(options.seed)
+        encoder = TouchEncoder(
+            TouchEncoderConfig.for_towers(
+                VIT_PRESETS[config.vit], towers, sensor, config.embedding_dim
+            )
+        )
+    loss, best = AlignmentLoss(encoder, config), BestEpoch()
+
+    def keep_best(history: list[dict[str, Any]], _: dict[str, Any]) -> None:
+        if max(history, key=_score) is history[-1]:
+            best.weights = copy.deepcopy(encoder.state_dict())
+
+    training = Training(
+        loss=loss,
+        n_samples=len(data),
+        batch=lambda rows, generator: make_batch(data, rows, config, generator),
+        optimizer=OptimizerConfig(
+            config.epochs,
+            config.batch_size,
+            config.lr,
+            config.weight_decay,
+            decoupled_weight_decay=config.optimizer == "adamw",
+            warmup=config.warmup,
+            final_lr=config.final_lr,
+        ),
+        identity={
+            "align": asdict(config),
+            "encoder": asdict(encoder.config),
+            "data": [_checksum(train), _checksum(val)],
+        },
+        evaluate=lambda: evaluate_retrieval(encoder, choosing) | loss_and_floors(loss, data),
+        progress=_progress,
+        after_epoch=keep_best,
+        extra_state={"best": best},
+    )
+    history, provenance = fit(training, out_dir, options, recipe)
+    encoder.load_state_dict(best.weights)
+    provenance |= {
         "align": asdict(config),
         "touches": {"train": len(data), "val": len(val_data), "objects": list(data.names)},
-        "metrics": max(run.history, key=_score),
+        "metrics": max(history, key=_score),
+        "test_metrics": evaluate_retrieval(encoder, test),
     }
-    pretrained.save(run.encoder, out_dir / _ENCODER, provenance)
+    on_first_process(lambda: pretrained.save(encoder, out_dir / _ENCODER, provenance))
     return pretrained.load_aligned(out_dir / _ENCODER)
 
 
-class _Run:
-    """State of a training that survives a kill."""
-
-    def __init__(self, config: AlignConfig, towers: Towers, data: TouchData) -> None:
-        self.config, self.data = config, data
-        shape = TouchEncoderConfig.for_towers(
-            VIT_PRESETS[config.vit], towers, config.sensor, config.embedding_dim
-        )
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(config.seed)
-            self.encoder = TouchEncoder(shape).to(config.device)
-        self.optimiser = _optimiser(self.encoder, config)
-        self.history: list[dict[str, float]] = []
-        self.best: dict[str, Tensor] = {}
-        self.batch_size = min(config.batch_size, len(data))
-        self.steps = len(data) // self.batch_size
-
-    def train_epoch(self, epoch: int) -> dict[str, float]:
-        """One pass: the mean of each loss, and the floors."""
-        config = self.config
-        count, size = len(self.data), self.batch_size
-        generator, batches = resumable.shuffle(count, size, config.seed, epoch)
-        self.encoder.train()
-        sums: dict[str, float] = {}
-        floors: dict[str, float] = {}
-        progress = tqdm(batches, desc=f"epoch {epoch + 1}/{config.epochs}", leave=False)
-        for step, rows in enumerate(progress):
-            for group in self.optimiser.param_groups:
-                group["lr"] = _learning_rate(config, epoch * self.steps + step, self.steps)
-            batch = _embed_batch(self.encoder, self.data, rows, config, generator)
-            losses = batch_losses(batch, self.encoder.config.pretrained_together, config)
-            self.optimiser.zero_grad()
-            losses["loss"].backward()
-            self.optimiser.step()
-            floors = floors or _floors(batch, config)
-            for name, loss in losses.items():
-                sums[name] = sums.get(name, 0.0) + loss.item()
-            progress.set_postfix(loss=f"{losses['loss'].item():.3f}")
-        return {name: total / self.steps for name, total in sums.items()} | floors
-
-    def note(self, metrics: dict[str, float]) -> None:
-        """Adds an epoch to the history; keeps its weights if it is the best so far."""
-        if not self.history or _score(metrics) > max(map(_score, self.history)):
-            self.best = copy.deepcopy(self.encoder.state_dict())
-        self.history.append(metrics)
-
-    def checkpoint(self, out_dir: Path) -> None:
-        """Writes everything needed to go on."""
-        state = {
-            "encoder": self.encoder.state_dict(),
-            "best": self.best,
-            "optimiser": self.optimiser.state_dict(),
-        }
-        resumable.save(out_dir, self._setting(), state, self.history)
-
-    def restore(self, out_dir: Path) -> None:
-        """Reads a checkpoint; UserError if it is of another training."""
-        state = resumable.restore(out_dir, self._setting(), self.config.device)
-        self.encoder.load_state_dict(state["encoder"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.best, self.history = state["best"], state["history"]
-
-    def _setting(self) -> str:
-        parts = asdict(self.config), asdict(self.encoder.config), len(self.data), self.data.names
-        return json.dumps(parts)
+def _checksum(touches: Touches) -> str:
+    sentences = [s for name in sorted(touches.descriptions) for s in touches.descriptions[name]]
+    return checksum(touches.frames, touches.view, touches.object, sentences)
 
 
-def _optimiser(encoder: TouchEncoder, config: AlignConfig) -> torch.optim.Optimizer:
-    matrices = [p for p in encoder.parameters() if p.ndim in (2, 4)]
-    others = [p for p in encoder.parameters() if p.ndim not in (2, 4)]
-    kind = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[config.optimiser]
-    groups: list[dict[str, Any]] = [
-        {"params": matrices, "weight_decay": config.weight_decay},
-        {"params": others, "weight_decay": 0.0},
-    ]
-    return kind(groups, lr=config.lr)
+class BestEpoch:
+    """The weights of the best epoch so far."""
 
+    def __init__(self) -> None:
+        self.weights: dict[str, Tensor] = {}
 
-def _learning_rate(config: AlignConfig, step: int, steps_per_epoch: int) -> float:
-    steps = config.epochs * steps_per_epoch
-    return config.lr * resumable.warmed_cosine(step, steps, config.warmup * steps, config.final_lr)
+    def state_dict(self) -> dict[str, Tensor]:
+        """For the checkpoint."""
+        return self.weights
+
+    def load_state_dict(self, weights: dict[str, Tensor]) -> None:
+        """From the checkpoint."""
+        self.weights = weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,31 +246,61 @@ class AlignedBatch:
     same: Bool[Tensor, "b b"]
 
 
-def _embed_batch(
-    encoder: TouchEncoder,
-    data: TouchData,
-    rows: Int[Tensor, " b"],
-    config: AlignConfig,
-    generator: torch.Generator,
-) -> AlignedBatch:
-    device = config.device
-    sentences = data.draw_sentences(rows, generator)
-    touch = config.augmentation(data.touch[rows].float(), generator).to(device)
-    ids_keep = None
-    if config.token_share < 1:
-        vit = encoder.config.vit
-        ids_keep = random_patches(vit, len(rows), config.token_share, generator).to(device)
-    with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=config.bfloat16):
-        embedded = encoder.embed_touch(touch, ids_keep).float()
-    label = data.label[rows]
-    same = (label[:, None] == label) | (sentences[:, None] == sentences)
-    return AlignedBatch(
-        touch=embedded,
-        text=encoder.project_text(data.texts[sentences].to(device)),
-        image=encoder.project_image(data.images[data.view_index[rows]].to(device)),
-        contact=data.contact[rows].to(device),
-        same=same.to(device),
-    )
+def make_batch(
+    data: TouchData, rows: Int[Tensor, " b"], config: AlignConfig, generator: torch.Generator
+) -> dict[str, Tensor | None]:
+    """What `AlignmentLoss` is called with: changed and masked touches beside their partners."""
+    sentence = data.draw_sentences(rows, generator)
+    touch, ids_keep = config.augmentation(data.touch[rows].float(), generator), None
+    if config.mask_ratio > 0:
+        vit = VIT_PRESETS[config.vit]
+        ids_keep = random_masking(vit, len(rows), config.mask_ratio, generator)
+    return {
+        "touch": touch,
+        "ids_keep": ids_keep,
+        "text": data.texts[sentence],
+        "image": data.images[data.view_index[rows]],
+        "contact": data.contact[rows],
+        "label": data.label[rows],
+        "sentence": sentence,
+    }
+
+
+class AlignmentLoss(nn.Module):
+    """An encoder and its loss; batches of several processes are compared as one."""
+
+    def __init__(self, encoder: TouchEncoder, config: AlignConfig) -> None:
+        """Of an encoder, which is trained."""
+        super().__init__()
+        self.encoder, self.config = encoder, config
+
+    def forward(self, **batch: Tensor | None) -> dict[str, Float[Tensor, ""]]:
+        """The losses of what `make_batch` returns, for the trainer."""
+        return self.losses(self.embed(batch, gather_batch))
+
+    def embed(
+        self, batch: Mapping[str, Any], gather: Callable[[Tensor], Tensor] = lambda rows: rows
+    ) -> AlignedBatch:
+        """A batch in the shared space, put together from all processes by `gather`."""
+        touch = self.encoder.embed_touch(batch["touch"], batch["ids_keep"]).float()
+        with torch.autocast(touch.device.type, enabled=False):
+            text = self.encoder.project_text(batch["text"])
+            image = self.encoder.project_image(batch["image"])
+        label, sentence, contact = (
+            gather(batch[k].long()) for k in ("label", "sentence", "contact")
+        )
+        return AlignedBatch(
+            touch=gather(touch),
+            text=gather(text),
+            image=gather(image),
+            contact=contact > 0,
+            same=(label[:, None] == label) | (sentence[:, None] == sentence),
+        )
+
+    def losses(self, batch: AlignedBatch) -> dict[str, Float[Tensor, ""]]:
+        """See `batch_losses`; in float32 whatever the precision."""
+        with torch.autocast(batch.touch.device.type, enabled=False):
+            return batch_losses(batch, self.encoder.config.pretrained_together, self.config)
 
 
 def batch_losses(
@@ -303,8 +308,8 @@ def batch_losses(
 ) -> dict[str, Float[Tensor, ""]]:
     """The weighted sum "loss" (the paper's Eq. 2) and its terms.
 
-    Touches without contact have no picture and take part in touch-text only. A batch with fewer than two
-    touches in contact has no image terms.
+    Touches without contact have no picture and take part in touch-text only. A batch with fewer than
+    two touches in contact has no image terms.
     """
     nce = symmetric_info_nce if config.symmetric else info_nce
     c, tau = batch.contact, config.temperature
@@ -318,33 +323,41 @@ def batch_losses(
         if not pretrained_together:
             terms["loss_image_text"] = nce(batch.image[c], batch.text[c], tau, same_c)
             loss = loss + config.image_text_weight * terms["loss_image_text"]
+    else:
+        loss = loss + 0 * batch.image.sum()  # several processes expect a gradient of every head
     return {"loss": loss} | terms
 
 
 @torch.no_grad()
-def _floors(batch: AlignedBatch, config: AlignConfig) -> dict[str, float]:
-    """One direction's loss on this batch beside the least that its targets would allow."""
+def loss_and_floors(loss: AlignmentLoss, data: TouchData) -> dict[str, float]:
+    """One direction's loss on a fixed batch of `data` beside the least that its targets allow."""
+    config, device = loss.config, loss.encoder.device
+    rows = torch.linspace(0, len(data) - 1, min(config.batch_size, len(data))).long()
+    made = make_batch(data, rows, config, torch.Generator().manual_seed(0))
+    batch = loss.embed(send_to_device(made, device))
     c = batch.contact
     floors = {}
-    for name, rows, target in (("text", c | ~c, batch.text), ("image", c, batch.image)):
-        if rows.sum() < 2:
+    for name, chosen, target in (("text", c | ~c, batch.text), ("image", c, batch.image)):
+        if chosen.sum() < 2:
             continue
-        right = batch.same[rows][:, rows] if config.multi_positive else None
-        loss = info_nce(batch.touch[rows], target[rows], config.temperature, right)
-        floors[f"touch_to_{name}_loss"] = loss.item()
-        floors[f"touch_to_{name}_floor"] = loss_floor(target[rows], config.temperature, right)
+        right = batch.same[chosen][:, chosen] if config.multi_positive else None
+        value = info_nce(batch.touch[chosen], target[chosen], config.temperature, right)
+        floors[f"touch_to_{name}_loss"] = value.item()
+        floors[f"touch_to_{name}_floor"] = loss_floor(target[chosen], config.temperature, right)
     return floors
 
 
-def _score(metrics: dict[str, float]) -> float:
-    return (metrics["touch_to_text_map"] + metrics["touch_to_image_map"]) / 2
+def _score(metrics: dict[str, Any]) -> float:
+    """Mean of the mAPs that are defined."""
+    found = [metrics[f"touch_to_{other}_map"] for other in ("text", "image")]
+    return float(np.mean([x for x in found if x is not None]))
 
 
-def _progress_line(metrics: dict[str, float], epoch: int, epochs: int) -> str:
-    m = metrics
+def _progress(m: dict[str, Any]) -> str:
+    image = m["touch_to_image_top1"]
+    image = "not measured (one episode an object)" if image is None else f"{image:.1%}"
     return (
-        f"epoch {epoch}/{epochs}  loss {m['loss']:.3f}  "
-        f"touch->text {m['touch_to_text_loss']:.2f} (floor {m['touch_to_text_floor']:.2f})  "
-        f"top-1 text {m['touch_to_text_top1']:.1%}, image {m['touch_to_image_top1']:.1%} "
-        f"(chance {m['chance_top1']:.1%})"
+        f"loss {m['loss']:.3f}; touch to text {m['touch_to_text_loss']:.2f} (at least "
+        f"{m['touch_to_text_floor']:.2f}); right object by touch: in sentences "
+        f"{m['touch_to_text_top1']:.1%}, in pictures {image} (chance {m['chance_top1']:.1%})"
     )

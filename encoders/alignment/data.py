@@ -1,6 +1,6 @@
 """What alignment trains on: preprocessed touches beside the cached embeddings of the towers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
+from touchgoal.control.option_types import CountOrNone, NotNegative, checked_dataclass
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.towers.towers import BATCH, Towers
 from touchgoal.episodes.touches import Touches
@@ -89,6 +90,34 @@ def prepare_touch_data(
     )
 
 
+def split_by_episode(data: TouchData, seed: int) -> tuple[TouchData, TouchData]:
+    """Two halves of the episodes that touch something, of every object as nearly as can be.
+
+    Args:
+        data: Touches; each episode has one view.
+        seed: Of the split.
+    """
+    episodes = data.view_index[data.contact].unique()
+    label = torch.zeros(len(data.images), dtype=torch.long)
+    label[data.view_index[data.contact]] = data.label[data.contact]
+    shuffled = episodes[
+        torch.randperm(len(episodes), generator=torch.Generator().manual_seed(seed))
+    ]
+    by_object = shuffled[label[shuffled].argsort(stable=True)]
+    return _of_episodes(data, by_object[::2]), _of_episodes(data, by_object[1::2])
+
+
+def _of_episodes(data: TouchData, episodes: Int[Tensor, " e"]) -> TouchData:
+    rows = torch.isin(data.view_index, episodes)
+    return replace(
+        data,
+        touch=data.touch[rows],
+        label=data.label[rows],
+        contact=data.contact[rows],
+        view_index=data.view_index[rows],
+    )
+
+
 def _sentences(
     names: tuple[str, ...], descriptions: dict[str, list[str]]
 ) -> tuple[list[str], Bool[Tensor, "k m"]]:
@@ -114,24 +143,21 @@ def _embed_views(views: np.ndarray, towers: Towers) -> Float[Tensor, "e i"]:
     return torch.cat([towers.embed_images(views[i : i + BATCH]) for i in starts])
 
 
-@dataclass(frozen=True)
+@checked_dataclass
 class Augmentation:
     """Random changes of a preprocessed touch that leave alone what is felt.
 
     No flips and no rotations: every colour of the LEDs comes from its own side, so a mirrored
-    GelSight image shows a relief (a dent for a bump) that no contact makes.
+    GelSight image shows a relief (a dent for a bump) that no contact makes."""
 
-    Attributes:
-        shift: Largest displacement in pixels, up, down and sideways; zeros come in.
-        gain: Largest relative change of the contrast, per colour.
-        offset: Largest change of the brightness, per colour, in the preprocessor's units.
-        noise: Standard deviation of the noise of a pixel, in the preprocessor's units.
-    """
-
-    shift: int = 0
-    gain: float = 0.0
-    offset: float = 0.0
-    noise: float = 0.0
+    shift: CountOrNone = 0
+    """Largest displacement in pixels, up, down and sideways; zeros come in."""
+    gain: NotNegative = 0.0
+    """Largest relative change of the contrast, per colour."""
+    offset: NotNegative = 0.0
+    """Largest change of the brightness, per colour, in the preprocessor's units."""
+    noise: NotNegative = 0.0
+    """Standard deviation of the noise of a pixel, in the preprocessor's units."""
 
     def __call__(
         self, touch: Float[Tensor, "b 3 h w"], generator: torch.Generator

@@ -10,42 +10,49 @@ from touchgoal.encoders.alignment.data import NO_CONTACT, TouchData
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
 from touchgoal.encoders.backbones.touch_backbone import BATCH
 
+METRICS = (
+    "chance_top1", "touch_to_text_top1", "touch_to_text_map", "chance_text_map",
+    "touch_to_image_top1", "touch_to_image_map", "chance_image_map",
+)  # fmt: skip
+
 
 @torch.no_grad()
-def evaluate_retrieval(encoder: TouchEncoder, data: TouchData) -> dict[str, float]:
+def evaluate_retrieval(encoder: TouchEncoder, data: TouchData) -> dict[str, float | None]:
     """Retrieval by cosine, of touches in contact.
+
+    A touch never finds the view of its own episode: that would reward knowing the episode again by
+    its size, place and light. So pictures are asked for only where an object has a second episode.
 
     Returns:
         `touch_to_text_top1`, `touch_to_image_top1`: how often the right object is nearest, an
         object being the mean of its sentences' or views' embeddings; `chance_top1`.
         `touch_to_text_map`, `touch_to_image_map`: mean average precision over all sentences or
         all views, right ones being those of the object; `chance_text_map`, `chance_image_map`.
-        `contact_accuracy` (if there are touches without contact): how often the nearest sentences, with those
-        for no contact among them, tell rightly whether anything is touched; `chance_contact` is the
-        share of the larger group.
+        `contact_accuracy` (if there are touches without contact): how often the nearest sentences,
+        with those for no contact among them, tell rightly whether anything is touched;
+        `chance_contact` is the share of the larger group.
+        None for what cannot be measured on these touches.
     """
     encoder.eval()
-    device = encoder.touch_head.weight.device
+    metrics: dict[str, float | None] = dict.fromkeys(METRICS)
+    if not data.contact.any():
+        return metrics
+    device = encoder.device
     touch = torch.cat(
         [encoder.embed_touch(batch.to(device).float()) for batch in data.touch.split(BATCH)]
     ).cpu()
     texts = encoder.project_text(data.texts.to(device)).cpu()
     images = encoder.project_image(data.images.to(device)).cpu()
-    felt = sorted(set(data.label[data.contact].tolist()))
-    label = torch.searchsorted(torch.tensor(felt), data.label[data.contact])
-    shows = _views_of_names(data)[felt]
-    seen = shows.any(0)  # views of episodes that gave no touch in contact are nobody's
-    metrics = {"chance_top1": 1 / len(felt)}
-    for modality, gallery, belongs in (
-        ("text", texts, data.describes[felt]),
-        ("image", images[seen], shows[:, seen]),
-    ):
-        cosines = touch[data.contact] @ _prototypes(gallery, belongs).T
-        metrics[f"touch_to_{modality}_top1"] = top1(cosines, label)
-        relevant = belongs[label].numpy()
-        similarity = (touch[data.contact] @ gallery.T).numpy()
-        metrics[f"touch_to_{modality}_map"] = mean_average_precision(similarity, relevant)
-        metrics[f"chance_{modality}_map"] = mean_average_precision(0 * similarity, relevant)
+    present, label = data.label[data.contact].unique(return_inverse=True)
+    metrics["chance_top1"] = 1 / len(present)
+    no_view = torch.full_like(label, -1)
+    metrics |= _retrieve(
+        "text", touch[data.contact], label, texts, data.describes[present], no_view
+    )
+    views, own_view = data.view_index[data.contact].unique(return_inverse=True)
+    shows = torch.zeros(len(present), len(views), dtype=torch.bool)
+    shows[label, own_view] = True
+    metrics |= _retrieve("image", touch[data.contact], label, images[views], shows, own_view)
     if NO_CONTACT in data.names:
         cosines = touch @ _prototypes(texts, data.describes).T
         says_contact = cosines.argmax(1) != data.names.index(NO_CONTACT)
@@ -55,11 +62,39 @@ def evaluate_retrieval(encoder: TouchEncoder, data: TouchData) -> dict[str, floa
     return metrics
 
 
-def _views_of_names(data: TouchData) -> Bool[Tensor, "k e"]:
-    """View j is a picture of name i."""
-    shows = torch.zeros(len(data.names), len(data.images), dtype=torch.bool)
-    shows[data.label[data.contact], data.view_index[data.contact]] = True
-    return shows
+def _retrieve(
+    modality: str,
+    touch: Float[Tensor, "n d"],
+    label: Int[Tensor, " n"],
+    gallery: Float[Tensor, "m d"],
+    belongs: Bool[Tensor, "k m"],
+    own: Int[Tensor, " n"],
+) -> dict[str, float]:
+    """Both metrics of one kind of partner.
+
+    Args:
+        modality: Of the partners, for the metrics' names.
+        touch: Embedded touches.
+        label: Object (row of `belongs`) of each.
+        gallery: Partners to choose from.
+        belongs: Which of them are of which object.
+        own: The one that a touch must not find; -1 for none.
+    """
+    relevant = belongs[label] & (torch.arange(len(gallery)) != own[:, None])
+    asked = relevant.any(1)
+    touch, label, own, relevant = touch[asked], label[asked], own[asked], relevant[asked]
+    if not len(touch):
+        return {}
+    cosines = touch @ _prototypes(gallery, belongs).T
+    cosines[torch.arange(len(touch)), label] = (touch * _prototypes(gallery, relevant)).sum(1)
+    similarity, chance = (touch @ gallery.T).numpy(), np.zeros(relevant.shape, np.float32)
+    excluded = own[:, None].numpy() == np.arange(len(gallery))
+    similarity[excluded] = chance[excluded] = -np.inf
+    return {
+        f"touch_to_{modality}_top1": top1(cosines, label),
+        f"touch_to_{modality}_map": mean_average_precision(similarity, relevant.numpy()),
+        f"chance_{modality}_map": mean_average_precision(chance, relevant.numpy()),
+    }
 
 
 def _prototypes(

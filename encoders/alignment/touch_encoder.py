@@ -132,7 +132,3 @@ class TouchEncoder(BaseTouchEncoder):
                 f"this touch encoder was trained with the towers {self.config.towers}, not "
                 f"{towers.name}: load those towers, or train an encoder with these"
             )
-
-    @property
-    def _device(self) -> torch.device:
-        return self.touch_head.weight.device

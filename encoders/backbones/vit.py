@@ -2,13 +2,18 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
+from pydantic import Field
 from torch import Tensor, nn
 
 from touchgoal.control.errors import UserError
+
+MaskRatio = Annotated[float, Field(ge=0, lt=1)]
+"""Share of the patches that are left out."""
 
 
 @dataclass(frozen=True)
@@ -158,13 +163,26 @@ class ViT(nn.Module):
         return tokens[:, 0] if self.class_token is not None else tokens.mean(1)
 
 
-def random_patches(
-    config: ViTConfig, count: int, share: float, generator: torch.Generator
-) -> Int[Tensor, "{count} k"]:
-    """Draws which patches of `count` images of the configured size to keep, for `ViT.forward`."""
+def patch_grid(config: ViTConfig) -> tuple[int, int]:
+    """Rows and columns of patches in an image of the configured size."""
     rows, columns = (-(-side // config.patch_size) for side in config.image_size)
+    return rows, columns
+
+
+def random_masking(
+    config: ViTConfig, count: int, mask_ratio: float, generator: torch.Generator
+) -> Int[Tensor, "{count} k"]:
+    """Draws which patches of `count` images of the configured size to keep, for `ViT.forward`.
+
+    Args:
+        config: Size of the images and patches.
+        count: Images.
+        mask_ratio: Share of the patches left out, in [0, 1); at least one patch is kept.
+        generator: Of the draw.
+    """
+    rows, columns = patch_grid(config)
     order = torch.rand(count, rows * columns, generator=generator).argsort(1)
-    return order[:, : max(1, round(share * rows * columns))]
+    return order[:, : max(1, round((1 - mask_ratio) * rows * columns))]
 
 
 def _initialise(module: nn.Module) -> None:

@@ -22,10 +22,12 @@ class TouchFrames:
         touch: Preprocessed frames; half precision, for they fill the memory.
         wrench: What the simulator says acts on each pad (N, Nm, pad frame), for probes only;
             None if the episodes do not say.
+        sensor: Name of the fingertip sensor.
     """
 
     touch: Float16[Tensor, "n 3 h w"]
     wrench: Float[Tensor, "n 6"] | None
+    sensor: str
 
     def __len__(self) -> int:
         """Number of touches."""
@@ -62,7 +64,7 @@ def sample_frames(episodes: EpisodeSet, sensor: str, per_episode: int, seed: int
             touch.append(torch.from_numpy(rows).half())
             for name in truth:
                 wrench.append(torch.from_numpy(frames[name][:, 6 * side : 6 * side + 6]))
-    return TouchFrames(torch.cat(touch), torch.cat(wrench) if truth else None)
+    return TouchFrames(torch.cat(touch), torch.cat(wrench) if truth else None, sensor)
 
 
 def check_sensor(episodes: EpisodeSet, i: int, sensor: str) -> None:

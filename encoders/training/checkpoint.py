@@ -1,17 +1,14 @@
-"""Trainings that survive a kill: each finished epoch leaves all that is needed to go on.
+"""What a training leaves on disk after every epoch: all that is needed to go on, and its metrics."""
 
-An epoch's randomness depends on seed and number alone, so a resumed training ends with the same
-weights as an uninterrupted one.
-"""
-
+import hashlib
 import json
-import math
 import os
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Int
 from torch import Tensor
 
 from touchgoal.control.errors import UserError
@@ -19,55 +16,123 @@ from touchgoal.control.errors import UserError
 _CHECKPOINT, _METRICS = "checkpoint.pt", "metrics.jsonl"
 
 
-def check(out_dir: Path, resume: bool, device: str) -> None:
-    """Raises UserError if the directory does not fit `resume`, or there is no such device."""
-    exists = (out_dir / _CHECKPOINT).is_file()
+def has_checkpoint(out_dir: Path) -> bool:
+    """Whether a run has finished an epoch there."""
+    return (out_dir / _CHECKPOINT).is_file()
+
+
+def check_run_folder(out_dir: Path, resume: bool) -> None:
+    """Raises UserError if there is nothing to resume, or an older run that must not be overwritten."""
+    exists = has_checkpoint(out_dir)
     if resume and not exists:
         raise UserError(f"nothing to resume in {out_dir}: start without resuming")
-    if exists and not resume:
+    if not resume and (exists or (out_dir / _METRICS).exists()):
         raise UserError(f"{out_dir} holds a run already: resume it, or choose another directory")
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise UserError("no CUDA device here: choose the device cpu")
 
 
-def shuffle(
-    count: int, batch_size: int, seed: int, epoch: int
-) -> tuple[torch.Generator, tuple[Int[Tensor, " b"], ...]]:
-    """An epoch's generator, and its batches of rows; rows that fill no batch are left out."""
-    generator = torch.Generator().manual_seed(seed * 1_000_003 + epoch)
-    order = torch.randperm(count, generator=generator)
-    return generator, order[: count // batch_size * batch_size].split(batch_size)
+def checksum(*parts: Tensor | np.ndarray | Iterable[str] | None) -> str:
+    """A short hash of data, by which a resumed run knows that they are the same."""
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Tensor):
+            part = part.numpy()
+        if isinstance(part, np.ndarray):
+            digest.update(f"{part.dtype}{part.shape}".encode())
+            digest.update(np.ascontiguousarray(part).data)
+        else:
+            digest.update(json.dumps(None if part is None else list(part)).encode())
+    return digest.hexdigest()[:16]
 
 
-def warmed_cosine(step: int, steps: int, warmup: float, final: float = 0.0) -> float:
-    """Factor of the learning rate: up from 0 in `warmup` steps, then down to `final` by a cosine."""
-    if step < warmup:
-        return (step + 1) / (warmup + 1)
-    cosine = (1 + math.cos(math.pi * (step - warmup) / max(steps - warmup, 1))) / 2
-    return final + (1 - final) * cosine
+class Record:
+    """Writes a run's files."""
+
+    def __init__(
+        self, out_dir: Path, identity: Mapping[str, Any], provenance: Mapping[str, Any]
+    ) -> None:
+        """For a run.
+
+        Args:
+            out_dir: Made if needed.
+            identity: JSON-able: whatever must be the same when the training goes on.
+            provenance: JSON-able: where the run comes from.
+        """
+        from torch.utils.tensorboard import SummaryWriter  # slow to import
+
+        out_dir.mkdir(parents=True, exist_ok=True)
+        self._dir, self._head = out_dir, {"identity": _json(identity), "provenance": provenance}
+        self._tensorboard = SummaryWriter(str(out_dir))
+
+    def write(self, history: list[dict[str, float]], state: Mapping[str, Any]) -> None:
+        """Writes what there is after an epoch; a kill leaves the older files or these.
+
+        Args:
+            history: Metrics of every epoch so far.
+            state: Modules, optimizers and the like, by name.
+        """
+        states = {name: part.state_dict() for name, part in state.items()}
+        temporary = self._dir / f"{_CHECKPOINT}.tmp"
+        torch.save({**self._head, "history": history, **states}, temporary)
+        os.replace(temporary, self._dir / _CHECKPOINT)
+        lines = "".join(json.dumps(epoch) + "\n" for epoch in history)
+        (self._dir / _METRICS).write_text(lines)
+        for name, value in history[-1].items():
+            if name != "epoch" and value is not None:
+                self._tensorboard.add_scalar(name, value, len(history))
+        self._tensorboard.flush()
+
+    def close(self) -> None:
+        """Closes TensorBoard's file."""
+        self._tensorboard.close()
 
 
-def save(
-    out_dir: Path, setting: str, state: dict[str, Any], history: list[dict[str, float]]
-) -> None:
-    """Writes the state after an epoch, and `metrics.jsonl`; a kill leaves the old one or this.
+def load(
+    out_dir: Path,
+    identity: Mapping[str, Any],
+    state: Mapping[str, Any],
+    provenance: Mapping[str, Any],
+) -> tuple[list[dict[str, float]], dict[str, Any]]:
+    """Fills `state` with what `Record.write` was given.
 
     Args:
-        out_dir: of the run.
-        setting: whatever must be the same when the training goes on.
-        state: of networks and optimiser.
-        history: metrics of every epoch so far.
+        out_dir: Of the run.
+        identity: Of the run that is to go on.
+        state: Modules, optimizers and the like, by name; loaded to where each is.
+        provenance: Of the resumption, which is noted if it differs.
+
+    Returns:
+        The metrics of every epoch so far, and the run's provenance.
+
+    Raises:
+        UserError: It is damaged, or of another training.
     """
-    temporary = out_dir / f"{_CHECKPOINT}.tmp"
-    torch.save({"setting": setting, "history": history, **state}, temporary)
-    os.replace(temporary, out_dir / _CHECKPOINT)
-    (out_dir / _METRICS).write_text("".join(json.dumps(epoch) + "\n" for epoch in history))
-
-
-def restore(out_dir: Path, setting: str, device: str) -> dict[str, Any]:
-    """What `save` was given, `history` included; UserError if it is of another training."""
     path = out_dir / _CHECKPOINT
-    state = torch.load(path, device, weights_only=True)
-    if state["setting"] != setting:
-        raise UserError(f"{path} is of another data set, encoder or config: resume with its own")
-    return state
+    try:
+        found = torch.load(path, "cpu", weights_only=True)
+        old, history, kept = found["identity"], found["history"], found["provenance"]
+    except Exception as error:  # torch.load raises whatever its parts raise
+        raise UserError(f"{path} cannot be read: start again in another directory") from error
+    if difference := _difference(old, _json(identity)):
+        raise UserError(
+            f"{path} is of another data set, encoder or config ({difference}): resume with its own"
+        )
+    for name, part in state.items():
+        part.load_state_dict(found[name])
+    if provenance != kept and provenance not in (resumed := kept.get("resumed", [])):
+        kept = {**kept, "resumed": [*resumed, dict(provenance)]}
+    return history, kept
+
+
+def _json(value: Mapping[str, Any]) -> dict[str, Any]:
+    return json.loads(json.dumps(value))
+
+
+def _difference(old: Any, new: Any, name: str = "") -> str:
+    """Says of the first value that differs what it was and is; "" if none does."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in {**old, **new}:
+            inner = f"{name}.{key}" if name else str(key)
+            if found := _difference(old.get(key), new.get(key), inner):
+                return found
+        return ""
+    return "" if old == new else f"{name} was {old}, is {new}"

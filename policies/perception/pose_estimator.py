@@ -94,6 +94,6 @@ class _SpatialSoftmax(nn.Module):
         share = self.where(maps).flatten(2).softmax(2)
         h, w = maps.shape[2:]
         y, x = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
-        place = torch.stack([x, y]).flatten(1).expand(len(maps), -1, -1)
+        place = torch.stack([x, y]).flatten(1).expand(len(maps), -1, -1).to(maps)
         there = torch.cat([place, self.what(maps).flatten(2)], 1)
         return (share @ there.mT).flatten(1)

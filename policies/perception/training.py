@@ -1,16 +1,25 @@
-"""Training of senses: contact in embeddings of touch, the scene in pictures of placements."""
+"""Training of the state estimator: contact in embeddings of touch, the scene in pictures."""
 
-from dataclasses import dataclass
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
-from torch import Tensor
-from tqdm import tqdm
+from torch import Tensor, nn
 
 from touchgoal.control import features as ft
-from touchgoal.encoders.training import checkpoint as resumable
+from touchgoal.control.option_types import (
+    Count,
+    CountOrNone,
+    NotNegative,
+    Positive,
+    checked_dataclass,
+)
+from touchgoal.encoders.training.checkpoint import checksum
+from touchgoal.encoders.training.trainer import OptimizerConfig, RunOptions, Training, fit
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.placements import Placements
@@ -18,30 +27,25 @@ from touchgoal.policies.perception.pose_estimator import PoseEstimator
 from touchgoal.policies.perception.state_estimation import StateEstimatorNetwork
 from touchgoal.policies.training.sequence_dataset import embed_episodes
 
-_HUBER_BETA = 0.3  # standard deviations beyond which an error of sight counts linearly
+_HUBER_BETA = 0.3  # standard deviations beyond which an error of the pose counts linearly
 
 
-@dataclass(frozen=True)
+@checked_dataclass
 class EstimatorTrainConfig:
-    """How senses are trained, by AdamW.
+    """How the state estimator is trained, by AdamW."""
 
-    Attributes:
-        steps: of sight.
-        batch_size: placements a step of sight.
-        lr: highest learning rate of sight, left by a cosine.
-        pixel_noise: counts by which each pixel is changed at most, as a camera's are.
-        contact_steps: of contact, 256 ticks each at a rate of 1e-3.
-        touch_noise: standard deviation of noise added to embeddings, scaled to variance 1.
-        seed: of everything random.
-    """
-
-    steps: int = 4000
-    batch_size: int = 64
-    lr: float = 2e-3
-    pixel_noise: int = 4
-    contact_steps: int = 600
-    touch_noise: float = 0.5
-    seed: int = 0
+    epochs: Count = 21
+    """Passes over the placements, for the pose estimator."""
+    batch_size: Count = 64
+    """Placements a step."""
+    lr: Positive = 2e-3
+    """Highest learning rate of the pose estimator, left by a cosine."""
+    pixel_noise: CountOrNone = 4
+    """Grey levels by which each pixel is changed at most, as a camera's are."""
+    contact_epochs: Count = 4
+    """Passes over the ticks, for contact; 256 ticks a step at a rate of 1e-3."""
+    touch_noise: NotNegative = 0.5
+    """Standard deviation of noise added to embeddings, in theirs."""
 
 
 def embed_touch_and_contact(
@@ -59,48 +63,90 @@ def train_contact_estimator(
     touch: Float[Tensor, "n e"],
     contact: Bool[Tensor, "n 2"],
     config: EstimatorTrainConfig,
+    out_dir: Path,
+    options: RunOptions,
+    recipe: dict[str, Any],
 ) -> None:
-    """Trains the reader of contact."""
-    generator = torch.Generator().manual_seed(config.seed)
+    """Trains the reader of contact; writes what `trainer.fit` does."""
     sides = touch.unflatten(1, (len(ft.TACTILE), -1)).flatten(0, 1)
     network.touch_scale.fit_mean_std(sides)
-    optimiser = torch.optim.AdamW(network.touch.parameters(), 1e-3)
-    spread = network.touch_scale.size.repeat(len(ft.TACTILE))
-    for _ in tqdm(range(config.contact_steps), desc="contact"):
-        rows = torch.randint(len(touch), (256,), generator=generator)
-        noise = torch.randn(len(rows), touch.shape[1], generator=generator)
-        predicted = network.contact(touch[rows] + config.touch_noise * spread * noise)
-        loss = F.binary_cross_entropy_with_logits(predicted, contact[rows].float())
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
+    noise = config.touch_noise * network.touch_scale.size.repeat(len(ft.TACTILE))
+
+    def batch(rows: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+        drawn = torch.randn(len(rows), touch.shape[1], generator=generator)
+        return {"touch": touch[rows] + noise * drawn, "contact": contact[rows]}
+
+    training = Training(
+        loss=_ContactLoss(network),
+        n_samples=len(touch),
+        batch=batch,
+        optimizer=OptimizerConfig(
+            config.contact_epochs, 256, 1e-3, weight_decay=1e-2, warmup=0, final_lr=1
+        ),
+        identity={"train": asdict(config), "data": checksum(touch, contact)},
+        progress=lambda metrics: f"contact: loss {metrics['loss']:.4f}",
+    )
+    network.sight.requires_grad_(False)  # has its own training
+    fit(training, out_dir, options, recipe)
+    network.cpu().sight.requires_grad_(True)
+
+
+class _ContactLoss(nn.Module):
+    def __init__(self, network: StateEstimatorNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, touch: Tensor, contact: Tensor) -> dict[str, Tensor]:
+        logits = self.network.contact(touch)
+        return {"loss": F.binary_cross_entropy_with_logits(logits, contact.float())}
 
 
 def train_pose_estimator(
-    sight: PoseEstimator, placements: Placements, config: EstimatorTrainConfig
+    estimator: PoseEstimator,
+    placements: Placements,
+    config: EstimatorTrainConfig,
+    out_dir: Path,
+    options: RunOptions,
+    recipe: dict[str, Any],
 ) -> None:
-    """Trains sight."""
-    generator = torch.Generator().manual_seed(config.seed)
-    sight.tcp_scale.fit_mean_std(placements.tcp)
-    sight.start_scale.fit_mean_std(placements.start)
-    optimiser = torch.optim.AdamW(sight.parameters(), config.lr, weight_decay=1e-4)
-    progress = tqdm(range(config.steps), desc="sight")
-    for step in progress:
-        rate = resumable.warmed_cosine(step, config.steps, min(50, config.steps // 10))
-        for group in optimiser.param_groups:
-            group["lr"] = config.lr * rate
-        rows = torch.randint(len(placements), (config.batch_size,), generator=generator)
+    """Trains the pose estimator; writes what `trainer.fit` does."""
+    estimator.tcp_scale.fit_mean_std(placements.tcp)
+    estimator.start_scale.fit_mean_std(placements.start)
+
+    def batch(rows: Tensor, generator: torch.Generator) -> dict[str, Any]:
         pictures = {
             key: _add_pixel_noise(placements.pictures[key][rows], config.pixel_noise, generator)
-            for key, _ in sight.config.crops
+            for key, _ in estimator.config.crops
         }
-        predicted = sight.scaled(pictures, placements.tcp[rows])
-        wanted = sight.start_scale(placements.start[rows])
-        loss = F.smooth_l1_loss(predicted, wanted, beta=_HUBER_BETA)
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        progress.set_postfix(loss=f"{loss.item():.4f}")
+        return {"pictures": pictures, "tcp": placements.tcp[rows], "start": placements.start[rows]}
+
+    training = Training(
+        loss=_PoseLoss(estimator),
+        n_samples=len(placements),
+        batch=batch,
+        optimizer=OptimizerConfig(
+            config.epochs, config.batch_size, config.lr, weight_decay=1e-4, max_warmup_steps=50
+        ),
+        identity={
+            "train": asdict(config),
+            "pose_estimator": asdict(estimator.config),
+            "data": checksum(*placements.pictures.values(), placements.tcp, placements.start),
+        },
+        progress=lambda metrics: f"pose: loss {metrics['loss']:.4f}",
+    )
+    fit(training, out_dir, options, recipe)
+    estimator.cpu()
+
+
+class _PoseLoss(nn.Module):
+    def __init__(self, estimator: PoseEstimator) -> None:
+        super().__init__()
+        self.estimator = estimator
+
+    def forward(self, pictures: dict[str, Tensor], tcp: Tensor, start: Tensor) -> dict[str, Tensor]:
+        predicted = self.estimator.scaled(pictures, tcp)
+        target = self.estimator.start_scale(start)
+        return {"loss": F.smooth_l1_loss(predicted, target, beta=_HUBER_BETA)}
 
 
 def _add_pixel_noise(
@@ -121,14 +167,14 @@ def contact_error_rate(
 
 
 @torch.no_grad()
-def pose_errors(sight: PoseEstimator, placements: Placements) -> dict[str, list[float]]:
+def pose_errors(estimator: PoseEstimator, placements: Placements) -> dict[str, list[float]]:
     """Median and 90th percentile of the errors.
 
     Returns:
         Of the object's and the goal's position on the table (mm), of the object's height (mm), of
         the grasp's yaw (degrees) where it matters.
     """
-    predicted, true = sight(placements.pictures, placements.tcp), placements.start
+    predicted, true = estimator(placements.pictures, placements.tcp), placements.start
     off = predicted - true
     twice = torch.atan2(predicted[:, 4], predicted[:, 3]) - torch.atan2(true[:, 4], true[:, 3])
     yaw = torch.rad2deg(torch.atan2(twice.sin(), twice.cos()) / 2).abs()

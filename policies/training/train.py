@@ -1,51 +1,59 @@
-"""Training a policy on recorded windows (the recipe of Chi et al. 2023)."""
+"""Training a policy on recorded sequences (the recipe of Chi et al. 2023)."""
 
-import copy
-import json
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
-from tqdm import tqdm
+from accelerate.utils import send_to_device
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
 
-from touchgoal.control.errors import UserError
-from touchgoal.encoders.training import checkpoint as resumable
+from touchgoal.control.option_types import (
+    Count,
+    CountOrNone,
+    NotNegative,
+    Positive,
+    checked_dataclass,
+)
+from touchgoal.encoders.training.checkpoint import checksum
+from touchgoal.encoders.training.trainer import (
+    OptimizerConfig,
+    RunOptions,
+    Training,
+    fit,
+    on_first_process,
+)
 from touchgoal.policies import checkpoint
 from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
-from touchgoal.policies.training import ema
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 POLICY, SNAPSHOTS = "policy", "snapshots"
 
 
-@dataclass(frozen=True)
+@checked_dataclass
 class TrainConfig:
-    """How to train a policy.
+    """How to train a policy."""
 
-    Attributes:
-        epochs: passes over the windows.
-        batch_size: windows a step; all of them if there are fewer.
-        lr: highest learning rate, of AdamW; reached from 0, left by a cosine to 0.
-        betas: of AdamW.
-        weight_decay: of AdamW.
-        warmup: steps in which the rate rises; a tenth of the training if that is shorter.
-        snapshot_epochs: a policy is kept for trial every so many epochs, and the last one.
-        validation_windows: on which losses are measured, evenly spaced.
-        device: of the training.
-        seed: of everything random.
-    """
-
-    epochs: int = 60
-    batch_size: int = 256
-    lr: float = 5e-4
+    epochs: Count = 60
+    """Passes over the windows."""
+    batch_size: Count = 256
+    """Windows a step; all of them if there are fewer."""
+    lr: Positive = 5e-4
+    """Highest learning rate, of AdamW; reached from 0, left by a cosine to 0."""
     betas: tuple[float, float] = (0.95, 0.999)
-    weight_decay: float = 1e-6
-    warmup: int = 500
-    snapshot_epochs: int = 10
-    validation_windows: int = 1024
-    device: str = "cpu"
-    seed: int = 0
+    """Of AdamW."""
+    weight_decay: NotNegative = 1e-6
+    """Of weight matrices and convolutions."""
+    warmup: CountOrNone = 500
+    """Steps in which the rate rises; a tenth of the training if that is shorter."""
+    snapshot_epochs: Count = 10
+    """Epochs between two snapshots of the policy; the last epoch is one too."""
+    validation_windows: Count = 1024
+    """On which losses are measured, evenly spaced."""
 
 
 def train(
@@ -54,164 +62,150 @@ def train(
     validation: SequenceDataset,
     config: TrainConfig,
     out_dir: Path,
+    options: RunOptions,
     recipe: dict[str, Any],
-    resume: bool = False,
 ) -> Policy:
-    """Trains a policy; its weights' average is what is kept.
+    """Trains a policy; the moving average of its weights is what is kept.
 
-    Writes `metrics.jsonl` (a line an epoch), `checkpoint.pt` (after every epoch), a policy to
-    `snapshots/epoch-<n>/` every so often and at the end, and the last one to `policy/`. Which
-    snapshot acts best, only closed-loop trials can tell. Killed and resumed, it ends with the same weights as
-    uninterrupted.
+    Writes what `trainer.fit` does, a policy to `snapshots/epoch-<n>/` every so often and at the end,
+    and the last one to `policy/`. Which snapshot acts best, only closed-loop trials can tell. Killed
+    and resumed, it ends with the same weights as uninterrupted.
 
     Args:
         policy: what to train.
         windows: to learn from.
         validation: of other episodes.
         config: how to train.
-        out_dir: a new run's directory, or with `resume` the one to go on with.
+        out_dir: a new run's directory, or one to go on with.
+        options: seed, device, precision, whether to go on.
         recipe: JSON-able; where the episodes come from, kept with the weights.
-        resume: go on after the last finished epoch.
 
     Returns:
         The policy as saved in `out_dir/policy`.
 
     Raises:
-        UserError: no such device, or a directory that does not fit `resume`.
+        UserError: no such device, or a directory that does not fit `options.resume`.
     """
-    resumable.check(out_dir, resume, config.device)
-    if config.epochs < 1 or config.batch_size < 1 or config.snapshot_epochs < 1:
-        raise UserError("training needs epochs, batch_size and snapshot_epochs of at least 1")
-    run = _Run(policy, windows, config)
-    if resume:
-        run.restore(out_dir)
-    out_dir.mkdir(parents=True, exist_ok=True)
-    for epoch in range(len(run.history), config.epochs):
-        losses = {"epoch": epoch + 1, "loss": run.train_epoch(epoch)}
-        run.history.append(losses | run.validate(validation))
-        provenance = {
-            **recipe,
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(options.seed)
+        network = Policy(policy)
+    recorded = windows.recorded
+    network.fit_normalizers(
+        recorded.touch.float(), recorded.state, windows.joints, windows.actions,
+        recorded.wrench, windows.action_is_pad,
+    )  # fmt: skip
+    average = AveragedModel(network, multi_avg_fn=_update_average).eval().requires_grad_(False)
+    averaged = cast(Policy, average.module)
+
+    def keep_snapshot(history: list[dict[str, float]], provenance: dict[str, Any]) -> None:
+        known = {"train": asdict(config), "windows": len(windows), "metrics": history[-1]}
+        last = len(history) == config.epochs
+        folders = [out_dir / POLICY] if last else []
+        if last or len(history) % config.snapshot_epochs == 0:
+            folders.append(out_dir / SNAPSHOTS / f"epoch-{len(history):04d}")
+        for folder in folders:
+            on_first_process(partial(checkpoint.save, averaged, folder, provenance | known))
+
+    training = Training(
+        loss=_PolicyLoss(network),
+        n_samples=len(windows),
+        batch=lambda rows, generator: _make_batch(windows, rows) | {"generator": generator},
+        optimizer=OptimizerConfig(
+            config.epochs,
+            config.batch_size,
+            config.lr,
+            config.weight_decay,
+            betas=config.betas,
+            max_warmup_steps=config.warmup,
+        ),
+        identity={
             "train": asdict(config),
-            "windows": len(windows),
-            "metrics": run.history[-1],
-        }
-        if (epoch + 1) % config.snapshot_epochs == 0 or epoch + 1 == config.epochs:
-            checkpoint.save(run.average, out_dir / SNAPSHOTS / f"epoch-{epoch + 1:04d}", provenance)
-        if epoch + 1 == config.epochs:
-            checkpoint.save(run.average, out_dir / POLICY, provenance)
-        run.checkpoint(out_dir)
-        tqdm.write(_progress_line(run.history[-1], config.epochs))
+            "policy": asdict(policy),
+            "data": [_checksum(windows), _checksum(validation)],
+        },
+        evaluate=lambda: _validate(averaged, validation, config, options.seed),
+        progress=_progress,
+        after_step=lambda: average.update_parameters(network),
+        after_epoch=keep_snapshot,
+        extra_state={"average": average},
+    )
+    fit(training, out_dir, options, recipe)
     return checkpoint.load(out_dir / POLICY)
 
 
-class _Run:
-    """State of a training that survives a kill."""
+def ema_decay(step: int, power: float = 0.75, greatest: float = 0.9999) -> float:
+    """Weight of the past after `step` updates; diffusion_policy's schedule and constants."""
+    return min(greatest, 1 - (1 + step) ** -power)
 
-    def __init__(self, policy: PolicyConfig, windows: SequenceDataset, config: TrainConfig) -> None:
-        self.config, self.windows = config, windows
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(config.seed)
-            self.policy = Policy(policy)
-        touch, state = windows.recorded.touch.float(), windows.recorded.state
-        wrench = windows.recorded.wrench
-        self.policy.fit_normalizers(
-            touch, state, windows.joints, windows.actions, wrench, windows.action_is_pad
-        )
-        self.policy.to(config.device)
-        self.average = copy.deepcopy(self.policy).eval().requires_grad_(False)
-        self.optimiser = torch.optim.AdamW(
-            self.policy.parameters(), config.lr, config.betas, weight_decay=config.weight_decay
-        )
-        self.history: list[dict[str, float]] = []
-        self.batch_size = min(config.batch_size, len(windows))
-        self.steps = len(windows) // self.batch_size
 
-    def train_epoch(self, epoch: int) -> float:
-        """One pass, its mean loss."""
-        count, size = len(self.windows), self.batch_size
-        generator, batches = resumable.shuffle(count, size, self.config.seed, epoch)
-        self.policy.train()
-        total = 0.0
-        progress = tqdm(batches, desc=f"epoch {epoch + 1}/{self.config.epochs}", leave=False)
-        for i, rows in enumerate(progress):
-            step = epoch * self.steps + i
-            for group in self.optimiser.param_groups:
-                group["lr"] = _learning_rate(self.config, step, self.config.epochs * self.steps)
-            loss = self._loss(self.policy, self.windows, rows, generator)
-            self.optimiser.zero_grad()
-            loss.backward()
-            self.optimiser.step()
-            ema.update(self.average, self.policy, step)
-            total += loss.item()
-            progress.set_postfix(loss=f"{loss.item():.4f}")
-        return total / self.steps
+@torch.no_grad()
+def _update_average(average: Sequence[Tensor], weights: Sequence[Tensor], n_averaged: Any) -> None:
+    for mean, weight in zip(average, weights, strict=True):
+        mean.lerp_(weight, 1 - ema_decay(int(n_averaged)))
 
-    @torch.no_grad()
-    def validate(self, windows: SequenceDataset) -> dict[str, float]:
-        """The average's loss, and the error of the joint change (rad) it plans over the chunk."""
-        n = min(self.config.validation_windows, len(windows))
-        rows = torch.linspace(0, len(windows) - 1, n).long()
-        batch, actions = self._take(windows, rows)
-        generator = torch.Generator().manual_seed(self.config.seed)
-        planned = self.average.plan(batch, generator)
-        off = (planned - actions)[..., :7]
-        off = off.masked_fill(windows.action_is_pad[rows, :, None].to(off.device), 0.0)
-        error = off.sum(1).norm(dim=1).mean()
-        loss = self._loss(self.average, windows, rows, generator)
-        return {"validation_loss": loss.item(), "validation_error": error.item()}
 
-    def checkpoint(self, out_dir: Path) -> None:
-        """Writes everything needed to go on."""
-        state = {
-            "policy": self.policy.state_dict(),
-            "average": self.average.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-        }
-        resumable.save(out_dir, self._setting(), state, self.history)
+class _PolicyLoss(nn.Module):
+    """A policy's training loss, for the trainer."""
 
-    def restore(self, out_dir: Path) -> None:
-        """Reads a checkpoint; UserError if it is of another training."""
-        state = resumable.restore(out_dir, self._setting(), self.config.device)
-        self.policy.load_state_dict(state["policy"])
-        self.average.load_state_dict(state["average"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.history = state["history"]
+    def __init__(self, policy: Policy) -> None:
+        super().__init__()
+        self.policy = policy
 
-    def _loss(
+    def forward(
         self,
-        policy: Policy,
-        windows: SequenceDataset,
-        rows: torch.Tensor,
+        touch: Float[Tensor, "b o e"],
+        state: Float[Tensor, "b o s"],
+        pictures: Tensor | None,
+        wrench: Float[Tensor, "b o 12"] | None,
+        actions: Float[Tensor, "b h 8"],
+        action_is_pad: Bool[Tensor, "b h"],
         generator: torch.Generator,
-    ) -> torch.Tensor:
-        wrench = windows.wrench(rows)
-        wrench = None if wrench is None else wrench.to(self.config.device)
-        is_pad = windows.action_is_pad[rows].to(self.config.device)
-        return policy.loss(*self._take(windows, rows), generator, wrench, is_pad)
-
-    def _take(
-        self, windows: SequenceDataset, rows: torch.Tensor
-    ) -> tuple[ObservationBatch, torch.Tensor]:
-        batch, actions = windows.take(rows)
-        device = self.config.device
-        pictures = None if batch.pictures is None else batch.pictures.to(device)
-        seen = ObservationBatch(batch.touch.to(device), batch.state.to(device), pictures)
-        return seen, actions.to(device)
-
-    def _setting(self) -> str:
-        recorded = self.windows.recorded
-        data = recorded.lengths, recorded.checksum
-        return json.dumps((asdict(self.config), asdict(self.policy.config), data))
+    ) -> dict[str, Tensor]:
+        batch = ObservationBatch(touch, state, pictures)
+        return {"loss": self.policy.loss(batch, actions, generator, wrench, action_is_pad)}
 
 
-def _learning_rate(config: TrainConfig, step: int, steps: int) -> float:
-    warmup = min(config.warmup, steps // 10)
-    return config.lr * resumable.warmed_cosine(step, steps, warmup)
+def _make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, Any]:
+    seen, actions = windows.take(rows)
+    return {
+        "touch": seen.touch,
+        "state": seen.state,
+        "pictures": seen.pictures,
+        "wrench": windows.wrench(rows),
+        "actions": actions,
+        "action_is_pad": windows.action_is_pad[rows],
+    }
 
 
-def _progress_line(metrics: dict[str, float], epochs: int) -> str:
+@torch.no_grad()
+def _validate(
+    policy: Policy, windows: SequenceDataset, config: TrainConfig, seed: int
+) -> dict[str, float]:
+    """The average's loss, and the error of the joint change (rad) it plans over the chunk."""
+    n = min(config.validation_windows, len(windows))
+    rows = torch.linspace(0, len(windows) - 1, n).long()
+    device = policy.action_scale.size.device
+    batch = send_to_device(_make_batch(windows, rows), device)
+    generator = torch.Generator().manual_seed(seed)
+    seen = ObservationBatch(batch["touch"], batch["state"], batch["pictures"])
+    planned = policy.plan(seen, generator)
+    is_pad = batch["action_is_pad"]
+    off = (planned - batch["actions"])[..., :7].masked_fill(is_pad[..., None], 0.0)
+    error = off.sum(1).norm(dim=1).mean()
+    loss = policy.loss(seen, batch["actions"], generator, batch["wrench"], is_pad)
+    return {"validation_loss": loss.item(), "validation_error": error.item()}
+
+
+def _checksum(windows: SequenceDataset) -> str:
+    recorded = windows.recorded
+    return checksum(
+        recorded.touch, recorded.state, recorded.actions, recorded.pictures, recorded.wrench,
+        map(str, recorded.lengths),
+    )  # fmt: skip
+
+
+def _progress(metrics: dict[str, float]) -> str:
     return (
-        f"epoch {metrics['epoch']}/{epochs}  loss {metrics['loss']:.4f}  "
-        f"validation {metrics['validation_loss']:.4f}, "
-        f"plan off by {1000 * metrics['validation_error']:.2f} mrad"
+        f"loss {metrics['loss']:.4f} in training, {metrics['validation_loss']:.4f} in validation; "
+        f"planned joint change off by {1000 * metrics['validation_error']:.2f} mrad"
     )

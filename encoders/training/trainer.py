@@ -1,0 +1,327 @@
+"""The one loop by which all networks here are trained, on Accelerate.
+
+A training is a module that computes the loss, a function that makes a batch, an optimizer's settings
+and a few plain functions called on the way. The loop adds devices, bfloat16, several GPUs (`torchrun`),
+gradient clipping, the learning rate's schedule, checkpoints, `metrics.jsonl` and TensorBoard.
+
+An epoch's randomness depends on seed and number alone, so a training that was stopped and resumed ends
+with the same weights, bit for bit, as an uninterrupted one.
+"""
+
+import math
+import shlex
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import torch
+from accelerate import Accelerator
+from accelerate.state import AcceleratorState
+from accelerate.utils import send_to_device
+from jaxtyping import Int, Shaped
+from torch import Tensor, nn
+from torch.distributed.nn.functional import all_gather
+from tqdm import tqdm
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.interruption import kept
+from touchgoal.control.provenance import command_line
+from touchgoal.encoders.training import checkpoint
+
+Precision = Literal["no", "bf16"]
+Metrics = dict[str, Any]
+"""Numbers by name; None where one is undefined."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What every training command lets its user choose, whatever is trained.
+
+    Attributes:
+        seed: Random seed of initial weights, order of the data and noise.
+        device: "cpu", "cuda", "cuda:<n>" or "mps"; under `torchrun` each process takes its own GPU.
+        precision: "bf16" computes in bfloat16 where that is safe (autocast); weights stay float32.
+            On a CPU without AVX-512 it is 20 times slower.
+        resume: Go on after the last finished epoch of the run in the same folder.
+    """
+
+    seed: int = 0
+    device: str = "cpu"
+    precision: Precision = "no"
+    resume: bool = False
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """How weights are updated.
+
+    Attributes:
+        epochs: Passes over the data.
+        batch_size: Samples a step, all processes together; all of them if there are fewer. Samples
+            that fill no batch are left out of their epoch.
+        lr: Highest learning rate.
+        weight_decay: Of weight matrices and convolutions; biases, norms, tokens have none.
+        betas: Of Adam.
+        decoupled_weight_decay: AdamW (Loshchilov and Hutter 2019); otherwise Adam with weight decay
+            as an L2 term in the gradient.
+        warmup: Share of the steps in which the rate rises linearly from 0.
+        max_warmup_steps: No more than so many.
+        final_lr: Rate at the end over `lr`, reached by a cosine; 1 keeps the rate constant.
+        max_grad_norm: Gradients are clipped to this norm; None: they are not.
+    """
+
+    epochs: int
+    batch_size: int
+    lr: float
+    weight_decay: float
+    betas: tuple[float, float] = (0.9, 0.999)
+    decoupled_weight_decay: bool = True
+    warmup: float = 0.1
+    max_warmup_steps: float = math.inf
+    final_lr: float = 0.0
+    max_grad_norm: float | None = None
+
+    def __post_init__(self) -> None:
+        """Raises UserError for settings that cannot train."""
+        if self.epochs < 1 or self.batch_size < 1:
+            raise UserError("training needs at least 1 epoch and a batch size of at least 1")
+        if not (math.isfinite(self.lr) and self.lr > 0 and self.weight_decay >= 0):
+            raise UserError("training needs a learning rate above 0 and weight decay of at least 0")
+
+    def build(self, module: nn.Module) -> torch.optim.Optimizer:
+        """The optimizer of a module's parameters."""
+        kind = torch.optim.AdamW if self.decoupled_weight_decay else torch.optim.Adam
+        return kind(parameter_groups(module, self.weight_decay), lr=self.lr, betas=self.betas)
+
+    def learning_rate(self, step: int, steps: int) -> float:
+        """The rate of a step (from 0) of so many."""
+        warmup = min(self.max_warmup_steps, int(self.warmup * steps))
+        if step < warmup:
+            return self.lr * (step + 1) / (warmup + 1)
+        cosine = (1 + math.cos(math.pi * (step - warmup) / max(steps - warmup, 1))) / 2
+        return self.lr * (self.final_lr + (1 - self.final_lr) * cosine)
+
+
+def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
+    """Weights of linear layers and convolutions decay; biases, norms and learned tokens do not."""
+    decayed, others = [], []
+    for name, parameter in module.named_parameters():
+        if not parameter.requires_grad:
+            continue
+        matrix = name.endswith("weight") and parameter.ndim > 1
+        (decayed if matrix else others).append(parameter)
+    return [
+        {"params": decayed, "weight_decay": weight_decay},
+        {"params": others, "weight_decay": 0.0},
+    ]
+
+
+def _nothing(*_: Any) -> None:
+    pass
+
+
+@dataclass(eq=False)
+class Training:
+    """What is trained, and how.
+
+    Attributes:
+        loss: Called with what `batch` returns; gives named scalars, of which "loss" is minimised.
+            Its parameters are what is trained, but for those that require no gradient.
+        n_samples: Samples of an epoch.
+        batch: Makes a batch of these samples on the CPU, drawing all that is random from the
+            generator.
+        optimizer: How weights are updated.
+        identity: JSON-able: data (a checksum) and settings. A run goes on only with the same.
+        evaluate: Called after every epoch; its metrics are kept beside the mean losses.
+        progress: The line printed of an epoch's metrics.
+        after_step: Called after every update of the weights.
+        after_epoch: Called with all metrics so far and the provenance before the checkpoint is
+            written; in every process, see `on_first_process`.
+        extra_state: What else must survive an interruption: objects with `state_dict` and
+            `load_state_dict`.
+    """
+
+    loss: nn.Module
+    n_samples: int
+    batch: Callable[[Int[Tensor, " b"], torch.Generator], dict[str, Any]]
+    optimizer: OptimizerConfig
+    identity: Mapping[str, Any]
+    evaluate: Callable[[], Metrics] = dict
+    progress: Callable[[Metrics], str] = str
+    after_step: Callable[[], None] = _nothing
+    after_epoch: Callable[[list[Metrics], dict[str, Any]], None] = _nothing
+    extra_state: dict[str, Any] = field(default_factory=dict)
+
+
+def fit(
+    training: Training, out_dir: Path, options: RunOptions, recipe: Mapping[str, Any]
+) -> tuple[list[Metrics], dict[str, Any]]:
+    """Trains; Ctrl-C keeps the finished epochs.
+
+    Writes `metrics.jsonl` (a line an epoch), TensorBoard's event files and `checkpoint.pt` (after
+    every epoch).
+
+    Args:
+        training: What is trained; its modules are moved to the device, and changed.
+        out_dir: A new run's folder, or with `options.resume` the one to go on with.
+        options: Seed, device, precision.
+        recipe: JSON-able provenance: command, commit, where the data come from and their checksum.
+
+    Returns:
+        The metrics of every epoch; the provenance to keep beside the weights.
+
+    Raises:
+        UserError: No such device, or a folder that does not fit `options.resume`.
+    """
+    checkpoint.check_run_folder(out_dir, options.resume)
+    accelerator = _accelerator(options)
+    config, size = training.optimizer, min(training.optimizer.batch_size, training.n_samples)
+    if size % accelerator.num_processes:
+        raise UserError(
+            f"batches of {size} cannot be shared by {accelerator.num_processes} processes: choose a "
+            "batch size that is a multiple"
+        )
+    for module in (training.loss, *training.extra_state.values()):
+        if isinstance(module, nn.Module):
+            module.to(accelerator.device)
+    optimizer = config.build(training.loss)
+    identity = {
+        **training.identity,
+        "n_samples": training.n_samples,
+        "seed": options.seed,
+        "precision": options.precision,
+    }
+    state = {"model": training.loss, "optimizer": optimizer, **training.extra_state}
+    history: list[Metrics] = []
+    provenance = {**recipe, "seed": options.seed, "precision": options.precision}
+    if options.resume:
+        history, provenance = checkpoint.load(out_dir, identity, state, provenance)
+    record = (
+        checkpoint.Record(out_dir, identity, provenance) if accelerator.is_main_process else None
+    )
+    model, optimizer = accelerator.prepare(training.loss, optimizer)
+    try:
+        with kept(lambda: _how_to_go_on(out_dir, len(history), config.epochs)):
+            for epoch in range(len(history), config.epochs):
+                losses = _train_epoch(training, accelerator, model, optimizer, options.seed, epoch)
+                training.loss.eval()
+                history.append({"epoch": epoch + 1, **losses, **training.evaluate()})
+                training.after_epoch(history, provenance)
+                if record:
+                    record.write(history, state)
+                    line = training.progress(history[-1])
+                    tqdm.write(f"epoch {epoch + 1}/{config.epochs}  {line}")
+                accelerator.wait_for_everyone()
+    finally:
+        if record:
+            record.close()
+    training.loss.eval()
+    return history, provenance
+
+
+def _train_epoch(
+    training: Training,
+    accelerator: Accelerator,
+    model: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    seed: int,
+    epoch: int,
+) -> Metrics:
+    """One pass over the data: the mean of each loss."""
+    config = training.optimizer
+    size = min(config.batch_size, training.n_samples)
+    rank, world = accelerator.process_index, accelerator.num_processes
+    generator, batches = epoch_batches(training.n_samples, size, seed, epoch)
+    if rank:
+        generator.manual_seed(generator.initial_seed() + rank * 2**32)
+    steps = config.epochs * len(batches)
+    model.train()
+    losses: list[dict[str, Tensor]] = []
+    name = f"epoch {epoch + 1}/{config.epochs}"
+    for i, rows in enumerate(
+        tqdm(batches, desc=name, leave=False, disable=None if not rank else True)
+    ):
+        for group in optimizer.param_groups:
+            group["lr"] = config.learning_rate(epoch * len(batches) + i, steps)
+        batch = send_to_device(training.batch(rows[rank::world], generator), accelerator.device)
+        terms = model(**batch)
+        optimizer.zero_grad()
+        accelerator.backward(terms["loss"])
+        if config.max_grad_norm is not None:
+            accelerator.clip_grad_norm_(model.parameters(), config.max_grad_norm)
+        optimizer.step()
+        training.after_step()
+        losses.append({name: term.detach() for name, term in terms.items()})
+    return _mean_over_steps(losses, accelerator)
+
+
+def _mean_over_steps(losses: list[dict[str, Tensor]], accelerator: Accelerator) -> Metrics:
+    """Mean of each term over all steps (absent ones count 0) and processes."""
+    means = {}
+    for name in {name: None for terms in losses for name in terms}:
+        values = torch.stack([terms[name].float() for terms in losses if name in terms])
+        values = cast(Tensor, accelerator.reduce(values, "mean"))
+        means[name] = sum(values.tolist()) / len(losses)
+    return means
+
+
+def _how_to_go_on(out_dir: Path, done: int, epochs: int) -> str:
+    if not done:
+        return f"no epoch was finished, nothing is kept in {out_dir}"
+    command = command_line()
+    if "--out" not in command:
+        command += f" --out {shlex.quote(str(out_dir))}"
+    if "--resume" not in command:
+        command += " --resume"
+    return f"kept {done} of {epochs} epochs in {out_dir}; go on with: {command}"
+
+
+def epoch_batches(
+    n_samples: int, batch_size: int, seed: int, epoch: int
+) -> tuple[torch.Generator, tuple[Int[Tensor, " b"], ...]]:
+    """An epoch's generator, and its batches of rows; rows that fill no batch are left out."""
+    generator = torch.Generator().manual_seed(seed * 1_000_003 + epoch)
+    order = torch.randperm(n_samples, generator=generator)
+    return generator, order[: n_samples // batch_size * batch_size].split(batch_size)
+
+
+def gather_batch(rows: Shaped[Tensor, "b ..."]) -> Shaped[Tensor, "n ..."]:
+    """The rows of all processes, with gradients, for losses that compare samples with each other."""
+    if not torch.distributed.is_initialized():
+        return rows
+    return torch.cat(list(all_gather(rows.contiguous())))
+
+
+def on_first_process(action: Callable[[], object]) -> None:
+    """Does something once, in the first of several processes, while the others wait."""
+    if is_first_process():
+        action()
+    if torch.distributed.is_initialized():
+        torch.distributed.barrier()
+
+
+def is_first_process() -> bool:
+    """Whether this is the only process, or the first of several."""
+    return not torch.distributed.is_initialized() or torch.distributed.get_rank() == 0
+
+
+def check_device(device: str) -> None:
+    """Raises UserError if there is no such device here."""
+    kind, _, index = device.partition(":")
+    if kind not in ("cpu", "cuda", "mps") or (index and not (kind == "cuda" and index.isdigit())):
+        raise UserError(f"unknown device '{device}': choose cpu, cuda, cuda:<number> or mps")
+    if kind == "cuda" and int(index or 0) >= torch.cuda.device_count():
+        raise UserError(f"there is no device {device} here: choose the device cpu")
+    if kind == "mps" and not torch.backends.mps.is_available():
+        raise UserError("there is no device mps here: choose the device cpu")
+
+
+def _accelerator(options: RunOptions) -> Accelerator:
+    check_device(options.device)
+    kind, _, index = options.device.partition(":")
+    if index:
+        torch.cuda.set_device(int(index))
+    # Accelerate keeps device and precision for the life of a process; two trainings may differ
+    AcceleratorState._reset_state(reset_partial_state=True)
+    return Accelerator(cpu=kind == "cpu", mixed_precision=options.precision)

@@ -1,0 +1,146 @@
+"""The one training loop: what decays, what is written, precision, and several processes."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from touchgoal.control.errors import UserError
+from touchgoal.encoders.backbones.vit import ViT, ViTConfig
+from touchgoal.encoders.ssl.mae import MaeConfig, MaskedAutoencoder
+from touchgoal.encoders.training.trainer import (
+    OptimizerConfig,
+    RunOptions,
+    Training,
+    check_device,
+    fit,
+    parameter_groups,
+)
+
+OPTIMIZER = OptimizerConfig(epochs=2, batch_size=4, lr=1e-2, weight_decay=0.0)
+
+
+class Line(nn.Module):
+    """Fits a line."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Linear(3, 1)
+
+    def forward(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {"loss": (self.linear(x)[:, 0] - x.sum(1)).square().mean()}
+
+
+def line() -> Training:
+    torch.manual_seed(0)
+    data = torch.randn(8, 3)
+    return Training(
+        loss=Line(),
+        n_samples=8,
+        batch=lambda rows, generator: {"x": data[rows]},
+        optimizer=OPTIMIZER,
+        identity={"data": "line"},
+    )
+
+
+def test_biases_norms_and_tokens_do_not_decay() -> None:
+    for module, kept in (
+        (ViT(ViTConfig(width=16, depth=1, heads=2, class_token=True)), "class_token"),
+        (MaskedAutoencoder(MaeConfig(vit="tiny", bottleneck=False), "gelsight_mini"), "mask_token"),
+    ):
+        names = {id(parameter): name for name, parameter in module.named_parameters()}
+        decayed, others = parameter_groups(module, 0.05)
+        assert decayed["weight_decay"] == 0.05 and others["weight_decay"] == 0.0
+        for group, matrices in ((decayed, True), (others, False)):
+            for parameter in group["params"]:
+                name = names.pop(id(parameter))
+                layer = module.get_submodule(name.rpartition(".")[0])
+                assert isinstance(layer, nn.Linear | nn.Conv2d) >= matrices, name
+                assert name.endswith("weight") or not matrices, name
+        assert not names, "every parameter is in one group"
+        assert any(p is getattr(module, kept) for p in others["params"])
+
+
+def test_tensorboard_lies_beside_the_metrics_and_resuming_is_recorded(tmp_path: Path) -> None:
+    fit(line(), tmp_path, RunOptions(), {"command": "train"})
+    assert (tmp_path / "metrics.jsonl").read_text().count("\n") == 2
+    (events,) = tmp_path.glob("events.out.tfevents.*")
+    assert b"loss" in events.read_bytes()
+    go_on = RunOptions(resume=True)
+    fit(line(), tmp_path, go_on, {"command": "go on"})
+    history, provenance = fit(line(), tmp_path, go_on, {"command": "go on"})
+    assert len(history) == 2 and provenance["command"] == "train"
+    assert [resumed["command"] for resumed in provenance["resumed"]] == ["go on"]
+
+
+def test_bfloat16_computes_in_it_and_keeps_float32(tmp_path: Path) -> None:
+    training, seen = line(), []
+    assert isinstance(training.loss, Line)
+    training.loss.linear.register_forward_hook(lambda *args: seen.append(args[2].dtype))
+    fit(training, tmp_path, RunOptions(precision="bf16"), {})
+    assert set(seen) == {torch.bfloat16}
+    assert {p.dtype for p in training.loss.parameters()} == {torch.float32}
+    with pytest.raises(UserError, match="precision was bf16, is no"):
+        fit(line(), tmp_path, RunOptions(resume=True), {})
+
+
+def test_devices_that_are_not_there_are_refused() -> None:
+    check_device("cpu")
+    for device, message in (("tpu", "unknown device 'tpu'"), ("cuda:77", "no device cuda:77")):
+        with pytest.raises(UserError, match=message):
+            check_device(device)
+
+
+WORKER = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+import torch
+sys.path.insert(0, {tests!r})
+import test_align, test_mae, toy_policies
+from touchgoal.encoders.alignment.data import Augmentation
+from touchgoal.encoders.ssl.mae import train_mae
+from touchgoal.encoders.training.trainer import OptimizerConfig, RunOptions
+from touchgoal.policies.training.train import TrainConfig, train
+
+# plain gradient descent: Adam would not show gradients that are twice too large
+OptimizerConfig.build = lambda self, module: torch.optim.SGD(module.parameters(), self.lr)
+out = Path(sys.argv[1])
+config = replace(test_mae.TOY, mask_ratio=0.0, epochs=2, lr=0.1)
+data = test_mae.blobs(32, 0)
+train_mae(data, data, config, out / "mae", RunOptions(), {{}})
+names = {{name: texts[:1] for name, texts in test_align.DESCRIPTIONS.items()}}
+touches = replace(test_align.TRAIN, descriptions=names)
+config = replace(test_align.CONFIG, lr=0.1, mask_ratio=0.0, augmentation=Augmentation(), no_contact_texts=("free",))
+test_align.run_align(touches, test_align.VAL, test_align.FakeTowers(), config, out / "align", {{}})
+windows, config = toy_policies.toy_dataset(toy_policies.TOY), TrainConfig(epochs=2, batch_size=8)
+train(toy_policies.TOY, windows, windows, config, out / "policy", RunOptions(), {{}})
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_train_as_one(tmp_path: Path) -> None:
+    """The same batches, shared: gradients, and so the weights, are those of one process.
+
+    A policy's loss draws noise, each process its own, so it is only seen to run.
+    """
+    script, tests = tmp_path / "worker.py", Path(__file__).parent
+    script.write_text(WORKER.format(tests=str(tests)))
+    weights = {}
+    for n in (1, 2):
+        torchrun = "-m torch.distributed.run --standalone --nproc-per-node".split()
+        command = [sys.executable, *torchrun, str(n), str(script), str(tmp_path / str(n))]
+        done = subprocess.run(
+            command, env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True
+        )
+        assert done.returncode == 0, done.stderr.decode()[-3000:]
+        for name in ("mae", "align"):
+            path = tmp_path / str(n) / name / "checkpoint.pt"
+            weights[name, n] = torch.load(path, weights_only=True)["model"]
+    for name in ("mae", "align"):
+        for key, weight in weights[name, 1].items():
+            torch.testing.assert_close(weights[name, 2][key], weight, rtol=1e-3, atol=1e-5, msg=key)
