@@ -217,7 +217,7 @@ def test_learning_to_pick_and_place(
     assert "are both" in same or "also in" in same
     other = refused(capsys, "train-policy", "--task", "bead-maze", *both, "--out", "policy")
     assert "is of pick-place, not of bead-maze" in other and not Path("policy").exists()
-    run("train-policy", *both, *one, "--estimator", "est/estimator", "--head",
+    run("train-policy", "--task", "pick-place", *both, *one, "--estimator", "est/estimator", "--head",
         "regression", "--representation", "base_twist", "--train.epochs", 1, "--trials", 1,
         "--env.max-seconds", 0.5, "--out", "policy")  # fmt: skip
     capsys.readouterr()
