@@ -47,7 +47,7 @@ def open_run(out: Path | None, command: str, config: Any, adds: bool = False) ->
     Raises:
         UserError: the folder holds results of another run, or cannot be written to.
     """
-    folder = out or Path("runs") / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{command}"
+    folder = out or _dated_folder(command)
     check_writable(folder)
     record = {
         "name": command,
@@ -62,6 +62,16 @@ def open_run(out: Path | None, command: str, config: Any, adds: bool = False) ->
     folder.mkdir(parents=True, exist_ok=True)
     name = RECORD if not records else f"config_{len(records) + 1}.json"
     write_json(folder / name, record)
+    return folder
+
+
+def _dated_folder(command: str) -> Path:
+    """A folder of `runs/` that is not there yet: two runs may begin in the same second."""
+    dated = Path("runs") / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{command}"
+    folder, number = dated, 1
+    while folder.exists():
+        number += 1
+        folder = dated.with_name(f"{dated.name}_{number}")
     return folder
 
 
