@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.option_types import Count, CountOrNone, checked_dataclass
+from touchgoal.control.progress import track
 from touchgoal.encoders.alignment.align import PRESETS, AlignConfig, align
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.ssl.frames import check_sensor, sample_frames
@@ -132,7 +132,7 @@ def _align(config: Align, sensor: str, data: EpisodeSet, validation: EpisodeSet)
     chosen = [i for i in range(len(data)) if data.meta(i).get("success", True)]
     embedded = [
         embedder.embed_episode(data.read(i), data.fps, f"{data.root}#{i}", True)
-        for i in tqdm(chosen[: config.scale_episodes], desc="scale", unit="episode")
+        for i in track(chosen[: config.scale_episodes], "scale", "episode")
     ]
     scale = fit_normalizer(embedded, ("image", "tactile", "text"), scene_of(data.features))
     scale.save(out / "encoder" / "scale.json")

@@ -7,10 +7,10 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float16, Int
 from torch import Tensor
-from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.option_types import CountOrNone, NotNegative, checked_dataclass
+from touchgoal.control.progress import track
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.towers.towers import BATCH, Towers
 from touchgoal.episodes.touches import Touches
@@ -132,14 +132,14 @@ def _sentences(
 def _preprocess(touches: Touches, rows: np.ndarray, sensor: str) -> Float16[Tensor, "n 3 h w"]:
     preprocess = preprocessor_for(sensor)
     out = torch.empty(len(rows), 3, *preprocess.size, dtype=torch.float16)
-    for i, row in enumerate(tqdm(rows, desc="preprocess", unit="touch", leave=False)):
+    for i, row in enumerate(track(rows, "preprocess", "touch", len(rows))):
         background = touches.background[touches.background_index[row]]
         out[i] = torch.from_numpy(preprocess(touches.frames[row : row + 1], background)[0])
     return out
 
 
 def _embed_views(views: np.ndarray, towers: Towers) -> Float[Tensor, "e i"]:
-    starts = tqdm(range(0, len(views), BATCH), desc="embed views", unit="batch", leave=False)
+    starts = track(range(0, len(views), BATCH), "embed views", "batch")
     return torch.cat([towers.embed_images(views[i : i + BATCH]) for i in starts])
 
 

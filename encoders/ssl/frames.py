@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float16
 from torch import Tensor
-from tqdm import tqdm
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import TACTILE, TRUTH_PAD_WRENCH
+from touchgoal.control.progress import track
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.episodes.store import EpisodeSet
 
@@ -53,7 +53,7 @@ def sample_frames(episodes: EpisodeSet, sensor: str, per_episode: int, seed: int
     preprocess = preprocessor_for(sensor)
     truth = [TRUTH_PAD_WRENCH] if TRUTH_PAD_WRENCH in episodes.features else []
     touch, wrench = [], []
-    for i in tqdm(range(len(episodes)), desc="touches", unit="episode"):
+    for i in track(range(len(episodes)), "touches", "episode"):
         check_sensor(episodes, i, sensor)
         rng = np.random.default_rng([seed, i])
         ticks = np.sort(rng.permutation(episodes.lengths[i])[:per_episode]).tolist()
