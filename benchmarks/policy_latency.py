@@ -18,8 +18,8 @@ from touchgoal.control import features as ft
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.policies import checkpoint
 from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy
+from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.diffusion import Diffusion, DiffusionConfig
-from touchgoal.policies.heads.samplers import SamplerConfig
 from touchgoal.policies.heads.unet import PRESETS
 from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.policy import PolicyConfig

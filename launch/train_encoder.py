@@ -8,10 +8,11 @@ import tyro
 from touchgoal.control.errors import UserError
 from touchgoal.control.option_types import Count, CountOrNone, checked_dataclass
 from touchgoal.control.progress import track
-from touchgoal.encoders.alignment.align import PRESETS, AlignConfig, align
+from touchgoal.encoders.alignment.align import align
+from touchgoal.encoders.config import ALIGN_PRESETS, AlignConfig, MaeConfig
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.ssl.frames import check_sensor, sample_frames
-from touchgoal.encoders.ssl.mae import MaeConfig, train_mae
+from touchgoal.encoders.ssl.mae import train_mae
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.training.trainer import is_first_process
 from touchgoal.episodes.store import EpisodeSet
@@ -48,7 +49,7 @@ class Align(TrainingOptions):
     scale_episodes: Count = 40
     """Successful training episodes whose distances to their goals fix what counts as far and as near
     in reward curves (encoder/scale.json)."""
-    align: AlignConfig = PRESETS["default"]
+    align: AlignConfig = ALIGN_PRESETS["default"]
     """The training."""
 
 
@@ -56,7 +57,7 @@ class Align(TrainingOptions):
 class AlignPaper(Align):
     """The same with the training of the MMWand paper: ViT-H, 100 epochs, temperature 0.2, lambda 1."""
 
-    align: AlignConfig = PRESETS["paper"]
+    align: AlignConfig = ALIGN_PRESETS["paper"]
     """The training."""
 
 

@@ -20,16 +20,15 @@ from touchgoal.launch.training_run import (
     open_training,
     recipe,
 )
+from touchgoal.policies.config import EstimatorTrainConfig, PoseEstimatorConfig
 from touchgoal.policies.perception.frozen_touch import load_touch
 from touchgoal.policies.perception.placements import render_placements
-from touchgoal.policies.perception.pose_estimator import PoseEstimatorConfig
 from touchgoal.policies.perception.state_estimation import (
     StateEstimatorConfig,
     StateEstimatorNetwork,
     save_estimator,
 )
 from touchgoal.policies.perception.training import (
-    EstimatorTrainConfig,
     contact_error_rate,
     embed_touch_and_contact,
     pose_errors,

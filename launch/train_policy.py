@@ -3,7 +3,6 @@
 import os
 from dataclasses import field, replace
 from pathlib import Path
-from typing import Literal
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
@@ -20,19 +19,24 @@ from touchgoal.launch.training_run import (
     recipe,
 )
 from touchgoal.policies import checkpoint
-from touchgoal.policies.actions import ActionRepresentation
 from touchgoal.policies.checkpoint import SavedPolicy
+from touchgoal.policies.config import (
+    ActionRepresentation,
+    Head,
+    SamplerConfig,
+    TouchReading,
+    TrainConfig,
+)
 from touchgoal.policies.evaluation.evaluate import Evaluation, run_trials, trial_specs
 from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
-from touchgoal.policies.heads.samplers import SamplerConfig
 from touchgoal.policies.heads.unet import PRESETS
 from touchgoal.policies.perception.end_to_end import EndToEndConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
 from touchgoal.policies.perception.state_estimation import ESTIMATED, load_estimator
-from touchgoal.policies.policy import PolicyConfig, TouchReading
+from touchgoal.policies.policy import PolicyConfig
 from touchgoal.policies.training.model_selection import Score, add_parts, select
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
-from touchgoal.policies.training.train import POLICY, TrainConfig, train
+from touchgoal.policies.training.train import POLICY, train
 from touchgoal.policies.training.training_data import (
     check_apart,
     choose_episodes,
@@ -42,7 +46,6 @@ from touchgoal.policies.training.training_data import (
 from touchgoal.sim_envs.config import TASKS, BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 from touchgoal.sim_envs.tasks import task_name
 
-Head = Literal["small", "published", "tiny", "regression"]
 _COLUMNS = ft.STATE, ft.TCP_POSE
 _TRIALS = 2_000_000  # seed of the first trial
 

@@ -10,10 +10,12 @@ from dataclasses import field
 
 from touchgoal.control.option_types import checked_dataclass
 from touchgoal.launch import train_policy
-from touchgoal.policies.actions import ActionRepresentation
-from touchgoal.policies.heads.samplers import SamplerConfig
-from touchgoal.policies.policy import TouchReading
-from touchgoal.policies.training.train import TrainConfig
+from touchgoal.policies.config import (
+    ActionRepresentation,
+    SamplerConfig,
+    TouchReading,
+    TrainConfig,
+)
 
 
 @checked_dataclass

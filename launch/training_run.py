@@ -7,8 +7,9 @@ from typing import Any
 from touchgoal.control.errors import UserError
 from touchgoal.control.option_types import Seed, checked_dataclass
 from touchgoal.control.provenance import provenance
+from touchgoal.encoders.config import Precision, RunOptions
 from touchgoal.encoders.training.checkpoint import check_run_folder
-from touchgoal.encoders.training.trainer import Precision, RunOptions, check_device
+from touchgoal.encoders.training.trainer import check_device
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.run_folder import open_run
 

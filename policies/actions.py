@@ -5,7 +5,6 @@ An action (8,) is the joint change (7) of one tick, rad, and the gripper width t
 """
 
 from functools import cache
-from typing import Literal
 
 import numpy as np
 import torch
@@ -15,14 +14,9 @@ from torch import Tensor, nn
 
 from touchgoal.control.features import N_JOINTS
 from touchgoal.control.motion.kinematics import DAMPING, Fr3Kinematics
+from touchgoal.policies.config import ActionRepresentation
 
 ACTION_DIM = N_JOINTS + 1
-ActionRepresentation = Literal["delta", "chunk", "absolute", "base_twist", "body_twist"]
-"""Of the joints: each tick's change; the change since the chunk's start; the joint positions that
-these changes lead to from the measured ones; the hand's displacement and turn since the chunk's start
-(m, rad, base frame, to first order) with the third joint's change for the elbow, which is nearly the
-same wherever on the table the hand does the same; the hand's displacement and turn along its own axes,
-the elbow going where the joints move least. The gripper's width is a target in all five."""
 
 _MIN_RANGE = 1e-6  # in SI units: smaller than anything that a policy should learn to vary
 

@@ -23,8 +23,8 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.policies.acting import Observation, Planner, PolicyActor
+from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
-from touchgoal.policies.heads.samplers import SamplerConfig
 from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch

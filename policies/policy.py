@@ -1,7 +1,6 @@
 """The policy: from what both fingertips and the arm have felt to the actions of the next ticks."""
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -10,13 +9,8 @@ from torch import Tensor, nn
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.policies.actions import (
-    ACTION_DIM,
-    ActionRepresentation,
-    Normalizer,
-    to_actions,
-    to_representation,
-)
+from touchgoal.policies.actions import ACTION_DIM, Normalizer, to_actions, to_representation
+from touchgoal.policies.config import ActionRepresentation, TouchReading
 from touchgoal.policies.heads.diffusion import (
     Diffusion,
     DiffusionConfig,
@@ -26,7 +20,6 @@ from touchgoal.policies.heads.diffusion import (
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEncoder
 from touchgoal.policies.perception.proprioception import input_widths, is_position, network_input
 
-TouchReading = Literal["wrench", "free"]
 WRENCH_DIM = ft.FEATURES[ft.TRUTH_PAD_WRENCH].shape[0]
 _CLIP = 5.0  # standard deviations beyond which an input is as surprising as it gets
 

@@ -13,16 +13,10 @@ import torch.nn.functional as F
 from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment import align as align_module
-from touchgoal.encoders.alignment.align import (
-    PRESETS,
-    AlignConfig,
-    AlignedBatch,
-    align,
-    batch_losses,
-)
+from touchgoal.encoders.alignment.align import AlignedBatch, align, batch_losses
 from touchgoal.encoders.alignment.data import (
-    Augmentation,
     TouchData,
+    augment,
     prepare_touch_data,
     split_by_episode,
 )
@@ -33,7 +27,7 @@ from touchgoal.encoders.alignment.retrieval import (
 )
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS as PRESETS_VIT
-from touchgoal.encoders.training.trainer import RunOptions
+from touchgoal.encoders.config import ALIGN_PRESETS, AlignConfig, Augmentation, RunOptions
 from touchgoal.episodes.touches import Touches
 
 DESCRIPTIONS = {
@@ -166,10 +160,10 @@ def test_augmentation() -> None:
     touch = torch.randn(6, 3, 20, 30, generator=torch.Generator().manual_seed(0))
 
     def changed(augmentation: Augmentation, seed: int = 1) -> torch.Tensor:
-        return augmentation(touch, torch.Generator().manual_seed(seed))
+        return augment(touch, augmentation, torch.Generator().manual_seed(seed))
 
     assert torch.equal(changed(Augmentation()), touch)
-    everything = PRESETS["default"].augmentation
+    everything = ALIGN_PRESETS["default"].augmentation
     assert torch.equal(changed(everything), changed(everything))
     assert not torch.equal(changed(everything), changed(everything, seed=2))
     shifted = changed(Augmentation(shift=4))
@@ -218,7 +212,7 @@ def test_loss_is_the_weighted_sum() -> None:
 def test_paper_preset_is_equation_2() -> None:
     batch = random_batch()
     c = batch.contact
-    paper = batch_losses(batch, True, PRESETS["paper"])
+    paper = batch_losses(batch, True, ALIGN_PRESETS["paper"])
     image = (batch.touch[c] @ batch.image[c].T / 0.2).log_softmax(1).diagonal().mean()
     text = (batch.touch @ batch.text.T / 0.2).log_softmax(1).diagonal().mean()
     torch.testing.assert_close(paper["loss"], -image - text)
@@ -297,7 +291,7 @@ def test_killed_and_resumed_is_bit_identical(
 
 
 def test_paper_preset_runs_with_towers_pretrained_together(tmp_path: Path) -> None:
-    paper = replace(PRESETS["paper"], vit="tiny", epochs=1, batch_size=8)
+    paper = replace(ALIGN_PRESETS["paper"], vit="tiny", epochs=1, batch_size=8)
     encoder = run_align(TRAIN, VAL, FakeTowers(pretrained_together=True), paper, tmp_path, {})
     assert encoder.config.embedding_dim == 26 and encoder.image_head is None
     (line,) = (tmp_path / "metrics.jsonl").read_text().splitlines()

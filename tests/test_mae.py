@@ -10,11 +10,11 @@ import torch
 from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.vit import random_masking
+from touchgoal.encoders.config import MaeConfig, RunOptions
 from touchgoal.encoders.probes.ridge import ridge_r2
 from touchgoal.encoders.ssl.frames import TouchFrames
-from touchgoal.encoders.ssl.mae import MaeConfig, MaskedAutoencoder, patchify, train_mae
+from touchgoal.encoders.ssl.mae import MaskedAutoencoder, patchify, train_mae
 from touchgoal.encoders.training import trainer
-from touchgoal.encoders.training.trainer import RunOptions
 
 SENSOR = "gelsight_mini_markers"
 TOY = MaeConfig(vit="tiny", decoder_width=16, decoder_depth=1, epochs=3, batch_size=16, lr=3e-3)

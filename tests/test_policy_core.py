@@ -25,23 +25,19 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import FR3_ARM
 from touchgoal.control.motion.kinematics import Fr3Kinematics
-from touchgoal.encoders.training.trainer import RunOptions
+from touchgoal.encoders.config import RunOptions
 from touchgoal.episodes.repair import validate
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies import checkpoint
-from touchgoal.policies.actions import (
-    ActionRepresentation,
-    Normalizer,
-    to_actions,
-    to_representation,
-)
+from touchgoal.policies.actions import Normalizer, to_actions, to_representation
+from touchgoal.policies.config import ActionRepresentation, TrainConfig
 from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.perception.proprioception import network_input
 from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
 from touchgoal.policies.training import train as train_module
 from touchgoal.policies.training.sequence_dataset import load_recordings
-from touchgoal.policies.training.train import TrainConfig, ema_decay, train
+from touchgoal.policies.training.train import ema_decay, train
 
 import mujoco  # isort: skip - after touchgoal, which chooses the OpenGL platform
 

@@ -7,9 +7,9 @@ import torch
 from toy_policies import torch_rng
 
 from touchgoal.control.errors import UserError
+from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.samplers import (
     FLOW_TIME_SCALE,
-    SamplerConfig,
     add_noise,
     alphas_cumprod,
     denoise,

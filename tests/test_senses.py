@@ -17,11 +17,11 @@ from toy_policies import (
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.encoders.training.trainer import RunOptions
+from touchgoal.encoders.config import RunOptions
 from touchgoal.policies.acting import Planner
 from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy
+from touchgoal.policies.config import EstimatorTrainConfig, PoseEstimatorConfig
 from touchgoal.policies.perception.placements import Placements
-from touchgoal.policies.perception.pose_estimator import PoseEstimatorConfig
 from touchgoal.policies.perception.proprioception import network_input
 from touchgoal.policies.perception.state_estimation import (
     ESTIMATED,
@@ -32,7 +32,6 @@ from touchgoal.policies.perception.state_estimation import (
     save_estimator,
 )
 from touchgoal.policies.perception.training import (
-    EstimatorTrainConfig,
     pose_errors,
     train_contact_estimator,
     train_pose_estimator,

@@ -11,10 +11,10 @@ from torch import nn
 
 from touchgoal.control.errors import UserError
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
-from touchgoal.encoders.ssl.mae import MaeConfig, MaskedAutoencoder
+from touchgoal.encoders.config import MaeConfig, RunOptions
+from touchgoal.encoders.ssl.mae import MaskedAutoencoder
 from touchgoal.encoders.training.trainer import (
     OptimizerConfig,
-    RunOptions,
     Training,
     check_device,
     fit,
@@ -102,10 +102,11 @@ from pathlib import Path
 import torch
 sys.path.insert(0, {tests!r})
 import test_align, test_mae, toy_policies
-from touchgoal.encoders.alignment.data import Augmentation
+from touchgoal.encoders.config import Augmentation, RunOptions
 from touchgoal.encoders.ssl.mae import train_mae
-from touchgoal.encoders.training.trainer import OptimizerConfig, RunOptions
-from touchgoal.policies.training.train import TrainConfig, train
+from touchgoal.encoders.training.trainer import OptimizerConfig
+from touchgoal.policies.config import TrainConfig
+from touchgoal.policies.training.train import train
 
 # plain gradient descent: Adam would not show gradients that are twice too large
 OptimizerConfig.build = lambda self, module: torch.optim.SGD(module.parameters(), self.lr)

@@ -6,8 +6,8 @@ import torch
 from touchgoal.control import features as ft
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS as VITS
+from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.diffusion import DiffusionConfig
-from touchgoal.policies.heads.samplers import SamplerConfig
 from touchgoal.policies.heads.unet import PRESETS
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.policy import WRENCH_DIM, Policy, PolicyConfig

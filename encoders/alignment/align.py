@@ -2,28 +2,20 @@
 
 import copy
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from accelerate.utils import send_to_device
 from jaxtyping import Bool, Float, Int
-from pydantic import Field
 from torch import Tensor, nn
 
-from touchgoal.control.option_types import (
-    Count,
-    Fraction,
-    NotNegative,
-    Positive,
-    checked_dataclass,
-)
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.data import (
-    Augmentation,
     TouchData,
+    augment,
     prepare_touch_data,
     split_by_episode,
 )
@@ -31,12 +23,12 @@ from touchgoal.encoders.alignment.infonce import info_nce, loss_floor, symmetric
 from touchgoal.encoders.alignment.retrieval import evaluate_retrieval
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS as VIT_PRESETS
-from touchgoal.encoders.backbones.vit import MaskRatio, random_masking
+from touchgoal.encoders.backbones.vit import random_masking
+from touchgoal.encoders.config import AlignConfig, RunOptions
 from touchgoal.encoders.towers.towers import Towers
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.trainer import (
     OptimizerConfig,
-    RunOptions,
     Training,
     fit,
     gather_batch,
@@ -45,81 +37,6 @@ from touchgoal.encoders.training.trainer import (
 from touchgoal.episodes.touches import Touches
 
 _ENCODER = "encoder"
-
-
-@checked_dataclass
-class AlignConfig:
-    """How to train a touch encoder."""
-
-    vit: Literal["tiny", "small", "huge"] = "small"
-    """Size of the touch backbone: "tiny", "small" or "huge"."""
-    embedding_dim: Count = 256
-    """Width of the shared space, when heads are trained into one."""
-    epochs: Count = 10
-    """Passes over the touches."""
-    batch_size: Annotated[int, Field(ge=2)] = 128
-    """Touches a step; all of them if there are fewer."""
-    optimizer: Literal["adam", "adamw"] = "adamw"
-    """"adam" (weight decay as L2 in the gradient) or "adamw" (decoupled)."""
-    lr: Positive = 1e-3
-    """Highest learning rate."""
-    weight_decay: NotNegative = 0.05
-    """Of weight matrices and convolutions."""
-    warmup: Fraction = 0.1
-    """Share of the steps in which the rate rises from 0."""
-    final_lr: Fraction = 0.01
-    """Rate at the end over `lr`, reached by a cosine; 1 keeps it constant."""
-    temperature: Positive = 0.1
-    """Fixed, of every term."""
-    text_weight: NotNegative = 1.0
-    """Of touch-text against touch-image, the paper's lambda."""
-    image_text_weight: NotNegative = 1.0
-    """Of image-text; only for towers not pretrained together, as it trains nothing but their
-    heads."""
-    symmetric: bool = True
-    """Both directions of each term; otherwise touch picks images and texts."""
-    multi_positive: bool = True
-    """Everything of the same object (or with the same sentence) is right; otherwise only the
-    partner is."""
-    no_contact_texts: tuple[str, ...] = (
-        "nothing touches the sensor",
-        "an untouched gel, no contact",
-        "the fingertip feels nothing",
-        "free in the air, touching no object",
-    )
-    """Said of touches without contact; if empty these are left out."""
-    mask_ratio: MaskRatio = 0.5
-    """Share of the patches of each touch that are left out in training. Half of them costs half
-    and does not harm (FLIP, Li et al. 2023)."""
-    augmentation: Augmentation = field(
-        default_factory=lambda: Augmentation(shift=8, gain=0.2, offset=0.1, noise=0.03)
-    )
-    """Random changes of the touches."""
-
-
-PRESETS: dict[str, AlignConfig] = {
-    # 10,000 touches in about 15 minutes on two CPU cores
-    "default": AlignConfig(),
-    # Section V of the paper. What it leaves open is plain here: a constant learning rate, no
-    # augmentation, no touches without contact. Meant for CLIP towers and a large GPU.
-    "paper": AlignConfig(
-        vit="huge",
-        epochs=100,
-        batch_size=64,
-        optimizer="adam",
-        lr=1e-4,
-        weight_decay=0.05,
-        warmup=0.0,
-        final_lr=1.0,
-        temperature=0.2,
-        text_weight=1.0,
-        symmetric=False,
-        multi_positive=False,
-        no_contact_texts=(),
-        mask_ratio=0.0,
-        augmentation=Augmentation(),
-    ),
-}
 
 
 def align(
@@ -251,7 +168,7 @@ def make_batch(
 ) -> dict[str, Tensor | None]:
     """What `AlignmentLoss` is called with: changed and masked touches beside their partners."""
     sentence = data.draw_sentences(rows, generator)
-    touch, ids_keep = config.augmentation(data.touch[rows].float(), generator), None
+    touch, ids_keep = augment(data.touch[rows].float(), config.augmentation, generator), None
     if config.mask_ratio > 0:
         vit = VIT_PRESETS[config.vit]
         ids_keep = random_masking(vit, len(rows), config.mask_ratio, generator)

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Float16, Int
 from torch import Tensor
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.option_types import CountOrNone, NotNegative, checked_dataclass
 from touchgoal.control.progress import track
+from touchgoal.encoders.config import Augmentation
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.towers.towers import BATCH, Towers
 from touchgoal.episodes.touches import Touches
@@ -143,41 +143,29 @@ def _embed_views(views: np.ndarray, towers: Towers) -> Float[Tensor, "e i"]:
     return torch.cat([towers.embed_images(views[i : i + BATCH]) for i in starts])
 
 
-@checked_dataclass
-class Augmentation:
-    """Random changes of a preprocessed touch that leave alone what is felt.
+def augment(
+    touch: Float[Tensor, "b 3 h w"], by: Augmentation, generator: torch.Generator
+) -> Float[Tensor, "b 3 h w"]:
+    """Randomly changed copies of preprocessed touches."""
+    touch = _shifted(touch, by.shift, generator) if by.shift else touch
+    gain = 1 + by.gain * _uniform((len(touch), 3, 1, 1), generator)
+    offset = by.offset * _uniform((len(touch), 3, 1, 1), generator)
+    touch = touch * gain + offset
+    if by.noise:
+        touch = touch + by.noise * torch.randn(touch.shape, generator=generator)
+    return touch
 
-    No flips and no rotations: every colour of the LEDs comes from its own side, so a mirrored
-    GelSight image shows a relief (a dent for a bump) that no contact makes."""
 
-    shift: CountOrNone = 0
-    """Largest displacement in pixels, up, down and sideways; zeros come in."""
-    gain: NotNegative = 0.0
-    """Largest relative change of the contrast, per colour."""
-    offset: NotNegative = 0.0
-    """Largest change of the brightness, per colour, in the preprocessor's units."""
-    noise: NotNegative = 0.0
-    """Standard deviation of the noise of a pixel, in the preprocessor's units."""
-
-    def __call__(
-        self, touch: Float[Tensor, "b 3 h w"], generator: torch.Generator
-    ) -> Float[Tensor, "b 3 h w"]:
-        """A changed copy."""
-        touch = self._shifted(touch, generator) if self.shift else touch
-        gain = 1 + self.gain * _uniform((len(touch), 3, 1, 1), generator)
-        offset = self.offset * _uniform((len(touch), 3, 1, 1), generator)
-        touch = touch * gain + offset
-        if self.noise:
-            touch = touch + self.noise * torch.randn(touch.shape, generator=generator)
-        return touch
-
-    def _shifted(self, touch: Tensor, generator: torch.Generator) -> Tensor:
-        s, (h, w) = self.shift, touch.shape[2:]
-        moves = torch.randint(0, 2 * s + 1, (len(touch), 2), generator=generator).tolist()
-        padded = F.pad(touch, (s, s, s, s))
-        return torch.stack(
-            [image[:, y : y + h, x : x + w] for image, (y, x) in zip(padded, moves, strict=True)]
-        )
+def _shifted(touch: Tensor, most: int, generator: torch.Generator) -> Tensor:
+    height, width = touch.shape[2:]
+    moves = torch.randint(0, 2 * most + 1, (len(touch), 2), generator=generator).tolist()
+    padded = F.pad(touch, (most,) * 4)
+    return torch.stack(
+        [
+            image[:, y : y + height, x : x + width]
+            for image, (y, x) in zip(padded, moves, strict=True)
+        ]
+    )
 
 
 def _uniform(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:

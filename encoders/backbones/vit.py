@@ -2,18 +2,13 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
-from pydantic import Field
 from torch import Tensor, nn
 
 from touchgoal.control.errors import UserError
-
-MaskRatio = Annotated[float, Field(ge=0, lt=1)]
-"""Share of the patches that are left out."""
 
 
 @dataclass(frozen=True)

@@ -2,65 +2,31 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.option_types import Count, NotNegative, Positive, checked_dataclass
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.touch_backbone import BATCH, TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS as VIT_PRESETS
 from touchgoal.encoders.backbones.vit import (
     Block,
-    MaskRatio,
     ViTConfig,
     patch_grid,
     random_masking,
     sinusoidal_positions,
 )
+from touchgoal.encoders.config import MaeConfig, RunOptions
 from touchgoal.encoders.probes.ridge import ridge_r2
 from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.training.checkpoint import checksum
-from touchgoal.encoders.training.trainer import (
-    OptimizerConfig,
-    RunOptions,
-    Training,
-    fit,
-    on_first_process,
-)
+from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
 
 _ENCODER = "encoder"
 _PROBE_SAMPLES = 2048
-
-
-@checked_dataclass
-class MaeConfig:
-    """How to train a backbone by masked autoencoding."""
-
-    vit: Literal["tiny", "compact", "small"] = "compact"
-    """Size of the backbone."""
-    mask_ratio: MaskRatio = 0.5
-    """Share of the patches that the backbone does not see."""
-    bottleneck: bool = True
-    """The decoder sees the mean of the backbone's tokens and nothing else, so that this mean,
-    which is the embedding, holds all that is needed to reconstruct the picture. Otherwise it sees
-    the tokens, as published."""
-    decoder_width: Count = 96
-    """Size of the decoder's tokens."""
-    decoder_depth: Count = 2
-    """Its blocks."""
-    epochs: Count = 30
-    """Passes over the touches."""
-    batch_size: Count = 128
-    """Touches a step; all of them if there are fewer."""
-    lr: Positive = 1e-3
-    """Highest learning rate, of AdamW; reached from 0 in a tenth of the training, left by a cosine
-    to 0."""
-    weight_decay: NotNegative = 0.05
-    """Of weight matrices and convolutions."""
 
 
 class MaskedAutoencoder(nn.Module):

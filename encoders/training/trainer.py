@@ -13,7 +13,7 @@ import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import torch
 from accelerate import Accelerator
@@ -27,29 +27,11 @@ from tqdm import tqdm
 from touchgoal.control.errors import UserError
 from touchgoal.control.interruption import kept
 from touchgoal.control.provenance import command_line
+from touchgoal.encoders.config import RunOptions
 from touchgoal.encoders.training import checkpoint
 
-Precision = Literal["no", "bf16"]
 Metrics = dict[str, Any]
 """Numbers by name; None where one is undefined."""
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """What every training command lets its user choose, whatever is trained.
-
-    Attributes:
-        seed: Random seed of initial weights, order of the data and noise.
-        device: "cpu", "cuda", "cuda:<n>" or "mps"; under `torchrun` each process takes its own GPU.
-        precision: "bf16" computes in bfloat16 where that is safe (autocast); weights stay float32.
-            On a CPU without AVX-512 it is 20 times slower.
-        resume: Go on after the last finished epoch of the run in the same folder.
-    """
-
-    seed: int = 0
-    device: str = "cpu"
-    precision: Precision = "no"
-    resume: bool = False
 
 
 @dataclass(frozen=True)

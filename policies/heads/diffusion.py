@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from touchgoal.policies.heads.samplers import SamplerConfig, add_noise, denoise
+from touchgoal.policies.config import SamplerConfig
+from touchgoal.policies.heads.samplers import add_noise, denoise
 from touchgoal.policies.heads.unet import PRESETS, UNet, UNetConfig
 
 

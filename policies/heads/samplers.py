@@ -5,58 +5,18 @@ network that was trained to denoise. The two diffusions are one formula (Song et
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from touchgoal.control.errors import UserError
+from touchgoal.policies.config import SamplerConfig
 
 FLOW_TIME_SCALE = (
     100.0  # what flow time 1 is called to the network, so that its embedding resolves it
 )
 DenoisingNetwork = Callable[[Float[Tensor, "b h a"], Float[Tensor, " b"]], Float[Tensor, "b h a"]]
-
-
-@dataclass(frozen=True)
-class SamplerConfig:
-    """How samples are noised in training and denoised in use.
-
-    Attributes:
-        kind: "ddpm" draws fresh noise at every step (Ho et al. 2020), "ddim" none (Song et al.
-            2021); both learn the same, so a network trained for one serves the other. "flow" goes
-            straight from noise to data (Lipman et al. 2023).
-        prediction_type: what the network answers: the noise ("epsilon") or the flow's velocity, as
-            published, or the clean sample. The last needs fewer steps and less training where
-            samples vary little (3D diffusion policy, Ze et al. 2024, which takes it as well).
-        num_train_timesteps: of the squared-cosine schedule (Nichol and Dhariwal 2021).
-        num_inference_steps: network calls for one sample. Two of "ddim" with "sample" led the bead as well as
-            four (docs/next_steps.md); "ddpm" and "epsilon" want more.
-        clip: clean samples lie in [-clip, clip].
-    """
-
-    kind: Literal["ddpm", "ddim", "flow"] = "ddim"
-    prediction_type: Literal["epsilon", "velocity", "sample"] = "sample"
-    num_train_timesteps: int = 100
-    num_inference_steps: int = 2
-    clip: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Raises UserError for numbers of steps that make no sampler."""
-        if self.num_inference_steps < 1 or self.num_train_timesteps < 2:
-            raise UserError("a sampler needs num_inference_steps >= 1 and num_train_timesteps >= 2")
-        if self.prediction_type == ("epsilon" if self.kind == "flow" else "velocity"):
-            raise UserError(
-                f"a network for {self.kind} cannot predict {self.prediction_type}: try sample"
-            )
-        if self.kind != "flow" and self.num_inference_steps > self.num_train_timesteps:
-            raise UserError(
-                f"num_inference_steps {self.num_inference_steps} exceed num_train_timesteps {self.num_train_timesteps}: some would "
-                "do nothing, so ask for fewer"
-            )
 
 
 @lru_cache

@@ -1,7 +1,5 @@
 """Pose estimator: a network that reads in the first pictures of an episode what lies where."""
 
-from dataclasses import dataclass
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
@@ -9,33 +7,10 @@ from torch import Tensor, nn
 
 from touchgoal.control import features as ft
 from touchgoal.policies.actions import Normalizer
+from touchgoal.policies.config import PoseEstimatorConfig
 
-Box = tuple[int, int, int, int]
 _START = ft.FEATURES[ft.TRUTH_START].shape[0]
 _TCP = ft.FEATURES[ft.TCP_POSE].shape[0]
-
-
-@dataclass(frozen=True)
-class PoseEstimatorConfig:
-    """Where to look, and the networks that look.
-
-    Attributes:
-        size: rows and columns of the cameras' pictures. With half as many the table is seen at 5 mm a
-            pixel, and an object's place is told no better than to 3 mm.
-        crops: of each camera's pictures, by its column, the rows and columns (from, to; from, to)
-            in which the table is seen.
-        channels: of the maps of a picture, one cell for 4 x 4 pixels.
-        keypoints: places found in each picture, by a spatial softmax.
-        keypoint_features: numbers that describe what is at such a place.
-        width: of the hidden layer that puts together what they say.
-    """
-
-    size: tuple[int, int] = (256, 256)
-    crops: tuple[tuple[str, Box], ...] = ((ft.FRONT, (104, 232, 16, 240)),)
-    channels: int = 32
-    keypoints: int = 16
-    keypoint_features: int = 32
-    width: int = 256
 
 
 class PoseEstimator(nn.Module):

@@ -10,7 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from touchgoal.control import features as ft
-from touchgoal.policies.actions import ActionRepresentation, body_jacobian
+from touchgoal.policies.actions import body_jacobian
+from touchgoal.policies.config import ActionRepresentation
 
 _LENGTH_SCALE = 0.02  # m
 _BODY_FRAME_WIDTHS = {ft.STATE: 7, ft.TCP_POSE: 3}  # columns there are, and their input_widths

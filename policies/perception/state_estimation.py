@@ -19,8 +19,9 @@ from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.policies.actions import Normalizer
+from touchgoal.policies.config import PoseEstimatorConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
-from touchgoal.policies.perception.pose_estimator import PoseEstimator, PoseEstimatorConfig
+from touchgoal.policies.perception.pose_estimator import PoseEstimator
 
 ESTIMATOR = WeightsFormat("estimator", "estimator", "train one with: touchgoal train-estimators")
 ESTIMATED = (ft.TRUTH_CONTACT, ft.TRUTH_START)

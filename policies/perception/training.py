@@ -11,16 +11,11 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
 from touchgoal.control import features as ft
-from touchgoal.control.option_types import (
-    Count,
-    CountOrNone,
-    NotNegative,
-    Positive,
-    checked_dataclass,
-)
+from touchgoal.encoders.config import RunOptions
 from touchgoal.encoders.training.checkpoint import checksum
-from touchgoal.encoders.training.trainer import OptimizerConfig, RunOptions, Training, fit
+from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.policies.config import EstimatorTrainConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.placements import Placements
 from touchgoal.policies.perception.pose_estimator import PoseEstimator
@@ -28,24 +23,6 @@ from touchgoal.policies.perception.state_estimation import StateEstimatorNetwork
 from touchgoal.policies.training.sequence_dataset import embed_episodes
 
 _HUBER_BETA = 0.3  # standard deviations beyond which an error of the pose counts linearly
-
-
-@checked_dataclass
-class EstimatorTrainConfig:
-    """How the state estimator is trained, by AdamW."""
-
-    epochs: Count = 21
-    """Passes over the placements, for the pose estimator."""
-    batch_size: Count = 64
-    """Placements a step."""
-    lr: Positive = 2e-3
-    """Highest learning rate of the pose estimator, left by a cosine."""
-    pixel_noise: CountOrNone = 4
-    """Grey levels by which each pixel is changed at most, as a camera's are."""
-    contact_epochs: Count = 4
-    """Passes over the ticks, for contact; 256 ticks a step at a rate of 1e-3."""
-    touch_noise: NotNegative = 0.5
-    """Standard deviation of noise added to embeddings, in theirs."""
 
 
 def embed_touch_and_contact(

@@ -12,48 +12,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
-from touchgoal.control.option_types import (
-    Count,
-    CountOrNone,
-    NotNegative,
-    Positive,
-    checked_dataclass,
-)
+from touchgoal.encoders.config import RunOptions
 from touchgoal.encoders.training.checkpoint import checksum
-from touchgoal.encoders.training.trainer import (
-    OptimizerConfig,
-    RunOptions,
-    Training,
-    fit,
-    on_first_process,
-)
+from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
 from touchgoal.policies import checkpoint
+from touchgoal.policies.config import TrainConfig
 from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 POLICY, SNAPSHOTS = "policy", "snapshots"
-
-
-@checked_dataclass
-class TrainConfig:
-    """How to train a policy."""
-
-    epochs: Count = 60
-    """Passes over the windows."""
-    batch_size: Count = 256
-    """Windows a step; all of them if there are fewer."""
-    lr: Positive = 5e-4
-    """Highest learning rate, of AdamW; reached from 0, left by a cosine to 0."""
-    betas: tuple[float, float] = (0.95, 0.999)
-    """Of AdamW."""
-    weight_decay: NotNegative = 1e-6
-    """Of weight matrices and convolutions."""
-    warmup: CountOrNone = 500
-    """Steps in which the rate rises; a tenth of the training if that is shorter."""
-    snapshot_epochs: Count = 10
-    """Epochs between two snapshots of the policy; the last epoch is one too."""
-    validation_windows: Count = 1024
-    """On which losses are measured, evenly spaced."""
 
 
 def train(
