@@ -1,32 +1,13 @@
 """Train a touch encoder on recorded episodes: align it with frozen towers, or by masking alone."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.option_types import Count, CountOrNone, checked_dataclass
-from touchgoal.control.progress import track
-from touchgoal.encoders.alignment.align import align
 from touchgoal.encoders.config import ALIGN_PRESETS, AlignConfig, MaeConfig
-from touchgoal.encoders.preprocess import preprocessor_for
-from touchgoal.encoders.ssl.frames import check_sensor, sample_frames
-from touchgoal.encoders.ssl.mae import train_mae
-from touchgoal.encoders.towers.towers import load_towers
-from touchgoal.encoders.training.trainer import is_first_process
-from touchgoal.episodes.store import EpisodeSet
-from touchgoal.episodes.touches import collect_touches
-from touchgoal.launch.training_run import (
-    TrainingOptions,
-    check_training,
-    open_sets,
-    open_training,
-    recipe,
-)
-from touchgoal.rewards.embedding_distance import EpisodeEmbedder
-from touchgoal.rewards.fit_normalizer import fit_normalizer
-from touchgoal.rewards.normalizer import scene_of
+from touchgoal.launch.training_options import TrainingOptions
 
 
 @checked_dataclass
@@ -50,7 +31,7 @@ class Align(TrainingOptions):
     """Successful training episodes whose distances to their goals fix what counts as far and as near
     in reward curves (encoder/scale.json)."""
     align: AlignConfig = ALIGN_PRESETS["default"]
-    """The training."""
+    """How the encoder is trained."""
 
 
 @checked_dataclass
@@ -58,7 +39,7 @@ class AlignPaper(Align):
     """The same with the training of the MMWand paper: ViT-H, 100 epochs, temperature 0.2, lambda 1."""
 
     align: AlignConfig = ALIGN_PRESETS["paper"]
-    """The training."""
+    """How the encoder is trained."""
 
 
 @checked_dataclass
@@ -72,7 +53,7 @@ class Mae(TrainingOptions):
     frames: Count = 40
     """Moments drawn from each episode, both fingertips of each."""
     mae: MaeConfig = MaeConfig()
-    """The training."""
+    """How the encoder is trained."""
 
 
 Config = (
@@ -82,59 +63,8 @@ Config = (
 )
 
 
-def main(config: Align | Mae) -> None:
+def main(config: Any) -> None:
     """Train one kind of encoder."""
-    check_training(config.run, config.out)
-    sets = open_sets(config.data, config.validation)
-    sensor = _sensor_of(config.sensor, *sets)
-    if isinstance(config, Mae):
-        _train_mae(config, sensor, *sets)
-    else:
-        _align(config, sensor, *sets)
+    from touchgoal.launch.commands.train_encoder import run_command
 
-
-def _sensor_of(named: str | None, *sets: EpisodeSet) -> str:
-    """The sensor of all episodes; UserError if it is unknown, or not the one that was named."""
-    sensor = named or str(sets[0].meta(0).get("sensor", ""))
-    if not sensor:
-        raise UserError(f"{sets[0].root} does not name its fingertip sensor: name it with --sensor")
-    preprocessor_for(sensor)
-    for episodes in sets:
-        for i in range(len(episodes)):
-            check_sensor(episodes, i, sensor)
-    return sensor
-
-
-def _train_mae(config: Mae, sensor: str, data: EpisodeSet, validation: EpisodeSet) -> None:
-    out = open_training(config, "train-encoder")
-    train, val = (
-        sample_frames(episodes, sensor, config.frames, config.seed)
-        for episodes in (data, validation)
-    )
-    train_mae(train, val, config.mae, out, config.run, recipe(data, validation))
-    print(f"encoder: {out / 'encoder'}")
-
-
-def _align(config: Align, sensor: str, data: EpisodeSet, validation: EpisodeSet) -> None:
-    """Cut touches from the episodes, train, fit what counts as far."""
-    towers = load_towers(config.towers)
-    out = open_training(config, "train-encoder")
-    train, val = (
-        collect_touches(episodes, config.contact_frames, config.no_contact_frames, config.seed)
-        for episodes in (data, validation)
-    )
-    print(f"{len(train)} touches of {len(train.descriptions)} objects; {len(val)} for validation")
-    encoder = align(
-        train, val, towers, config.align, sensor, out, config.run, recipe(data, validation)
-    )
-    if not is_first_process():
-        return
-    embedder = EpisodeEmbedder(towers, encoder)
-    chosen = [i for i in range(len(data)) if data.meta(i).get("success", True)]
-    embedded = [
-        embedder.embed_episode(data.read(i), data.fps, f"{data.root}#{i}", True)
-        for i in track(chosen[: config.scale_episodes], "scale", "episode")
-    ]
-    scale = fit_normalizer(embedded, ("image", "tactile", "text"), scene_of(data.features))
-    scale.save(out / "encoder" / "scale.json")
-    print(f"encoder and scale: {out / 'encoder'}")
+    run_command(config)

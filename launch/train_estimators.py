@@ -1,44 +1,13 @@
 """Train the state estimator of pick-and-place: contact from touch, where things lie from pictures."""
 
 import os
-import shutil
-from dataclasses import field, replace
 from pathlib import Path
+from typing import Annotated, Any
 
-import torch
-
-from touchgoal.control import features as ft
-from touchgoal.control.option_types import Count, checked_dataclass
-from touchgoal.encoders import pretrained
-from touchgoal.encoders.training.checkpoint import has_checkpoint
-from touchgoal.encoders.training.trainer import is_first_process
-from touchgoal.launch.run_folder import write_json
-from touchgoal.launch.training_run import (
-    TrainingOptions,
-    check_training,
-    open_sets,
-    open_training,
-    recipe,
-)
+from touchgoal.control.option_types import RARE, Count, checked_dataclass
+from touchgoal.launch.training_options import TrainingOptions
 from touchgoal.policies.config import EstimatorTrainConfig, PoseEstimatorConfig
-from touchgoal.policies.perception.frozen_touch import load_touch
-from touchgoal.policies.perception.placements import render_placements
-from touchgoal.policies.perception.state_estimation import (
-    StateEstimatorConfig,
-    StateEstimatorNetwork,
-    save_estimator,
-)
-from touchgoal.policies.perception.training import (
-    contact_error_rate,
-    embed_touch_and_contact,
-    pose_errors,
-    train_contact_estimator,
-    train_pose_estimator,
-)
 from touchgoal.sim_envs.config import PickPlaceConfig
-
-_CONTACT, _POSE = "contact", "pose"  # folders of the two trainings in that of the run
-_SEED, _VALIDATION_SEED = 4_000_000, 4_900_000  # of the things placed
 
 
 @checked_dataclass
@@ -48,65 +17,28 @@ class Config(TrainingOptions):
     data: Path
     """Set of pick-and-place episodes with touch, to learn contact from."""
     validation: Path
-    """Set of other episodes, on which contact is judged."""
+    """Set of other episodes, on which errors of contact are measured."""
     out: Path | None = None
     """Folder of the run; the state estimator goes to its `estimator/`."""
-    encoder: Path = pretrained.SHIPPED
-    """Folder of a frozen touch encoder (train-encoder), which is copied beside the estimator unless it
-    is the shipped one."""
+    encoder: Path | None = None
+    """Folder of a frozen touch encoder (train-encoder), which is copied beside the estimator; default:
+    the shipped one, which is not copied."""
     objects: Count = 600
     """Number of objects to look at, of random kind and size."""
     placements: Count = 20
     """Number of places on the table for each object."""
-    pose_estimator: PoseEstimatorConfig = PoseEstimatorConfig()
-    """The network that looks."""
     train: EstimatorTrainConfig = EstimatorTrainConfig()
-    """The training."""
-    env: PickPlaceConfig = field(default_factory=PickPlaceConfig)
-    """Options of the task."""
+    """How the networks are trained."""
+    pose_estimator: Annotated[PoseEstimatorConfig, RARE] = PoseEstimatorConfig()
+    """The network that finds in pictures where things lie."""
+    env: Annotated[PickPlaceConfig, RARE] = PickPlaceConfig()
+    """Options of the scenes that are rendered."""
     workers: Count = os.cpu_count() or 1
     """Processes that render and embed."""
 
 
-def main(config: Config) -> None:
+def main(config: Any) -> None:
     """Place, embed, train, judge."""
-    check_training(config.run, config.out, _CONTACT)
-    sets = open_sets(config.data, config.validation)
-    touch = load_touch(config.encoder)
-    out = open_training(config, "train-estimators")
-    torch.manual_seed(config.seed)
-    network = StateEstimatorNetwork(
-        StateEstimatorConfig(touch.name, touch.dim, config.pose_estimator)
-    )
-    provenance = recipe(*sets)
-    rows, validation = (
-        embed_touch_and_contact(episodes, touch, config.workers) for episodes in sets
-    )
-    contact_out, pose_out = out / _CONTACT, out / _POSE
-    train_contact_estimator(network, *rows, config.train, contact_out, config.run, provenance)
-    errors: dict = {"contact": contact_error_rate(network, *validation)}
-    cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key, _ in config.pose_estimator.crops)
-    size = config.pose_estimator.size
-    env = replace(config.env, tactile=False, cameras=cameras, camera_size=size)
-    train_pose_estimator(
-        network.sight,
-        render_placements(env, config.objects, config.placements, _SEED, config.workers),
-        config.train,
-        pose_out,
-        replace(config.run, resume=config.resume and has_checkpoint(pose_out)),
-        provenance,
-    )
-    if not is_first_process():
-        return
-    others = render_placements(
-        env, max(1, config.objects // 8), 5, _VALIDATION_SEED, config.workers
-    )
-    errors |= pose_errors(network.sight, others)
-    save_estimator(network, out / "estimator", provenance | {"errors": errors})
-    if config.encoder.resolve() != pretrained.SHIPPED.resolve():
-        shutil.copytree(config.encoder, out / "estimator" / "touch", dirs_exist_ok=True)
-    write_json(out / "metrics.json", errors)
-    print(f"contact: {errors['contact']:.2%} of ticks misread")
-    for name, (middle, most) in list(errors.items())[1:]:
-        print(f"{name.replace('_', ', ')}: {middle:.1f} (median), {most:.1f} (90 %)")
-    print(f"state estimator: {out / 'estimator'}")
+    from touchgoal.launch.commands.train_estimators import run_command
+
+    run_command(config)

@@ -6,12 +6,13 @@ ticks of a plan are done (here all 8), at what rate, and for how long to train (
 diffusion_policy's real-robot tasks). On a CPU this is a matter of days.
 """
 
-from dataclasses import field
+from typing import Annotated
 
-from touchgoal.control.option_types import checked_dataclass
+from touchgoal.control.option_types import RARE, Count, NotNegative, checked_dataclass
 from touchgoal.launch import train_policy
 from touchgoal.policies.config import (
     ActionRepresentation,
+    Head,
     SamplerConfig,
     TouchReading,
     TrainConfig,
@@ -22,28 +23,18 @@ from touchgoal.policies.config import (
 class Config(train_policy.Config):
     """Options of train-policy, with the published ones as defaults."""
 
-    head: train_policy.Head = "published"
-    """Size of the diffusion's U-Net."""
-    sampler: SamplerConfig = field(
-        default_factory=lambda: SamplerConfig(
-            "ddpm", "epsilon", num_train_timesteps=100, num_inference_steps=100
-        )
-    )
-    """How the diffusion is trained and sampled."""
+    head: Head = "published"
     representation: ActionRepresentation = "delta"
-    """Of the actions while learning."""
     touch_reading: TouchReading = "free"
-    """What the policy makes of a frozen embedding."""
-    touch_projection_dim: int = 256
-    """Numbers to which a frozen embedding is projected."""
-    touch_noise: float = 0.0
-    """Of frozen embeddings while learning; none in the paper."""
-    position_noise: float = 0.0
-    """Of joint and TCP positions while learning; none in the paper."""
-    execution_horizon: int = 8
-    """Ticks of a plan that are done before the next one."""
+    touch_projection_dim: Annotated[Count, RARE] = 256
+    touch_noise: Annotated[NotNegative, RARE] = 0.0
+    position_noise: Annotated[NotNegative, RARE] = 0.0
+    execution_horizon: Count = 8
     train: TrainConfig = TrainConfig(epochs=600, lr=1e-4, snapshot_epochs=100)
-    """The training."""
+    sampler: Annotated[SamplerConfig, RARE] = SamplerConfig(
+        "ddpm", "epsilon", num_train_timesteps=100, num_inference_steps=100
+    )
 
 
+ENVS = train_policy.ENVS
 main = train_policy.main

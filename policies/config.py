@@ -7,6 +7,7 @@ from pydantic import Field
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.control.option_types import (
+    RARE,
     Count,
     CountOrNone,
     Fraction,
@@ -71,15 +72,15 @@ class TrainConfig:
     """Sequences in each step; all of them if there are fewer."""
     lr: Positive = 5e-4
     """Highest learning rate of AdamW; reached from 0, left by a cosine to 0."""
-    betas: tuple[Fraction, Fraction] = (0.95, 0.999)
+    betas: Annotated[tuple[Fraction, Fraction], RARE] = (0.95, 0.999)
     """Decay rates of AdamW's running means of gradients and of their squares."""
-    weight_decay: NotNegative = 1e-6
+    weight_decay: Annotated[NotNegative, RARE] = 1e-6
     """Weight decay of weight matrices and convolutions."""
-    warmup: CountOrNone = 500
+    warmup: Annotated[CountOrNone, RARE] = 500
     """Steps in which the learning rate rises; a tenth of the training if that is shorter."""
     snapshot_epochs: Count = 10
     """Epochs between two snapshots of the policy; the last epoch is one too."""
-    validation_windows: Count = 1024
+    validation_windows: Annotated[Count, RARE] = 1024
     """Number of validation sequences on which losses are measured, evenly spaced."""
 
 

@@ -196,11 +196,8 @@ def test_progress_in_a_pipe_is_a_line_now_and_then(
     assert capsys.readouterr().err == ""  # no total, and half a minute has not passed
 
 
-LIGHT = [name for name in COMMANDS if not name.startswith("train-")]
-
-
 def test_help_imports_nothing_heavy() -> None:
-    modules = [f"touchgoal.launch.{name.replace('-', '_')}" for name in LIGHT]
+    modules = [f"touchgoal.launch.{name.replace('-', '_')}" for name in COMMANDS]
     program = f"""
 import sys, touchgoal.launch.__main__, touchgoal.launch.command_line, {", ".join(modules)}
 heavy = {{"torch", "mujoco", "casadi", "numba", "gymnasium", "matplotlib", "scipy"}} & set(sys.modules)
@@ -208,7 +205,7 @@ assert not heavy, heavy"""
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-@pytest.mark.parametrize("name", LIGHT)
+@pytest.mark.parametrize("name", COMMANDS)
 def test_every_option_is_described(name: str) -> None:
     module = __import__(f"touchgoal.launch.{name.replace('-', '_')}", fromlist=["Config"])
     for _, member in _members(module.Config):

@@ -1,0 +1,81 @@
+"""What `touchgoal train-encoder` does."""
+
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.progress import track
+from touchgoal.encoders.alignment.align import align
+from touchgoal.encoders.preprocess import preprocessor_for
+from touchgoal.encoders.ssl.frames import check_sensor, sample_frames
+from touchgoal.encoders.ssl.mae import train_mae
+from touchgoal.encoders.towers.towers import load_towers
+from touchgoal.encoders.training.trainer import is_first_process
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.episodes.touches import collect_touches
+from touchgoal.launch.train_encoder import Align, Mae
+from touchgoal.launch.training_run import (
+    check_training,
+    open_sets,
+    open_training,
+    recipe,
+)
+from touchgoal.rewards.embedding_distance import EpisodeEmbedder
+from touchgoal.rewards.fit_normalizer import fit_normalizer
+from touchgoal.rewards.normalizer import scene_of
+
+
+def run_command(config: Align | Mae) -> None:
+    """Train one kind of encoder."""
+    check_training(config.run, config.out)
+    sets = open_sets(config.data, config.validation)
+    sensor = _sensor_of(config.sensor, *sets)
+    if isinstance(config, Mae):
+        _train_mae(config, sensor, *sets)
+    else:
+        _align(config, sensor, *sets)
+
+
+def _sensor_of(named: str | None, *sets: EpisodeSet) -> str:
+    """The sensor of all episodes; UserError if it is unknown, or not the one that was named."""
+    sensor = named or str(sets[0].meta(0).get("sensor", ""))
+    if not sensor:
+        raise UserError(f"{sets[0].root} does not name its fingertip sensor: name it with --sensor")
+    preprocessor_for(sensor)
+    for episodes in sets:
+        for i in range(len(episodes)):
+            check_sensor(episodes, i, sensor)
+    return sensor
+
+
+def _train_mae(config: Mae, sensor: str, data: EpisodeSet, validation: EpisodeSet) -> None:
+    out = open_training(config, "train-encoder")
+    train, val = (
+        sample_frames(episodes, sensor, config.frames, config.seed)
+        for episodes in (data, validation)
+    )
+    train_mae(train, val, config.mae, out, config.run, recipe(data, validation))
+    print(f"encoder: {out / 'encoder'}")
+
+
+def _align(config: Align, sensor: str, data: EpisodeSet, validation: EpisodeSet) -> None:
+    """Cut touches from the episodes, train, fit what counts as far."""
+    towers = load_towers(config.towers)
+    out = open_training(config, "train-encoder")
+    train, val = (
+        collect_touches(episodes, config.contact_frames, config.no_contact_frames, config.seed)
+        for episodes in (data, validation)
+    )
+    print(f"{len(train)} touches of {len(train.descriptions)} objects; {len(val)} for validation")
+    encoder = align(
+        train, val, towers, config.align, sensor, out, config.run, recipe(data, validation)
+    )
+    if not is_first_process():
+        return
+    embedder = EpisodeEmbedder(towers, encoder)
+    chosen = [i for i in range(len(data)) if data.meta(i).get("success", True)]
+    embedded = [
+        embedder.embed_episode(data.read(i), data.fps, f"{data.root}#{i}", True)
+        for i in track(chosen[: config.scale_episodes], "scale", "episode")
+    ]
+    scale = fit_normalizer(embedded, ("image", "tactile", "text"), scene_of(data.features))
+    scale.save(out / "encoder" / "scale.json")
+    print(f"encoder and scale: {out / 'encoder'}")

@@ -1,0 +1,83 @@
+"""What `touchgoal train-estimators` does."""
+
+import shutil
+from dataclasses import replace
+
+import torch
+
+from touchgoal.control import features as ft
+from touchgoal.encoders import pretrained
+from touchgoal.encoders.training.checkpoint import has_checkpoint
+from touchgoal.encoders.training.trainer import is_first_process
+from touchgoal.launch.run_folder import write_json
+from touchgoal.launch.train_estimators import Config
+from touchgoal.launch.training_run import (
+    check_training,
+    open_sets,
+    open_training,
+    recipe,
+)
+from touchgoal.policies.perception.frozen_touch import load_touch
+from touchgoal.policies.perception.placements import render_placements
+from touchgoal.policies.perception.state_estimation import (
+    StateEstimatorConfig,
+    StateEstimatorNetwork,
+    save_estimator,
+)
+from touchgoal.policies.perception.training import (
+    contact_error_rate,
+    embed_touch_and_contact,
+    pose_errors,
+    train_contact_estimator,
+    train_pose_estimator,
+)
+
+_CONTACT, _POSE = "contact", "pose"  # folders of the two trainings in that of the run
+
+
+_SEED, _VALIDATION_SEED = 4_000_000, 4_900_000  # of the things placed
+
+
+def run_command(config: Config) -> None:
+    """Place, embed, train, judge."""
+    check_training(config.run, config.out, _CONTACT)
+    sets = open_sets(config.data, config.validation)
+    encoder = config.encoder or pretrained.SHIPPED
+    touch = load_touch(encoder)
+    out = open_training(config, "train-estimators")
+    torch.manual_seed(config.seed)
+    network = StateEstimatorNetwork(
+        StateEstimatorConfig(touch.name, touch.dim, config.pose_estimator)
+    )
+    provenance = recipe(*sets)
+    rows, validation = (
+        embed_touch_and_contact(episodes, touch, config.workers) for episodes in sets
+    )
+    contact_out, pose_out = out / _CONTACT, out / _POSE
+    train_contact_estimator(network, *rows, config.train, contact_out, config.run, provenance)
+    errors: dict = {"contact": contact_error_rate(network, *validation)}
+    cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key, _ in config.pose_estimator.crops)
+    size = config.pose_estimator.size
+    env = replace(config.env, tactile=False, cameras=cameras, camera_size=size)
+    train_pose_estimator(
+        network.sight,
+        render_placements(env, config.objects, config.placements, _SEED, config.workers),
+        config.train,
+        pose_out,
+        replace(config.run, resume=config.resume and has_checkpoint(pose_out)),
+        provenance,
+    )
+    if not is_first_process():
+        return
+    others = render_placements(
+        env, max(1, config.objects // 8), 5, _VALIDATION_SEED, config.workers
+    )
+    errors |= pose_errors(network.sight, others)
+    save_estimator(network, out / "estimator", provenance | {"errors": errors})
+    if encoder.resolve() != pretrained.SHIPPED.resolve():
+        shutil.copytree(encoder, out / "estimator" / "touch", dirs_exist_ok=True)
+    write_json(out / "metrics.json", errors)
+    print(f"contact: {errors['contact']:.2%} of ticks misread")
+    for name, (middle, most) in list(errors.items())[1:]:
+        print(f"{name.replace('_', ', ')}: {middle:.1f} (median), {most:.1f} (90 %)")
+    print(f"state estimator: {out / 'estimator'}")
