@@ -15,7 +15,7 @@ from touchgoal.control.option_types import (
     checked_dataclass,
 )
 from touchgoal.sim_envs.scene.objects import find as find_object
-from touchgoal.sim_envs.scene.wires import TRAINED, Family, Split, Wire, choose
+from touchgoal.sim_envs.scene.wires import PER_FAMILY, TRAINED, Family, Split, Wire, choose
 from touchgoal.sim_envs.scene.wires import find as find_wire
 
 Outcome = Literal["success", "never_touch", "drop", "wrong_object", "freeze"]
@@ -182,8 +182,8 @@ class BeadMazeConfig(EnvConfig):
     """Set from which wires are taken; no wire is in two of them."""
     families: tuple[Family, ...] = TRAINED
     """Shapes of wires to take."""
-    n_wires: Count = 200
-    """Number of wires to draw from."""
+    n_wires: Count | None = None
+    """Number of wires to draw from; default: 200, or all where the split has fewer."""
     bead: Literal["sphere", "cylinder"] = "sphere"
     """Shape of the bead: a cylinder feels the wire's direction as a torque, a sphere much less."""
     grasp_force: ForceRange = (8.0, 12.0)
@@ -198,7 +198,8 @@ class BeadMazeConfig(EnvConfig):
     def chosen_wires(self, count: int | None = None) -> list[Wire]:
         """The wires to draw from; if a count is given, so many of them, named ones in turn."""
         if not self.wires:
-            return choose(self.split, count or self.n_wires, self.families)
+            most = min(200, PER_FAMILY[self.split] * len(self.families))
+            return choose(self.split, count or self.n_wires or most, self.families)
         named = [find_wire(name) for name in self.wires]
         return named if count is None else [named[i % len(named)] for i in range(count)]
 

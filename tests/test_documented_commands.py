@@ -88,10 +88,6 @@ DEPLOYING = [
 ]
 
 
-@pytest.mark.xfail(
-    reason="open, see docs/next_steps.md: a documented maze recording asks for too many wires",
-    strict=False,
-)
 @pytest.mark.slow
 def test_commands_run(desk: Path) -> None:
     """One after the other, as a person would who reads the pages from the first to the last."""

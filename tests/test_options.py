@@ -62,3 +62,4 @@ def test_named_wires_are_taken_in_turn() -> None:
     assert [w.name for w in config.chosen_wires(3)] == ["helix-1", "arc-2000009", "helix-1"]
     assert len(config.chosen_wires()) == 2
     assert len(BeadMazeConfig(n_wires=5).chosen_wires()) == 5
+    assert len(BeadMazeConfig(split="validation").chosen_wires()) == 80  # all there are
