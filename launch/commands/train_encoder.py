@@ -1,6 +1,5 @@
 """What `touchgoal train-encoder` does."""
 
-
 from touchgoal.control.errors import UserError
 from touchgoal.control.progress import track
 from touchgoal.encoders.alignment.align import align
