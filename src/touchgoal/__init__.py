@@ -7,8 +7,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from touchgoal.encoders.pretrained import load_encoder as load_encoder
     from touchgoal.policies.checkpoint import load_policy as load_policy
     from touchgoal.policies.evaluation.evaluate import evaluate as evaluate
+    from touchgoal.rewards.api import reward_curve as reward_curve
     from touchgoal.sim_envs.tasks import make as make
 
 __version__ = "0.1.0"
