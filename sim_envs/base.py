@@ -25,6 +25,7 @@ from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 GRIPPER_MAX_WIDTH = FRANKA_HAND.stroke[1]  # m, to which experts open
 DISTURBANCE_SECONDS = 0.5  # for which a disturbance keeps its direction
 GRIPPER_SPEED = FRANKA_HAND.speed  # m/s of width
+_FINGER_LAG = 1e-3  # m by which a finger may follow its set-point while it moves freely
 
 Observation = dict[str, np.ndarray]
 
@@ -186,6 +187,9 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         """
         travel = speed / 2 * steps * self.model.opt.timestep  # m of one finger
         self._finger_target += min(max(width / 2 - self._finger_target, -travel), travel)
+        # No winding up while fingers are held open, or letting go would take as long again.
+        deepest = self.width() / 2 - 2 * self.grasp_force / self._finger_stiffness - _FINGER_LAG
+        self._finger_target = max(self._finger_target, deepest)
         self.model.actuator_forcerange[self._gripper, 0] = -2 * self.grasp_force
         self.data.ctrl[: self.n_joints] = joints
         self.data.ctrl[self._gripper] = self._finger_target
@@ -271,6 +275,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.arm_dofs = [joint.dofadr[0] for joint in joints]
         self._fingers = [model.joint(f"finger_joint{i}").qposadr[0] for i in (1, 2)]
         self._gripper = model.actuator("gripper").id
+        self._finger_stiffness = float(model.actuator_gainprm[self._gripper, 0])
         self._tcp = model.site("tcp").id
         self._reader = ContactReader(model)
         self._frames: list[TactileFrame] = []

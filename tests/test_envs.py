@@ -210,6 +210,18 @@ def test_grasp_force_weight_and_creep(blind: PickPlace, name: str, force: float)
     assert weight == pytest.approx(0.1 * 9.81, rel=0.02)
 
 
+def test_a_long_grasp_lets_go_at_once(blind: PickPlace) -> None:
+    lift(blind, object="wooden_block", grasp_force=20.0, mass=0.1)
+    for _ in range(20):
+        blind.step(STILL)
+    held = blind.width()
+    for _ in range(3):
+        blind.step(np.append(STILL[:-1], 0.08))
+    assert (
+        blind.width() - held > 0.5 * 0.15 * 0.1
+    )  # m: at 0.1 m/s for 0.15 s, the pads let go first
+
+
 def test_weak_grasp_loses_a_heavy_object(blind: PickPlace) -> None:
     """Coulomb: 0.2 kg at friction 0.6 needs 1.64 N on each side."""
     lift(blind, object="glass_ball", grasp_force=1.5, mass=0.2)

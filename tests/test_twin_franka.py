@@ -134,7 +134,6 @@ def picks(address: str, home: list[float], position: list[float], yaw: float) ->
     }
 
 
-@pytest.mark.xfail(reason="open, see docs/next_steps.md: the grasp is over too soon", strict=False)
 def test_franka_grasps_what_is_there(fr3: RunningTwin) -> None:
     fr3.begin('reset 3 {"object": "wooden_block", "mass": 0.1}')
     pose = fr3.ask("truth")["layout"]["object"]
