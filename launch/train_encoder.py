@@ -12,7 +12,7 @@ from touchgoal.launch.training_options import TrainingOptions
 
 @checked_dataclass
 class Align(TrainingOptions):
-    """Options of train-encoder align."""
+    """Align touch with frozen image and text networks (contrastive, as in MMWand)."""
 
     validation: Path
     """Set of other episodes, four or more of each object. Retrieval on one half of them chooses the
@@ -36,7 +36,7 @@ class Align(TrainingOptions):
 
 @checked_dataclass
 class AlignPaper(Align):
-    """The same with the training of the MMWand paper: ViT-H, 100 epochs, temperature 0.2, lambda 1."""
+    """Align with the training of the MMWand paper: ViT-H, 100 epochs, temperature 0.2, lambda 1."""
 
     align: AlignConfig = ALIGN_PRESETS["paper"]
     """How the encoder is trained."""
@@ -44,7 +44,7 @@ class AlignPaper(Align):
 
 @checked_dataclass
 class Mae(TrainingOptions):
-    """Options of train-encoder mae."""
+    """Learn touch without labels, by masked autoencoding (MAE)."""
 
     out: Path | None = None
     """Folder of the run; the encoder goes to its `encoder/`."""

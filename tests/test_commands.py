@@ -275,8 +275,11 @@ def test_wrong_encoder_for_the_sensor(
     assert "is for digit, not gelsight_mini" in message and not out.exists()
 
 
-def test_wrong_sensor_for_the_encoder(
-    episodes: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+def test_wrong_data_for_an_encoder(
+    episodes: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     validation = shutil.copytree(episodes, tmp_path / "validation")
     both = ("--data", episodes, "--validation", validation)
@@ -287,6 +290,10 @@ def test_wrong_sensor_for_the_encoder(
     assert "judge by episodes" in refused(capsys, "train-encoder", "mae", *same, "--out", out)
     nothing = refused(capsys, "train-encoder", "mae", *both, "--resume", "--out", out)
     assert "nothing to resume" in nothing and not out.exists()
+    meta = EpisodeSet.meta
+    monkeypatch.setattr(EpisodeSet, "meta", lambda self, i: meta(self, i) | {"success": None})
+    unknown = refused(capsys, "train-encoder", "align", *both, "--out", out)
+    assert "says that it succeeded" in unknown and not out.exists()
 
 
 def test_corrupt_episode_is_named(

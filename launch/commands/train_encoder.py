@@ -57,6 +57,12 @@ def _train_mae(config: Mae, sensor: str, data: EpisodeSet, validation: EpisodeSe
 
 def _align(config: Align, sensor: str, data: EpisodeSet, validation: EpisodeSet) -> None:
     """Cut touches from the episodes, train, fit what counts as far."""
+    successes = [i for i in range(len(data)) if data.meta(i).get("success") is True]
+    if not successes:
+        raise UserError(
+            f"no episode of {data.root} says that it succeeded, and reward curves are scaled by those "
+            "that did: record some, or say so in their meta"
+        )
     towers = load_towers(config.towers)
     out = open_training(config, "train-encoder")
     train, val = (
@@ -70,10 +76,9 @@ def _align(config: Align, sensor: str, data: EpisodeSet, validation: EpisodeSet)
     if not is_first_process():
         return
     embedder = EpisodeEmbedder(towers, encoder)
-    chosen = [i for i in range(len(data)) if data.meta(i).get("success", True)]
     embedded = [
         embedder.embed_episode(data.read(i), data.fps, f"{data.root}#{i}", True)
-        for i in track(chosen[: config.scale_episodes], "scale", "episode")
+        for i in track(successes[: config.scale_episodes], "scale", "episode")
     ]
     scale = fit_normalizer(embedded, ("image", "tactile", "text"), scene_of(data.features))
     scale.save(out / "encoder" / "scale.json")
