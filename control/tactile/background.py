@@ -74,7 +74,7 @@ class Background:
                 "the touch sensor's picture changes while its background is taken: "
                 "keep it still and untouched, and start again"
             )
-        self._current = first.copy()
+        self._current, self._frames = first.copy(), len(frames)
         self.reference = first if reference is None else reference.astype(np.float32)
         if float(local_change(first, self.reference).max()) > _ANOTHER_SENSOR:
             raise UserError(
@@ -88,8 +88,12 @@ class Background:
         return self._current
 
     def update(self, frame: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Follow the drift by one frame; only for frames in which nothing touches."""
-        cv2.accumulateWeighted(frame, self._current, _RATE)
+        """Follow the drift by one frame; only for frames in which nothing touches.
+
+        The first 50 count alike: of a single first frame its noise must not stay.
+        """
+        self._frames += 1
+        cv2.accumulateWeighted(frame, self._current, max(_RATE, 1 / self._frames))
 
     def drift(self) -> Drift:
         """How far the background went from the reference; see `Drift.large`."""
