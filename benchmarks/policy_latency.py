@@ -78,12 +78,14 @@ def _stages(config: PolicyLatencyOptions) -> list[Stage]:
             ),
             _time("touch encoder, both", config.repeats, lambda: encoder.embed_touch(touch)),
         ]
-    if (end_to_end := policy.config.end_to_end) is not None and policy.eye is not None:
+    if (
+        end_to_end := policy.config.end_to_end
+    ) is not None and policy.end_to_end_encoder is not None:
         pictures = [
             difference_images(ticks[1][k][None], ticks[0][k], end_to_end.size) for k in ft.TACTILE
         ]
         seen = torch.from_numpy(np.stack(pictures, 1))
-        look = policy.eye
+        look = policy.end_to_end_encoder
         stages.append(_time("end-to-end encoder", config.repeats, lambda: look(seen)))
     condition = torch.zeros(1, policy.condition_dim)
     generator = torch.Generator().manual_seed(0)

@@ -83,14 +83,14 @@ class Normalizer(nn.Module):
     A component that was constant becomes 0, and comes back as the constant.
     """
 
-    centre: Tensor
-    size: Tensor
+    offset: Tensor
+    scale: Tensor
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         """The identity, until fitted."""
         super().__init__()
-        self.register_buffer("centre", torch.zeros(shape))
-        self.register_buffer("size", torch.ones(shape))
+        self.register_buffer("offset", torch.zeros(shape))
+        self.register_buffer("scale", torch.ones(shape))
 
     def fit_range(
         self, values: Float[Tensor, "n ..."], valid: Bool[Tensor, "n ..."] | None = None
@@ -113,13 +113,13 @@ class Normalizer(nn.Module):
 
     def forward(self, values: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
         """To the network's range."""
-        constant = self.size == 0
-        return (values - self.centre) * ~constant / (self.size + constant)
+        constant = self.scale == 0
+        return (values - self.offset) * ~constant / (self.scale + constant)
 
     def inverse(self, scaled: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
         """Back from it."""
-        return scaled * self.size + self.centre
+        return scaled * self.scale + self.offset
 
-    def _set(self, centre: Tensor, size: Tensor) -> None:
-        self.centre.copy_(centre)
-        self.size.copy_(torch.where(size < _MIN_RANGE, 0.0, size))
+    def _set(self, offset: Tensor, scale: Tensor) -> None:
+        self.offset.copy_(offset)
+        self.scale.copy_(torch.where(scale < _MIN_RANGE, 0.0, scale))

@@ -147,26 +147,26 @@ class Policy(nn.Module):
         super().__init__()
         self.config = config
         ticks = config.prediction_horizon
-        self.touch_scale = Normalizer((config.touch_dim,))
-        self.wrench_scale = Normalizer((WRENCH_DIM,))
-        self.state_scale = Normalizer((config.proprioception_dim,))
-        self.action_scale = Normalizer((ticks, ACTION_DIM))
+        self.touch_normalizer = Normalizer((config.touch_dim,))
+        self.wrench_normalizer = Normalizer((WRENCH_DIM,))
+        self.state_normalizer = Normalizer((config.proprioception_dim,))
+        self.action_normalizer = Normalizer((ticks, ACTION_DIM))
         # narrowed before the U-Net, whose FiLM would multiply the embedding's width
-        self.read, width = None, 0
+        self.touch_readout, width = None, 0
         if config.reads_wrench:
             width, hidden = WRENCH_DIM, 256
-            self.read = nn.Sequential(
+            self.touch_readout = nn.Sequential(
                 nn.Linear(config.touch_dim, hidden), nn.Mish(),
                 nn.Linear(hidden, hidden), nn.Mish(),
                 nn.Linear(hidden, width),
             )  # fmt: skip
         elif config.touch_dim:
             width = config.touch_projection_dim
-            self.read = nn.Linear(config.touch_dim, width)
+            self.touch_readout = nn.Linear(config.touch_dim, width)
         condition_dim = config.observation_horizon * (width + config.proprioception_dim)
-        self.eye = None
+        self.end_to_end_encoder = None
         if config.end_to_end:
-            self.eye = EndToEndEncoder(config.end_to_end)
+            self.end_to_end_encoder = EndToEndEncoder(config.end_to_end)
             condition_dim += len(ft.TACTILE) * config.end_to_end.width
         self.condition_dim = condition_dim
         if isinstance(config.head, DiffusionConfig):
@@ -190,13 +190,13 @@ class Policy(nn.Module):
         count.
         """
         if self.config.touch_dim:
-            self.touch_scale.fit_mean_std(touch)
+            self.touch_normalizer.fit_mean_std(touch)
         if wrench is not None:
-            self.wrench_scale.fit_mean_std(wrench)
+            self.wrench_normalizer.fit_mean_std(wrench)
         columns, kind = self.config.proprioception, self.config.representation
-        self.state_scale.fit_mean_std(network_input(state, columns, kind))
+        self.state_normalizer.fit_mean_std(network_input(state, columns, kind))
         valid = None if action_is_pad is None else ~action_is_pad[..., None]
-        self.action_scale.fit_range(to_representation(actions, joints, kind), valid)
+        self.action_normalizer.fit_range(to_representation(actions, joints, kind), valid)
 
     def loss(
         self,
@@ -220,10 +220,10 @@ class Policy(nn.Module):
         wrench_loss = torch.zeros((), device=touch.device)
         if self.config.reads_wrench:
             assert wrench is not None, "this policy learns to read wrenches"
-            wrench_loss = F.mse_loss(touch, self.wrench_scale(wrench))
+            wrench_loss = F.mse_loss(touch, self.wrench_normalizer(wrench))
             touch = touch.detach()
         encoded = self._encode(batch, touch, generator)
-        loss = self.head.loss(self.action_scale(chunk), encoded, generator, action_is_pad)
+        loss = self.head.loss(self.action_normalizer(chunk), encoded, generator, action_is_pad)
         return loss + wrench_loss
 
     @torch.inference_mode()
@@ -233,20 +233,20 @@ class Policy(nn.Module):
         The same generator state (on the CPU) gives the same plan.
         """
         encoded = self._encode(batch, self._encode_touch(batch))
-        chunk = self.action_scale.inverse(self.head.sample(encoded, generator))
+        chunk = self.action_normalizer.inverse(self.head.sample(encoded, generator))
         return to_actions(chunk, batch.joints, self.config.representation)
 
     def _encode_touch(
         self, batch: ObservationBatch, noise: torch.Generator | None = None
     ) -> Float[Tensor, "b o w"]:
         """What touch tells the head, with the training's noise if there is a generator for it."""
-        if self.read is None:
+        if self.touch_readout is None:
             return batch.state[..., :0]
-        touch = self.touch_scale(batch.touch).clamp(-_CLIP, _CLIP)
+        touch = self.touch_normalizer(batch.touch).clamp(-_CLIP, _CLIP)
         if noise is not None:
             noise_drawn = torch.randn(touch.shape, generator=noise).to(touch)
             touch = touch + self.config.touch_noise * noise_drawn
-        return self.read(touch)
+        return self.touch_readout(touch)
 
     def _encode(
         self,
@@ -257,12 +257,12 @@ class Policy(nn.Module):
         """What the head sees, with the training's noise if there is a generator for it."""
         columns, kind = self.config.proprioception, self.config.representation
         state = network_input(batch.state, columns, kind)
-        seen = self.state_scale(state).clamp(-_CLIP, _CLIP)
+        seen = self.state_normalizer(state).clamp(-_CLIP, _CLIP)
         if noise is not None:
             shift = torch.randn(len(seen), 1, seen.shape[2], generator=noise).to(seen)
             seen = seen + self.config.position_noise * shift * is_position(columns, kind).to(seen)
         seen = torch.cat([touch, seen], -1)
-        if self.eye is None:
+        if self.end_to_end_encoder is None:
             return seen.flatten(1)
         assert batch.pictures is not None, "this policy looks at pictures"
-        return torch.cat([seen.flatten(1), self.eye(batch.pictures)], 1)
+        return torch.cat([seen.flatten(1), self.end_to_end_encoder(batch.pictures)], 1)

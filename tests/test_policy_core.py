@@ -149,7 +149,7 @@ def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
     wild = toy_dataset(config, (3, 20))
     wild.recorded.actions[[2, 22]] = 9.0  # the last tick's, never done
     for name, scale in toy_policy(config, wild).named_buffers():
-        if name.startswith("action_scale"):
+        if name.startswith("action_normalizer"):
             torch.testing.assert_close(scale, dict(policy.named_buffers())[name])
 
 

@@ -101,7 +101,7 @@ def test_a_place_is_learnt(tmp_path: Path) -> None:
     start[:, 3] = 1.0
     start[:, :2] = spots / 100
     placements = Placements({ft.FRONT: pictures}, torch.randn(256, 7, generator=torch_rng()), start)
-    sight = StateEstimatorNetwork(StateEstimatorConfig("toy", 6, SMALL)).sight
+    sight = StateEstimatorNetwork(StateEstimatorConfig("toy", 6, SMALL)).pose_estimator
     config = EstimatorTrainConfig(epochs=75, lr=1e-2)
     train_pose_estimator(sight, placements, config, tmp_path, RunOptions(), {})
     assert pose_errors(sight, placements)["object_mm"][0] < 15  # 60 by chance

@@ -78,7 +78,7 @@ class TouchEncoder(BaseTouchEncoder):
         """Builds a randomly initialised encoder; UserError for an unknown sensor."""
         super().__init__(config.sensor, config.embedding_dim)
         self.config = config
-        self.trunk = ViT(config.vit)
+        self.backbone = ViT(config.vit)
         d = config.embedding_dim
         self.touch_head = nn.Linear(config.vit.width, d, bias=False)
         together = config.pretrained_together
@@ -89,7 +89,7 @@ class TouchEncoder(BaseTouchEncoder):
         self, touch: Float[Tensor, "n 3 h w"], ids_keep: Int[Tensor, "n k"] | None = None
     ) -> Float[Tensor, "n d"]:
         """See BaseTouchEncoder."""
-        return F.normalize(self.touch_head(self.trunk.features(touch, ids_keep)), dim=1)
+        return F.normalize(self.touch_head(self.backbone.features(touch, ids_keep)), dim=1)
 
     def project_image(self, embeddings: Float[Tensor, "n k"]) -> Float[Tensor, "n d"]:
         """Brings the image tower's embeddings into the shared space."""

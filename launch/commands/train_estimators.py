@@ -60,7 +60,7 @@ def run_command(config: Config) -> None:
     size = config.pose_estimator.size
     env = replace(config.env, tactile=False, cameras=cameras, camera_size=size)
     train_pose_estimator(
-        network.sight,
+        network.pose_estimator,
         render_placements(env, config.objects, config.placements, _SEED, config.workers),
         config.train,
         pose_out,
@@ -72,7 +72,7 @@ def run_command(config: Config) -> None:
     others = render_placements(
         env, max(1, config.objects // 8), 5, _VALIDATION_SEED, config.workers
     )
-    errors |= pose_errors(network.sight, others)
+    errors |= pose_errors(network.pose_estimator, others)
     save_estimator(network, out / "estimator", provenance | {"errors": errors})
     if encoder.resolve() != pretrained.SHIPPED.resolve():
         shutil.copytree(encoder, out / "estimator" / "touch", dirs_exist_ok=True)

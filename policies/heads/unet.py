@@ -73,12 +73,14 @@ class UNet(nn.Module):
         widths, last = config.channels, config.channels[-1]
         steps = list(zip((action_dim, *widths), widths, strict=False))
         self.down = nn.ModuleList(nn.ModuleList([block(a, b), block(b, b)]) for a, b in steps)
-        self.shrink = nn.ModuleList(nn.Conv1d(n, n, 3, 2, 1) for n in widths[:-1])
+        self.downsample = nn.ModuleList(nn.Conv1d(n, n, 3, 2, 1) for n in widths[:-1])
         self.middle = nn.ModuleList([block(last, last), block(last, last)])
         self.up = nn.ModuleList(
             nn.ModuleList([block(2 * b, a), block(a, a)]) for a, b in reversed(steps[1:])
         )
-        self.grow = nn.ModuleList(nn.ConvTranspose1d(n, n, 4, 2, 1) for n in reversed(widths[:-1]))
+        self.upsample = nn.ModuleList(
+            nn.ConvTranspose1d(n, n, 4, 2, 1) for n in reversed(widths[:-1])
+        )
         self._sizes = [2 * m.out_channels for m in self.modules() if isinstance(m, ResidualBlock)]
         # one matrix for all blocks: the same numbers as one a block, with fewer calls
         self.film = nn.Sequential(nn.Mish(), nn.Linear(condition_dim + w, sum(self._sizes)))
@@ -109,15 +111,15 @@ class UNet(nn.Module):
             for block in cast(Iterable[nn.Module], blocks):
                 x = block(x, next(films))
             skips.append(x)
-            if level < len(self.shrink):
-                x = self.shrink[level](x)
+            if level < len(self.downsample):
+                x = self.downsample[level](x)
         for block in self.middle:
             x = block(x, next(films))
-        for blocks, grow in zip(self.up, self.grow, strict=True):
+        for blocks, upsample in zip(self.up, self.upsample, strict=True):
             x = torch.cat([x, skips.pop()], 1)
             for block in cast(Iterable[nn.Module], blocks):
                 x = block(x, next(films))
-            x = grow(x)
+            x = upsample(x)
         return self.out(x).transpose(1, 2)
 
 

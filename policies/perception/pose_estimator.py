@@ -22,8 +22,8 @@ class PoseEstimator(nn.Module):
         self.config = config
         self.networks = nn.ModuleList(_SpatialSoftmax(config) for _ in config.crops)
         seen = _TCP + config.keypoints * (2 + config.keypoint_features) * len(config.crops)
-        self.tcp_scale, self.start_scale = Normalizer((_TCP,)), Normalizer((_START,))
-        self.read = nn.Sequential(
+        self.tcp_normalizer, self.start_normalizer = Normalizer((_TCP,)), Normalizer((_START,))
+        self.head = nn.Sequential(
             nn.Linear(seen, config.width), nn.Mish(),
             nn.Linear(config.width, config.width), nn.Mish(),
             nn.Linear(config.width, _START),
@@ -38,19 +38,19 @@ class PoseEstimator(nn.Module):
             pictures: by column, as the cameras take them.
             tcp: pose of the hand, which carries a camera.
         """
-        return self.start_scale.inverse(self.scaled(pictures, tcp))
+        return self.start_normalizer.inverse(self.scaled(pictures, tcp))
 
     def scaled(
         self, pictures: dict[str, UInt8[Tensor, "b h w 3"]], tcp: Float[Tensor, "b 7"]
     ) -> Float[Tensor, "b 7"]:
         """The same, scaled to variance 1."""
-        parts = [self.tcp_scale(tcp)]
+        parts = [self.tcp_normalizer(tcp)]
         for (key, (top, bottom, left, right)), network in zip(
             self.config.crops, self.networks, strict=True
         ):
             crop = pictures[key][:, top:bottom, left:right].permute(0, 3, 1, 2)
             parts.append(network(crop.float() / 64 - 2))
-        return self.read(torch.cat(parts, 1))
+        return self.head(torch.cat(parts, 1))
 
 
 class _SpatialSoftmax(nn.Module):
@@ -60,15 +60,15 @@ class _SpatialSoftmax(nn.Module):
         super().__init__()
         width, self.keypoints = config.channels, config.keypoints
         self.patches = nn.Conv2d(3, width, 8, 4, 2)
-        self.join = nn.Conv2d(width, width, 3, 1, 1)
-        self.where = nn.Conv2d(width, config.keypoints, 1)
-        self.what = nn.Conv2d(width, config.keypoint_features, 1)
+        self.mix = nn.Conv2d(width, width, 3, 1, 1)
+        self.attention = nn.Conv2d(width, config.keypoints, 1)
+        self.features = nn.Conv2d(width, config.keypoint_features, 1)
 
     def forward(self, pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b p"]:
-        maps = F.relu(self.join(F.relu(self.patches(pictures))))
-        share = self.where(maps).flatten(2).softmax(2)
+        maps = F.relu(self.mix(F.relu(self.patches(pictures))))
+        share = self.attention(maps).flatten(2).softmax(2)
         h, w = maps.shape[2:]
         y, x = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
         place = torch.stack([x, y]).flatten(1).expand(len(maps), -1, -1).to(maps)
-        there = torch.cat([place, self.what(maps).flatten(2)], 1)
+        there = torch.cat([place, self.features(maps).flatten(2)], 1)
         return (share @ there.mT).flatten(1)

@@ -43,20 +43,20 @@ class StateEstimatorConfig:
 
 
 class StateEstimatorNetwork(nn.Module):
-    """One reader of contact for both fingertips, and sight."""
+    """Tells contact of each fingertip from touch, and poses from pictures of the start."""
 
     def __init__(self, config: StateEstimatorConfig) -> None:
         """Randomly initialised."""
         super().__init__()
         self.config = config
-        one = config.touch_dim // len(ft.TACTILE)
-        self.touch_scale, self.touch = Normalizer((one,)), nn.Linear(one, 1)
-        self.sight = PoseEstimator(config.pose_estimator)
+        side_dim = config.touch_dim // len(ft.TACTILE)
+        self.touch_normalizer, self.contact_head = Normalizer((side_dim,)), nn.Linear(side_dim, 1)
+        self.pose_estimator = PoseEstimator(config.pose_estimator)
 
     def contact(self, touch: Float[Tensor, "b e"]) -> Float[Tensor, "b 2"]:
         """Log-odds that each pad touches something, given embeddings of both."""
         sides = touch.unflatten(1, (len(ft.TACTILE), -1))
-        return self.touch(self.touch_scale(sides)).squeeze(2)
+        return self.contact_head(self.touch_normalizer(sides)).squeeze(2)
 
 
 class StateEstimator:
@@ -94,7 +94,7 @@ class StateEstimator:
         if self._start[0] is not first:
             pictures = {key: self._picture(key, first[key]) for key in self.cameras}
             tcp = torch.from_numpy(first[ft.TCP_POSE])[None]
-            self._start = first, self.network.sight(pictures, tcp)[0].numpy()
+            self._start = first, self.network.pose_estimator(pictures, tcp)[0].numpy()
         touch = torch.from_numpy(self.touch.embed_tick(observation, first))[None]
         contact = self.network.contact(touch).sigmoid()[0].numpy()
         return {ft.TRUTH_CONTACT: contact, ft.TRUTH_START: self._start[1]}

@@ -46,8 +46,8 @@ def train_contact_estimator(
 ) -> None:
     """Trains the reader of contact; writes what `trainer.fit` does."""
     sides = touch.unflatten(1, (len(ft.TACTILE), -1)).flatten(0, 1)
-    network.touch_scale.fit_mean_std(sides)
-    noise = config.touch_noise * network.touch_scale.size.repeat(len(ft.TACTILE))
+    network.touch_normalizer.fit_mean_std(sides)
+    noise = config.touch_noise * network.touch_normalizer.scale.repeat(len(ft.TACTILE))
 
     def batch(rows: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
         drawn = torch.randn(len(rows), touch.shape[1], generator=generator)
@@ -63,9 +63,9 @@ def train_contact_estimator(
         identity={"train": asdict(config), "data": checksum(touch, contact)},
         progress=lambda metrics: f"contact: loss {metrics['loss']:.4f}",
     )
-    network.sight.requires_grad_(False)  # has its own training
+    network.pose_estimator.requires_grad_(False)  # has its own training
     fit(training, out_dir, options, recipe)
-    network.cpu().sight.requires_grad_(True)
+    network.cpu().pose_estimator.requires_grad_(True)
 
 
 class _ContactLoss(nn.Module):
@@ -87,8 +87,8 @@ def train_pose_estimator(
     recipe: dict[str, Any],
 ) -> None:
     """Trains the pose estimator; writes what `trainer.fit` does."""
-    estimator.tcp_scale.fit_mean_std(placements.tcp)
-    estimator.start_scale.fit_mean_std(placements.start)
+    estimator.tcp_normalizer.fit_mean_std(placements.tcp)
+    estimator.start_normalizer.fit_mean_std(placements.start)
 
     def batch(rows: Tensor, generator: torch.Generator) -> dict[str, Any]:
         pictures = {
@@ -122,7 +122,7 @@ class _PoseLoss(nn.Module):
 
     def forward(self, pictures: dict[str, Tensor], tcp: Tensor, start: Tensor) -> dict[str, Tensor]:
         predicted = self.estimator.scaled(pictures, tcp)
-        target = self.estimator.start_scale(start)
+        target = self.estimator.start_normalizer(start)
         return {"loss": F.smooth_l1_loss(predicted, target, beta=_HUBER_BETA)}
 
 

@@ -151,7 +151,7 @@ def _validate(
     """The average's loss, and the error of the joint change (rad) it plans over the chunk."""
     n = min(config.validation_windows, len(windows))
     rows = torch.linspace(0, len(windows) - 1, n).long()
-    device = policy.action_scale.size.device
+    device = policy.action_normalizer.scale.device
     batch = send_to_device(_make_batch(windows, rows), device)
     generator = torch.Generator().manual_seed(seed)
     seen = ObservationBatch(batch["touch"], batch["state"], batch["pictures"])
