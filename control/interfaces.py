@@ -28,8 +28,9 @@ class ArmReading:
     Attributes:
         q: joint positions, rad.
         velocity: of the joints, rad/s.
-        wrench: external force (N) and torque (Nm) at the TCP, base frame.
-        torque: external torque in each joint, Nm.
+        wrench: force (N) and torque (Nm) of the environment on the robot at the TCP, base frame; not a
+            number where the arm cannot tell, as an FR3 near a singularity.
+        torque: that the environment puts on each joint, Nm.
         fault: why the arm refuses commands until a person recovers it; empty if it does not.
         stamp: s; the controller's clock advanced then.
         time: s, that clock, from an origin of its own.

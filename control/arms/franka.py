@@ -8,6 +8,7 @@ the sum of the velocities from drifting.
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from touchgoal.control.arms.streaming import (
     ArmClient,
@@ -83,8 +84,9 @@ class FrankaClient(ArmClient):
         return ArmReading(
             q=state.q,
             velocity=state.dq,
-            wrench=shift_wrench(state.O_F_ext_hat_K, contact, tcp),
-            torque=state.tau_ext_hat_filtered,
+            wrench=shift_wrench(wrench_on_robot(state.O_F_ext_hat_K), contact, tcp),
+            # tau_J minus what the model expects of it (robot_state.h): what the robot pushes with.
+            torque=-np.asarray(state.tau_ext_hat_filtered),
             fault=self._fault(state),
             stamp=self._stamped(state.time.to_sec()),
             time=state.time.to_sec(),
@@ -122,6 +124,16 @@ class FrankaClient(ArmClient):
         if self._robot is None:
             raise DriverError("the arm is not connected")
         return self._robot
+
+
+def wrench_on_robot(estimate: Float[np.ndarray, "6"]) -> Float[np.ndarray, "6"]:
+    """libfranka's O_F_ext_hat_K (N, Nm) as a wrench of the environment on the robot.
+
+    libfranka's robot_state.h: "Forces applied by the robot to the environment are positive, while
+    forces applied by the environment on the robot are negative. Becomes [0,0,0,0,0,0] when near or in
+    a singularity." Nothing is known there: not a number.
+    """
+    return np.full(6, np.nan) if not np.any(estimate) else -np.asarray(estimate)
 
 
 def _errors(state: "franky.RobotState") -> str:

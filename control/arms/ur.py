@@ -48,6 +48,9 @@ class UrClient(ArmClient):
         self._control = import_client("rtde_control", INSTALL).RTDEControlInterface(
             self.config.address
         )
+        self._control.setPayload(robot.tool.mass, list(robot.tool.centre_of_mass))
+        if not recover:  # what presses after a stop is to be felt
+            self._control.zeroFtSensor()
         self._control.setWatchdog(_WATCHDOG)
         self._lookahead = float(np.clip(2 * self.period, *_LOOKAHEAD))
         return self.config.robot.interface
@@ -70,7 +73,8 @@ class UrClient(ArmClient):
         clock, q = receive.getTimestamp(), np.array(receive.getActualQ())
         self._commanded = np.array(receive.getTargetQ())
         tcp, _ = self._kinematics.forward(q)
-        # About the controller's own TCP, in its base frame, the tool's weight taken off.
+        # Forces "acting on the end point of the TCP" (UR about get_tcp_force), about the controller's
+        # own TCP, in its base frame, the payload's weight taken off.
         wrench = np.array(receive.getActualTCPForce())
         wrench = shift_wrench(wrench, np.array(receive.getActualTCPPose()[:3]), tcp)
         reading = ArmReading(

@@ -55,6 +55,8 @@ class Fault:
 
     def __str__(self) -> str:
         """For the operator."""
+        if np.isnan(self.value):
+            return f"{self.limit} is unknown"
         return f"{self.limit} {self.value:.3g} above {self.ceiling:.3g}"
 
 

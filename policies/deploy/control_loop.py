@@ -294,7 +294,10 @@ class ControlLoop:
         if fault.limit == Limit.TOUCH and self._execute:  # open by as much as both gels give way
             width = sensed.gripper.width + 2 * self._safety.limits.touch
             self._connection.gripper.command(min(width, self._safety.limits.tool.stroke[1]))
-        return self.stop(reason, ADVICE.get(fault.limit, "look at what it names"))
+        advice = ADVICE.get(fault.limit, "look at what it names")
+        if fault.limit == Limit.FORCE and np.isnan(fault.value):
+            advice = "the arm is near a singularity, where it feels no forces: keep the task away"
+        return self.stop(reason, advice)
 
     def _as_commanded(self, sensed: CellReading) -> CellReading:
         """As if the arm had followed."""

@@ -106,6 +106,8 @@ def _arm(connection: CellConnection, safety: Safety) -> str:
     if np.abs(reading.velocity).max() > 0.05:
         raise UserError("it moves: let it come to rest")
     force = float(np.linalg.norm(reading.wrench[:3]))
+    if np.isnan(force):
+        raise UserError("it cannot tell forces here, near a singularity: move it by hand")
     if force > safety.limits.force / 2:
         raise UserError(f"it feels {force:.1f} N at rest: set the hand's mass in Desk, or clear it")
     safety.start(reading.q)

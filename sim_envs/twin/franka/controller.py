@@ -369,8 +369,10 @@ class FrankaArm:
         state["O_dP_EE_d"] = state["O_dP_EE_c"] = jacobian @ cell.dq_d
         state["elbow"] = cell.q[2], np.sign(cell.q[3])
         state["elbow_d"] = state["elbow_c"] = cell.q_d[2], np.sign(cell.q_d[3])
-        state["tau_ext_hat_filtered"], state["O_F_ext_hat_K"] = cell.tau_ext, self._wrench
-        turned = self._wrench.reshape(2, 3) @ self._pose[:3, :3]
+        # The maker's signs: what the robot does to the environment. `cell` has it the other way round.
+        sent = limits.estimate_sent(self._wrench, jacobian)
+        state["tau_ext_hat_filtered"], state["O_F_ext_hat_K"] = -cell.tau_ext, sent
+        turned = sent.reshape(2, 3) @ self._pose[:3, :3]
         state["K_F_ext_hat_K"] = turned.ravel()
         for name, value in vars(contact).items():
             state[name] = value

@@ -16,6 +16,9 @@ _TCP_SPEED, _TCP_TURN, _TORQUE_RATE = 3.0, 2.5, 1000.0
 TORQUE = np.array([87.0] * 4 + [12.0] * 3)  # N m
 _SLACK = 1.01  # for the wire's rounding
 _STEADY = 0.1  # rad/s^2: below it the thresholds for nominal motion hold
+# Least singular value of the Jacobian below which the arm gives no wrench; the maker's is unpublished.
+_SINGULAR = 0.02
+_NEVER_ZERO = 1e-6  # N: what a measured estimate differs from 0 by, with nothing touching
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,17 @@ def arm_fault(q: Joints, dq: Joints) -> str | None:
     if (np.abs(dq) > 1.1 * hardware.velocity).any():
         return "joint_velocity_violation"
     return None
+
+
+def estimate_sent(wrench: Wrench, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
+    """What O_F_ext_hat_K says of a wrench (N, Nm) of the environment on the robot.
+
+    libfranka, robot_state.h: what the robot applies to the environment is positive, and all is 0 near
+    or in a singularity.
+    """
+    if np.linalg.eigvalsh(jacobian @ jacobian.T)[0] < _SINGULAR**2:
+        return np.zeros(6)
+    return -wrench + _NEVER_ZERO
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,7 @@ class UrController:
         self._stopped_at = self._last_input_at = 0.0
         self._clock = 0.0
         self._speed_fraction = 1.0
+        self._felt, self._zero = np.zeros(6), np.zeros(6)
         self._program = self._new_program()
         self._program.running = False
 
@@ -208,7 +209,11 @@ class UrController:
             self._last_input_at = self._clock
 
     def _new_program(self) -> UrProgram:
-        return UrProgram(self.cell, self._inputs, self.protective_stop)
+        return UrProgram(self.cell, self._inputs, self.protective_stop, self._zero_force)
+
+    def _zero_force(self) -> None:
+        """What is felt now counts as nothing, as after URScript's zero_ftsensor."""
+        self._zero = self._felt.copy()
 
     def _dashboard_answer(self, line: str) -> str:
         """The dashboard's."""
@@ -262,9 +267,10 @@ class UrController:
     # Data.
 
     def _estimate_wrench(self) -> None:
-        """The wrench at the TCP that joint torques say is there, base frame."""
+        """The wrench on the TCP that joint torques say is there, base frame, less the sensor's zero."""
         _, _, J = self.cell.kinematics(self.cell.q, np.zeros(3))
-        self._wrench = np.linalg.solve(J @ J.T + 1e-8 * np.eye(6), J @ self.cell.tau_ext)
+        self._felt = np.linalg.solve(J @ J.T + 1e-8 * np.eye(6), J @ self.cell.tau_ext)
+        self._wrench = self._felt - self._zero
 
     def _data(self, client: Client) -> bytes:
         numbers: list[float] = []

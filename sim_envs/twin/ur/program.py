@@ -25,7 +25,7 @@ from touchgoal.sim_envs.twin.ur.motion import (
 
 _READY, _DONE = 1, 2
 _STREAMED = {6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71}  # acknowledged at once
-_IGNORED = {0, 8, 13, 14, 17, 20, 21, 48, 59, 65, 99}  # payload, force sensor, outputs, a kick
+_IGNORED = {0, 13, 14, 17, 20, 21, 48, 59, 65, 99}  # payload, outputs, a kick
 _STOP_SCRIPT = 255
 _REACH = 0.85  # m, UR5e data sheet
 _FLANGE_TO_TCP = np.array([0.0, 0.0, UR5E.tool.tcp_offset])
@@ -44,10 +44,15 @@ class UrProgram:
     """
 
     def __init__(
-        self, cell: SimulatedCell, inputs: dict[str, float], stop: Callable[[], None]
+        self,
+        cell: SimulatedCell,
+        inputs: dict[str, float],
+        stop: Callable[[], None],
+        zero_force: Callable[[], None],
     ) -> None:
-        """`stop` is what the program calls for a protective stop."""
-        self.cell, self.inputs, self._protective_stop = cell, inputs, stop
+        """What the program calls for a protective stop, and to zero the force sensor."""
+        self.cell, self.inputs = cell, inputs
+        self._protective_stop, self._zero_force = stop, zero_force
         self.activity: Activity | None = None
         self.ints, self.doubles = [0] * 48, [0.0] * 48
         self.ints[0], self.running = _READY, True
@@ -92,6 +97,7 @@ class UrProgram:
             2: lambda: self._move_to_pose(),
             3: lambda: self._move(self._line(self._doubles(0))),
             4: lambda: self._move(self._line(self.pose(self._doubles(0)))),
+            8: self._zero_force,
             9: lambda: self._go(Speed(self._doubles(0), self._double(6))),
             10: lambda: self._go(Speed(self._doubles(0), self._double(6), self.cell)),
             11: lambda: self._servo(self._doubles(0)),
