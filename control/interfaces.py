@@ -117,11 +117,18 @@ class Gripper(Protocol):
         ...
 
     def command(self, width: float) -> None:
-        """Go on to a width (m), clipped to the stroke; returns at once. DriverError at fault."""
+        """Go on to a width (m), clipped to the stroke; returns at once.
+
+        DriverError at fault or after `stop`, which only a new connection ends.
+        """
         ...
 
-    def stop(self) -> None:
-        """Stay as it is; what is held stays held."""
+    def stop(self, release_to: float | None = None) -> None:
+        """Stop moving and take no command any more; what is held stays held.
+
+        Args:
+            release_to: let go instead: open to this width (m) and stay there.
+        """
         ...
 
     def close(self) -> None:

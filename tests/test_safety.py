@@ -25,7 +25,7 @@ EPS = 1e-9
 
 
 def reading(q: np.ndarray, **changes: object) -> Measurements:
-    calm = Measurements(q, np.zeros(3), np.zeros(q.size), np.zeros(2), 0.0, 0.0, 0.0)
+    calm = Measurements(q, np.zeros(3), np.zeros(q.size), np.zeros(2), *[0.0] * 4)
     return replace(calm, **changes)  # pyright: ignore[reportArgumentType]
 
 

@@ -80,7 +80,7 @@ def test_behind_the_safety_layer_the_fingers_stay_in_their_box() -> None:
     for tick in range(200):
         if tick % 25 == 0:
             push = rng.choice([0.05, 1.0]) * rng.standard_normal(7)
-        calm = Measurements(state.q, np.zeros(3), np.zeros(7), np.zeros(2), 0.0, 0.0, 0.0)
+        calm = Measurements(state.q, np.zeros(3), np.zeros(7), np.zeros(2), *[0.0] * 4)
         state = layer.filter_action(state, push, calm)
         ticks += 50
         if rng.random() > 0.1:

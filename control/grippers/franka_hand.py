@@ -1,13 +1,13 @@
 """Franka Hand through franky-control, in a child process.
 
 The hand takes one slow command at a time, while a policy asks for a width every tick. The newest
-width is sent when the last command is done, which is after 0.8 s at most: franky cannot interrupt one
-(measured: its stop waits for the end). A hand's grasp closes until it meets something, whatever width
+width is sent when the last command is done, which is after 0.8 s at most; `stop` ends one at once. A hand's grasp closes until it meets something, whatever width
 it is told, so only closing all the way grasps; any other width is a move, and one that meets something
 on its way in grasps that.
 """
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from touchgoal.control.arms.driver_process import DriverProcess
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _STEP = 2e-3  # m between commands that differ, and up to which a width is shut
 _SPEED = 0.1  # m/s; the hand's fastest
+_STOP_TIMEOUT = 0.5  # s that a stop may take; 0.06 on the twin
 
 
 class FrankaHandClient:
@@ -38,27 +39,36 @@ class FrankaHandClient:
         self._inwards = False  # whether that is a move that closes
         self._sent = self._target = self._hand.state.width
         self._fault, self._clock = "", -1
+        self._stopped = False
         self._reading = self._measure()
 
     def read(self) -> GripperReading:
-        """The state as of the last tick."""
-        return self._reading
+        """The state as of the last tick; a fault counts from when it happened."""
+        return replace(self._reading, fault=self._fault)
 
     def command(self, width: float) -> None:
         """A new target (m)."""
-        if self._fault:
-            raise DriverError(f"no command is taken: {self._fault}")
+        if self._fault or self._stopped:
+            raise DriverError(f"no command is taken: {self._fault or 'the hand was stopped'}")
         self._target = min(max(width, 0.0), self._max_width)
 
-    def stop(self) -> None:
-        """Send nothing more."""
+    def stop(self, release_to: float | None = None) -> None:
+        """End the command that runs and send no other, except to let go (m)."""
+        if not self._stopped and self._running is not None and not self._running.wait(0.0):
+            self._hand.stop_async().wait(_STOP_TIMEOUT)
+        self._stopped, self._running, self._inwards = True, None, False
         self._target = self._sent
+        if release_to is not None:
+            width = min(max(release_to, 0.0), self._max_width)
+            self._running = self._hand.move_async(width, _SPEED)
 
     def tick(self) -> None:
         """Read the state; send the target if it is news."""
         try:
             self._reading = self._measure()
-            if not self._fault and self._idle() and abs(self._target - self._sent) > _STEP:
+            if self._fault or self._stopped:
+                return
+            if self._idle() and abs(self._target - self._sent) > _STEP:
                 self._go(self._target)
         except Exception as error:
             self._fault = f"{type(error).__name__}: {' '.join(str(error).split())}"
@@ -117,9 +127,9 @@ class FrankaHand:
         """See Gripper."""
         self._process.call("command", width)
 
-    def stop(self) -> None:
+    def stop(self, release_to: float | None = None) -> None:
         """See Gripper."""
-        self._process.call("stop")
+        self._process.call("stop", release_to)
 
     def close(self) -> None:
         """See Gripper."""

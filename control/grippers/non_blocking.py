@@ -1,8 +1,9 @@
 """A gripper behind a thread, for drivers whose answers take longer than a control loop can wait."""
 
+import threading
 import time
 
-from touchgoal.control.interfaces import Gripper, GripperReading
+from touchgoal.control.interfaces import DriverError, Gripper, GripperReading
 from touchgoal.control.sensors.latest_value import LatestValue
 
 _PAUSE = 0.01  # s between exchanges
@@ -14,6 +15,7 @@ class NonBlockingGripper:
     def __init__(self, gripper: Gripper) -> None:
         self._gripper = gripper
         self._wanted: float | None = None
+        self._lock, self._stopped = threading.Lock(), False
         self._latest = LatestValue("gripper", self._take)
 
     def read(self) -> GripperReading:
@@ -22,12 +24,15 @@ class NonBlockingGripper:
 
     def command(self, width: float) -> None:
         """See Gripper; a fault shows in the next reading."""
+        if self._stopped:
+            raise DriverError("no command is taken: the gripper was stopped")
         self._wanted = width
 
-    def stop(self) -> None:
-        """See Gripper."""
-        self._wanted = None
-        self._gripper.stop()
+    def stop(self, release_to: float | None = None) -> None:
+        """See Gripper. No width that was read before is sent after it: both hold the lock."""
+        with self._lock:
+            self._stopped = True
+            self._gripper.stop(release_to)
 
     def close(self) -> None:
         """See Gripper."""
@@ -36,7 +41,9 @@ class NonBlockingGripper:
 
     def _take(self) -> GripperReading:
         time.sleep(_PAUSE)
-        reading, wanted = self._gripper.read(), self._wanted
-        if wanted is not None and not reading.fault:
-            self._gripper.command(wanted)
+        reading = self._gripper.read()
+        with self._lock:
+            wanted = None if self._stopped else self._wanted
+            if wanted is not None and not reading.fault:
+                self._gripper.command(wanted)
         return reading

@@ -58,6 +58,7 @@ class Robotiq:
         self._modbus = minimalmodbus.Instrument(self._port, registers.SLAVE)
         self._lock = threading.Lock()
         self._wanted: int | None = None
+        self._stopped = False
         self._misses = 0
         try:
             self._start()
@@ -74,23 +75,30 @@ class Robotiq:
         """See Gripper."""
         if fault := self.read().fault:
             raise DriverError(f"no command is taken: {fault}")
-        opened, closed = self.config.widths
-        share = min(max((opened - width) / (opened - closed), 0.0), 1.0)
         with self._lock:
-            self._wanted = round(
-                registers.POSITIONS[0] + share * (registers.POSITIONS[1] - registers.POSITIONS[0])
-            )
+            if self._stopped:
+                raise DriverError("no command is taken: the gripper was stopped")
+            self._wanted = self._position(width)
 
-    def stop(self) -> None:
+    def stop(self, release_to: float | None = None) -> None:
         """See Gripper: without the go bit the fingers halt, and what is held stays held."""
         with self._lock:
-            self._wanted = None
-            self._write(bytes([registers.ACTIVATE, 0, 0, 0, 0, 0]))
+            self._stopped = True
+            self._wanted = None if release_to is None else self._position(release_to)
+            if self._wanted is None:
+                self._write(bytes([registers.ACTIVATE, 0, 0, 0, 0, 0]))
 
     def close(self) -> None:
         """See Gripper."""
         self._latest.close()
         self._port.close()
+
+    def _position(self, width: float) -> int:
+        """Of a width (m), in counts."""
+        opened, closed = self.config.widths
+        share = min(max((opened - width) / (opened - closed), 0.0), 1.0)
+        first, last = registers.POSITIONS
+        return round(first + share * (last - first))
 
     def _start(self) -> None:
         """Finds the gripper activated, or activates it if that is allowed."""

@@ -39,6 +39,7 @@ class Limit(StrEnum):
     STALE_OBSERVATION = "observation age"
     STALE_ACTION = "action age"
     STALE_STATE = "robot state age"
+    STALE_GRIPPER = "gripper age"
     FORCE = "external force"
     TORQUE = "external torque"
     TOUCH = "gel indentation"
@@ -70,15 +71,16 @@ class Deadline:
 
 @dataclass(frozen=True)
 class Watchdogs:
-    """Deadlines of camera and touch frames, of the policy's action, of the arm's state.
+    """Deadlines of camera and touch frames, of the policy's action, of the arm's and gripper's state.
 
     Hold after 100 ms, two ticks at 20 Hz and 50 ms: shared/research/drivers.md 6. Stop: half a
-    second, well below the client libraries' own 1 s.
+    second, well below the client libraries' own 1 s. A gripper's state comes every 20 to 50 ms.
     """
 
     observation: Deadline = Deadline(0.1, 0.5)
     action: Deadline = Deadline(0.1, 0.5)
     state: Deadline = Deadline(0.05, 0.25)
+    gripper: Deadline = Deadline(0.3, 1.0)
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ class Measurements:
         force: N on the TCP from outside.
         torque: Nm in each joint from outside.
         touch: m that each fingertip's gel is pressed in.
-        observation_age, action_age, state_age: s since the oldest of each was taken.
+        observation_age, action_age, state_age, gripper_age: s since the oldest of each was taken.
     """
 
     q: Joints
@@ -100,6 +102,7 @@ class Measurements:
     observation_age: float
     action_age: float
     state_age: float
+    gripper_age: float
 
 
 @dataclass(frozen=True)
@@ -199,6 +202,7 @@ class Safety:
             (Limit.STALE_OBSERVATION, reading.observation_age, w.observation),
             (Limit.STALE_ACTION, reading.action_age, w.action),
             (Limit.STALE_STATE, reading.state_age, w.state),
+            (Limit.STALE_GRIPPER, reading.gripper_age, w.gripper),
         ]
 
     def _stale(self, reading: Measurements) -> tuple[Limit, ...]:

@@ -8,7 +8,7 @@ nothing.
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol, runtime_checkable
 
@@ -17,8 +17,9 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.control.cell.connection import CellConnection, RealClock
 from touchgoal.control.errors import UserError
-from touchgoal.control.interfaces import DriverError
+from touchgoal.control.interfaces import ArmReading, DriverError
 from touchgoal.control.safety.action_filter import Limit, Measurements, Safety, SafetyState
+from touchgoal.policies.deploy.held_object import HeldObject
 from touchgoal.policies.deploy.observation import CellReading, ObservationReader
 from touchgoal.sim_envs.base import Observation
 
@@ -30,12 +31,14 @@ ADVICE = {
     Limit.NOT_A_NUMBER: "the policy's output is broken: do not use this checkpoint",
     Limit.STALE_OBSERVATION: "a camera or fingertip is late: check its cable and the machine's load",
     Limit.STALE_ACTION: "the policy is too slow or hangs: make it smaller, or free the machine",
-    Limit.STALE_STATE: "the arm's state is late: check the network to the controller",
+    Limit.STALE_STATE: "the arm's state is late or broken: check the network to the controller",
+    Limit.STALE_GRIPPER: "the gripper's state is late or broken: check its cable and supply",
     Limit.FORCE: "something pressed on the hand: clear it, then start again; a task that presses by "
     "itself (the shipped pick-and-place policy sets down with about 15 N) needs a higher safety.force "
     "in the cell file, such as 25; an FR3 itself stops at 30",
     Limit.TORQUE: "something pressed on the arm: clear it, then start again",
-    Limit.TOUCH: "a gel was pressed too deep, the hand let go: look at it, lower gripper.force",
+    Limit.TOUCH: "a gel was pressed too deep: look at it, lower gripper.force; the hand let go, unless "
+    "it was carrying something",
     Limit.TRACKING: "the arm does not follow: look for what blocks it",
 }
 
@@ -185,6 +188,7 @@ class ControlLoop:
         self.reader = ObservationReader(connection, camera_size)
         self.state = safety.start(connection.arm.read().q)
         self.width = connection.gripper.read().width
+        self._held = HeldObject()
 
     def commanded(self) -> np.ndarray:
         """Joint positions (rad) commanded now."""
@@ -223,21 +227,28 @@ class ControlLoop:
             first = False
             clock.wait(due)
 
-    def stop(self, reason: str, advice: str) -> Ending:
-        """Stop the arm and watch it come to rest."""
+    def stop(self, reason: str, advice: str, release_to: float | None = None) -> Ending:
+        """Stop arm and gripper for good, and watch the arm come to rest.
+
+        Args:
+            reason, advice: for the operator.
+            release_to: width (m) that the gripper opens to; None: it stays, and what it holds is held.
+        """
         if not self._execute:
             return Ending(reason, False, True, advice)
         arm, clock = self._connection.arm, self._connection.clock
         began, end = clock.now(), time.monotonic() + _REST_WALL_TIMEOUT
         arm.stop()
-        rest, last = np.inf, arm.read().time
+        with suppress(DriverError):  # of a lost gripper; the arm is what matters
+            self._connection.gripper.stop(release_to)
+        rest, last = np.inf, arm.read()
         while clock.now() - began < _REST_TIMEOUT and time.monotonic() < end:
             clock.wait(clock.now() + self._safety.dt / 5)
             reading = arm.read()
-            if reading.time > last and np.abs(reading.velocity).max() < _REST_SPEED:
+            if reading.time > last.time and _speed(last, reading) < _REST_SPEED:
                 rest = clock.now() - began
                 break
-            last = reading.time
+            last = reading
         return Ending(reason, False, True, advice, rest)
 
     def _tick(
@@ -248,6 +259,9 @@ class ControlLoop:
             sensed = self._as_commanded(sensed)
         if sensed.fault:
             return self.stop(sensed.fault, "see above; then start deploy again")
+        self._held.update(sensed.gripper, self.width, float(sensed.observation[ft.TCP_POSE][2]))
+        if self._held.lost:
+            return self.stop("the hand has lost what it held", "put it back, then start again")
         if request := self._operator_request():
             if request == "stop":
                 return self.stop("stopped by the operator", "start deploy again when you are ready")
@@ -263,6 +277,7 @@ class ControlLoop:
             observation_age=sensed.age,
             action_age=actor.action_age,
             state_age=self._connection.clock.age(sensed.arm.stamp) if self._execute else 0.0,
+            gripper_age=self._connection.clock.age(sensed.gripper.stamp),
         )
         before, self.state = (
             self.state,
@@ -291,13 +306,17 @@ class ControlLoop:
         reason = str(fault)
         if fault.limit == Limit.STALE_OBSERVATION:
             reason += f" s ({sensed.oldest_source}; {self.reader.problem() or 'it is slow'})"
-        if fault.limit == Limit.TOUCH and self._execute:  # open by as much as both gels give way
+        elif self.reader.unsound and fault.limit in (Limit.STALE_STATE, Limit.STALE_GRIPPER):
+            reason += f" s ({self.reader.unsound})"
+        release_to = None
+        if fault.limit == Limit.TOUCH and not self._held.carried:
+            # Open by as much as both gels give way; what is carried would fall.
             width = sensed.gripper.width + 2 * self._safety.limits.touch
-            self._connection.gripper.command(min(width, self._safety.limits.tool.stroke[1]))
+            release_to = min(width, self._safety.limits.tool.stroke[1])
         advice = ADVICE.get(fault.limit, "look at what it names")
         if fault.limit == Limit.FORCE and np.isnan(fault.value):
             advice = "the arm is near a singularity, where it feels no forces: keep the task away"
-        return self.stop(reason, advice)
+        return self.stop(reason, advice, release_to)
 
     def _as_commanded(self, sensed: CellReading) -> CellReading:
         """As if the arm had followed."""
@@ -305,3 +324,10 @@ class ControlLoop:
         state = np.concatenate([q, velocity, [self.width]]).astype(np.float32)
         arm = replace(sensed.arm, q=q, velocity=velocity)
         return replace(sensed, arm=arm, observation={**sensed.observation, ft.STATE: state})
+
+
+def _speed(before: ArmReading, now: ArmReading) -> float:
+    """Of the fastest joint, rad/s; by differences if the arm does not tell."""
+    if np.isfinite(now.velocity).all():
+        return float(np.abs(now.velocity).max())
+    return float(np.abs(now.q - before.q).max()) / (now.time - before.time)

@@ -1,6 +1,6 @@
 """What a connection's devices say in one control tick, in the vocabulary and with its age."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -33,6 +33,7 @@ class CellReading:
         age: s since the oldest picture was taken.
         oldest_source: whose picture that was.
         indentation: m that the left and the right gel are pressed in; 0 without fingertips.
+        arm, gripper: the last ones in which all are numbers, with the stamps of then: ages tell.
         fault: what a device says is wrong with it; empty if nothing.
     """
 
@@ -50,6 +51,9 @@ class ObservationReader:
     """Reads a connection whose fingertips are untouched at first.
 
     It never waits: drivers keep the newest reading of everything.
+
+    Attributes:
+        unsound: what is not a number in the newest readings of arm and gripper; empty if all is.
     """
 
     def __init__(
@@ -74,11 +78,14 @@ class ObservationReader:
         self._indentations: dict[
             str, tuple[int, float]
         ] = {}  # sequence of the last frame, indentation
+        self._arm: ArmReading | None = None
+        self._gripper: GripperReading | None = None
+        self.unsound = ""
 
     def read(self) -> CellReading:
         """The newest of everything; DriverError if something broke for good."""
         connection = self._connection
-        arm, gripper = connection.arm.read(), connection.gripper.read()
+        arm, gripper = self._sound(connection.arm.read(), connection.gripper.read())
         frames = {key: camera.read() for key, camera in connection.cameras.items()}
         load = connection.load_cell.read() if connection.load_cell else None
         age = connection.clock.age
@@ -103,6 +110,22 @@ class ObservationReader:
             indentation,
             fault,
         )
+
+    def _sound(
+        self, arm: ArmReading, gripper: GripperReading
+    ) -> tuple[ArmReading, GripperReading]:
+        """The newest of either without a value that is not a number; faults are always the newest."""
+        parts = {"joint positions": arm.q, "joint velocity": arm.velocity, "joint torque": arm.torque}
+        bad = [name for name, value in parts.items() if not np.isfinite(value).all()]
+        if not bad or self._arm is None:
+            self._arm = arm
+        narrow = [] if np.isfinite(gripper.width) else ["gripper width"]
+        if not narrow or self._gripper is None:
+            self._gripper = gripper
+        self.unsound = f"{' and '.join(bad + narrow)} not a number" if bad or narrow else ""
+        if not np.isfinite(self._arm.q).all():
+            raise DriverError("the arm's joint positions are not numbers: restart its controller")
+        return replace(self._arm, fault=arm.fault), replace(self._gripper, fault=gripper.fault)
 
     def _indentation(self, frames: dict[str, Frame]) -> Float[np.ndarray, "2"]:
         """Every picture is measured once: between two of them there is no news."""

@@ -29,9 +29,7 @@ from touchgoal.sim_envs.config import STREAM_SIZE, BeadMazeConfig, PickPlaceConf
 from touchgoal.sim_envs.tasks import make_env
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 
-_HELD_GAP = (
-    0.005  # m between the width asked for and the width there is, that mean something is held
-)
+_HELD_FORCE = 0.5  # N on both pads that mean something is held
 
 
 class SimulatedClock:
@@ -125,22 +123,34 @@ class SimulatedGripper:
 
     def __init__(self, cell: SimulatedCell, force: float) -> None:
         self._cell, self._force = cell, force
+        self._stopped = False
 
     def read(self) -> GripperReading:
         """See Gripper."""
-        cell = self._cell
-        width = cell.env.width()
-        return GripperReading(width, width - cell.gripper_command.width > _HELD_GAP, "", cell.time)
+        env = self._cell.env
+        held = min(pad.normal_force for pad in env.pad_contacts()) > _HELD_FORCE
+        return GripperReading(env.width(), held, "", self._cell.time)
 
     def command(self, width: float) -> None:
         """See Gripper."""
-        self._cell.command_gripper(width, self._cell.env.robot.tool.speed, self._force)
+        if self._stopped:
+            raise DriverError("no command is taken: the gripper was stopped")
+        self._go(width)
 
-    def stop(self) -> None:
-        """See Gripper."""
+    def stop(self, release_to: float | None = None) -> None:
+        """See Gripper: what is held goes on being pressed."""
+        cell = self._cell
+        if release_to is not None:
+            self._go(release_to)
+        elif not self._stopped and not self.read().grasped:
+            self._go(cell.env.width())
+        self._stopped = True
 
     def close(self) -> None:
         """See Gripper."""
+
+    def _go(self, width: float) -> None:
+        self._cell.command_gripper(width, self._cell.env.robot.tool.speed, self._force)
 
 
 class SimulatedCamera:

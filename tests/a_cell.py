@@ -1,0 +1,152 @@
+"""A cell of made-up devices that do as they are told, for what the control loop makes of them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from touchgoal.control import features as ft
+from touchgoal.control.cell.connection import CellConnection
+from touchgoal.control.interfaces import ArmReading, Frame, GripperReading, LoadReading
+from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.safety.limits import FR3
+from touchgoal.policies.deploy.control_loop import ControlLoop, Ending, RunLog
+
+
+@dataclass
+class MadeUpClock:
+    """Jumps where it is waited for."""
+
+    time: float = 0.0
+
+    def now(self) -> float:
+        return self.time
+
+    def age(self, stamp: float) -> float:
+        return self.time - stamp
+
+    def wait(self, until: float) -> None:
+        self.time = max(self.time, until)
+
+
+@dataclass
+class MadeUpArm:
+    """Is at once where it is commanded."""
+
+    clock: MadeUpClock
+    reading: ArmReading = field(
+        default_factory=lambda: ArmReading(
+            FR3.arm.home, np.zeros(7), np.zeros(6), np.zeros(7), "", 0.0, 0.0
+        )
+    )
+    stopped: bool = False
+
+    def read(self) -> ArmReading:
+        return replace(self.reading, stamp=self.clock.time, time=self.clock.time)
+
+    def command(self, q: np.ndarray) -> None:
+        self.reading = replace(self.reading, q=q)
+
+    def stop(self) -> None:
+        self.stopped = True
+
+    def recover(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+@dataclass
+class MadeUpGripper:
+    """Remembers what it was told."""
+
+    clock: MadeUpClock
+    reading: GripperReading = field(default_factory=lambda: GripperReading(0.04, False, "", 0.0))
+    silent_from: float = np.inf
+    told: list[str] = field(default_factory=list)
+
+    def read(self) -> GripperReading:
+        return replace(self.reading, stamp=min(self.clock.time, self.silent_from))
+
+    def command(self, width: float) -> None:
+        self.told.append(f"{width:.3f}")
+
+    def stop(self, release_to: float | None = None) -> None:
+        self.told.append("stop" if release_to is None else f"open to {release_to:.3f}")
+
+    def close(self) -> None: ...
+
+
+@dataclass
+class MadeUpCamera:
+    """Shows one picture, new each time."""
+
+    clock: MadeUpClock
+    image: np.ndarray
+    rate: float = 30.0
+    problem: str = ""
+
+    def read(self) -> Frame:
+        return Frame(self.image, round(1000 * self.clock.time), self.clock.time)
+
+    def close(self) -> None: ...
+
+
+@dataclass
+class MadeUpLoadCell:
+    """Says one force (N)."""
+
+    clock: MadeUpClock
+    force: float = 0.0
+
+    def read(self) -> LoadReading:
+        return LoadReading(self.force, 0, self.clock.time)
+
+    def close(self) -> None: ...
+
+
+class MadeUpCell:
+    """Its devices, and a run of the control loop on them.
+
+    Attributes:
+        log: what the last run recorded.
+    """
+
+    def __init__(self) -> None:
+        self.clock = MadeUpClock()
+        self.arm, self.gripper = MadeUpArm(self.clock), MadeUpGripper(self.clock)
+        self.load_cell: MadeUpLoadCell | None = None
+        self.cameras: dict = {}
+        self.log = RunLog()
+
+    def run(
+        self,
+        each_tick: Callable[[int], None],
+        step: float = 0.0,
+        width: float = 0.0,
+        seconds: float = 5.0,
+    ) -> Ending:
+        """`each_tick` is told the number of the tick before the actor acts in it.
+
+        Args:
+            step: rad that the first joint is to go each tick.
+            width: m asked of the gripper.
+            seconds: after which it ends.
+        """
+        connection = CellConnection(
+            FR3, self.arm, self.gripper, self.cameras, self.load_cell, self.clock
+        )
+        safety = Safety(FR3, ft.CONTROL_HZ)
+        loop = ControlLoop(connection, safety, True, lambda: "", lambda _: None)
+        self.log = RunLog()
+
+        class Actor:
+            done, action_age, ticks = False, 0.0, 0
+
+            def act(self, observation: dict) -> np.ndarray:
+                self.ticks += 1
+                each_tick(self.ticks)
+                return np.array([step, *[0.0] * 6, width])
+
+            def close(self) -> None: ...
+
+        return loop.run(Actor(), seconds, self.log)

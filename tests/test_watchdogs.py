@@ -1,0 +1,226 @@
+"""What the control loop does about readings that go missing, and what the gripper does at a stop."""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from a_cell import MadeUpCell
+
+from touchgoal.control import features as ft
+from touchgoal.control.grippers.franka_hand import FrankaHandClient
+from touchgoal.control.grippers.non_blocking import NonBlockingGripper
+from touchgoal.control.interfaces import DriverError, GripperReading
+from touchgoal.control.safety.limits import FR3
+from touchgoal.policies.deploy.held_object import HeldObject
+
+NAN = float("nan")
+
+
+def at(tick: int, change: Callable[[], None]) -> Callable[[int], None]:
+    return lambda now: change() if now == tick else None
+
+
+def set_(device: object, **values: object) -> Callable[[], None]:
+    def change() -> None:
+        device.reading = replace(device.reading, **values)  # pyright: ignore
+
+    return change
+
+
+def test_every_stop_stops_the_gripper_too() -> None:
+    cell = MadeUpCell()
+    cell.run(at(10, set_(cell.arm, fault="reflex")))
+    assert cell.arm.stopped and cell.gripper.told[-1] == "stop"
+
+
+def test_a_gripper_that_falls_silent_holds_then_stops_the_arm() -> None:
+    cell = MadeUpCell()
+    cell.gripper.silent_from = 1.0
+    ending = cell.run(lambda _: None, step=0.001)
+    assert ending.stopped and "gripper age" in ending.reason
+    moved = np.diff([row[ft.STATE][0] for row in cell.log.rows])
+    assert (moved[:15] > 0).all() and (np.abs(moved[-8:]) < 1e-9).all()
+
+
+@pytest.mark.parametrize(
+    ("device", "values", "said"),
+    [
+        ("arm", {"velocity": np.full(7, NAN)}, "joint velocity not a number"),
+        ("arm", {"torque": np.full(7, NAN)}, "joint torque not a number"),
+        ("gripper", {"width": NAN}, "gripper width not a number"),
+    ],
+)
+def test_what_is_not_a_number_stops_the_arm_and_never_reaches_the_record(
+    device: str, values: dict, said: str
+) -> None:
+    cell = MadeUpCell()
+    ending = cell.run(at(10, set_(getattr(cell, device), **values)), step=0.001)
+    assert ending.stopped and said in ending.reason and np.isfinite(ending.rest_seconds)
+    assert len(cell.log.rows) >= 10
+    assert all(np.isfinite(value).all() for row in cell.log.rows for value in row.values())
+
+
+def test_a_moment_without_numbers_is_bridged() -> None:
+    cell = MadeUpCell()
+
+    def each(tick: int) -> None:
+        set_(cell.arm, velocity=np.full(7, NAN if tick == 10 else 0.0))()
+
+    ending = cell.run(each, step=0.001, seconds=2.0)
+    assert not ending.stopped and len(cell.log.rows) > 30
+
+
+def test_forces_that_nobody_knows_stop_the_arm() -> None:
+    cell = MadeUpCell()
+    ending = cell.run(at(10, set_(cell.arm, wrench=np.full(6, NAN))))
+    assert ending.reason == "external force is unknown" and "singularity" in ending.advice
+
+
+def test_an_object_lost_on_the_way_stops_the_arm() -> None:
+    cell = MadeUpCell()
+    set_(cell.gripper, width=0.04, grasped=True)()
+    ending = cell.run(at(20, set_(cell.gripper, width=0.0, grasped=False)))
+    assert ending.stopped and "lost what it held" in ending.reason
+
+
+def reading(width: float, grasped: bool) -> GripperReading:
+    return GripperReading(width, grasped, "", 0.0)
+
+
+def test_opening_the_hand_loses_nothing_and_lifting_is_carrying() -> None:
+    held = HeldObject()
+    held.update(reading(0.05, False), 0.0, 0.10)
+    for _ in range(3):
+        held.update(reading(0.04, True), 0.0, 0.10)
+    assert not held.carried  # the table carries it
+    held.update(reading(0.04, True), 0.0, 0.12)
+    assert held.carried
+    held.update(reading(0.04, False), 0.0, 0.12)  # for a moment
+    held.update(reading(0.04, True), 0.0, 0.12)
+    held.update(reading(0.045, False), 0.06, 0.10)
+    assert not held.lost and not held.carried
+
+
+class Slow:
+    """A gripper whose readings take a while, and that counts what comes after a stop."""
+
+    def __init__(self) -> None:
+        self.stopped, self.late = threading.Event(), 0
+
+    def read(self) -> GripperReading:
+        time.sleep(0.003)
+        return reading(0.04, False)
+
+    def command(self, width: float) -> None:
+        self.late += self.stopped.is_set()
+
+    def stop(self, release_to: float | None = None) -> None:
+        self.stopped.set()
+
+    def close(self) -> None: ...
+
+
+def test_a_stopped_gripper_is_sent_no_width_again() -> None:
+    for _ in range(20):
+        slow = Slow()
+        gripper = NonBlockingGripper(slow)
+        gripper.read()
+        gripper.command(0.02)
+        gripper.stop()
+        with pytest.raises(DriverError, match="stopped"):
+            gripper.command(0.03)
+        time.sleep(0.01)
+        gripper.close()
+        assert slow.late == 0
+
+
+class HandState:
+    """What franky says of a hand."""
+
+    def __init__(self) -> None:
+        self.width, self.max_width, self.is_grasped = 0.06, 0.08, False
+        self.time, self.ticks = self, 0
+
+    def to_msec(self) -> int:
+        self.ticks += 1
+        return self.ticks
+
+
+class Running:
+    """franky's promise of an answer."""
+
+    def __init__(self) -> None:
+        self.done = False
+
+    def wait(self, seconds: float) -> bool:
+        return self.done
+
+    def get(self) -> bool:
+        return False  # it met something
+
+
+class Hand:
+    """franky's gripper."""
+
+    def __init__(self) -> None:
+        self.state, self.running, self.orders = HandState(), Running(), []
+
+    def move_async(self, width: float, speed: float) -> Running:
+        self.orders.append(f"move {width:.2f}")
+        return self.running
+
+    def grasp_async(self, *_: float, **__: float) -> Running:
+        self.orders.append("grasp")
+        return self.running
+
+    def stop_async(self) -> Running:
+        self.orders.append("stop")
+        return Running()
+
+
+@pytest.fixture
+def hand(monkeypatch: pytest.MonkeyPatch) -> tuple[FrankaHandClient, Hand]:
+    made = Hand()
+    monkeypatch.setattr(
+        "touchgoal.control.grippers.franka_hand.import_client",
+        lambda *_: type("Client", (), {"Gripper": staticmethod(lambda address: made)}),
+    )
+    return FrankaHandClient("here", 30.0), made
+
+
+def test_a_stopped_hand_does_not_grasp_what_its_last_move_met(
+    hand: tuple[FrankaHandClient, Hand],
+) -> None:
+    client, franky = hand
+    client.command(0.02)
+    client.tick()
+    client.stop()
+    franky.running.done = True
+    for _ in range(3):
+        client.tick()
+    assert franky.orders == ["move 0.02", "stop"]
+    with pytest.raises(DriverError, match="stopped"):
+        client.command(0.05)
+
+
+def test_a_hand_that_is_to_let_go_opens_and_does_no_more(
+    hand: tuple[FrankaHandClient, Hand],
+) -> None:
+    client, franky = hand
+    client.command(0.02)
+    client.tick()
+    client.stop(release_to=0.07)
+    for _ in range(3):
+        client.tick()
+    assert franky.orders == ["move 0.02", "stop", "move 0.07"]
+
+
+def test_a_hands_fault_reaches_the_reading(hand: tuple[FrankaHandClient, Hand]) -> None:
+    client, franky = hand
+    franky.state = None  # pyright: ignore
+    client.tick()
+    assert "AttributeError" in client.read().fault
+    assert FR3.tool.stroke[0] <= client.read().width
