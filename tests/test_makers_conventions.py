@@ -5,6 +5,7 @@ wire are read by the maker's client library, and what they should be is written 
 documents, without our kinematics.
 """
 
+import time
 
 import numpy as np
 import pytest
@@ -108,7 +109,7 @@ def reads_ur(address: str) -> dict:
     from rtde_receive import RTDEReceiveInterface
 
     receive = RTDEReceiveInterface(address)
-    time.sleep(0.3)  # noqa: F821, in the program that `client` makes of it
+    time.sleep(0.3)
     said = {
         "force": receive.getActualTCPForce(),
         "pose": receive.getActualTCPPose(),

@@ -111,11 +111,13 @@ class ObservationReader:
             fault,
         )
 
-    def _sound(
-        self, arm: ArmReading, gripper: GripperReading
-    ) -> tuple[ArmReading, GripperReading]:
+    def _sound(self, arm: ArmReading, gripper: GripperReading) -> tuple[ArmReading, GripperReading]:
         """The newest of either without a value that is not a number; faults are always the newest."""
-        parts = {"joint positions": arm.q, "joint velocity": arm.velocity, "joint torque": arm.torque}
+        parts = {
+            "joint positions": arm.q,
+            "joint velocity": arm.velocity,
+            "joint torque": arm.torque,
+        }
         bad = [name for name, value in parts.items() if not np.isfinite(value).all()]
         if not bad or self._arm is None:
             self._arm = arm
