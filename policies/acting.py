@@ -12,6 +12,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
+from touchgoal.policies.perception.proprioception import tare
 from touchgoal.policies.policy import ObservationBatch, Policy
 
 Observation = Mapping[str, np.ndarray]
@@ -95,6 +96,8 @@ class Planner:
         known = dict(observation)
         if self._estimator:
             known |= self._estimator.estimate(observation, self._first)
+        if self.config.tares_wrench:
+            known[ft.WRENCH] = tare(observation[ft.WRENCH], self._first[ft.WRENCH])
         state = np.concatenate([known[key] for key in self.config.proprioception])
         return self._embed_touch(observation), state
 

@@ -30,6 +30,7 @@ from touchgoal.policies.perception.end_to_end import EndToEndConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
 from touchgoal.policies.perception.state_estimation import StateEstimator, load_estimator
 from touchgoal.policies.policy import Policy, PolicyConfig
+from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.config import TASKS, EnvConfig, TaskConfig, TaskName
 from touchgoal.sim_envs.tasks import task_name
 
@@ -92,10 +93,10 @@ class SavedPolicy:
     directory: Path
     latency: int = 0
 
-    def __call__(self, env: object = None) -> PolicyActor:
-        """An actor for one episode, on one core; which environment does not matter."""
+    def __call__(self, env: FrankaTactileEnv | None = None) -> PolicyActor:
+        """An actor for one episode, on one core; its plans come as late as the environment says."""
         torch.set_num_threads(1)  # two lose badly when the other core is taken
-        return PolicyActor(self.planner(), self.latency)
+        return PolicyActor(self.planner(), max(self.latency, env.plan_ticks if env else 0))
 
     def planner(self) -> Planner:
         """What makes its plans in one episode."""

@@ -56,6 +56,7 @@ class PolicyConfig:
         head: what draws the chunk.
         task: of the episodes learned from, such as "bead-maze"; "" if unknown.
         sensor: of the fingertips in them; "" for a policy without touch.
+        tares_wrench: whether it sees the force on the hand less that of the episode's first tick.
     """
 
     touch_dim: int
@@ -74,6 +75,7 @@ class PolicyConfig:
     head: DiffusionConfig | RegressionConfig = field(default_factory=DiffusionConfig)
     task: str = ""
     sensor: str = ""
+    tares_wrench: bool = False
 
     def __post_init__(self) -> None:
         """Raises UserError for what makes no policy."""

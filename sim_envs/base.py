@@ -14,7 +14,8 @@ from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.motion.tool import FRANKA_HAND
 from touchgoal.control.tactile.sensor_models import find_sensor
-from touchgoal.sim_envs.config import SETPOINT_PERIOD, EnvConfig, SceneConfig
+from touchgoal.sim_envs.config import NOTHING_BETWEEN, SETPOINT_PERIOD, EnvConfig, SceneConfig
+from touchgoal.sim_envs.deployed_arm import DeployedArm
 from touchgoal.sim_envs.scene.build import ROBOTS, SIDES, arm_joints, build
 from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, ContactReader, PadContact
 from touchgoal.sim_envs.scene.objects import Body
@@ -34,7 +35,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     """An FR3 with two fingertip sensors at a table; a task adds objects, progress and success.
 
     Observations are a flat dict with the keys of `control/features.py`; truth (`truth.*`) is in
-    `info`. The action is the joint change (rad) for this tick, added to the commanded joint
+    `info`; that of the pads is of when the pictures were taken. The action is the joint change (rad) for this tick, added to the commanded joint
     positions, and the gripper width target (m). The gripper closes at its own speed and then
     holds with `grasp_force` N on each finger, as the Franka Hand's `grasp` does.
     """
@@ -60,6 +61,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self._renderer: Renderer | None = None
         self._view_renderer: Renderer | None = None
         self._pads: list[TactilePad] = []
+        self._deployed: DeployedArm | None = None
 
     # What a task defines.
 
@@ -100,7 +102,9 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.data.qpos[self.arm_positions] = self.command
         self.data.qpos[self._fingers] = self._finger_target
         self._ticks = 0
+        self._deployed = None
         self._let_settle()
+        self._begin_deployment()
         self.evaluate()
         return self._observe(), self._info(0.0, False)
 
@@ -116,7 +120,10 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         action = np.clip(action, low, high)
         before = self._progress
         self.begin_tick()
-        self._run_tick(action[:-1], action[-1], seconds=1 / self.config.control_hz)
+        if self._deployed:
+            self._deployed.run_tick(action[:-1], action[-1])
+        else:
+            self._run_tick(action[:-1], action[-1], seconds=1 / self.config.control_hz)
         progress, success = self.end_tick()
         truncated = self._ticks >= self.config.max_seconds * self.config.control_hz
         info = self._info(progress, success)
@@ -301,7 +308,19 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
             self.step_physics(joints, width, self.robot.tool.speed, steps)
         self.update_contacts()
 
+    def _begin_deployment(self) -> None:
+        """From here on the arm is as it is deployed, if it is to be."""
+        between = self.config.between()
+        if between != NOTHING_BETWEEN:
+            self._deployed = DeployedArm(self, between, self.np_random.spawn(1)[0])
+
     def _observe(self) -> Observation:
+        if self._deployed:
+            return self._deployed.observation()
+        return self.read_proprioception() | self.take_pictures()
+
+    def read_proprioception(self) -> Observation:
+        """State, TCP pose and wrench as they are; `update_contacts` first."""
         data = self.data
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, data.site_xmat[self._tcp])
@@ -310,18 +329,31 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
             ft.TCP_POSE: np.concatenate([data.site_xpos[self._tcp], quat]),
             ft.WRENCH: self._external,
         }
-        observation = {key: value.astype(np.float32) for key, value in values.items()}
-        for camera in self.config.cameras:
-            observation[ft.IMAGE_PREFIX + camera] = self.render_camera(camera)
+        return {key: value.astype(np.float32) for key, value in values.items()}
+
+    def take_pictures(self) -> Observation:
+        """What cameras and fingertips show now; `update_contacts` first, keep to the order of time."""
+        pictures = {
+            ft.IMAGE_PREFIX + camera: self.render_camera(camera) for camera in self.config.cameras
+        }
         if self._pads:
             self._frames = [self.read_tactile(side) for side in range(2)]
             for key, frame in zip(ft.TACTILE, self._frames, strict=True):
-                observation[key] = frame.image
-        return observation
+                pictures[key] = frame.image
+        return pictures
+
+    def contacts_shown(self) -> tuple[PadContact, PadContact]:
+        """The pads' contacts when the pictures of the last observation were taken."""
+        return self._deployed.contacts if self._deployed else self._contacts
+
+    @property
+    def plan_ticks(self) -> int:
+        """Control ticks by which a learned policy's plans come late in this episode."""
+        return self._deployed.plan_ticks if self._deployed else 0
 
     def _info(self, progress: float, success: bool) -> dict[str, Any]:
         self._progress = progress
-        pads = self._contacts
+        pads = self.contacts_shown()
         wrench = np.concatenate([w for pad in pads for w in (pad.force, pad.torque)])
         return {
             ft.TRUTH_PAD_WRENCH: wrench.astype(np.float32),

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control import features as ft
-from touchgoal.control.motion.rotations import fingers_across
+from touchgoal.control.motion.rotations import fingers_across, rotation_matrix
 from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
 from touchgoal.sim_envs.config import BeadMazeConfig, BeadMazeReset
 from touchgoal.sim_envs.options import with_options
@@ -129,6 +129,10 @@ class BeadMaze(FrankaTactileEnv):
         """Joint positions with the bead between the fingers, not quite in their middle."""
         point, tangent = self.wire.at(START)
         R = fingers_across(tangent)
+        if self.config.start_angle > 0:
+            turn = rng.normal(size=3)
+            turn *= np.radians(rng.uniform(0, self.config.start_angle)) / np.linalg.norm(turn)
+            R = R @ rotation_matrix(turn)
         offset = R @ np.array([rng.uniform(-0.001, 0.001), 0.0, rng.uniform(-0.001, 0.001)])
         guess = self.robot.arm.home.copy()
         # the hand's yaw; wires head into the half plane y > 0, or nearly so

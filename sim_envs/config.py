@@ -1,5 +1,6 @@
 """Options of the simulated cell and of each task; light to import, for every command shows them."""
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
@@ -97,6 +98,65 @@ class SceneConfig:
             )
 
 
+Delay = Annotated[float, Field(ge=0.0, le=0.2)]
+"""s"""
+DelayRange = Annotated[tuple[Delay, Delay], ORDERED]
+TickRange = Annotated[tuple[Annotated[int, Field(ge=0, le=2)], ...], Field(min_length=1)]
+
+
+@checked_dataclass
+class DeploymentConfig:
+    """What lies between a policy and a real arm; each is drawn anew for each episode.
+
+    What is not given is as `as_deployed` says: all of it as over the wire (`AS_DEPLOYED`), or none.
+    """
+
+    tracked: bool | None = None
+    """The arm is driven as `deploy` drives it: the lag of deploy's loop, the safety layer's limits,
+    the 1 kHz tracker, and an arm that follows its set-point without a lag of its own."""
+    hand: bool | None = None
+    """The hand is a Franka Hand: one command at a time, each runs to its end; closing to 0 grasps
+    what it meets, any other width is a move. Its width is read every 50 ms."""
+    wrench: bool | None = None
+    """The force on the hand is a real arm's estimate: with noise, bias, lag, and now and then exactly
+    zero, which means unknown."""
+    state_delay: DelayRange | None = None
+    """Age of joint positions, velocities and force when the policy sees them, s."""
+    picture_delay: DelayRange | None = None
+    """Age of the pictures of cameras and fingertips when the policy sees them, s."""
+    command_delay: DelayRange | None = None
+    """From the policy's answer until arm and hand get it, s."""
+    jitter: DelayRange | None = None
+    """How much each of these delays varies from tick to tick: up to so much is added, s."""
+    plan_ticks: TickRange | None = None
+    """Control ticks by which a learned policy's plans come late: one of these."""
+
+
+NOTHING_BETWEEN = DeploymentConfig(
+    tracked=False,
+    hand=False,
+    wrench=False,
+    state_delay=(0.0, 0.0),
+    picture_delay=(0.0, 0.0),
+    command_delay=(0.0, 0.0),
+    jitter=(0.0, 0.0),
+    plan_ticks=(0,),
+)
+# Measured on the wire, `shared/research/deployment.md`: a state is 7 to 18 ms old, commands take 20 to
+# 25 ms of which the tracker has its share; fingertips and cameras send 25 to 30 pictures a second; a
+# plan is asked for a tick early.
+AS_DEPLOYED = DeploymentConfig(
+    tracked=True,
+    hand=True,
+    wrench=True,
+    state_delay=(0.005, 0.02),
+    picture_delay=(0.01, 0.04),
+    command_delay=(0.005, 0.02),
+    jitter=(0.0, 0.02),
+    plan_ticks=(1,),
+)
+
+
 @checked_dataclass
 class EnvConfig(SceneConfig):
     """Options every task has."""
@@ -120,6 +180,16 @@ class EnvConfig(SceneConfig):
     pick-place and 20 rad/s in bead-maze, whose bead turns with it."""
     randomization: Annotated[SensorRandomization, RARE] = SensorRandomization()
     """How much the two fingertip sensors differ, drawn anew for each episode."""
+    as_deployed: bool = False
+    """Behave as the arm does when it is deployed: driven, delayed and sensed as over the wire."""
+    deployment: DeploymentConfig = DeploymentConfig()
+    """Single options behind `as-deployed`, each in place of what that says."""
+
+    def between(self) -> DeploymentConfig:
+        """What lies between policy and arm, every field of it given."""
+        base = AS_DEPLOYED if self.as_deployed else NOTHING_BETWEEN
+        own = {name: value for name, value in vars(self.deployment).items() if value is not None}
+        return replace(base, **own)
 
     def __post_init__(self) -> None:
         """Raises ValueError if a tick is no whole number of set-points, or an episode has none."""
@@ -128,6 +198,10 @@ class EnvConfig(SceneConfig):
             raise ValueError(
                 "control_hz must divide 500, for set-points come every 2 ms (10, 20, 25, 50, 100, "
                 f"...), not {self.control_hz}"
+            )
+        if self.between() != NOTHING_BETWEEN and not _is_multiple(1e-3, self.timestep):
+            raise ValueError(
+                f"as deployed, time goes by in ms: timestep 0.001, not {self.timestep:g}"
             )
         if self.max_seconds * self.control_hz < 1:
             raise ValueError(f"max_seconds must be at least a tick of 1/{self.control_hz} s")
@@ -188,6 +262,8 @@ class BeadMazeConfig(EnvConfig):
     """Shape of the bead: a cylinder feels the wire's direction as a torque, a sphere much less."""
     grasp_force: ForceRange = (8.0, 12.0)
     """Weakest and strongest force of each finger, N."""
+    start_angle: Annotated[NotNegative, Field(le=45)] = 0.0
+    """Largest angle between the hand and the wire's first direction at the start, degrees."""
     wire_friction: Annotated[tuple[Friction, Friction], ORDERED] = (0.15, 0.25)
     """Least and greatest friction coefficient between bead and wire."""
     stall_seconds: Positive = 5.0

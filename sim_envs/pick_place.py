@@ -80,8 +80,10 @@ class PickPlace(FrankaTactileEnv):
         self.command = self.start_joints(rng)
         data.qpos[self.arm_positions] = self.command
         data.qvel[:] = 0
+        self._deployed = None
         self.update_contacts()
         self._note_start()
+        self._begin_deployment()
         return self._observe(), self._info(0.0, False)
 
     def sample_episode(self, rng: np.random.Generator, options: dict[str, Any]) -> None:

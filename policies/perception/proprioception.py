@@ -5,6 +5,7 @@ Two views of the same columns. From the base: joints and hand as they are. Along
 it faces, so that what was learnt on one wire holds for every wire that bends as much.
 """
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -15,6 +16,16 @@ from touchgoal.policies.config import ActionRepresentation
 
 _LENGTH_SCALE = 0.02  # m
 _BODY_FRAME_WIDTHS = {ft.STATE: 7, ft.TCP_POSE: 3}  # columns there are, and their input_widths
+
+
+def tare(wrench: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """The force on the hand since an episode's first tick, when nothing touched it: (..., 6).
+
+    An arm's estimate has a bias of some newtons that stays for a while. Exactly zero means that the
+    arm knows no estimate, and stays zero.
+    """
+    known = wrench.any(-1, keepdims=True)
+    return np.where(known, wrench - first, 0.0).astype(np.float32)
 
 
 def input_widths(columns: tuple[str, ...], kind: ActionRepresentation) -> list[int]:

@@ -39,7 +39,7 @@ class DaggerRoles:
         if isinstance(self.policy, SavedPolicy) and isinstance(env, PickPlace):
             policy = checkpoint.load(self.policy.directory)
             if policy.config.estimated:
-                return PolicyActor(Planner(policy, None, _TrueState(env))), expert
+                return PolicyActor(Planner(policy, None, _TrueState(env)), env.plan_ticks), expert
         return self.policy(env), expert
 
 
@@ -53,5 +53,5 @@ class _TrueState:
         self, observation: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray]
     ) -> dict[str, np.ndarray]:
         """See StateEstimator."""
-        contact = np.array([pad.touching for pad in self._env.pad_contacts()], np.float32)
+        contact = np.array([pad.touching for pad in self._env.contacts_shown()], np.float32)
         return {ft.TRUTH_CONTACT: contact, ft.TRUTH_START: self._env.start}

@@ -22,6 +22,7 @@ from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
+from touchgoal.policies.perception.proprioception import tare
 from touchgoal.policies.policy import ObservationBatch, PolicyConfig
 
 
@@ -74,6 +75,8 @@ def load_recordings(
     touch, state, actions, pictures, wrench = [], [], [], [], []
     for n, i in enumerate(track(chosen, "reading", "episode")):
         frames = episodes.read(i, keys).frames
+        if config.tares_wrench:
+            frames[ft.WRENCH] = tare(frames[ft.WRENCH], frames[ft.WRENCH][0])
         state.append(np.concatenate([frames[key] for key in config.proprioception], 1))
         actions.append(frames[ft.ACTION])
         if config.reads_wrench:

@@ -1,0 +1,46 @@
+"""The force on the hand as a real arm estimates it from its joint torques."""
+
+import numpy as np
+from jaxtyping import Float
+
+_LAG = 0.02  # s, first order: the estimate's filter, as the twin's
+_NOISE = np.array([0.1] * 3 + [0.01] * 3)  # N, N m, standard deviation of each reading
+_BIAS = np.array([1.5] * 3 + [0.3] * 3)  # N, N m, at most, of an episode
+_WANDER = np.array([0.5] * 3 + [0.1] * 3)  # N, N m, standard deviation of what drifts
+_WANDER_TIME = 1.0  # s
+_UNKNOWN = 0.005  # share of readings that begin a spell without an estimate
+_SPELL = 10  # readings that such a spell lasts on average
+
+Wrench = Float[np.ndarray, "6"]
+
+
+class EstimatedWrench:
+    """Noise, bias, drift and lag on the true wrench, drawn for one episode; at times exactly zero.
+
+    Franka's data sheet of the FR3 has noise of 0.035 N and 0.005 N m and an accuracy of 0.8 N and 0.3
+    N m at rest; friction and what the model of the arm leaves out make more of it in motion, so about
+    twice as much is drawn here. libfranka gives zero near singularities: unknown, not no force.
+    """
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._bias = rng.uniform(-_BIAS, _BIAS)
+        self._wandering = rng.normal(0, _WANDER)
+        self._filtered = np.zeros(6)
+        self._unknown = False
+
+    def update(self, true: Wrench, seconds: float) -> None:
+        """The true wrench (N, N m) so long after the last one."""
+        self._filtered += (1 - np.exp(-seconds / _LAG)) * (true - self._filtered)
+        keep = np.exp(-seconds / _WANDER_TIME)
+        self._wandering = keep * self._wandering + np.sqrt(1 - keep**2) * self._rng.normal(
+            0, _WANDER
+        )
+
+    def read(self) -> Wrench:
+        """The estimate (N, N m)."""
+        change = 1 / _SPELL if self._unknown else _UNKNOWN
+        self._unknown ^= bool(self._rng.random() < change)
+        if self._unknown:
+            return np.zeros(6)
+        return self._filtered + self._bias + self._wandering + self._rng.normal(0, _NOISE)

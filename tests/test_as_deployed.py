@@ -1,0 +1,152 @@
+"""An environment as deployed: what is late is late by what it says, and what is off changes nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from touchgoal.control import features as ft
+from touchgoal.policies.perception.proprioception import tare
+from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.config import BeadMazeConfig, DeploymentConfig, PickPlaceConfig
+from touchgoal.sim_envs.estimated_wrench import EstimatedWrench
+from touchgoal.sim_envs.pick_place import PickPlace
+
+BLIND = PickPlaceConfig(cameras=(), tactile=False)
+# Through the code of a deployment, and yet nothing between: plans are late, which no action here is.
+PLAIN = DeploymentConfig(plan_ticks=(1,))
+
+
+def roll(actions, config=BLIND, seed=3, between=None):
+    """Observations of these actions, the reset's first; with options of the deployment."""
+    if between is not None:
+        config = replace(config, deployment=replace(PLAIN, **between))
+    env = PickPlace(config)
+    seen = [env.reset(seed=seed, options={"object": "wooden_block"})[0]]
+    seen += [env.step(action)[0] for action in actions]
+    env.close()
+    return seen
+
+
+def moving(n=8):
+    actions = np.zeros((n, 8))
+    actions[:, 0], actions[:, 3], actions[:, 7] = 0.01, -0.008, 0.08
+    return actions
+
+
+def column(seen, key=ft.STATE):
+    return np.stack([observation[key] for observation in seen])
+
+
+def test_nothing_between_is_the_plain_environment() -> None:
+    plain, through = (column(roll(moving(), between=between)) for between in (None, {}))
+    # Set-points every ms in place of every 2: no more than that.
+    assert np.abs(plain - through)[:, :7].max() < 2e-4
+    assert not BLIND.between().tracked
+
+
+@pytest.mark.parametrize("option", ["state_delay", "picture_delay"])
+def test_what_is_seen_is_as_old_as_it_says(option: str) -> None:
+    config = replace(BLIND, cameras=("front",), camera_size=(32, 32))
+    here = roll(moving(), config, between={})
+    late = roll(moving(), config, between={option: (0.1, 0.1)})
+    for key in (ft.STATE, ft.TCP_POSE, ft.WRENCH, ft.FRONT):
+        pictures = key == ft.FRONT
+        ticks = 2 if pictures == (option == "picture_delay") else 0
+        now, then = column(here, key), column(late, key)
+        assert np.array_equal(then[ticks:], now[: len(now) - ticks]), key
+        assert np.array_equal(then[:ticks], now[:1].repeat(ticks, 0)), key
+
+
+def test_a_command_arrives_so_late() -> None:
+    now = column(roll(moving(), between={}))[:, :7]
+    late = column(roll(moving(), between={"command_delay": (0.1, 0.1)}))[:, :7]
+    assert np.abs(late[2:] - now[:-2]).max() < 1e-5
+    assert np.abs(late[2] - late[0]).max() < 1e-5 < np.abs(now[2] - now[0]).max()
+
+
+def test_a_seed_repeats_and_keeps_its_scene() -> None:
+    config = replace(BLIND, as_deployed=True)
+    one, again, other = (roll(moving(), config, seed) for seed in (3, 3, 4))
+    for key in (ft.STATE, ft.WRENCH):
+        assert np.array_equal(column(one, key), column(again, key))
+    assert not np.array_equal(column(one, ft.WRENCH), column(other, ft.WRENCH))
+    scenes = []
+    for as_deployed in (False, True):
+        env = PickPlace(replace(BLIND, as_deployed=as_deployed))
+        env.reset(seed=5)
+        scenes.append(np.concatenate([env.object_pose(), env.goal, env.command]))
+    assert np.array_equal(*scenes)
+
+
+def test_the_tracked_arm_comes_to_rest_where_it_is_sent() -> None:
+    env = PickPlace(replace(BLIND, deployment=DeploymentConfig(tracked=True)))
+    env.reset(seed=3)
+    start = env.command.copy()
+    for action in [*moving(10), *np.zeros((20, 8))]:
+        env.step(np.append(action[:7], 0.08))
+    # Friction in the joints holds a servo without integral back by so much.
+    assert np.abs(env.joints()[0] - start - moving(10)[:, :7].sum(0)).max() < 2e-3
+    # Faster than a policy may: what is commanded stays behind, as the safety layer has it.
+    before = env.command.copy()
+    env.step(np.full(8, 0.08))
+    for _ in range(40):
+        env.step(np.append(np.zeros(7), 0.08))
+    fast = 0.2 * env.robot.hardware.velocity / 20
+    assert np.all(env.command - before <= 0.08 + 1e-9) and np.all(env.command - before > 0.5 * fast)
+
+
+def test_a_hand_ends_a_move_before_it_takes_the_next() -> None:
+    env = PickPlace(replace(BLIND, deployment=DeploymentConfig(hand=True)))
+    env.reset(seed=3)
+    still = np.zeros(7)
+    widths = []
+    for width in [0.03, *[0.08] * 29]:  # passed through: the ideal hand would open again at once
+        env.step(np.append(still, width))
+        widths.append(env.width())
+    assert min(widths) < 0.032 and widths[-1] > 0.078
+    env.reset(seed=3)
+    env.step(np.append(still, 0.0))
+    widths = []
+    for _ in range(50):
+        env.step(np.append(still, 0.08))
+        widths.append(env.width())
+    assert min(widths) < 0.002 and widths[-1] > 0.078
+
+
+def test_an_estimated_wrench_is_biased_noisy_and_at_times_unknown() -> None:
+    true = np.array([0.0, 0, 5, 0, 0, 0])
+    means, unknown = [], []
+    for seed in range(40):
+        sensor = EstimatedWrench(np.random.default_rng(seed))
+        readings = []
+        for _ in range(400):
+            sensor.update(true, 0.01)
+            readings.append(sensor.read())
+        known = np.array([r for r in readings if r.any()])
+        unknown.append(1 - len(known) / len(readings))
+        means.append(known[50:].mean(0) - true)
+        assert 0.01 < known[50:, 0].std() < 1.5
+    assert 0.5 < np.std(means, axis=0)[0] < 1.5 and np.abs(np.mean(means, axis=0)[0]) < 0.5
+    assert 0.01 < np.mean(unknown) < 0.15
+
+
+def test_taring_takes_the_bias_and_leaves_unknown() -> None:
+    first = np.array([1.0, 2, 3, 0.1, 0.2, 0.3], np.float32)
+    wrench = np.stack([first, first + 1, np.zeros(6, np.float32)])
+    assert np.allclose(tare(wrench, first), [[0.0] * 6, [1.0] * 6, [0.0] * 6])
+
+
+def test_a_maze_may_begin_beside_the_wires_direction() -> None:
+    def beside(config: BeadMazeConfig, seed: int) -> float:
+        env = BeadMaze(replace(config, tactile=False))
+        env.reset(seed=seed)
+        _, R = env.kinematics.forward(env.command)
+        return float(
+            np.degrees(np.arccos(np.clip(R[:, 0] @ env.wire.at(env.arc_length)[1], -1, 1)))
+        )
+
+    straight = BeadMazeConfig(wires=("helix-1",))
+    assert beside(straight, 0) < 0.1
+    angles = [beside(replace(straight, start_angle=15.0), seed) for seed in range(6)]
+    assert max(angles) > 2 and max(angles) < 15.1
