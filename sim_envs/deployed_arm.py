@@ -197,7 +197,16 @@ class DeployedArm:
 
 def _all_well(q: Joints) -> Measurements:
     """So that the safety layer clamps, as it does on the wire, and never stops: tasks do that here."""
-    return Measurements(q, np.zeros(3), np.zeros(q.size), np.zeros(2), 0.0, 0.0, 0.0)
+    return Measurements(
+        q=q,
+        force=np.zeros(3),
+        torque=np.zeros(q.size),
+        touch=np.zeros(2),
+        observation_age=0.0,
+        action_age=0.0,
+        state_age=0.0,
+        gripper_age=0.0,
+    )
 
 
 def _range(given: tuple[float, float] | None) -> tuple[float, float]:
