@@ -68,56 +68,16 @@ weights-markers: $(READY)
 		--validation runs/markers/val/episodes --scale-episodes 60 --out runs/markers/run
 	cp runs/markers/run/encoder/* encoders/weights/gelsight_mini_markers_offline/
 
-# How the shipped bead-maze policy and its touch encoder were made: hours on 2 cores, most of them
-# for the recordings. It learns from demonstrations, and from what the expert would have done where
-# the policy has got to by itself: a regression learns that fast, and the diffusion policy learns from
-# all of it. (The learners of what ships planned every fourth tick, and it was taught without trials and
-# with four DDIM steps, see docs/next_steps.md.)
-MAZE := runs/maze
-FEEL := --data $(MAZE)/train/episodes --validation $(MAZE)/val/episodes \
-	--encoder $(MAZE)/mae/encoder --representation body_twist --train.lr 1e-3
-maze-policy: $(READY)
-	$(BIN)/touchgoal collect-demos --task bead-maze --episodes 16 --seed 20000 \
-		--env.split validation --env.n-wires 16 --out $(MAZE)/val
-	$(BIN)/touchgoal collect-demos --task bead-maze --episodes 260 --seed 0 --env.n-wires 260 \
-		--out $(MAZE)/train
-	$(BIN)/touchgoal train-encoder mae --data $(MAZE)/train/episodes \
-		--validation $(MAZE)/val/episodes --frames 30 --mae.epochs 12 --out $(MAZE)/mae
-	for round in 0 1; do \
-		$(BIN)/touchgoal train-policy $(FEEL) --head regression --trials 0 \
-			--train.epochs $$((6 + 2 * round)) --out $(MAZE)/round-$$round && \
-		$(BIN)/touchgoal collect-demos --task bead-maze --policy $(MAZE)/round-$$round/policy \
-			--episodes 120 --seed 5$${round}000 --env.n-wires 260 --out $(MAZE)/train || exit 1; \
-	done
-	$(BIN)/touchgoal train-policy $(FEEL) --train.epochs 10 \
-		--train.snapshot-epochs 5 --trials 48 --env.disturbance 0.003 --out $(MAZE)/policy
-	rm -rf policies/weights/bead_maze && mkdir -p policies/weights
-	cp -r $(MAZE)/policy/policy policies/weights/bead_maze
-
-# How the shipped pick-and-place policy was made: about 45 minutes on 2 cores, most of them for its
-# pose estimator. What its state estimator reads it learns from the recordings of `make weights` and from pictures of
-# placements; what it does, from an expert that answers what to do wherever the policy has got to.
-PICK := runs/pick_place
-BLIND := --env.no-tactile --env.cameras
-LEARN := --task pick-place --data $(PICK)/train/episodes --validation $(PICK)/val/episodes \
-	--estimator $(PICK)/estimator/estimator --head regression --representation base_twist --position-noise 0 \
-	--train.lr 1e-3 --train.epochs 16 --train.snapshot-epochs 16
+# How a shipped policy is made anew, by one command each that says what it did (recipe.json beside the
+# weights). With new pads: make the touch encoder or the state estimator first, and name its run with
+# --touch. (What ships of the maze is older than this recipe, see docs/training.md.)
 pick-place-policy: $(READY)
-	$(BIN)/touchgoal train-estimators --data runs/weights/train/episodes \
-		--validation runs/weights/val/episodes --out $(PICK)/estimator
-	$(BIN)/touchgoal collect-demos --feedback --episodes 20 --seed 120000 $(BLIND) --out $(PICK)/val
-	$(BIN)/touchgoal collect-demos --feedback --episodes 120 --seed 20000 $(BLIND) \
-		--out $(PICK)/train
-	$(BIN)/touchgoal collect-demos --feedback --episodes 120 --seed 20120 $(BLIND) \
-		--env.disturbance 0.02 --out $(PICK)/train
-	for round in 1 2 3; do \
-		$(BIN)/touchgoal train-policy $(LEARN) --trials 0 \
-			--out $(PICK)/round-$$round && \
-		$(BIN)/touchgoal collect-demos --policy $(PICK)/round-$$round/policy --episodes 120 \
-			--seed 3$${round}000 $(BLIND) --out $(PICK)/train || exit 1; \
-	done
-	$(BIN)/touchgoal train-policy $(LEARN) --trials 40 --out $(PICK)/policy
-	rm -rf policies/weights/pick_place && cp -r $(PICK)/policy/policy policies/weights/pick_place
+	$(BIN)/touchgoal make-policy --out runs/pick_place
+	rm -rf policies/weights/pick_place && cp -r runs/pick_place/policy/policy policies/weights/pick_place
+
+maze-policy: $(READY)
+	$(BIN)/touchgoal make-policy --task bead-maze --out runs/maze
+	rm -rf policies/weights/bead_maze && cp -r runs/maze/policy/policy policies/weights/bead_maze
 
 $(READY): pyproject.toml constraints.txt
 	@echo "setting up $(VENV): about 1 GB from PyPI, 2 to 3 minutes"

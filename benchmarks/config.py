@@ -7,8 +7,15 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from touchgoal.control import features as ft
-from touchgoal.control.option_types import Count, CountOrNone, Seed, checked_dataclass
-from touchgoal.sim_envs.config import BeadMazeConfig
+from touchgoal.control.option_types import (
+    Count,
+    CountOrNone,
+    NotNegative,
+    Positive,
+    Seed,
+    checked_dataclass,
+)
+from touchgoal.sim_envs.config import BeadMazeConfig, TaskName
 
 CORES = os.cpu_count() or 1
 
@@ -76,6 +83,29 @@ class MotionOptions(BenchmarkOptions):
     """Moves of each arm between random postures."""
     seed: Seed = 0
     """Random seed of poses and moves."""
+
+
+@checked_dataclass
+class PolicyDelayOptions(BenchmarkOptions):
+    """How often does a policy succeed when everything comes late?"""
+
+    task: TaskName = "pick-place"
+    """In which task; of the maze, on validation wires."""
+    policy: str = "shipped"
+    """Which policy, named as for run-policy."""
+    delay: tuple[NotNegative, ...] = (0.0, 50.0, 100.0, 150.0)
+    """From what is measured to the command that follows from it, ms, beside the tick for which plans are
+    asked ahead: half of it before the policy, half after."""
+    jitter: tuple[NotNegative, ...] = (0.0, 50.0)
+    """By how much each half may be longer, drawn tick by tick, ms."""
+    rates: tuple[Positive, ...] = (30.0, 15.0)
+    """Pictures a second, Hz."""
+    episodes: Count = 20
+    """Number of episodes of each row."""
+    seed: Seed = 4_000_000
+    """Random seed of the first episode; each further one adds one."""
+    workers: Count = CORES
+    """Processes that simulate."""
 
 
 @checked_dataclass

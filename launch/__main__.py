@@ -21,6 +21,7 @@ COMMANDS = {
     "train-encoder": "train a touch encoder",
     "train-estimators": "train networks that tell contact from touch and poses from pictures",
     "train-policy": "train a policy on recorded episodes",
+    "make-policy": "make a shipped policy anew: recordings, corrections, training, choice",
     "train-policy-paper": "the same with the network, sampler and actions that Sparsh publishes",
     "run-policy": "run a policy in a task: success rate, video",
     "reward-curves": "costs and rewards along episodes or plain videos",

@@ -16,6 +16,7 @@ BENCHMARKS: dict[str, type[options.BenchmarkOptions]] = {
     "env-speed": options.EnvSpeedOptions,
     "faults": options.FaultsOptions,
     "motion": options.MotionOptions,
+    "policy-delay": options.PolicyDelayOptions,
     "policy-latency": options.PolicyLatencyOptions,
     "reward-quality": options.RewardQualityOptions,
     "tactile-realism": options.TactileRealismOptions,
@@ -28,6 +29,7 @@ Config = (
     | Annotated[options.EnvSpeedOptions, tyro.conf.subcommand("env-speed")]
     | Annotated[options.FaultsOptions, tyro.conf.subcommand("faults")]
     | Annotated[options.MotionOptions, tyro.conf.subcommand("motion")]
+    | Annotated[options.PolicyDelayOptions, tyro.conf.subcommand("policy-delay")]
     | Annotated[options.PolicyLatencyOptions, tyro.conf.subcommand("policy-latency")]
     | Annotated[options.RewardQualityOptions, tyro.conf.subcommand("reward-quality")]
     | Annotated[options.TactileRealismOptions, tyro.conf.subcommand("tactile-realism")]

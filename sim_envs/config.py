@@ -124,6 +124,8 @@ class DeploymentConfig:
     """Age of joint positions, velocities and force when the policy sees them, s."""
     picture_delay: DelayRange | None = None
     """Age of the pictures of cameras and fingertips when the policy sees them, s."""
+    picture_rate: Annotated[float, Field(ge=5, le=1000)] | None = None
+    """Pictures a second that cameras and fingertips take, Hz: between two of them the last is seen."""
     command_delay: DelayRange | None = None
     """From the policy's answer until arm and hand get it, s."""
     jitter: DelayRange | None = None
@@ -138,6 +140,7 @@ NOTHING_BETWEEN = DeploymentConfig(
     wrench=False,
     state_delay=(0.0, 0.0),
     picture_delay=(0.0, 0.0),
+    picture_rate=1000.0,
     command_delay=(0.0, 0.0),
     jitter=(0.0, 0.0),
     plan_ticks=(0,),
@@ -150,7 +153,8 @@ AS_DEPLOYED = DeploymentConfig(
     hand=True,
     wrench=True,
     state_delay=(0.005, 0.02),
-    picture_delay=(0.01, 0.04),
+    picture_delay=(0.005, 0.02),
+    picture_rate=30.0,
     command_delay=(0.005, 0.02),
     jitter=(0.0, 0.02),
     plan_ticks=(1,),

@@ -128,7 +128,10 @@ class DeployedArm:
         ticks = round(env.config.max_seconds * hz) + _AHEAD
         jitter = rng.uniform(*_range(between.jitter))
         self._state_at = _read_times(rng, between.state_delay, jitter, ticks, self._tick_ms)
-        self._picture_at = _read_times(rng, between.picture_delay, jitter, ticks, self._tick_ms)
+        period = 1000 / (between.picture_rate or 1000.0)
+        self._picture_at = _read_times(
+            rng, between.picture_delay, jitter, ticks, self._tick_ms, period
+        )
         delays = _delays(rng, between.command_delay, jitter, ticks)
         # A command never overtakes the one before it.
         self._arrives = np.maximum.accumulate(np.arange(ticks) * self._tick_ms + delays)
@@ -228,9 +231,16 @@ def _read_times(
     jitter: float,
     ticks: int,
     tick_ms: int,
+    period: float = 1.0,
 ) -> Int[np.ndarray, " t"]:
-    """When (ms) what is seen at each tick was measured: never before the start, in the order of time."""
+    """When (ms) what is seen at each tick was measured, every `period` ms.
+
+    Never before the start, and in the order of time.
+    """
     at = np.arange(ticks) * tick_ms - _delays(rng, delay, jitter, ticks)
+    if period > 1:
+        phase = rng.uniform(0, period)
+        at = (np.floor((at - phase) / period) * period + phase).astype(int)
     return np.maximum.accumulate(np.maximum(at, 0))
 
 

@@ -30,6 +30,7 @@ NOT_RUN = {
     "calibrate": "needs presses of a real sensor: test_calibration.py",
     "teleop": "needs a terminal and a person: test_teleop.py",
     "benchmark": "test_commands.py runs each at toy size",
+    "make-policy": "test_commands.py",
     "demo": "test_commands.py",
 }
 

@@ -1,5 +1,6 @@
 """An environment as deployed: what is late is late by what it says, and what is off changes nothing."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -56,6 +57,13 @@ def test_what_is_seen_is_as_old_as_it_says(option: str) -> None:
         now, then = column(here, key), column(late, key)
         assert np.array_equal(then[ticks:], now[: len(now) - ticks]), key
         assert np.array_equal(then[:ticks], now[:1].repeat(ticks, 0)), key
+
+
+def test_slow_cameras_show_a_picture_again() -> None:
+    config = replace(BLIND, cameras=("front",), camera_size=(32, 32))
+    seen = column(roll(moving(), config, between={"picture_rate": 7.0}), ft.FRONT)
+    news = [not np.array_equal(*pair) for pair in itertools.pairwise(seen)]
+    assert 1 <= sum(news) <= 4  # 0.4 s at 7 Hz
 
 
 def test_a_command_arrives_so_late() -> None:

@@ -172,6 +172,8 @@ def test_learning_the_bead_maze(
         "--demonstrations", 2, "--latencies", "--env.max-seconds", 3, *one)  # fmt: skip
     printed = capsys.readouterr().out
     assert "frozen touch, 1 demos, shuffled" in printed and "zero motion" in printed
+    run("benchmark", "policy-delay", "--policy", "expert", "--episodes", 1, "--delay", 0, "--jitter", 0, "--rates",
+        30, "--workers", 1, "--out", "delay")  # fmt: skip
     run("benchmark", "policy-latency", "--policy", "policy/policy", "--repeats", 3,
         "--large-repeats", 0)  # fmt: skip
     assert "denoising" in capsys.readouterr().out
@@ -226,6 +228,23 @@ def test_learning_to_pick_and_place(
     assert "the policy succeeded in 0/1" in capsys.readouterr().out
     found = EpisodeSet(Path("demos/episodes"))
     assert [found.meta(i)["outcome"] for i in range(2)] == ["success", "corrected"]
+
+
+@pytest.mark.slow
+def test_a_shipped_policy_is_made_by_one_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    make = "make-policy --demonstrations 2 --corrections 1 --rounds 1 --epochs 1 --trials 0 --workers 1 --out made"
+    run(*make.split())
+    recipe = json.loads(Path("made/policy/policy/recipe.json").read_text())
+    assert [s["command"].split()[1] for s in recipe["steps"]] == [
+        *["collect-demos"] * 2, "train-policy", "collect-demos", "train-policy",
+    ]  # fmt: skip
+    assert checkpoint.load(Path("made/policy/policy")).config.tares_wrench
+    capsys.readouterr()
+    run(*make.split(), "--resume")  # nothing is left to do
+    assert "5 steps" in capsys.readouterr().out and "collect-demos" not in capsys.readouterr().out
 
 
 def test_doctor_and_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -1,0 +1,122 @@
+"""What `touchgoal make-policy` does."""
+
+import json
+import shlex
+import time
+from pathlib import Path
+
+from touchgoal.control.errors import UserError
+from touchgoal.launch.__main__ import read_options
+from touchgoal.launch.make_policy import Config
+from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED, TOUCH
+
+RECIPE = "recipe.json"
+
+# What lies between policy and arm, wider than what was measured on the wire: see `DeploymentConfig`.
+_DEPLOYED = shlex.split(
+    "--env.as-deployed --env.deployment.state-delay 0 0.05 --env.deployment.picture-delay 0 0.08 "
+    "--env.deployment.command-delay 0 0.04 --env.deployment.jitter 0 0.03 "
+    "--env.deployment.plan-ticks 0 1 1 2"
+)
+_BLIND = [
+    "--env.no-tactile",
+    "--env.cameras",
+]  # the policy learns on the truth of what it estimates
+_MAZE = shlex.split("--task bead-maze --env.n-wires 260 --env.start-angle 10")
+_VALIDATION = shlex.split(
+    "--task bead-maze --env.split validation --env.n-wires 16 --env.start-angle 10"
+)
+
+
+def run_command(config: Config) -> None:
+    """Record, train, correct, train again, choose."""
+    steps = _pick_place if config.task == "pick-place" else _bead_maze
+    if config.resume and config.out is None:
+        raise UserError("to go on with a run, name its folder with --out")
+    out = open_run(config.out, "make-policy", config, adds=config.resume)
+    done = json.loads((out / RECIPE).read_text())["steps"] if (out / RECIPE).exists() else []
+    for number, step in enumerate(steps(config, out)):
+        command = shlex.join(["touchgoal", *step])
+        if number < len(done) and done[number]["command"] == command:
+            continue
+        print(f"\n{command}", flush=True)
+        began = time.monotonic()
+        _run(step)
+        done[number:] = [{"command": command, "hours": (time.monotonic() - began) / 3600}]
+        write_json(out / RECIPE, {"steps": done, "hours": sum(s["hours"] for s in done)})
+    policy = out / "policy" / "policy"
+    write_json(policy / RECIPE, json.loads((out / RECIPE).read_text()))
+    hours = sum(step["hours"] for step in done)
+    print(f"\n{len(done)} steps, {hours:.1f} h on this machine: {policy / RECIPE}")
+
+
+def _run(step: list[str]) -> None:
+    """A command; where it was interrupted it goes on."""
+    folder = Path(step[step.index("--out") + 1])
+    begun = folder.exists() and any(folder.iterdir())
+    module, options = read_options(step[0], [*step[1:], *["--resume"] * begun])
+    module.main(options)
+
+
+def _pick_place(config: Config, out: Path) -> list[list[str]]:
+    """A regression of the feedback expert, corrected where it has got to by itself."""
+    wired = [*_BLIND, *_DEPLOYED]
+    estimator = config.touch / "estimator" if config.touch else SHIPPED["pick-place"] / ESTIMATOR
+    learn = shlex.split(
+        "--task pick-place --head regression --representation base_twist --position-noise 0 "
+        f"--train.lr 1e-3 --train.epochs {config.epochs or 16} --train.snapshot-epochs 16"
+    )
+    learn += ["--estimator", str(estimator)]
+    many = config.demonstrations or 160
+    disturbed = many * 7 // 16  # so that the expert shows how to come back
+    return [
+        _record(out / "val", max(1, many // 13), 120_000, ["--feedback", *wired], config),
+        _record(out / "train", many - disturbed, 20_000, ["--feedback", *wired], config),
+        *(
+            [_record(out / "train", disturbed, 25_000,
+                     ["--feedback", *wired, "--env.disturbance", "0.02"], config)]
+            if disturbed else []
+        ),
+        *_corrected(config, out, learn, learn, wired, 3, 80),
+    ]  # fmt: skip
+
+
+def _bead_maze(config: Config, out: Path) -> list[list[str]]:
+    """A diffusion policy of what a regression, which learns fast, has gathered corrections with."""
+    encoder = config.touch / "encoder" if config.touch else SHIPPED["bead-maze"] / TOUCH
+    learn = shlex.split("--representation body_twist --train.lr 1e-3 --env.start-angle 10")
+    learn += ["--encoder", str(encoder), "--task", "bead-maze"]
+    learn += ["--train.epochs", str(config.epochs or 10), "--train.snapshot-epochs", "5"]
+    wired = [*_MAZE, *_DEPLOYED]
+    many = config.demonstrations or 120
+    return [
+        _record(out / "val", max(1, many // 13), 20_000, [*_VALIDATION, *_DEPLOYED], config),
+        _record(out / "train", many, 0, wired, config),
+        *_corrected(config, out, [*learn, "--head", "regression"], learn, wired, 2, 60),
+    ]
+
+
+def _corrected(
+    config: Config, out: Path, first: list[str], last: list[str], env: list[str],
+    rounds: int, episodes: int,
+) -> list[list[str]]:  # fmt: skip
+    """Rounds of learning and correcting (DAgger), and the last training."""
+    data = ["--data", str(out / "train/episodes"), "--validation", str(out / "val/episodes")]
+    learn = ["train-policy", *data, "--workers", str(config.workers)]
+    steps = []
+    for k in range(rounds if config.rounds is None else config.rounds):
+        folder = out / f"round-{k + 1}"
+        steps.append([*learn, *first, "--trials", "0", "--out", str(folder)])
+        acts = ["--policy", str(folder / "policy"), *env]
+        many = config.corrections or episodes
+        steps.append(_record(out / "train", many, 31_000 + 1000 * k, acts, config))
+    final = [*learn, *last, "--trials", str(config.trials), "--env.as-deployed"]
+    return [*steps, [*final, "--out", str(out / "policy")]]
+
+
+def _record(
+    folder: Path, episodes: int, seed: int, options: list[str], config: Config
+) -> list[str]:
+    count = ["--episodes", str(episodes), "--seed", str(seed), "--workers", str(config.workers)]
+    return ["collect-demos", *options, *count, "--out", str(folder)]

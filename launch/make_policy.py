@@ -1,0 +1,47 @@
+"""Make a shipped policy anew, from its recordings to its weights, and say what was done.
+
+Every step is a command of its own, printed before it runs; recipe.json beside the weights lists all of
+them with their seeds, episodes and hours.
+"""
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+from touchgoal.control.option_types import RARE, Count, CountOrNone, checked_dataclass
+from touchgoal.sim_envs.config import TaskName
+
+
+@checked_dataclass
+class Config:
+    """Options of make-policy."""
+
+    task: TaskName = "pick-place"
+    """Which policy."""
+    out: Path | None = None
+    """Folder of the run; the policy goes to its `policy/policy`."""
+    demonstrations: Count | None = None
+    """Episodes of the expert; default: 160 of pick-place, 120 of the maze."""
+    corrections: Count | None = None
+    """Episodes of each round in which the policy acts and the expert answers; default: 80 of pick-place,
+    60 of the maze."""
+    rounds: CountOrNone | None = None
+    """Rounds of corrections; default: 3 of pick-place, 2 of the maze."""
+    epochs: Count | None = None
+    """Passes over the data in each training; default: 16 for pick-place, 10 for the maze."""
+    trials: CountOrNone = 24
+    """Validation episodes in which every snapshot of the last training is tried; 0 keeps the last."""
+    touch: Annotated[Path | None, RARE] = None
+    """Run folder of a new touch encoder (the maze), or of a state estimator (pick-place), in place of the
+    shipped one: after the pads have changed."""
+    resume: bool = False
+    """Go on with an interrupted run in `out`."""
+    workers: Count = os.cpu_count() or 1
+    """Processes that simulate."""
+
+
+def main(config: Any) -> None:
+    """Record, train, correct, train again, choose."""
+    from touchgoal.launch.commands.make_policy import run_command
+
+    run_command(config)
