@@ -1,6 +1,7 @@
 """Options of every benchmark; light to import, for `touchgoal benchmark --help` shows them all."""
 
 import os
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -8,6 +9,7 @@ from pydantic import Field
 
 from touchgoal.control import features as ft
 from touchgoal.control.option_types import (
+    RARE,
     Count,
     CountOrNone,
     NotNegative,
@@ -120,6 +122,21 @@ class PolicyLatencyOptions(BenchmarkOptions):
     """Runs of each network of a published size; 0 leaves them out."""
     control_hz: Count = ft.CONTROL_HZ
     """Control ticks per second; a plan should fit into one."""
+
+
+@checked_dataclass
+class RealTouchOptions(BenchmarkOptions):
+    """What do encoders know of real touches: which thing, how hard, rough and bumpy?"""
+
+    data: Path = field(kw_only=True)
+    """Folder of labelled videos: labels.csv and videos/, as PhysiCLeAR's."""
+    encoders: tuple[str, ...] = ("gelsight_mini", "random:gelsight_mini", "pixels", "efficientnet")
+    """Touch encoders by name or folder; `random:NAME` for the same network untrained, `pixels`,
+    `efficientnet` (ImageNet), or a vision model of Hugging Face by its id or folder."""
+    every: Annotated[Count, RARE] = 1
+    """Take every so many videos."""
+    seed: Seed = 0
+    """Random seed of untrained weights."""
 
 
 @checked_dataclass

@@ -1,6 +1,6 @@
 """Raw fingertip frames to network input: the same numbers in training, tests and deployment."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -8,6 +8,7 @@ from jaxtyping import Float32, UInt8
 
 from touchgoal.control.errors import UserError
 
+_BRIGHTNESS_CELL = 4  # px
 _ASPECT_TOLERANCE = 0.02  # a GelSight Mini's own 3280 x 2464 differs from 4:3 by 0.2 %
 
 
@@ -23,12 +24,14 @@ class TactilePreprocessor:
         version: Counts changes.
         size: Height and width of the output in pixels.
         scale: Grey levels (of 255) that make 1.0; about the contrast of a firm contact.
+        steady_light: Take out what brighter or dimmer light changes, before the subtraction.
     """
 
     sensor: str
     version: int
     size: tuple[int, int]
     scale: float
+    steady_light: bool = False
 
     @property
     def id(self) -> str:
@@ -57,7 +60,8 @@ class TactilePreprocessor:
         interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
         untouched = background.astype(np.float32)
         for i, frame in enumerate(frames):
-            change = (frame - untouched) / np.float32(self.scale)
+            lit = frame / _brightness(frame, untouched) if self.steady_light else frame
+            change = (lit - untouched) / np.float32(self.scale)
             out[i] = cv2.resize(change, (w, h), interpolation=interpolation).transpose(2, 0, 1)
         return out
 
@@ -68,6 +72,19 @@ class TactilePreprocessor:
                 f"a {self.sensor} frame is {expected:.2f} times as wide as high, these are "
                 f"{shape[1]}x{shape[0]}: crop them, or choose the right sensor"
             )
+
+
+def _brightness(
+    frame: UInt8[np.ndarray, "h w 3"], untouched: Float32[np.ndarray, "h w 3"]
+) -> Float32[np.ndarray, "3"]:
+    """Of each channel, relative to the untouched sensor: the median, which most contacts leave."""
+    h, w, _ = frame.shape
+    size = max(w // _BRIGHTNESS_CELL, 1), max(h // _BRIGHTNESS_CELL, 1)
+    now, before = (
+        cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) + 1
+        for image in (frame, untouched)
+    )
+    return np.median(now / before, (0, 1)).astype(np.float32)
 
 
 def check_pictures(name: str, pictures: object, ndim: tuple[int, ...]) -> None:
@@ -107,3 +124,8 @@ def preprocessor_for(sensor: str) -> TactilePreprocessor:
     if sensor not in PREPROCESSORS:
         raise UserError(f"unknown sensor '{sensor}': choose from {', '.join(PREPROCESSORS)}")
     return PREPROCESSORS[sensor]
+
+
+def steady_preprocessor_for(sensor: str) -> TactilePreprocessor:
+    """Version 2, which takes out changes of the light; UserError for an unknown sensor."""
+    return replace(preprocessor_for(sensor), version=2, steady_light=True)

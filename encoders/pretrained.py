@@ -8,9 +8,10 @@ import torch
 
 from touchgoal.control.errors import UserError
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
+from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import ViTConfig
-from touchgoal.encoders.preprocess import preprocessor_for
+from touchgoal.encoders.preprocess import preprocessor_for, steady_preprocessor_for
 from touchgoal.encoders.towers.towers import same_towers
 from touchgoal.encoders.training.weights import WeightsFormat
 
@@ -20,7 +21,7 @@ ENCODER = WeightsFormat("encoder", "touch encoder", "train one with: touchgoal t
 
 
 def save(
-    encoder: TouchEncoder | TouchBackbone,
+    encoder: TouchEncoder | TouchBackbone | PooledEncoder,
     directory: Path,
     provenance: dict[str, Any],
     half: bool = True,
@@ -85,6 +86,15 @@ def load_touch_backbone(directory: Path, sensor: str | None = None) -> TouchBack
     return encoder
 
 
+def load_pooled(directory: Path, sensor: str | None = None) -> PooledEncoder:
+    """Reads a whitened ImageNet network for inference, on the CPU; UserError as `load_aligned`."""
+    config = ENCODER.read_config(directory, lambda fields: PooledEncoderConfig(**fields))
+    _check_sensor(config, directory, sensor)
+    encoder = PooledEncoder(config)
+    ENCODER.load_weights(encoder, directory)
+    return encoder
+
+
 def encoder_names() -> list[str]:
     """Names of the encoders that ship, for `load_encoder` and `--encoder`."""
     return sorted(path.parent.name for path in _WEIGHTS.glob("*/encoder.json"))
@@ -112,7 +122,7 @@ def find_encoder(name_or_path: str | Path) -> Path:
     )
 
 
-def load_encoder(name_or_path: str | Path) -> TouchEncoder | TouchBackbone:
+def load_encoder(name_or_path: str | Path) -> TouchEncoder | TouchBackbone | PooledEncoder:
     """A touch encoder of either kind, on the CPU, ready for `embed`; see `find_encoder`.
 
         encoder = load_encoder("gelsight_mini")
@@ -122,18 +132,23 @@ def load_encoder(name_or_path: str | Path) -> TouchEncoder | TouchBackbone:
         UserError: no such encoder, or as `load_aligned`.
     """
     directory = find_encoder(name_or_path)
-    aligned = "towers" in ENCODER.read_json(directory).get("config", {})
-    return load_aligned(directory) if aligned else load_touch_backbone(directory)
+    config = ENCODER.read_json(directory).get("config", {})
+    if "features" in config:
+        return load_pooled(directory)
+    return load_aligned(directory) if "towers" in config else load_touch_backbone(directory)
 
 
 def _check_sensor(
-    config: TouchEncoderConfig | TouchBackboneConfig, directory: Path, sensor: str | None
+    config: TouchEncoderConfig | TouchBackboneConfig | PooledEncoderConfig,
+    directory: Path,
+    sensor: str | None,
 ) -> None:
     if sensor is not None and sensor != config.sensor:
         raise UserError(
             f"the encoder in {directory} is for {config.sensor}, not {sensor}: {ENCODER.remedy}"
         )
-    current = preprocessor_for(config.sensor).id
+    steady = isinstance(config, PooledEncoderConfig)
+    current = (steady_preprocessor_for if steady else preprocessor_for)(config.sensor).id
     if config.preprocessor != current:
         raise UserError(
             f"the encoder in {directory} needs the preprocessor {config.preprocessor}, this is "

@@ -18,6 +18,7 @@ BENCHMARKS: dict[str, type[options.BenchmarkOptions]] = {
     "motion": options.MotionOptions,
     "policy-delay": options.PolicyDelayOptions,
     "policy-latency": options.PolicyLatencyOptions,
+    "real-touch": options.RealTouchOptions,
     "reward-quality": options.RewardQualityOptions,
     "tactile-realism": options.TactileRealismOptions,
     "tactile-speed": options.TactileSpeedOptions,
@@ -31,6 +32,7 @@ Config = (
     | Annotated[options.MotionOptions, tyro.conf.subcommand("motion")]
     | Annotated[options.PolicyDelayOptions, tyro.conf.subcommand("policy-delay")]
     | Annotated[options.PolicyLatencyOptions, tyro.conf.subcommand("policy-latency")]
+    | Annotated[options.RealTouchOptions, tyro.conf.subcommand("real-touch")]
     | Annotated[options.RewardQualityOptions, tyro.conf.subcommand("reward-quality")]
     | Annotated[options.TactileRealismOptions, tyro.conf.subcommand("tactile-realism")]
     | Annotated[options.TactileSpeedOptions, tyro.conf.subcommand("tactile-speed")]

@@ -1,10 +1,12 @@
 """Fit a sensor's light, gel and noise to ball presses, and write its sensor file.
 
 PRESSES holds background.png (the untouched sensor), the pictures of the presses, and presses.csv
-with the columns file, x_px, y_px, radius_px (centre and radius of the circle in which ball and gel
-touch; the first pixel is 0, 0) and ball_mm (the ball's radius; empty if not known).
+with the columns file and ball_mm (the ball's radius). Where ball and gel touch is found in the
+pictures, or taken from the columns x_px, y_px, radius_px (circles; the first pixel is 0, 0). Presses
+of two balls of different size tell most about depth.
 """
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -25,6 +27,11 @@ class Config:
     """Length on the gel that a pixel shows, mm."""
     sensor: str = "gelsight_mini"
     """Model of the sensor (`touchgoal list sensors`)."""
+    ball_mm: Positive | None = None
+    """Radius of the ball, mm, of presses for which presses.csv gives none."""
+    light_power: Positive | None = None
+    """Power of the background's brightness by which the response varies over the image; default: the
+    one with which the balls come out at their size (four fits, a few minutes)."""
     out: Path | None = None
     """Folder of the run; the sensor file goes to its `sensor_file/`."""
     held_out: Annotated[float, Field(ge=0.1, le=0.5)] = 0.25
@@ -37,8 +44,16 @@ class Config:
 
 def main(config: Config) -> None:
     """Fit without the held-out presses and judge on them, then fit all; UserError for bad input."""
+    import numpy as np
+
     from touchgoal.control.calibration import report
-    from touchgoal.control.calibration.calibrate import STEPS, fit
+    from touchgoal.control.calibration.calibrate import (
+        LIGHT_POWERS,
+        STEPS,
+        fit,
+        select_light_power,
+    )
+    from touchgoal.control.calibration.held_out_depth import depth_errors, median_by_ball
     from touchgoal.control.calibration.pictures import light_compass
     from touchgoal.control.calibration.press_set import read_presses, split
     from touchgoal.control.progress import Progress
@@ -50,17 +65,30 @@ def main(config: Config) -> None:
     if config.sensor not in SENSORS:
         raise UserError(f"unknown sensor {config.sensor!r}; choose from: {', '.join(SENSORS)}")
     pitch = config.mm_per_pixel * 1e-3
-    presses = read_presses(config.presses, pitch)
+    presses = read_presses(config.presses, pitch, config.ball_mm or math.nan)
+    if np.isnan(presses.ball_radius).any():
+        raise UserError(
+            "no picture tells the ball's radius, and every depth in mm hangs on it: measure the ball "
+            "and give --ball-mm, or ball_mm in presses.csv (two balls of different size are best)"
+        )
     out = open_run(config.out, "calibrate", config)
     train, test = split(presses, round(config.held_out * len(presses)), config.seed)
+    power = config.light_power
+    if power is None:
+        with Progress("finding how the light varies", len(LIGHT_POWERS), "fit") as bar:
+            power = select_light_power(train, pitch, config.sensor, bar.update)
     with Progress("fitting", 2 * STEPS, "step") as bar:
-        judged = fit(train, pitch, config.sensor, bar.update)
-        fitted = fit(presses, pitch, config.sensor, bar.update)
+        judged = fit(train, pitch, config.sensor, bar.update, light_power=power)
+        fitted = fit(presses, pitch, config.sensor, bar.update, light_power=power)
     errors = report.held_out_errors(judged, test)
     print(report.errors_table(errors, len(test)))
-    for line in report.warnings(fitted):
+    report.refuse_useless(errors)
+    circles, balls = judged.fit_circles(test), judged.ball_radii(test)
+    depths = median_by_ball(depth_errors(judged.calibration, test, circles, balls), balls)
+    print(report.depth_table(depths))
+    for line in [*report.warnings(fitted), *report.at_limits(fitted, presses)]:
         print(line)
-    record = report.record(fitted, presses, errors, len(test))
+    record = report.record(fitted, presses, errors, depths, len(test))
     source = {"source": config.source or str(config.presses), **provenance()}
     save(fitted.calibration, out / "sensor_file", {**source, **record})
     write_json(out / "metrics.json", record)

@@ -1,11 +1,12 @@
-"""Train a touch encoder on recorded episodes: align it with frozen towers, or by masking alone."""
+"""Train a touch encoder on recorded episodes: align it with frozen towers, or by masking alone; or on surfaces."""
 
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+from pydantic import Field
 
-from touchgoal.control.option_types import Count, CountOrNone, checked_dataclass
+from touchgoal.control.option_types import Count, CountOrNone, Seed, checked_dataclass
 from touchgoal.encoders.config import ALIGN_PRESETS, AlignConfig, MaeConfig
 from touchgoal.launch.training_options import TrainingOptions
 
@@ -56,10 +57,27 @@ class Mae(TrainingOptions):
     """How the encoder is trained."""
 
 
+@checked_dataclass
+class Surfaces:
+    """Fit an ImageNet network to touch, on simulated presses of random surfaces: no episodes needed."""
+
+    sensor: str = "gelsight_mini_measured"
+    """Sensor that is simulated: a name, or the folder of a sensor file."""
+    surfaces: Annotated[int, Field(ge=16)] = 5000
+    """Random surfaces."""
+    presses: Annotated[int, Field(ge=2)] = 4
+    """Presses of each, on other units, places, turns and depths."""
+    seed: Seed = 0
+    """Random seed of surfaces, units and presses."""
+    out: Path | None = None
+    """Folder of the run; the encoder goes to its `encoder/`."""
+
+
 Config = (
     Annotated[Align, tyro.conf.subcommand("align")]
     | Annotated[AlignPaper, tyro.conf.subcommand("align-paper")]
     | Annotated[Mae, tyro.conf.subcommand("mae")]
+    | Annotated[Surfaces, tyro.conf.subcommand("surfaces")]
 )
 
 

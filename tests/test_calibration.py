@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from touchgoal.control.calibration.ball import ball_overlap, press_surface
-from touchgoal.control.calibration.calibrate import fit
+from touchgoal.control.calibration.calibrate import fit, median_background
+from touchgoal.control.calibration.held_out_depth import sphere_in
+from touchgoal.control.calibration.light_drift import without_drift
 from touchgoal.control.calibration.press_set import PressSet, read_presses, split, write_presses
 from touchgoal.control.errors import UserError
 from touchgoal.control.tactile import gel, sensor_calibration
@@ -101,7 +103,8 @@ def test_light_comes_from_where_it_stands() -> None:
 def test_calibrate_finds_known_lights(
     presses: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    main(["calibrate", str(presses), "--mm-per-pixel", "0.118", "--out", str(tmp_path)])
+    main(["calibrate", str(presses), "--mm-per-pixel", "0.118", "--out", str(tmp_path),
+          "--light-power", "1"])  # fmt: skip
     found = sensor_calibration.load(tmp_path / "sensor_file")
     for azimuth, true in zip(found.light_azimuths, AZIMUTHS, strict=True):
         assert off_by(azimuth, true) < 10
@@ -112,6 +115,8 @@ def test_calibrate_finds_known_lights(
     labelled = record["held_out"]["fit, circles as labelled"]["l1_near"]
     assert labelled < 0.6 * record["held_out"]["background alone"]["l1_near"]
     assert record["response_varies_over_image"] and not record["ball_fitted"]
+    depth = record["held_out_depth"]["3"]
+    assert depth["radius_mm"] == pytest.approx(3, rel=0.1) and depth["residual_um"] < 30
     for name in ("held_out.png", "lights.png"):
         assert cv2.imread(str(tmp_path / name)) is not None
     assert "held-out presses" in capsys.readouterr().out
@@ -147,6 +152,11 @@ def set_row(column: int, value: str) -> Callable[[Path], None]:
     return damage
 
 
+def without_balls(table: str) -> str:
+    head, *rows = table.splitlines()
+    return "\n".join([head, *(row.rpartition(",")[0] + "," for row in rows)])
+
+
 def cut_table(folder: Path) -> None:
     edit(folder, "presses.csv", lambda t: "\n".join(t.splitlines()[:9]))
 
@@ -166,7 +176,7 @@ def no_contact(folder: Path) -> None:
         (lambda f: (f / "background.png").unlink(), "background.png is missing"),
         (lambda f: (f / "presses.csv").unlink(), "presses.csv is missing: write one line a press"),
         (lambda f: (f / "00.png").unlink(), "00.png is missing"),
-        (lambda f: edit(f, "presses.csv", lambda t: t.replace("x_px", "x")), "column x_px"),
+        (lambda f: edit(f, "presses.csv", lambda t: t.replace("file", "name")), "column file"),
         (set_row(1, "left"), "line 2"),
         (set_row(1, "170"), "lies outside the 160 x 120 picture"),
         (set_row(3, "30"), "does not fit a ball of radius 3 mm"),
@@ -175,6 +185,7 @@ def no_contact(folder: Path) -> None:
         (set_row(4, "-2"), "ball_mm"),
         (other_size, "100 x 100 pixels, background.png 160 x 120"),
         (no_contact, "shows no contact"),
+        (lambda f: edit(f, "presses.csv", without_balls), "no picture tells the ball's radius"),
     ],
 )
 def test_unfit_presses_are_refused(
@@ -208,7 +219,7 @@ def test_sensor_file_comes_back(tmp_path: Path) -> None:
         (lambda f: (f / "sensor.json").unlink(), "no sensor file in"),
         (lambda f: (f / "background.png").unlink(), "background.png is missing"),
         (lambda f: edit(f, "sensor.json", lambda t: t[:99]), "is no sensor file"),
-        (lambda f: edit(f, "sensor.json", lambda t: t.replace('t": 1', 't": 9')), "has format 9"),
+        (lambda f: edit(f, "sensor.json", lambda t: t.replace('t": 2', 't": 9')), "has format 9"),
         (lambda f: edit(f, "sensor.json", lambda t: t.replace("noise", "nose")), "no usable noise"),
         (lambda f: edit(f, "sensor.json", lambda t: t.replace("120,", "240,")), "rows and columns"),
         (lambda f: edit(f, "sensor.json", lambda t: t.replace("25.0, ", "")), "shadow is (3, 3)"),
@@ -239,3 +250,52 @@ def test_split_takes_every_press_once() -> None:
     assert len(train) == 4 and sorted(train.files + test.files) == [
         f"{i:02d}.png" for i in range(6)
     ]
+
+
+def test_circles_are_found_in_the_pictures(tmp_path: Path) -> None:
+    """No column of circles: the visible disc is larger than the contact, which the fit then finds."""
+    made = made_presses(known_sensor(), 16)
+    write_presses(made, tmp_path)
+    edit(tmp_path, "presses.csv", lambda t: "\n".join(
+        ",".join([line.split(",")[0], line.split(",")[4]]) for line in t.splitlines()))  # fmt: skip
+    found = read_presses(tmp_path, PITCH)
+    off = np.abs(found.circles[:, :2] - made.circles[:, :2])
+    assert np.median(off) < 2 and off.max() < 6
+    assert (0.7 < found.circles[:, 2] / made.circles[:, 2]).all()
+    assert (found.circles[:, 2] / made.circles[:, 2] < 1.5).all()
+
+
+def test_light_that_drifts_from_press_to_press_is_taken_out() -> None:
+    press = made_presses(known_sensor(), 1)
+    image = press.images[0]
+    brighter = np.rint(image * np.array([1.05, 0.97, 1.02]) + [2, 0, -3]).clip(0, 255)
+    steady = without_drift(brighter.astype(np.uint8), press.background, press.circles[0])
+    assert np.abs(steady.astype(float) - image).mean() < 1.0
+
+
+def test_a_sphere_is_read_from_a_depth_map() -> None:
+    rows, columns = np.mgrid[:120, :160]
+    square = ((columns - 82) ** 2 + (rows - 60) ** 2) * PITCH**2
+    depth = (np.sqrt(np.maximum(9e-6 - square, 0)) - 2.7e-3).astype(np.float32)
+    seen = sphere_in(depth, PITCH, np.array([80.0, 60.0, 10.0]), 2.5e-3)
+    assert seen.radius == pytest.approx(3 / 2.5, rel=1e-3)
+    assert seen.residual < 1e-6
+    assert seen.peak_offset == pytest.approx(2 * PITCH, rel=1e-2)
+
+
+def test_a_background_is_filled_in_without_a_seam() -> None:
+    """Where presses lie on top of each other, the settled gel's change goes on from around them."""
+    made = made_presses(known_sensor(), 8)
+    circles = np.tile([80.0, 60.0, 8.0], (8, 1))
+    settled = (made.background.astype(int) + 6).astype(np.uint8)
+    presses = replace(made, images=np.stack([settled] * 8), circles=circles)
+    change = median_background(presses).astype(int) - made.background
+    assert change.min() >= 5 and change.max() <= 7
+
+
+def test_sensor_files_from_before_the_lights_power_are_read(tmp_path: Path) -> None:
+    sensor_calibration.save(known_sensor(), tmp_path, {})
+    old = json.loads((tmp_path / "sensor.json").read_text())
+    del old["light_power"]
+    (tmp_path / "sensor.json").write_text(json.dumps(old | {"format": 1}))
+    assert sensor_calibration.load(tmp_path).light_power == 1

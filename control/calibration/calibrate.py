@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from touchgoal.control.calibration.ball import Circle, press_surface
+from touchgoal.control.calibration.held_out_depth import depth_errors
 from touchgoal.control.calibration.press_fit import (
     BLUR_PYRAMID,
     NARROWEST,
@@ -24,12 +25,16 @@ from touchgoal.control.tactile.sensor_calibration import (
     shape_features,
 )
 
+LIGHT_POWERS = (1.0, 1.5, 2.0, 2.5)
+"""What `select_light_power` chooses from."""
 STEPS = 7
 """How often `fit` reports progress."""
 
 # Position terms need presses spread over the picture: the standard deviation of the centres, as a
 # share of the picture, in both directions (evenly spread over all of it: 0.29).
 _MIN_SPREAD = 0.1
+_WINDOWS = (4.0, 8.0, 16.0, 32.0, 64.0)  # px
+_DEPTH_PRESSES = 12  # whose depth decides on the light's power
 _FAR = 4.0  # contact radii from which on a press leaves the gel as it was
 
 
@@ -84,7 +89,8 @@ class FittedCalibration:
         That looks at the pictures: an error at these circles is the model's alone, an error at
         `correct_labels` the labels' as well.
         """
-        steps = PressFit(presses, self.calibration.background, self.varies_over_image)
+        p = self.calibration
+        steps = PressFit(presses, p.background, self.varies_over_image, light_power=p.light_power)
         state = FitState(self.calibration, self.correct_labels(presses), self.ball_radii(presses))
         for _ in range(8):
             state = steps.fit_circles(state)
@@ -101,6 +107,7 @@ def fit(
     sensor: str,
     on_progress: Callable[[], object] = lambda: None,
     trust_labels: bool = False,
+    light_power: float = 1.0,
 ) -> FittedCalibration:
     """Calibrate a sensor.
 
@@ -110,11 +117,13 @@ def fit(
         sensor: name of the sensor model.
         on_progress: called STEPS times as the work proceeds.
         trust_labels: leave the circles as they are, but for one common scale of their radii.
+        light_power: see `SensorCalibration.light_power` and `select_light_power`.
     """
     background, varies_over_image = median_background(presses), _spread_out(presses)
-    steps = PressFit(presses, background, varies_over_image, trust_labels)
+    steps = PressFit(presses, background, varies_over_image, trust_labels, light_power)
     ball_fitted = bool(np.isnan(presses.ball_radius).any())
     initial = _initial_calibration(background, pitch, sensor, noise(presses))
+    initial = replace(initial, light_power=light_power)
     state = steps.initialise(initial, presses.ball_radius)
     on_progress()
     for _ in range(2):
@@ -136,11 +145,42 @@ def fit(
     )
 
 
+def select_light_power(
+    presses: PressSet, pitch: float, sensor: str, on_progress: Callable[[], object] = lambda: None
+) -> float:
+    """The power of light with which the balls of these presses come out at their size.
+
+    The error of pictures cannot tell: it is the same within a hundredth of a count.
+
+    Args:
+        presses: with known balls.
+        pitch: m per pixel.
+        sensor: name of the sensor model.
+        on_progress: called once a power tried.
+    """
+    wrong = {}
+    chosen = np.arange(0, len(presses), max(1, len(presses) // _DEPTH_PRESSES))
+    for power in LIGHT_POWERS:
+        fitted = fit(presses, pitch, sensor, light_power=power)
+        errors = depth_errors(
+            fitted.calibration,
+            presses.take(chosen),
+            fitted.circles[chosen],
+            fitted.ball_radius[chosen],
+            finest=4,
+        )
+        # The median: balls that the picture's border cuts tell little.
+        wrong[power] = float(np.median([abs(math.log(error.radius)) for error in errors]))
+        on_progress()
+    return min(wrong, key=lambda power: wrong[power])
+
+
 def median_background(presses: PressSet) -> UInt8[np.ndarray, "h w 3"]:
     """The background as the presses show it away from their contacts.
 
     A gel settles under the first presses: bands of several counts against the picture taken before
-    them. Where fewer than three presses lie far away, the given background stays.
+    them. Where fewer than three presses lie far away, the given background takes on the change of
+    its surroundings, so that no seam is left.
     """
     rows, cols = np.ogrid[: presses.background.shape[0], : presses.background.shape[1]]
     x, y, radius = presses.circles.T[:, :, None, None]
@@ -149,8 +189,27 @@ def median_background(presses: PressSet) -> UInt8[np.ndarray, "h w 3"]:
     enough = far.sum(0) >= 3
     for channel in range(3):
         seen = np.ma.MaskedArray(presses.images[..., channel], ~far)
-        settled[enough, channel] = np.round(np.ma.median(seen, 0).filled(0)[enough])
+        median = np.ma.median(seen, 0).filled(0)
+        change = np.where(enough, median - presses.background[..., channel], 0)
+        around = _spread(change.astype(np.float32), enough)
+        filled = np.where(enough, median, presses.background[..., channel] + around)
+        settled[..., channel] = np.round(filled).clip(0, 255)
     return settled
+
+
+def _spread(
+    change: Float32[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w"]:
+    """A change continued smoothly to where it is not known: averages over ever wider windows."""
+    spread, covered = np.zeros_like(change), np.zeros(change.shape, bool)
+    weight = known.astype(np.float32)
+    for sigma in _WINDOWS:
+        total = cv2.GaussianBlur(change * weight, (0, 0), sigma)
+        share = cv2.GaussianBlur(weight, (0, 0), sigma)
+        new = (share > 0.05) & ~covered
+        spread[new] = total[new] / share[new]
+        covered |= new
+    return cv2.GaussianBlur(spread, (0, 0), _WINDOWS[0])
 
 
 def noise(presses: PressSet) -> float:

@@ -34,7 +34,7 @@ _PIXELS = 5000  # of a press that take part in the fit
 _FOLDS = 4
 _RIDGE = 1e-3  # of each term's own energy; between 1e-4 and 1e-2 the held-out error hardly moves
 # What cross-validation chooses from.
-_BLUR_SCALES = (0.15, 0.25, 0.35, 0.5, 0.7, 1.0)
+BLUR_SCALES = (0.15, 0.25, 0.35, 0.5, 0.7, 1.0)
 _SHADOW_SLOPES = (0.05, 0.1, 0.2, 0.4, 0.8)
 _PENUMBRAS = (0.03e-3, 0.1e-3, 0.3e-3, 1e-3)
 _LABEL_SCALES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1)
@@ -89,6 +89,7 @@ class PressFit:
         background: the untouched sensor (RGB) that changes are taken against.
         varies_over_image: whether the response may vary over the image.
         trust_labels: whether circles stay as they are.
+        light_power: of the background's brightness (`SensorCalibration.light_power`).
     """
 
     def __init__(
@@ -97,10 +98,11 @@ class PressFit:
         background: UInt8[np.ndarray, "h w 3"],
         varies_over_image: bool,
         trust_labels: bool = False,
+        light_power: float = 1.0,
     ) -> None:
         self._labels = presses.circles
         self._trust_labels = trust_labels
-        self._light = illumination(background).reshape(-1, 3)
+        self._light = illumination(background, light_power).reshape(-1, 3)
         self._samples = [
             _sample(image, background, circle)
             for image, circle in zip(presses.images, presses.circles, strict=True)
@@ -173,7 +175,7 @@ class PressFit:
         return replace(state, circles=np.stack(moved))
 
     def _select_blur(self, state: FitState) -> FitState:
-        pyramids = [tuple(scale * sigma for sigma in BLUR_PYRAMID) for scale in _BLUR_SCALES]
+        pyramids = [tuple(scale * sigma for sigma in BLUR_PYRAMID) for scale in BLUR_SCALES]
         return self._select_value(state, "blur_sigmas", pyramids)
 
     def _select_value(self, state: FitState, name: str, values: Sequence[Any]) -> FitState:
@@ -231,7 +233,8 @@ class PressFit:
         label: Circle,
     ) -> Circle:
         """One damped Gauss-Newton step of centre and radius."""
-        model, light, step = coefficients(calibration), self._light[sample.pixels], 0.25
+        model, step = coefficients(calibration), 0.25
+        light = self._light[sample.pixels]
         widest = WIDEST * ball / calibration.pixel_pitch
 
         def bounded(at: Circle) -> Circle:

@@ -9,9 +9,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from touchgoal.control.calibration.circles import find_circle
+from touchgoal.control.calibration.light_drift import without_drift
 from touchgoal.control.errors import UserError
 
 COLUMNS = ("file", "x_px", "y_px", "radius_px", "ball_mm")
+_NEEDED = ("file",)
 # Twelve are fitted and four held out: with fewer, the 30 response terms of a channel follow single
 # presses, and the held-out error of the GelSight presses is a tenth above that of 36.
 MINIMUM = 16
@@ -71,12 +74,15 @@ def write_presses(presses: PressSet, folder: Path) -> None:
             rows.writerow([name, *(f"{v:g}" for v in circle), known])
 
 
-def read_presses(folder: Path, pitch: float) -> PressSet:
-    """Read `background.png`, `presses.csv` and the pictures it names.
+def read_presses(folder: Path, pitch: float, ball_mm: float = math.nan) -> PressSet:
+    """Read `background.png`, `presses.csv` and the pictures it names, in the background's light.
+
+    Circles that the table leaves open are found in the pictures.
 
     Args:
         folder: what to read.
         pitch: m per pixel.
+        ball_mm: radius of the ball of presses for which the table gives none, mm.
 
     Raises:
         UserError: something is missing, does not fit together, or cannot be calibrated from.
@@ -89,22 +95,31 @@ def read_presses(folder: Path, pitch: float) -> PressSet:
             "30 response terms of a colour, 4 to check them): add presses at other places"
         )
     names = tuple(row[0] for row in rows)
-    circles = np.array([row[1:4] for row in rows])
-    ball = np.array([row[4] for row in rows]) * 1e-3
-    images = []
-    for name, circle, radius in zip(names, circles, ball, strict=True):
+    ball = np.array([row[4] for row in rows])
+    ball = np.where(np.isnan(ball), ball_mm, ball) * 1e-3
+    images, circles = [], []
+    for name, given, radius in zip(names, (row[1:4] for row in rows), ball, strict=True):
         image = _read_image(folder / name)
         if image.shape != background.shape:
             raise UserError(
                 f"{folder / name} has {image.shape[1]} x {image.shape[0]} pixels, background.png "
                 f"{background.shape[1]} x {background.shape[0]}: record them at the same size"
             )
+        circle = _found(name, image, background) if np.isnan(given).any() else np.array(given)
         _check_circle(name, circle, radius, background.shape, pitch)
         _check_visible(name, circle, image, background)
-        images.append(image)
+        circles.append(circle)
+        images.append(without_drift(image, background, circle))
     if np.isnan(ball).any() and not np.isnan(ball).all():
         raise UserError("presses.csv gives ball_mm for some presses only: fill in all, or none")
-    return PressSet(background, np.stack(images), circles, ball, names)
+    return PressSet(background, np.stack(images), np.stack(circles), ball, names)
+
+
+def _found(name: str, image: np.ndarray, background: np.ndarray) -> np.ndarray:
+    try:
+        return find_circle(image, background)
+    except UserError as error:
+        raise UserError(f"{name}: {error}") from error
 
 
 def _read_rows(path: Path) -> list[tuple[str, float, float, float, float]]:
@@ -112,22 +127,25 @@ def _read_rows(path: Path) -> list[tuple[str, float, float, float, float]]:
         raise UserError(f"{path} is missing: write one line a press: {','.join(COLUMNS)}")
     with path.open(newline="") as file:
         reader = csv.DictReader(file)
-        missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
+        missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
         if missing:
-            raise UserError(f"{path} lacks the column {missing[0]}: its first line must be "
-                            f"{','.join(COLUMNS)}")  # fmt: skip
+            raise UserError(f"{path} lacks the column {missing[0]}: its first line must be file,ball_mm "
+                            f"or {','.join(COLUMNS)}")  # fmt: skip
         return [_read_row(path, line, row) for line, row in enumerate(reader, 2)]
 
 
 def _read_row(path: Path, line: int, row: dict[str, str]) -> tuple[str, float, float, float, float]:
     try:
-        x, y, radius = (float(row[name]) for name in COLUMNS[1:4])
-        ball = float(row["ball_mm"]) if (row["ball_mm"] or "").strip() else math.nan
+        x, y, radius, ball = (_number(row.get(name)) for name in COLUMNS[1:])
     except (TypeError, ValueError) as error:
         raise UserError(
-            f"{path}, line {line}: {error}; write numbers, ball_mm may be empty"
+            f"{path}, line {line}: {error}; write numbers, or leave them out"
         ) from error
     return row["file"], x, y, radius, ball
+
+
+def _number(text: str | None) -> float:
+    return float(text) if (text or "").strip() and text is not None else math.nan
 
 
 def _read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:

@@ -14,8 +14,18 @@ from touchgoal.control.calibration.picture_errors import (
     picture_errors,
 )
 from touchgoal.control.calibration.pictures import side_by_side
+from touchgoal.control.calibration.press_fit import (
+    BLUR_PYRAMID,
+    BLUR_SCALES,
+    NARROWEST,
+    WIDEST,
+)
 from touchgoal.control.calibration.press_set import PressSet
+from touchgoal.control.errors import UserError
 
+# Errors (L1) above this share of the background's own mean that the fit explains nothing.
+_USELESS = 0.9
+_AT_LIMIT = 0.2  # share of circles at a search limit that is worth a warning
 _MAX_SHOWN = 6  # held-out presses in the picture
 
 
@@ -46,6 +56,49 @@ def errors_table(errors: dict[str, PictureErrors], n: int) -> str:
     return "\n".join([head, *rows])
 
 
+def depth_table(depths: dict[str, dict[str, float]]) -> str:
+    """The depth of held-out presses as people read it."""
+    return "\n".join(
+        f"depth: a ball of {size} mm reads {d['radius_mm']:.2f} mm (median of {d['presses']:.0f} held-out "
+        f"presses), {d['residual_um']:.0f} um from a sphere, its peak {d['peak_offset_mm']:.2f} mm off"
+        for size, d in depths.items()
+    )
+
+
+def refuse_useless(errors: dict[str, PictureErrors]) -> None:
+    """UserError unless the fit predicts held-out pictures better than the background does."""
+    alone = errors["background alone"].l1_near
+    best = min(e.l1_near for name, e in errors.items() if name != "background alone")
+    if best > _USELESS * alone:
+        raise UserError(
+            f"the fit predicts held-out presses no better ({best:.1f} counts) than the background "
+            f"alone ({alone:.1f}): check that background.png is of this sensor and that the circles lie "
+            "on the contacts, or leave them out of presses.csv to have them found"
+        )
+
+
+def at_limits(fitted: FittedCalibration, presses: PressSet) -> list[str]:
+    """What stands at a limit of its search, so that the best may lie beyond."""
+    calibration, circles = fitted.calibration, fitted.circles
+    moved = np.abs(circles[:, :2] - presses.circles[:, :2]).max(1) > 0.98 * presses.circles[:, 2]
+    widest = WIDEST * fitted.ball_radius / calibration.pixel_pitch
+    most = np.minimum(1.5 * presses.circles[:, 2], widest)
+    size = (circles[:, 2] > 0.99 * most) | (circles[:, 2] <= NARROWEST)
+    lines = []
+    if (stuck := moved | size).mean() > _AT_LIMIT:
+        names = ", ".join(np.array(presses.files)[stuck][:4])
+        lines.append(
+            f"{stuck.sum()} of {len(stuck)} circles stand at their search limit ({names}): check ball_mm, "
+            "the scale, and that one ball alone touches"
+        )
+    narrowest, softest = (BLUR_SCALES[i] * BLUR_PYRAMID[0] for i in (0, -1))
+    if calibration.blur_sigmas[0] >= softest or calibration.blur_sigmas[0] <= narrowest:
+        lines.append(
+            "the gel's bulge stands at its search limit: depths beside contacts are uncertain"
+        )
+    return lines
+
+
 def warnings(fitted: FittedCalibration) -> list[str]:
     """What the user should know about the presses."""
     calibration = fitted.calibration
@@ -60,20 +113,26 @@ def warnings(fitted: FittedCalibration) -> list[str]:
         )
     if fitted.ball_fitted:
         lines.append(
-            f"ball_mm is empty: fitted, {fitted.ball_radius[0] * 1e3:.2f} mm; pictures tell it "
+            f"the ball's radius is fitted, {fitted.ball_radius[0] * 1e3:.2f} mm; pictures tell it "
             "poorly, and every depth in mm is only as good: measure the ball"
         )
     return lines
 
 
 def record(
-    fitted: FittedCalibration, presses: PressSet, errors: dict[str, PictureErrors], n_test: int
+    fitted: FittedCalibration,
+    presses: PressSet,
+    errors: dict[str, PictureErrors],
+    depths: dict[str, dict[str, float]],
+    n_test: int,
 ) -> dict[str, Any]:
     """What metrics.json holds, and the sensor file beside its values."""
     return {
         "presses": len(presses),
         "held_out_presses": n_test,
         "held_out": {name: asdict(e) for name, e in errors.items()},
+        "held_out_depth": depths,
+        "light_power": fitted.calibration.light_power,
         "ball_mm": sorted({round(float(r) * 1e3, 3) for r in fitted.ball_radius}),
         "ball_fitted": fitted.ball_fitted,
         "response_varies_over_image": fitted.varies_over_image,

@@ -101,7 +101,8 @@ class _Level:
         rows, columns, _ = p.background.shape
         h, w = self._shape = rows // cell, columns // cell
         self._pitch = p.pixel_pitch * cell
-        light = cv2.resize(illumination(p.background), (w, h), interpolation=cv2.INTER_AREA)
+        gain = illumination(p.background, p.light_power)
+        light = cv2.resize(gain, (w, h), interpolation=cv2.INTER_AREA)
         self._gain = np.ascontiguousarray(np.moveaxis(light, 2, 0))
         self._noise = np.float32(np.hypot(p.noise / cell, _MODEL_ERROR))
         self._rest = np.float32(cell**2 / _PATCH / _REST**2)

@@ -90,6 +90,14 @@ GELSIGHT_MINI = SensorModel(
     sensor_file=_FILES / "gelsight_mini",
 )
 
+# The same model, one unit of it fitted to 46 presses of two balls of known radius (GelSLAM): depths in
+# millimetres hold on it. `GELSIGHT_MINI` stays what encoders and policies are trained on.
+GELSIGHT_MINI_MEASURED = replace(
+    GELSIGHT_MINI,
+    pixel_pitch=0.0634e-3,
+    sensor_file=_FILES / "gelsight_mini_measured",
+)
+
 # 63 dots found in three real pictures: pitch 31.4-32.5 px, diameter 14-18 px of 320.
 GELSIGHT_MINI_MARKERS = replace(
     GELSIGHT_MINI,
@@ -134,10 +142,18 @@ DIGIT = SensorModel(
     sensor_file=_FILES / "digit",
 )
 
+# The same model, one unit of it fitted to 20 presses of one ball (FOTS). Ball (3 mm) and scale are
+# assumed: neither is stated, and pictures do not tell.
+DIGIT_MEASURED = replace(
+    DIGIT,
+    pixel_pitch=0.047e-3,
+    sensor_file=_FILES / "digit_measured",
+)
+
 SENSORS = {
     sensor.name: sensor
     for sensor in (GELSIGHT_MINI, GELSIGHT_MINI_MARKERS, GELSIGHT, GELSIGHT_MARKERS, DIGIT)
-}
+} | {"gelsight_mini_measured": GELSIGHT_MINI_MEASURED, "digit_measured": DIGIT_MEASURED}
 
 
 def find_sensor(name: str) -> SensorModel:

@@ -1,5 +1,6 @@
 """What a frozen embedding knows, as a ridge regression can read it."""
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -29,3 +30,25 @@ def ridge_r2(
     read = ((test_inputs - mean) / spread).double() @ weights + offset
     error = ((read - test_targets) ** 2).mean(0)
     return (1 - error / test_targets.double().var(0, correction=0)).float()
+
+
+def ridge_scores(
+    inputs: Float[np.ndarray, "n d"],
+    targets: Float[np.ndarray, "n k"],
+    test_inputs: Float[np.ndarray, "m d"],
+    strength: float,
+) -> Float[np.ndarray, "m k"]:
+    """Targets of new inputs by a ridge regression in its dual form: fewer samples than columns.
+
+    Args:
+        inputs: Embeddings to fit on; columns are brought to variance 1.
+        targets: What to read from them.
+        test_inputs: Other embeddings.
+        strength: Of the ridge, beside the mean square of an input's columns.
+    """
+    mean, spread = inputs.mean(0), inputs.std(0) + 1e-6
+    known = (inputs - mean) / spread
+    kernel, width = known @ known.T / known.shape[1], len(known)
+    offset = targets.mean(0)
+    weights = np.linalg.solve(kernel + strength * np.eye(width), targets - offset)
+    return ((test_inputs - mean) / spread) @ known.T / known.shape[1] @ weights + offset

@@ -186,6 +186,11 @@ def imagenet_pixels(images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n 3 
     return _normalised(_resize_shorter_side(images, 224), _IMAGENET_MEAN, _IMAGENET_STD)
 
 
+def imagenet_normalised(pixels: Float[Tensor, "n 3 y x"]) -> Float[Tensor, "n 3 y x"]:
+    """Pixels of 0 to 1, of any size, normalised as for ImageNet."""
+    return _normalised(pixels, _IMAGENET_MEAN, _IMAGENET_STD)
+
+
 def clip_pixels(images: UInt8[np.ndarray, "n h w 3"], size: int) -> Float[Tensor, "n 3 y x"]:
     """The centre square, as transformers' CLIPImageProcessorPil makes it."""
     pixels = _resize_shorter_side(images, size)

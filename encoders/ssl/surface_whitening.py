@@ -1,0 +1,142 @@
+"""What of a touch does not matter, learned from simulated surfaces pressed again and again.
+
+Every surface is pressed several times, each time at another place, turn and depth, on another unit of
+the sensor, in other light and through other compression. The covariance within surfaces is what does
+not matter; its inverse square root makes distances that ignore it (within-class covariance
+normalisation: Hatch et al. 2006). A closed form: nothing is tuned, the seed hardly matters.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float32, UInt8
+
+from touchgoal.control.progress import track
+from touchgoal.control.tactile.sensor_models import SensorModel
+from touchgoal.encoders.backbones.pooled_encoder import (
+    FEATURES,
+    PooledEncoder,
+    PooledEncoderConfig,
+)
+from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
+from touchgoal.sim_envs.tactile.surface_press import press, random_pose, untouched
+from touchgoal.sim_envs.tactile.surfaces import random_surface
+
+_UNITS = 48
+_BATCH = 32
+_SHRINKAGE = 0.1  # of the covariance towards a sphere; 0.01 to 0.3 tell real things apart alike
+_VISIBLE = 4.0  # counts of change that a press makes somewhere, or another is drawn
+_TRIES = 3
+# Brightness between two moments, common and by channel; JPEG quality; share of streams compressed.
+_COMMON_DRIFT, _CHANNEL_DRIFT = 0.03, 0.01
+_QUALITY = 40, 95
+_COMPRESSED = 0.7
+
+
+@dataclass(frozen=True)
+class WhiteningConfig:
+    """How much is simulated."""
+
+    surfaces: int = 5000
+    presses: int = 4
+    seed: int = 0
+
+
+def train(sensor: SensorModel, name: str, config: WhiteningConfig) -> PooledEncoder:
+    """An encoder fitted to simulated touch.
+
+    Args:
+        sensor: simulated: a measured sensor file says most.
+        name: sensor whose pictures the encoder is for.
+        config: how much is simulated.
+    """
+    encoder = PooledEncoder(PooledEncoderConfig.for_sensor(name))
+    total, square = np.zeros(FEATURES), np.zeros((FEATURES, FEATURES))
+    within = np.zeros((FEATURES, FEATURES))
+    count = config.surfaces * config.presses
+    for rows in track(_pooled(encoder, sensor, config), "surfaces", "batch", _batches(config)):
+        total += rows.sum((0, 1))
+        flat = rows.reshape(-1, FEATURES)
+        square += flat.T @ flat
+        apart = (rows - rows.mean(1, keepdims=True)).reshape(-1, FEATURES)
+        within += apart.T @ apart
+    mean = total / count
+    spread = np.sqrt(np.diag(square) / count - mean**2) + 1e-4
+    covariance = within / (config.surfaces * (config.presses - 1)) / np.outer(spread, spread)
+    whitening = inverse_square_root(covariance, _SHRINKAGE) / spread[:, None]
+    encoder.mean.copy_(torch.from_numpy(mean))
+    encoder.whitening.copy_(torch.from_numpy(whitening))
+    return encoder
+
+
+def inverse_square_root(covariance: np.ndarray, shrinkage: float) -> np.ndarray:
+    """V of a covariance C, shrunk towards a sphere, such that V.T C V is the identity."""
+    size = len(covariance)
+    sphere = np.trace(covariance) / size * np.eye(size)
+    values, vectors = np.linalg.eigh((1 - shrinkage) * covariance + shrinkage * sphere)
+    return vectors / np.sqrt(values)
+
+
+def _batches(config: WhiteningConfig) -> int:
+    return -(-config.surfaces // _surfaces_a_batch(config))
+
+
+def _surfaces_a_batch(config: WhiteningConfig) -> int:
+    return max(1, _BATCH // config.presses)
+
+
+def _pooled(
+    encoder: PooledEncoder, sensor: SensorModel, config: WhiteningConfig
+) -> Iterator[Float32[np.ndarray, "surfaces presses d"]]:
+    """Pooled features of some surfaces at a time, each pressed several times."""
+    rng = np.random.default_rng([config.seed, 0])
+    units = [_unit(sensor, rng) for _ in range(_UNITS)]
+    step = _surfaces_a_batch(config)
+    for first in range(0, config.surfaces, step):
+        touches = []
+        for i in range(first, min(first + step, config.surfaces)):
+            rng = np.random.default_rng([config.seed, 1, i])
+            surface = random_surface(rng)
+            for _ in range(config.presses):
+                unit = units[rng.integers(_UNITS)]
+                before, after = _visible_press(surface, unit, rng)
+                touches.append(encoder.preprocess(after[None], before)[0])
+        rows = encoder.pool(torch.from_numpy(np.stack(touches))).numpy()
+        yield rows.reshape(-1, config.presses, FEATURES)
+
+
+def _unit(sensor: SensorModel, rng: np.random.Generator) -> SensorInstance:
+    """One unit of the sensor, its response stronger or weaker than the file's."""
+    instance = sample_instance(sensor, rng)
+    strength = rng.uniform(0.75, 1.3) * rng.uniform(0.85, 1.15, (3, 1, 1))
+    response = (instance.calibration.response * strength).astype(np.float32)
+    return replace(instance, calibration=replace(instance.calibration, response=response))
+
+
+def _visible_press(
+    surface, unit: SensorInstance, rng: np.random.Generator
+) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
+    """The unit untouched, and pressed, as its camera sends both."""
+    rest = untouched(unit, rng)
+    frame = rest
+    for _ in range(_TRIES):
+        frame = press(surface, random_pose(rng), unit, rng)
+        change = cv2.resize(frame.astype(np.float32) - rest, (40, 30), interpolation=cv2.INTER_AREA)
+        if np.abs(change).max() > _VISIBLE:
+            break
+    quality = int(rng.integers(*_QUALITY)) if rng.random() < _COMPRESSED else None
+    gain = 1 + _COMMON_DRIFT * rng.normal() + _CHANNEL_DRIFT * rng.normal(size=3)
+    lit = np.rint(frame * gain).clip(0, 255).astype(np.uint8)
+    return _sent(rest, quality), _sent(lit, quality)
+
+
+def _sent(frame: UInt8[np.ndarray, "h w 3"], quality: int | None) -> UInt8[np.ndarray, "h w 3"]:
+    if quality is None:
+        return frame
+    data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return decoded

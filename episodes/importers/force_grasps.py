@@ -1,0 +1,70 @@
+"""Grasps with a known force: the layout of EstimateModulus (MIT, arXiv 2407.15304).
+
+A folder holds `grasps.csv` (trial, object), and of each trial `TRIAL.avi` (a fingertip's raw pictures)
+and `TRIAL.csv` (force_newtons, gripper_width_m; one row a frame).
+"""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from touchgoal.control.errors import UserError
+from touchgoal.episodes.media import read_frames
+
+_COLUMNS = ("force_newtons", "gripper_width_m")
+
+
+@dataclass(frozen=True, eq=False)
+class ForceGrasp:
+    """One grasp, from the open hand and back.
+
+    Attributes:
+        trial: its name.
+        object: id of the thing.
+        video: its file.
+        force: of the grasp, N, one a frame, as its load cell says: spikes and drift included.
+        width: of the gripper, m, one a frame.
+    """
+
+    trial: str
+    object: str
+    video: Path
+    force: Float[np.ndarray, " n"]
+    width: Float[np.ndarray, " n"]
+
+    def frames(self) -> UInt8[np.ndarray, "m h w 3"]:
+        """RGB frames, raw; as many as `force` has."""
+        return read_frames(self.video)[0][: len(self.force)]
+
+
+def read_force_grasps(folder: Path) -> list[ForceGrasp]:
+    """The grasps of a folder.
+
+    Raises:
+        UserError: a table, a column or a video is missing.
+    """
+    index = folder / "grasps.csv"
+    if not index.is_file():
+        raise UserError(f"no grasps.csv in {folder}: give a folder of grasps with it")
+    grasps = []
+    with index.open(newline="") as file:
+        for row in csv.DictReader(file):
+            video, table = (folder / f"{row['trial']}.{kind}" for kind in ("avi", "csv"))
+            for path in (video, table):
+                if not path.is_file():
+                    raise UserError(f"{path} is missing, which {index} names")
+            force, width = _read_table(table)
+            grasps.append(ForceGrasp(row["trial"], row["object"], video, force, width))
+    return grasps
+
+
+def _read_table(path: Path) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    with path.open(newline="") as file:
+        reader = csv.DictReader(file)
+        if missing := [name for name in _COLUMNS if name not in (reader.fieldnames or ())]:
+            raise UserError(f"{path} lacks the column {missing[0]}")
+        rows = np.array([[float(row[name]) for name in _COLUMNS] for row in reader])
+    return rows[:, 0], rows[:, 1]

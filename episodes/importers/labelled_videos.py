@@ -1,0 +1,73 @@
+"""Touch videos with ranks of what they feel like: PhysiCLeAR (Octopi, RSS 2024, arXiv 2405.02794).
+
+A folder holds `videos/` and `labels.csv` with the columns file, object, name, split (train, val, test or
+unlabelled), hardness, roughness and bumpiness (0, 1 or 2 each; empty where not ranked).
+"""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from touchgoal.control.errors import UserError
+from touchgoal.episodes.media import read_frames
+
+PROPERTIES = ("hardness", "roughness", "bumpiness")
+_COLUMNS = ("file", "object", "name", "split", *PROPERTIES)
+
+
+@dataclass(frozen=True)
+class LabelledVideo:
+    """One press of one thing.
+
+    Attributes:
+        path: of the video.
+        object: id of the thing.
+        name: what people call it.
+        split: train, val, test or unlabelled.
+        ranks: hardness, roughness, bumpiness, 0 to 2; None where not ranked.
+    """
+
+    path: Path
+    object: str
+    name: str
+    split: str
+    ranks: tuple[int, int, int] | None
+
+    def frames(self) -> UInt8[np.ndarray, "n h w 3"]:
+        """RGB frames; the first few are untouched."""
+        return read_frames(self.path)[0]
+
+
+def read_labelled_videos(folder: Path) -> list[LabelledVideo]:
+    """The videos of a folder, in the order of `labels.csv`.
+
+    Raises:
+        UserError: no such table, a column or a video is missing, or a rank is none.
+    """
+    table = folder / "labels.csv"
+    if not table.is_file():
+        raise UserError(f"no labels.csv in {folder}: give a folder of PhysiCLeAR videos with it")
+    with table.open(newline="") as file:
+        reader = csv.DictReader(file)
+        if missing := [name for name in _COLUMNS if name not in (reader.fieldnames or ())]:
+            raise UserError(f"{table} lacks the column {missing[0]}")
+        videos = [_video(folder, row) for row in reader]
+    if absent := [video.path for video in videos if not video.path.is_file()]:
+        raise UserError(f"{table} names {absent[0].name}, which is not in {folder / 'videos'}")
+    return videos
+
+
+def _video(folder: Path, row: dict[str, str]) -> LabelledVideo:
+    values = [row[name].strip() for name in PROPERTIES]
+    ranks = None
+    if all(values):
+        if not set(values) <= {"0", "1", "2"}:
+            raise UserError(
+                f"{folder / 'labels.csv'}: {row['file']} has a rank that is not 0, 1 or 2"
+            )
+        ranks = int(values[0]), int(values[1]), int(values[2])
+    path = folder / "videos" / row["file"]
+    return LabelledVideo(path, row["object"], row["name"], row["split"], ranks)

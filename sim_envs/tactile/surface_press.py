@@ -1,0 +1,117 @@
+"""Presses of random surfaces, by the pad simulator alone: no robot, no physics, a millisecond each.
+
+For learning what touch looks like. The depth is drawn, not solved for; a press with forces is
+`press_bench`'s.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from touchgoal.control.tactile.gel import deform
+from touchgoal.sim_envs.tactile.optics import render, render_untouched
+from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance
+from touchgoal.sim_envs.tactile.surfaces import TILE, TILE_PITCH, Surface
+
+DEPTHS = 0.15e-3, 1.3e-3
+"""How deep a thing is pressed in, m: least and most of a light hand."""
+_NOTHING = -5e-3  # m: far below the gel
+
+
+@dataclass(frozen=True)
+class SurfacePose:
+    """How a surface is held against the gel.
+
+    Attributes:
+        centre: where the body's middle lies on the gel, m along x and y from the image's middle.
+        turn: about the gel's normal, rad.
+        tilt: slopes along x and y, m per m.
+        texture_at: which cell of the texture lies in the body's middle.
+        depth: of the highest point in the undeformed gel, m.
+    """
+
+    centre: tuple[float, float]
+    turn: float
+    tilt: tuple[float, float]
+    texture_at: tuple[float, float]
+    depth: float
+
+
+def random_pose(rng: np.random.Generator) -> SurfacePose:
+    """As a person presses a thing: somewhere near the middle, at any angle, not quite level."""
+    x, y = rng.normal(0, 2.5e-3, 2)
+    a, b = rng.normal(0, 0.012, 2)
+    u, v = rng.uniform(0, TILE, 2)
+    low, high = np.log(DEPTHS)
+    turn = float(rng.uniform(0, 2 * math.pi))
+    return SurfacePose((x, y), turn, (a, b), (u, v), float(np.exp(rng.uniform(low, high))))
+
+
+def overlap(
+    surface: Surface, pose: SurfacePose, shape: tuple[int, int], pitch: float
+) -> Float32[np.ndarray, "h w"]:
+    """How deep the surface lies in the undeformed gel, m; zero where it does not reach it.
+
+    Args:
+        surface: what presses.
+        pose: how.
+        shape: rows and columns of the grid, centred on the image.
+        pitch: of the grid, m.
+    """
+    h, w = shape
+    x = (np.arange(w, dtype=np.float32) - (w - 1) / 2) * np.float32(pitch)
+    y = ((np.arange(h, dtype=np.float32) - (h - 1) / 2) * np.float32(pitch))[:, None]
+    x, y = x - np.float32(pose.centre[0]), y - np.float32(pose.centre[1])
+    c, s = np.float32(math.cos(pose.turn)), np.float32(math.sin(pose.turn))
+    height = _body(surface, c * x + s * y, c * y - s * x)
+    height += np.float32(pose.tilt[0]) * x + np.float32(pose.tilt[1]) * y
+    # cell of the texture under pixel (column j, row i): linear in j and i
+    step = pitch / TILE_PITCH
+    middle = (w - 1) / 2 + pose.centre[0] / pitch, (h - 1) / 2 + pose.centre[1] / pitch
+    turned = step * np.array([[c, s], [-s, c]])
+    shift = np.array(pose.texture_at) - turned @ middle
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    to_cells = np.column_stack([turned, shift])
+    height += cv2.warpAffine(
+        surface.texture, to_cells, (w, h), flags=flags, borderMode=cv2.BORDER_WRAP
+    )
+    # The highest points, not the one highest: a single grain does not carry the press.
+    top = float(np.partition(height.ravel(), -40)[-40])
+    height += np.float32(pose.depth - top)
+    return np.maximum(height, 0) * np.float32(surface.firmness)
+
+
+def _body(surface: Surface, x: np.ndarray, y: np.ndarray) -> Float32[np.ndarray, "h w"]:
+    """Height of the body's coarse shape over its own axes, 0 at its highest."""
+    if surface.body == "ball":
+        height = -(x * x + y * y) / np.float32(2 * surface.size)
+    elif surface.body == "cylinder":
+        height = -(x * x + 0 * y) / np.float32(2 * surface.size)
+    elif surface.body == "edge":
+        height = -np.maximum(x + 0 * y, 0) * np.float32(surface.slope)
+    elif surface.body == "bar":
+        beside = np.maximum(np.abs(x + 0 * y) - np.float32(surface.size / 2), 0)
+        height = -beside * np.float32(1 + 3 * surface.slope)
+    elif surface.body == "corner":
+        height = -np.maximum(np.maximum(x, y), 0) * np.float32(1 + surface.slope)
+    else:
+        height = 0 * (x + y)
+    return np.maximum(height, _NOTHING)
+
+
+def press(
+    surface: Surface, pose: SurfacePose, instance: SensorInstance, rng: np.random.Generator
+) -> UInt8[np.ndarray, "h w 3"]:
+    """What one sensor shows of a press, RGB."""
+    _, h, w = instance.background.shape
+    pitch = 2 * instance.pixel_pitch  # surfaces are at half the image's resolution
+    raw = overlap(surface, pose, (h // 2, w // 2), pitch)
+    return render(deform(raw, pitch, instance.calibration.blur_sigmas), instance, rng)
+
+
+def untouched(instance: SensorInstance, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
+    """The same sensor with nothing on it, RGB."""
+    return render_untouched(instance, rng)

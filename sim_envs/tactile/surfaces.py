@@ -1,0 +1,205 @@
+"""Surfaces without end: bodies and textures drawn at random, as height maps in metres.
+
+A surface is what one thing feels like all over: a body (flat, round, edged) and one or two textures on
+it. Textures are tiles that repeat; a press takes them anywhere, at any angle (`surface_press`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+TILE = 256
+"""Cells along a texture's side."""
+TILE_PITCH = 0.1e-3
+"""m per cell of a texture: a tile shows 25.6 mm."""
+
+Tile = Float32[np.ndarray, "256 256"]
+Body = Literal["flat", "ball", "cylinder", "edge", "bar", "corner"]
+BODIES: tuple[Body, ...] = ("flat", "ball", "cylinder", "edge", "bar", "corner")
+
+
+@dataclass(frozen=True)
+class Surface:
+    """One thing to touch.
+
+    Attributes:
+        body: its coarse shape where it meets the gel.
+        size: radius of a ball or cylinder, half the width of a bar, m; of no meaning to the others.
+        slope: of what falls away beside an edge, bar or corner, m per m.
+        texture: height added to the body, m.
+        firmness: share of the overlap that goes into the gel and not into the thing itself.
+    """
+
+    body: Body
+    size: float
+    slope: float
+    texture: Tile
+    firmness: float
+
+
+def random_surface(rng: np.random.Generator) -> Surface:
+    """Draw a thing to touch."""
+    texture = np.zeros((TILE, TILE), np.float32)
+    for _ in range(int(rng.choice([0, 1, 2], p=[0.08, 0.5, 0.42]))):
+        amplitude = _log_uniform(rng, 8e-6, 6e-4)
+        texture += np.float32(amplitude) * _unit(_PATTERNS[rng.integers(len(_PATTERNS))](rng))
+    return Surface(
+        body=BODIES[rng.choice(len(BODIES), p=[0.3, 0.34, 0.17, 0.07, 0.08, 0.04])],
+        size=_log_uniform(rng, 1.5e-3, 40e-3),
+        slope=_log_uniform(rng, 0.1, 2.0),
+        texture=texture,
+        firmness=float(rng.choice([1.0, rng.uniform(0.15, 1.0)])),
+    )
+
+
+def _log_uniform(rng: np.random.Generator, least: float, most: float) -> float:
+    return float(np.exp(rng.uniform(np.log(least), np.log(most))))
+
+
+def _unit(tile: Tile) -> Tile:
+    """With a mean of 0 and a range of about 1."""
+    low, high = np.percentile(tile[::4, ::4], [1, 99])
+    return ((tile - tile.mean()) / max(float(high - low), 1e-6)).astype(np.float32)
+
+
+def _noise(rng: np.random.Generator, wavelength: float, octaves: float, falloff: float) -> Tile:
+    """Noise from a wavelength (cells) down over some octaves, its amplitude falling off."""
+    f = np.hypot(np.fft.fftfreq(TILE)[:, None], np.fft.rfftfreq(TILE)[None]).astype(np.float32)
+    low, high = 1 / wavelength, 2**octaves / wavelength
+    band = np.where((f >= low) & (f <= high), np.maximum(f, 1e-4) ** -falloff, 0)
+    if not band.any():
+        band = np.exp(-((f - low) ** 2) / (0.1 * low) ** 2)
+    phase = np.exp(2j * np.pi * rng.random(band.shape, np.float32))
+    return np.fft.irfft2(band * phase, (TILE, TILE)).astype(np.float32)
+
+
+def _rough(rng: np.random.Generator) -> Tile:
+    return _noise(rng, _log_uniform(rng, 5, 120), rng.uniform(0.7, 4), rng.uniform(0.5, 2.5))
+
+
+def _wrinkles(rng: np.random.Generator) -> Tile:
+    """Creases or folds: a noise folded at its mean, either way up."""
+    folded = np.abs(_noise(rng, _log_uniform(rng, 15, 100), rng.uniform(0.3, 2), 1.5))
+    return folded * np.float32(rng.choice([-1, 1]))
+
+
+def _phases(rng: np.random.Generator) -> tuple[Tile, Tile]:
+    """Two crossing directions in radians, a whole number of periods a tile, a little uneven."""
+    periods = int(_log_uniform(rng, 4, 70))
+    y, x = np.mgrid[:TILE, :TILE].astype(np.float32) * np.float32(2 * np.pi / TILE)
+    uneven = np.float32(rng.uniform(0, 0.8))
+    bend = _unit(_noise(rng, 100, 1, 1)) * uneven
+    skew = int(rng.integers(-periods, periods + 1)) if rng.random() < 0.3 else 0
+    return periods * x + skew * y + bend, periods * y + bend
+
+
+def _ribs(rng: np.random.Generator) -> Tile:
+    a, _ = _phases(rng)
+    return np.abs(np.sin(a / 2)) ** np.float32(_log_uniform(rng, 0.3, 8))
+
+
+def _knurl(rng: np.random.Generator) -> Tile:
+    a, b = _phases(rng)
+    return (np.abs(np.sin(a / 2)) * np.abs(np.sin(b / 2))) ** np.float32(_log_uniform(rng, 0.3, 6))
+
+
+def _weave(rng: np.random.Generator) -> Tile:
+    """Threads over and under each other."""
+    a, b = _phases(rng)
+    over = np.sin(a / 2) * np.sin(b / 2) > 0
+    return np.where(over, np.abs(np.cos(a / 2)), np.abs(np.cos(b / 2))) ** np.float32(
+        _log_uniform(rng, 0.5, 2)
+    )
+
+
+def _grains(rng: np.random.Generator) -> Tile:
+    """Half ellipsoids strewn about: grain, gravel, bristles, bumps."""
+    tile = np.zeros((TILE, TILE), np.float32)
+    length = _log_uniform(rng, 3, 30)
+    width = length * rng.uniform(0.35, 1)
+    count = int(rng.uniform(0.15, 0.8) * TILE**2 / (np.pi * length * width)) + 3
+    along = rng.uniform(0, np.pi)
+    spread = rng.choice([0.2, np.pi])
+    reach = int(length) + 1
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1].astype(np.float32)
+    stamps = []
+    for turn in along + spread * rng.uniform(-1, 1, 12):
+        c, s = np.float32(np.cos(turn)), np.float32(np.sin(turn))
+        inside = 1 - ((c * x + s * y) / length) ** 2 - ((c * y - s * x) / width) ** 2
+        stamps.append(np.sqrt(np.maximum(inside, 0)))
+    for _ in range(min(count, 600)):
+        row, column = rng.integers(0, TILE, 2)
+        rows = np.arange(row - reach, row + reach + 1) % TILE
+        columns = np.arange(column - reach, column + reach + 1) % TILE
+        stamp = stamps[rng.integers(12)] * np.float32(rng.uniform(0.6, 1))
+        tile[np.ix_(rows, columns)] = np.maximum(tile[np.ix_(rows, columns)], stamp)
+    return tile
+
+
+def _cells(rng: np.random.Generator) -> Tile:
+    """Foam, leather, bubbles: the distance to the nearest of some points."""
+    seeds = np.full((TILE, TILE), 255, np.uint8)
+    points = rng.integers(0, TILE, (int(_log_uniform(rng, 12, 900)), 2))
+    seeds[points[:, 0], points[:, 1]] = 0
+    around = cv2.copyMakeBorder(seeds, 64, 64, 64, 64, cv2.BORDER_WRAP)
+    distance = cv2.distanceTransform(around, cv2.DIST_L2, 3)[64:-64, 64:-64]
+    return distance * np.float32(rng.choice([-1, 1]))
+
+
+def _strands(rng: np.random.Generator) -> Tile:
+    """Hairs, wires and scratches."""
+    tile = np.zeros((TILE, TILE), np.float32)
+    width, main = int(rng.integers(1, 9)), rng.uniform(0, np.pi)
+    spread = rng.choice([0.15, 1.5])
+    for _ in range(int(_log_uniform(rng, 4, 60))):
+        angle = main + spread * rng.normal()
+        reach = np.array([np.cos(angle), np.sin(angle)]) * rng.uniform(30, 300)
+        middle = rng.uniform(0, TILE, 2)
+        ends = [tuple(int(v) for v in middle + sign * reach) for sign in (-1, 1)]
+        cv2.line(tile, ends[0], ends[1], float(rng.uniform(0.5, 1)), width, cv2.LINE_AA)
+    return _rounded(tile, width) * np.float32(rng.choice([1, 1, -1]))
+
+
+def _plateaus(rng: np.random.Generator) -> Tile:
+    """Buttons, letters and stamped figures."""
+    tile = np.zeros((TILE, TILE), np.uint8)
+    white = 255.0
+    for _ in range(int(rng.integers(2, 14))):
+        at = tuple(int(v) for v in rng.integers(0, TILE, 2))
+        size = _log_uniform(rng, 8, 60)
+        if rng.random() < 0.3:
+            text = "".join(rng.choice(list("ABEKRSXZ0235689"), 3))
+            cv2.putText(tile, text, at, cv2.FONT_HERSHEY_SIMPLEX, size / 25, white, 3, cv2.LINE_AA)
+        elif rng.random() < 0.5:
+            cv2.ellipse(
+                tile, (at, (size, size * rng.uniform(0.4, 1)), rng.uniform(0, 180)), white, -1
+            )
+        else:
+            box = cv2.boxPoints((at, (size, size * rng.uniform(0.3, 1)), rng.uniform(0, 180)))
+            cv2.fillConvexPoly(tile, box.astype(np.int32), white, cv2.LINE_AA)
+    return _rounded(tile.astype(np.float32), rng.uniform(1, 8)) * np.float32(
+        rng.choice([1, 1, 1, -1])
+    )
+
+
+def _rounded(tile: Tile, width: float) -> Tile:
+    return cv2.GaussianBlur(tile, (0, 0), max(0.4 * width, 0.5))
+
+
+_PATTERNS: tuple[Callable[[np.random.Generator], Tile], ...] = (
+    _rough,
+    _rough,
+    _wrinkles,
+    _ribs,
+    _knurl,
+    _weave,
+    _grains,
+    _grains,
+    _cells,
+    _strands,
+    _plateaus,
+)

@@ -1,0 +1,121 @@
+"""Readers of published touch data, and the benchmark that judges encoders by them."""
+
+import csv
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from touchgoal.benchmarks.config import RealTouchOptions
+from touchgoal.benchmarks.real_touch import run
+from touchgoal.benchmarks.real_touch_encoders import find_embedder
+from touchgoal.control.errors import UserError
+from touchgoal.encoders.probes import property_probe
+from touchgoal.episodes.importers.force_grasps import read_force_grasps
+from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
+from touchgoal.episodes.media import write_video
+
+Y, X = np.mgrid[:60, :80].astype(np.float32)
+
+
+def press(thing: int, frames: int = 9) -> np.ndarray:
+    """Stripes whose width and colour tell the thing, after three untouched frames."""
+    rng = np.random.default_rng(thing)
+    stripes = 60 * np.sin(X / (4 + 2 * thing))[..., None] * [1, 0.5 * thing, -1]
+    gel = 100 + rng.normal(0, 1, (frames, 60, 80, 3))
+    pressed = np.arange(frames)[:, None, None, None] >= 5
+    return (gel + pressed * stripes).clip(0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("clips")
+    (folder / "videos").mkdir()
+    with (folder / "labels.csv").open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow("file object name split hardness roughness bumpiness".split())
+        for thing in range(6):
+            for take in range(3):
+                name = f"thing{thing}_{take}.mp4"
+                write_video(folder / "videos" / name, press(thing), 10)
+                split = ("val" if thing % 3 == 2 else "train") if thing < 5 else "unlabelled"
+                ranks = [thing % 3, thing // 2, 1] if thing < 5 else ["", "", ""]
+                rows.writerow([name, f"thing{thing}", f"thing {thing}", split, *ranks])
+    return folder
+
+
+def test_videos_are_read_with_their_labels(clips: Path) -> None:
+    videos = read_labelled_videos(clips)
+    assert len(videos) == 18 and videos[3].object == "thing1"
+    assert videos[3].ranks == (1, 0, 1) and videos[-1].ranks is None
+    assert videos[0].frames().shape == (9, 60, 80, 3)
+
+
+def test_the_benchmark_judges_encoders(clips: Path) -> None:
+    result = run(RealTouchOptions(data=clips, encoders=("pixels", "random:gelsight_mini")))
+    row = result["rows"][0]
+    assert row["videos"] == 15 and row["things"] == 5
+    assert row["nearest"] == 1.0
+    assert row["light"]["light"] > 0
+    assert (
+        "contact in 18 clips: 0 alarms within the first three frames; 0 missed" in result["table"]
+    )
+
+
+def test_the_benchmark_takes_a_hugging_face_model(tmp_path: Path) -> None:
+    """A tiny one with random weights, through the loading code of the real ones."""
+    transformers = pytest.importorskip("transformers")
+    sizes = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
+    config = transformers.ViTConfig(**sizes, intermediate_size=16, image_size=32, patch_size=16)
+    transformers.ViTModel(config).save_pretrained(tmp_path)
+    size = {"height": 32, "width": 32}
+    transformers.ViTImageProcessorPil(size=size).save_pretrained(tmp_path)
+    frames = press(1)
+    assert find_embedder(str(tmp_path), 0)(frames[-2:], frames[0]).shape == (2, 16)
+
+
+def test_forces_come_with_their_frames(tmp_path: Path) -> None:
+    (tmp_path / "grasps.csv").write_text("trial,object\nball_1,ball\n")
+    fourcc = cv2.VideoWriter.fourcc(*"MJPG")
+    video = cv2.VideoWriter(str(tmp_path / "ball_1.avi"), fourcc, 30, (80, 60))
+    for frame in press(1):
+        video.write(frame[..., ::-1])
+    video.release()
+    with pytest.raises(UserError, match=r"ball_1\.csv is missing"):
+        read_force_grasps(tmp_path)
+    rows = "\n".join(f"{0.5 * i},0.05" for i in range(9))
+    (tmp_path / "ball_1.csv").write_text(f"force_newtons,gripper_width_m\n{rows}\n")
+    (grasp,) = read_force_grasps(tmp_path)
+    assert grasp.object == "ball" and grasp.force[3] == 1.5
+    assert grasp.frames().shape == (9, 60, 80, 3)
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda t: t.replace("hardness", "firmness"), "lacks the column hardness"),
+        (lambda t: t.replace(",0,0,1", ",7,0,1"), "a rank that is not 0, 1 or 2"),
+        (lambda t: t.replace("thing0_0.mp4", "lost.mp4"), "names lost.mp4"),
+    ],
+)
+def test_unfit_labels_are_refused(clips: Path, tmp_path: Path, damage, says: str) -> None:
+    (tmp_path / "videos").symlink_to(clips / "videos")
+    (tmp_path / "labels.csv").write_text(damage((clips / "labels.csv").read_text()))
+    with pytest.raises(UserError, match=says):
+        read_labelled_videos(tmp_path)
+
+
+def test_properties_are_read_of_things_never_seen() -> None:
+    rng = np.random.default_rng(0)
+    things = np.repeat(np.arange(30), 4)
+    ranks = np.stack([things % 3, (things // 3) % 3], 1)
+    embeddings = np.eye(3)[ranks].reshape(120, 6) + 0.2 * rng.normal(size=(120, 6))
+    reading = property_probe.cross_validated(embeddings, ranks, things)
+    assert reading.right.mean() > 0.95
+    assert property_probe.pair_accuracy(reading.scores[:, 0], ranks[:, 0], things) > 0.9
+    assert property_probe.most_of_three(reading.scores[:, 0], ranks[:, 0], things, rng) > 0.95
+    low, high = property_probe.interval(reading.all_right, things)
+    assert low <= reading.all_right.mean() <= high
+    shuffled = property_probe.cross_validated(rng.normal(size=(120, 6)), ranks, things)
+    assert shuffled.right.mean() < 0.5
