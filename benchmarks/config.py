@@ -95,6 +95,8 @@ class PolicyDelayOptions(BenchmarkOptions):
     """In which task; of the maze, on validation wires."""
     policy: str = "shipped"
     """Which policy, named as for run-policy."""
+    causes: bool = False
+    """In place of the delays: each part of what lies between policy and arm, alone and left out."""
     delay: tuple[NotNegative, ...] = (0.0, 50.0, 100.0, 150.0)
     """From what is measured to the command that follows from it, ms, beside the tick for which plans are
     asked ahead: half of it before the policy, half after."""

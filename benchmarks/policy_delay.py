@@ -1,59 +1,85 @@
-"""How often a policy succeeds when what it sees, plans and commands comes late, in the environment.
+"""How often a policy succeeds in the environment when what it sees, plans and commands comes late.
 
-The arm is as deployed otherwise: `--env.as-deployed` with other delays. The same seeds in every row.
+The arm is as deployed otherwise: `--env.as-deployed` with other delays. With `causes` each part of that
+is put in by itself, and left out by itself. The same seeds in every row.
 """
 
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from typing import Any
 
 from touchgoal.benchmarks.config import PolicyDelayOptions
 from touchgoal.policies.by_name import choose_policy, env_config_for
-from touchgoal.policies.evaluation.evaluate import Evaluation, run_trials, trial_specs
-from touchgoal.sim_envs.config import BeadMazeConfig, DeploymentConfig, PickPlaceConfig, TaskConfig
+from touchgoal.policies.evaluation.evaluate import Evaluation, Trial, run_trials, trial_specs
+from touchgoal.sim_envs.config import (
+    AS_DEPLOYED,
+    NOTHING_BETWEEN,
+    BeadMazeConfig,
+    DeploymentConfig,
+    PickPlaceConfig,
+    TaskConfig,
+)
+
+# Parts of `--env.as-deployed`, by what a person would call them.
+_PARTS = {
+    "lag, limits and tracker": ("tracked",),
+    "a Franka Hand": ("hand",),
+    "an estimated wrench": ("wrench",),
+    "late states and pictures": ("state_delay", "picture_delay", "picture_rate", "jitter"),
+    "late commands": ("command_delay",),
+    "late plans": ("plan_ticks",),
+}
 
 
 def run(config: PolicyDelayOptions) -> dict[str, Any]:
-    """Success by delay, jitter and picture rate; `table` and the trials behind it."""
-    lines = [
-        f"{'delay ms':>8}{'jitter ms':>11}{'pictures Hz':>13}   success [95 % Wilson]   peak N"
-    ]
+    """Success by delay, jitter and picture rate, or by cause; `table` and the trials behind it."""
+    cases = _causes() if config.causes else _delays(config)
+    lines = [f"{'':<40}{'success [95 % Wilson]':<24}{'peak N':>7}"]
     rows = []
-    for rate in config.rates:
-        for jitter in config.jitter:
-            for delay in config.delay:
-                row = _row(config, delay, jitter, rate)
-                lines.append(row.pop("line"))
-                print(lines[-1], flush=True)
-                rows.append(row)
+    for what, as_deployed, between in cases:
+        trials = _trials(config, as_deployed, between)
+        peak = max(trial.peak_force for trial in trials)
+        lines.append(f"{what:<40}{Evaluation(trials)!s:<24}{peak:>7.0f}")
+        print(lines[-1], flush=True)
+        rows.append({"what": what, "trials": [asdict(trial) for trial in trials]})
     return {"table": "\n".join(lines), "rows": rows}
 
 
-def _row(config: PolicyDelayOptions, delay: float, jitter: float, rate: float) -> dict[str, Any]:
-    half = (
-        delay / 2000,
-        delay / 2000,
-    )  # s: half of it on the way to the policy, half on the way back
-    between = DeploymentConfig(
-        state_delay=half,
-        picture_delay=half,
-        command_delay=half,
-        jitter=(jitter / 1000, jitter / 1000),
-        picture_rate=rate,
-    )
+def _delays(config: PolicyDelayOptions) -> Iterator[tuple[str, bool, DeploymentConfig]]:
+    for rate in config.rates:
+        for jitter in config.jitter:
+            for delay in config.delay:
+                half = delay / 2000, delay / 2000  # s: before the policy, and after it
+                between = DeploymentConfig(
+                    state_delay=half,
+                    picture_delay=half,
+                    command_delay=half,
+                    jitter=(jitter / 1000, jitter / 1000),
+                    picture_rate=rate,
+                )
+                what = f"{delay:.0f} ms, jitter {jitter:.0f} ms, pictures {rate:.0f} Hz"
+                yield what, True, between
+
+
+def _causes() -> Iterator[tuple[str, bool, DeploymentConfig]]:
+    yield "the plain environment", False, DeploymentConfig()
+    for what, fields in _PARTS.items():
+        own = {field: getattr(AS_DEPLOYED, field) for field in fields}
+        yield f"only {what}", False, DeploymentConfig(**own)
+    yield "as deployed", True, DeploymentConfig()
+    for what, fields in _PARTS.items():
+        own = {field: getattr(NOTHING_BETWEEN, field) for field in fields}
+        yield f"as deployed, but for {what}", True, DeploymentConfig(**own)
+
+
+def _trials(
+    config: PolicyDelayOptions, as_deployed: bool, between: DeploymentConfig
+) -> tuple[Trial, ...]:
     task: TaskConfig = PickPlaceConfig()
     if config.task == "bead-maze":
         task = BeadMazeConfig(split="validation")
-    task = replace(task, as_deployed=True, deployment=between)
+    task = replace(task, as_deployed=as_deployed, deployment=between)
     policy = choose_policy(config.policy, task)
     task = env_config_for(policy, task)
     specs = trial_specs(task, config.episodes, config.seed)
-    result = Evaluation(tuple(run_trials(task, policy, specs, config.workers)))
-    peak = max(trial.peak_force for trial in result.trials)
-    line = f"{delay:>8.0f}{jitter:>11.0f}{rate:>13.0f}   {result!s:<24}{peak:>6.0f}"
-    return {
-        "line": line,
-        "delay_ms": delay,
-        "jitter_ms": jitter,
-        "picture_rate": rate,
-        "trials": [asdict(trial) for trial in result.trials],
-    }
+    return tuple(run_trials(task, policy, specs, config.workers))

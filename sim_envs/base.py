@@ -61,7 +61,6 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self._renderer: Renderer | None = None
         self._view_renderer: Renderer | None = None
         self._pads: list[TactilePad] = []
-        self._deployed: DeployedArm | None = None
 
     # What a task defines.
 
@@ -102,7 +101,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.data.qpos[self.arm_positions] = self.command
         self.data.qpos[self._fingers] = self._finger_target
         self._ticks = 0
-        self._deployed = None
+        self._deployed: DeployedArm | None = None
         self._let_settle()
         self._begin_deployment()
         self.evaluate()
@@ -345,6 +344,12 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     def contacts_shown(self) -> tuple[PadContact, PadContact]:
         """The pads' contacts when the pictures of the last observation were taken."""
         return self._deployed.contacts if self._deployed else self._contacts
+
+    @property
+    def fastest(self) -> Float[np.ndarray, " n"] | None:
+        """Joint changes (rad) in a tick that a safety layer does not clamp; None: there is none."""
+        tracked, velocity = self.config.between().tracked, self.robot.policy.velocity
+        return velocity / self.config.control_hz if tracked else None
 
     @property
     def plan_ticks(self) -> int:

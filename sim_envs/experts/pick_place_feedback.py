@@ -67,7 +67,10 @@ class FeedbackExpert:
         solution = env.kinematics.solve_ik_near(
             here + (pace + change) / hz, fingers_down(yaw + turn), env.command
         )
-        return np.append(solution.q - env.command, grip)
+        delta = solution.q - env.command
+        if env.fastest is not None:  # the whole of it slower, not bent by a clamp of single joints
+            delta *= min(1.0, float((env.fastest / np.maximum(np.abs(delta), 1e-9)).min()))
+        return np.append(delta, grip)
 
     def _fetch(
         self, here: np.ndarray, turn: float, width: float
