@@ -96,7 +96,7 @@ class Planner:
         known = dict(observation)
         if self._estimator:
             known |= self._estimator.estimate(observation, self._first)
-        if self.config.tares_wrench:
+        if ft.WRENCH in self.config.proprioception:
             known[ft.WRENCH] = tare(observation[ft.WRENCH], self._first[ft.WRENCH])
         state = np.concatenate([known[key] for key in self.config.proprioception])
         return self._embed_touch(observation), state

@@ -45,7 +45,8 @@ class PolicyConfig:
             orientation stay as they are. "body_twist" sees no positions.
         end_to_end: for fingertips that no frozen encoder reads; None for a policy without.
         proprioception: columns of `features.FEATURES`, the state first. Where it acts, those that
-            only a simulator knows come from its senses, see `senses.py`.
+            only a simulator knows come from its senses, see `senses.py`. The force on the hand is seen
+            less that of the episode's first tick, see `proprioception.tare`.
         observation_horizon: ticks seen, the latest included.
         prediction_horizon: ticks planned. The first is the latest observation's, so that all of
             them can be done; diffusion_policy counts from the oldest observation instead.
@@ -56,7 +57,6 @@ class PolicyConfig:
         head: what draws the chunk.
         task: of the episodes learned from, such as "bead-maze"; "" if unknown.
         sensor: of the fingertips in them; "" for a policy without touch.
-        tares_wrench: whether it sees the force on the hand less that of the episode's first tick.
     """
 
     touch_dim: int
@@ -75,7 +75,6 @@ class PolicyConfig:
     head: DiffusionConfig | RegressionConfig = field(default_factory=DiffusionConfig)
     task: str = ""
     sensor: str = ""
-    tares_wrench: bool = False
 
     def __post_init__(self) -> None:
         """Raises UserError for what makes no policy."""

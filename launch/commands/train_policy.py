@@ -108,7 +108,6 @@ def _policy_config(
         execution_horizon=config.execution_horizon,
         control_hz=episodes.fps,
         head=head,
-        tares_wrench=config.estimator is not None,
     )
 
 

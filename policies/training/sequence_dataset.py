@@ -75,7 +75,7 @@ def load_recordings(
     touch, state, actions, pictures, wrench = [], [], [], [], []
     for n, i in enumerate(track(chosen, "reading", "episode")):
         frames = episodes.read(i, keys).frames
-        if config.tares_wrench:
+        if ft.WRENCH in frames:
             frames[ft.WRENCH] = tare(frames[ft.WRENCH], frames[ft.WRENCH][0])
         state.append(np.concatenate([frames[key] for key in config.proprioception], 1))
         actions.append(frames[ft.ACTION])
