@@ -131,7 +131,8 @@ class RealTouchOptions(BenchmarkOptions):
     """What do encoders know of real touches: which thing, how hard, rough and bumpy?"""
 
     data: Path = field(kw_only=True)
-    """Folder of labelled videos: labels.csv and videos/, as PhysiCLeAR's."""
+    """Folder of labelled videos (labels.csv and videos/, as PhysiCLeAR's), or of grasps with forces
+    (grasps.csv and TRIAL.avi, TRIAL.csv, as EstimateModulus')."""
     encoders: tuple[str, ...] = ("gelsight_mini", "random:gelsight_mini", "pixels", "efficientnet")
     """Touch encoders by name or folder; `random:NAME` for the same network untrained, `pixels`,
     `efficientnet` (ImageNet), or a vision model of Hugging Face by its id or folder."""

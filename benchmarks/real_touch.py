@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from touchgoal.benchmarks.config import RealTouchOptions
+from touchgoal.benchmarks.real_force import force_table, judge_grasps
 from touchgoal.benchmarks.real_touch_encoders import Embedder, find_embedder
 from touchgoal.control.errors import UserError
 from touchgoal.control.progress import track
@@ -25,6 +26,7 @@ from touchgoal.encoders.probes.property_probe import (
     pair_accuracy,
     read_properties,
 )
+from touchgoal.episodes.importers.force_grasps import read_force_grasps
 from touchgoal.episodes.importers.labelled_videos import (
     PROPERTIES,
     LabelledVideo,
@@ -48,6 +50,7 @@ class VideoTouch:
         video: its labels.
         frames: those of the largest change.
         background: the sensor untouched.
+        rest: one untouched frame.
         untouched, peak: contact strength of the first three frames, and the largest, counts.
         threshold: counts, from the first frames' noise.
     """
@@ -55,6 +58,7 @@ class VideoTouch:
     video: LabelledVideo
     frames: UInt8[np.ndarray, "k h w 3"]
     background: UInt8[np.ndarray, "h w 3"]
+    rest: UInt8[np.ndarray, "h w 3"]
     untouched: float
     peak: float
     threshold: float
@@ -62,6 +66,9 @@ class VideoTouch:
 
 def run(config: RealTouchOptions) -> dict[str, Any]:
     """Read the videos once, then embed and judge them by every encoder."""
+    if (config.data / "grasps.csv").is_file():
+        grasps = judge_grasps(read_force_grasps(config.data)[:: config.every])
+        return {"table": force_table(grasps), **grasps}
     videos = read_labelled_videos(config.data)[:: config.every]
     touches = [read_touch(video) for video in track(videos, "reading", "video")]
     if sum(touch.video.ranks is not None for touch in touches) < 10:
@@ -84,7 +91,8 @@ def read_touch(video: LabelledVideo) -> VideoTouch:
     first = contact_strength(frames[:FRAMES], background)
     threshold = threshold_for(frames[:FRAMES], background)
     peak, untouched = float(max(strength.max(), first.max())), float(first[:3].max())
-    return VideoTouch(video, frames[chosen], background, untouched, peak, threshold)
+    rest = frames[int(first[:3].argmin())]
+    return VideoTouch(video, frames[chosen], background, rest, untouched, peak, threshold)
 
 
 def judge(touches: list[VideoTouch], embed: Embedder, name: str) -> dict[str, Any]:
@@ -122,15 +130,18 @@ def judge(touches: list[VideoTouch], embed: Embedder, name: str) -> dict[str, An
 def light_shift(
     touches: list[VideoTouch], embeddings: Float[np.ndarray, "n d"], embed: Embedder
 ) -> dict[str, float]:
-    """How far 10 % more light moves an untouched frame, beside how far touches do."""
+    """How far 10 % more light moves an untouched frame, beside how far touches do.
+
+    The lightest touch is the twentieth part's: a few clips are touched from their first frame on.
+    """
     moved, touched = [], []
     for touch, embedding in zip(touches, embeddings, strict=True):
-        lit = np.rint(np.clip(touch.background * BRIGHTER, 0, 255)).astype(np.uint8)
-        rest, brighter = embed(np.stack([touch.background, lit]), touch.background)
+        lit = np.rint(np.clip(touch.rest * BRIGHTER, 0, 255)).astype(np.uint8)
+        rest, brighter = embed(np.stack([touch.rest, lit]), touch.background)
         moved.append(np.linalg.norm(brighter - rest))
         if touch.peak > touch.threshold and touch.video.ranks is not None:
             touched.append(np.linalg.norm(embedding - rest))
-    light, lightest, usual = np.median(moved), np.min(touched), np.median(touched)
+    light, lightest, usual = np.median(moved), np.quantile(touched, 0.05), np.median(touched)
     return {"light": float(light), "lightest": float(lightest), "usual": float(usual)}
 
 
@@ -180,7 +191,7 @@ def _validation(val: dict[str, Any] | None) -> str:
     if val is None:
         return "-"
     single = " ".join(f"{val[name]:.2f}" for name in PROPERTIES)
-    pc, pss = (float(np.mean(val[name])) for name in ("pc", "pss"))
+    pc, pss = (float(np.nanmean(val[name])) for name in ("pc", "pss"))
     return f"{single} / {_with(val['all'], val['all_interval'])} / {pc:.2f} / {pss:.2f}"
 
 

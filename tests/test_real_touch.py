@@ -11,6 +11,7 @@ from touchgoal.benchmarks.config import RealTouchOptions
 from touchgoal.benchmarks.real_touch import run
 from touchgoal.benchmarks.real_touch_encoders import find_embedder
 from touchgoal.control.errors import UserError
+from touchgoal.control.tactile.picture_force import calibrate_force, shrunk, statistics
 from touchgoal.encoders.probes import property_probe
 from touchgoal.episodes.importers.force_grasps import read_force_grasps
 from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
@@ -119,3 +120,25 @@ def test_properties_are_read_of_things_never_seen() -> None:
     assert low <= reading.all_right.mean() <= high
     shuffled = property_probe.cross_validated(rng.normal(size=(120, 6)), ranks, things)
     assert shuffled.right.mean() < 0.5
+
+
+def test_force_is_read_of_another_thing() -> None:
+    """Calibrated on blocks that press wider with force, read on narrower ones."""
+
+    def grasp(width: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        rng = np.random.default_rng(seed)
+        force = np.concatenate([np.zeros(10), np.linspace(0, 20, 40)])
+        rows = []
+        background = np.full((60, 80, 3), 100, np.float32)
+        for newton in force:
+            bump = 4 * newton * np.exp(-((X - 40) ** 2 + (Y - 30) ** 2) / (2 * width**2))
+            frame = background + bump[..., None] * [1, -1, 0.5] + rng.normal(0, 1, (60, 80, 3))
+            rows.append(statistics(frame.clip(0, 255).astype(np.uint8), shrunk(background)))
+        return np.stack(rows), force
+
+    known = [grasp(width, i) for i, width in enumerate((3.0, 5.0))]
+    reader = calibrate_force(*(np.concatenate(part) for part in zip(*known, strict=True)))
+    rows, force = grasp(4.0, 9)
+    assert np.median(np.abs(reader.of_statistics(rows) - force)) < 1.5
+    with pytest.raises(UserError, match="are too few"):
+        calibrate_force(rows[:20], force[:20])

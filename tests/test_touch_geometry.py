@@ -208,6 +208,20 @@ def test_a_hidden_marker_is_flagged_and_found_again(gel: SensorInstance) -> None
         assert error.max() < 0.3  # the neighbours carry the lost one along
 
 
+def test_a_grid_that_jumps_and_stops_does_not_swap_dots(gel: SensorInstance) -> None:
+    """Between two frames of a stream that skips; expected to go on, it would land on its neighbours."""
+    rng = np.random.default_rng(7)
+    plain = render_untouched(gel, rng)
+    assert DOTTED.markers is not None
+    tracker = MarkerTracker(dotted(plain, gel), DOTTED.markers, gel.pixel_pitch)
+    pitch = DOTTED.markers.pitch / gel.pixel_pitch
+    jump = np.array([0.4 * pitch, 0.0]) + rng.normal(0, 0.04 * pitch, (63, 2))
+    for moved in (jump, jump, jump, np.zeros((63, 2)), np.zeros((63, 2))):
+        now = tracker.update(dotted(plain, gel, moved))
+        error = np.linalg.norm(now.positions.reshape(-1, 2) - gel.markers - moved, axis=1)
+        assert now.found.all() and error.max() < 0.5
+
+
 @pytest.mark.parametrize(
     ("degrees", "scale", "shift"), [(12, 1.0, 4), (-20, 0.9, 0), (3, 1.15, -6)]
 )

@@ -33,9 +33,11 @@ class Markers:
 class MarkerTracker:
     """Follows the dots of one gel from frame to frame.
 
-    A dot takes the spot nearest to where its last motion would bring it, if it is that spot's
-    nearest dot as well and lies within half the pitch: dots can get lost, which is flagged, but
-    not swapped. A lost dot is expected where its neighbours' displacement would carry it.
+    A dot takes the spot nearest to where it is expected, if it is that spot's nearest dot as well and
+    lies within half the pitch: dots can get lost, which is flagged, but not swapped. They are expected
+    to go on as they moved, or to stay: whichever explains the frame better, for a grid that jumped and
+    stopped would overshoot onto its neighbours. A lost dot is expected where its neighbours'
+    displacement would carry it.
 
     Args:
         untouched: RGB frame of the untouched gel.
@@ -69,25 +71,40 @@ class MarkerTracker:
     def update(self, frame: UInt8[np.ndarray, "h w 3"]) -> Markers:
         """Find the dots in the next frame."""
         before = self.now.positions
-        expected = before + self._motion
         grey = _grey(frame)
         spots, darkness = _spots(grey, self._size)
         spots = spots[darkness > self._faintest]
         for _ in range(2):  # steep shading may throw the first centre off by several pixels
             spots = _refined(grey, spots, self._size / 2)
-        positions, found = expected.copy(), np.zeros(expected.shape[:2], bool)
-        if len(spots):
-            distance = np.linalg.norm(expected[:, :, None] - spots, axis=-1)
-            spot = distance.argmin(-1)
-            nearest = distance.reshape(-1, len(spots)).argmin(0)[spot]
-            own = np.arange(spot.size).reshape(spot.shape)
-            found = (nearest == own) & (distance.min(-1) < self._reach)
-            positions[found] = spots[spot[found]]
+        matches = [
+            _match(expected, spots, self._reach) for expected in (before, before + self._motion)
+        ]
+        positions, found, _ = min(matches, key=lambda match: match[2])
+        if found.any():
             moved = _spread(positions - self.rest.positions, found)
             positions[~found] = (self.rest.positions + moved)[~found]
         self._motion = positions - before
         self.now = Markers(positions, found)
         return self.now
+
+
+def _match(
+    expected: Float32[np.ndarray, "rows columns 2"], spots: Float32[np.ndarray, "n 2"], reach: float
+) -> tuple[Float32[np.ndarray, "rows columns 2"], Bool[np.ndarray, "rows columns"], float]:
+    """Each dot's spot where it has one, whether it has, and how far they are off, px.
+
+    Every dot that finds none counts as `reach` px.
+    """
+    positions, found = expected.copy(), np.zeros(expected.shape[:2], bool)
+    if not len(spots):
+        return positions, found, reach
+    distance = np.linalg.norm(expected[:, :, None] - spots, axis=-1)
+    spot = distance.argmin(-1)
+    nearest = distance.reshape(-1, len(spots)).argmin(0)[spot]
+    own = np.arange(spot.size).reshape(spot.shape)
+    found = (nearest == own) & (distance.min(-1) < reach)
+    positions[found] = spots[spot[found]]
+    return positions, found, float(np.where(found, distance.min(-1), reach).mean())
 
 
 def find_markers(
