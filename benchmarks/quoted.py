@@ -72,28 +72,7 @@ def _realism(metrics: Metrics) -> str:
     )
 
 
-def _real_touch(metrics: Metrics) -> str:
-    rows = {row["encoder"]: row for row in metrics["rows"]}
-    shipped, other = rows["gelsight_mini_surfaces"], rows["gelsight_mini"]
-    return f"{shipped['nearest']:.2f} of {shipped['videos']}; the aligned encoder {other['nearest']:.2f}"
-
-
-def _real_force(metrics: Metrics) -> str:
-    return f"{metrics['median_error']:.1f} N (median)"
-
-
 QUOTED = {
-    "real-touch": Quoted(
-        "touchgoal benchmark real-touch --data physiclear --encoders gelsight_mini_surfaces "
-        "gelsight_mini random:gelsight_mini pixels efficientnet",
-        "real touches whose nearest other touch is of the same thing (encoder fitted to simulated touch)",
-        _real_touch,
-    ),
-    "real-force": Quoted(
-        "touchgoal benchmark real-touch --data franka_wedge_grasps",
-        "force of real grasps from pictures, of things not calibrated on",
-        _real_force,
-    ),
     "pick-place": Quoted(
         "touchgoal run-policy --episodes 100",
         "the shipped policy picks and places, of 100 scenes it has not seen",

@@ -101,3 +101,15 @@ def test_an_encoder_fitted_to_surfaces_comes_back(tmp_path: Path) -> None:
     embedded = loaded.embed(frames)
     np.testing.assert_allclose(np.linalg.norm(embedded, axis=1), 1, rtol=1e-4)
     np.testing.assert_allclose(embedded, encoder.embed(frames), atol=1e-4)
+
+
+def test_the_shipped_one_loads_and_takes_the_light_out() -> None:
+    rng = np.random.default_rng(0)
+    unit = sample_instance(GELSIGHT_MINI, rng)
+    rest = untouched(unit, rng)
+    frame = press(Surface("ball", 5e-3, 1.0, SMOOTH, 1.0), LEVEL, unit, rng)
+    lit = np.rint(frame * 1.1).clip(0, 255).astype(np.uint8)
+    steady, brighter, other = load_encoder("gelsight_mini_surfaces").embed(
+        np.stack([frame, lit, press(random_surface(rng), LEVEL, unit, rng)]), rest
+    )
+    assert np.linalg.norm(brighter - steady) < 0.7 * np.linalg.norm(other - steady)
