@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,9 @@ from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import cell_limits, cell_watchdogs
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.safety.limits import FR3
+from touchgoal.control.tactile.indentation import require_readable
+from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.repair import validate
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.__main__ import main
@@ -278,6 +282,31 @@ def test_an_example_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.Mon
     assert find_cell_file(Path("sim.toml")) == Path("sim.toml")
 
 
+def test_the_cells_tool_is_the_one_that_is_watched(tmp_path: Path) -> None:
+    """Longer fingers: the TCP and the corners are theirs."""
+    cell = read_cell_file(EXAMPLES / "ur5e.toml")
+    assert cell.tool is not None
+    longer = replace(
+        cell.tool,
+        tcp=0.3,
+        finger_corners=tuple((x, y, 0.32) for x, y, _ in cell.tool.finger_corners),
+    )
+    limits = cell_limits(replace(cell, tool=longer))
+    assert limits.tool.tcp_offset == 0.3 and limits.tool.mass == cell.tool.mass
+    before, after = (
+        Safety(each, 20).monitored_points(limits.arm.home[None])[0, 1:, 2].min()
+        for each in (cell_limits(cell), limits)
+    )
+    assert before - after > 0.1
+
+
+def test_a_touch_ceiling_that_no_picture_can_show_is_refused() -> None:
+    require_readable(find_sensor("digit"), 1.5e-3)
+    require_readable(find_sensor("gelsight_mini"), FR3.touch)
+    with pytest.raises(UserError, match="deeper than the gelsight_mini's sensor file can read"):
+        require_readable(find_sensor("gelsight_mini"), 5e-3)
+
+
 def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
     """What is written into its JSON by hand counts, or is refused."""
     cell = read_cell_file(write_cell_file(tmp_path, SIM))
@@ -298,6 +327,15 @@ def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
         (SIM.replace('arm = "sim"', ""), "arm is missing"),
         (SIM.replace('"sim"', '"fr4"'), "arm must be 'fr3', 'ur5e' or 'sim', not 'fr4'"),
         (SIM.replace('"sim"', '"fr3"'), "address is missing"),
+        (
+            SIM.replace('"sim"', '"fr3"\naddress = "a"').replace('_hand"', '_hand", address = "a"'),
+            "tool is missing: measure tcp, mass, centre_of_mass and finger_corners",
+        ),
+        (
+            SIM
+            + "tool = { tcp = 0.1, mass = inf, centre_of_mass = [0, 0, 0], finger_corners = [] }",
+            "tool.mass must be a finite number",
+        ),
         (SIM + "speed = 3", "speed is unknown: There are: arm, "),
         (SIM.replace("cameras.front", "cameras.back"), "cameras.back must be 'front' or 'wrist'"),
         (SIM.replace("policy =", "polcy ="), "task.polcy is unknown: did you mean policy?"),
@@ -307,6 +345,7 @@ def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
         (SIM + "safety = { force = true }", "safety.force must be a valid number, not True"),
         (SIM + "safety = { force = nan }", "safety.force must be a finite number, not nan: Force"),
         (SIM + "safety = { velocity_share = 20 }", "safety.velocity_share must be less than or eq"),
+        (SIM + "safety = { tip_speed = inf }", "safety.tip_speed must be a finite number, not inf"),
         (SIM + "safety = { velocity_share = 0 }", "safety.velocity_share must be greater than 0"),
         (SIM + "safety = { observation_age = inf }", "safety.observation_age must be a finite"),
         (SIM + "safety = { flange_lower = [0, 0] }", "safety.flange_lower has too few values"),

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from touchgoal.control.errors import UserError
+from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety import limits as robots
 from touchgoal.control.safety.action_filter import Limit, Measurements, Mode, Safety, SafetyState
 from touchgoal.control.safety.limits import RobotLimits
@@ -42,6 +43,10 @@ def check(layer: Safety, path: list[SafetyState]) -> None:
     assert (np.abs(np.diff(q, axis=0)) <= layer.limits.max_step + EPS).all()
     assert (np.abs(np.diff(velocity, axis=0)) <= j.acceleration * dt + EPS).all()
     assert layer.inside_workspace(q[1:]).all()
+    points = layer.monitored_points(q)
+    fastest = np.linalg.norm(np.diff(points, axis=0), axis=-1).max(axis=1) / dt
+    # Braking joint by joint may bend the path a little faster for a tick.
+    assert (fastest <= 1.15 * layer.limits.tip_speed).all()
 
 
 def run(layer: Safety, actions: list[np.ndarray]) -> SafetyState:
@@ -94,6 +99,37 @@ def test_nothing_leaves_the_limits_in_a_long_random_walk(name: str) -> None:
         check(layer, path)
         state = path[-1]
     assert {Limit.STEP, Limit.VELOCITY, Limit.ACCELERATION, Limit.WORKSPACE} <= seen
+
+
+@pytest.mark.parametrize("robot", [robots.FR3, robots.UR5E], ids=lambda r: r.arm.name)
+def test_eight_corners_of_the_fingertips_are_watched_5_mm_above_the_table(
+    robot: RobotLimits,
+) -> None:
+    """Turned about the approach axis the edges across the fingers come lowest: two points miss them."""
+    layer = LAYERS[robot.arm.name]
+    points = layer.monitored_points(robot.arm.home[None])[0]
+    assert len(points) == 1 + 8 and robot.fingertips.lower[2] == 0.005
+    kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
+    position, R = kinematics.forward(robot.arm.home)
+    case = np.array([0.0145, 0.0285, 0.0165])  # half of 28.5 x 32.5 mm, and 28.3 mm behind the gel
+    half = robot.tool.stroke[1] / 2
+    for sign in (1, -1):
+        outer = position + R @ np.array([case[0], sign * (half + case[1]), case[2]])
+        assert np.linalg.norm(points[1:] - outer, axis=1).min() < 2e-3
+
+
+@pytest.mark.parametrize("robot", [robots.FR3, robots.UR5E], ids=lambda r: r.arm.name)
+def test_fingertips_keep_to_their_speed(robot: RobotLimits) -> None:
+    layer = Safety(replace(robot, tip_speed=0.1), HZ)
+    n, named = robot.arm.home.size, set()
+    path = [layer.start(robot.arm.home)]
+    for _ in range(30):
+        path.append(layer.filter_action(path[-1], 0.05 * np.eye(n)[0], reading(path[-1].q)))
+        named |= set(path[-1].active_limits)
+    check(layer, path)
+    assert Limit.TIP_SPEED in named
+    speed = layer.tip_speed(path[-1].q, path[-1].velocity[None])[0]
+    assert 0.05 < speed < 0.115
 
 
 def test_a_gentle_command_passes_untouched() -> None:

@@ -51,6 +51,23 @@ class GripperSection:
 
 
 @dataclass(frozen=True, config=STRICT)
+class ToolSection:
+    """What the arm carries: gripper, mounts and fingertip sensors together.
+
+    Hand frame: at the flange, z out of it, the fingers close along y.
+    """
+
+    tcp: Annotated[float, Field(gt=0, le=0.5)]
+    """Distance from the flange to the middle between the two gels' centres, along the hand's z axis, m."""
+    mass: Annotated[float, Field(gt=0, le=10)]
+    """Mass of all beyond the flange, kg."""
+    centre_of_mass: Corner
+    """Where that mass has its centre, m (hand frame)."""
+    finger_corners: Annotated[tuple[Corner, ...], Field(min_length=4)]
+    """Corners of a box around the fingertips when the hand is open, m (hand frame)."""
+
+
+@dataclass(frozen=True, config=STRICT)
 class FingertipsSection:
     """The two fingertip sensors."""
 
@@ -124,6 +141,8 @@ class SafetySection:
     """Lower corner of the box that the fingertips stay in, m (base frame)."""
     fingertips_upper: Corner | None = None
     """Upper corner of the box that the fingertips stay in, m (base frame)."""
+    tip_speed: Annotated[float, Field(gt=0, le=3)] | None = None
+    """Speed that the fingertips may reach, m/s."""
     velocity_share: Annotated[float, Field(gt=0, le=1)] | None = None
     """Share of the maker's joint speed that a policy may use."""
     force: Annotated[float, Field(gt=0, le=100)] | None = None
@@ -150,6 +169,8 @@ class CellConfig:
     """The gripper."""
     task: TaskSection
     """What is to be done."""
+    tool: ToolSection | None = None
+    """What the arm carries; a simulated arm has its own."""
     address: str = ""
     """Network address of the arm's controller, such as 172.16.0.2."""
     fingertips: FingertipsSection | None = None
@@ -177,6 +198,11 @@ def check(cell: CellConfig) -> None:
     needed = {"franka_hand": "address", "robotiq": "port"}[gripper.kind]
     if cell.arm != "sim" and not getattr(gripper, needed):
         raise UserError(f"gripper.{needed} is missing: a {gripper.kind} needs it")
+    if cell.arm != "sim" and cell.tool is None:
+        raise UserError(
+            "tool is missing: measure tcp, mass, centre_of_mass and finger_corners of what the arm "
+            "carries; launch/cells/fr3_two_minis.toml and ur5e.toml show those of two GelSight Minis"
+        )
     least, most = _FORCES[gripper.kind]
     if not least <= gripper.force <= most:
         raise UserError(

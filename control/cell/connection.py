@@ -17,12 +17,14 @@ from touchgoal.control.cell.config import (
     FingertipsSection,
     GripperSection,
     SafetySection,
+    ToolSection,
 )
 from touchgoal.control.errors import UserError
 from touchgoal.control.grippers.franka_hand import FrankaHand
 from touchgoal.control.grippers.non_blocking import NonBlockingGripper
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
 from touchgoal.control.interfaces import Arm, Camera, Gripper, LoadCell
+from touchgoal.control.motion.tool import Tool
 from touchgoal.control.safety.action_filter import Deadline, Watchdogs
 from touchgoal.control.safety.limits import FR3, UR5E, Box, RobotLimits
 from touchgoal.control.sensors.load_cell import SerialLoadCell
@@ -164,9 +166,11 @@ def connect_cell(cell: CellConfig, hz: float) -> CellConnection:
 def cell_limits(cell: CellConfig) -> RobotLimits:
     """The robot's limits with the cell's own in place of some."""
     robot, own = UR5E if cell.arm == "ur5e" else FR3, cell.safety
+    if cell.tool is not None and cell.arm != "sim":
+        robot = replace(robot, tool=_tool(robot.tool, cell.tool))
     given = {
         name: value
-        for name in ("velocity_share", "force", "torque", "touch")
+        for name in ("tip_speed", "velocity_share", "force", "torque", "touch")
         if (value := getattr(own, name)) is not None
     }
     boxes = {name: _box(getattr(robot, name), own, name) for name in ("flange", "fingertips")}
@@ -180,6 +184,16 @@ def cell_watchdogs(cell: CellConfig) -> Watchdogs:
         Watchdogs(),
         observation=Deadline(own.observation_age, _STOP_FACTOR * own.observation_age),
         state=Deadline(own.state_age, _STOP_FACTOR * own.state_age),
+    )
+
+
+def _tool(tool: Tool, own: ToolSection) -> Tool:
+    return replace(
+        tool,
+        tcp_offset=own.tcp,
+        mass=own.mass,
+        centre_of_mass=own.centre_of_mass,
+        finger_corners=own.finger_corners,
     )
 
 

@@ -22,7 +22,7 @@ class Tool:
         force: N, least and greatest with which the gripper can be told to hold.
         mass: kg, of all beyond the flange; the sensors' is unpublished and not in it.
         centre_of_mass: m, hand frame.
-        finger_corners: m, hand frame: the outer lower edges of the fingers, fully open.
+        finger_corners: m, hand frame: corners of a box around the fingertips, fully open.
     """
 
     name: str
@@ -36,12 +36,18 @@ class Tool:
 
 
 def _corners(tcp_offset: float, half_stroke: float) -> tuple[Point, ...]:
-    """Edges of a GelSight Mini on each open finger (GelSight's STEP file), rounded outwards.
+    """Of a box around the GelSight Minis on two open fingers (GelSight's STEP file), rounded outwards.
 
-    A Mini's outer face is 28.3 mm behind the gel; its lower edge half of 32.5 mm below its centre.
+    A Mini is 28.5 mm wide; its outer face is 28.3 mm behind the gel, its ends half of 32.5 mm from the
+    gel's centre. What lies inside the box is watched with it, for limits are boxes, too.
     """
-    side, down = half_stroke + 0.03, tcp_offset + 0.0165
-    return (0.0, side, down), (0.0, -side, down)
+    across, side, half = 0.0145, half_stroke + 0.03, 0.0165
+    return tuple(
+        (x, y, z)
+        for x in (across, -across)
+        for y in (side, -side)
+        for z in (tcp_offset + half, tcp_offset - half)
+    )
 
 
 # m from a finger's carriage to the sensor's centre: the adapter's bolt axis is 12 mm below the carriage

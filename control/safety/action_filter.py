@@ -36,6 +36,7 @@ class Limit(StrEnum):
     VELOCITY = "velocity"
     ACCELERATION = "acceleration"
     WORKSPACE = "workspace"
+    TIP_SPEED = "fingertip speed"
     STALE_OBSERVATION = "observation age"
     STALE_ACTION = "action age"
     STALE_STATE = "robot state age"
@@ -126,7 +127,7 @@ class SafetyState:
     bad_actions: int = 0
 
 
-# Shares of the way from braking to the wanted command that are tried at the workspace's edge.
+# Shares of the way from braking to the wanted command that are tried where that is too much.
 _SHARES = np.array([0.8, 0.6, 0.4, 0.2])
 _ROUNDING = 1e-12  # rad/s; a smaller change is no clamp
 
@@ -192,9 +193,14 @@ class Safety:
         flange = self.limits.flange.contains(points[:, 0])
         return flange & self.limits.fingertips.contains(points[:, 1:]).all(axis=1)
 
-    def monitored_points(self, q: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k 3 3"]:
-        """Flange and the two finger edges in the base frame (m), for each of k postures."""
-        return self._points(q.T).full().T.reshape(len(q), 3, 3)
+    def monitored_points(self, q: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k p 3"]:
+        """Flange and the fingertips' corners in the base frame (m), for each of k postures."""
+        return self._points(q.T).full().T.reshape(len(q), -1, 3)
+
+    def tip_speed(self, q: Joints, velocity: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " k"]:
+        """Speed (m/s) of the fastest monitored point over a tick, for each of k joint velocities."""
+        points = self.monitored_points(np.vstack([q, q + velocity * self.dt]))
+        return np.linalg.norm(points[1:] - points[0], axis=-1).max(axis=1) / self.dt
 
     def _ages(self, reading: Measurements) -> list[tuple[Limit, float, Deadline]]:
         w = self.watchdogs
@@ -253,13 +259,25 @@ class Safety:
         velocity = clamp(
             velocity, state.velocity - reach, state.velocity + reach, Limit.ACCELERATION
         )
-        safe = self._into_workspace(state, velocity)
-        if safe is not velocity:
+        slower = self._slowed(state, velocity)
+        if slower is not velocity:
+            active_limits.append(Limit.TIP_SPEED)
+        safe = self._into_workspace(state, slower)
+        if safe is not slower:
             active_limits.append(Limit.WORKSPACE)
         q = state.q + safe * dt
         return replace(
             state, q=q, velocity=safe, mode=Mode.MOVE, active_limits=tuple(active_limits)
         )
+
+    def _slowed(self, state: SafetyState, wanted: Joints) -> Joints:
+        """The wanted velocity, or as much of it beyond braking as keeps the fingertips slow enough."""
+        if self.tip_speed(state.q, wanted[None])[0] <= self.limits.tip_speed:
+            return wanted
+        rest = braked_velocity(state.velocity, self.joints.acceleration, self.dt)
+        tries = rest + _SHARES[:, None] * (wanted - rest)
+        slow = np.flatnonzero(self.tip_speed(state.q, tries) <= self.limits.tip_speed)
+        return tries[slow[0]] if slow.size else rest
 
     def _into_workspace(self, state: SafetyState, wanted: Joints) -> Joints:
         """The wanted velocity, or as much of it as lets braking end inside the boxes.

@@ -33,7 +33,8 @@ class RobotLimits:
         margin: rad kept from the ends of the joints' ranges.
         max_step: rad, largest joint change in one control tick.
         tracking: rad between commanded and measured joints that mean a blocked or lost arm.
-        flange, fingertips: where the flange and the fingers' outer lower edges may be.
+        flange, fingertips: where the flange and the corners of the fingertips may be.
+        tip_speed: m/s, of the flange and of each of those corners.
         force, torque: N and Nm from outside at the TCP and in a joint, below the reflex.
         touch: m that anything may press into a gel, as seen (`control.tactile.indentation`).
     """
@@ -47,6 +48,7 @@ class RobotLimits:
     margin: float = 0.1
     max_step: float = 0.05
     tracking: float = 0.2
+    tip_speed: float = 0.5
     force: float = 15.0
     torque: float = 10.0
     touch: float = 1.5e-3
@@ -73,9 +75,12 @@ class RobotLimits:
 # what FEATS pressed into a Mini (0.86 mm); simulated, a golf ball at 30 N, the least that a Franka
 # Hand grasps with, goes in by 1.2 mm, a pebble's edge by 2 mm. Compare it with your sensor's sheet.
 
-# The half of the table in front of the arm; the table's top is z = 0.
+# Speed of the fingertips: twice ISO 10218-1's reduced speed of 0.25 m/s, at which a person may be near;
+# set that in the cell file on the first day.
+
+# The half of the table in front of the arm; the table's top is z = 0, and fingertips keep 5 mm off it.
 _FLANGE = Box(np.array([0.15, -0.5, 0.12]), np.array([0.75, 0.5, 0.9]))
-_FINGERTIPS = Box(np.array([0.15, -0.5, 0.0]), np.array([0.8, 0.5, 0.75]))
+_FINGERTIPS = Box(np.array([0.15, -0.5, 0.005]), np.array([0.8, 0.5, 0.75]))
 
 FR3 = RobotLimits(FR3_ARM, FRANKA_HAND, _FLANGE, _FINGERTIPS)
 UR5E = RobotLimits(UR5E_ARM, ROBOTIQ_2F85, _FLANGE, _FINGERTIPS)

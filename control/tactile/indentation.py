@@ -3,16 +3,20 @@
 import numpy as np
 from jaxtyping import UInt8
 
+from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.control.tactile.depth import DepthEstimator
-from touchgoal.control.tactile.sensor_calibration import load
+from touchgoal.control.tactile.gel import deform
+from touchgoal.control.tactile.sensor_calibration import load, shade
 from touchgoal.control.tactile.sensor_models import SensorModel
 
 # Cells of half a millimetre on a Mini. On simulated grasps at 10 and 30 N the deepest point came out
 # within a tenth for blocks and balls; a pebble's edges, steeper than any calibration press, at 60 %.
 # Printed dots are left in: they change it by less than a tenth.
 _CELL = 8  # px
+_BALL = 4e-3  # m, radius of the ball that a touch ceiling is tried with
+_READABLE = 0.8  # share of a depth that must be read
 
 
 class IndentationMeter:
@@ -32,3 +36,33 @@ class IndentationMeter:
         if not self._detector.update(frame):
             return 0.0
         return float(self._depth.estimate(frame, self._detector.background.image).max())
+
+
+def require_readable(sensor: SensorModel, ceiling: float) -> None:
+    """UserError unless the sensor file can read a ball pressed in by a touch ceiling (m).
+
+    A ball is drawn by the sensor file's own model and read back: with the walls that its presses never
+    showed, a deep one reads too shallow, and a ceiling above that would never be met.
+    """
+    if _read_ball(sensor, ceiling) >= _READABLE * ceiling:
+        return
+    steps = np.arange(1, 21) * 1e-4
+    deepest = max((d for d in steps if _read_ball(sensor, d) >= _READABLE * d), default=0.0)
+    raise UserError(
+        f"safety.touch is {1e3 * ceiling:g} mm, deeper than the {sensor.name}'s sensor file can read "
+        f"({1e3 * deepest:.1f} mm): lower it, or calibrate with deeper presses"
+    )
+
+
+def _read_ball(sensor: SensorModel, depth: float) -> float:
+    """What is read (m) of a ball pressed into the middle of the gel by `depth` (m)."""
+    calibration = load(sensor.sensor_file)
+    rows, columns = calibration.background.shape[:2]
+    y, x = np.mgrid[:rows, :columns].astype(np.float32)
+    away = calibration.pixel_pitch * np.hypot(x - columns / 2, y - rows / 2)
+    ball = np.sqrt(np.maximum(_BALL**2 - away**2, 0)) - (_BALL - np.float32(depth))
+    surface = deform(
+        np.maximum(ball, 0).astype(np.float32), calibration.pixel_pitch, calibration.blur_sigmas
+    )
+    picture = np.clip(np.rint(shade(calibration, surface)), 0, 255).astype(np.uint8)
+    return float(DepthEstimator(calibration, _CELL).estimate(picture).max())

@@ -17,6 +17,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import Camera, DriverError, Gripper, TactileSensor
 from touchgoal.control.safety.action_filter import Safety
 from touchgoal.control.tactile.contact import contact_strength
+from touchgoal.control.tactile.indentation import require_readable
 from touchgoal.control.tactile.markers import find_markers, without_markers
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
@@ -44,7 +45,7 @@ def preflight(
     checks: list[tuple[str, Callable[[], str]]] = [
         ("client", lambda: check_client(cell)),
         ("arm", lambda: _arm(connection, safety)),
-        ("limits", lambda: _limits(safety)),
+        ("limits", lambda: _limits(cell, safety)),
         ("gripper", lambda: _gripper(connection)),
     ]
     for key, camera in connection.cameras.items():
@@ -114,7 +115,9 @@ def _arm(connection: CellConnection, safety: Safety) -> str:
     return f"{connection.robot.arm.name} at {np.round(reading.q, 2).tolist()} rad, {force:.1f} N"
 
 
-def _limits(safety: Safety) -> str:
+def _limits(cell: CellConfig, safety: Safety) -> str:
+    if cell.fingertips is not None:
+        require_readable(find_sensor(cell.sensor), safety.limits.touch)
     limits, dogs = safety.limits, safety.watchdogs
     return (
         f"joints up to {safety.joints.velocity.max():.2f} rad/s; stops above {limits.force:g} N, "

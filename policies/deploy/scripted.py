@@ -26,10 +26,7 @@ _MAX_LAG = (
 )
 _GRIPPER_MOVES = 5e-4  # m a tick that the gripper does when it moves
 _CLEARANCE = 0.12  # m above the object before and after the grasp
-_MIN_HEIGHTS = (
-    0.0185,
-    0.0172,
-)  # m of a grasp, of a placement: the sensors' cases stay above the table
+_OFF_THE_FLOOR = 0.002, 0.0007  # m that fingertips keep above their box's floor: grasping, placing
 _PROBE_DEPTH = 0.004  # m below the grasp's height to look for the table
 _TABLE_FORCE = 2.5  # N upwards, more than while it was carried, that mean the table carries it
 _CLOSE_SECONDS, _PROBE_SECONDS, _HOLD_SECONDS = (
@@ -150,9 +147,11 @@ def pick_and_place(
     kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
     limits = safety.joints.scaled(_SPEED_SHARE, _SPEED_SHARE)
     x, y, z, yaw = place.grasp
-    z = max(z, _MIN_HEIGHTS[0])
+    below = max(corner[2] for corner in robot.tool.finger_corners) - robot.tool.tcp_offset
+    floor = float(robot.fingertips.lower[2]) + below  # the lowest that the TCP may be
+    z = max(z, floor + _OFF_THE_FLOOR[0])
     pick, put = np.array([x, y, z]), np.array([*place.goal, z])
-    deepest = np.array([*place.goal, max(z - _PROBE_DEPTH, _MIN_HEIGHTS[1])])
+    deepest = np.array([*place.goal, max(z - _PROBE_DEPTH, floor + _OFF_THE_FLOOR[1])])
     up, opened = np.array([0, 0, _CLEARANCE]), robot.tool.stroke[1]
     q = commanded()
 

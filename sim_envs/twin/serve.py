@@ -14,8 +14,10 @@ from touchgoal.control.cell.config import (
     GripperSection,
     SafetySection,
     TaskSection,
+    ToolSection,
 )
 from touchgoal.control.errors import UserError
+from touchgoal.control.safety.limits import FR3, UR5E
 from touchgoal.control.sensors.load_cell import LoadCellConfig
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.bead_maze import BeadMaze
@@ -189,7 +191,8 @@ def _cell_config(
     for name in get_args(CameraName):
         if name in streams:
             cameras[name] = CameraSection(streams[name], rate or CAMERA_RATE)
-    fingertips = None
+    limits = UR5E if config.arm == "ur5e" else FR3
+    tool, fingertips = limits.tool, None
     if "tactile_left" in streams:
         sides = streams["tactile_left"], streams["tactile_right"]
         fingertips = FingertipsSection(config.task.sensor, *sides, rate)
@@ -198,10 +201,15 @@ def _cell_config(
         address=config.host,
         gripper=gripper,
         task=task,
+        tool=ToolSection(
+            tool.tcp_offset, tool.mass, tool.centre_of_mass, tuple(tool.finger_corners)
+        ),
         fingertips=fingertips,
         cameras=cameras,
         load_cell=load_cell,
         safety=SafetySection(
+            # The tasks' objects are grasped 2 mm above the table, which nobody can harm here.
+            fingertips_lower=(*limits.fingertips.lower[:2].tolist(), 0.0),
             # A wire pushes back; the arm's own reflex is at 30 N.
             force=_MAZE_FORCE if task.name == "bead-maze" else None,
             state_timeout=_LOCK_STEP_TIMEOUT if config.lock_step else None,
