@@ -12,6 +12,7 @@ import pytest
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError, TactileSensor
+from touchgoal.control.sensors.pictures import FrozenParts, JpegDecoder, is_broken_gel
 from touchgoal.control.sensors.tactile_camera import (
     DIGIT_CROP,
     GELSIGHT_MINI_CROP,
@@ -21,6 +22,7 @@ from touchgoal.control.sensors.tactile_camera import (
 )
 from touchgoal.control.sensors.usb_cameras import find_sensor_camera, list_cameras
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
+from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
 
 BITS = 12
@@ -46,6 +48,7 @@ class Streamer(ThreadingHTTPServer):
     def __init__(self, port: int = 0) -> None:
         super().__init__(("127.0.0.1", port), _Stream)
         self.count, self.stalled, self.frozen, self.shut = 0, False, False, False
+        self.picture, self.damage = numbered, bytes  # what is drawn, and done to the JPEG
         threading.Thread(target=self.serve_forever, args=(0.01,), daemon=True).start()
         threading.Thread(target=self._count, daemon=True).start()
         self.url = f"http://127.0.0.1:{self.server_port}/stream.mjpg"
@@ -73,8 +76,8 @@ class _Stream(BaseHTTPRequestHandler):
         try:
             while not streamer.shut:
                 if not streamer.stalled:
-                    picture = cv2.cvtColor(numbered(streamer.count), cv2.COLOR_RGB2BGR)
-                    jpeg = cv2.imencode(".jpg", picture)[1].tobytes()
+                    picture = cv2.cvtColor(streamer.picture(streamer.count), cv2.COLOR_RGB2BGR)
+                    jpeg = streamer.damage(cv2.imencode(".jpg", picture)[1].tobytes())
                     head = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
                     self.wfile.write(b"--frame\r\n" + head.encode() + jpeg + b"\r\n")
                 time.sleep(0.02)
@@ -128,6 +131,69 @@ def test_a_frozen_picture_and_a_stalled_stream_grow_old_and_are_said(streamer: S
     streamer.stalled = False
     until(lambda: camera.read().sequence > stalled.sequence and camera.problem == "")
     camera.close()
+
+
+def test_pictures_cut_in_half_are_refused_and_said(streamer: Streamer) -> None:
+    """FFmpeg would fill the rest with the picture before, silently."""
+    camera = VideoCamera(VideoConfig(streamer.url, rate=50.0))
+    until(lambda: camera.problem == "")
+    streamer.damage = lambda jpeg: jpeg[: len(jpeg) // 2]
+    until(lambda: "broken" in camera.problem)
+    last = camera.read()
+    time.sleep(0.2)
+    assert camera.read() is last, "no new picture, so that ages tell"
+    streamer.damage = bytes
+    until(lambda: camera.read().sequence > last.sequence and camera.problem == "")
+    camera.close()
+
+
+def test_another_size_in_mid_run_is_refused_and_said(streamer: Streamer) -> None:
+    camera = VideoCamera(VideoConfig(streamer.url, rate=50.0))
+    until(lambda: camera.problem == "")
+    streamer.picture = lambda k: numbered(k, (192, 256))
+    until(lambda: "256x192 pixels instead of 128x96" in camera.problem)
+    assert camera.read().image.shape == (96, 128, 3)
+    camera.close()
+
+
+GEL = load(GELSIGHT_MINI.sensor_file).background
+
+
+def noisy(seed: int, noise: float = 1.5) -> np.ndarray:
+    noise_ = np.random.default_rng(seed).normal(0, noise, GEL.shape)
+    return np.clip(GEL + noise_, 0, 255).astype(np.uint8)
+
+
+def test_a_part_that_stands_still_counts_as_frozen_and_a_dark_part_does_not() -> None:
+    parts = FrozenParts()
+    for k in range(60):
+        picture = noisy(k)
+        picture[-40:] = 0  # never lit: tells nothing
+        if k >= 40:
+            picture[120:180] = noisy(39)[120:180]
+        since = parts.update(picture, k / 30)
+        assert since == pytest.approx((39 if k >= 40 else k) / 30, abs=1e-9)
+
+
+def test_broken_jpegs_of_a_gel_are_refused_and_presses_of_a_real_one_are_not() -> None:
+    """Random bytes; decoders show them as blocks, which read as millimetres of indentation."""
+    rng, decoder, passed = np.random.default_rng(0), JpegDecoder(), 0
+    for k in range(100):
+        data = bytearray(
+            cv2.imencode(".jpg", noisy(k), [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+        )
+        start = data.index(b"\xff\xda") + 14
+        for _ in range(20):
+            data[rng.integers(start, len(data) - 2)] = rng.integers(256)
+        image = decoder.decode(bytes(data))
+        if image is not None and not is_broken_gel(image[..., ::-1], noisy(1000)):
+            seen = cv2.blur(np.abs(image[..., ::-1].astype(np.float32) - GEL), (8, 8))
+            passed += seen.max() > 20
+    assert passed <= 5  # in 100 with visible damage; without the checks it is half
+    assert all(not is_broken_gel(noisy(k, 3.0), noisy(1000)) for k in range(20))
+    real = sorted(Path("/work/shared/data/mini_presses").glob("ball*.png"))
+    pictures = [cv2.imread(str(path)) for path in real]
+    assert not any(is_broken_gel(p, pictures[0]) for p in pictures if p is not None)
 
 
 def test_a_lost_stream_is_joined_again(streamer: Streamer) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import Frame
 from touchgoal.control.sensors.latest_value import LatestValue
+from touchgoal.control.sensors.pictures import FrozenParts, JpegDecoder, is_broken_gel
 
 # A lost stream is told in `problem`; what the libraries print about it would tear a live view apart.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
@@ -26,7 +27,8 @@ _OPEN_TIMEOUT = 5000  # ms to open it the first time: the first frame may take l
 _REOPEN_INTERVAL = 0.5  # s between attempts
 _RATE_WINDOW = 2.0  # s that the rate is measured over
 _LATE_PERIODS = 3.0  # periods without a frame that mean a problem
-_COMPARE_STRIDE = 4  # pixels; every so many are compared for frozen pictures
+_MANUAL_EXPOSURE = 1  # V4L2_EXPOSURE_MANUAL
+_JPEG = b"\xff\xd8"  # what a JPEG begins with
 
 
 @dataclass(frozen=True)
@@ -38,14 +40,21 @@ class VideoConfig:
             (`frame_%04d.png`) or the address of an MJPEG stream (`http://...`).
         size: (width, height) to ask a camera for; None: its default.
         rate: Hz; of a camera to ask for, of images to play, and what `problem` compares with.
-        frozen_after: s of pixel-for-pixel the same picture after which it counts as old. Sensor
-            noise makes real pictures differ; rendered ones may rightly stand still: then infinity.
+        exposure, white_balance: fixed values for a camera, in V4L2's units (`v4l2-ctl --list-ctrls`;
+            usually 0.1 ms, and kelvin); None: as it is set.
+        frozen_after: s of pixel-for-pixel the same picture, or part of it, after which it counts as
+            old. Sensor noise makes real pictures differ; rendered ones may rightly stand still: then
+            infinity.
+        gel: whether it is a fingertip's, whose pictures are smooth: broken ones show.
     """
 
     source: str
     size: tuple[int, int] | None = None
     rate: float = 25.0
+    exposure: float | None = None
+    white_balance: int | None = None
     frozen_after: float = 0.5
+    gel: bool = False
 
     @property
     def is_camera(self) -> bool:
@@ -70,8 +79,9 @@ class VideoCamera:
         self._capture = _open(config, _OPEN_TIMEOUT)
         self._count, self._grab_times = 0, deque[float]()
         self._image: np.ndarray | None = None
-        self._changed_at = self._next_frame_at = time.monotonic()
-        self._lost = ""
+        self._next_frame_at = time.monotonic()
+        self._frozen_parts, self._decoder = FrozenParts(), JpegDecoder()
+        self._lost = self._refused = ""
         self._latest = LatestValue(f"camera {config.source}", self._take)
 
     @property
@@ -87,8 +97,10 @@ class VideoCamera:
         frame, now = self.read(), time.monotonic()
         if self._lost:
             return f"{self.config.source} {self._lost}"
+        if self._refused:
+            return f"{self.config.source} {self._refused}"
         if self._grab_times[-1] - frame.stamp > self.config.frozen_after:
-            return f"{self.config.source} shows one picture for {now - frame.stamp:.1f} s"
+            return f"{self.config.source} or a part of it shows one picture for {now - frame.stamp:.1f} s"
         if now - frame.stamp > _LATE_PERIODS / self.config.rate:
             return f"{self.config.source} gave its last frame {now - frame.stamp:.2f} s ago"
         return ""
@@ -112,16 +124,37 @@ class VideoCamera:
             self._reopen()
             return None
         self._lost = ""
+        image = self._checked(image)
+        if image is None:
+            return None
         self._count += 1
         self._grab_times.append(stamp)
         while self._grab_times[0] < stamp - _RATE_WINDOW:
             self._grab_times.popleft()
-        if self._image is None or _differs(image, self._image):
-            self._changed_at = stamp
         self._image = image
-        frozen = stamp - self._changed_at > self.config.frozen_after
-        rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-        return Frame(rgb, self._count, self._changed_at if frozen else stamp)
+        same_since = self._frozen_parts.update(image, stamp)
+        frozen = stamp - same_since > self.config.frozen_after
+        return Frame(image, self._count, same_since if frozen else stamp)
+
+    def _checked(self, image: np.ndarray) -> np.ndarray | None:
+        """RGB of what was grabbed, a JPEG or BGR; None if it is not to be believed."""
+        if image.ndim == 2 and 1 in image.shape:
+            decoded = self._decoder.decode(image.tobytes())
+        else:
+            decoded = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+        before = self._image
+        if decoded is None:
+            self._refused = "sends broken pictures: check its cable"
+        elif before is not None and decoded.shape != before.shape:
+            was, now = (f"{x.shape[1]}x{x.shape[0]}" for x in (before, decoded))
+            self._refused = f"sends {now} pixels instead of {was}: another camera, or set anew?"
+            return None
+        elif before is not None and self.config.gel and is_broken_gel(decoded, before):
+            self._refused = "sends broken pictures: check its cable"
+            return None
+        else:
+            self._refused = ""
+        return decoded
 
     def _wait_for_turn(self) -> None:
         self._next_frame_at = max(
@@ -154,6 +187,10 @@ def _open(config: VideoConfig, timeout_ms: int) -> cv2.VideoCapture:
         opening = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms]
         reading = [cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_TIMEOUT]
         capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, opening + reading)
+        if _sends_jpeg(capture):
+            return capture
+        capture.release()
+        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, opening + reading)
     if not capture.isOpened():
         raise UserError(f"cannot open {config.source}: check cable, address and permission (video)")
     if config.is_camera:
@@ -179,8 +216,36 @@ def _configure_camera(capture: cv2.VideoCapture, config: VideoConfig) -> None:
                 "size that `v4l2-ctl --list-formats-ext` lists"
             )
     capture.set(cv2.CAP_PROP_FPS, config.rate)
+    if config.exposure is not None:
+        _lock(capture, config, "exposure", cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL_EXPOSURE)
+    if config.white_balance is not None:
+        _lock(capture, config, "white_balance", cv2.CAP_PROP_AUTO_WB, 0)
+    if int(capture.get(cv2.CAP_PROP_FOURCC)) == cv2.VideoWriter.fourcc(*"MJPG"):
+        capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # the JPEGs themselves, see `_sends_jpeg`
 
 
-def _differs(image: np.ndarray, before: np.ndarray) -> bool:
-    sample = slice(None, None, _COMPARE_STRIDE)
-    return not np.array_equal(image[sample, sample], before[sample, sample])
+def _lock(
+    capture: cv2.VideoCapture, config: VideoConfig, name: str, automatic: int, manual: int
+) -> None:
+    """Switch an automatism off and set its value, read back; UserError if the camera does not do it."""
+    prop = {"exposure": cv2.CAP_PROP_EXPOSURE, "white_balance": cv2.CAP_PROP_WB_TEMPERATURE}[name]
+    wanted = getattr(config, name)
+    capture.set(automatic, manual)
+    capture.set(prop, wanted)
+    if (got := capture.get(prop)) != wanted:
+        capture.release()
+        raise UserError(
+            f"{config.source} keeps {name} {got:g} instead of {wanted:g}: choose a value that "
+            "`v4l2-ctl --list-ctrls` allows"
+        )
+
+
+def _sends_jpeg(capture: cv2.VideoCapture) -> bool:
+    """Whether a stream gives its JPEGs undecoded, which it then does from now on.
+
+    OpenCV's own decoder shows a broken one as if it were whole.
+    """
+    if not capture.isOpened() or not capture.set(cv2.CAP_PROP_FORMAT, -1):
+        return False
+    read, first = capture.read()
+    return bool(read) and first is not None and first.tobytes()[:2] == _JPEG
