@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from touchgoal.control.cell.connection import fingertip_view
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError, TactileSensor
 from touchgoal.control.sensors.pictures import FrozenParts, JpegDecoder, is_broken_gel
@@ -287,3 +289,69 @@ def test_a_stream_that_never_gives_a_picture_is_said(streamer: Streamer) -> None
     streamer.stalled = True
     with pytest.raises((UserError, DriverError)):
         VideoCamera(VideoConfig(streamer.url)).read()
+
+
+def test_a_fingertips_view_is_chosen_by_its_model_for_a_device_too() -> None:
+    assert fingertip_view(DIGIT, "/dev/video3", None) == DIGIT_CROP
+    assert fingertip_view(GELSIGHT_MINI, "28GHEJZ8", None) == GELSIGHT_MINI_CROP
+    assert fingertip_view(GELSIGHT_MINI, "http://127.0.0.1/left", None) == NO_CROP
+    assert fingertip_view(DIGIT, "D20001", 0.1) == replace(DIGIT_CROP, border=0.1)
+
+
+class PluggedCamera:
+    """What OpenCV says of a camera that gives one picture and is then pulled out."""
+
+    def __init__(self, keeps: float = 0.0) -> None:
+        self.set_to: dict[int, float] = {}
+        self.keeps, self.grabs = keeps, 0
+
+    def isOpened(self) -> bool:
+        return True
+
+    def set(self, prop: int, value: float) -> bool:
+        self.set_to[prop] = value
+        return True
+
+    def get(self, prop: int) -> float:
+        return self.keeps or self.set_to.get(prop, 0.0)
+
+    def grab(self) -> bool:
+        self.grabs += 1
+        return self.grabs == 1
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        data = cv2.imencode(".jpg", numbered(self.grabs))[1]
+        return True, data.reshape(1, -1)
+
+    def release(self) -> None: ...
+
+
+def test_after_a_replug_the_serial_number_is_looked_up_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked, devices = [], iter(["/dev/video2", "/dev/video4", *["/dev/video6"] * 99])
+
+    def opened(source: str, _: int) -> PluggedCamera:
+        asked.append(source)
+        return PluggedCamera()
+
+    monkeypatch.setattr(cv2, "VideoCapture", opened)
+    camera = VideoCamera(VideoConfig("28GHEJZ8", device=lambda: next(devices)))
+    assert camera.read().image.shape == (96, 128, 3)
+    until(lambda: len(asked) > 1)
+    camera.close()
+    assert asked[:2] == ["/dev/video2", "/dev/video4"]
+
+
+def test_exposure_and_white_balance_are_locked_or_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    plugged = PluggedCamera()
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: plugged)
+    VideoCamera(VideoConfig("0", exposure=120.0, white_balance=4600)).close()
+    assert plugged.set_to[cv2.CAP_PROP_AUTO_EXPOSURE] == 1  # V4L2_EXPOSURE_MANUAL
+    assert (
+        plugged.set_to[cv2.CAP_PROP_EXPOSURE] == 120 and plugged.set_to[cv2.CAP_PROP_AUTO_WB] == 0
+    )
+    assert plugged.set_to[cv2.CAP_PROP_WB_TEMPERATURE] == 4600
+    plugged.keeps = 99.0
+    with pytest.raises(UserError, match="keeps exposure 99 instead of 120"):
+        VideoCamera(VideoConfig("0", exposure=120.0))

@@ -22,6 +22,8 @@ Angle = Annotated[float, Field(ge=-6.3, le=6.3)]  # rad
 Rate = Annotated[float, Field(gt=0, le=1000)]  # Hz
 Seconds = Annotated[float, Field(gt=0, le=5)]
 Pixels = Annotated[int, Field(ge=16, le=8192)]
+Exposure = Annotated[float, Field(gt=0, le=100_000)]
+Kelvin = Annotated[int, Field(ge=1000, le=15_000)]
 CameraName = Literal["front", "wrist"]
 
 # N, what a gripper can be set to. A real Franka Hand does no less than 30; a simulated one does.
@@ -79,6 +81,16 @@ class FingertipsSection:
     """USB serial number, or address of a stream."""
     rate: Rate | None = None
     """Pictures a second, Hz; not given: the model's."""
+    sensor_files: tuple[str, str] | None = None
+    """Folders that calibrate made of the left and of the right sensor; not given: the model's for both."""
+    size: tuple[Pixels, Pixels] | None = None
+    """Width and height to ask the sensors' cameras for, pixels; not given: their default."""
+    border: Annotated[float, Field(ge=0, lt=0.5)] | None = None
+    """Share cut off at each side of a camera's picture; not given: the model's."""
+    exposure: Exposure | None = None
+    """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); not given: as it is set."""
+    white_balance: Kelvin | None = None
+    """White balance to lock, K; not given: as it is set."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -91,6 +103,10 @@ class CameraSection:
     """Pictures a second, Hz."""
     size: tuple[Pixels, Pixels] | None = None
     """Width and height to ask the camera for, pixels; not given: its default."""
+    exposure: Exposure | None = None
+    """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); not given: as it is set."""
+    white_balance: Kelvin | None = None
+    """White balance to lock, K; not given: as it is set."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -222,9 +238,16 @@ def check(cell: CellConfig) -> None:
         )
     if cell.fingertips is not None:
         try:
-            find_sensor(cell.fingertips.sensor)
+            model = find_sensor(cell.fingertips.sensor)
         except UserError as error:
             raise UserError(f"fingertips.sensor: {error}") from error
+        for folder in cell.fingertips.sensor_files or ():
+            try:
+                own = find_sensor(folder)
+            except UserError as error:
+                raise UserError(f"fingertips.sensor_files: {error}") from error
+            if own.image_shape != model.image_shape:
+                raise UserError(f"fingertips.sensor_files: {folder} is of a {own.name}")
     if task.name == "pick-place" and task.wires or task.name == "bead-maze" and task.objects:
         other = "wires" if task.wires else "objects"
         raise UserError(f"task.{other} does nothing in {task.name}: leave it out")

@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -32,11 +33,12 @@ from touchgoal.control.sensors.tactile_camera import (
     DIGIT_CROP,
     GELSIGHT_MINI_CROP,
     NO_CROP,
+    Crop,
     TactileCamera,
 )
 from touchgoal.control.sensors.usb_cameras import find_sensor_camera
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
-from touchgoal.control.tactile.sensor_models import DIGIT, find_sensor
+from touchgoal.control.tactile.sensor_models import DIGIT, SensorModel, find_sensor
 
 _STOP_FACTOR = 5  # times the age at which the arm holds
 _CLOCK_TIMEOUT = 1.0  # s on the wall for which an arm's clock may stand
@@ -148,13 +150,13 @@ def connect_cell(cell: CellConfig, hz: float) -> CellConnection:
 
         cameras = {}
         for name, camera in cell.cameras.items():
-            config = VideoConfig(camera.source, camera.size, camera.rate)
+            config = VideoConfig(
+                camera.source, camera.size, camera.rate, camera.exposure, camera.white_balance
+            )
             cameras[ft.IMAGE_PREFIX + name] = keep(VideoCamera(config))
         if cell.fingertips:
-            for key, source in zip(
-                ft.TACTILE, (cell.fingertips.left, cell.fingertips.right), strict=True
-            ):
-                cameras[key] = keep(_tactile_camera(cell.fingertips, source))
+            for side, key in enumerate(ft.TACTILE):
+                cameras[key] = keep(_tactile_camera(cell.fingertips, side))
         load_cell = keep(SerialLoadCell(cell.load_cell)) if cell.load_cell else None
         gripper = keep(_gripper(cell.gripper))
         arm = keep(_arm(cell, robot, hz))
@@ -225,12 +227,31 @@ def _gripper(cell: GripperSection) -> Gripper:
     return Robotiq(RobotiqConfig(cell.port, cell.activate, force=cell.force, widths=cell.widths))
 
 
-def _tactile_camera(cell: FingertipsSection, source: str) -> TactileCamera:
-    """By serial number over USB, or a stream whose pictures are the sensor's already."""
-    model = find_sensor(cell.sensor)
-    rate = cell.rate or model.frame_rate
-    if "/" in source:
-        return TactileCamera(VideoCamera(VideoConfig(source, rate=rate)), model, NO_CROP)
-    crop = DIGIT_CROP if model.name == DIGIT.name else GELSIGHT_MINI_CROP
-    device = find_sensor_camera(model, source).device
-    return TactileCamera(VideoCamera(VideoConfig(device, rate=rate)), model, crop)
+def _tactile_camera(cell: FingertipsSection, side: int) -> TactileCamera:
+    """Of the left (0) or right (1) finger, at a device, a USB serial number or a stream."""
+    source = (cell.left, cell.right)[side]
+    model = find_sensor(cell.sensor_files[side] if cell.sensor_files else cell.sensor)
+    config = VideoConfig(
+        source,
+        cell.size,
+        cell.rate or model.frame_rate,
+        cell.exposure,
+        cell.white_balance,
+        gel=True,
+        # Looked up again whenever it is opened: after a replug it is another device.
+        device=None if "/" in source else partial(_device_of, model, source),
+    )
+    return TactileCamera(VideoCamera(config), model, fingertip_view(model, source, cell.border))
+
+
+def fingertip_view(model: SensorModel, source: str, border: float | None) -> Crop:
+    """How the sensor's picture lies in its camera's: a stream is cut and turned already."""
+    if "://" in source:
+        view = NO_CROP
+    else:
+        view = DIGIT_CROP if model.name == DIGIT.name else GELSIGHT_MINI_CROP
+    return view if border is None else replace(view, border=border)
+
+
+def _device_of(model: SensorModel, serial: str) -> str:
+    return find_sensor_camera(model, serial).device

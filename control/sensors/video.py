@@ -8,7 +8,9 @@ source that fails is opened again until it comes back, and meanwhile frames keep
 import os
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -46,6 +48,7 @@ class VideoConfig:
             old. Sensor noise makes real pictures differ; rendered ones may rightly stand still: then
             infinity.
         gel: whether it is a fingertip's, whose pictures are smooth: broken ones show.
+        device: finds the camera's device whenever it is opened, when `source` is a serial number.
     """
 
     source: str
@@ -55,10 +58,13 @@ class VideoConfig:
     white_balance: int | None = None
     frozen_after: float = 0.5
     gel: bool = False
+    device: Callable[[], str] | None = None
 
     @property
     def is_camera(self) -> bool:
         """Whether it is a camera of this computer."""
+        if self.device is not None:
+            return True
         return self.source.isdigit() or self.source.startswith("/dev/")
 
     @property
@@ -176,9 +182,11 @@ class VideoCamera:
             pass  # not back yet
 
 
-def _open(config: VideoConfig, timeout_ms: int) -> cv2.VideoCapture:
+def _open(config: VideoConfig, timeout_ms: int) -> Any:
     """Within `timeout_ms` ms if it is a stream."""
     source = int(config.source) if config.source.isdigit() else config.source
+    if config.device is not None:
+        source = config.device()
     if config.is_camera:
         capture = cv2.VideoCapture(source, cv2.CAP_V4L2)
     elif config.is_file:
@@ -198,7 +206,7 @@ def _open(config: VideoConfig, timeout_ms: int) -> cv2.VideoCapture:
     return capture
 
 
-def _configure_camera(capture: cv2.VideoCapture, config: VideoConfig) -> None:
+def _configure_camera(capture: Any, config: VideoConfig) -> None:
     """Format, size and rate of a camera, read back because drivers ignore what they cannot do."""
     capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
     if config.size is not None:
@@ -225,7 +233,7 @@ def _configure_camera(capture: cv2.VideoCapture, config: VideoConfig) -> None:
 
 
 def _lock(
-    capture: cv2.VideoCapture, config: VideoConfig, name: str, automatic: int, manual: int
+    capture: Any, config: VideoConfig, name: str, automatic: int, manual: int
 ) -> None:
     """Switch an automatism off and set its value, read back; UserError if the camera does not do it."""
     prop = {"exposure": cv2.CAP_PROP_EXPOSURE, "white_balance": cv2.CAP_PROP_WB_TEMPERATURE}[name]
@@ -240,7 +248,7 @@ def _lock(
         )
 
 
-def _sends_jpeg(capture: cv2.VideoCapture) -> bool:
+def _sends_jpeg(capture: Any) -> bool:
     """Whether a stream gives its JPEGs undecoded, which it then does from now on.
 
     OpenCV's own decoder shows a broken one as if it were whole.
