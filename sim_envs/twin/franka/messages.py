@@ -17,6 +17,8 @@ import numpy as np
 ROBOT_PORT, HAND_PORT = 1337, 1338
 ROBOT_VERSION, HAND_VERSION = 10, 3
 _SEND_TIMEOUT = 0.5  # s that a client may take to read an answer
+_LONGEST = 4096  # bytes of a command; the longest of the protocol has 300
+# Bytes of arguments that each command has; a real controller drops a client that sends others.
 
 
 def _floats(**sizes: int) -> list[tuple]:
@@ -180,6 +182,19 @@ ERRORS = (
 )
 
 
+_ARGUMENTS = {
+    (True, RobotCommand.CONNECT): 4,
+    (True, RobotCommand.SET_COLLISION_BEHAVIOUR): COLLISION_BEHAVIOUR.itemsize,
+    (True, RobotCommand.SET_NE_TO_EE): 128,
+    (True, RobotCommand.SET_EE_TO_K): 128,
+    (True, RobotCommand.SET_LOAD): 104,
+    (False, HandCommand.CONNECT): 4,
+    (False, HandCommand.MOVE): 16,
+    (False, HandCommand.GRASP): 40,
+}
+_LEAST_OF_MOVE = 8  # controller and motion generator; tolerances follow
+
+
 @dataclass(frozen=True)
 class Request:
     """A client's command over TCP: its number, the id to answer under, its arguments."""
@@ -201,7 +216,7 @@ class Link:
 
     def __init__(self, host: str, port: int, version: int, wide: bool) -> None:
         """`wide`: the arm's messages have a 4-byte command and 1-byte status; the hand's, 2."""
-        self._version = version
+        self._version, self._wide = version, wide
         self._header = struct.Struct("<III" if wide else "<HII")
         self._status = struct.Struct("<B" if wide else "<H")
         self._listener = socket.socket()
@@ -296,14 +311,30 @@ class Link:
         size = self._header.size
         while len(self._unread) >= size:
             command, id, length = self._header.unpack_from(self._unread)
+            if not size <= length <= _LONGEST:
+                self.drop()  # whatever speaks there, it is no libfranka
+                return
             if len(self._unread) < length:
                 return
             request = Request(command, id, self._unread[size:length])
             self._unread = self._unread[length:]
+            if not self._well_formed(request):
+                self.drop()
+                return
             if command == RobotCommand.CONNECT:
                 self._handshake(request)
             elif self.connected:
                 yield request
+
+    def _well_formed(self, request: Request) -> bool:
+        """Whether the arguments have the size and, where they are numbers, the values that they can."""
+        n = len(request.payload)
+        if self._wide and request.command == RobotCommand.MOVE:
+            return n >= _LEAST_OF_MOVE
+        expected = _ARGUMENTS.get((self._wide, request.command))
+        if expected is None or request.command == RobotCommand.CONNECT:
+            return n >= (expected or 0)
+        return n == expected and bool(np.isfinite(np.frombuffer(request.payload, "<f8")).all())
 
     def _handshake(self, request: Request) -> None:
         assert self._tcp is not None
