@@ -232,9 +232,7 @@ def _configure_camera(capture: Any, config: VideoConfig) -> None:
         capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # the JPEGs themselves, see `_sends_jpeg`
 
 
-def _lock(
-    capture: Any, config: VideoConfig, name: str, automatic: int, manual: int
-) -> None:
+def _lock(capture: Any, config: VideoConfig, name: str, automatic: int, manual: int) -> None:
     """Switch an automatism off and set its value, read back; UserError if the camera does not do it."""
     prop = {"exposure": cv2.CAP_PROP_EXPOSURE, "white_balance": cv2.CAP_PROP_WB_TEMPERATURE}[name]
     wanted = getattr(config, name)

@@ -16,11 +16,13 @@ for the truth.
     unplug|plug NAME              a serial port
     kill                          end the twin's process at once, as kill -9 does
 
-Every answer is one line of JSON; a mistake is {"error": ...}.
+Every answer is one line of JSON; a mistake is {"error": ...}. A browser is hung up on at its first line,
+whatever its origin: no web page may break a twin.
 """
 
 import json
 import os
+import re
 import signal
 import socket
 import time
@@ -34,6 +36,8 @@ from touchgoal.sim_envs.twin.mjpeg import Stream
 from touchgoal.sim_envs.twin.serial.devices import SerialPort
 from touchgoal.sim_envs.twin.tcp_ports import ListeningPort
 
+_HTTP = re.compile(r" HTTP/\d")  # what any browser's first line ends in
+_STRONGEST_NUDGE = 500.0  # N
 _REST_TIMEOUT, _POLL_INTERVAL = 10.0, 0.1  # s for the arm of the run before to come to rest
 
 
@@ -89,6 +93,9 @@ class ControlPort:
                 self._arm.freeze(False)
         for client in self._listener.poll():
             for line in client.lines():
+                if _HTTP.search(line):
+                    client.close()  # a web page in a browser; what it sends after that is no order
+                    break
                 client.send(json.dumps(self._answer(line)).encode() + b"\n")
 
     def send(self) -> None:
@@ -120,8 +127,8 @@ class ControlPort:
             return {"error": f"unknown command {command!r}; there are: {', '.join(actions)}"}
         try:
             return actions[command]() or {"ok": True}
-        except (UserError, ValueError, TypeError, KeyError) as error:
-            return {"error": f"{line!r} cannot be done: {error}"}
+        except (UserError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+            return {"error": f"{line[:200]!r} cannot be done: {error}"}
 
     def _reset(self, seed: str, options: str = "{}") -> None:
         if self._cell.moving:
@@ -132,10 +139,14 @@ class ControlPort:
         self._arm.clear_error()
 
     def _freeze(self, seconds: float) -> None:
+        _require_finite(seconds)
         self._arm.freeze(True)
         self._frozen_seconds = seconds
 
     def _nudge(self, x: float, y: float, z: float, seconds: float) -> None:
+        _require_finite(x, y, z, seconds)
+        if max(abs(x), abs(y), abs(z)) > _STRONGEST_NUDGE:
+            raise UserError(f"a nudge has at most {_STRONGEST_NUDGE:g} N")
         self._cell.nudge(np.array([x, y, z]), seconds)
 
     def _set_stream_fault(self, fault: str, name: str, seconds: str) -> None:
@@ -143,6 +154,11 @@ class ControlPort:
 
     def _garble(self, name: str, share: str) -> None:
         self._ports[name].garble = float(share)
+
+
+def _require_finite(*numbers: float) -> None:
+    if not np.isfinite(numbers).all():
+        raise UserError("numbers must be finite")
 
 
 def ask_twin(address: str, line: str) -> dict[str, Any]:

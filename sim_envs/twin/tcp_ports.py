@@ -3,6 +3,7 @@
 import socket
 
 _MOST_UNSENT = 1_000_000  # bytes a client may leave unread before it is cut off
+_MOST_UNREAD = 300_000  # bytes it may send without making sense; a control script has 42,000
 
 
 class ClientConnection:
@@ -25,7 +26,7 @@ class ClientConnection:
         except OSError:
             chunk = b""
         self.unread += chunk
-        self.open &= bool(chunk)
+        self.open &= bool(chunk) and len(self.unread) <= _MOST_UNREAD
 
     def lines(self) -> list[str]:
         """Whole lines that have come."""

@@ -34,6 +34,7 @@ _SETTERS = {
     RobotCommand.SET_CARTESIAN_IMPEDANCE,
     RobotCommand.SET_GUIDING_MODE,
 }
+_BASE_ACCELERATION = 0.0, 0.0, -9.81  # m/s^2; robot_state.h: "hard-coded for now"
 _BRAKING = FR3.hardware.acceleration  # rad/s^2 of braking; a real reflex brakes harder
 
 Pose = Float[np.ndarray, "4 4"]
@@ -81,6 +82,7 @@ class FrankaArm:
         self._thresholds = Thresholds.default()
         self._ee, self._k = np.eye(4), np.eye(4)  # NE_T_EE and EE_T_K
         self._state = np.zeros((), messages.ROBOT_STATE)
+        self._state["O_ddP_O"] = _BASE_ACCELERATION
         self._reset_setpoint()
         self._describe_hand()
 
@@ -218,6 +220,9 @@ class FrankaArm:
             self.link.answer(request, status)
             return
         controller, generator = (int(n) for n in np.frombuffer(request.payload, "<u4", 2))
+        if controller > _OTHER or (controller != _EXTERNAL and generator > _TWIST):
+            self.link.answer(request, MoveStatus.INVALID_ARGUMENT)
+            return
         if controller == _EXTERNAL:
             generator = _TORQUE
         self._motion, self._success_rate = Motion(request, generator, controller), 1.0
@@ -257,7 +262,9 @@ class FrankaArm:
             if len(datagram) != messages.ROBOT_ORDER.itemsize:
                 continue
             order = np.frombuffer(datagram, messages.ROBOT_ORDER, 1)[0]
-            if int(order["message_id"]) > self._echoed:
+            if (
+                self._echoed < int(order["message_id"]) < max(self._sent, 1)
+            ):  # of a state that was sent
                 self._echoed = int(order["message_id"])
                 # Set-points that come after the arm has gone on without them are too old.
                 late = self._motion is not None and self._motion.lost > 0
@@ -298,6 +305,10 @@ class FrankaArm:
         now, jacobian = self._pose_and_jacobian(q)
         if motion.generator == _POSE:
             target = order["O_T_EE_c"].reshape(4, 4).T
+            R = target[:3, :3]
+            if not np.isfinite(target).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3:
+                self.abort("cartesian_position_motion_generator_invalid_frame")
+                return
             error = np.concatenate(
                 [target[:3, 3] - now[:3, 3], rotation_vector(target[:3, :3] @ now[:3, :3].T)]
             )

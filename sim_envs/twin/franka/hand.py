@@ -73,8 +73,11 @@ class FrankaHand:
             self._job = None
             self.link.answer(job.request, HandStatus.ABORTED)
         self._grasped = False
-        numbers = np.frombuffer(request.payload, "<f8")
-        if command == HandCommand.STOP:
+        moves = command in (HandCommand.MOVE, HandCommand.GRASP)
+        numbers = np.frombuffer(request.payload, "<f8") if moves else np.zeros(0)
+        if not np.isfinite(numbers).all() or (numbers[:2] < 0).any():
+            self.link.answer(request, HandStatus.FAIL)
+        elif command == HandCommand.STOP:
             cell.command_gripper(cell.env.width(), GRIPPER_SPEED, cell.gripper_command.force)
             self.link.answer(request, HandStatus.SUCCESS)
         elif command == HandCommand.HOMING:

@@ -61,8 +61,8 @@ def joint_fault(before: Setpoint, now: Setpoint, cartesian: bool) -> str | None:
 
 def tcp_fault(twist: Wrench) -> str | None:
     """Whether a Cartesian set-point is too fast; m/s, rad/s."""
-    fast = np.linalg.norm(twist[:3]) > _SLACK * _TCP_SPEED
-    if fast or not np.linalg.norm(twist[3:]) <= _SLACK * _TCP_TURN:
+    slow = np.linalg.norm(twist[:3]) <= _SLACK * _TCP_SPEED
+    if not slow or not np.linalg.norm(twist[3:]) <= _SLACK * _TCP_TURN:
         return "cartesian_motion_generator_velocity_limits_violation"
     return None
 
@@ -71,7 +71,7 @@ def torque_fault(before: Joints, now: Joints) -> str | None:
     """Which limit commanded torques (N m) break."""
     if not (np.abs(now) <= _SLACK * TORQUE).all():
         return "tau_j_range_violation"
-    if (np.abs(now - before) > _SLACK * DT * _TORQUE_RATE).any():
+    if not (np.abs(now - before) <= _SLACK * DT * _TORQUE_RATE).all():
         return "controller_torque_discontinuity"
     return None
 

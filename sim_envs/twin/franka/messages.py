@@ -18,7 +18,6 @@ ROBOT_PORT, HAND_PORT = 1337, 1338
 ROBOT_VERSION, HAND_VERSION = 10, 3
 _SEND_TIMEOUT = 0.5  # s that a client may take to read an answer
 _LONGEST = 4096  # bytes of a command; the longest of the protocol has 300
-# Bytes of arguments that each command has; a real controller drops a client that sends others.
 
 
 def _floats(**sizes: int) -> list[tuple]:
@@ -182,6 +181,7 @@ ERRORS = (
 )
 
 
+# Bytes of arguments that each command has; a client that sends others is dropped.
 _ARGUMENTS = {
     (True, RobotCommand.CONNECT): 4,
     (True, RobotCommand.SET_COLLISION_BEHAVIOUR): COLLISION_BEHAVIOUR.itemsize,
@@ -334,7 +334,10 @@ class Link:
         expected = _ARGUMENTS.get((self._wide, request.command))
         if expected is None or request.command == RobotCommand.CONNECT:
             return n >= (expected or 0)
-        return n == expected and bool(np.isfinite(np.frombuffer(request.payload, "<f8")).all())
+        if n != expected:
+            return False
+        # The hand answers for itself what it cannot do; libfranka checks the arm's numbers.
+        return not self._wide or bool(np.isfinite(np.frombuffer(request.payload, "<f8")).all())
 
     def _handshake(self, request: Request) -> None:
         assert self._tcp is not None
@@ -343,6 +346,8 @@ class Link:
         self._write(request, struct.pack("<HH4x", 0, self._version))
 
     def _write(self, request: Request, body: bytes) -> None:
+        if self._tcp is None:  # the client that asked has gone
+            return
         length = self._header.size + len(body)
         self._unsent += self._header.pack(request.command, request.id, length) + body
         self._flush()

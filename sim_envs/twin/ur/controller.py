@@ -11,12 +11,15 @@ from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort
 from touchgoal.sim_envs.twin.ur import messages
 from touchgoal.sim_envs.twin.ur.messages import Package, Safety
+from touchgoal.sim_envs.twin.ur.outputs import Outputs
 from touchgoal.sim_envs.twin.ur.program import UrProgram
 
 _CYCLE = 2  # ms, of a controller of the e-Series
 _SELDOM = 10  # ms between looks at what is not real-time
 _UNLOCK_DELAY = 5.0  # s after a protective stop before it can be unlocked
 _FORCE_LIMIT = 150.0  # N at the tool; the factory's safety presets run from 100 to 250
+_FASTEST = 500.0  # Hz of an e-Series' data; also rad/s that no joint comes near
+_MOST_RECIPES = 255
 _STOPPED, _PLAYING = 1, 2  # runtime_state
 _POWER_OFF, _IDLE, _RUNNING = 3, 5, 7  # robot_mode
 
@@ -60,7 +63,8 @@ class UrController:
         self._stopped_at = self._last_input_at = 0.0
         self._clock = 0.0
         self._speed_fraction = 1.0
-        self._felt, self._zero = np.zeros(6), np.zeros(6)
+        self._io = Outputs()
+        self._felt, self._zero, self._wrench = np.zeros(6), np.zeros(6), np.zeros(6)
         self._program = self._new_program()
         self._program.running = False
 
@@ -78,9 +82,11 @@ class UrController:
             program.cycle()
         if program.running and program.activity is not None:
             q, dq = program.activity.step(self.cell.q_d, self.cell.dq_d, self._speed_fraction)
-            self.cell.set_target(q, dq)
             hardware = UR5E.hardware
-            if (q < hardware.lower).any() or (q > hardware.upper).any():
+            # Nor may numbers that are none, from absurd speeds, reach the physics.
+            if ((q >= hardware.lower) & (q <= hardware.upper) & (np.abs(dq) < _FASTEST)).all():
+                self.cell.set_target(q, dq)
+            else:
                 self.protective_stop()
 
     def send(self) -> None:
@@ -147,9 +153,13 @@ class UrController:
         connections = self._rtde.poll()
         self._clients = {c: self._clients.get(c) or Client(c) for c in connections}
         for connection, client in self._clients.items():
-            packages, connection.unread = messages.split(connection.unread)
-            for kind, payload in packages:
-                self._handle(client, kind, payload)
+            try:
+                packages, connection.unread = messages.split(connection.unread)
+                for kind, payload in packages:
+                    self._handle(client, kind, payload)
+            except (ValueError, IndexError, OverflowError) as error:  # bytes that mean nothing
+                print(f"an RTDE client was dropped: {error}")
+                connection.close()
 
     def _poll_dashboard_and_script(self) -> None:
         """Dashboard and scripts."""
@@ -175,24 +185,33 @@ class UrController:
             answer(np.array(messages.VERSION, ">u4").tobytes())
         elif kind == Package.OUTPUTS:
             frequency = float(np.frombuffer(payload[:8], ">f8")[0])
+            if not 0 <= frequency <= _FASTEST:
+                raise messages.MalformedError(f"data at {frequency} Hz")
             client.period = max(_CYCLE, round(1000 / max(frequency, 1.0)))
             client.outputs, kinds = _recipe(payload[8:], messages.OUTPUTS)
             answer(b"\x01" + kinds)
         elif kind == Package.INPUTS:
             names, kinds = _recipe(payload, messages.INPUTS)
+            if len(client.inputs) >= _MOST_RECIPES:
+                raise messages.MalformedError("too many recipes")
             client.inputs.append(names)
             answer(bytes([len(client.inputs)]) + kinds)
         elif kind in (Package.START, Package.PAUSE):
             client.started = kind == Package.START
             answer(b"\x01")
-        elif kind == Package.DATA and 0 < payload[0] <= len(client.inputs):
+        elif kind == Package.DATA and payload and 0 < payload[0] <= len(client.inputs):
             self._take_inputs(client.inputs[payload[0] - 1], payload[1:])
 
     def _take_inputs(self, names: list[str], payload: bytes) -> None:
         form = messages.layout(names, messages.INPUTS)
         if form.size != len(payload) or "external_force_torque" in names:
             return
-        self._inputs.update(zip(names, form.unpack(payload), strict=True))
+        values = form.unpack(payload)
+        if not np.isfinite(values).all():
+            self.protective_stop()
+            return
+        self._inputs.update(zip(names, values, strict=True))
+        self._io.update(self._inputs, names)
         self._last_input_at = self._clock
         if "speed_slider_mask" in names and self._inputs["speed_slider_mask"]:
             self._speed_fraction = float(np.clip(self._inputs["speed_slider_fraction"], 0.0, 1.0))
@@ -209,7 +228,9 @@ class UrController:
             self._last_input_at = self._clock
 
     def _new_program(self) -> UrProgram:
-        return UrProgram(self.cell, self._inputs, self.protective_stop, self._zero_force)
+        return UrProgram(
+            self.cell, self._inputs, self.protective_stop, self._zero_force, lambda: self._wrench
+        )
 
     def _zero_force(self) -> None:
         """What is felt now counts as nothing, as after URScript's zero_ftsensor."""
@@ -304,6 +325,9 @@ _CONSTANTS: dict[str, float | Sequence[float]] = {
     "joint_temperatures": [30.0] * 6,
 }
 _VARIABLES = {
+    "actual_digital_output_bits": lambda c, p, cell: c._io.digital,
+    "standard_analog_output0": lambda c, p, cell: c._io.analog[0],
+    "standard_analog_output1": lambda c, p, cell: c._io.analog[1],
     "timestamp": lambda c, p, cell: c._clock,
     "target_q": lambda c, p, cell: cell.q_d,
     "target_qd": lambda c, p, cell: cell.dq_d,

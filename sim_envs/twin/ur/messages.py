@@ -87,12 +87,18 @@ def package(kind: Package, payload: bytes) -> bytes:
     return struct.pack(">HB", 3 + len(payload), kind) + payload
 
 
+class MalformedError(ValueError):
+    """What a client has sent is no RTDE package."""
+
+
 def split(unread: bytes) -> tuple[list[tuple[int, bytes]], bytes]:
-    """Whole packages (kind, payload), and what is left."""
+    """Whole packages (kind, payload), and what is left; MalformedError for a length that cannot be."""
     found = []
     while len(unread) >= 3:
         length, kind = struct.unpack_from(">HB", unread)
-        if length < 3 or len(unread) < length:
+        if length < 3:
+            raise MalformedError("a package shorter than its header")
+        if len(unread) < length:
             break
         found.append((kind, unread[3:length]))
         unread = unread[length:]

@@ -1,10 +1,11 @@
 """How a UR moves between commands: moves with trapezoidal speed, servo, speed, stop."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from touchgoal.control.motion.rotations import rotation_matrix, rotation_vector
 from touchgoal.control.safety.braking import braked_velocity
@@ -12,6 +13,9 @@ from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 
 _SERVO_ACCELERATION = 40.0  # rad/s^2, the most that ur-rtde lets a client ask for
 _STILL = 1e-3  # rad/s
+# Our choices: the maker's controllers are unpublished.
+_FORCE_GAIN, _FORCE_SPEED = 2e-3, 0.1  # m/s for each N missing, and m/s at most; likewise rad, Nm
+_FREEDRIVE_GAIN, _FREEDRIVE_SPEED = 0.05, 0.5  # rad/s for each Nm, and rad/s at most
 
 Joints = Float[np.ndarray, "6"]
 Target = tuple[Joints, Joints]  # rad, rad/s
@@ -85,7 +89,7 @@ class JointMove:
     @property
     def done(self) -> bool:
         """Whether the goal is reached."""
-        return self._profile is not None and self._profile.time >= self._profile.duration
+        return self._profile is not None and bool(self._profile.time >= self._profile.duration)
 
 
 class LineMove:
@@ -121,7 +125,7 @@ class LineMove:
     @property
     def done(self) -> bool:
         """Whether the goal is reached."""
-        return self._profile.time >= self._profile.duration
+        return bool(self._profile.time >= self._profile.duration)
 
 
 @dataclass
@@ -175,4 +179,47 @@ class Stop:
         left = max(0.0, fastest - self.deceleration * DT)
         dq = dq * (left / fastest if fastest > 0 else 0.0)
         self.done = left == 0.0
+        return q + DT * dq, dq
+
+
+@dataclass
+class Force:
+    """`force_mode`: along free axes of the base the arm gives way until it pushes as hard as asked.
+
+    Attributes:
+        free: which of x, y, z, rx, ry, rz are.
+        wanted: N and Nm that the robot is to apply to its environment.
+        limits: m/s and rad/s of the free axes.
+        wrench: reads what the environment does to the robot.
+    """
+
+    cell: SimulatedCell
+    free: Bool[np.ndarray, "6"]
+    wanted: Float[np.ndarray, "6"]
+    limits: Float[np.ndarray, "6"]
+    wrench: Callable[[], Float[np.ndarray, "6"]]
+    done: bool = field(default=False, init=False)
+
+    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
+        """The next target."""
+        missing = self.wanted + self.wrench()
+        most = np.minimum(self.limits, _FORCE_SPEED)
+        twist = self.free * np.clip(_FORCE_GAIN * missing, -most, most)
+        _, _, J = self.cell.kinematics(q, np.zeros(3))
+        goal = J.T @ np.linalg.solve(J @ J.T + 1e-6 * np.eye(6), twist)
+        dq = dq + np.clip(goal - dq, -_SERVO_ACCELERATION * DT, _SERVO_ACCELERATION * DT)
+        return q + DT * dq, dq
+
+
+@dataclass
+class Freedrive:
+    """`freedrive_mode`: every joint gives way to what pushes it."""
+
+    cell: SimulatedCell
+    done: bool = field(default=False, init=False)
+
+    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
+        """The next target."""
+        goal = np.clip(_FREEDRIVE_GAIN * self.cell.tau_ext, -_FREEDRIVE_SPEED, _FREEDRIVE_SPEED)
+        dq = dq + np.clip(goal - dq, -_SERVO_ACCELERATION * DT, _SERVO_ACCELERATION * DT)
         return q + DT * dq, dq

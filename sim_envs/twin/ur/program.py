@@ -16,6 +16,8 @@ from touchgoal.control.safety.limits import UR5E
 from touchgoal.sim_envs.twin.cell import SimulatedCell
 from touchgoal.sim_envs.twin.ur.motion import (
     Activity,
+    Force,
+    Freedrive,
     JointMove,
     LineMove,
     Servo,
@@ -24,9 +26,30 @@ from touchgoal.sim_envs.twin.ur.motion import (
 )
 
 _READY, _DONE = 1, 2
-_STREAMED = {6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71}  # acknowledged at once
+_STREAMED = {
+    6,
+    9,
+    10,
+    11,
+    12,
+    24,
+    25,
+    26,
+    27,
+    38,
+    58,
+    66,
+    67,
+    68,
+    69,
+    70,
+    71,
+}  # acknowledged at once
 _IGNORED = {0, 13, 14, 17, 20, 21, 48, 59, 65, 99}  # payload, outputs, a kick
 _STOP_SCRIPT = 255
+_LONGEST_TOOL = 10.0  # m and rad
+_END_OF_FREEDRIVE = 5.0  # rad/s^2
+_PACE = 1e-3, 40.0  # rad/s or m/s, and those per s
 _REACH = 0.85  # m, UR5e data sheet
 _FLANGE_TO_TCP = np.array([0.0, 0.0, UR5E.tool.tcp_offset])
 
@@ -49,9 +72,11 @@ class UrProgram:
         inputs: dict[str, float],
         stop: Callable[[], None],
         zero_force: Callable[[], None],
+        wrench: Callable[[], Float[np.ndarray, "6"]],
     ) -> None:
-        """What the program calls for a protective stop, and to zero the force sensor."""
-        self.cell, self.inputs = cell, inputs
+        """What it calls for a protective stop, to zero the force sensor, and to read it."""
+        self.cell, self.inputs, self._wrench = cell, inputs, wrench
+        self._freedriving = False
         self._protective_stop, self._zero_force = stop, zero_force
         self.activity: Activity | None = None
         self.ints, self.doubles = [0] * 48, [0.0] * 48
@@ -93,11 +118,19 @@ class UrProgram:
 
     def _execute(self, command: int) -> None:
         actions = {
-            1: lambda: self._move(JointMove(self._doubles(0), self._double(6), self._double(7))),
+            1: lambda: self._move(JointMove(self._doubles(0), *self._pace())),
             2: lambda: self._move_to_pose(),
             3: lambda: self._move(self._line(self._doubles(0))),
             4: lambda: self._move(self._line(self.pose(self._doubles(0)))),
+            6: self._force_mode,
+            7: lambda: self._stop(asynchronous=False),
             8: self._zero_force,
+            12: lambda: self._servo(self._inverse(self._doubles(0), self.cell.q_d)),
+            18: lambda: self._freedrive(True),
+            19: lambda: self._freedrive(False),
+            52: lambda: self._freedrive(True),
+            53: lambda: self._freedrive(False),
+            54: lambda: self._answer_int(0 if self._freedriving else 1),
             9: lambda: self._go(Speed(self._doubles(0), self._double(6))),
             10: lambda: self._go(Speed(self._doubles(0), self._double(6), self.cell)),
             11: lambda: self._servo(self._doubles(0)),
@@ -126,8 +159,7 @@ class UrProgram:
         if command in actions:
             actions[command]()
         elif command not in _IGNORED:
-            print(f"the twin does not simulate ur-rtde's command {command}; program ended")
-            self.end()
+            print(f"the twin does not simulate ur-rtde's command {command}: it does nothing")
 
     def end(self) -> None:
         """The program ends; the arm comes to rest."""
@@ -146,6 +178,19 @@ class UrProgram:
         lookahead = min(max(self._double(9), 0.03), 0.2)
         self._go(Servo(UR5E.hardware.velocity, goal, lookahead))
 
+    def _force_mode(self) -> None:
+        """In the base's axes; a task frame that is turned counts as unturned."""
+        free = np.array([self._int(i) for i in range(2, 8)]) != 0
+        limits = np.abs(self._doubles(12))
+        self._go(Force(self.cell, free, self._doubles(6), limits, self._wrench))
+
+    def _freedrive(self, on: bool) -> None:
+        self._freedriving = on
+        if on:
+            self._go(Freedrive(self.cell))
+        else:
+            self.activity = Stop(_END_OF_FREEDRIVE)
+
     def _move(self, activity: Activity) -> None:
         self.activity = activity
         if self._int(1) == 1:
@@ -157,7 +202,7 @@ class UrProgram:
 
     def _move_to_pose(self) -> None:
         q = self._inverse(self._doubles(0), self.cell.q_d)
-        self._move(JointMove(q, self._double(6), self._double(7)))
+        self._move(JointMove(q, *self._pace()))
 
     def _stop(self, asynchronous: bool) -> None:
         self._asynchronous, self.ints[2] = False, self._started << 24
@@ -168,7 +213,8 @@ class UrProgram:
         self.watchdog = 1 / self._double(0) if self._double(0) > 0 else np.inf
 
     def _set_tcp(self) -> None:
-        self.tcp = self._doubles(0)
+        if (np.abs(self._doubles(0)) < _LONGEST_TOOL).all():
+            self.tcp = self._doubles(0)
 
     def _forward(self) -> None:
         kept, self.tcp = self.tcp, self._doubles(6)
@@ -188,12 +234,14 @@ class UrProgram:
 
     def _line(self, pose: Pose) -> LineMove:
         R = rotation_matrix(pose[3:]) @ rotation_matrix(self.tcp[3:]).T
-        speed, acceleration = self._double(6), self._double(7)
-        return LineMove(self.cell, self._offset(), pose[:3], R, speed, acceleration)
+        return LineMove(self.cell, self._offset(), pose[:3], R, *self._pace())
 
     def _inverse(self, pose: Pose, near: np.ndarray) -> Float[np.ndarray, "6"]:
         """Joint positions, by the nearest way; without a solution a UR stops its program."""
         position, R = self._target(pose)
+        if not (np.abs(position) < 2 * _REACH).all() or not np.isfinite(R).all():
+            self._protective_stop()
+            return self.cell.q_d.copy()
         solution = self._kinematics.solve_ik_near(position, R, near, posture=0.0)
         if not solution.reached:
             print("the twin's UR found no inverse kinematics; protective stop")
@@ -207,6 +255,10 @@ class UrProgram:
 
     # Registers.
 
+    def _pace(self) -> tuple[float, float]:
+        """Speed and acceleration of a move, inside what ur-rtde lets through."""
+        return tuple(float(np.clip(self._double(i), *_PACE)) for i in (6, 7))  # pyright: ignore
+
     def _int(self, index: int) -> int:
         return int(self.inputs[f"input_int_register_{index}"])
 
@@ -218,6 +270,9 @@ class UrProgram:
 
     def _answer(self, numbers) -> None:
         self.doubles[: len(numbers)] = [float(number) for number in numbers]
+
+    def _answer_int(self, number: int) -> None:
+        self.ints[1] = number
 
     def _answer_bool(self, yes: bool) -> None:
         self.ints[1] = int(yes)
