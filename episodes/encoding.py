@@ -9,6 +9,7 @@ so that everything under meta/ can be made again from the data files alone.
 
 import io
 import json
+import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,6 +37,7 @@ from touchgoal.episodes.schema import (
 # Frames a row group: reading one window of touch reads a few groups, not the whole episode.
 FRAMES_PER_ROW_GROUP = 32
 _FOOTER_KEY = b"touchgoal"
+_MOST_PIXELS = 50_000_000
 # Measured on noisy 320 x 240 touch: 3.6 ms and 90 kB a frame; OpenCV's default filter 8.1 ms and
 # 110 kB, PIL at compress_level 1 11.0 ms and 114 kB.
 _PNG = [
@@ -123,7 +125,10 @@ def encode_png(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
 
 def decode_png(png: bytes) -> UInt8[np.ndarray, "h w 3"]:
     """The RGB picture of a PNG file."""
-    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    width, height = struct.unpack(">II", png[16:24].ljust(8, b"\0"))
+    image = None
+    if 0 < width * height <= _MOST_PIXELS:  # a few bytes may unpack to gigabytes
+        image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise UserError("a picture in the data file is no readable PNG")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
@@ -162,7 +167,9 @@ def data_file(encoded: EncodedEpisode, indices: dict[str, Shaped[np.ndarray, " n
 def write_table(table: pa.Table, description: Description) -> bytes:
     """A Parquet file of frames: with a checksum on every page."""
     footer = {_FOOTER_KEY: json.dumps(vars(description)).encode()}
-    table = table.replace_schema_metadata(footer)
+    # Read back, the elements of a list have another name: the same content is to make the same bytes.
+    columns = {name: _as_encoded(table[name].combine_chunks()) for name in table.column_names}
+    table = pa.table(columns).replace_schema_metadata(footer)
     file = io.BytesIO()
     pq.write_table(
         table,
@@ -174,6 +181,12 @@ def write_table(table: pa.Table, description: Description) -> bytes:
         write_page_checksum=True,
     )
     return file.getvalue()
+
+
+def _as_encoded(column: pa.Array) -> pa.Array:
+    if not pa.types.is_fixed_size_list(column.type):
+        return column
+    return pa.FixedSizeListArray.from_arrays(column.flatten(), column.type.list_size)
 
 
 def has_description(file: pq.ParquetFile) -> bool:
@@ -189,7 +202,10 @@ def read_description(file: pq.ParquetFile) -> Description:
     """
     if not has_description(file):
         raise UserError("this Parquet file was not written by touchgoal")
-    return Description(**json.loads(file.schema_arrow.metadata[_FOOTER_KEY]))
+    try:
+        return Description(**json.loads(file.schema_arrow.metadata[_FOOTER_KEY]))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise UserError("the description in this Parquet file is damaged") from error
 
 
 def _to_arrow(key: str, column: Shaped[np.ndarray, "n d"] | list[bytes]) -> pa.Array:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import av
 import av.error
-import cv2
 import numpy as np
 from av.video.reformatter import VideoReformatter
 from jaxtyping import UInt8
 
 from touchgoal.control.errors import UserError
+from touchgoal.control.picture_file import read_picture
 
 # Every second frame is a key frame, so that one frame is found by decoding at most two.
 KEY_FRAME_INTERVAL = 2
@@ -128,10 +128,10 @@ def _read_folder(folder: Path) -> UInt8[np.ndarray, "n h w 3"]:
         raise UserError(f"{folder} holds no picture ({', '.join(sorted(_PICTURES))})")
     frames = []
     for path in sorted(paths, key=lambda path: _natural_order(path.name)):
-        picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        picture = read_picture(path)
         if picture is None:
             raise UserError(f"{path} is no readable picture: remove or replace it")
-        frames.append(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+        frames.append(picture)
     return _stack_equal_sizes(folder, frames)
 
 

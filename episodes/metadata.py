@@ -245,6 +245,9 @@ def read_video(root: Path, name: str, crc32: int) -> bytes:
     return video
 
 
+_NEEDED = "fps", "features", "total_episodes", "total_frames", "total_tasks"
+
+
 def load_info(root: Path) -> dict[str, Any]:
     """Reads meta/info.json.
 
@@ -258,6 +261,10 @@ def load_info(root: Path) -> dict[str, Any]:
         )
     info = load_json(root, INFO)
     check_version(root, info)
+    if missing := [key for key in _NEEDED if key not in info]:
+        raise UserError(
+            f"{root / INFO} is corrupt (it has no {missing[0]}): {repair_command(root)}"
+        )
     return info
 
 
@@ -274,7 +281,7 @@ def load_json(root: Path, name: str) -> dict[str, Any]:
     """Reads a JSON file of a set; UserError names it if it is missing or broken."""
     try:
         return json.loads((root / name).read_bytes())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise unreadable(root, name, error) from error
 
 
@@ -391,8 +398,16 @@ def _tasks_table(tasks: tuple[str, ...]) -> pa.Table:
 
 def _parquet(table: pa.Table | None) -> bytes:
     file = io.BytesIO()
+    if table is not None:
+        # Read back, a list's elements have another name: the same content is to make the same bytes.
+        kinds = [pa.field(f.name, _as_made(f.type)) for f in table.schema]
+        table = table.cast(pa.schema(kinds, metadata=table.schema.metadata))
     pq.write_table(table, file, write_page_checksum=True)
     return file.getvalue()
+
+
+def _as_made(kind: pa.DataType) -> pa.DataType:
+    return pa.list_(_as_made(kind.value_type)) if pa.types.is_list(kind) else kind
 
 
 def _json(value: Any) -> bytes:

@@ -1,7 +1,10 @@
 """Whether a set of episodes is sound, and making it sound again after a crash or damage."""
 
+import io
 import itertools
 import os
+import re
+import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -25,6 +28,7 @@ from touchgoal.episodes.metadata import SetMetadata
 REPAIRED = "repaired"
 _FOLDERS = ("data", "videos", "meta")
 _META = (metadata.INFO, metadata.EPISODES, metadata.TASKS, metadata.STATS)
+_WRITER = re.compile(r"parquet-cpp-arrow version \d+\.\d+\.\d+")
 _DATA_FILES = "chunk-[0-9][0-9][0-9]/file-[0-9][0-9][0-9].parquet"
 
 
@@ -77,7 +81,7 @@ def _read_episode(root: Path, file_number: int) -> tuple[Description, pa.Table]:
     try:
         with pq.ParquetFile(root / name, page_checksum_verification=True) as file:
             description, table = read_description(file), file.read()
-    except (OSError, pa.ArrowException) as error:
+    except (OSError, pa.ArrowException, UserError) as error:
         raise metadata.unreadable(root, name, error) from error
     for key, crc32 in description.video_crc32.items():
         metadata.read_video(root, metadata.video_path(key, file_number), crc32)
@@ -120,21 +124,66 @@ def validate(root: str | os.PathLike[str]) -> list[str]:
     except UserError as error:
         return [str(error)]
     problems = contradictions_in_meta(root, set_metadata)
-    rebuilt = SetMetadata(set_metadata.fps, set_metadata.features)
+    rebuilt: SetMetadata | None = None
     for file_number in track(_file_numbers(set_metadata), "checking", "file"):
         try:
             description, table = _read_episode(root, file_number)
+            rebuilt = rebuilt or SetMetadata(description.fps, description.features)
             if differing := _wrong_index_columns(table, rebuilt.index_columns_for(description)):
                 name = root / metadata.data_path(file_number)
                 problems.append(
                     f"{name} has wrong {', '.join(differing)}: {metadata.repair_command(root)}"
                 )
+            name = root / metadata.data_path(file_number)
+            same_features = description.features == rebuilt.features
+            if not (same_features and _is_as_written(name, table, description)):
+                problems.append(_altered(root, metadata.data_path(file_number)))
             rebuilt = rebuilt.with_episode(description, file_number)
         except UserError as error:
             problems.append(str(error))
+    if not problems and rebuilt is not None:
+        problems += _altered_meta(root, rebuilt)
     return problems + [
         f"{root / n} belongs to no episode" for n in unlisted_files(root, set_metadata)
     ]
+
+
+def _altered(root: Path, name: str) -> str:
+    return f"{root / name} is not as it was written: {metadata.repair_command(root)}"
+
+
+def _is_as_written(path: Path, table: pa.Table, description: Description) -> bool:
+    """Whether a data file has the bytes that its content makes: its footer has no checksum."""
+    return _same_parquet(path.read_bytes(), write_table(table, description))
+
+
+def _altered_meta(root: Path, rebuilt: SetMetadata) -> list[str]:
+    """The files under meta/ that are not what the data files make them."""
+    problems = []
+    with tempfile.TemporaryDirectory() as made:
+        rebuilt.write(Path(made))
+        for name in _META:
+            there, expected = (root / name).read_bytes(), (Path(made) / name).read_bytes()
+            same = _same_parquet if name.endswith(".parquet") else bytes.__eq__
+            if not same(there, expected):
+                problems.append(_altered(root, name))
+    return problems
+
+
+def _same_parquet(there: bytes, made: bytes) -> bool:
+    """Whether the bytes agree; of a file that another release of pyarrow wrote, whether the content does."""
+    if there == made:
+        return True
+    try:
+        with (
+            pq.ParquetFile(io.BytesIO(there)) as first,
+            pq.ParquetFile(io.BytesIO(made)) as second,
+        ):
+            writers = first.metadata.created_by, second.metadata.created_by
+            elsewhere = writers[0] != writers[1] and bool(_WRITER.fullmatch(writers[0]))
+            return elsewhere and first.read().equals(second.read(), check_metadata=True)
+    except (OSError, pa.ArrowException):
+        return False
 
 
 def repair(root: str | os.PathLike[str]) -> list[str]:

@@ -89,7 +89,13 @@ class PictureFile:
                 return np.asarray(picture.convert("RGB"))[None]
         except FileNotFoundError:
             raise UserError(f"goal picture {self.path} does not exist") from None
-        except (UnidentifiedImageError, OSError):
+        except (
+            UnidentifiedImageError,
+            OSError,
+            ValueError,
+            SyntaxError,
+            Image.DecompressionBombError,
+        ):
             raise UserError(f"goal picture {self.path} cannot be read as an image") from None
 
 

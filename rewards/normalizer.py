@@ -158,5 +158,5 @@ class DistanceNormalizer:
             if content.keys() != {f.name for f in fields(cls)}:
                 raise ValueError
             return cls(**content | {"source": EmbeddingSource(**content["source"])})
-        except (ValueError, AttributeError, TypeError):
+        except (ValueError, RecursionError, AttributeError, TypeError):
             raise UserError(f"{path} is not a scale: make one with touchgoal fit-scale") from None

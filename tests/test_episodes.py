@@ -5,9 +5,11 @@ import pickle
 import random
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import time
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +19,11 @@ import pytest
 from PIL import Image
 
 from touchgoal.control import features as ft
+from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.errors import UserError
 from touchgoal.episodes import metadata, statistics
-from touchgoal.episodes.encoding import encode
-from touchgoal.episodes.media import write_video
+from touchgoal.episodes.encoding import decode_png, encode
+from touchgoal.episodes.media import read_frames, write_video
 from touchgoal.episodes.repair import repair, validate
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
@@ -403,6 +406,67 @@ def test_damaged_metadata_is_made_again(small: Path, name: str, harm) -> None:
     assert repair(small)
     assert validate(small) == []
     assert {path: path.read_bytes() for path in before} == before
+
+
+FILES = (
+    metadata.INFO,
+    metadata.EPISODES,
+    metadata.TASKS,
+    metadata.STATS,
+    metadata.data_path(1),
+    metadata.video_path(ft.WRIST, 1),
+)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_flipped_byte_anywhere_is_noticed(small: Path, name: str) -> None:
+    """Footers and JSON have no checksum: they are compared with what the data files make them."""
+    whole, rng = (small / name).read_bytes(), np.random.default_rng(0)
+    writer = whole.rfind(b"parquet-cpp-arrow version ")  # another release may have written it
+    unnoticed = []
+    for place in rng.integers(0, len(whole), 40):
+        if writer >= 0 and writer <= place < writer + 40:
+            continue
+        data = bytearray(whole)
+        data[place] ^= 1 << int(rng.integers(8))
+        (small / name).write_bytes(bytes(data))
+        try:
+            if not validate(small):
+                unnoticed.append(int(place))
+        except UserError:
+            pass
+    assert unnoticed == []
+
+
+def test_statistics_that_are_none_of_the_frames_are_noticed(small: Path) -> None:
+    stats = json.loads((small / metadata.STATS).read_text())
+    stats[ft.STATE]["mean"] = [999.0] * 15
+    stats[ft.STATE]["std"] = [0.0] * 15
+    (small / metadata.STATS).write_text(json.dumps(stats))
+    assert any(metadata.STATS in problem for problem in validate(small))
+    assert repair(small) and validate(small) == []
+
+
+def test_pictures_and_json_that_are_traps_are_one_line(tmp_path: Path, small: Path) -> None:
+    """A PNG of 50,000 squared in 60 bytes, lengths that cannot be, JSON a hundred thousand deep."""
+    chunk = b"IHDR" + struct.pack(">IIBBBBB", 50_000, 50_000, 8, 2, 0, 0, 0)
+    bomb = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk
+    bomb += struct.pack(">I", zlib.crc32(chunk))
+    (tmp_path / "0.png").write_bytes(bomb)
+    with pytest.raises(UserError, match="pixels|readable"):
+        read_frames(tmp_path)
+    with pytest.raises(UserError, match="no readable PNG"):
+        decode_png(bomb)
+    for rubbish in (b"", b"\x89PNG", bomb[:20]):
+        with pytest.raises(UserError):
+            decode_png(rubbish)
+    (small / metadata.INFO).write_text("[" * 100_000)
+    with pytest.raises(UserError, match="corrupt"):
+        EpisodeSet(small)
+    deep = tmp_path / "cell.json"
+    deep.write_text('{"a":' * 100_000)
+    with pytest.raises(UserError, match="no JSON"):
+        read_cell_file(deep)
 
 
 class Killed(BaseException):

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int, UInt8
 from touchgoal.control.calibration.circles import find_circle
 from touchgoal.control.calibration.light_drift import without_drift
 from touchgoal.control.errors import UserError
+from touchgoal.control.picture_file import read_picture
 
 COLUMNS = ("file", "x_px", "y_px", "radius_px", "ball_mm")
 _NEEDED = ("file",)
@@ -149,11 +150,11 @@ def _number(text: str | None) -> float:
 
 
 def _read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
+    image = read_picture(path)
     if image is None:
         raise UserError(f"{path} is missing or no picture: a folder of presses needs "
                         "background.png, presses.csv and the pictures it names")  # fmt: skip
-    return np.ascontiguousarray(image[..., ::-1])
+    return image
 
 
 def _check_circle(

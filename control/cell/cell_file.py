@@ -31,7 +31,12 @@ def read_cell_file(path: Path, policy: str = "") -> CellConfig:
         table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
     except OSError as error:
         raise UserError(f"cannot read the cell file {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (
+        tomllib.TOMLDecodeError,
+        json.JSONDecodeError,
+        UnicodeDecodeError,
+        RecursionError,
+    ) as error:
         form = "JSON" if path.suffix == ".json" else "TOML"
         raise UserError(f"{path} is no {form}: {error}") from error
     try:

@@ -29,6 +29,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from touchgoal.control.errors import UserError
+from touchgoal.control.picture_file import read_picture
 from touchgoal.control.tactile import gel
 
 N_FEATURES = 10
@@ -198,7 +199,7 @@ def load(folder: Path) -> SensorCalibration:
     """
     description = _read_description(folder)
     path = folder / _JSON
-    image = cv2.imread(str(folder / _BACKGROUND), cv2.IMREAD_COLOR)
+    image = read_picture(folder / _BACKGROUND)
     if image is None:
         raise UserError(f"{folder / _BACKGROUND} is missing or no picture: {_MAKE}")
     if list(image.shape[:2]) != description.get("image_shape"):
@@ -227,8 +228,7 @@ def load(folder: Path) -> SensorCalibration:
     ):
         if not values[name] > 0:
             raise UserError(f"{path}: {name} must be positive, not {values[name]}: {_MAKE}")
-    background = np.ascontiguousarray(image[..., ::-1])
-    return SensorCalibration(background=background, **values)
+    return SensorCalibration(background=image, **values)
 
 
 def read_provenance(folder: Path) -> dict[str, Any]:
@@ -243,7 +243,7 @@ def _read_description(folder: Path) -> dict[str, Any]:
     try:
         description = json.loads(path.read_text())
         version, _ = description["format"], description["provenance"]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise UserError(f"{path} is no sensor file: {_MAKE}") from error
     if version == _WITHOUT_LIGHT_POWER:
         description.setdefault("light_power", 1.0)

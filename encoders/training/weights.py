@@ -65,7 +65,7 @@ class WeightsFormat:
         try:
             description = json.loads(path.read_text())
             version = description["format"]
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise UserError(f"{path} is damaged: {self.remedy}") from error
         if version != FORMAT:
             raise UserError(

@@ -1,0 +1,51 @@
+"""Pictures from files that somebody else made: whatever is in them, a picture or one line."""
+
+import io
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from touchgoal.control.errors import UserError
+
+_MOST_PIXELS = 50_000_000  # a small file may unpack to gigabytes
+
+
+def read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"] | None:
+    """The RGB picture of a file; None if there is none or it cannot be read.
+
+    Raises:
+        UserError: it has more than 50 million pixels.
+    """
+    try:
+        return decode_picture(path.read_bytes(), str(path))
+    except OSError:
+        return None
+
+
+def decode_picture(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"] | None:
+    """As `read_picture`, from bytes; `name` is for the message."""
+    if not data:
+        return None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data)) as picture:  # reads the header alone
+                width, height = picture.size
+        too_large = width * height > _MOST_PIXELS
+    except Image.DecompressionBombError:
+        width = height = 0
+        too_large = True
+    except (OSError, ValueError, SyntaxError):
+        return None
+    if too_large:
+        size = f"{width} x {height} pixels" if width else "far too many pixels"
+        raise UserError(f"{name} has {size}: make it smaller than {_MOST_PIXELS / 1e6:.0f} million")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error:
+        return None
+    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
