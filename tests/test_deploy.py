@@ -1,10 +1,12 @@
 """Deploying: on the twin through libfranka over the wire, on a simulated arm, and with faults."""
 
 import json
+import os
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -130,6 +132,50 @@ def test_a_simulated_arm_reaches_the_same_outcome(
     assert said["success"] and meta["arm"] == "sim" and meta["success"] is True
     printed = capsys.readouterr().out
     assert "the hand still holds something" in printed and "task: done" in printed
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 1.5 MB."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1536k", "tmpfs", str(disk)]
+    if subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("only root may mount a small disk")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_a_disk_that_fills_up_costs_one_episode_and_is_said_in_a_line(
+    small_disk: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Through the command, on a real file system: the table is there, earlier episodes are whole."""
+    monkeypatch.setattr("touchgoal.policies.deploy.preflight._MIN_FREE_BYTES", 0)
+    cell = write_cell_file(tmp_path, SIM.replace("seed = 3", "seed = 3, seconds = 0.4"))
+    arguments = ["deploy", cell, "--execute", "--yes", "--out", small_disk / "run"]
+    with pytest.raises(SystemExit):
+        run(*arguments)  # not done: time is up; kept
+    full = small_disk / "full"
+    with full.open("wb", buffering=0) as file, suppress(OSError):
+        while True:
+            file.write(bytes(4096))
+    with pytest.raises(SystemExit, match="cannot write into the folder of this run"):
+        run(*arguments)  # full before anything has moved
+    os.truncate(full, full.stat().st_size - 24_000)  # what the run's own notes take
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as ended:
+        run(*arguments)
+    said = capsys.readouterr()
+    assert "ticks of the control loop" in said.out and "ended: time is up" in said.out
+    assert "could not be kept" in f"{ended.value.code}{said.err}"
+    full.unlink()
+    assert len(EpisodeSet(small_disk / "run" / "episodes")) == 1
+    assert not any(
+        "belongs to no" not in line for line in validate(small_disk / "run" / "episodes")
+    )
 
 
 def test_a_dry_run_moves_and_records_nothing(tmp_path: Path) -> None:

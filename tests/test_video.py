@@ -50,7 +50,9 @@ class Streamer(ThreadingHTTPServer):
     def __init__(self, port: int = 0) -> None:
         super().__init__(("127.0.0.1", port), _Stream)
         self.count, self.stalled, self.frozen, self.shut = 0, False, False, False
-        self.picture, self.damage = numbered, bytes  # what is drawn, and done to the JPEG
+        # What is drawn, and done to the JPEG.
+        self.picture: Callable[[int], np.ndarray] = numbered
+        self.damage: Callable[[bytes], bytes] = bytes
         threading.Thread(target=self.serve_forever, args=(0.01,), daemon=True).start()
         threading.Thread(target=self._count, daemon=True).start()
         self.url = f"http://127.0.0.1:{self.server_port}/stream.mjpg"
@@ -194,8 +196,8 @@ def test_broken_jpegs_of_a_gel_are_refused_and_presses_of_a_real_one_are_not() -
     assert passed <= 5  # in 100 with visible damage; without the checks it is half
     assert all(not is_broken_gel(noisy(k, 3.0), noisy(1000)) for k in range(20))
     real = sorted(Path("/work/shared/data/mini_presses").glob("ball*.png"))
-    pictures = [cv2.imread(str(path)) for path in real]
-    assert not any(is_broken_gel(p, pictures[0]) for p in pictures if p is not None)
+    pictures = [p for path in real if (p := cv2.imread(str(path))) is not None]
+    assert not any(is_broken_gel(p, pictures[0]) for p in pictures)
 
 
 def test_a_lost_stream_is_joined_again(streamer: Streamer) -> None:

@@ -2,6 +2,7 @@
 
 import av
 import numpy as np
+from av.error import FFmpegError
 from jaxtyping import Bool, Float32, UInt8
 
 Picture = UInt8[np.ndarray, "h w 3"]
@@ -30,7 +31,7 @@ class JpegDecoder:
         """RGB picture; None if anything about it is broken, such as a cut end."""
         try:
             frames = self._codec.decode(av.Packet(data))
-        except av.FFmpegError:
+        except FFmpegError:
             return None
         if not frames or frames[0].is_corrupt:
             return None

@@ -49,7 +49,12 @@ def run_command(config: Config) -> None:
     cell = _read(config)
     policy, cost = load_cell_policy(cell), _load_cost(cell)
     check_client(cell)
-    out = open_run(config.out, "deploy", config, adds=True)
+    try:
+        out = open_run(config.out, "deploy", config, adds=True)
+    except OSError as error:
+        raise UserError(
+            f"cannot write into the folder of this run ({error.strerror}): give another --out"
+        ) from error
     print(_summary(cell, config), flush=True)
     if cell.task.twin and cell.arm != "sim":
         put_scene_back(cell.task.twin, cell.task.seed)
@@ -203,7 +208,11 @@ def _report(result: Result, out: Path) -> None:
         "force_max_newtons": float(max(forces, default=0.0)),
         "clamped": log.limit_counts,
     }
-    write_json(out / "metrics.json", numbers)
+    unwritten = ""
+    try:
+        write_json(out / "metrics.json", numbers)
+    except OSError as error:  # the table is printed all the same
+        unwritten = f"metrics.json could not be written ({error.strerror}): make room on the disk"
     clamped = ", ".join(f"{name} {n}" for name, n in log.limit_counts.items()) or "never"
     print(f"{len(log.rows)} ticks of the control loop; 99 % began at most {numbers['late_p99_ms']:.1f} ms late, "
           f"95 % were answered within {numbers['answered_p95_ms']:.1f} ms")  # fmt: skip
@@ -221,16 +230,18 @@ def _report(result: Result, out: Path) -> None:
     verdict = {True: "done", False: "not done", None: "nobody can tell whether it is done"}
     if not ending.stopped and (result.episode is not None or result.success is not None):
         print(f"task: {verdict[result.success]}")
-    _exit(result)
+    _exit(result, unwritten)
 
 
-def _exit(result: Result) -> None:
+def _exit(result: Result, unwritten: str) -> None:
     """Status and one line on stderr, unless all is well."""
+    lost = "; ".join(part for part in (result.recording_error, unwritten) if part)
     if result.ending.stopped:
-        print(f"touchgoal deploy: stopped: {result.ending.reason}", file=sys.stderr)
+        also = f"; {lost}" if lost else ""
+        print(f"touchgoal deploy: stopped: {result.ending.reason}{also}", file=sys.stderr)
         sys.exit(STOPPED)
-    if result.recording_error:
-        raise UserError(result.recording_error)
+    if lost:
+        raise UserError(lost)
     if result.success is False:
         print("touchgoal deploy: the task is not done", file=sys.stderr)
         sys.exit(NOT_DONE)

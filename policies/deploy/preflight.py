@@ -84,7 +84,7 @@ def _run_checks(checks: list[tuple[str, Callable[[], str]]]) -> Iterator[CheckRe
     for what, check in checks:
         try:
             yield CheckResult(what, True, check())
-        except (UserError, DriverError) as error:
+        except (UserError, DriverError, OSError) as error:  # such as a disk that takes no file
             yield CheckResult(what, False, "", str(error))
 
 

@@ -102,7 +102,7 @@ class Session:
         if self.execute and log.rows:
             try:
                 episode = self._record(log, ending, success)
-            except (OSError, UserError) as error:
+            except (OSError, UserError, MemoryError) as error:
                 recording_error = (
                     f"this episode could not be kept ({error}); those before it are whole"
                 )

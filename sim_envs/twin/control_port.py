@@ -135,7 +135,10 @@ class ControlPort:
             raise UserError("the arm moves; stop it first")
         if self._arm.driven:
             raise UserError("another program drives the arm; end that first")
-        self._cell.reset(int(seed), json.loads(options))
+        number, chosen = int(seed), json.loads(options)
+        if not 0 <= number < 2**63 or not isinstance(chosen, dict):
+            raise UserError("a seed is a number from 0, options are a JSON object")
+        self._cell.reset(number, chosen)
         self._arm.clear_error()
 
     def _freeze(self, seconds: float) -> None:
