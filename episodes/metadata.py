@@ -5,7 +5,6 @@ episode's fact NAME (plain scalar or list of strings) and `videos/KEY/crc32` for
 its video.
 """
 
-import io
 import json
 import os
 import sys
@@ -19,6 +18,7 @@ import pyarrow.parquet as pq
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import FEATURES
+from touchgoal.episodes.bytes_on_disk import json_bytes, parquet_bytes
 from touchgoal.episodes.encoding import Description, index_columns
 from touchgoal.episodes.schema import INDEX_DTYPES
 from touchgoal.episodes.statistics import Stats, array_statistics, merge
@@ -193,10 +193,10 @@ class SetMetadata:
 
     def write(self, root: Path) -> None:
         """Writes all of meta/, each file at once and info.json, which commits, last."""
-        write_file(root / EPISODES, _parquet(self.episodes))
-        write_file(root / STATS, _json(self.stats))
-        write_file(root / TASKS, _parquet(_tasks_table(self.tasks)))
-        write_file(root / INFO, _json(self._info()))
+        write_file(root / EPISODES, parquet_bytes(self.episodes))
+        write_file(root / STATS, json_bytes(self.stats))
+        write_file(root / TASKS, parquet_bytes(_tasks_table(self.tasks)))
+        write_file(root / INFO, json_bytes(self._info()))
 
     def _info(self) -> dict[str, Any]:
         last = last_row(self.episodes)
@@ -394,21 +394,3 @@ def _tasks_table(tasks: tuple[str, ...]) -> pa.Table:
         "pandas_version": "2.0.0",
     }
     return table.replace_schema_metadata({b"pandas": json.dumps(pandas).encode()})
-
-
-def _parquet(table: pa.Table | None) -> bytes:
-    file = io.BytesIO()
-    if table is not None:
-        # Read back, a list's elements have another name: the same content is to make the same bytes.
-        kinds = [pa.field(f.name, _as_made(f.type)) for f in table.schema]
-        table = table.cast(pa.schema(kinds, metadata=table.schema.metadata))
-    pq.write_table(table, file, write_page_checksum=True)
-    return file.getvalue()
-
-
-def _as_made(kind: pa.DataType) -> pa.DataType:
-    return pa.list_(_as_made(kind.value_type)) if pa.types.is_list(kind) else kind
-
-
-def _json(value: Any) -> bytes:
-    return json.dumps(value, indent=1, allow_nan=False).encode()

@@ -249,3 +249,12 @@ def test_the_robotiq_bears_a_garbled_answer_and_says_faults(line: tuple[int, str
     with pytest.raises(DriverError, match="gripper"):
         until(lambda: gripper.read().width > 1)
     gripper.close()
+
+
+def test_a_load_cell_whose_controller_restarts_is_heard_again_and_one_old_line_is_not() -> None:
+    cell = SerialLoadCell.__new__(SerialLoadCell)
+    cell._clock, cell._last, cell._behind = -np.inf, -np.inf, 0
+    taken = [cell._clock_advances(Sample(0.0, float(t))) for t in [*range(100, 120), 50, 120, 121]]
+    assert taken == [True] * 20 + [False, True, True]
+    again = [cell._clock_advances(Sample(0.0, float(t))) for t in range(30)]
+    assert not any(again[:10]) and all(again[11:])

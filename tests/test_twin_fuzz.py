@@ -170,8 +170,9 @@ def test_random_packets_neither_end_the_twin_nor_make_it_grow(twin: Twin) -> Non
                 arm.stop_button(False)  # pyright: ignore
     assert np.isfinite(cell.q).all() and not any(w.number for w in cell.env.data.warning)
     assert cell.worst.excess <= 0.01 and grown() - before < MAY_GROW
-    for fuzzer in {getattr(f, "__self__", None) for f in fuzzers} - {None}:
-        fuzzer.close()
+    for fuzzer in fuzzers:
+        if isinstance(owner := getattr(fuzzer, "__self__", None), Fuzzer):
+            owner.close()
     for _ in range(5000):
         twin.step()
     arm.clear_error()  # pyright: ignore

@@ -24,6 +24,7 @@ from touchgoal.control.sensors.serial_port import modbus_crc, open_port
 Checksum = Literal["none", "xor", "crc16"]
 
 _MAX_LINE_LENGTH = 256  # bytes of a line
+_RESTARTED = 10  # lines with a clock that goes forwards, but behind the newest, that mean a restart
 
 
 @pydantic.dataclasses.dataclass(frozen=True, config=STRICT)
@@ -94,6 +95,7 @@ class SerialLoadCell:
         self.config = config
         self._port = open_port(config.port, config.baud, timeout=0.2)
         self._buffer, self._clock, self._rejected = b"", -math.inf, 0
+        self._last, self._behind = -math.inf, 0  # clock of the last line; lines behind the newest
         self._at_line_start = False  # whether the buffer starts at a line's start
         self._latest = LatestValue(f"load cell {config.port}", self._take)
 
@@ -127,5 +129,10 @@ class SerialLoadCell:
         """Whether the device's clock has advanced, if it has one."""
         if sample.clock is None:
             return True
-        before, self._clock = self._clock, max(self._clock, sample.clock)
+        before, last, self._last = self._clock, self._last, sample.clock
+        # Behind what it was, line by line forwards: the microcontroller has begun anew.
+        self._behind = self._behind + 1 if last < sample.clock <= before else 0
+        if self._behind >= _RESTARTED:
+            before = self._clock = last
+        self._clock = max(self._clock, sample.clock)
         return sample.clock > before

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from touchgoal.control import features as ft
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down
+from touchgoal.control.motion.self_collision import SelfDistance, require_no_self_collision
 from touchgoal.control.motion.trajectories import (
     Trajectory,
     joint_move,
@@ -128,11 +129,12 @@ def start_move(
 ) -> ScriptedActor:
     """Slowly to a posture (rad), the gripper staying at `width` (m).
 
-    UserError if the way leaves the workspace.
+    UserError if the way leaves the workspace, or leads the arm into itself.
     """
     limits = safety.joints.scaled(_START_SPEED_SHARE, _START_SPEED_SHARE)
     path = joint_move(commanded(), goal, limits)
     require_inside_workspace(path, safety)
+    require_no_self_collision(path, SelfDistance(safety.limits.arm))
     return ScriptedActor([Segment(path, width, path.duration)], commanded, 1 / safety.dt)
 
 

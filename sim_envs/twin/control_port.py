@@ -12,6 +12,8 @@ for the truth.
     error NAME                    stop the arm with an error, such as cartesian_reflex
     nudge FX FY FZ SECONDS        push the hand, N in the base frame
     stall|repeat|lose NAME SECONDS  a camera or sensor sends nothing, one picture, cuts clients off
+    break|halve NAME SECONDS      its JPEGs come with wrong bytes, or cut in half
+    nonsense on|off               the arm says that its joints' speeds are not numbers
     garble NAME SHARE             a serial port's messages lose bytes
     unplug|plug NAME              a serial port
     kill                          end the twin's process at once, as kill -9 does
@@ -64,6 +66,9 @@ class FaultyArm(Protocol):
 
     def abort(self, error: str) -> None:
         """Stop with an error; UserError if there is none of that name."""
+
+    def set_nonsense(self, on: bool) -> None:
+        """Say that the joints' speeds are not numbers, or say them again."""
 
 
 class ControlPort:
@@ -118,6 +123,9 @@ class ControlPort:
             "stall": lambda: self._set_stream_fault("stalled", *rest.split()),
             "repeat": lambda: self._set_stream_fault("frozen", *rest.split()),
             "lose": lambda: self._set_stream_fault("lost", *rest.split()),
+            "break": lambda: self._set_stream_fault("broken", *rest.split()),
+            "halve": lambda: self._set_stream_fault("halved", *rest.split()),
+            "nonsense": lambda: self._arm.set_nonsense({"on": True, "off": False}[rest]),
             "garble": lambda: self._garble(*rest.split()),
             "unplug": lambda: self._ports[rest].unplug(),
             "plug": lambda: self._ports[rest].plug(),

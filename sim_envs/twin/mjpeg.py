@@ -17,6 +17,7 @@ from touchgoal.sim_envs.twin.cell import SimulatedCell
 CAMERA_RATE = 30  # Hz, a webcam's
 _CAMERA_NOISE = 1.5  # counts: by it a driver tells a still scene from a frozen camera
 _QUALITY = 95  # of JPEG; real GelSight Minis send MJPEG, too
+_JPEG_HEADER = 640  # bytes of OpenCV's
 _POLL_INTERVAL = 0.2  # s between looks at whether the stream is to end
 
 Picture = UInt8[np.ndarray, "h w 3"]
@@ -29,8 +30,8 @@ class Stream:
     Attributes:
         rate: Hz, simulated.
         render: takes a picture, RGB.
-        stalled, frozen, lost: until when (s, time.monotonic) nothing comes, one picture repeats, or
-            clients are cut off and turned away.
+        stalled, frozen, lost, broken, halved: until when (s, time.monotonic) nothing comes, one picture
+            repeats, clients are cut off and turned away, JPEGs have wrong bytes or are cut in half.
     """
 
     rate: int
@@ -38,6 +39,8 @@ class Stream:
     stalled: float = 0.0
     frozen: float = 0.0
     lost: float = 0.0
+    broken: float = 0.0
+    halved: float = 0.0
     clients: int = 0
     count: int = 0
     picture: Picture | None = None
@@ -117,6 +120,14 @@ class Streams:
         return self._cell.env.read_tactile(side).image
 
 
+def _with_random_bytes(jpeg: UInt8[np.ndarray, " n"]) -> UInt8[np.ndarray, " n"]:
+    """With 20 bytes of what follows the header replaced."""
+    rng, damaged = np.random.default_rng(), jpeg.copy()
+    places = rng.integers(_JPEG_HEADER, len(jpeg) - 2, 20)
+    damaged[places] = rng.integers(0, 256, 20)
+    return damaged
+
+
 def _is_due(steps: int, rate: int) -> bool:
     """Whether something at `rate` Hz is due in this millisecond."""
     return steps * rate // 1000 > (steps - 1) * rate // 1000
@@ -157,8 +168,13 @@ class _Handler(BaseHTTPRequestHandler):
                     continue
                 seen, picture = stream.count, stream.picture
             assert picture is not None
+            now = time.monotonic()
             bgr = np.ascontiguousarray(picture[..., ::-1])
             _, jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            if now < stream.halved:
+                jpeg = jpeg[: len(jpeg) // 2]
+            elif now < stream.broken:
+                jpeg = _with_random_bytes(jpeg)
             head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
             self.wfile.write(head.encode() + jpeg.tobytes() + b"\r\n")
 

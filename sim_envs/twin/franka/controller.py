@@ -24,17 +24,7 @@ from touchgoal.sim_envs.twin.franka.messages import MoveStatus, RobotCommand, Ro
 _MAX_LOST_PACKETS = 20  # packets in a row after which the arm stops: Franka's documentation
 _POSITION, _VELOCITY, _POSE, _TWIST, _TORQUE = range(5)  # motion generators; 4 is none
 _EXTERNAL, _OTHER = 2, 3  # controllers
-_SETTERS = {
-    RobotCommand.SET_COLLISION_BEHAVIOUR,
-    RobotCommand.SET_EE_TO_K,
-    RobotCommand.SET_NE_TO_EE,
-    RobotCommand.SET_LOAD,
-    # These change nothing here.
-    RobotCommand.SET_JOINT_IMPEDANCE,
-    RobotCommand.SET_CARTESIAN_IMPEDANCE,
-    RobotCommand.SET_GUIDING_MODE,
-}
-_BASE_ACCELERATION = 0.0, 0.0, -9.81  # m/s^2; robot_state.h: "hard-coded for now"
+_SETTERS = {*range(RobotCommand.SET_COLLISION_BEHAVIOUR, RobotCommand.SET_LOAD + 1)}
 _BRAKING = FR3.hardware.acceleration  # rad/s^2 of braking; a real reflex brakes harder
 
 Pose = Float[np.ndarray, "4 4"]
@@ -78,11 +68,12 @@ class FrankaArm:
         self._recovery: messages.Request | None = None
         self._cleared = False
         self._sent = self._echoed = 0
+        self._nonsense = False
         self._success_rate = 1.0
         self._thresholds = Thresholds.default()
         self._ee, self._k = np.eye(4), np.eye(4)  # NE_T_EE and EE_T_K
         self._state = np.zeros((), messages.ROBOT_STATE)
-        self._state["O_ddP_O"] = _BASE_ACCELERATION
+        self._state["O_ddP_O"] = 0.0, 0.0, -9.81  # robot_state.h: "hard-coded for now"
         self._reset_setpoint()
         self._describe_hand()
 
@@ -140,6 +131,10 @@ class FrankaArm:
     def freeze(self, frozen: bool) -> None:
         """Let nothing through in either direction, or let it through again."""
         self.link.frozen = self._hand.frozen = frozen
+
+    def set_nonsense(self, on: bool) -> None:
+        """Say that the joints' speeds are not numbers, or say them again."""
+        self._nonsense = on
 
     def drop(self) -> None:
         """Hang up on the client."""
@@ -319,7 +314,7 @@ class FrankaArm:
         if fault is not None:
             self.abort(fault)
             return
-        inverse = _pseudo_inverse(jacobian).T
+        inverse = limits.pseudo_inverse(jacobian).T
         step = inverse @ (DT * twist)
         if order["valid_elbow"]:
             null = np.eye(7) - inverse @ jacobian
@@ -362,13 +357,13 @@ class FrankaArm:
     def _estimate_wrench(self) -> limits.Contact:
         """Estimate the wrench from outside and judge it; joint torques say what it is."""
         pose, jacobian = self._pose_and_jacobian(self.cell.q)
-        self._pose, self._wrench = pose, _pseudo_inverse(jacobian) @ self.cell.tau_ext
+        self._pose, self._wrench = pose, limits.pseudo_inverse(jacobian) @ self.cell.tau_ext
         return self._thresholds.judge(self.cell.tau_ext, self._wrench, self._setpoint.ddq)
 
     def _send_state(self, contact: limits.Contact) -> None:
         cell, state, motion = self.cell, self._state, self._motion
         state["message_id"] = self._sent
-        state["q"], state["dq"] = cell.q, cell.dq
+        state["q"], state["dq"] = cell.q, np.nan if self._nonsense else cell.dq
         state["q_d"], state["dq_d"] = cell.q_d, cell.dq_d
         state["ddq_d"] = self._setpoint.ddq
         state["theta"], state["dtheta"] = cell.q, cell.dq
@@ -396,8 +391,3 @@ class FrankaArm:
         state["control_command_success_rate"] = self._success_rate if moving else 0.0
         self.link.send(state.tobytes())
         self._sent += 1
-
-
-def _pseudo_inverse(jacobian: Float[np.ndarray, "6 7"]) -> Float[np.ndarray, "6 7"]:
-    """Of J^T: joint torques to the wrench behind them; damped against singular poses."""
-    return np.linalg.solve(jacobian @ jacobian.T + 1e-8 * np.eye(6), jacobian)

@@ -146,3 +146,8 @@ class Thresholds:
             (wrench > low).astype(float),
             (wrench > high).astype(float),
         )
+
+
+def pseudo_inverse(jacobian: Float[np.ndarray, "6 7"]) -> Float[np.ndarray, "6 7"]:
+    """Of J^T: joint torques to the wrench behind them; damped against singular poses."""
+    return np.linalg.solve(jacobian @ jacobian.T + 1e-8 * np.eye(6), jacobian)

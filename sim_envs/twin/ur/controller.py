@@ -63,6 +63,7 @@ class UrController:
         self._stopped_at = self._last_input_at = 0.0
         self._clock = 0.0
         self._speed_fraction = 1.0
+        self._nonsense = False
         self._io = Outputs()
         self._felt, self._zero, self._wrench = np.zeros(6), np.zeros(6), np.zeros(6)
         self._program = self._new_program()
@@ -140,6 +141,10 @@ class UrController:
         if pressed:
             self._mode = _POWER_OFF
             self._program.end()
+
+    def set_nonsense(self, on: bool) -> None:
+        """Say that the joints' speeds are not numbers, or say them again."""
+        self._nonsense = on
 
     def drop(self) -> None:
         """Hang up on every RTDE client."""
@@ -332,7 +337,7 @@ _VARIABLES = {
     "target_q": lambda c, p, cell: cell.q_d,
     "target_qd": lambda c, p, cell: cell.dq_d,
     "actual_q": lambda c, p, cell: cell.q,
-    "actual_qd": lambda c, p, cell: cell.dq,
+    "actual_qd": lambda c, p, cell: np.full(6, np.nan) if c._nonsense else cell.dq,
     "target_moment": lambda c, p, cell: cell.joint_torque,
     "actual_TCP_pose": lambda c, p, cell: p.pose(cell.q),
     "target_TCP_pose": lambda c, p, cell: p.pose(cell.q_d),
