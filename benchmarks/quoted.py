@@ -72,7 +72,17 @@ def _realism(metrics: Metrics) -> str:
     )
 
 
+def _real_force(metrics: Metrics) -> str:
+    low, high = metrics["median_error_interval"]
+    return f"{metrics['median_error']:.1f} N (median; 95 % over things {low:.1f} to {high:.1f})"
+
+
 QUOTED = {
+    "real-force": Quoted(
+        "touchgoal benchmark real-touch --data franka_wedge_grasps",
+        "force of real grasps from pictures, of things not calibrated on",
+        _real_force,
+    ),
     "pick-place": Quoted(
         "touchgoal run-policy --episodes 100",
         "the shipped policy picks and places, of 100 scenes it has not seen",
