@@ -101,13 +101,15 @@ def test_one_tick_at_a_time_no_observation_is_planned_from_twice() -> None:
     assert len(planner.plans) == 2
 
 
-def test_a_quick_plan_is_done_from_the_tick_it_was_made_on() -> None:
-    """So an arm does what was judged in simulation, where plans take no time."""
+def test_however_quick_the_machine_a_plan_is_done_from_the_tick_after_its_observation() -> None:
+    """So an arm does what was judged in simulation with plans that come a tick late."""
     touch = toy_touch_embedder()
-    config = replace(TOY, touch_dim=touch.dim, execution_horizon=3, control_hz=2)
+    config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
     policy = toy_policy(config, toy_dataset(config)).eval()
-    threaded, plain = RealTimeActor(Planner(policy, touch)), PolicyActor(Planner(policy, touch))
-    for tick in toy_observations(10):
+    threaded = RealTimeActor(Planner(policy, touch), timeout=20.0)
+    plain = PolicyActor(Planner(policy, touch), latency=1)
+    for i, tick in enumerate(toy_observations(10)):
+        time.sleep(0.03 * (i % 3))
         np.testing.assert_array_equal(threaded.act(tick), plain.act(tick))
     threaded.close()
 
@@ -126,5 +128,6 @@ def test_a_planner_that_fails_later_is_not_waited_for() -> None:
     actor = RealTimeActor(planner, timeout=3600)
     actor.act(toy_observations(1)[0])
     with pytest.raises(KeyError):
-        actor.act({})
+        for _ in range(2):  # a plan from the first is needed in the second
+            actor.act({})
     actor.close()

@@ -28,6 +28,7 @@ from touchgoal.control.interfaces import Arm, Camera, Gripper, LoadCell
 from touchgoal.control.motion.tool import Tool
 from touchgoal.control.safety.action_filter import Deadline, Watchdogs
 from touchgoal.control.safety.limits import FR3, UR5E, Box, RobotLimits
+from touchgoal.control.safety.task_ceilings import TASK_FORCES
 from touchgoal.control.sensors.load_cell import SerialLoadCell
 from touchgoal.control.sensors.tactile_camera import (
     DIGIT_CROP,
@@ -166,11 +167,12 @@ def connect_cell(cell: CellConfig, hz: float) -> CellConnection:
 
 
 def cell_limits(cell: CellConfig) -> RobotLimits:
-    """The robot's limits with the cell's own in place of some."""
+    """The robot's limits with the task's ceilings and the cell's own in place of some."""
     robot, own = UR5E if cell.arm == "ur5e" else FR3, cell.safety
     if cell.tool is not None and cell.arm != "sim":
         robot = replace(robot, tool=_tool(robot.tool, cell.tool))
-    given = {
+    forces = TASK_FORCES[cell.task.name]
+    given = {"force": forces.force_ceiling, "torque": forces.torque_ceiling} | {
         name: value
         for name in ("tip_speed", "velocity_share", "force", "torque", "touch")
         if (value := getattr(own, name)) is not None

@@ -21,13 +21,15 @@ if TYPE_CHECKING:
 
 _STEP = 2e-3  # m between commands that differ, and up to which a width is shut
 _SPEED = 0.1  # m/s; the hand's fastest
+_PERIOD = 0.05  # s between looks at the hand
+_MOST_PASSING = 3  # of them for which widths may pass
 _STOP_TIMEOUT = 0.5  # s that a stop may take; 0.06 on the twin
 
 
 class FrankaHandClient:
     """In the child: one hand. Its state comes every 20 to 50 ms."""
 
-    period = 0.05
+    period = _PERIOD
 
     def __init__(self, address: str, force: float) -> None:
         self._franky, self._force = import_client("franky", INSTALL), force
@@ -37,7 +39,8 @@ class FrankaHandClient:
             raise UserError("the Franka Hand does not know its stroke: home it in Desk first")
         self._running: franky.BoolFuture | None = None
         self._inwards = False  # whether that is a move that closes
-        self._sent = self._target = self._hand.state.width
+        self._sent = self._target = self._last_target = self._hand.state.width
+        self._passing = 0  # ticks for which widths have passed
         self._fault, self._clock = "", -1
         self._stopped = False
         self._reading = self._measure()
@@ -68,13 +71,21 @@ class FrankaHandClient:
             self._reading = self._measure()
             if self._fault or self._stopped:
                 return
-            if self._idle() and abs(self._target - self._sent) > _STEP:
+            news = not self._passes() and abs(self._target - self._sent) > _STEP
+            if self._idle() and news:
                 self._go(self._target)
         except Exception as error:
             self._fault = f"{type(error).__name__}: {' '.join(str(error).split())}"
 
     def close(self) -> None:
         """See Gripper."""
+
+    def _passes(self) -> bool:
+        """Whether the target only passes, faster than the hand could follow; once a tick."""
+        changed, self._last_target = abs(self._target - self._last_target), self._target
+        passes = self._target > _STEP and changed > _SPEED * _PERIOD
+        self._passing = self._passing + 1 if passes else 0
+        return 0 < self._passing <= _MOST_PASSING
 
     def _measure(self) -> GripperReading:
         state = self._hand.state

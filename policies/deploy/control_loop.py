@@ -21,11 +21,13 @@ from touchgoal.control.interfaces import ArmReading, DriverError
 from touchgoal.control.safety.action_filter import Limit, Measurements, Safety, SafetyState
 from touchgoal.policies.deploy.held_object import HeldObject
 from touchgoal.policies.deploy.observation import CellReading, ObservationReader
+from touchgoal.policies.deploy.realtime import RealTimeActor
 from touchgoal.sim_envs.base import Observation
 
 _REST_SPEED = 0.01  # rad/s
 _REST_TIMEOUT = 3.0  # s to wait for that by the loop's clock
 _REST_WALL_TIMEOUT = 10.0  # s on the wall for the same
+_SLOW_ARM = 0.95  # share of real time below which an arm's clock means a twin that cannot keep up
 
 ADVICE = {
     Limit.NOT_A_NUMBER: "the policy's output is broken: do not use this checkpoint",
@@ -33,9 +35,8 @@ ADVICE = {
     Limit.STALE_ACTION: "the policy is too slow or hangs: make it smaller, or free the machine",
     Limit.STALE_STATE: "the arm's state is late or broken: check the network to the controller",
     Limit.STALE_GRIPPER: "the gripper's state is late or broken: check its cable and supply",
-    Limit.FORCE: "something pressed on the hand: clear it, then start again; a task that presses by "
-    "itself (the shipped pick-and-place policy sets down with about 15 N) needs a higher safety.force "
-    "in the cell file, such as 25; an FR3 itself stops at 30",
+    Limit.FORCE: "something pressed on the hand: clear it, then start again; a task that presses harder "
+    "by itself needs a higher safety.force in the cell file; an FR3 itself stops at 30",
     Limit.TORQUE: "something pressed on the arm: clear it, then start again",
     Limit.TOUCH: "a gel was pressed too deep: look at it, lower gripper.force; the hand let go, unless "
     "it was carrying something",
@@ -127,12 +128,27 @@ class RunLog:
         lateness: s by which each tick began too late.
         answer_times: s after which the actor had answered, each time.
         limit_counts: how often each limit changed a command.
+        clocks: s, the loop's and the arm's, at each tick.
     """
 
     rows: list[dict[str, np.ndarray]] = field(default_factory=list)
     lateness: list[float] = field(default_factory=list)
     answer_times: list[float] = field(default_factory=list)
     limit_counts: dict[str, int] = field(default_factory=dict)
+    clocks: list[tuple[float, float]] = field(default_factory=list)
+
+    @property
+    def arm_pace(self) -> float:
+        """Share of real time at which the arm's clock goes, in the median second; 1 if that is unknown.
+
+        Below 1 it is a twin on a machine that is too slow for it: in its own time everything comes
+        late, and it looks like an arm that does not follow.
+        """
+        ticks = np.array(self.clocks)
+        if len(ticks) < 2 or ticks[-1, 0] - ticks[0, 0] < 1:
+            return 1.0
+        seconds = np.arange(ticks[0, 0], ticks[-1, 0] + 1e-9)
+        return float(np.median(np.diff(np.interp(seconds, *ticks.T))))
 
     def frames(self) -> dict[str, np.ndarray]:
         """Key -> (T, ...)."""
@@ -208,6 +224,8 @@ class ControlLoop:
 
     def _loop(self, actor: DeployedActor, seconds: float, log: RunLog) -> Ending:
         clock = self._connection.clock
+        if isinstance(actor, RealTimeActor):
+            actor.start(self.reader.read().observation)
         begin = due = clock.now()
         first = True
         while True:
@@ -221,7 +239,7 @@ class ControlLoop:
                 return ending
             if not first:
                 log.lateness.append(late)
-            # What was missed is not made up for, and the first tick warms the policy up.
+            # What was missed is not made up for.
             dt, now = self._safety.dt, clock.now()
             due = now + dt if first else max(due + dt, now - dt)
             first = False
@@ -255,6 +273,7 @@ class ControlLoop:
         self, actor: DeployedActor, log: RunLog, seconds: float, late: float
     ) -> Ending | None:
         sensed = self.reader.read()
+        log.clocks.append((self._connection.clock.now(), sensed.arm.time))
         if not self._execute:
             sensed = self._as_commanded(sensed)
         if sensed.fault:
@@ -289,7 +308,7 @@ class ControlLoop:
         cost = self._cost(sensed.observation) if self._cost else None
         self._on_tick(TickStatus(seconds, self.state, sensed, self.width, late, cost))
         if self.state.fault is not None:
-            return self._stop_for_fault(sensed)
+            return self._stop_for_fault(sensed, log.arm_pace)
         if self._execute:
             self._connection.arm.command(self.state.q)
             self._connection.gripper.command(self.width)
@@ -300,7 +319,7 @@ class ControlLoop:
         log.rows.append(row)
         return None
 
-    def _stop_for_fault(self, sensed: CellReading) -> Ending:
+    def _stop_for_fault(self, sensed: CellReading, arm_pace: float) -> Ending:
         fault = self.state.fault
         assert fault is not None
         reason = str(fault)
@@ -316,6 +335,11 @@ class ControlLoop:
         advice = ADVICE.get(fault.limit, "look at what it names")
         if fault.limit == Limit.FORCE and np.isnan(fault.value):
             advice = "the arm is near a singularity, where it feels no forces: keep the task away"
+        if arm_pace < _SLOW_ARM:
+            advice = (
+                f"the arm's clock goes at {arm_pace:.2f} of real time: this twin cannot keep up, and "
+                "everything comes late in its time; free the machine, or start it with --lock-step"
+            )
         return self.stop(reason, advice, release_to)
 
     def _as_commanded(self, sensed: CellReading) -> CellReading:

@@ -16,6 +16,7 @@ from touchgoal.control.checks import CheckResult
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import Camera, DriverError, Gripper, TactileSensor
 from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.safety.task_ceilings import TASK_FORCES
 from touchgoal.control.tactile.contact import contact_strength
 from touchgoal.control.tactile.indentation import require_readable
 from touchgoal.control.tactile.markers import find_markers, without_markers
@@ -28,6 +29,7 @@ _MIN_RATE_SHARE = 0.8  # of what the cell says of a camera
 # grasp makes 20 and more; real units differ by more than simulated ones (unmeasured here).
 _TOUCHED_COUNTS = 12.0
 _WATCH_SECONDS = 1.0  # s for which cameras are watched
+_MAX_REST_FORCE = 7.5  # N felt at rest above which the arm does not begin
 _MIN_FREE_BYTES = 2e9  # bytes: a 40 s episode with both fingertips takes 0.4 GB at most
 _CLIENTS = {"fr3": "franky-control", "ur5e": "ur-rtde", "sim": "mujoco"}
 _INSTALL = {
@@ -46,6 +48,7 @@ def preflight(
         ("client", lambda: check_client(cell)),
         ("arm", lambda: _arm(connection, safety)),
         ("limits", lambda: _limits(cell, safety)),
+        ("ceilings", lambda: _ceilings(cell, safety)),
         ("gripper", lambda: _gripper(connection)),
     ]
     for key, camera in connection.cameras.items():
@@ -109,7 +112,7 @@ def _arm(connection: CellConnection, safety: Safety) -> str:
     force = float(np.linalg.norm(reading.wrench[:3]))
     if np.isnan(force):
         raise UserError("it cannot tell forces here, near a singularity: move it by hand")
-    if force > safety.limits.force / 2:
+    if force > _MAX_REST_FORCE:
         raise UserError(f"it feels {force:.1f} N at rest: set the hand's mass in Desk, or clear it")
     safety.start(reading.q)
     return f"{connection.robot.arm.name} at {np.round(reading.q, 2).tolist()} rad, {force:.1f} N"
@@ -120,9 +123,20 @@ def _limits(cell: CellConfig, safety: Safety) -> str:
         require_readable(find_sensor(cell.sensor), safety.limits.touch)
     limits, dogs = safety.limits, safety.watchdogs
     return (
-        f"joints up to {safety.joints.velocity.max():.2f} rad/s; stops above {limits.force:g} N, "
-        f"{limits.torque:g} Nm or {1e3 * limits.touch:g} mm into a gel; holds when pictures are older "
-        f"than {1e3 * dogs.observation.hold:.0f} ms or the arm's state than {1e3 * dogs.state.hold:.0f}"
+        f"joints up to {safety.joints.velocity.max():.2f} rad/s; stops above {1e3 * limits.touch:g} mm "
+        f"into a gel; holds when pictures are older than {1e3 * dogs.observation.hold:.0f} ms or the "
+        f"arm's state than {1e3 * dogs.state.hold:.0f}"
+    )
+
+
+def _ceilings(cell: CellConfig, safety: Safety) -> str:
+    """Where the arm is stopped by force, and where that comes from."""
+    task = TASK_FORCES[cell.task.name]
+    own = [name for name in ("force", "torque") if getattr(cell.safety, name) is not None]
+    source = f"{' and '.join(own)} as the cell file says; " if own else ""
+    return (
+        f"stops above {safety.limits.force:.3g} N or {safety.limits.torque:.3g} Nm; {source}"
+        f"{task.episodes} demonstrations of {cell.task.name} reach {task.reached:g} N"
     )
 
 

@@ -20,8 +20,16 @@ _CLOSE_TIMEOUT = 2.0  # s for a plan under way when the episode ends
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    tick: int  # at which its first action belongs
+    tick: int  # of the observation that it was made from, at which its first action belongs
+    end: int  # from here on the next plan is wanted
     actions: Float32[np.ndarray, "h 8"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Request:
+    tick: int  # of the newest observation
+    seen: list[Observation]
+    at: float  # when that came, monotonic s
 
 
 @runtime_checkable
@@ -47,17 +55,18 @@ class ChunkPlanner(Protocol):
 
 
 class RealTimeActor:
-    """Answers within half a tick, from the newest plan; the next one is made in a thread.
+    """Answers at once, from the newest plan; the next one is made in a thread.
 
-    A plan that is due is waited for so long. While plans take longer they are asked for a tick
-    early, and no answer waits. A plan's action k belongs to the tick k after its observation, so
-    what has gone by while it was made is left out: a late plan makes no jump. If plans run out the
-    arm is told to stand still, and that is counted. The first plan, which warms everything up, is
-    waited for and not counted.
+    A plan is stamped with the tick of its observation and meant for the tick after it, always: it is
+    asked for that much earlier, so it has a whole tick to be made, and what is done does not depend on
+    how fast the machine is. Its action k belongs to the tick k after its observation: a plan that is
+    late all the same makes no jump. If plans run out the arm is told to stand still, and that is
+    counted. Plans that are no longer than what is done of them are asked for when they are needed.
 
     Attributes:
         latencies: seconds from an observation to its plan, of every plan but the first.
-        ticks_without_plan: ticks for which no plan was ready.
+        late_plans: ticks at which the plan that was meant for them was not there.
+        ticks_without_plan: ticks for which no plan at all was ready.
         action_age: s for which that has been so without a break.
         failure: what ended the planning thread, if something did; `act` raises it.
     """
@@ -67,42 +76,57 @@ class RealTimeActor:
 
         Args:
             planner: of this episode.
-            timeout: s for which a plan that is due is waited for; None: half a tick.
+            timeout: s for which a plan that should be there is waited for; None: half a tick.
         """
         self._planner, self._config = planner, planner.config
         self.latencies: list[float] = []
-        self.ticks_without_plan = 0
+        self.late_plans = self.ticks_without_plan = 0
         self.action_age = 0.0
         self.failure: BaseException | None = None
-        self._sensed = -1  # tick of the newest observation that the thread has taken
         half = 0.5 / planner.config.control_hz
         self._timeout = half if timeout is None else timeout
-        self._tick = -1
+        self._tick = self._embedded = -1
         self._history: list[Observation] = []
-        self._observed_at = 0.0  # when the newest observation came, monotonic s
+        self._request: _Request | None = None  # for a plan that is not there yet
+        self._lead = 0  # ticks between a plan's observation and the first tick that it is meant for
         self._plan: _Plan | None = None
         self._width = 0.0
         self._condition = threading.Condition()
         self._closed = False
         self._thread = threading.Thread(target=self._work, name="planner", daemon=True)
 
-    def act(self, observation: Observation) -> Float32[np.ndarray, "8"]:
-        """The action for the next tick."""
+    def start(self, observation: Observation) -> None:
+        """Make the first plan, which warms everything up, before the first tick; the arm rests.
+
+        Raises:
+            UserError: there is none in 20 s.
+        """
         with self._condition:
-            first = self._tick < 0
+            self._history = [observation] * self._config.observation_horizon
+            self._request = _Request(0, self._history, time.monotonic())
+            self._thread.start()
+            if not self._condition.wait_for(self._nothing_asked, _FIRST_PLAN_TIMEOUT):
+                raise UserError(
+                    f"the policy made no plan in {_FIRST_PLAN_TIMEOUT:.0f} s: make it smaller"
+                )
+            if self.failure is not None:
+                raise self.failure
+
+    def act(self, observation: Observation) -> Float32[np.ndarray, "8"]:
+        """The action for this tick; the first one belongs to what `start` has seen, if it was called."""
+        if not self._history:
+            self.start(observation)
+        with self._condition:
             self._tick += 1
-            before = self._history or [observation] * self._config.observation_horizon
-            self._history = [*before[1:], observation]
-            self._observed_at = time.monotonic()
+            self._history = [*self._history[1:], observation]
+            if self._request:  # the plan was meant for this tick
+                self._condition.wait_for(self._nothing_asked, self._timeout)
+                self.late_plans += self._request is not None
+            if self._request is None and self._due():
+                self._request = _Request(self._tick, self._history, time.monotonic())
             self._condition.notify_all()
-            if first:
-                self._thread.start()
-                if not self._condition.wait_for(self._has_plan, _FIRST_PLAN_TIMEOUT):
-                    raise UserError(
-                        f"the policy made no plan in {_FIRST_PLAN_TIMEOUT:.0f} s: make it smaller"
-                    )
-            elif not self._slow and self._due():
-                self._condition.wait_for(self._plan_not_due, self._timeout)
+            if self._lead == 0:
+                self._condition.wait_for(self._nothing_asked, self._timeout)
             if self.failure is not None:
                 raise self.failure
             return self._action()
@@ -114,6 +138,11 @@ class RealTimeActor:
             self._condition.notify_all()
         if self._thread.is_alive():
             self._thread.join(_CLOSE_TIMEOUT)
+
+    def _due(self, ahead: int = 0) -> bool:
+        """Whether it is time to ask for the next plan, or will be in some ticks."""
+        assert self._plan is not None
+        return self._tick > self._plan.tick and (self._tick + ahead + self._lead >= self._plan.end)
 
     def _action(self) -> np.ndarray:
         assert self._plan is not None
@@ -127,53 +156,43 @@ class RealTimeActor:
         self.action_age += 1 / self._config.control_hz
         return np.append(np.zeros(ft.N_JOINTS), self._width).astype(np.float32)
 
-    def _plan_not_due(self) -> bool:
-        return self._closed or self.failure is not None or not self._due()
-
-    def _has_plan(self) -> bool:
-        return self._plan is not None or self.failure is not None
+    def _nothing_asked(self) -> bool:
+        return self._closed or self.failure is not None or self._request is None
 
     def _work(self) -> None:
         torch.set_num_threads(1)  # of this thread; two lose badly when the other core is taken
         try:
-            while (task := self._wait()) is not None:
-                tick, seen, asked, due = task
-                if not due:
+            while (seen := self._wait()) is not None:
+                if isinstance(seen, _Request):
+                    self._take(seen, self._planner.plan(seen.seen))
+                else:
                     self._planner.embed(seen)
-                    continue
-                actions = self._planner.plan(seen)
-                with self._condition:
-                    if self._plan is not None:
-                        self.latencies.append(time.monotonic() - asked)
-                    self._plan = _Plan(tick, actions)
-                    self._condition.notify_all()
         except BaseException as error:
             with self._condition:
                 self.failure = error
                 self._condition.notify_all()
 
-    def _wait(self) -> tuple[int, list[Observation], float, bool] | None:
-        """What to plan from, if a plan is due, or to sense, if the next plan sees it, too."""
+    def _take(self, request: _Request, actions: Float32[np.ndarray, "h 8"]) -> None:
+        """A plan is there."""
+        horizon = self._config.execution_horizon
         with self._condition:
-            seen = self._config.observation_horizon - 1
-            self._condition.wait_for(
-                lambda: self._due() or (self._sensed < self._tick and self._due(seen))
-            )
-            self._sensed = self._tick
-            return (
-                None
-                if self._closed
-                else (self._tick, [*self._history], self._observed_at, self._due())
-            )
+            end = request.tick + horizon
+            if self._plan is None:
+                self._lead = int(len(actions) > horizon)
+            else:
+                self.latencies.append(time.monotonic() - request.at)
+                end += self._lead
+            self._plan, self._request = _Plan(request.tick, end, actions), None
+            self._condition.notify_all()
 
-    @property
-    def _slow(self) -> bool:
-        return bool(self.latencies) and self.latencies[-1] > self._timeout
+    def _wait(self) -> _Request | list[Observation] | None:
+        """What a plan is asked for from, or else what the next plan sees, too; None at the end."""
+        ahead = self._config.observation_horizon - 1
 
-    def _due(self, ahead: int = 0) -> bool:
-        """Whether it is time for another plan, or will be in some ticks; or for the end."""
-        if self._closed or self._plan is None:
-            return self._closed or self._tick >= 0
-        # At least one tick on: from the same observation the thread would plan again and again.
-        horizon = max(1, self._config.execution_horizon - self._slow)
-        return self._tick + ahead - self._plan.tick >= horizon
+        def to_embed() -> bool:
+            return self._embedded < self._tick and self._due(ahead)
+
+        with self._condition:
+            self._condition.wait_for(lambda: self._closed or self._request or to_embed())
+            self._embedded = self._tick
+            return None if self._closed else self._request or self._history

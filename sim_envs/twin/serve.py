@@ -37,7 +37,6 @@ _MAX_BACKLOG = 0.1  # s behind real time beyond which the twin stops trying to c
 # real time about as long as a busy one hiccups.
 _LOCK_STEP_TIMEOUT, _CLIENT_TIMEOUT = 2.0, 0.1
 _LOCK_STEP_PICTURE_RATE = 1.0  # Hz by the clock on the wall that a slow machine still manages
-_MAZE_FORCE = 25.0  # N
 _RUN_SECONDS = 40.0
 
 
@@ -210,8 +209,6 @@ def _cell_config(
         safety=SafetySection(
             # The tasks' objects are grasped 2 mm above the table, which nobody can harm here.
             fingertips_lower=(*limits.fingertips.lower[:2].tolist(), 0.0),
-            # A wire pushes back; the arm's own reflex is at 30 N.
-            force=_MAZE_FORCE if task.name == "bead-maze" else None,
             state_timeout=_LOCK_STEP_TIMEOUT if config.lock_step else None,
         ),
         lock_step=config.lock_step,

@@ -1,0 +1,37 @@
+"""How hard each task presses by itself, and the ceilings that follow: above the task, below the reflex."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+_MARGIN = 1.5  # by which a ceiling lies above what demonstrations reach
+_MOST = 28.0  # N: the arm is stopped before it stops itself, an FR3 at 30 N (`arms/franka.py`)
+_LEVER = 0.6  # m: farthest that a hand over the table is from the axis of a joint that lifts it
+
+
+@dataclass(frozen=True)
+class TaskForces:
+    """What the demonstrations of a task reach.
+
+    Attributes:
+        reached: N on the hand, at most.
+        episodes: demonstrations that say so (`touchgoal benchmark task-forces`).
+    """
+
+    reached: float
+    episodes: int
+
+    @property
+    def force_ceiling(self) -> float:
+        """N on the hand above which a run of this task is stopped."""
+        return min(_MARGIN * self.reached, _MOST)
+
+    @property
+    def torque_ceiling(self) -> float:
+        """Nm in a joint, likewise: what that force makes of it, so that neither stops the other's task."""
+        return _LEVER * self.force_ceiling
+
+
+TASK_FORCES: dict[Literal["pick-place", "bead-maze"], TaskForces] = {
+    "pick-place": TaskForces(reached=23.8, episodes=116),
+    "bead-maze": TaskForces(reached=17.9, episodes=29),
+}
