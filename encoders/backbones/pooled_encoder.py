@@ -43,6 +43,11 @@ class PooledEncoderConfig:
         """The configuration for a sensor; UserError for an unknown one."""
         return cls(FEATURES, sensor, steady_preprocessor_for(sensor).id)
 
+    @property
+    def embedding_dim(self) -> int:
+        """Width of an embedding."""
+        return self.features
+
 
 class PooledEncoder(BaseTouchEncoder):
     """A frozen ImageNet network, pooled and whitened; unit vectors.
