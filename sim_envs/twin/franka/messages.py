@@ -17,6 +17,7 @@ import numpy as np
 ROBOT_PORT, HAND_PORT = 1337, 1338
 ROBOT_VERSION, HAND_VERSION = 10, 3
 _SEND_TIMEOUT = 0.5  # s that a client may take to read an answer
+_ABSURD = 1e6  # in any unit of an arm's settings
 _LONGEST = 4096  # bytes of a command; the longest of the protocol has 300
 
 
@@ -337,7 +338,10 @@ class Link:
         if n != expected:
             return False
         # The hand answers for itself what it cannot do; libfranka checks the arm's numbers.
-        return not self._wide or bool(np.isfinite(np.frombuffer(request.payload, "<f8")).all())
+        # What no arm has (a tool a thousand metres long) would overflow the Jacobian.
+        return not self._wide or bool(
+            (np.abs(np.frombuffer(request.payload, "<f8")) < _ABSURD).all()
+        )
 
     def _handshake(self, request: Request) -> None:
         assert self._tcp is not None
