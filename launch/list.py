@@ -77,10 +77,9 @@ def encoders() -> dict[str, str]:
     """The touch encoders that ship."""
     found = {}
     for path in sorted(_WEIGHTS.glob("*/encoder.json")):
-        made = json.loads(path.read_text())
-        found[path.parent.name] = (
-            f"for {made['config']['sensor']}, towers {made['config']['towers']}"
-        )
+        made = json.loads(path.read_text())["config"]
+        towers = f"towers {made['towers']}" if "towers" in made else "touch alone"
+        found[path.parent.name] = f"for {made['sensor']}, {towers}"
     return found
 
 

@@ -196,7 +196,8 @@ def test_a_stopped_hand_does_not_grasp_what_its_last_move_met(
 ) -> None:
     client, franky = hand
     client.command(0.02)
-    client.tick()
+    for _ in range(2):  # a width that stays is sent, one that passes is not
+        client.tick()
     client.stop()
     franky.running.done = True
     for _ in range(3):
@@ -211,7 +212,8 @@ def test_a_hand_that_is_to_let_go_opens_and_does_no_more(
 ) -> None:
     client, franky = hand
     client.command(0.02)
-    client.tick()
+    for _ in range(2):  # a width that stays is sent, one that passes is not
+        client.tick()
     client.stop(release_to=0.07)
     for _ in range(3):
         client.tick()
