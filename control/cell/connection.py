@@ -239,7 +239,7 @@ def _tactile_camera(cell: FingertipsSection, side: int) -> TactileCamera:
         cell.rate or model.frame_rate,
         cell.exposure,
         cell.white_balance,
-        gel=True,
+        gel=model.markers is None,  # dots that move look like broken blocks
         # Looked up again whenever it is opened: after a replug it is another device.
         device=None if "/" in source else partial(_device_of, model, source),
     )

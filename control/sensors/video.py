@@ -47,7 +47,7 @@ class VideoConfig:
         frozen_after: s of pixel-for-pixel the same picture, or part of it, after which it counts as
             old. Sensor noise makes real pictures differ; rendered ones may rightly stand still: then
             infinity.
-        gel: whether it is a fingertip's, whose pictures are smooth: broken ones show.
+        gel: whether it is a fingertip's without markers, whose pictures are smooth: broken ones show.
         device: finds the camera's device whenever it is opened, when `source` is a serial number.
     """
 
