@@ -18,6 +18,7 @@ from touchgoal.sim_envs.config import DeploymentConfig
 from touchgoal.sim_envs.deployed_hand import DeployedHand
 from touchgoal.sim_envs.estimated_wrench import EstimatedWrench
 from touchgoal.sim_envs.scene.build import SERVO_DAMPING
+from touchgoal.sim_envs.servo_lag import ServoLag
 
 _DT = 1e-3  # s
 _WRENCH_PERIOD = 10  # ms between readings of the force on the hand
@@ -73,21 +74,17 @@ class _TrackedDrive:
     """As deployed: lag, safety layer, tracker, and an arm that follows its set-point at once."""
 
     def __init__(self, start: Joints, safety: Safety) -> None:
-        n = start.size
         self._safety, self._state = safety, safety.start(start)
         self._tracker = Tracker(safety.limits.interface, safety.dt, _DT)
         self._track = self._tracker.start(start)
-        self._share = 1 - float(np.exp(-safety.dt / SERVO_DAMPING))
-        self._remaining = np.zeros(n)  # rad, wanted and not yet passed on
+        self._lag = ServoLag(safety.dt, start.size)
 
     @property
     def command(self) -> Joints:
-        return self._state.q + self._remaining
+        return self._state.q + self._lag.remaining
 
     def accept(self, delta: Joints) -> Joints:
-        self._remaining = self._remaining + delta
-        step = self._share * self._remaining
-        self._remaining = self._remaining - step
+        step = self._lag.update(delta)
         self._state = self._safety.filter_action(self._state, step, _all_well(self._state.q))
         return self._state.q
 

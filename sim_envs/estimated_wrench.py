@@ -17,9 +17,8 @@ Wrench = Float[np.ndarray, "6"]
 class EstimatedWrench:
     """Noise, bias, drift and lag on the true wrench, drawn for one episode; at times exactly zero.
 
-    Franka's data sheet of the FR3 has noise of 0.035 N and 0.005 N m and an accuracy of 0.8 N and 0.3
-    N m at rest; friction and what the model of the arm leaves out make more of it in motion, so about
-    twice as much is drawn here. libfranka gives zero near singularities: unknown, not no force.
+    The sizes are guesses: no data sheet and no recording of an arm was at hand to check them by.
+    libfranka gives zero near singularities: unknown, not no force.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:

@@ -18,7 +18,7 @@ from touchgoal.policies.deploy.control_loop import DeployedActor
 from touchgoal.policies.deploy.realtime import ChunkPlanner, RealTimeActor
 from touchgoal.policies.deploy.scripted import PickPlacePoses, pick_and_place
 from touchgoal.policies.follower import WireFollower
-from touchgoal.sim_envs.scene.build import SERVO_DAMPING
+from touchgoal.sim_envs.servo_lag import ServoLag
 from touchgoal.sim_envs.twin.in_process import env_config_of
 
 _SIMULATED_PLAN_TIMEOUT = 20.0  # s for which a simulated arm's time stands still for a plan
@@ -52,16 +52,12 @@ class LearnedActor(RealTimeActor):
     def __init__(self, planner: ChunkPlanner, timeout: float | None = None) -> None:
         """See RealTimeActor."""
         super().__init__(planner, timeout)
-        self._share = 1 - float(np.exp(-1 / (planner.config.control_hz * SERVO_DAMPING)))
-        self._remaining = np.zeros(ft.N_JOINTS)  # rad, wanted and not yet passed on
+        self._lag = ServoLag(1 / planner.config.control_hz, ft.N_JOINTS)
 
     def act(self, observation: Observation) -> np.ndarray:
         """See DeployedActor."""
         action = super().act(observation)
-        self._remaining = self._remaining + action[:-1]
-        step = self._share * self._remaining
-        self._remaining = self._remaining - step
-        return np.append(step, action[-1])
+        return np.append(self._lag.update(action[:-1]), action[-1])
 
 
 @dataclass(frozen=True)
