@@ -90,9 +90,6 @@ def test_picks_and_places_on_the_twin_and_the_episode_has_reward_curves(
     assert touch_comes_nearer(tmp_path)
 
 
-@pytest.mark.xfail(
-    reason="open, see docs/next_steps.md: lock-step does not wait for plans", strict=False
-)
 @pytest.mark.realtime
 def test_the_shipped_policy_leads_a_bead_on_the_twin(tmp_path: Path) -> None:
     pytest.importorskip("franky", reason="pip install 'touchgoal[franka]'")
