@@ -322,7 +322,7 @@ def test_an_example_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.chdir(tmp_path)
     for name in ("sim", "sim.toml", "launch/cells/sim.toml"):
         assert find_cell_file(Path(name)) == EXAMPLES / "sim.toml"
-    with pytest.raises(UserError, match="no cell file mine.toml.*fr3_two_minis, sim, twin, ur5e"):
+    with pytest.raises(UserError, match="no cell file mine.toml.*fr3_two_minis, sim, ur5e"):
         find_cell_file(Path("mine.toml"))
     (tmp_path / "sim.toml").write_text(SIM)
     assert find_cell_file(Path("sim.toml")) == Path("sim.toml")

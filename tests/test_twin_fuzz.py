@@ -222,11 +222,16 @@ def test_web_pages_and_nonsense_change_nothing_at_the_control_port(twin: Twin) -
     thread = threading.Thread(target=twin.run)
     thread.start()
     try:
-        host, _, number = port.rpartition(":")
+        token, _, where = port.rpartition("@")
+        host, _, number = where.rpartition(":")
+        for stranger in ("kill", "x kill", f"{token[:-1]} kill"):
+            with socket.create_connection((host, int(number)), timeout=5) as other:
+                other.sendall(f"{stranger}\n".encode())
+                assert b"token" in other.recv(100) and other.recv(100) == b""
         with socket.create_connection((host, int(number)), timeout=5) as page:
-            body = "stop-button on\nnudge 0 400 0 5\nkill\n"
+            body = f"stop-button on\n{token} nudge 0 400 0 5\n{token} kill\n"
             page.sendall(
-                f"POST / HTTP/1.1\r\nHost: {port}\r\nOrigin: http://a.example\r\n"
+                f"POST / HTTP/1.1\r\nHost: {where}\r\nOrigin: http://a.example\r\n"
                 f"Content-Type: text/plain\r\nContent-Length: {len(body)}\r\n\r\n{body}".encode()
             )
             assert page.recv(100) == b""

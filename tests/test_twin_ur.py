@@ -83,6 +83,49 @@ def test_ur_moves_servoes_and_watches(ur5e: RunningTwin) -> None:
     assert ur5e.ask("truth")["worst"]["excess"] <= 0
 
 
+def asks_too_much(address: str) -> dict:
+    """Calls what the twin does not simulate, and moves afterwards."""
+    from rtde_control import RTDEControlInterface
+    from rtde_receive import RTDEReceiveInterface
+
+    receive, control = RTDEReceiveInterface(address), RTDEControlInterface(address)
+    q = np.array(receive.getActualQ())
+    control.moveJ(q.tolist(), 1.0, 1.0)
+
+    def refused(call) -> bool:
+        try:
+            return call() is False
+        except RuntimeError:
+            return True
+        finally:
+            time.sleep(0.1)  # the news that the program runs has to come
+
+    path = [[*(q + way).tolist(), 0.5, 0.5, 0.0] for way in (0.05, 0.1)]
+    said = {
+        "path": refused(lambda: control.moveJ(path)),
+        "jog": refused(lambda: control.jogStart([0.05, 0, 0, 0, 0, 0])),
+        "contact": refused(lambda: control.moveUntilContact([0, 0, -0.05, 0, 0, 0])),
+        "poses": refused(lambda: control.poseTrans([0.1] * 6, [0.1] * 6)),
+        "moved": float(np.abs(np.array(receive.getActualQ()) - q).max()),
+    }
+    said["goes on"] = control.moveJ((q + 0.05).tolist(), 1.0, 1.0)
+    said["short"] = float(np.abs(np.array(receive.getActualQ()) - q - 0.05).max())
+    control.directTorque([5.0, 0, 0, 0, 0, 0])  # True whatever happens
+    time.sleep(0.3)
+    said["torque"] = receive.isProtectiveStopped()
+    said["gone"] = float(np.abs(np.array(receive.getActualQ()) - q - 0.05).max())
+    return said
+
+
+def test_ur_refuses_what_it_does_not_simulate_and_goes_on(ur5e: RunningTwin) -> None:
+    said = client(asks_too_much, ur5e.cell.address)
+    assert said["path"] and said["jog"] and said["contact"] and said["poses"]
+    assert said["moved"] < 2e-3
+    assert said["goes on"] and said["short"] < 2e-3
+    assert said["torque"] and said["gone"] < 2e-3
+    ur5e.begin("reset 3")  # which clears the protective stop
+
+
 def protected(address: str, reset: str) -> dict:
     """Servoes into a protective stop, unlocks it after 5 s, and goes on; then connects anew."""
     import socket
@@ -95,9 +138,10 @@ def protected(address: str, reset: str) -> dict:
     q = receive.getActualQ()
 
     def order(line: str) -> None:
-        host, _, port = reset.rpartition(":")
+        token, _, where = reset.rpartition("@")
+        host, _, port = where.rpartition(":")
         with socket.create_connection((host, int(port))) as faults:
-            faults.sendall(line.encode() + b"\n")
+            faults.sendall(f"{token} {line}\n".encode())
             faults.recv(1000)
 
     order("error protective_stop")

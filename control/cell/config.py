@@ -129,7 +129,7 @@ class TaskSection:
     goal: tuple[Coordinate, Coordinate] | None = None
     """For the expert, where on the table the object is to go: x, y (m, base frame)."""
     twin: str = ""
-    """Control port (host:port) of a twin: it puts its scene back before each run, and says where
+    """Control port (token@host:port) of a twin: it puts its scene back before each run, and says where
     things are and whether the task is done."""
     seed: Seed = 1_000_000
     """Random seed of the scene of a simulated arm or a twin."""

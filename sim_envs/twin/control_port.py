@@ -18,20 +18,27 @@ for the truth.
     unplug|plug NAME              a serial port
     kill                          end the twin's process at once, as kill -9 does
 
-Every answer is one line of JSON; a mistake is {"error": ...}. A browser is hung up on at its first line,
-whatever its origin: no web page may break a twin.
+Before each line goes the twin's token and a space; the cell file has it before the port's address
+(`token@host:port`). Every answer is one line of JSON; a mistake is {"error": ...}. Who says no token, or
+is a browser, is hung up on at the first line: no web page and no program on the network may break a twin.
+
+From a shell: python -m touchgoal.sim_envs.twin.control_port runs/twin/cell.json stop-button on
 """
 
 import json
 import os
 import re
+import secrets
 import signal
 import socket
+import sys
 import time
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.mjpeg import Stream
@@ -88,7 +95,8 @@ class ControlPort:
         self._frozen_seconds = (
             0.0  # s left, simulated: a slow machine would end it before a packet is lost
         )
-        self.address = f"{host}:{self._listener.port}"
+        self._token = secrets.token_hex(8)
+        self.address = f"{self._token}@{host}:{self._listener.port}"
 
     def receive(self) -> None:
         """Do what has been asked."""
@@ -101,7 +109,14 @@ class ControlPort:
                 if _HTTP.search(line):
                     client.close()  # a web page in a browser; what it sends after that is no order
                     break
-                client.send(json.dumps(self._answer(line)).encode() + b"\n")
+                token, _, order = line.partition(" ")
+                if not secrets.compare_digest(token.encode(), self._token.encode()):
+                    client.send(
+                        b'{"error": "the twin\'s token is missing: its cell file has it"}\n'
+                    )
+                    client.close()
+                    break
+                client.send(json.dumps(self._answer(order)).encode() + b"\n")
 
     def send(self) -> None:
         """Nothing is said unasked."""
@@ -173,18 +188,19 @@ def _require_finite(*numbers: float) -> None:
 
 
 def ask_twin(address: str, line: str) -> dict[str, Any]:
-    """Send one line to a twin's port (`host:port`) and return the answer.
+    """Send one line to a twin's port (`token@host:port`) and return the answer.
 
     Raises:
         UserError: the twin refuses, or has ended.
     """
-    host, _, port = address.rpartition(":")
+    token, _, where = address.rpartition("@")
+    host, _, port = where.rpartition(":")
     try:
         with socket.create_connection((host, int(port)), timeout=10) as connection:
-            connection.sendall(line.encode() + b"\n")
+            connection.sendall(f"{token} {line}\n".encode())
             answer = json.loads(connection.makefile().readline())
     except (OSError, json.JSONDecodeError) as error:
-        raise UserError(f"no twin answers at {address}; start one: touchgoal twin") from error
+        raise UserError(f"no twin answers at {where}; start one: touchgoal twin") from error
     if "error" in answer:
         raise UserError(answer["error"])
     return answer
@@ -200,3 +216,14 @@ def put_scene_back(address: str, seed: int) -> None:
     while ask_twin(address, "truth")["rest"] == 0 and time.monotonic() < end:
         time.sleep(_POLL_INTERVAL)
     ask_twin(address, f"reset {seed}")
+
+
+if __name__ == "__main__":
+    try:
+        print(
+            json.dumps(
+                ask_twin(read_cell_file(Path(sys.argv[1])).task.twin, " ".join(sys.argv[2:]))
+            )
+        )
+    except (UserError, IndexError) as mistake:
+        sys.exit(f"{mistake}; usage: control_port CELL_FILE ORDER")

@@ -224,13 +224,19 @@ class UrController:
             self._program.cycle()
 
     def _play(self, script: str) -> None:
-        """Start an uploaded program; one that is not ur-rtde's control script ends at once."""
+        """Start an uploaded program; of one that is not ur-rtde's control script nothing can be run."""
         name = re.match(r"def\s+(\w+)", script)
         if self.safety is Safety.NORMAL and self._mode == _RUNNING:
             self._program.end()
             self._program = self._new_program()
             self._program.running = name is not None and name[1] == "rtde_control"
             self._last_input_at = self._clock
+            if not self._program.running:
+                print(
+                    "REFUSED: the twin does not run URScript of one's own; protective stop",
+                    flush=True,
+                )
+                self.protective_stop()
 
     def _new_program(self) -> UrProgram:
         return UrProgram(
@@ -346,9 +352,9 @@ _VARIABLES = {
     "actual_TCP_force": lambda c, p, cell: c._wrench,
     "ft_raw_wrench": lambda c, p, cell: c._wrench,
     "tcp_force_scalar": lambda c, p, cell: float(np.linalg.norm(c._wrench[:3])),
-    "runtime_state": lambda c, p, cell: _PLAYING if p.running else _STOPPED,
+    "runtime_state": lambda c, p, cell: _PLAYING if p.says_running else _STOPPED,
     "robot_mode": lambda c, p, cell: c._mode,
-    "robot_status_bits": lambda c, p, cell: int(c._mode != _POWER_OFF) | p.running << 1,
+    "robot_status_bits": lambda c, p, cell: int(c._mode != _POWER_OFF) | p.says_running << 1,
     "safety_mode": lambda c, p, cell: int(c.safety),
     "safety_status": lambda c, p, cell: int(c.safety),
     "safety_status_bits": lambda c, p, cell: c.safety.bits,

@@ -46,6 +46,8 @@ _STREAMED = {
     71,
 }  # acknowledged at once
 _IGNORED = {0, 13, 14, 17, 20, 21, 48, 59, 65, 99}  # payload, outputs, a kick
+_UNANSWERED = {25, 66}  # toolContact, directTorque
+_REFUSAL_CYCLES = 250  # 0.5 s at most; a client that waits for an answer has given up long before
 _STOP_SCRIPT = 255
 _LONGEST_TOOL = 10.0  # m and rad
 _END_OF_FREEDRIVE = 5.0  # rad/s^2
@@ -81,6 +83,7 @@ class UrProgram:
         self.activity: Activity | None = None
         self.ints, self.doubles = [0] * 48, [0.0] * 48
         self.ints[0], self.running = _READY, True
+        self._refused = self._cycles_refused = 0
         self.watchdog = np.inf  # s without a command after which the program ends
         self.tcp = np.concatenate([_FLANGE_TO_TCP, np.zeros(3)])
         self._executing = self._waiting = self._asynchronous = False
@@ -98,16 +101,26 @@ class UrProgram:
             self._asynchronous = False
             self.ints[2] = self._started << 24
         command = self._int(0)
+        if command == self._refused and command:
+            self._cycles_refused += 1
+            return
+        self._refused = 0
         if command in _STREAMED:
             self._execute(command)
-            self.ints[0] = _READY
+            self.ints[0] = 0 if self._refused else _READY
         elif command == 0:
             self._executing, self.ints[0] = False, _READY
         elif not self._executing:
             self._executing, self.ints[0] = True, 0
             self._execute(command)
-            if not self._waiting and self.running:
+            if not self._waiting and self.running and not self._refused:
                 self.ints[0] = _DONE
+
+    @property
+    def says_running(self) -> bool:
+        """What clients are told of `running`; not so while a command is refused."""
+        refusing = self._refused and self._cycles_refused < _REFUSAL_CYCLES
+        return self.running and not refusing
 
     def pose(self, q: Float[np.ndarray, "6"]) -> Pose:
         """Of the configured TCP at joint positions (rad), base frame."""
@@ -159,7 +172,19 @@ class UrProgram:
         if command in actions:
             actions[command]()
         elif command not in _IGNORED:
-            print(f"the twin does not simulate ur-rtde's command {command}: it does nothing")
+            self._refuse(command)
+
+    def _refuse(self, command: int) -> None:
+        """What is not simulated: ur-rtde's call fails, and the program goes on.
+
+        The client gives up on a command when the program is said to have stopped. Some of its calls
+        look at no answer; a protective stop tells those.
+        """
+        print(f"REFUSED: the twin does not simulate ur-rtde's command {command}", flush=True)
+        if command in _UNANSWERED:
+            self._protective_stop()
+        else:
+            self._refused, self._cycles_refused = command, 0
 
     def end(self) -> None:
         """The program ends; the arm comes to rest."""
