@@ -77,7 +77,19 @@ def _real_force(metrics: Metrics) -> str:
     return f"{metrics['median_error']:.1f} N (median; 95 % over things {low:.1f} to {high:.1f})"
 
 
+def _nearest(metrics: Metrics) -> str:
+    row = metrics["rows"][0]
+    low, high = row["nearest_interval"]
+    return f"{row['nearest']:.2f} (95 % over things {low:.2f} to {high:.2f})"
+
+
 QUOTED = {
+    "real-touch": Quoted(
+        "touchgoal benchmark real-touch --data physiclear --encoders gelsight_mini_surfaces "
+        "gelsight_mini random:gelsight_mini pixels efficientnet",
+        "the nearest other video of a real touch is of the same thing (chance 0.015)",
+        _nearest,
+    ),
     "real-force": Quoted(
         "touchgoal benchmark real-touch --data franka_wedge_grasps",
         "force of real grasps from pictures, of things not calibrated on",
