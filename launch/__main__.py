@@ -26,6 +26,8 @@ COMMANDS = {
     "run-policy": "run a policy in a task: success rate, video",
     "reward-curves": "costs and rewards along episodes or plain videos",
     "fit-scale": "fit what normalises the distances of reward-curves to your own episodes",
+    "record-presses": "record presses of a ball all over a sensor's gel, and calibrate from them",
+    "check-sensor": "try a sensor on frames of one's own: noise, drift, contact, depth, force, markers",
     "calibrate": "fit a sensor's light and gel to presses of a ball",
     "deploy": "run a policy on an arm or on the twin, with safety and recording",
     "twin": "serve the simulated cell over the wire protocols of real ones",

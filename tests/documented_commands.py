@@ -28,6 +28,8 @@ TOY = {
 }
 # What is not run here, and where it is, or why not.
 NOT_RUN = {
+    "record-presses": "needs a sensor and a person: test_own_sensor.py",
+    "check-sensor": "needs a sensor and a person: test_own_sensor.py",
     "calibrate": "needs presses of a real sensor: test_calibration.py",
     "teleop": "needs a terminal and a person: test_teleop.py",
     "benchmark": "test_commands.py runs each at toy size",

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from touchgoal.control.cell.connection import fingertip_view
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError, TactileSensor
+from touchgoal.control.sensors.fingertip_source import fingertip_view
 from touchgoal.control.sensors.pictures import FrozenParts, JpegDecoder, is_broken_gel
 from touchgoal.control.sensors.tactile_camera import (
     DIGIT_CROP,

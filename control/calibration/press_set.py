@@ -60,13 +60,14 @@ def split(presses: PressSet, n_held_out: int, seed: int) -> tuple[PressSet, Pres
     return presses.take(np.sort(order[n_held_out:])), presses.take(np.sort(order[:n_held_out]))
 
 
-def write_presses(presses: PressSet, folder: Path) -> None:
-    """Make the folder that `read_presses` reads."""
+def write_presses(presses: PressSet, folder: Path, adds: bool = False) -> None:
+    """Make the folder that `read_presses` reads, or add to its presses; the background is the new one."""
     folder.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(folder / "background.png"), presses.background[..., ::-1])
-    with (folder / "presses.csv").open("w", newline="") as file:
+    with (folder / "presses.csv").open("a" if adds else "w", newline="") as file:
         rows = csv.writer(file)
-        rows.writerow(COLUMNS)
+        if file.tell() == 0:
+            rows.writerow(COLUMNS)
         for name, image, circle, ball in zip(
             presses.files, presses.images, presses.circles, presses.ball_radius, strict=True
         ):

@@ -5,7 +5,6 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -29,17 +28,11 @@ from touchgoal.control.motion.tool import Tool
 from touchgoal.control.safety.action_filter import Deadline, Watchdogs
 from touchgoal.control.safety.limits import FR3, UR5E, Box, RobotLimits
 from touchgoal.control.safety.task_ceilings import TASK_FORCES
+from touchgoal.control.sensors.fingertip_source import fingertip_video, fingertip_view
 from touchgoal.control.sensors.load_cell import SerialLoadCell
-from touchgoal.control.sensors.tactile_camera import (
-    DIGIT_CROP,
-    GELSIGHT_MINI_CROP,
-    NO_CROP,
-    Crop,
-    TactileCamera,
-)
-from touchgoal.control.sensors.usb_cameras import find_sensor_camera
+from touchgoal.control.sensors.tactile_camera import TactileCamera
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
-from touchgoal.control.tactile.sensor_models import DIGIT, SensorModel, find_sensor
+from touchgoal.control.tactile.sensor_models import find_sensor
 
 _STOP_FACTOR = 5  # times the age at which the arm holds
 _CLOCK_TIMEOUT = 1.0  # s on the wall for which an arm's clock may stand
@@ -233,27 +226,11 @@ def _tactile_camera(cell: FingertipsSection, side: int) -> TactileCamera:
     """Of the left (0) or right (1) finger, at a device, a USB serial number or a stream."""
     source = (cell.left, cell.right)[side]
     model = find_sensor(cell.sensor_files[side] if cell.sensor_files else cell.sensor)
-    config = VideoConfig(
-        source,
-        cell.size,
-        cell.rate or model.frame_rate,
-        cell.exposure,
-        cell.white_balance,
-        gel=model.markers is None,  # dots that move look like broken blocks
-        # Looked up again whenever it is opened: after a replug it is another device.
-        device=None if "/" in source else partial(_device_of, model, source),
+    config = replace(
+        fingertip_video(source, model),
+        size=cell.size,
+        rate=cell.rate or model.frame_rate,
+        exposure=cell.exposure,
+        white_balance=cell.white_balance,
     )
     return TactileCamera(VideoCamera(config), model, fingertip_view(model, source, cell.border))
-
-
-def fingertip_view(model: SensorModel, source: str, border: float | None) -> Crop:
-    """How the sensor's picture lies in its camera's: a stream is cut and turned already."""
-    if "://" in source:
-        view = NO_CROP
-    else:
-        view = DIGIT_CROP if model.name == DIGIT.name else GELSIGHT_MINI_CROP
-    return view if border is None else replace(view, border=border)
-
-
-def _device_of(model: SensorModel, serial: str) -> str:
-    return find_sensor_camera(model, serial).device

@@ -78,7 +78,8 @@ def shadow_depth(
     scale = pixels_per_cell(pitch)
     low = cv2.resize(surface, (w // scale, h // scale), interpolation=cv2.INTER_AREA)
     rise = slope * pitch * scale
-    longest = min(math.ceil(float(low.max()) / rise), SHADOW_CELLS)  # no shadow reaches farther
+    # No shadow reaches farther; a surface that lies below rest all over throws none.
+    longest = min(max(math.ceil(float(low.max()) / rise), 0), SHADOW_CELLS)
     shadows = np.empty((len(azimuths), h, w), np.float32)
     for shadow, azimuth in zip(shadows, azimuths, strict=True):
         # Measured from a plane that climbs to the light, the running maximum is a plain one.

@@ -1,0 +1,121 @@
+"""One fingertip sensor's frames, from wherever they come: plugged in, streamed, or recorded."""
+
+import time
+from collections.abc import Generator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from touchgoal.control.errors import UserError
+from touchgoal.control.interfaces import DriverError
+from touchgoal.control.picture_file import read_picture
+from touchgoal.control.sensors.tactile_camera import (
+    DIGIT_CROP,
+    GELSIGHT_MINI_CROP,
+    NO_CROP,
+    Crop,
+    TactileCamera,
+    crop_to_sensor,
+)
+from touchgoal.control.sensors.usb_cameras import find_sensor_camera
+from touchgoal.control.sensors.video import VideoCamera, VideoConfig
+from touchgoal.control.tactile.sensor_models import DIGIT, SensorModel
+
+_PICTURES = (".png", ".jpg", ".jpeg")
+_UNTOUCHED = "background.png"  # of a folder of presses: what the sensor shows before them
+_POLL_INTERVAL = 0.005  # s between looks for a new frame
+_TIMEOUT = 5.0  # s without any
+
+Frame = UInt8[np.ndarray, "h w 3"]
+
+
+def is_recorded(source: str) -> bool:
+    """Whether it is a video file or a folder of pictures, which end."""
+    return not source.startswith("/dev/") and Path(source).exists()
+
+
+def fingertip_video(source: str, model: SensorModel) -> VideoConfig:
+    """How to open a live source: a USB serial number, a device (/dev/video2) or a stream's address.
+
+    A serial number is looked up again whenever it is opened: after a replug it is another device.
+    """
+    return VideoConfig(
+        source,
+        rate=model.frame_rate,
+        gel=model.markers is None,  # dots that move look like broken blocks
+        device=None if "/" in source else partial(_device_of, model, source),
+    )
+
+
+def fingertip_view(model: SensorModel, source: str, border: float | None = None) -> Crop:
+    """How the sensor's picture lies in its camera's: a stream is cut and turned already."""
+    if "://" in source:
+        view = NO_CROP
+    else:
+        view = DIGIT_CROP if model.name == DIGIT.name else GELSIGHT_MINI_CROP
+    return view if border is None else replace(view, border=border)
+
+
+def recorded_frames(source: Path, model: SensorModel) -> Generator[Frame, None, None]:
+    """Every frame of a video, or of a folder's pictures by name (background.png first), cut already.
+
+    Raises:
+        UserError: no pictures in it, or of other proportions than the sensor's.
+    """
+    empty = True
+    for frame in _folder(source) if source.is_dir() else _video(source):
+        empty = False
+        yield crop_to_sensor(frame, model, NO_CROP)
+    if empty:
+        raise UserError(
+            f"{source} holds no pictures: give a video, or a folder of PNG or JPEG files"
+        )
+
+
+def live_frames(config: VideoConfig, model: SensorModel) -> Generator[Frame, None, None]:
+    """Frames of a live sensor as they come, without end; close the iterator to release it.
+
+    Raises:
+        UserError: it cannot be opened.
+        DriverError: for 5 s nothing came.
+    """
+    view = fingertip_view(model, config.source)
+    camera = TactileCamera(VideoCamera(config), model, view)
+    try:
+        last, heard = -1, time.monotonic()
+        while True:
+            frame = camera.read()
+            if frame.sequence != last:
+                last, heard = frame.sequence, time.monotonic()
+                yield frame.image
+            elif time.monotonic() > heard + _TIMEOUT:
+                raise DriverError(f"{config.source}: {camera.problem or 'no more pictures'}")
+            time.sleep(_POLL_INTERVAL)
+    finally:
+        camera.close()
+
+
+def _folder(folder: Path) -> Generator[Frame, None, None]:
+    files = [path for path in folder.iterdir() if path.suffix.lower() in _PICTURES]
+    for path in sorted(files, key=lambda path: (path.name != _UNTOUCHED, path.name)):
+        picture = read_picture(path)
+        if picture is None:
+            raise UserError(f"{path} is no picture")
+        yield picture
+
+
+def _video(path: Path) -> Generator[Frame, None, None]:
+    capture = cv2.VideoCapture(str(path))
+    try:
+        while (read := capture.read())[0]:
+            yield cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB)
+    finally:
+        capture.release()
+
+
+def _device_of(model: SensorModel, serial: str) -> str:
+    return find_sensor_camera(model, serial).device

@@ -1,0 +1,81 @@
+"""A picture that changes, shown in any browser: for machines with and without a screen."""
+
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from touchgoal.control.errors import UserError
+
+_BOUNDARY = b"picture"
+_PATIENCE = 1.0  # s without a new picture after which the last one is sent again
+
+
+class LivePicture:
+    """Serves the newest picture at http://127.0.0.1:port/ as an MJPEG stream.
+
+    Args:
+        port: 0 for any free one.
+
+    Raises:
+        UserError: the port is taken.
+    """
+
+    def __init__(self, port: int) -> None:
+        self._changed, self._jpeg, self._closed = threading.Condition(), b"", False
+        handler = type("Handler", (_Handler,), {"live": self})
+        try:
+            self._server = ThreadingHTTPServer(("127.0.0.1", port), handler)
+        except OSError as error:
+            raise UserError(f"port {port}: {error.strerror}; choose another with --port") from error
+        self._server.daemon_threads = True
+        threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True).start()
+
+    @property
+    def address(self) -> str:
+        """What to open in a browser."""
+        return f"http://127.0.0.1:{self._server.server_address[1]}/"
+
+    def show(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Replace the picture, RGB."""
+        with self._changed:
+            self._jpeg = cv2.imencode(".jpg", picture[..., ::-1])[1].tobytes()
+            self._changed.notify_all()
+
+    def next_jpeg(self) -> bytes | None:
+        """The next picture, or the last one again; None when closed."""
+        with self._changed:
+            self._changed.wait(_PATIENCE)
+            return None if self._closed else self._jpeg
+
+    def close(self) -> None:
+        """Hang up."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._server.shutdown()
+        self._server.server_close()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Sends pictures to one browser until either is gone."""
+
+    live: LivePicture
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        kind = f"multipart/x-mixed-replace; boundary={_BOUNDARY.decode()}"
+        self.send_header("Content-Type", kind)
+        self.end_headers()
+        try:
+            while (jpeg := self.live.next_jpeg()) is not None:
+                if jpeg:
+                    head = b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(jpeg)
+                    self.wfile.write(b"--" + _BOUNDARY + b"\r\n" + head + jpeg + b"\r\n")
+        except ConnectionError:
+            pass  # the browser was closed
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Nothing on the terminal."""

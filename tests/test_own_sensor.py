@@ -1,0 +1,199 @@
+"""A sensor of one's own: its frames from any source, presses recorded from them, the sensor checked."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from touchgoal.control.calibration.ball import press_surface
+from touchgoal.control.calibration.press_recorder import PressRecorder
+from touchgoal.control.calibration.press_set import read_presses
+from touchgoal.control.calibration.sensor_check import check_sensor
+from touchgoal.control.errors import UserError
+from touchgoal.control.sensors.fingertip_source import live_frames, recorded_frames
+from touchgoal.control.sensors.live_picture import LivePicture
+from touchgoal.control.sensors.video import VideoConfig
+from touchgoal.control.tactile.depth import DepthEstimator
+from touchgoal.control.tactile.sensor_calibration import load, shade
+from touchgoal.control.tactile.sensor_models import (
+    GELSIGHT_MINI,
+    GELSIGHT_MINI_MARKERS,
+    GELSIGHT_MINI_MEASURED,
+)
+from touchgoal.launch.__main__ import main
+from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
+from touchgoal.sim_envs.tactile.surface_press import SurfacePose, press, untouched
+from touchgoal.sim_envs.tactile.surfaces import TILE, Surface
+
+BALL = Surface("ball", 4e-3, 1.0, np.zeros((TILE, TILE), np.float32), 1.0)
+RNG = np.random.default_rng(0)
+UNIT = sample_instance(GELSIGHT_MINI, RNG)
+
+
+def centres(unit: SensorInstance) -> list[tuple[float, float]]:
+    """Where balls are pressed, px from the middle: once in each part of the picture."""
+    return [(x, y) for y in (-75, 0, 75) for x in (-110, -40, 40, 110)]
+
+
+def pressing(unit: SensorInstance, at: tuple[float, float]) -> Iterator[np.ndarray]:
+    """Frames of a ball that comes, stands for a fifth of a second, and goes."""
+    x, y = (pixels * unit.pixel_pitch for pixels in at)
+    for depth in (0.1, 0.25, *[0.4] * 6, 0.2):
+        pose = SurfacePose((x, y), 0.0, (0.0, 0.0), (0.0, 0.0), depth * 1e-3)
+        yield press(BALL, pose, unit, RNG)
+    for _ in range(4):
+        yield untouched(unit, RNG)
+
+
+@pytest.fixture(scope="module")
+def session() -> list[np.ndarray]:
+    """A whole recording: a settled gel, then a press in each part."""
+    frames = [untouched(UNIT, RNG) for _ in range(30)]
+    return frames + [frame for at in centres(UNIT) for frame in pressing(UNIT, at)]
+
+
+def test_every_press_is_kept_once_where_it_was(session: list[np.ndarray]) -> None:
+    recorder = PressRecorder((240, 320), a_cell=1)
+    kept = [recorder.update(frame) for frame in session]
+    assert recorder.complete and sum(kept) == 12
+    found = np.array(recorder.circles)[:, :2] - [159.5, 119.5]
+    assert (
+        np.abs(found - centres(UNIT)).max() < 10
+    )  # px: within the contact, the fit moves it further
+    assert (recorder.counts == 1).all()
+
+
+def test_a_gel_that_is_touched_first_is_waited_for(session: list[np.ndarray]) -> None:
+    recorder = PressRecorder((240, 320))
+    for frame in session[30:39]:
+        assert not recorder.update(frame)
+    assert "untouched" in recorder.hint
+    with pytest.raises(UserError, match="untouched"):
+        _ = recorder.background
+    for frame in session[:16]:
+        recorder.update(frame)
+    assert recorder.hint == "press at the top, left"
+
+
+def test_a_press_that_never_stands_still_is_not_kept(session: list[np.ndarray]) -> None:
+    recorder = PressRecorder((240, 320))
+    for frame in session[:30]:
+        recorder.update(frame)
+    for x in range(-60, 60, 8):
+        pose = SurfacePose((x * UNIT.pixel_pitch, 0.0), 0.0, (0.0, 0.0), (0.0, 0.0), 0.4e-3)
+        assert not recorder.update(press(BALL, pose, UNIT, RNG))
+    assert recorder.hint == "hold still"
+
+
+def test_record_presses_writes_what_calibrate_reads(
+    session: list[np.ndarray], tmp_path: Path
+) -> None:
+    """From a folder of pictures; then another ball is added to it."""
+    pictures, out = tmp_path / "pictures", tmp_path / "out"
+    pictures.mkdir()
+    for i, frame in enumerate(session):
+        cv2.imwrite(str(pictures / f"{i:04d}.png"), frame[..., ::-1])
+    options = ["--mm-per-pixel", "0.059", "--presses", "1", "--no-calibrate", "--out", str(out)]
+    main(["record-presses", str(pictures), "--ball-mm", "4", *options])
+    main(["record-presses", str(pictures), "--ball-mm", "5", "--resume", *options])
+    presses = read_presses(out / "presses", 0.059e-3)
+    assert len(presses) == 24
+    assert sorted(set(presses.ball_radius.round(4))) == [4e-3, 5e-3]
+    np.testing.assert_array_equal(presses.files, [f"press_{i:03d}.png" for i in range(24)])
+
+
+def test_a_video_and_a_folder_give_every_frame(session: list[np.ndarray], tmp_path: Path) -> None:
+    path = tmp_path / "touch.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25, (320, 240))
+    for frame in session[:40]:
+        writer.write(frame[..., ::-1])
+    writer.release()
+    read = list(recorded_frames(path, GELSIGHT_MINI))
+    assert len(read) == 40
+    assert np.abs(read[0].astype(int) - session[0]).mean() < 4
+    with pytest.raises(UserError, match="no pictures"):
+        list(recorded_frames(tmp_path / "nothing", GELSIGHT_MINI))
+
+
+def test_what_is_shown_live_can_be_read_live(session: list[np.ndarray]) -> None:
+    """The picture that record-presses shows is itself a stream such as live sensors send."""
+    ended = threading.Event()
+    with closing(LivePicture(0)) as live:
+        live.show(session[0])
+
+        def play() -> None:
+            while not ended.wait(0.04):
+                live.show(session[35])
+
+        threading.Thread(target=play, daemon=True).start()
+        with closing(live_frames(VideoConfig(live.address), GELSIGHT_MINI)) as frames:
+            read = [next(frames) for _ in range(5)]
+        ended.set()
+    assert read[-1].shape == (240, 320, 3)
+    assert np.abs(read[-1].astype(int) - session[35]).mean() < 4
+
+
+@pytest.fixture(scope="module")
+def balls() -> list[np.ndarray]:
+    """The measured Mini, untouched and under a ball of 4 mm, with noise of one count."""
+    calibration, rng = load(GELSIGHT_MINI_MEASURED.sensor_file), np.random.default_rng(0)
+    flat = np.zeros((240, 320), np.float32)
+    pressed = [
+        press_surface(calibration, np.array([x, 120.0, 22.0]), 4e-3) for x in (100.0, 160.0, 220.0)
+    ]
+    clean = [shade(calibration, surface) for surface in ([flat] * 12 + pressed + [flat] * 3)]
+    noisy = [picture + rng.normal(size=picture.shape) for picture in clean]
+    return [picture.round().clip(0, 255).astype(np.uint8) for picture in noisy]
+
+
+def test_a_sensor_check_reads_noise_ball_and_contact(balls: list[np.ndarray]) -> None:
+    check = check_sensor(balls, GELSIGHT_MINI_MEASURED, ball_radius=4e-3)
+    assert (check.frames, check.touching, len(check.presses)) == (18, 3, 3)
+    assert check.noise == pytest.approx(1.05, abs=0.1)  # rounding adds a twelfth
+    assert check.untouched < check.threshold < check.touched / 2
+    radii = [press.ball.radius for press in check.presses if press.ball is not None]
+    assert np.median(radii) == pytest.approx(1, abs=0.1)
+    assert not check.drift.large and not check.drift_from_file.large
+
+
+def test_check_sensor_says_what_is_off(
+    balls: list[np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Light that grows by a fifth on the way, a wrong ball, and a weight."""
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    for i, frame in enumerate([*balls, *[balls[0]] * 90]):
+        lit = np.rint(frame * (1 + 0.2 * min(i / 60, 1))).clip(0, 255)
+        cv2.imwrite(str(pictures / f"{i:03d}.png"), lit.astype(np.uint8)[..., ::-1])
+    main(["check-sensor", str(pictures), "--sensor", "gelsight_mini_measured", "--ball-mm", "6",
+          "--weight-g", "2000", "--out", str(tmp_path / "out")])  # fmt: skip
+    said = capsys.readouterr().out
+    assert "lock the exposure" in said and "record-presses" in said
+    assert "of a weight of 19.6 N: multiply" in said
+    drawn = cv2.imread(str(tmp_path / "out" / "check.png"))
+    assert drawn is not None and drawn.shape == (3 * 240, 3 * 320, 3)
+
+
+def test_a_sensor_check_counts_markers() -> None:
+    frames = []
+    for moved in (0.0, 0.0, 3.0):
+        frame = untouched(UNIT, RNG)
+        for row, column in np.ndindex(7, 9):
+            at = 160 + 31.9 * (column - 4) + moved, 120 + 31.9 * (row - 3)
+            fixed = round(16 * at[0]), round(16 * at[1])
+            cv2.circle(frame, fixed, 8 * 16, (20, 20, 20), -1, cv2.LINE_AA, shift=4)
+        frames.append(frame)
+    check = check_sensor(frames, GELSIGHT_MINI_MARKERS)
+    assert check.markers == pytest.approx(1, abs=0.02)
+    assert check.largest_shift == pytest.approx(3, abs=0.5)
+
+
+def test_a_darker_picture_has_a_depth(balls: list[np.ndarray]) -> None:
+    """It once had none: a surface that lies below rest all over threw shadows of negative length."""
+    estimator = DepthEstimator(load(GELSIGHT_MINI_MEASURED.sensor_file), 8)
+    depth = estimator.estimate(np.rint(0.75 * balls[0]).astype(np.uint8), balls[0].astype("f4"))
+    assert np.isfinite(depth).all()
