@@ -1,6 +1,6 @@
 """An episode as the bytes that lie on disk, and back.
 
-Numbers are stored as they are, touch as PNG (lossless), cameras as H.264 (lossy). Encoding is the
+Numbers are stored as they are, touch as PNG, cameras as H.264, both lossless. Encoding is the
 slow part of recording and holds no state: worker processes encode, one process appends.
 
 A data file carries a `Description` of its episode as JSON in its Parquet footer (key `touchgoal`),

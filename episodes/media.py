@@ -18,17 +18,32 @@ from touchgoal.control.picture_file import read_picture
 # Every second frame is a key frame, so that one frame is found by decoding at most two.
 KEY_FRAME_INTERVAL = 2
 # No B frames: presentation order is decoding order and the first time stamp is exactly 0.
-_X264 = {"crf": "18", "g": str(KEY_FRAME_INTERVAL), "bf": "0", "preset": "veryfast"}
+_SEEKABLE = {"g": str(KEY_FRAME_INTERVAL), "bf": "0", "preset": "veryfast"}
 _PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
 
 
 def encode_video(frames: UInt8[np.ndarray, "n h w 3"], fps: float | int) -> bytes:
-    """An MP4 of H.264 (yuv420p, crf 18) whose frame i is shown at i / fps seconds.
+    """An MP4 of lossless H.264 in RGB, whose frame i is shown at i / fps seconds.
+
+    Image towers see what an eye does not: at crf 18 the image cost of a stored episode differed by 9 to
+    15 % from the raw frames', in lossless yuv444p, whose colours are rounded, still by 5 %. It takes 5.5
+    kB for a simulated picture of 128 x 128 (crf 18: 1.0), 26 kB with noise of 3 counts (1.8); touch takes
+    90 kB a finger.
 
     Args:
-        frames: RGB pictures of even height and width.
+        frames: RGB pictures.
         fps: frames per second.
     """
+    return _encode(frames, fps, "libx264rgb", "rgb24", {"qp": "0"})
+
+
+def _encode(
+    frames: UInt8[np.ndarray, "n h w 3"],
+    fps: float | int,
+    codec: str,
+    pixels: str,
+    quality: dict[str, str],
+) -> bytes:
     n, height, width, _ = frames.shape
     if n == 0 or height % 2 or width % 2:
         raise UserError(
@@ -38,8 +53,9 @@ def encode_video(frames: UInt8[np.ndarray, "n h w 3"], fps: float | int) -> byte
     rate = Fraction(fps).limit_denominator(1001)
     file = io.BytesIO()
     with av.open(file, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=rate, options=_X264)
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream = container.add_stream(codec, rate=rate, options=_SEEKABLE | quality)
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt = width, height, pixels
         stream.time_base = 1 / rate
         stream.codec_context.thread_count = 1  # the same bytes on every machine
         for i, picture in enumerate(frames):
@@ -82,12 +98,12 @@ def decode_video(
 
 
 def write_video(path: Path, frames: UInt8[np.ndarray, "n h w 3"], fps: float | int) -> None:
-    """Writes an MP4 (H.264) file that any browser plays; makes its folder.
+    """Writes an MP4 (H.264, yuv420p, crf 18) that any browser plays; makes its folder.
 
     Raises:
         UserError: no frame, or odd height or width.
     """
-    data = encode_video(frames, fps)
+    data = _encode(frames, fps, "libx264", "yuv420p", {"crf": "18"})
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
 

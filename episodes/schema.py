@@ -35,7 +35,7 @@ def is_image(key: str) -> bool:
 
 
 def is_camera(key: str) -> bool:
-    """Whether a key holds context pictures, stored as lossy video; touch is stored losslessly."""
+    """Whether a key holds context pictures, stored as video; touch is stored picture by picture."""
     return is_image(key) and "tactile" not in key
 
 
@@ -105,7 +105,7 @@ def _check_key(features: dict[str, Feature], key: str, values: np.ndarray) -> No
 def _check_image_shape(key: str, shape: tuple[int, ...]) -> None:
     if len(shape) != 4 or shape[3] != 3 or 0 in shape:
         raise UserError(f"{key} has shape {shape}: pictures are (T, h, w, 3), RGB")
-    # H.264 with subsampled colour (yuv420p) shares one colour sample between 2 x 2 pixels.
+    # Other writers' H.264 (yuv420p) shares one colour sample between 2 x 2 pixels, as `write_video` does.
     if is_camera(key) and (shape[1] % 2 or shape[2] % 2):
         raise UserError(f"{key} is {shape[1]} x {shape[2]}: a camera needs even height and width")
 
@@ -147,7 +147,7 @@ def _video_info(shape: list[int], fps: int) -> dict[str, Any]:
         "video.height": shape[0],
         "video.width": shape[1],
         "video.codec": "h264",
-        "video.pix_fmt": "yuv420p",
+        "video.pix_fmt": "gbrp",
         "video.fps": fps,
         "video.channels": 3,
         "is_depth_map": False,

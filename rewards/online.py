@@ -11,6 +11,7 @@ from touchgoal.control.features import CONTROL_HZ, FRONT, TACTILE
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
 from touchgoal.encoders.towers.towers import Towers
+from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.embedding_distance import (
     EmbeddedEpisode,
@@ -19,6 +20,7 @@ from touchgoal.rewards.embedding_distance import (
     compute_curves,
 )
 from touchgoal.rewards.goals import GoalSpec, assign_goals
+from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.rewards.normalizer import DistanceNormalizer
 
 _FIRST_COST_TIMEOUT = 30.0  # s for the first cost, which warms everything up
@@ -27,11 +29,65 @@ _IDLE_SLEEP = 0.005  # s between looks for a new tick
 Observation = Mapping[str, np.ndarray]
 
 
-class OnlineCost:
-    """Measures ticks in a thread: the newest one whenever it is through with the last.
+class CostMeter:
+    """The cost of one tick after the other, by the same steps as `reward-curves`.
 
-    The fingertips' background is the first tick's: they are untouched then.
+    From the fifth tick on the numbers are the same. Before, the fingertips' background is the median
+    of the ticks there have been, while a recording's is always that of its first five.
     """
+
+    def __init__(
+        self,
+        towers: Towers,
+        encoder: TouchEncoder,
+        normalizer: DistanceNormalizer | None,
+        goals: Sequence[GoalSpec],
+    ) -> None:
+        """See OnlineCost."""
+        self._normalizer, self._goals = normalizer, goals
+        self._embedder = EpisodeEmbedder(towers, encoder)
+        self._goal: EmbeddedGoal | None = None
+
+    def measure(self, observation: Observation, first: Sequence[Observation]) -> float:
+        """The cost of a tick; `first` are the run's first ticks, in their order, five at most."""
+        episode = self._embed(observation, first)
+        if self._goal is None:
+            goal = assign_goals(self._goals, episode.modalities)
+            if goal.own:
+                raise UserError("task.rewards: last and frame:K are not known before the end")
+            self._goal = self._embedder.embed_goal(goal, episode)
+            if self._normalizer is None and len(goal.as_dict()) > 1:
+                raise UserError(
+                    "task.rewards: raw distances of several modalities cannot be averaged: give "
+                    "one goal of one modality (image:PATH or text:SENTENCE), or a scale"
+                )
+        curves = compute_curves(episode, self._goal, self._normalizer)
+        return float(np.mean([curves.costs[name][0] for name in curves.raw]))
+
+    def _embed(self, observation: Observation, first: Sequence[Observation]) -> EmbeddedEpisode:
+        """One tick as an episode."""
+        if FRONT not in observation:
+            raise UserError("task.rewards: the cost looks through the front camera: add it")
+        sides = tuple(key for key in TACTILE if key in observation)
+        touch = [
+            self._embedder.embed_touch(
+                observation[key][None], touch_background(np.stack([tick[key] for tick in first]))
+            )
+            for key in sides
+        ]
+        return EmbeddedEpisode(
+            source="this run",
+            fps=CONTROL_HZ,
+            contact=Contact(None, "not looked for"),
+            made_with=self._embedder.made_with,
+            image=self._embedder.embed_pictures(observation[FRONT][None]),
+            sides=sides,
+            touch=np.stack(touch) if touch else None,
+        )
+
+
+class OnlineCost:
+    """Measures ticks in a thread: the newest one whenever it is through with the last."""
 
     def __init__(
         self,
@@ -50,21 +106,21 @@ class OnlineCost:
             goals: each modality takes the first that speaks for it; what none speaks for is left
                 out. Frames of the episode itself are not known yet and cannot be goals.
         """
-        self._normalizer, self._goals = normalizer, goals
-        self._embedder = EpisodeEmbedder(towers, encoder)
-        self._untouched: Observation = {}
-        self._goal: EmbeddedGoal | None = None
-        self._observation: Observation | None = None
+        self._meter = CostMeter(towers, encoder, normalizer, goals)
+        self._first: tuple[Observation, ...] = ()  # ticks in which nothing is touched
+        self._newest: tuple[Observation, tuple[Observation, ...]] | None = None
         self._latest = LatestValue("cost", self._measure_newest, _FIRST_COST_TIMEOUT)
 
     def latest_cost(self, observation: Observation) -> float:
-        """Hand a tick over; the newest cost there is.
+        """Hand every tick over, from the first; the newest cost there is, of this tick or an earlier one.
 
         The mean over the modalities that have a goal, each 1 at the usual start and 0 at the usual
         end or nearer; without a normalizer the cosine distance. It waits for the first one alone.
         DriverError, with the reason, if nothing can be measured.
         """
-        self._observation = observation
+        if len(self._first) < START_FRAMES:
+            self._first = (*self._first, observation)
+        self._newest = observation, self._first
         return self._latest.read()
 
     def close(self) -> None:
@@ -72,40 +128,9 @@ class OnlineCost:
         self._latest.close()
 
     def _measure_newest(self) -> float | None:
-        observation, self._observation = self._observation, None
-        if observation is None:
+        newest, self._newest = self._newest, None
+        if newest is None:
             time.sleep(_IDLE_SLEEP)
             return None
         torch.set_num_threads(1)  # of this thread: the control loop needs the other core
-        self._untouched = self._untouched or observation
-        episode = self._embed(observation)
-        if self._goal is None:
-            goal = assign_goals(self._goals, episode.modalities)
-            if goal.own:
-                raise UserError("task.rewards: last and frame:K are not known before the end")
-            self._goal = self._embedder.embed_goal(goal, episode)
-            if self._normalizer is None and len(goal.as_dict()) > 1:
-                raise UserError(
-                    "task.rewards: raw distances of several modalities cannot be averaged: give "
-                    "one goal of one modality (image:PATH or text:SENTENCE), or a scale"
-                )
-        curves = compute_curves(episode, self._goal, self._normalizer)
-        return float(np.mean([curves.costs[name][0] for name in curves.raw]))
-
-    def _embed(self, observation: Observation) -> EmbeddedEpisode:
-        """One tick as an episode."""
-        if FRONT not in observation:
-            raise UserError("task.rewards: the cost looks through the front camera: add it")
-        sides = tuple(key for key in TACTILE if key in observation)
-        touch = [
-            self._embedder.embed_touch(observation[k][None], self._untouched[k]) for k in sides
-        ]
-        return EmbeddedEpisode(
-            source="this run",
-            fps=CONTROL_HZ,
-            contact=Contact(None, "not looked for"),
-            made_with=self._embedder.made_with,
-            image=self._embedder.embed_pictures(observation[FRONT][None]),
-            sides=sides,
-            touch=np.stack(touch) if touch else None,
-        )
+        return self._meter.measure(*newest)

@@ -19,12 +19,14 @@ from touchgoal.control.interfaces import DriverError
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.episodes.media import write_video
+from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.rewards.api import reward_curve
-from touchgoal.rewards.goals import PictureFile, Sentence
+from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
+from touchgoal.rewards.goals import PictureFile, Sentence, assign_goals
 from touchgoal.rewards.normalizer import DistanceNormalizer
-from touchgoal.rewards.online import OnlineCost
+from touchgoal.rewards.online import CostMeter, OnlineCost
 from touchgoal.rewards.sources import open_source
 
 EPISODE = recorded()
@@ -247,3 +249,25 @@ def test_cost_during_a_run_is_raw_where_no_scale_applies(
     with pytest.raises(DriverError, match="raw distances of several modalities"):
         both.latest_cost(tick)
     both.close()
+
+
+def test_cost_during_a_run_is_that_of_its_recording(encoder: TouchEncoder, tmp_path: Path) -> None:
+    """Same frames, same cost, from the fifth tick on; one fingertip flickers in the first ticks."""
+    Image.fromarray(IMAGES[9]).save(tmp_path / "end.png")
+    noise = np.random.default_rng(1).integers(0, 30, (5, *TOUCH["left"].shape[1:]), dtype=np.uint8)
+    left = np.concatenate([TOUCH["left"][:5] + noise, TOUCH["left"][5:]])
+    embedder = EpisodeEmbedder(PaintTowers(), encoder)
+    ends = {"image": 1.0, "text": 1.0}, {"image": 0.1, "text": 0.2}
+    scale = DistanceNormalizer(*ends, {}, embedder.made_with, "recorded, not simulated", 3)
+    goals = [PictureFile(tmp_path / "end.png"), Sentence("soft")]
+    frames = {FRONT: IMAGES, TACTILE_LEFT: left, TACTILE_RIGHT: TOUCH["right"]}
+    recording = embedder.embed_episode(Episode(frames=frames, task="", meta={}), 20.0, "recording")
+    goal = embedder.embed_goal(assign_goals(goals, recording.modalities), recording)
+    expected = compute_curves(recording, goal, scale).costs["image+text"]
+    meter, ticks = (
+        CostMeter(PaintTowers(), encoder, scale, goals),
+        [{key: values[i] for key, values in frames.items()} for i in range(len(IMAGES))],
+    )
+    during = [meter.measure(tick, ticks[: min(i + 1, 5)]) for i, tick in enumerate(ticks)]
+    np.testing.assert_allclose(during[4:], expected[4:], atol=1e-5)
+    assert np.abs(during[0] - expected[0]) > 1e-4  # one frame is another background
