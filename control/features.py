@@ -10,6 +10,7 @@ from dataclasses import dataclass
 STATE = "observation.state"
 TCP_POSE = "observation.tcp_pose"
 WRENCH = "observation.wrench"
+LOAD = "observation.load"
 FRONT = "observation.images.front"
 WRIST = "observation.images.wrist"
 TACTILE_LEFT = "observation.images.tactile_left"
@@ -77,6 +78,9 @@ FEATURES: dict[str, Feature] = {
     TCP_POSE: Feature("float32", (7,), _POSE, "tool centre point in the base frame: m, wxyz"),
     WRENCH: Feature(
         "float32", (6,), _WRENCH, "external force (N) and torque (Nm) at the TCP, base frame"
+    ),
+    LOAD: Feature(
+        "float32", (1,), ("fz",), "force on the table's load cell, N; where there is one"
     ),
     FRONT: Feature("uint8", CAMERA_SHAPE, _IMAGE_NAMES, "fixed camera facing the robot, RGB"),
     WRIST: Feature("uint8", CAMERA_SHAPE, _IMAGE_NAMES, "camera on the hand, RGB"),

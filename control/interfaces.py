@@ -16,6 +16,9 @@ from touchgoal.control.tactile.sensor_models import SensorModel
 
 Joints = Float[np.ndarray, "n"]
 
+STOPPED_ON_REQUEST = "stopped on request"
+"""What the fault of an arm begins with that has nothing but been stopped."""
+
 
 class DriverError(RuntimeError):
     """A component failed; one line says what happened and what a person can do."""

@@ -124,6 +124,7 @@ class MadeUpCell:
         step: float = 0.0,
         width: float = 0.0,
         seconds: float = 5.0,
+        execute: bool = True,
     ) -> Ending:
         """`each_tick` is told the number of the tick before the actor acts in it.
 
@@ -131,12 +132,13 @@ class MadeUpCell:
             step: rad that the first joint is to go each tick.
             width: m asked of the gripper.
             seconds: after which it ends.
+            execute: False: a dry run.
         """
         connection = CellConnection(
             FR3, self.arm, self.gripper, self.cameras, self.load_cell, self.clock
         )
         safety = Safety(FR3, ft.CONTROL_HZ)
-        loop = ControlLoop(connection, safety, True, lambda: "", lambda _: None)
+        loop = ControlLoop(connection, safety, execute, lambda: "", lambda _: None)
         self.log = RunLog()
 
         class Actor:

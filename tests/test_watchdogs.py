@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from a_cell import MadeUpCell
+from a_cell import MadeUpCell, MadeUpLoadCell
 
 from touchgoal.control import features as ft
 from touchgoal.control.grippers.franka_hand import FrankaHandClient
 from touchgoal.control.grippers.non_blocking import NonBlockingGripper
-from touchgoal.control.interfaces import DriverError, GripperReading
+from touchgoal.control.interfaces import DriverError, GripperReading, LoadReading
+from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.limits import FR3
 from touchgoal.policies.deploy.held_object import HeldObject
 
@@ -77,6 +78,52 @@ def test_forces_that_nobody_knows_stop_the_arm() -> None:
     cell = MadeUpCell()
     ending = cell.run(at(10, set_(cell.arm, wrench=np.full(6, NAN))))
     assert ending.reason == "external force is unknown" and "singularity" in ending.advice
+
+
+def test_what_presses_on_the_table_is_recorded_and_stops_the_arm() -> None:
+    """More by the task's force ceiling than what lay there at first; a sudden relief counts, too."""
+    for change in (40.0, -40.0):
+        cell = MadeUpCell()
+        cell.load_cell = MadeUpLoadCell(cell.clock, force=55.0)
+        ending = cell.run(at(10, lambda c=cell, n=change: setattr(c.load_cell, "force", 55 + n)))
+        assert ending.stopped and "load on the table 40" in ending.reason
+        assert [row[ft.LOAD].item() for row in cell.log.rows] == [55.0] * len(cell.log.rows)
+
+
+def test_an_arm_that_took_other_devices_along_is_what_the_operator_reads() -> None:
+    cell = MadeUpCell()
+    cell.load_cell = MadeUpLoadCell(cell.clock)
+
+    def power_cut() -> None:
+        set_(cell.arm, fault="the controller closed the connection")()
+        cell.load_cell = None
+
+    def read() -> LoadReading:
+        if cell.load_cell is None:
+            raise DriverError("load cell: device disconnected")
+        return LoadReading(0.0, 0, cell.clock.time)
+
+    cell.load_cell.read = read  # pyright: ignore
+    cell.arm.reading = replace(cell.arm.reading, fault="")
+    # The load cell says so first: the arm's driver has not noticed yet when it is read.
+    cell.arm.stop = power_cut  # pyright: ignore
+    ending = cell.run(at(10, lambda: setattr(cell, "load_cell", None)))
+    assert ending.reason.startswith("arm: the controller closed the connection; also: load cell")
+
+
+def test_a_dry_run_imagines_one_consistent_arm() -> None:
+    cell = MadeUpCell()
+    set_(cell.arm, wrench=np.full(6, 2.0))()
+    ending = cell.run(lambda _: None, step=0.01, seconds=1.0, width=0.06, execute=False)
+    assert not ending.stopped and not cell.gripper.told
+    kinematics = Kinematics(FR3.arm, FR3.tool.tcp_offset)
+    for row in cell.log.rows:
+        position, _ = kinematics.forward(row[ft.STATE][:7].astype(float))
+        np.testing.assert_allclose(row[ft.TCP_POSE][:3], position, atol=1e-5)
+        assert not row[ft.WRENCH].any()
+    first, last = cell.log.rows[0], cell.log.rows[-1]
+    assert np.linalg.norm(last[ft.TCP_POSE][:3] - first[ft.TCP_POSE][:3]) > 0.02
+    assert last[ft.STATE][-1] == pytest.approx(0.06)
 
 
 def test_an_object_lost_on_the_way_stops_the_arm() -> None:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from touchgoal.control.arms.driver_process import DriverProcess
 from touchgoal.control.errors import UserError
-from touchgoal.control.interfaces import ArmReading, DriverError, Joints
+from touchgoal.control.interfaces import STOPPED_ON_REQUEST, ArmReading, DriverError, Joints
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.tracker import Tracker, TrackerState
 from touchgoal.control.safety.limits import RobotLimits
@@ -102,7 +102,7 @@ class ArmClient(ABC):
 
     def stop(self) -> None:
         """Brake, and take no command until `recover`."""
-        self._refuse_from_now_on("stopped on request; recover the arm to go on")
+        self._refuse_from_now_on(f"{STOPPED_ON_REQUEST}; recover the arm to go on")
 
     def tick(self) -> None:
         """Read the state and stream the next command.

@@ -162,8 +162,8 @@ class SafetySection:
     velocity_share: Annotated[float, Field(gt=0, le=1)] | None = None
     """Share of the maker's joint speed that a policy may use."""
     force: Annotated[float, Field(gt=0, le=100)] | None = None
-    """Force from outside at the hand that stops the arm, N; not given: the task's own, which is above
-    what its demonstrations reach and below the arm's reflex."""
+    """Force from outside at the hand that stops the arm, N, and change of the load cell's; not given: the
+    task's own, which is above what its demonstrations reach and below the arm's reflex."""
     torque: Annotated[float, Field(gt=0, le=100)] | None = None
     """Torque from outside in a joint that stops the arm, Nm; not given: the task's own."""
     touch: Annotated[float, Field(gt=0, le=0.005)] | None = None

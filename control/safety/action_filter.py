@@ -43,6 +43,7 @@ class Limit(StrEnum):
     STALE_GRIPPER = "gripper age"
     FORCE = "external force"
     TORQUE = "external torque"
+    LOAD = "load on the table"
     TOUCH = "gel indentation"
     TRACKING = "distance of joints from command"
 
@@ -94,6 +95,7 @@ class Measurements:
         torque: Nm in each joint from outside.
         touch: m that each fingertip's gel is pressed in.
         observation_age, action_age, state_age, gripper_age: s since the oldest of each was taken.
+        load: N more or less on the table than at first; 0 without a load cell.
     """
 
     q: Joints
@@ -104,6 +106,7 @@ class Measurements:
     action_age: float
     state_age: float
     gripper_age: float
+    load: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -221,6 +224,7 @@ class Safety:
         checks += [
             (Limit.FORCE, np.linalg.norm(reading.force), limits.force),
             (Limit.TORQUE, np.abs(reading.torque).max(), limits.torque),
+            (Limit.LOAD, abs(reading.load), limits.force),
             (Limit.TOUCH, np.abs(reading.touch).max(), limits.touch),
             (Limit.TRACKING, np.abs(reading.q - state.q).max(), limits.tracking),
             (Limit.NOT_A_NUMBER, state.bad_actions * self.dt, self.watchdogs.action.stop),

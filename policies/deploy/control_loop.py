@@ -17,7 +17,7 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.control.cell.connection import CellConnection, RealClock
 from touchgoal.control.errors import UserError
-from touchgoal.control.interfaces import ArmReading, DriverError
+from touchgoal.control.interfaces import STOPPED_ON_REQUEST, ArmReading, DriverError
 from touchgoal.control.safety.action_filter import Limit, Measurements, Safety, SafetyState
 from touchgoal.policies.deploy.held_object import HeldObject
 from touchgoal.policies.deploy.observation import CellReading, ObservationReader
@@ -38,6 +38,7 @@ ADVICE = {
     Limit.FORCE: "something pressed on the hand: clear it, then start again; a task that presses harder "
     "by itself needs a higher safety.force in the cell file; an FR3 itself stops at 30",
     Limit.TORQUE: "something pressed on the arm: clear it, then start again",
+    Limit.LOAD: "something pressed on the table: clear it, then start again",
     Limit.TOUCH: "a gel was pressed too deep: look at it, lower gripper.force; the hand let go, unless "
     "it was carrying something",
     Limit.TRACKING: "the arm does not follow: look for what blocks it",
@@ -217,7 +218,7 @@ class ControlLoop:
             with _realtime_priority() if real else nullcontext():
                 return self._loop(actor, seconds, log)
         except (DriverError, UserError) as error:
-            return self.stop(str(error), "check what it names, then start again")
+            return self._arm_first(self.stop(str(error), "check what it names, then start again"))
         except Exception as error:  # the policy's, most likely; the arm must not go on
             said = " ".join(str(error).split())
             return self.stop(f"{type(error).__name__}: {said}", "the program or the policy failed")
@@ -269,6 +270,13 @@ class ControlLoop:
             last = reading
         return Ending(reason, False, True, advice, rest)
 
+    def _arm_first(self, ending: Ending) -> Ending:
+        """With the arm's own fault, if it has one by now: what takes it away takes other devices along."""
+        fault = self._connection.arm.read().fault
+        if not fault or fault.startswith(STOPPED_ON_REQUEST) or fault in ending.reason:
+            return ending
+        return replace(ending, reason=f"arm: {fault}; also: {ending.reason}")
+
     def _tick(
         self, actor: DeployedActor, log: RunLog, seconds: float, late: float
     ) -> Ending | None:
@@ -297,6 +305,7 @@ class ControlLoop:
             action_age=actor.action_age,
             state_age=self._connection.clock.age(sensed.arm.stamp) if self._execute else 0.0,
             gripper_age=self._connection.clock.age(sensed.gripper.stamp),
+            load=self.reader.added_load(sensed.load),
         )
         before, self.state = (
             self.state,
@@ -343,11 +352,12 @@ class ControlLoop:
         return self.stop(reason, advice, release_to)
 
     def _as_commanded(self, sensed: CellReading) -> CellReading:
-        """As if the arm had followed."""
-        q, velocity = self.state.q, self.state.velocity
-        state = np.concatenate([q, velocity, [self.width]]).astype(np.float32)
-        arm = replace(sensed.arm, q=q, velocity=velocity)
-        return replace(sensed, arm=arm, observation={**sensed.observation, ft.STATE: state})
+        """As if arm and hand had followed, through free air: what the real one feels still stops it."""
+        arm = replace(sensed.arm, q=self.state.q, velocity=self.state.velocity)
+        gripper = replace(sensed.gripper, width=self.width)
+        felt = replace(arm, wrench=np.zeros(6))
+        imagined = self.reader.proprioception(felt, gripper)
+        return replace(sensed, arm=arm, observation={**sensed.observation, **imagined})
 
 
 def _speed(before: ArmReading, now: ArmReading) -> float:

@@ -80,6 +80,7 @@ class ObservationReader:
         ] = {}  # sequence of the last frame, indentation
         self._arm: ArmReading | None = None
         self._gripper: GripperReading | None = None
+        self._first_load: float | None = None
         self.unsound = ""
 
     def read(self) -> CellReading:
@@ -95,7 +96,9 @@ class ObservationReader:
         oldest_source = max(ages, key=ages.__getitem__) if ages else ""
         fault = f"arm: {arm.fault}" if arm.fault else ""
         fault = fault or (f"gripper: {gripper.fault}" if gripper.fault else "")
-        observation = self._proprioception(arm, gripper)
+        observation = self.proprioception(arm, gripper)
+        if load is not None:
+            observation[ft.LOAD] = np.array([load.force], np.float32)
         for key, frame in frames.items():
             tactile = key in ft.TACTILE
             observation[key] = frame.image if tactile else crop_and_resize(frame.image, self._size)
@@ -151,7 +154,16 @@ class ObservationReader:
                 found.append(f"{key.removeprefix(ft.IMAGE_PREFIX)}: {problem}")
         return "; ".join(found)
 
-    def _proprioception(self, arm: ArmReading, gripper: GripperReading) -> dict[str, np.ndarray]:
+    def added_load(self, load: LoadReading | None) -> float:
+        """Force (N) on the load cell beyond what lay on it when this reader began; 0 without one."""
+        if load is None:
+            return 0.0
+        if self._first_load is None:
+            self._first_load = load.force
+        return load.force - self._first_load
+
+    def proprioception(self, arm: ArmReading, gripper: GripperReading) -> dict[str, np.ndarray]:
+        """What the arm and the gripper say, by the keys of the vocabulary."""
         position, R = self._kinematics.forward(arm.q)
         values = {
             ft.STATE: np.concatenate([arm.q, arm.velocity, [gripper.width]]),

@@ -15,6 +15,7 @@ from touchgoal.control.cell.config import CameraSection, CellConfig
 from touchgoal.control.cell.connection import CellConnection, cell_limits
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import (
+    STOPPED_ON_REQUEST,
     ArmReading,
     Camera,
     DriverError,
@@ -97,7 +98,7 @@ class SimulatedArm:
         """See Arm."""
         self._state = None
         self._refused_because = (
-            self._refused_because or "stopped on request; recover the arm to go on"
+            self._refused_because or f"{STOPPED_ON_REQUEST}; recover the arm to go on"
         )
         self._cell.brake(self._limits.acceleration)
 
