@@ -54,6 +54,32 @@ class BeadMazeOptions(BenchmarkOptions):
 
 
 @checked_dataclass
+class DeployOptions(BenchmarkOptions):
+    """How often does what is deployed succeed, through the arm and in the environment?"""
+
+    tasks: tuple[TaskName, ...] = ("pick-place", "bead-maze")
+    """Which tasks."""
+    policies: tuple[str, ...] = ("scripted", "shipped")
+    """Which policies, named as for deploy; scripted: of each task its own, the expert or the follower."""
+    arms: tuple[Literal["environment", "in-process", "lock-step", "real-time"], ...] = (
+        "environment",
+        "in-process",
+        "lock-step",
+        "real-time",
+    )
+    """Through what: the task's environment; an arm in this program, from an example cell file; a fresh
+    twin over libfranka by the cell file that it writes, whose time waits for the client, or does not."""
+    episodes: Count = 10
+    """Number of episodes of each row."""
+    in_a_row: CountOrNone = 0
+    """In place of all that: so many deployments on one twin of each task, in turn."""
+    seconds: Positive = 40.0
+    """After which a deployment ends."""
+    seed: Seed = 6_000_000
+    """Random seed of the first episode; each further one adds one."""
+
+
+@checked_dataclass
 class EnvSpeedOptions(BenchmarkOptions):
     """How fast does the simulated cell run on one core?"""
 

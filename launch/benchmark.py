@@ -13,6 +13,7 @@ from touchgoal.launch.run_folder import open_run, write_json
 
 BENCHMARKS: dict[str, type[options.BenchmarkOptions]] = {
     "bead-maze": options.BeadMazeOptions,
+    "deploy": options.DeployOptions,
     "env-speed": options.EnvSpeedOptions,
     "faults": options.FaultsOptions,
     "motion": options.MotionOptions,
@@ -27,6 +28,7 @@ RESULTS = Path(__file__).resolve().parents[1] / "benchmarks" / "results"
 
 Config = (
     Annotated[options.BeadMazeOptions, tyro.conf.subcommand("bead-maze")]
+    | Annotated[options.DeployOptions, tyro.conf.subcommand("deploy")]
     | Annotated[options.EnvSpeedOptions, tyro.conf.subcommand("env-speed")]
     | Annotated[options.FaultsOptions, tyro.conf.subcommand("faults")]
     | Annotated[options.MotionOptions, tyro.conf.subcommand("motion")]

@@ -29,7 +29,7 @@ from touchgoal.episodes.recording import Actor
 from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy, find_policy, suggestion
 from touchgoal.policies.follower import WireFollower
 from touchgoal.sim_envs.base import FrankaTactileEnv
-from touchgoal.sim_envs.config import TaskConfig
+from touchgoal.sim_envs.config import TaskConfig, TaskName
 from touchgoal.sim_envs.tasks import make_expert, task_name
 
 BUILT_IN = {
@@ -98,6 +98,12 @@ class ImportedPolicy:
     @property
     def _is_file(self) -> bool:
         return self.module.endswith(".py")
+
+
+def scripted(task: TaskName) -> str:
+    """The task's own policy without learning that an arm can do: it does not see the simulator's state
+    but for where things are at the start."""
+    return "follower" if task == "bead-maze" else "expert"
 
 
 def choose_policy(name: str | Path, task: TaskConfig, latency: int = 0) -> PolicyMaker:

@@ -28,8 +28,10 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.__main__ import main
 from touchgoal.launch.commands.deploy import EXAMPLES, NOT_DONE, STOPPED, find_cell_file
 from touchgoal.policies import checkpoint
+from touchgoal.policies.deploy.actors import load_cell_policy
 from touchgoal.policies.deploy.control_loop import ControlLoop, Request, RunLog, TickStatus
 from touchgoal.policies.deploy.session import Session
+from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.twin.in_process import simulate_cell
 
 _PATIENCE = 300  # s for a loop, on a machine however loaded
@@ -315,14 +317,22 @@ def test_a_port_that_cannot_be_is_one_line(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda p: p.stem)
 def test_example_cell_files_are_read(path: Path) -> None:
-    assert read_cell_file(path).task.name == "pick-place"
+    maze = path.stem == "sim_maze"
+    cell = read_cell_file(path)
+    assert cell.task.name == ("bead-maze" if maze else "pick-place")
+    if maze:  # as it was trained: what ships feels with printed dots, and fingers that hardly press
+        low, high = BeadMazeConfig().grasp_force
+        assert low <= cell.gripper.force <= high
+        assert load_cell_policy(cell) is not None
 
 
 def test_an_example_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("sim", "sim.toml", "launch/cells/sim.toml"):
         assert find_cell_file(Path(name)) == EXAMPLES / "sim.toml"
-    with pytest.raises(UserError, match="no cell file mine.toml.*fr3_two_minis, sim, ur5e"):
+    with pytest.raises(
+        UserError, match="no cell file mine.toml.*fr3_two_minis, sim, sim_maze, ur5e"
+    ):
         find_cell_file(Path("mine.toml"))
     (tmp_path / "sim.toml").write_text(SIM)
     assert find_cell_file(Path("sim.toml")) == Path("sim.toml")

@@ -23,6 +23,7 @@ from touchgoal.control.interfaces import DriverError
 
 _GRACE = 1.0  # s that the kernel's alarm gives beyond the parent's patience
 _CLOSING = 3.0  # s to bring an arm to rest and disconnect
+NEVER = 1e6  # s, as a driver's period: it ticks when it is told to
 _EXIT_WITH_REASON = 3  # exit code; the reason is the last line of output
 
 

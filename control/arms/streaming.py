@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.arms.driver_process import DriverProcess
+from touchgoal.control.arms.driver_process import NEVER, DriverProcess
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import STOPPED_ON_REQUEST, ArmReading, DriverError, Joints
 from touchgoal.control.motion.arm_models import JointLimits
@@ -37,6 +37,8 @@ class ArmConfig:
         rate: Hz of the stream that goes out.
         state_timeout: s without news of the controller after which it is lost. Each driver has its own;
             a simulator on a loaded machine needs more.
+        lock_step: a twin's time stands but when told to go on; then `advance` takes the place of the
+            clock's ticks.
     """
 
     address: str
@@ -44,6 +46,7 @@ class ArmConfig:
     hz: float
     rate: float
     state_timeout: float
+    lock_step: bool = False
 
 
 class ArmClient(ABC):
@@ -56,13 +59,15 @@ class ArmClient(ABC):
     _commanded: Joints  # the controller's own present command, rad; `_measure` sets it
 
     def __init__(self, config: ArmConfig, recover: bool) -> None:
-        self.config, self.period = config, 1 / config.rate
+        self.config, self._stream_period = config, 1 / config.rate
+        self.period = NEVER if config.lock_step else self._stream_period
         self._state: TrackerState | None = None
-        self._tracker = Tracker(self._connect(recover), 1 / config.hz, self.period)
+        self._twin_time: float | None = None
+        self._tracker = Tracker(self._connect(recover), 1 / config.hz, self._stream_period)
         self._clock, self._stamp = -1.0, time.monotonic()
         self._reading = self._measure()
         self._refusal = self._reading.fault
-        self._ticked, self._streamed = time.monotonic(), 0.0
+        self._ticked, self._streamed, self._streams = time.monotonic(), 0.0, False
 
     @abstractmethod
     def _connect(self, recover: bool) -> JointLimits:
@@ -113,6 +118,8 @@ class ArmClient(ABC):
         punctual = now - self._ticked < self.config.state_timeout / 2
         self._ticked = now
         self._reading = self._measure()
+        if self._twin_time is not None:
+            self._reading = replace(self._reading, time=self._twin_time)
         if punctual and now - self._reading.stamp > self.config.state_timeout:
             raise DriverError(
                 f"no state for {1e3 * self.config.state_timeout:.0f} ms: check power and cable, then recover"
@@ -122,13 +129,21 @@ class ArmClient(ABC):
         if self._state is None:
             return
         time_, before = self._reading.time, self._state.q
-        periods = min(round((time_ - self._streamed) / self.period), _MAX_CATCH_UP)
+        period = self._stream_period
+        periods = min(round((time_ - self._streamed) / period), _MAX_CATCH_UP)
         if periods < 1:
             return
-        self._streamed = max(self._streamed + periods * self.period, time_ - self.period)
+        self._streamed = max(self._streamed + periods * period, time_ - period)
         for _ in range(periods):
             self._state = self._tracker.step(self._state)
-        self._send(self._state.q, (self._state.q - before) / (periods * self.period))
+        self._send(self._state.q, (self._state.q - before) / (periods * period))
+        self._streams = True
+
+    def advance(self, time: float) -> bool:
+        """Tick at a twin's time (s); whether its stream goes out, and the arm is to be driven by it."""
+        self._twin_time = time
+        self.tick()
+        return self._streams
 
     def close(self) -> None:
         """Bring the arm to rest and let go of it."""
@@ -145,7 +160,7 @@ class ArmClient(ABC):
 
     def _refuse_from_now_on(self, reason: str) -> None:
         """Brake; the first reason stays."""
-        self._state = None
+        self._state, self._streams = None, False
         if not self._refusal:
             self._refusal = reason
             with suppress(Exception):
@@ -185,6 +200,13 @@ class ArmProcess:
     def command(self, q: Joints) -> None:
         """See Arm."""
         self._process.call("command", q)
+
+    def advance(self, time: float) -> bool:
+        """See ArmClient; False of a lost arm, whose next reading says so."""
+        try:
+            return self._process.call("advance", time)
+        except DriverError:
+            return False
 
     def stop(self) -> None:
         """See Arm. There is nothing to do for a lost arm: its controller stops it."""

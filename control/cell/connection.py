@@ -11,14 +11,14 @@ import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.control.arms import franka, ur
-from touchgoal.control.arms.streaming import ArmConfig
+from touchgoal.control.arms.streaming import ArmConfig, ArmProcess
 from touchgoal.control.cell.config import (
     CellConfig,
     FingertipsSection,
-    GripperSection,
     SafetySection,
     ToolSection,
 )
+from touchgoal.control.cell.lock_step import LockStepClock
 from touchgoal.control.errors import UserError
 from touchgoal.control.grippers.franka_hand import FrankaHand
 from touchgoal.control.grippers.non_blocking import NonBlockingGripper
@@ -34,6 +34,8 @@ from touchgoal.control.sensors.tactile_camera import TactileCamera
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_models import find_sensor
 
+# Hz, and s without a picture, on the wall: what a loaded machine still manages.
+_LOCK_STEP_RATE, _LOCK_STEP_TIMEOUT = 1.0, 10.0
 _STOP_FACTOR = 5  # times the age at which the arm holds
 _CLOCK_TIMEOUT = 1.0  # s on the wall for which an arm's clock may stand
 _POLL_INTERVAL = 0.002  # s between looks at it
@@ -74,7 +76,7 @@ class RealClock:
 
 
 class ArmClock:
-    """The arm's own: of a twin in lock-step, whose time passes as slowly as the machine needs.
+    """The arm's own: of a UR's twin in lock-step, whose time passes as slowly as the machine needs.
 
     Stamps count the time on the wall; what the arm's clock said then is remembered. When it stands
     for longer than a loaded machine explains, time goes on all the same, so that ages tell.
@@ -123,6 +125,8 @@ class CellConnection:
 
     def close(self) -> None:
         """The arm first; a device that fails to close holds up no other."""
+        if isinstance(self.clock, LockStepClock):
+            self.clock.close()
         with ExitStack() as stack:
             for device in (self.load_cell, *self.cameras.values(), self.gripper, self.arm):
                 if device is not None:
@@ -147,15 +151,20 @@ def connect_cell(cell: CellConfig, hz: float) -> CellConnection:
             config = VideoConfig(
                 camera.source, camera.size, camera.rate, camera.exposure, camera.white_balance
             )
-            cameras[ft.IMAGE_PREFIX + name] = keep(VideoCamera(config))
+            cameras[ft.IMAGE_PREFIX + name] = keep(VideoCamera(_timed(config, cell)))
         if cell.fingertips:
             for side, key in enumerate(ft.TACTILE):
-                cameras[key] = keep(_tactile_camera(cell.fingertips, side))
+                cameras[key] = keep(_tactile_camera(cell, cell.fingertips, side))
         load_cell = keep(SerialLoadCell(cell.load_cell)) if cell.load_cell else None
-        gripper = keep(_gripper(cell.gripper))
+        gripper = keep(_gripper(cell))
         arm = keep(_arm(cell, robot, hz))
+        clock: Clock = RealClock()
+        if cell.lock_step and isinstance(gripper, FrankaHand):
+            clock = LockStepClock(cell.task.twin, arm, gripper, cameras)
+            clock.reset(cell.task.seed)
+        elif cell.lock_step:
+            clock = ArmClock(arm)
         undo.pop_all()
-    clock = ArmClock(arm) if cell.lock_step else RealClock()
     return CellConnection(robot, arm, gripper, cameras, load_cell, clock)
 
 
@@ -208,21 +217,24 @@ def _box(box: Box, own: SafetySection, name: str) -> Box:
     return box
 
 
-def _arm(cell: CellConfig, robot: RobotLimits, hz: float) -> Arm:
+def _arm(cell: CellConfig, robot: RobotLimits, hz: float) -> ArmProcess:
     ur5e = cell.arm == "ur5e"
     rate, timeout = (ur.RATE, ur.STATE_TIMEOUT) if ur5e else (franka.RATE, franka.STATE_TIMEOUT)
     timeout = cell.safety.state_timeout or timeout
-    config = ArmConfig(cell.address, robot, hz, rate, timeout)
+    lock_step = cell.lock_step and not ur5e
+    config = ArmConfig(cell.address, robot, hz, rate, timeout, lock_step)
     return ur.connect_ur(config) if ur5e else franka.connect_franka(config)
 
 
-def _gripper(cell: GripperSection) -> Gripper:
-    if cell.kind == "franka_hand":
-        return NonBlockingGripper(FrankaHand(cell.address, cell.force))
-    return Robotiq(RobotiqConfig(cell.port, cell.activate, force=cell.force, widths=cell.widths))
+def _gripper(cell: CellConfig) -> Gripper:
+    own = cell.gripper
+    if own.kind == "robotiq":
+        return Robotiq(RobotiqConfig(own.port, own.activate, force=own.force, widths=own.widths))
+    hand = FrankaHand(own.address, own.force, cell.lock_step)
+    return hand if cell.lock_step else NonBlockingGripper(hand)
 
 
-def _tactile_camera(cell: FingertipsSection, side: int) -> TactileCamera:
+def _tactile_camera(whole: CellConfig, cell: FingertipsSection, side: int) -> TactileCamera:
     """Of the left (0) or right (1) finger, at a device, a USB serial number or a stream."""
     source = (cell.left, cell.right)[side]
     model = find_sensor(cell.sensor_files[side] if cell.sensor_files else cell.sensor)
@@ -233,4 +245,13 @@ def _tactile_camera(cell: FingertipsSection, side: int) -> TactileCamera:
         exposure=cell.exposure,
         white_balance=cell.white_balance,
     )
-    return TactileCamera(VideoCamera(config), model, fingertip_view(model, source, cell.border))
+    return TactileCamera(
+        VideoCamera(_timed(config, whole)), model, fingertip_view(model, source, cell.border)
+    )
+
+
+def _timed(config: VideoConfig, cell: CellConfig) -> VideoConfig:
+    """Pictures of a lock-step twin come when they come."""
+    if not cell.lock_step:
+        return config
+    return replace(config, rate=_LOCK_STEP_RATE, timeout=_LOCK_STEP_TIMEOUT, frozen_after=np.inf)

@@ -1,7 +1,9 @@
 """Franka Hand through franky-control, in a child process.
 
 The hand takes one slow command at a time, while a policy asks for a width every tick. The newest
-width is sent when the last command is done, which is after 0.8 s at most; `stop` ends one at once. A hand's grasp closes until it meets something, whatever width
+width is sent when the last command is done, which is after 0.8 s at most; `stop` ends one at once.
+So a width that merely passes on the way to another is not sent: one that changes faster than the hand
+could follow, unless it goes on doing so. A hand's grasp closes until it meets something, whatever width
 it is told, so only closing all the way grasps; any other width is a move, and one that meets something
 on its way in grasps that.
 """
@@ -10,7 +12,7 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from touchgoal.control.arms.driver_process import DriverProcess
+from touchgoal.control.arms.driver_process import NEVER, DriverProcess
 from touchgoal.control.arms.franka import INSTALL
 from touchgoal.control.arms.streaming import import_client
 from touchgoal.control.errors import UserError
@@ -21,17 +23,20 @@ if TYPE_CHECKING:
 
 _STEP = 2e-3  # m between commands that differ, and up to which a width is shut
 _SPEED = 0.1  # m/s; the hand's fastest
-_PERIOD = 0.05  # s between looks at the hand
-_MOST_PASSING = 3  # of them for which widths may pass
 _STOP_TIMEOUT = 0.5  # s that a stop may take; 0.06 on the twin
+_ANSWER_TIMEOUT = 1.0  # s for an answer that a twin has sent to arrive
+PERIOD = 0.05  # s between looks at the hand
+_MOST_PASSING = 3  # of them for which widths may pass
 
 
 class FrankaHandClient:
     """In the child: one hand. Its state comes every 20 to 50 ms."""
 
-    period = _PERIOD
-
-    def __init__(self, address: str, force: float) -> None:
+    def __init__(self, address: str, force: float, lock_step: bool = False) -> None:
+        """With `lock_step`, `advance` takes the place of the clock's ticks."""
+        self.period = NEVER if lock_step else PERIOD
+        self._issued = 0  # commands sent to the hand
+        self._answered: int | None = None  # of them, as a twin says
         self._franky, self._force = import_client("franky", INSTALL), force
         self._hand = self._franky.Gripper(address)
         self._max_width = self._hand.state.max_width
@@ -77,13 +82,19 @@ class FrankaHandClient:
         except Exception as error:
             self._fault = f"{type(error).__name__}: {' '.join(str(error).split())}"
 
+    def advance(self, answered: int) -> int:
+        """Tick, when a twin says that so many commands are answered; how many have been sent."""
+        self._answered = answered
+        self.tick()
+        return self._issued
+
     def close(self) -> None:
         """See Gripper."""
 
     def _passes(self) -> bool:
         """Whether the target only passes, faster than the hand could follow; once a tick."""
         changed, self._last_target = abs(self._target - self._last_target), self._target
-        passes = self._target > _STEP and changed > _SPEED * _PERIOD
+        passes = self._target > _STEP and changed > _SPEED * PERIOD
         self._passing = self._passing + 1 if passes else 0
         return 0 < self._passing <= _MOST_PASSING
 
@@ -99,7 +110,8 @@ class FrankaHandClient:
         """Whether the last command is done; what it met on its way in is grasped."""
         if self._running is None:
             return True
-        if not self._running.wait(0.0):
+        arrives = self._answered is not None and self._answered >= self._issued
+        if not self._running.wait(_ANSWER_TIMEOUT if arrives else 0.0):
             return False
         arrived, self._running = self._running.get(), None  # raises what went wrong
         if not arrived and self._inwards:
@@ -114,11 +126,13 @@ class FrankaHandClient:
             self._grasp(width)
         else:
             self._inwards = width < self._reading.width
+            self._issued += 1
             self._running = self._hand.move_async(width, _SPEED)
 
     def _grasp(self, width: float) -> None:
         # What is met before `width` counts as grasped, whatever its size.
         self._inwards = False
+        self._issued += 1
         self._running = self._hand.grasp_async(
             width, _SPEED, self._force, epsilon_inner=width, epsilon_outer=self._max_width
         )
@@ -127,8 +141,8 @@ class FrankaHandClient:
 class FrankaHand:
     """The Gripper protocol over a hand; it closes with `force` (N, 30 to 70)."""
 
-    def __init__(self, address: str, force: float = 30.0) -> None:
-        self._process = DriverProcess(FrankaHandClient, address, force)
+    def __init__(self, address: str, force: float = 30.0, lock_step: bool = False) -> None:
+        self._process = DriverProcess(FrankaHandClient, address, force, lock_step)
 
     def read(self) -> GripperReading:
         """See Gripper."""
@@ -141,6 +155,10 @@ class FrankaHand:
     def stop(self, release_to: float | None = None) -> None:
         """See Gripper."""
         self._process.call("stop", release_to)
+
+    def advance(self, answered: int) -> int:
+        """See FrankaHandClient."""
+        return self._process.call("advance", answered)
 
     def close(self) -> None:
         """See Gripper."""

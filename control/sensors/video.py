@@ -24,8 +24,7 @@ from touchgoal.control.sensors.pictures import FrozenParts, JpegDecoder, is_brok
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_FATAL)
 
-_READ_TIMEOUT = 1000  # ms without a frame after which OpenCV gives up on a stream
-_OPEN_TIMEOUT = 5000  # ms to open it the first time: the first frame may take longer to come
+_OPEN_TIMEOUT = 5.0  # s to open it the first time: the first frame may take longer to come
 _REOPEN_INTERVAL = 0.5  # s between attempts
 _RATE_WINDOW = 2.0  # s that the rate is measured over
 _LATE_PERIODS = 3.0  # periods without a frame that mean a problem
@@ -44,6 +43,7 @@ class VideoConfig:
         rate: Hz; of a camera to ask for, of images to play, and what `problem` compares with.
         exposure, white_balance: fixed values for a camera, in V4L2's units (`v4l2-ctl --list-ctrls`;
             usually 0.1 ms, and kelvin); None: as it is set.
+        timeout: s without a frame after which a stream counts as gone and is opened again.
         frozen_after: s of pixel-for-pixel the same picture, or part of it, after which it counts as
             old. Sensor noise makes real pictures differ; rendered ones may rightly stand still: then
             infinity.
@@ -56,6 +56,7 @@ class VideoConfig:
     rate: float = 25.0
     exposure: float | None = None
     white_balance: int | None = None
+    timeout: float = 1.0
     frozen_after: float = 0.5
     gel: bool = False
     device: Callable[[], str] | None = None
@@ -177,13 +178,13 @@ class VideoCamera:
         self._capture.release()
         time.sleep(_REOPEN_INTERVAL)
         try:
-            self._capture = _open(self.config, _READ_TIMEOUT)
+            self._capture = _open(self.config, self.config.timeout)
         except UserError:
             pass  # not back yet
 
 
-def _open(config: VideoConfig, timeout_ms: int) -> Any:
-    """Within `timeout_ms` ms if it is a stream."""
+def _open(config: VideoConfig, timeout: float) -> Any:
+    """Within `timeout` s if it is a stream."""
     source = int(config.source) if config.source.isdigit() else config.source
     if config.device is not None:
         source = config.device()
@@ -192,8 +193,8 @@ def _open(config: VideoConfig, timeout_ms: int) -> Any:
     elif config.is_file:
         capture = cv2.VideoCapture(source)
     else:
-        opening = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms]
-        reading = [cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_TIMEOUT]
+        opening = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(1e3 * timeout)]
+        reading = [cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(1e3 * config.timeout)]
         capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, opening + reading)
         if _sends_jpeg(capture):
             return capture

@@ -132,10 +132,17 @@ def _deploy(
     )
     # Scripts end by themselves; of others only a simulator knows when the task is done.
     endless = cell.task.policy != "expert"
-    watcher = LatestValue("simulator", partial(_success, truth)) if endless and truth else None
+    watcher = watch = None
+    if (
+        endless and truth and (cell.arm == "sim" or cell.lock_step)
+    ):  # in its time, not in the wall's
+        watch = partial(_success, truth)
+    elif endless and truth:
+        watcher = LatestValue("simulator", partial(_ask_now_and_then, truth))
+        watch = watcher.read
 
     def request() -> Request:
-        return terminal.operator_request() or (watcher.read() if watcher else "")
+        return terminal.operator_request() or (watch() if watch else "")
 
     print(f"{'MOVING' if config.execute else 'dry run'}: {HELP}", flush=True)
     with terminal.watching():
@@ -174,8 +181,12 @@ def _load_cost(cell: CellConfig) -> OnlineCost | None:
 
 def _success(truth: Callable[[], dict[str, Any]]) -> Request:
     """What a simulator asks for: an end once the task is done."""
-    time.sleep(_ASKING)
     return "success" if truth()["success"] else ""
+
+
+def _ask_now_and_then(truth: Callable[[], dict[str, Any]]) -> Request:
+    time.sleep(_ASKING)
+    return _success(truth)
 
 
 def _confirm(cell: CellConfig) -> None:
@@ -199,6 +210,7 @@ def _report(result: Result, out: Path) -> None:
         "advice": ending.advice,
         "rest_seconds": ending.rest_seconds,
         "success": result.success,
+        "progress": result.progress,
         "held_width": result.held_width,
         "episode": result.episode,
         "recording_error": result.recording_error,

@@ -145,7 +145,8 @@ def make_actor(
     """The actor for one run, from where the arm is now."""
     if policy is not None:
         # So a run on a simulated arm repeats on any machine.
-        return LearnedActor(policy.planner, _SIMULATED_PLAN_TIMEOUT if cell.arm == "sim" else None)
+        waits = cell.arm == "sim" or cell.lock_step
+        return LearnedActor(policy.planner, _SIMULATED_PLAN_TIMEOUT if waits else None)
     if cell.task.policy == "follower":
         return FollowerActor(ft.CONTROL_HZ)
     return pick_and_place(pick_place_poses(cell, truth), safety, commanded)

@@ -42,6 +42,7 @@ class Result:
         log: what was recorded.
         success: whether the task is done: by the simulator's truth, or as the ending tells; None
             where nobody knows.
+        progress: of the task, in [0, 1], by the simulator's truth; None without one.
         held_width: m, of what the hand still holds; None if nothing.
         episode: index of the recorded episode; None without one.
         recording_error: why there is none, if there should be one.
@@ -50,6 +51,7 @@ class Result:
     ending: Ending
     log: RunLog
     success: bool | None
+    progress: float | None
     held_width: float | None
     episode: int | None
     recording_error: str = ""
@@ -106,7 +108,15 @@ class Session:
                 recording_error = (
                     f"this episode could not be kept ({error}); those before it are whole"
                 )
-        return Result(ending, log, success, self._held_width(), episode, recording_error)
+        return Result(
+            ending,
+            log,
+            success,
+            self._progress(),
+            self._held_width(),
+            episode,
+            recording_error,
+        )
 
     def _move_to_start(self, loop: ControlLoop) -> Ending | None:
         """Why it does not go on; None if the arm is where the task begins."""
@@ -147,6 +157,12 @@ class Session:
         except UserError:  # the twin has ended
             return ending.done
         return success
+
+    def _progress(self) -> float | None:
+        try:
+            return None if self.truth is None else float(self.truth()["progress"])
+        except UserError:  # the twin has ended
+            return None
 
     def _held_width(self) -> float | None:
         try:

@@ -2,6 +2,9 @@
 for the truth.
 
     truth                         what only a simulator knows, and where the arm is
+    hold                          let the time of a lock-step twin stand until this connection closes
+    advance STEPS DRIVEN COMMANDS let it go on by so many ms, once a client drives the arm if DRIVEN is
+                                  1, and once so many commands have come to the hand since `hold`
     reset SEED [OPTIONS]          put the scene, the arm and the open hand where an episode starts, and
                                   clear an error as a person does in Desk; OPTIONS is a JSON object
                                   of the task's
@@ -33,6 +36,7 @@ import signal
 import socket
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -41,9 +45,10 @@ import numpy as np
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
+from touchgoal.sim_envs.twin.lock_step import LockStep
 from touchgoal.sim_envs.twin.mjpeg import Stream
 from touchgoal.sim_envs.twin.serial.devices import SerialPort
-from touchgoal.sim_envs.twin.tcp_ports import ListeningPort
+from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort
 
 _HTTP = re.compile(r" HTTP/\d")  # what any browser's first line ends in
 _STRONGEST_NUDGE = 500.0  # N
@@ -89,7 +94,10 @@ class ControlPort:
         ports: dict[str, SerialPort],
         host: str,
         port: int,
+        lock_step: LockStep | None,
+        on_reset: Callable[[], None],
     ) -> None:
+        self._lock_step, self._on_reset = lock_step, on_reset
         self._cell, self._arm, self._streams, self._ports = cell, arm, streams, ports
         self._listener = ListeningPort(host, port)
         self._frozen_seconds = (
@@ -104,6 +112,10 @@ class ControlPort:
             self._frozen_seconds -= DT
             if self._frozen_seconds <= 0:
                 self._arm.freeze(False)
+        self.hold()
+
+    def hold(self) -> None:
+        """Do what has been asked; time may stand meanwhile."""
         for client in self._listener.poll():
             for line in client.lines():
                 if _HTTP.search(line):
@@ -116,7 +128,14 @@ class ControlPort:
                     )
                     client.close()
                     break
-                client.send(json.dumps(self._answer(order)).encode() + b"\n")
+                answer = self._answer(order, client)
+                if answer is not None:
+                    client.send(json.dumps(answer).encode() + b"\n")
+
+    @property
+    def sockets(self) -> list[ListeningPort | ClientConnection]:
+        """On which someone may say something."""
+        return [self._listener, *(client for client in self._listener.clients if client.open)]
 
     def send(self) -> None:
         """Nothing is said unasked."""
@@ -125,9 +144,12 @@ class ControlPort:
         """Free the port."""
         self._listener.close()
 
-    def _answer(self, line: str) -> dict[str, Any]:
+    def _answer(self, line: str, client: ClientConnection) -> dict[str, Any] | None:
+        """The answer; None if it comes later."""
         command, _, rest = line.partition(" ")
         actions = {
+            "hold": lambda: self._held_time().hold(client),
+            "advance": None,
             "truth": self._cell.truth,
             "reset": lambda: self._reset(*rest.split(" ", 1)),
             "freeze": lambda: self._freeze(float(rest)),
@@ -149,9 +171,18 @@ class ControlPort:
         if command not in actions:
             return {"error": f"unknown command {command!r}; there are: {', '.join(actions)}"}
         try:
+            if command == "advance":
+                steps, driven, commands = (int(number) for number in rest.split())
+                self._held_time().advance(client, steps, bool(driven), commands)
+                return None
             return actions[command]() or {"ok": True}
         except (UserError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
             return {"error": f"{line[:200]!r} cannot be done: {error}"}
+
+    def _held_time(self) -> LockStep:
+        if self._lock_step is None:
+            raise UserError("this twin is not in lock-step: start it with --lock-step")
+        return self._lock_step
 
     def _reset(self, seed: str, options: str = "{}") -> None:
         if self._cell.moving:
@@ -163,6 +194,7 @@ class ControlPort:
             raise UserError("a seed is a number from 0, options are a JSON object")
         self._cell.reset(number, chosen)
         self._arm.clear_error()
+        self._on_reset()
 
     def _freeze(self, seconds: float) -> None:
         _require_finite(seconds)

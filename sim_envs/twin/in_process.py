@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.control.cell.config import CameraSection, CellConfig
+from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection, cell_limits
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import (
@@ -218,7 +218,7 @@ def simulate_cell(config: CellConfig, hz: float) -> CellConnection:
     env.update_contacts()
     arm = SimulatedArm(cell, hz)
     cameras: dict[str, Camera] = {
-        ft.IMAGE_PREFIX + name: SimulatedCamera(cell, name, _picture_rate(config, camera))
+        ft.IMAGE_PREFIX + name: SimulatedCamera(cell, name, camera.rate)
         for name, camera in config.cameras.items()
     }
     if config.fingertips:
@@ -233,11 +233,6 @@ def simulate_cell(config: CellConfig, hz: float) -> CellConnection:
         SimulatedClock(cell, arm),
         cell.truth,
     )
-
-
-def _picture_rate(config: CellConfig, camera: CameraSection) -> float:
-    """Hz of simulated time. A lock-step twin counts its pictures a second of the wall's clock."""
-    return CameraSection.rate if config.lock_step else camera.rate
 
 
 def env_config_of(config: CellConfig) -> TaskConfig:

@@ -18,6 +18,7 @@ CAMERA_RATE = 30  # Hz, a webcam's
 _CAMERA_NOISE = 1.5  # counts: by it a driver tells a still scene from a frozen camera
 _QUALITY = 95  # of JPEG; real GelSight Minis send MJPEG, too
 _JPEG_HEADER = 640  # bytes of OpenCV's
+_SENDING_TIMEOUT = 2.0  # s
 _POLL_INTERVAL = 0.2  # s between looks at whether the stream is to end
 
 Picture = UInt8[np.ndarray, "h w 3"]
@@ -32,6 +33,7 @@ class Stream:
         render: takes a picture, RGB.
         stalled, frozen, lost, broken, halved: until when (s, time.monotonic) nothing comes, one picture
             repeats, clients are cut off and turned away, JPEGs have wrong bytes or are cut in half.
+        clients, count, sent: who watches; pictures published; pictures sent to the last who came.
     """
 
     rate: int
@@ -43,6 +45,7 @@ class Stream:
     halved: float = 0.0
     clients: int = 0
     count: int = 0
+    sent: int = 0
     picture: Picture | None = None
     condition: threading.Condition = field(default_factory=threading.Condition)
 
@@ -58,6 +61,13 @@ class Stream:
             self.count += 1
             self.condition.notify_all()
 
+    def wait_until_sent(self) -> None:
+        """Until the last picture is on its way to whoever watches."""
+        with self.condition:
+            self.condition.wait_for(
+                lambda: self.sent >= self.count or not self.clients, _SENDING_TIMEOUT
+            )
+
 
 class Streams:
     """Serves every camera and sensor of the cell at `http://host:port/NAME`.
@@ -66,8 +76,8 @@ class Streams:
         streams: by name, such as tactile_left.
     """
 
-    def __init__(self, cell: SimulatedCell, host: str, port: int) -> None:
-        self._cell, self._host = cell, host
+    def __init__(self, cell: SimulatedCell, host: str, port: int, lock_step: bool) -> None:
+        self._cell, self._host, self._lock_step = cell, host, lock_step
         self._rng = np.random.default_rng(0)
         self._noise = np.empty(0)
         env = cell.env
@@ -93,6 +103,9 @@ class Streams:
     def receive(self) -> None:
         """Nobody says anything here."""
 
+    def hold(self) -> None:
+        """No picture is due while time stands."""
+
     def send(self) -> None:
         """Take the pictures that are due."""
         due = [s for s in self.streams.values() if _is_due(self._cell.steps, s.rate)]
@@ -100,6 +113,17 @@ class Streams:
             self._cell.env.update_contacts()  # watched or not: watching must not change the physics
         for stream in due:
             stream.publish()
+            if self._lock_step:
+                stream.wait_until_sent()
+
+    def sent(self) -> dict[str, int]:
+        """How many pictures of each stream are on their way so far."""
+        return {name: stream.sent for name, stream in self.streams.items()}
+
+    def reset(self) -> None:
+        """From here on the cameras' noise is that of a twin that begins."""
+        self._rng = np.random.default_rng(0)
+        self._noise = np.empty(0)
 
     def close(self) -> None:
         """Hang up on everyone."""
@@ -152,6 +176,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         with stream.condition:
             stream.clients += 1
+            stream.sent = stream.count
         try:
             self._serve(stream)
         except OSError:  # the client has gone
@@ -161,7 +186,7 @@ class _Handler(BaseHTTPRequestHandler):
                 stream.clients -= 1
 
     def _serve(self, stream: Stream) -> None:
-        seen = stream.count
+        seen = stream.sent
         while time.monotonic() >= stream.lost:
             with stream.condition:
                 if stream.count == seen and not stream.condition.wait(_POLL_INTERVAL):
@@ -177,6 +202,9 @@ class _Handler(BaseHTTPRequestHandler):
                 jpeg = _with_random_bytes(jpeg)
             head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
             self.wfile.write(head.encode() + jpeg.tobytes() + b"\r\n")
+            with stream.condition:
+                stream.sent = seen
+                stream.condition.notify_all()
 
     def log_message(self, format: str, *args: object) -> None:
         """Say nothing."""

@@ -28,6 +28,7 @@ from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.control_port import ControlPort
 from touchgoal.sim_envs.twin.franka.controller import FrankaArm
 from touchgoal.sim_envs.twin.franka.hand import FrankaHand
+from touchgoal.sim_envs.twin.lock_step import LockStep
 from touchgoal.sim_envs.twin.mjpeg import CAMERA_RATE, Streams
 from touchgoal.sim_envs.twin.serial import devices as serial_ports
 from touchgoal.sim_envs.twin.ur.controller import UrController
@@ -36,7 +37,6 @@ _MAX_BACKLOG = 0.1  # s behind real time beyond which the twin stops trying to c
 # s to wait for a client that drives the arm. In lock-step for as long as a loaded machine needs; in
 # real time about as long as a busy one hiccups.
 _LOCK_STEP_TIMEOUT, _CLIENT_TIMEOUT = 2.0, 0.1
-_LOCK_STEP_PICTURE_RATE = 1.0  # Hz by the clock on the wall that a slow machine still manages
 _RUN_SECONDS = 40.0
 
 
@@ -70,6 +70,9 @@ class Service(Protocol):
     def receive(self) -> None:
         """Before a physics step: take what clients have sent."""
 
+    def hold(self) -> None:
+        """In place of a step, while a lock-step twin's time stands."""
+
     def send(self) -> None:
         """After it: answer them."""
 
@@ -80,8 +83,8 @@ class Service(Protocol):
 class Twin:
     """The cell with its services, in one thread.
 
-    In lock-step simulated time never runs faster than the clock; in real time the cell catches up
-    with the clock.
+    In real time the cell catches up with the clock. In lock-step it waits for the client that drives
+    the arm, and while a client holds the time (`lock_step.py`), for that.
 
     Attributes:
         cell_config: where everything is, for whoever deploys on it.
@@ -94,7 +97,8 @@ class Twin:
         if env.config.tactile:
             # A client would lose the arm while code is loaded at the first touch.
             warm_up(env.bodies, env.sensor)
-        self._lock_step, self._next_step_at = config.lock_step, time.monotonic()
+        self._lock_step: LockStep | None = None
+        self._next_step_at = time.monotonic()
         self.stopped = False
         self._services: list[Service] = []
         with ExitStack() as undo:
@@ -114,13 +118,22 @@ class Twin:
             self.step()
 
     def step(self) -> None:
-        """One millisecond of everything."""
+        """One millisecond of everything, unless time stands."""
+        lock_step = self._lock_step
+        if lock_step is not None and lock_step.standing:
+            for service in self._services:
+                service.hold()
+            lock_step.wait(self._commands.sockets)
+            return
         for service in self._services:
             service.receive()
         self.cell.step()
         for service in self._services:
             service.send()
-        self._keep_pace()
+        if lock_step is not None and lock_step.held:
+            lock_step.count_step()
+        else:
+            self._keep_pace()
 
     def close(self) -> None:
         """Free ports, files and the OpenGL contexts."""
@@ -130,7 +143,7 @@ class Twin:
 
     def _keep_pace(self) -> None:
         now = time.monotonic()
-        allowed = 0.0 if self._lock_step else _MAX_BACKLOG
+        allowed = 0.0 if self.cell_config.lock_step else _MAX_BACKLOG
         self._next_step_at = max(self._next_step_at + DT, now - allowed)
         if self._next_step_at > now:
             time.sleep(self._next_step_at - now)
@@ -143,6 +156,7 @@ class Twin:
         services.append(load_cell := serial_ports.LoadCell(cell, folder / "load_cell"))
         ports = {"load_cell": load_cell.port}
         force = cell.env.grasp_force  # with which the episode's object is to be held
+        hand = None
         if config.arm == "fr3":
             timeout = _LOCK_STEP_TIMEOUT if config.lock_step else _CLIENT_TIMEOUT
             services.append(hand := FrankaHand(cell, host))
@@ -159,9 +173,20 @@ class Twin:
                 widths=(tool.stroke[1], tool.stroke[0]),
                 force=max(force, tool.force[0]),
             )
-        services.append(streams := Streams(cell, host, config.port))
+        services.append(streams := Streams(cell, host, config.port, config.lock_step))
         control = config.port + 1 if config.port else 0
-        services.append(commands := ControlPort(cell, arm, streams.streams, ports, host, control))
+
+        def reset() -> None:
+            streams.reset()
+            if hand is not None:
+                hand.reset()
+
+        if config.lock_step and hand is not None and isinstance(arm, FrankaArm):
+            self._lock_step = LockStep(cell, arm, hand, streams)
+        self._commands = ControlPort(
+            cell, arm, streams.streams, ports, host, control, self._lock_step, reset
+        )
+        services.append(self._commands)
         return _cell_config(
             config,
             gripper,
@@ -169,7 +194,7 @@ class Twin:
             LoadCellConfig(
                 str(load_cell.port.path), serial_ports.NEWTONS_PER_COUNT, serial_ports.ZERO
             ),
-            _task_section(config, cell.env, commands.address),
+            _task_section(config, cell.env, self._commands.address),
         )
 
 
@@ -183,18 +208,17 @@ def _cell_config(
     """What `deploy` is to know of this twin.
 
     In lock-step time goes as slowly as the machine needs: by the clock on the wall, which drivers go
-    by, pictures may be rare and the link silent for longer.
+    by, the link may be silent for longer.
     """
-    rate = _LOCK_STEP_PICTURE_RATE if config.lock_step else None
     cameras: dict[CameraName, CameraSection] = {}
     for name in get_args(CameraName):
         if name in streams:
-            cameras[name] = CameraSection(streams[name], rate or CAMERA_RATE)
+            cameras[name] = CameraSection(streams[name], CAMERA_RATE)
     limits = UR5E if config.arm == "ur5e" else FR3
     tool, fingertips = limits.tool, None
     if "tactile_left" in streams:
         sides = streams["tactile_left"], streams["tactile_right"]
-        fingertips = FingertipsSection(config.task.sensor, *sides, rate)
+        fingertips = FingertipsSection(config.task.sensor, *sides)
     return CellConfig(
         arm=config.arm,
         address=config.host,

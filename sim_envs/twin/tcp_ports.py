@@ -17,6 +17,10 @@ class ClientConnection:
         self.unread, self._unsent = b"", b""
         self.open = True
 
+    def fileno(self) -> int:
+        """For `select`."""
+        return self._socket.fileno()
+
     def read(self) -> None:
         """Take in what has come."""
         try:
@@ -65,6 +69,10 @@ class ListeningPort:
     def port(self) -> int:
         """The port's number."""
         return self._socket.getsockname()[1]
+
+    def fileno(self) -> int:
+        """For `select`."""
+        return self._socket.fileno()
 
     def poll(self) -> list[ClientConnection]:
         """Let new clients in, hear the others, forget those who left."""

@@ -6,7 +6,6 @@ set by the client (the servo stays at Franka's default), self-collision, guiding
 """
 
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,34 +17,19 @@ from touchgoal.control.safety.limits import FR3
 from touchgoal.sim_envs.scene.build import robot_model
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.franka import limits, messages
+from touchgoal.sim_envs.twin.franka.hand_frames import Pose, describe_hand
 from touchgoal.sim_envs.twin.franka.limits import Setpoint, Thresholds
 from touchgoal.sim_envs.twin.franka.messages import MoveStatus, RobotCommand, RobotMode
+from touchgoal.sim_envs.twin.franka.motion import Motion
 
 _MAX_LOST_PACKETS = 20  # packets in a row after which the arm stops: Franka's documentation
 _POSITION, _VELOCITY, _POSE, _TWIST, _TORQUE = range(5)  # motion generators; 4 is none
 _EXTERNAL, _OTHER = 2, 3  # controllers
 _SETTERS = {*range(RobotCommand.SET_COLLISION_BEHAVIOUR, RobotCommand.SET_LOAD + 1)}
+# s between states while time stands: to a client that does not drive the arm, whose motion begins, that
+# drives it (libfranka gives up after 1 s).
+_HELD_INTERVALS = 0.005, 0.02, 0.2
 _BRAKING = FR3.hardware.acceleration  # rad/s^2 of braking; a real reflex brakes harder
-
-Pose = Float[np.ndarray, "4 4"]
-
-
-@dataclass
-class Motion:
-    """A motion in progress.
-
-    Attributes:
-        request: the Move command, answered when the motion ends.
-        generator, controller: what drives it.
-        begun: whether the client has sent a set-point.
-        lost: milliseconds since the last one.
-    """
-
-    request: messages.Request
-    generator: int
-    controller: int
-    begun: bool = False
-    lost: int = 0
 
 
 class FrankaArm:
@@ -69,6 +53,7 @@ class FrankaArm:
         self._cleared = False
         self._sent = self._echoed = 0
         self._nonsense = False
+        self._sent_at = 0.0  # monotonic s
         self._success_rate = 1.0
         self._thresholds = Thresholds.default()
         self._ee, self._k = np.eye(4), np.eye(4)  # NE_T_EE and EE_T_K
@@ -100,6 +85,39 @@ class FrankaArm:
             if fault is not None:
                 self.abort(fault)
         self._send_state(contact)
+
+    def hold(self) -> None:
+        """While time stands: take what the client sends, and keep it from giving the arm up.
+
+        A client that drives the arm is sent the last state again, which it has answered: to it, too,
+        no time passes. One that does not looks for new states; so does one whose motion begins.
+        """
+        for request in self.link.requests():
+            self._handle(request)
+        self._take_orders()
+        motion = self._motion
+        if motion is not None and not self.link.connected:
+            self._end(None)
+        interval = _HELD_INTERVALS[0 if motion is None else 1 + motion.begun]
+        if time.monotonic() - self._sent_at < interval:
+            return
+        if motion is not None and motion.begun:
+            self._sent_at = time.monotonic()
+            self.link.send(self._state.tobytes())
+        else:
+            self._send_state(self._estimate_wrench())
+
+    @property
+    def answered(self) -> bool:
+        """Whether the client has answered the last state, if it drives the arm."""
+        motion = self._motion
+        return motion is None or not motion.begun or self._echoed >= self._sent - 1
+
+    @property
+    def obeys(self) -> bool:
+        """Whether a client's set-points come, or none are taken."""
+        motion = self._motion
+        return self.mode != RobotMode.IDLE or (motion is not None and motion.begun)
 
     def close(self) -> None:
         """Free the port."""
@@ -330,22 +348,8 @@ class FrankaArm:
         self._setpoint = Setpoint(self.cell.q_d.copy(), zero, zero)
         self._torque = zero
 
-    def _flange(self) -> Pose:
-        """Of the hand's tool centre point on the flange (F_T_NE)."""
-        T = np.eye(4)
-        arm = FR3.arm
-        c, s = np.cos(arm.hand_yaw), np.sin(arm.hand_yaw)
-        T[:2, :2] = [[c, -s], [s, c]]
-        T[2, 3] = FR3.tool.tcp_offset
-        return T
-
     def _describe_hand(self) -> None:
-        state = self._state
-        state["F_T_NE"] = self._flange().T.ravel()
-        state["F_T_EE"] = (self._flange() @ self._ee).T.ravel()
-        state["NE_T_EE"], state["EE_T_K"] = self._ee.T.ravel(), self._k.T.ravel()
-        state["m_ee"], state["I_ee"] = 0.73, np.diag([0.001, 0.0025, 0.0017]).ravel()  # fr3.xml
-        state["F_x_Cee"] = [-0.01, 0.0, 0.03]
+        describe_hand(self._state, self._ee, self._k)
 
     def _pose_and_jacobian(self, q: np.ndarray) -> tuple[Pose, Float[np.ndarray, "6 7"]]:
         """Pose and Jacobian of the end effector, which a client may have moved off the TCP."""
@@ -391,3 +395,4 @@ class FrankaArm:
         state["control_command_success_rate"] = self._success_rate if moving else 0.0
         self.link.send(state.tobytes())
         self._sent += 1
+        self._sent_at = time.monotonic()

@@ -1,5 +1,6 @@
 """The Franka Hand's service in front of the cell's gripper."""
 
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from touchgoal.sim_envs.twin.franka.messages import HandCommand, HandStatus
 _STILL = 1e-3  # m/s of width
 _SETTLED = 0.1  # s without motion after which a move is over
 _SOMETHING = 1e-3  # m: narrower than this the fingers have met
+_HELD_INTERVAL = 0.004  # s between states while time stands
 _KEPT = 2e-3  # m by which the width may change while something is held
 
 
@@ -37,11 +39,16 @@ class FrankaHand:
     """Serves the hand at `host`, port 1338.
 
     A grasp closes until something resists; closing on air fails, whatever width was expected.
+
+    Attributes:
+        commands, answers: how many commands have come, and how many were answered.
     """
 
     def __init__(self, cell: SimulatedCell, host: str) -> None:
         self.cell = cell
         self.link = messages.Link(host, messages.HAND_PORT, messages.HAND_VERSION, wide=False)
+        self.commands = self.answers = 0
+        self._held_at = 0.0  # monotonic s, of the last state while time stands
         self._job: Job | None = None
         self._grasped, self._held = False, 0.0  # m, the width of what is held
         self._state = np.zeros((), messages.HAND_STATE)
@@ -63,6 +70,21 @@ class FrankaHand:
         self.link.send(self._state.tobytes())
         self._state["message_id"] += 1
 
+    def hold(self) -> None:
+        """While time stands: take commands, and let the client see the state as it is."""
+        for request in self.link.requests():
+            self._handle(request)
+        if time.monotonic() - self._held_at > _HELD_INTERVAL:
+            self._held_at = time.monotonic()
+            self.link.send(self._state.tobytes())
+
+    def reset(self) -> None:
+        """Nothing is held or under way any more."""
+        self._grasped = False
+        if self._job is not None:
+            self.link.answer(self._job.request, HandStatus.ABORTED)  # whoever asked is gone
+        self._job = None
+
     def close(self) -> None:
         """Free the port."""
         self.link.close()
@@ -71,7 +93,8 @@ class FrankaHand:
         command, job, cell = request.command, self._job, self.cell
         if job is not None:
             self._job = None
-            self.link.answer(job.request, HandStatus.ABORTED)
+            self._answer(job.request, HandStatus.ABORTED)
+        self.commands += 1
         self._grasped = False
         moves = command in (HandCommand.MOVE, HandCommand.GRASP)
         numbers = np.frombuffer(request.payload, "<f8") if moves else np.zeros(0)
@@ -79,7 +102,7 @@ class FrankaHand:
             self.link.answer(request, HandStatus.FAIL)
         elif command == HandCommand.STOP:
             cell.command_gripper(cell.env.width(), GRIPPER_SPEED, cell.gripper_command.force)
-            self.link.answer(request, HandStatus.SUCCESS)
+            self._answer(request, HandStatus.SUCCESS)
         elif command == HandCommand.HOMING:
             self._job = Job(request, [0.0, GRIPPER_MAX_WIDTH])
             cell.command_gripper(0.0, GRIPPER_SPEED / 2, GRIPPER_MAX_FORCE / 4)
@@ -112,4 +135,8 @@ class FrankaHand:
             status = HandStatus.SUCCESS if self._grasped else HandStatus.UNSUCCESSFUL
         elif abs(width - reached) > 2e-3:
             status = HandStatus.UNSUCCESSFUL  # something was in the way
-        self.link.answer(job.request, status)
+        self._answer(job.request, status)
+
+    def _answer(self, request: messages.Request, status: HandStatus) -> None:
+        self.link.answer(request, status)
+        self.answers += 1

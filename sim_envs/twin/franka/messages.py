@@ -238,6 +238,11 @@ class Link:
         """Whether a client is there and has said hello."""
         return self._peer is not None
 
+    @property
+    def sockets(self) -> list[socket.socket]:
+        """On which a client may say something."""
+        return [self._listener if self._tcp is None else self._tcp, self._udp]
+
     def requests(self) -> list[Request]:
         """What the client has asked since; greets a new client by itself."""
         if self.frozen:
@@ -271,8 +276,7 @@ class Link:
 
     def wait(self, seconds: float) -> None:
         """Until the client sends something, over either way."""
-        waiting = [self._udp] if self._tcp is None else [self._udp, self._tcp]
-        select.select(waiting, [], [], seconds)
+        select.select(self.sockets, [], [], seconds)
 
     def send(self, state: bytes) -> None:
         """A state, if anyone is there; a datagram that does not get through is lost."""

@@ -86,6 +86,9 @@ class LoadCell:
         """Nothing is said to a load cell."""
         self.port.read()
 
+    def hold(self) -> None:
+        """No line is due while time stands."""
+
     def send(self) -> None:
         """Write a line if one is due."""
         self._milliseconds += 1
@@ -126,6 +129,10 @@ class Robotiq:
                 return
             answer = self._serve(frame)
             self.port.write(answer + modbus_crc(answer))
+
+    def hold(self) -> None:
+        """Take requests and answer them."""
+        self.receive()
 
     def send(self) -> None:
         """See how far the fingers are."""

@@ -90,6 +90,9 @@ class UrController:
             else:
                 self.protective_stop()
 
+    def hold(self) -> None:
+        """A UR's time never stands: nobody answers every one of its states."""
+
     def send(self) -> None:
         """Look for collisions after a millisecond, and send data that is due."""
         self._estimate_wrench()

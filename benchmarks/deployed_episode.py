@@ -1,0 +1,106 @@
+"""One deployment by `touchgoal deploy --execute`, and what came of it."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from touchgoal.control import features as ft
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
+
+_TIMEOUT = 1800.0  # s for one deployment, on a machine however loaded
+_SHUT = 0.01  # m by which fingers must have closed to have tried a grasp
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One episode: what the environment, the twin and the cell file are to draw alike."""
+
+    task: TaskName
+    seed: int
+    thing: str  # the object or the wire
+
+    def config(self) -> TaskConfig:
+        """Of the environment."""
+        if self.task == "bead-maze":
+            return BeadMazeConfig(wires=(self.thing,))
+        return PickPlaceConfig(objects=(self.thing,))
+
+
+@dataclass(frozen=True)
+class Deployment:
+    """One deployment and what came of it.
+
+    Attributes:
+        progress: of the task at the end, in [0, 1]; None if nobody knows.
+        ending: how it ended, for a person.
+        phase: what the fingers were doing then.
+        peak_force: greatest external force on the hand, N.
+        clamped: share of the ticks in which each limit changed the command.
+        late: ms by which 99 % of the ticks were late at most.
+    """
+
+    task: str
+    policy: str
+    arm: str
+    seed: int
+    thing: str
+    success: bool
+    progress: float | None
+    ending: str
+    phase: str
+    seconds: float
+    peak_force: float
+    clamped: dict[str, float]
+    late: float
+
+
+def limited(cell: Path, seconds: float) -> Path:
+    """A cell file (JSON) with that time for a deployment."""
+    table = json.loads(cell.read_text())
+    table["task"]["seconds"] = seconds
+    cell.write_text(json.dumps(table))
+    return cell
+
+
+def deploy(cell: Path, scene: Scene, policy: str, arm: str, out: Path) -> Deployment:
+    """`touchgoal deploy --execute` of a cell file, in a process of its own."""
+    command = [sys.executable, "-m", "touchgoal.launch", "deploy", str(cell), "--policy", policy]
+    done = subprocess.run(
+        [*command, "--execute", "--yes", "--seed", str(scene.seed), "--out", str(out)],
+        capture_output=True,
+        text=True,
+        timeout=_TIMEOUT,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    kind = (scene.task, policy, arm, scene.seed, scene.thing)
+    report = out / "metrics.json"
+    if not report.exists():  # refused, or worse
+        ending = f"refused: {' '.join(done.stderr.split())[-300:]}"
+        return Deployment(*kind, False, None, ending, "", 0.0, 0.0, {}, 0.0)
+    said = json.loads(report.read_text())
+    ticks = max(1, said["ticks"])
+    return Deployment(
+        *kind,
+        bool(said["success"]),
+        said["progress"],
+        said["reason"],
+        _phase(out / "episodes", said["held_width"] is not None),
+        said["ticks"] / ft.CONTROL_HZ,
+        said["force_max_newtons"],
+        {name: count / ticks for name, count in said["clamped"].items()},
+        said["late_p99_ms"],
+    )
+
+
+def _phase(episodes: Path, holding: bool) -> str:
+    """What the fingers were doing at the end of the episode."""
+    if holding:
+        return "holding"
+    if not episodes.exists() or not len(found := EpisodeSet(episodes)):
+        return "not begun"
+    width = found.read(len(found) - 1).frames[ft.STATE][:, -1]
+    return "let go or missed" if width.max() - width.min() > _SHUT else "reaching"

@@ -1,0 +1,79 @@
+"""A twin in a process of its own, to be deployed on, and what it takes of the machine."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from touchgoal.control.errors import UserError
+from touchgoal.sim_envs.config import TaskName
+
+_START_TIMEOUT, _END_TIMEOUT = 300.0, 60.0  # s, on a machine however loaded
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """What a process has: threads, open files, child processes, memory (bytes, resident)."""
+
+    threads: int
+    files: int
+    children: int
+    memory: int
+
+
+class DeployedTwin:
+    """`touchgoal twin`, until the context ends.
+
+    Attributes:
+        cell_file: that it has written.
+    """
+
+    def __init__(
+        self, task: TaskName, seed: int, thing: str, lock_step: bool, folder: Path, number: int
+    ) -> None:
+        """Start one with an object or a wire; twins of different numbers run side by side."""
+        pid = os.getpid()
+        host = f"127.{100 + number % 100}.{pid // 250 % 250}.{1 + pid % 250}"
+        kind = "--env.wires" if task == "bead-maze" else "--env.objects"
+        command = [sys.executable, "-m", "touchgoal.launch", "twin", "--task", task, kind, thing]
+        command += ["--seed", str(seed), "--host", host, "--port", "0", "--out", str(folder)]
+        self._log = (folder / "twin.log").open("w")
+        self._process = subprocess.Popen(
+            [*command, *["--lock-step"] * lock_step], stdout=self._log, stderr=self._log
+        )
+        self.cell_file = folder / "cell.json"
+        end = time.monotonic() + _START_TIMEOUT
+        while not self.cell_file.exists():
+            if self._process.poll() is not None or time.monotonic() > end:
+                self._process.kill()
+                raise UserError(f"no twin: {(folder / 'twin.log').read_text()[-500:]}")
+            time.sleep(0.05)
+
+    def __enter__(self) -> Self:
+        """It runs already."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Ctrl-C; killed if it does not end by that."""
+        self._process.send_signal(signal.SIGINT)
+        try:
+            self._process.wait(_END_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+        self._log.close()
+
+    def footprint(self) -> Footprint:
+        """What it takes now (Linux)."""
+        process = Path(f"/proc/{self._process.pid}")
+        status = dict(line.split(":", 1) for line in (process / "status").read_text().splitlines())
+        children = (process / "task" / process.name / "children").read_text().split()
+        return Footprint(
+            threads=int(status["Threads"]),
+            files=len(list((process / "fd").iterdir())),
+            children=len(children),
+            memory=1024 * int(status["VmRSS"].split()[0]),
+        )

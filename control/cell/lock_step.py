@@ -1,0 +1,154 @@
+"""The clock of a twin in lock-step: its time stands but while a deployment waits for it.
+
+So nothing depends on how fast the machine is: the same seed and cell file give the same run. Arm and
+hand are told of every step, and what is on its way, a command to the hand, its answer, a picture, is
+waited for before time goes on. libfranka's own 1 kHz loop takes part in every millisecond as ever.
+"""
+
+import json
+import socket
+import time
+from collections import deque
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from touchgoal.control.arms.streaming import ArmProcess
+from touchgoal.control.errors import UserError
+from touchgoal.control.grippers.franka_hand import PERIOD, FrankaHand
+from touchgoal.control.interfaces import Camera, DriverError
+
+_DT = 1e-3  # s of a step of the twin
+_STREAM_STEPS = 5  # of them between two commands of the arm's stream, `arms.franka.RATE`
+_ANSWER_TIMEOUT = 60.0  # s for a few steps, on a machine however loaded
+_PICTURE_TIMEOUT = 2.0  # s for a picture that was sent
+_SETTLING = 0.3  # s without a picture after which none is on its way
+_HISTORY_LENGTH = 400  # of a few steps each, for the ages of readings
+
+
+def connect_control_port(address: str) -> socket.socket:
+    """To a twin's control port at (token@)host:port; UserError if no twin answers there."""
+    host, _, port = address.rpartition("@")[2].rpartition(":")
+    try:
+        return socket.create_connection((host, int(port)), _ANSWER_TIMEOUT)
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"no twin answers at {address or 'task.twin'}; start one: touchgoal twin"
+        ) from error
+
+
+class LockStepClock:
+    """See Clock. Once a twin has ended, time goes on as on the wall, so that ages tell."""
+
+    def __init__(
+        self, address: str, arm: ArmProcess, gripper: FrankaHand, cameras: dict[str, Camera]
+    ) -> None:
+        """Let the twin's time stand; `address` (token@host:port) is of its control port.
+
+        Raises:
+            UserError: no twin is there, or it is not in lock-step.
+        """
+        self._arm, self._gripper, self._cameras = arm, gripper, cameras
+        self._token, self._connection = address.rpartition("@")[0], connect_control_port(address)
+        self._answers = self._connection.makefile()
+        self._lost = self._driven = False
+        self._issued = self._answered = 0
+        answer = self._ask("hold")
+        if "error" in answer:
+            raise UserError(answer["error"])
+        self._time = self._gripper_due = answer["time"]
+        self._swallowed = self._swallowed_pictures(answer["pictures"])
+        self._history = deque([(time.monotonic(), self._time)], maxlen=_HISTORY_LENGTH)
+
+    def reset(self, seed: int) -> None:
+        """Let the twin begin the episode of a seed, at time 0; UserError if it refuses."""
+        answer = self._ask(f"reset {seed}")
+        if "error" in answer:
+            raise UserError(answer["error"])
+        self._time = self._gripper_due = 0.0
+        self._history.clear()
+        self._history.append((time.monotonic(), 0.0))
+        self._arm.advance(0.0)  # from here on it goes by this time, not by libfranka's
+
+    def now(self) -> float:
+        """See Clock."""
+        return self._time
+
+    def age(self, stamp: float) -> float:
+        """See Clock."""
+        return self._time - float(np.interp(stamp, *np.array(self._history).T))
+
+    def wait(self, until: float) -> None:
+        """See Clock."""
+        sent: dict[str, int] = {}
+        while (steps := round((until - self._time) / _DT)) > 0 and not self._lost:
+            # Steps end where the stream's commands are due, whatever is waited for.
+            steps = min(steps, _STREAM_STEPS - round(self._time / _DT) % _STREAM_STEPS)
+            answer = self._ask(f"advance {steps} {int(self._driven)} {self._issued}")
+            if self._lost:
+                break
+            self._time, self._answered, sent = (answer[key] for key in ("time", "hand", "pictures"))
+            self._history.append((time.monotonic(), self._time))
+            if not answer["frozen"]:
+                self._let_drivers_tick()
+        if self._lost:
+            self._wait_without_twin(until)
+        self._await_pictures(sent)
+
+    def close(self) -> None:
+        """Let the twin's time go on by itself."""
+        self._answers.close()  # or the connection stays open
+        self._connection.close()
+
+    def _let_drivers_tick(self) -> None:
+        self._driven = self._arm.advance(self._time)
+        if self._time >= self._gripper_due - _DT / 2:
+            self._gripper_due += PERIOD
+            with suppress(DriverError):  # the next reading says so
+                self._issued = self._gripper.advance(self._answered)
+
+    def _wait_without_twin(self, until: float) -> None:
+        while self._time < until:
+            time.sleep(_STREAM_STEPS * _DT)
+            self._time += _STREAM_STEPS * _DT
+            self._history.append((time.monotonic(), self._time))
+            self._arm.advance(self._time)
+
+    def _swallowed_pictures(self, sent: dict[str, int]) -> dict[str, int]:
+        """How many of those sent each camera has not counted, once all have arrived; DriverError of a
+        camera that is broken."""
+        while True:
+            found = {
+                key: sent[n] - camera.read().sequence for key, n, camera in self._streams(sent)
+            }
+            time.sleep(_SETTLING)
+            if all(
+                sent[n] - camera.read().sequence == found[key]
+                for key, n, camera in self._streams(sent)
+            ):
+                return found
+
+    def _streams(self, sent: dict[str, int]) -> list[tuple[str, str, Camera]]:
+        """Key, the twin's name and the camera of each of its streams that is read here."""
+        named = ((key, key.rpartition(".")[2], camera) for key, camera in self._cameras.items())
+        return [(key, name, camera) for key, name, camera in named if name in sent]
+
+    def _await_pictures(self, sent: dict[str, int]) -> None:
+        """Until all that the twin has sent are here, or are not going to be."""
+        end = time.monotonic() + _PICTURE_TIMEOUT
+        for key, name, camera in self._streams(sent):
+            with suppress(DriverError):
+                while (missing := sent[name] - self._swallowed[key] - camera.read().sequence) > 0:
+                    if time.monotonic() > end:  # lost, as when a stream is opened again
+                        self._swallowed[key] += missing
+                        break
+                    time.sleep(_DT / 2)
+
+    def _ask(self, line: str) -> dict[str, Any]:
+        try:
+            self._connection.sendall(f"{self._token} {line}\n".encode())
+            return json.loads(self._answers.readline())
+        except (OSError, json.JSONDecodeError):
+            self._lost = True
+            return {}

@@ -1,0 +1,100 @@
+"""Who may let a lock-step twin's time go on: a client that holds it, a few milliseconds at a time."""
+
+import json
+import select
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from touchgoal.control.errors import UserError
+from touchgoal.sim_envs.twin.cell import SimulatedCell
+from touchgoal.sim_envs.twin.franka.controller import FrankaArm
+from touchgoal.sim_envs.twin.franka.hand import FrankaHand
+from touchgoal.sim_envs.twin.mjpeg import Streams
+from touchgoal.sim_envs.twin.tcp_ports import ClientConnection
+
+_POLL_INTERVAL = 5e-3  # s between looks at the links while time stands and nothing comes
+_MOST_STEPS = 1000  # at a time
+_PATIENCE = 3.0  # s on the wall for what a holder says is on its way
+
+
+class LockStep:
+    """Time stands while a client holds it, and goes on by what that asks for.
+
+    A few steps begin once the arm's client drives it, if it is said to, and once the hand has got as
+    many commands as were sent; they are over once the arm's client has answered the last state and
+    all pictures that were due are sent.
+    """
+
+    def __init__(
+        self, cell: SimulatedCell, arm: FrankaArm, hand: FrankaHand, streams: Streams
+    ) -> None:
+        self._cell, self._arm, self._hand, self._streams = cell, arm, hand, streams
+        self._holder: ClientConnection | None = None
+        self._left = 0  # steps asked for and not yet made
+        self._driven, self._issued, self._until = False, 0, 0.0
+        self._commands_before = self._answers_before = 0
+        self._asked = False  # whether an answer is owed
+
+    def hold(self, client: ClientConnection) -> dict[str, Any]:
+        """From now on time is this client's, until it leaves; UserError if it is another's."""
+        if self.held:
+            raise UserError("another program holds the time of this twin")
+        self._holder, self._left, self._asked = client, 0, False
+        self._commands_before, self._answers_before = self._hand.commands, self._hand.answers
+        return self._report()
+
+    def advance(self, client: ClientConnection, steps: int, driven: bool, issued: int) -> None:
+        """Go on by so many steps; the answer follows when they are made."""
+        if client is not self._holder:
+            raise UserError("hold the time of this twin first")
+        if not 0 < steps <= _MOST_STEPS:
+            raise UserError(f"steps are a number from 1 to {_MOST_STEPS}")
+        self._left, self._asked, self._until = steps, True, time.monotonic() + _PATIENCE
+        self._driven, self._issued = driven, issued
+
+    @property
+    def held(self) -> bool:
+        """Whether a client holds the time."""
+        return self._holder is not None and self._holder.open
+
+    @property
+    def standing(self) -> bool:
+        """Whether time stands now; answers the holder where its steps are made."""
+        if not self.held:
+            return False
+        if self._left and self._ready():
+            return False
+        if self._asked and not self._left and (self._arm.answered or self._impatient):
+            self._asked = False
+            assert self._holder is not None
+            self._holder.send(json.dumps(self._report()).encode() + b"\n")
+        return True
+
+    def count_step(self) -> None:
+        """A step was made."""
+        self._left -= self._left > 0
+
+    def wait(self, sockets: Sequence[Any]) -> None:
+        """Until the arm's or hand's client says something, or someone on these sockets; not for long."""
+        links = [*self._arm.link.sockets, *self._hand.link.sockets]
+        select.select([*links, *sockets], [], [], _POLL_INTERVAL)
+
+    def _ready(self) -> bool:
+        """Whether what is on its way has come; what does not come is not waited for much longer."""
+        if self._arm.link.frozen or self._impatient:
+            return True
+        commanded = self._hand.commands - self._commands_before >= self._issued
+        return commanded and self._arm.answered and (self._arm.obeys or not self._driven)
+
+    @property
+    def _impatient(self) -> bool:
+        return time.monotonic() > self._until
+
+    def _report(self) -> dict[str, Any]:
+        return {
+            "time": self._cell.time,
+            "hand": self._hand.answers - self._answers_before,
+            "pictures": self._streams.sent(),
+            "frozen": self._arm.link.frozen,
+        }
