@@ -7,7 +7,6 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.config import TaskName
@@ -53,7 +52,7 @@ class DeployedTwin:
                 raise UserError(f"no twin: {(folder / 'twin.log').read_text()[-500:]}")
             time.sleep(0.05)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "DeployedTwin":
         """It runs already."""
         return self
 

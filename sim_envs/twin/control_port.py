@@ -148,9 +148,9 @@ class ControlPort:
         """The answer; None if it comes later."""
         command, _, rest = line.partition(" ")
         actions = {
+            "truth": self._cell.truth,
             "hold": lambda: self._held_time().hold(client),
             "advance": None,
-            "truth": self._cell.truth,
             "reset": lambda: self._reset(*rest.split(" ", 1)),
             "freeze": lambda: self._freeze(float(rest)),
             "drop": self._arm.drop,

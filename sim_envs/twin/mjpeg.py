@@ -74,10 +74,12 @@ class Streams:
 
     Attributes:
         streams: by name, such as tactile_left.
+        time_is_held: whether a client lets time go on, which must get a picture before it does.
     """
 
-    def __init__(self, cell: SimulatedCell, host: str, port: int, lock_step: bool) -> None:
-        self._cell, self._host, self._lock_step = cell, host, lock_step
+    def __init__(self, cell: SimulatedCell, host: str, port: int) -> None:
+        self._cell, self._host = cell, host
+        self.time_is_held: Callable[[], bool] = lambda: False
         self._rng = np.random.default_rng(0)
         self._noise = np.empty(0)
         env = cell.env
@@ -113,7 +115,7 @@ class Streams:
             self._cell.env.update_contacts()  # watched or not: watching must not change the physics
         for stream in due:
             stream.publish()
-            if self._lock_step:
+            if self.time_is_held():
                 stream.wait_until_sent()
 
     def sent(self) -> dict[str, int]:

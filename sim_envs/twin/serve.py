@@ -173,7 +173,7 @@ class Twin:
                 widths=(tool.stroke[1], tool.stroke[0]),
                 force=max(force, tool.force[0]),
             )
-        services.append(streams := Streams(cell, host, config.port, config.lock_step))
+        services.append(streams := Streams(cell, host, config.port))
         control = config.port + 1 if config.port else 0
 
         def reset() -> None:
@@ -182,7 +182,8 @@ class Twin:
                 hand.reset()
 
         if config.lock_step and hand is not None and isinstance(arm, FrankaArm):
-            self._lock_step = LockStep(cell, arm, hand, streams)
+            lock_step = self._lock_step = LockStep(cell, arm, hand, streams)
+            streams.time_is_held = lambda: lock_step.held
         self._commands = ControlPort(
             cell, arm, streams.streams, ports, host, control, self._lock_step, reset
         )
