@@ -200,3 +200,17 @@ class TactileSpeedOptions(BenchmarkOptions):
     """Measurements of each figure; the median is printed."""
     frames: Count = 100
     """Frames in one measurement."""
+
+
+@checked_dataclass
+class TouchProbesOptions(BenchmarkOptions):
+    """What do frozen features tell of force, place, shape and slip, on one sensor and across sensors?"""
+
+    encoder: str = "gelsight_mini_surfaces"
+    """Encoder whose network is probed, by name or folder (of `train-encoder surfaces`)."""
+    sensors: tuple[str, ...] = ("gelsight_mini_measured", "digit_measured", "gelsight")
+    """Sensors that are simulated, by name or folder of a sensor file."""
+    presses: Annotated[int, Field(ge=24)] = 600
+    """Presses simulated on each."""
+    seed: Seed = 0
+    """Random seed of units and presses."""

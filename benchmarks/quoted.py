@@ -135,5 +135,6 @@ QUOTED = {
         "from an observation to the maze policy's plan, one core (a tick has 50 ms)",
         _plan,
     ),
+    "touch-probes": Quoted("touchgoal benchmark touch-probes"),
     "faults": Quoted("touchgoal benchmark faults"),
 }

@@ -23,6 +23,7 @@ BENCHMARKS: dict[str, type[options.BenchmarkOptions]] = {
     "reward-quality": options.RewardQualityOptions,
     "tactile-realism": options.TactileRealismOptions,
     "tactile-speed": options.TactileSpeedOptions,
+    "touch-probes": options.TouchProbesOptions,
 }
 RESULTS = Path(__file__).resolve().parents[1] / "benchmarks" / "results"
 
@@ -38,6 +39,7 @@ Config = (
     | Annotated[options.RewardQualityOptions, tyro.conf.subcommand("reward-quality")]
     | Annotated[options.TactileRealismOptions, tyro.conf.subcommand("tactile-realism")]
     | Annotated[options.TactileSpeedOptions, tyro.conf.subcommand("tactile-speed")]
+    | Annotated[options.TouchProbesOptions, tyro.conf.subcommand("touch-probes")]
 )
 
 

@@ -94,15 +94,27 @@ class PooledEncoder(BaseTouchEncoder):
         strength = F.adaptive_avg_pool2d(square, _CELLS).amax((1, 2)).sqrt()
         return strength**4 / (strength**4 + _HALF_LENGTH**4)
 
-    @torch.no_grad()
     def pool(self, touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d"]:
         """Means and standard deviations over the picture, stage by stage."""
+        return _pooled(self._stages(touch))
+
+    def pool_parts(self, touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d"]:
+        """As `pool`, and means over sixteen parts of the picture: for probes that ask where."""
+        stages = self._stages(touch)
+        return torch.cat([_pooled(stages), F.adaptive_avg_pool2d(stages[1], 4).flatten(1)], 1)
+
+    @torch.no_grad()
+    def _stages(self, touch: Float[Tensor, "n 3 h w"]) -> list[Float[Tensor, "n _ _ _"]]:
         network = self._network[0].to(touch.device)
         drawn = (128 + _CONTRAST * self.preprocess.scale * touch).clamp(0, 255) / 255
         x = network.stem(imagenet_normalised(drawn).contiguous(memory_format=torch.channels_last))
-        pooled, wanted = [], {block for block, _ in STAGES}
+        stages, wanted = [], {block for block, _ in STAGES}
         for i in range(STAGES[-1][0] + 1):
             x = network.blocks[i](x)
             if i in wanted:
-                pooled += [x.mean((2, 3)), x.std((2, 3))]
-        return torch.cat(pooled, 1)
+                stages.append(x)
+        return stages
+
+
+def _pooled(stages: list[Float[Tensor, "n _ _ _"]]) -> Float[Tensor, "n d"]:
+    return torch.cat([m for x in stages for m in (x.mean((2, 3)), x.std((2, 3)))], 1)

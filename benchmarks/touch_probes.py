@@ -1,0 +1,167 @@
+"""What frozen features tell beside what is touched: force, place, shape, slip; on one sensor and on others.
+
+Ten indenters are pressed with known forces into simulated units of each sensor. A ridge reads frozen
+features: the shipped encoder's network, pooled over the picture and over its parts. Its input is either
+the sensor's own change of colour, or the shape that all sensors share: slopes and depth of the gel, read
+from the picture by the unit's sensor file and drawn at one scale. Units of training are not tested on.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+
+from touchgoal.benchmarks.config import TouchProbesOptions
+from touchgoal.control.progress import track
+from touchgoal.control.tactile.depth import DepthEstimator
+from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
+from touchgoal.encoders.pretrained import find_encoder, load_pooled
+from touchgoal.encoders.probes.ridge import ridge_scores
+from touchgoal.sim_envs.tactile.indenters import FIELD, INDENTERS, IndenterPose, indent
+from touchgoal.sim_envs.tactile.optics import render_untouched
+from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
+
+FORCES = 0.5, 15.0
+"""N, least and most; forces between are drawn evenly."""
+SLIDES = 0.4e-3, 1.5e-3
+"""m that an indenter slides between two frames; one that sticks moves with the gel, by up to _SHEAR."""
+_SHEAR = 0.15e-3
+_PLACES = 2.5e-3  # m from the middle
+_UNITS, _TEST_UNITS = 6, 2
+_SIDE = 120  # px of the field
+_SLOPE, _DEPTH = 2.5, 4e3  # of the network's input (1.0 is a firm contact) per slope, and per m
+_RIDGE = 0.01
+_CELL = 4  # px of the depth's cells
+
+
+@dataclass(frozen=True, eq=False)
+class Presses:
+    """Features and truth of n presses on one sensor.
+
+    Attributes:
+        own, shared: features of the sensor's own colours, and of the shape.
+        own_moved, shared_moved: of what changed since the frame before.
+        shape: which indenter.
+        force: N.
+        place: m.
+        slid: whether it did.
+        test: whether its unit is one to test on.
+    """
+
+    own: Float32[np.ndarray, "n d"]
+    shared: Float32[np.ndarray, "n d"]
+    own_moved: Float32[np.ndarray, "n d"]
+    shared_moved: Float32[np.ndarray, "n d"]
+    shape: np.ndarray
+    force: Float[np.ndarray, " n"]
+    place: Float[np.ndarray, "n 2"]
+    slid: np.ndarray
+    test: np.ndarray
+
+
+def run(config: TouchProbesOptions) -> dict[str, Any]:
+    """Press, embed, probe within and across sensors."""
+    encoder = load_pooled(find_encoder(config.encoder)).eval()
+    sets = {name: _presses(name, encoder, config) for name in config.sensors}
+    rows = [
+        {"from": source, "to": target, "input": kind, **_probe(sets[source], sets[target], kind)}
+        for kind in ("own", "shared")
+        for source in sets
+        for target in sets
+    ]
+    return {"table": _table(rows, config), "rows": rows}
+
+
+def _presses(name: str, encoder: PooledEncoder, config: TouchProbesOptions) -> Presses:
+    sensor, rng = find_sensor(name), np.random.default_rng([config.seed, len(name)])
+    units = [sample_instance(sensor, rng) for _ in range(_UNITS)]
+    depths = [DepthEstimator(unit.calibration, _CELL) for unit in units]
+    names = list(INDENTERS)
+    rows: list[list[Any]] = []
+    for i in track(range(config.presses), name, "press"):
+        u, shape = i % _UNITS, int(rng.integers(len(names)))
+        unit, force, slid = units[u], float(rng.uniform(*FORCES)), bool(rng.random() < 0.5)
+        x, y = rng.uniform(-_PLACES, _PLACES, 2)
+        turn, way = rng.uniform(0, 2 * np.pi, 2)
+        far = rng.uniform(*SLIDES) if slid else rng.uniform(0, _SHEAR)
+        before = IndenterPose(x - far * np.cos(way), y - far * np.sin(way), turn)
+        rest = render_untouched(unit, rng)
+        frames = [
+            indent(names[shape], pose, force * load, unit, rng)
+            for pose, load in ((before, rng.uniform(0.85, 1.1)), (IndenterPose(x, y, turn), 1.0))
+        ]
+        own = [_field((frame.astype(np.float32) - rest) / 16, unit) for frame in frames]
+        shared = [_shape(frame, rest, unit, depths[u]) for frame in frames]
+        pictures = [own[1], shared[1], own[1] - own[0], shared[1] - shared[0]]
+        features = _features(np.stack(pictures), encoder)
+        rows.append([*features, shape, force, (x, y), slid, u >= _UNITS - _TEST_UNITS])
+    return Presses(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def _field(
+    change: Float32[np.ndarray, "h w c"], unit: SensorInstance
+) -> Float32[np.ndarray, "side side c"]:
+    """The middle of a sensor's picture, at the scale that all share."""
+    h, w, _ = change.shape
+    scale = FIELD / _SIDE / unit.pixel_pitch  # px of the picture per px of the field
+    shift = [(w - 1) / 2 - scale * (_SIDE - 1) / 2, (h - 1) / 2 - scale * (_SIDE - 1) / 2]
+    to_picture = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(change, to_picture, (_SIDE, _SIDE), flags=flags)
+
+
+def _shape(
+    frame: np.ndarray, rest: np.ndarray, unit: SensorInstance, estimator: DepthEstimator
+) -> Float32[np.ndarray, "side side 3"]:
+    """Slopes along x and y, and depth."""
+    depth = estimator.estimate(frame, rest.astype(np.float32))
+    gy, gx = np.gradient(depth, np.float32(unit.pixel_pitch))
+    return _field(np.stack([_SLOPE * gx, _SLOPE * gy, _DEPTH * depth], -1).astype("f4"), unit)
+
+
+@torch.no_grad()
+def _features(pictures: np.ndarray, encoder: PooledEncoder) -> Float32[np.ndarray, "n d"]:
+    touch = torch.from_numpy(np.ascontiguousarray(pictures.transpose(0, 3, 1, 2)))
+    return encoder.pool_parts(touch).numpy()
+
+
+def _probe(known: Presses, asked: Presses, kind: str) -> dict[str, float]:
+    train, test = ~known.test, asked.test
+    inputs, others = getattr(known, kind)[train], getattr(asked, kind)[test]
+    shapes = np.eye(len(INDENTERS))[known.shape[train]]
+    targets = np.column_stack([known.force[train], 1e3 * known.place[train], 10 * shapes])
+    read = ridge_scores(inputs, targets, others, _RIDGE)
+    moved, other_moved = (
+        getattr(s, f"{kind}_moved")[m] for s, m in ((known, train), (asked, test))
+    )
+    slid = (
+        ridge_scores(moved, known.slid[train, None].astype(float), other_moved, _RIDGE)[:, 0] > 0.5
+    )
+    right = float((slid & asked.slid[test]).sum())
+    off = np.linalg.norm(read[:, 1:3] - 1e3 * asked.place[test], axis=1)
+    return {
+        "force_error": float(np.median(np.abs(read[:, 0] - asked.force[test]))),
+        "place_error_mm": float(np.median(off)),
+        "shape": float((read[:, 3:].argmax(1) == asked.shape[test]).mean()),
+        "slip_f1": 2 * right / max(float(slid.sum() + asked.slid[test].sum()), 1),
+    }
+
+
+def _table(rows: list[dict[str, Any]], config: TouchProbesOptions) -> str:
+    tested = config.presses // _UNITS * _TEST_UNITS
+    lines = [
+        f"{config.presses} presses of {len(INDENTERS)} indenters on each sensor, tested on {tested} of other units;",
+        f"force of {FORCES[0]:g} to {FORCES[1]:g} N, median error; place, median error; slip against sticking",
+        f"{'probe from':<24}{'read on':<24}{'input':<9}{'force':>8}{'place':>10}{'shape':>7}{'slip F1':>9}",
+    ]
+    lines += [
+        f"{row['from']:<24}{row['to']:<24}{'shape' if row['input'] == 'shared' else 'colours':<9}"
+        f"{row['force_error']:>6.1f} N{row['place_error_mm']:>7.2f} mm{row['shape']:>7.2f}"
+        f"{row['slip_f1']:>9.2f}"
+        for row in rows
+    ]
+    return "\n".join(lines)
