@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from touchgoal.benchmarks.real_cost import EmbeddedGrasp, cost_table, judge_cost
+from touchgoal.benchmarks.real_touch_encoders import Embedder
 from touchgoal.control.progress import track
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
@@ -16,11 +18,13 @@ RANGE = 25.0
 _PRESSED = 0.5  # N
 _FIRST = 5  # frames
 _STEADY = 0.2  # N
+_IMPOSSIBLE = 60.0  # N: a spike of the load cell, beyond what the hand can do
 
 
-def judge_grasps(grasps: list[ForceGrasp]) -> dict[str, Any]:
-    """Errors on things left out of the calibration, and the frame at which contact is told."""
+def judge_grasps(grasps: list[ForceGrasp], embedders: dict[str, Embedder]) -> dict[str, Any]:
+    """Errors on things left out of the calibration, when contact is told, and each encoder's cost."""
     rows, forces, things, contact = [], [], [], []
+    embedded: dict[str, list[EmbeddedGrasp]] = {name: [] for name in embedders}
     for grasp in track(grasps, "reading", "grasp"):
         frames = grasp.frames()
         force = grasp.force[: len(frames)]
@@ -28,15 +32,22 @@ def judge_grasps(grasps: list[ForceGrasp]) -> dict[str, Any]:
         open_hand = float(np.ptp(force[:_FIRST])) < _STEADY
         if open_hand:
             force = force - np.median(force[:_FIRST])
-        background = shrunk(np.median(frames[: _FIRST if open_hand else 1], 0).astype(np.uint8))
+        untouched = np.median(frames[: _FIRST if open_hand else 1], 0).astype(np.uint8)
+        background = shrunk(untouched)
         small = [shrunk(frame).astype(np.uint8) for frame in frames]
         rows.append(np.stack([statistics(frame, background) for frame in small]))
         forces.append(force)
         things.append(np.full(len(force), grasp.object))
         detector = ContactDetector(Background(np.stack(small[:1])))
         felt = np.array([detector.update(frame) for frame in small])
-        if open_hand and felt.any() and (force > _PRESSED).any():
-            contact.append(int(felt.argmax() - (force > _PRESSED).argmax()))
+        begins = int((force > _PRESSED).argmax()) if (force > _PRESSED).any() else None
+        if open_hand and felt.any() and begins is not None:
+            contact.append(int(felt.argmax()) - begins)
+        firmest = int(np.where(force < _IMPOSSIBLE, force, 0).argmax())
+        for name, embed in embedders.items():
+            seen = embed(frames, untouched).astype(np.float64)
+            start = begins if open_hand else None
+            embedded[name].append(EmbeddedGrasp(grasp.trial, grasp.object, seen, firmest, start))
     every, force, thing = np.concatenate(rows), np.concatenate(forces), np.concatenate(things)
     judged = (force <= RANGE) & (force > -1)
     error = np.full(len(force), np.nan)
@@ -57,6 +68,7 @@ def judge_grasps(grasps: list[ForceGrasp]) -> dict[str, Any]:
             str(n): float(np.median(error[pressed & (thing == n)])) for n in np.unique(thing)
         },
         "contact_delay": contact,
+        "cost": {name: judge_cost(seen) for name, seen in embedded.items()},
     }
 
 
@@ -76,4 +88,5 @@ def force_table(result: dict[str, Any]) -> str:
             f"contact is told {min(delay)} to {max(delay)} frames (median {np.median(delay):g}) after "
             f"{_PRESSED:g} N on the load cell, in {len(delay)} grasps that start open"
         )
+    lines += ["\n" + cost_table(cost, name) for name, cost in result["cost"].items()]
     return "\n".join(lines)

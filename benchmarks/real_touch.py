@@ -67,7 +67,8 @@ class VideoTouch:
 def run(config: RealTouchOptions) -> dict[str, Any]:
     """Read the videos once, then embed and judge them by every encoder."""
     if (config.data / "grasps.csv").is_file():
-        grasps = judge_grasps(read_force_grasps(config.data)[:: config.every])
+        embedders = {name: find_embedder(name, config.seed) for name in config.encoders}
+        grasps = judge_grasps(read_force_grasps(config.data)[:: config.every], embedders)
         return {"table": force_table(grasps), **grasps}
     videos = read_labelled_videos(config.data)[:: config.every]
     touches = [read_touch(video) for video in track(videos, "reading", "video")]

@@ -157,6 +157,7 @@ def test_a_sensor_check_reads_noise_ball_and_contact(balls: list[np.ndarray]) ->
     assert check.untouched < check.threshold < check.touched / 2
     radii = [press.ball.radius for press in check.presses if press.ball is not None]
     assert np.median(radii) == pytest.approx(1, abs=0.1)
+    assert max(press.unexplained for press in check.presses) < 0.15
     assert not check.drift.large and not check.drift_from_file.large
 
 
@@ -175,7 +176,7 @@ def test_check_sensor_says_what_is_off(
     assert "lock the exposure" in said and "record-presses" in said
     assert "of a weight of 19.6 N: multiply" in said
     drawn = cv2.imread(str(tmp_path / "out" / "check.png"))
-    assert drawn is not None and drawn.shape == (3 * 240, 3 * 320, 3)
+    assert drawn is not None and drawn.shape == (3 * 240, 5 * 320, 3)
 
 
 def test_a_sensor_check_counts_markers() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from touchgoal.benchmarks.config import RealTouchOptions
+from touchgoal.benchmarks.real_cost import EmbeddedGrasp, cost_table, judge_cost
 from touchgoal.benchmarks.real_touch import run
 from touchgoal.benchmarks.real_touch_encoders import find_embedder
 from touchgoal.control.errors import UserError
@@ -142,3 +143,17 @@ def test_force_is_read_of_another_thing() -> None:
     assert np.median(np.abs(reader.of_statistics(rows) - force)) < 1.5
     with pytest.raises(UserError, match="are too few"):
         calibrate_force(rows[:20], force[:20])
+
+
+def test_the_cost_falls_with_the_touch_and_tells_the_wrong_thing() -> None:
+    """Two things, felt along two directions; 0.5 N from the sixth frame on."""
+    strength = np.array([0, 0, 0, 0, 0, 0.4, 0.7, 1, 1, 1])
+
+    def grasp(trial: int) -> EmbeddedGrasp:
+        seen = strength[:, None] * np.eye(2)[trial // 2] + 0.01 * trial
+        return EmbeddedGrasp(f"trial {trial}", f"thing {trial // 2}", seen, 8, 5)
+
+    result = judge_cost([grasp(trial) for trial in range(4)])
+    assert result["delays"] == [0] * 4 and result["near"] == 1
+    assert result["auc"] == 1 and set(result["auc_of_pairs"]) == {"thing 0", "thing 1"}
+    assert "within 3 frames in 100 % of 4 pairs" in cost_table(result, "ours")

@@ -6,6 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from touchgoal.benchmarks.config import TouchProbesOptions
+from touchgoal.benchmarks.touch_probes import run as run_probes
+from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 from touchgoal.encoders.preprocess import steady_preprocessor_for
 from touchgoal.encoders.pretrained import load_encoder, save
@@ -14,6 +17,7 @@ from touchgoal.encoders.ssl.surface_whitening import (
     inverse_square_root,
     train,
 )
+from touchgoal.sim_envs.tactile.indenters import FOUNDATION_MODULUS, IndenterPose, indent
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 from touchgoal.sim_envs.tactile.surface_press import (
     SurfacePose,
@@ -127,3 +131,27 @@ def test_light_on_an_untouched_gel_is_no_touch() -> None:
     )
     lightest = np.linalg.norm(touched - same)
     assert max(np.linalg.norm(darker - same), np.linalg.norm(brighter - same)) < 0.2 * lightest
+
+
+def test_an_indenter_presses_with_the_force_asked_for() -> None:
+    """The volume that a disc pushes in, times the foundation modulus: read back from the depth."""
+    rng = np.random.default_rng(0)
+    unit = sample_instance(GELSIGHT_MINI, rng)
+    rest = untouched(unit, rng)
+    light, firm = (
+        indent("large ball", IndenterPose(0.0, 0.0, 0.0), force, unit, rng) for force in (1.0, 9.0)
+    )
+    estimator = DepthEstimator(unit.calibration, 4)
+    reads = [estimator.estimate(frame, rest.astype(np.float32)).max() for frame in (light, firm)]
+    # The volume of a cap of depth d is about pi R d^2: nine times the force, three times the depth.
+    assert reads[1] / reads[0] == pytest.approx(3, rel=0.2)
+    expected = np.sqrt(9.0 / (FOUNDATION_MODULUS * np.pi * 7e-3))
+    assert reads[1] == pytest.approx(expected, rel=0.25)
+
+
+def test_touch_probes_print_a_row_for_every_pair() -> None:
+    sensors = ("gelsight_mini_measured", "digit_measured")
+    result = run_probes(TouchProbesOptions(sensors=sensors, presses=36))
+    assert len(result["rows"]) == 8 and len(result["table"].splitlines()) == 11
+    own = result["rows"][0]
+    assert own["force_error"] < 4 and own["place_error_mm"] < 1.5

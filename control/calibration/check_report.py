@@ -27,6 +27,7 @@ def figures(check: SensorCheck, ball_mm: float | None, weight_g: float | None) -
         read |= {"ball_mm": ball_mm, "radius_mm": _quartiles(radii), "residual_mm": residual}
     if check.presses:
         read["depth_mm"] = _quartiles([1e3 * float(press.depth.max()) for press in check.presses])
+        read["unexplained"] = _quartiles([press.unexplained for press in check.presses])
         read["force"] = _quartiles([press.force for press in check.presses])
     if weight_g is not None:
         read["weight"] = weight_g * 1e-3 * _GRAVITY
@@ -82,6 +83,11 @@ def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
         said.append(
             "deepest      {1:.2f} mm (quartiles {0:.2f} to {2:.2f})".format(*figures["depth_mm"])
         )
+    if "unexplained" in figures:
+        said.append(
+            f"simulation   leaves {100 * figures['unexplained'][1]:.0f} % of the change unexplained, of the depth "
+            "that it reads itself"
+        )
     if "force" in figures:
         low, middle, high = figures["force"]
         line = f"force        {middle:.1f} N (quartiles {low:.1f} to {high:.1f})"
@@ -95,15 +101,17 @@ def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
 
 
 def picture(check: SensorCheck) -> UInt8[np.ndarray, "H W 3"]:
-    """Rows of press, change against the untouched gel times 4 about grey, and depth."""
+    """Rows of press, the simulator's picture of its depth, changes of both times 4 about grey, depth."""
     rows = [_row(press, check.background) for press in check.presses[:_SHOWN]]
-    empty = np.hstack([check.background, *[np.full_like(check.background, 128)] * 2])
+    empty = np.hstack([check.background] * 2)
     return np.vstack(rows or [empty])
 
 
 def _row(press: PressRead, background: UInt8[np.ndarray, "h w 3"]) -> np.ndarray:
-    change = press.frame.astype(np.float32) - background
-    drawn = np.clip(128 + _CONTRAST * change, 0, 255).astype(np.uint8)
+    drawn, simulated = (
+        np.clip(128 + _CONTRAST * (frame.astype(np.float32) - background), 0, 255).astype(np.uint8)
+        for frame in (press.frame, press.drawn)
+    )
     deepest = max(float(press.depth.max()), 1e-6)
     grey = (255 * np.clip(press.depth / deepest, 0, 1)).astype(np.uint8)
     depth = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)[..., ::-1].copy()
@@ -114,7 +122,7 @@ def _row(press: PressRead, background: UInt8[np.ndarray, "h w 3"]) -> np.ndarray
     cv2.putText(
         depth, text, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA
     )
-    return np.hstack([press.frame, drawn, depth])
+    return np.hstack([press.frame, press.drawn, drawn, simulated, depth])
 
 
 def _contact(check: SensorCheck) -> str:

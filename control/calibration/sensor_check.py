@@ -15,10 +15,11 @@ from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.force import estimate_force
 from touchgoal.control.tactile.markers import MarkerTracker, without_markers
-from touchgoal.control.tactile.sensor_calibration import load
+from touchgoal.control.tactile.sensor_calibration import load, shade
 from touchgoal.control.tactile.sensor_models import SensorModel
 
 _PRESSES = 12  # whose depth is read: the firmest frame of as many stretches of contact
+_STRONGEST = 0.1  # share of the picture over which it is asked what the simulator explains
 _FIRM = 0.3  # of the strongest: a ball that only comes or goes tells no depth
 
 Frame = UInt8[np.ndarray, "h w 3"]
@@ -31,6 +32,8 @@ class PressRead:
     Attributes:
         frame: the picture.
         depth: of the gel, m.
+        drawn: the picture that the simulator makes of that depth, RGB.
+        unexplained: share of the change, over its strongest tenth, that is not in that picture.
         circle: of the contact, px, if a ball pressed and is seen, and
         ball: the sphere that the depth shows there.
         force: normal to the gel, N.
@@ -38,6 +41,8 @@ class PressRead:
 
     frame: Frame
     depth: Float32[np.ndarray, "h w"]
+    drawn: Frame
+    unexplained: float
     circle: Circle | None
     ball: DepthErrors | None
     force: float
@@ -156,7 +161,8 @@ class _Reader:
     ) -> None:
         self._sensor, self._ball_radius, self._rest = sensor, ball_radius, rest
         self._dot = sensor.markers.diameter / sensor.pixel_pitch / 2 if sensor.markers else 0.0
-        self._depth = DepthEstimator(load(sensor.sensor_file))
+        self._calibration = load(sensor.sensor_file)
+        self._depth = DepthEstimator(self._calibration)
 
     def __call__(self, touch: _Touch) -> PressRead:
         frame, pitch = self._painted(touch.frame, touch.dots), self._sensor.pixel_pitch
@@ -170,7 +176,13 @@ class _Reader:
             except UserError:
                 circle = None  # too faint: the picture shows it without
         force = estimate_force(depth, pitch, self._sensor).normal
-        return PressRead(touch.frame, depth, circle, ball, force)
+        change, file = frame.astype(np.float32) - background, self._calibration.background
+        left = change - (shade(self._calibration, depth) - file)
+        drawn = np.rint(background + change - left).clip(0, 255).astype(np.uint8)
+        strong = np.abs(change).sum(2)
+        strong = strong >= np.quantile(strong, 1 - _STRONGEST)
+        unexplained = float(np.abs(left[strong]).mean() / np.abs(change[strong]).mean())
+        return PressRead(touch.frame, depth, drawn, unexplained, circle, ball, force)
 
     def _painted(self, image: np.ndarray, dots: np.ndarray | None) -> np.ndarray:
         return image if dots is None else without_markers(image, dots, self._dot)

@@ -1,0 +1,122 @@
+"""Whether the tactile cost of real grasps falls when force begins, and tells the wrong thing."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from touchgoal.encoders.probes.property_probe import interval
+
+_UNTOUCHED = 5  # frames
+_LASTING = 3  # frames that a fall must last
+_FALLEN = 0.05  # of the whole fall
+_NEAR = 3  # frames
+
+
+@dataclass(frozen=True, eq=False)
+class EmbeddedGrasp:
+    """One grasp as an encoder sees it.
+
+    Attributes:
+        trial, object: its name, and what is grasped.
+        embeddings: of its frames.
+        firmest: frame of the largest force.
+        begins: frame from which on the load cell shows 0.5 N; None if the hand was not open before.
+    """
+
+    trial: str
+    object: str
+    embeddings: Float[np.ndarray, "n d"]
+    firmest: int
+    begins: int | None
+
+    @property
+    def goal(self) -> Float[np.ndarray, " d"]:
+        """What is felt at the largest force."""
+        return self.embeddings[self.firmest]
+
+
+def cost(
+    embeddings: Float[np.ndarray, "*n d"], goal: Float[np.ndarray, " d"]
+) -> Float[np.ndarray, "*n"]:
+    """Share of the goal's touch that is missing: 1 untouched, 0 at the goal."""
+    return 1 - embeddings @ goal / max(float(goal @ goal), 1e-12)
+
+
+def judge_cost(grasps: list[EmbeddedGrasp]) -> dict[str, Any]:
+    """When the cost to another grasp of the same thing falls, and how it compares with other things'."""
+    delays = [
+        delay
+        for grasp in grasps
+        for other in grasps
+        if other.object == grasp.object and other is not grasp and grasp.begins is not None
+        if (delay := _delay(grasp, other.goal)) is not None
+    ]
+    firm = np.stack([grasp.goal for grasp in grasps])
+    things = np.array([grasp.object for grasp in grasps])
+    costs = np.stack([cost(firm, goal) for goal in firm], 1)
+    pairs = _aucs(costs, things)
+    by_goal = {name: float(np.mean(list(row.values()))) for name, row in pairs.items()}
+    values, names = np.array(list(by_goal.values())), np.array(list(by_goal))
+    return {
+        "delays": delays,
+        "near": float(np.mean(np.abs(delays) <= _NEAR)) if delays else float("nan"),
+        "auc": float(values.mean()),
+        "auc_interval": interval(values, names),
+        "auc_of_pairs": pairs,
+    }
+
+
+def cost_table(result: dict[str, Any], encoder: str) -> str:
+    """As people read it."""
+    names = list(result["auc_of_pairs"])
+    low, high = result["auc_interval"]
+    delays = result["delays"]
+    lines = [f"tactile cost by {encoder}, to the firmest frame of another grasp:"]
+    if delays:
+        lines.append(
+            f"falls {min(delays)} to {max(delays)} frames (median {np.median(delays):g}) after 0.5 N on the "
+            f"load cell, within {_NEAR} frames in {100 * result['near']:.0f} % of {len(delays)} pairs of grasps"
+        )
+    lines += [
+        f"tells the wrong thing: area under ROC {result['auc']:.2f} ({low:.2f}-{high:.2f}); by goal (row) and thing:",
+        " " * 27 + "".join(f"{name[:11]:>13}" for name in names),
+    ]
+    for name in names:
+        row = result["auc_of_pairs"][name]
+        cells = "".join(f"{row[n]:>13.2f}" if n in row else f"{'-':>13}" for n in names)
+        lines.append(f"{name[:26]:<27}{cells}")
+    return "\n".join(lines)
+
+
+def _delay(grasp: EmbeddedGrasp, goal: np.ndarray) -> int | None:
+    """Frames from 0.5 N to where the cost falls, to stay below for a while; None if it never does."""
+    assert grasp.begins is not None
+    costs = cost(grasp.embeddings, goal)
+    open_hand = costs[: min(_UNTOUCHED, max(grasp.begins, 1))]
+    start = float(np.median(open_hand))
+    down = np.asarray(costs < start - _FALLEN * (start - costs.min()))
+    at = _first_lasting(down)
+    return None if at is None else at - grasp.begins
+
+
+def _first_lasting(down: Bool[np.ndarray, " n"]) -> int | None:
+    lasting = np.convolve(down, np.ones(_LASTING), "valid") == _LASTING
+    return int(lasting.argmax()) if lasting.any() else None
+
+
+def _aucs(costs: np.ndarray, things: np.ndarray) -> dict[str, dict[str, float]]:
+    """Of every goal's thing and every other: how often the other's grasp costs more than its own."""
+    table: dict[str, dict[str, float]] = {}
+    for goal in np.unique(things):
+        own = costs[np.ix_(things == goal, things == goal)]
+        own = own[~np.eye(len(own), dtype=bool)]
+        table[str(goal)] = {
+            str(thing): float(
+                (own[:, None] < costs[np.ix_(things == thing, things == goal)].ravel()).mean()
+            )
+            for thing in np.unique(things)
+            if thing != goal and len(own)
+        }
+    return {name: row for name, row in table.items() if row}
