@@ -91,7 +91,7 @@ QUOTED = {
         _nearest,
     ),
     "real-force": Quoted(
-        "touchgoal benchmark real-touch --data franka_wedge_grasps --encoders gelsight_mini_surfaces pixels",
+        "touchgoal benchmark real-touch --data franka_wedge_grasps",
         "force of real grasps from pictures, of things not calibrated on",
         _real_force,
     ),

@@ -157,7 +157,8 @@ def test_a_sensor_check_reads_noise_ball_and_contact(balls: list[np.ndarray]) ->
     assert check.untouched < check.threshold < check.touched / 2
     radii = [press.ball.radius for press in check.presses if press.ball is not None]
     assert np.median(radii) == pytest.approx(1, abs=0.1)
-    assert max(press.unexplained for press in check.presses) < 0.15
+    # The noise of one count is a part of the change, and no depth explains it.
+    assert max(press.unexplained for press in check.presses) < 0.2
     assert not check.drift.large and not check.drift_from_file.large
 
 
