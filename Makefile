@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 CODE := control sim_envs episodes encoders rewards policies benchmarks launch tests
 
-.PHONY: setup demo test lint check format build typings weights weights-markers maze-policy pick-place-policy clean
+.PHONY: setup demo test interop lint check format build typings weights weights-markers maze-policy pick-place-policy clean
 
 setup: $(READY)
 	@echo "touchgoal is ready: $(BIN)/touchgoal --help"
@@ -19,6 +19,12 @@ demo: $(READY)
 test: $(READY)
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not realtime" --durations 20
 	$(BIN)/python -m pytest -m realtime --durations 10
+
+# Clients that are not ours (pylibfranka, franky, ur-rtde), in an environment of their own, on the twin.
+interop: $(READY)
+	$(PYTHON) -m venv .venv-interop
+	.venv-interop/bin/pip install -q numpy pylibfranka franky-control ur_rtde
+	$(BIN)/python tests/interop/run.py
 
 # Format, lint and types.
 lint: $(READY) typings

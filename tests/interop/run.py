@@ -1,0 +1,109 @@
+"""Clients that are not ours against the twin, each in a process and an interpreter of its own.
+
+    python tests/interop/run.py [NAME ...]      NAME: pylibfranka, franky, ur_rtde; none: all
+
+The clients run in the virtual environment `.venv-interop` (`make interop` makes it). It prints what each
+one found, and fails if that is wrong.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+from running_twin import RunningTwin  # noqa: E402
+
+PYTHON = HERE.parents[1] / ".venv-interop" / "bin" / "python"
+_TIMEOUT = 400.0  # s
+_TOLERANCE = 5e-3  # rad or m
+
+
+def near(value: Any, expected: Any, tolerance: float = _TOLERANCE) -> bool:
+    """Whether all numbers are."""
+    return bool(np.allclose(value, expected, atol=tolerance))
+
+
+def check_pylibfranka(said: dict[str, Any]) -> dict[str, bool]:
+    """Commanded: 0.1 rad, -0.1 rad (an integral of sin squared), 0.05 rad, and 0.1 rad again."""
+    return {
+        "gravity is felt": said["gravity"] > 5,
+        "positions": near(said["position"], 0.1),
+        "velocities": near(said["velocity"], -0.1),
+        "torques": near(said["torque"], 0.05, 0.03),
+        "a jump is refused": "discontinuity" in said["error"] or "violation" in said["error"],
+        "recovery": near(said["recovered"], 0.1),
+    }
+
+
+def check_franky(said: dict[str, Any]) -> dict[str, bool]:
+    """Its hand points down: 3 cm along its own axis is 3 cm down."""
+    return {
+        "joints": near(said["joint"], 0.1),
+        "Cartesian": near(said["cartesian"], [0, 0, -0.03], 0.01),
+        "velocity": 0.05 < said["velocity"][0] < 0.12,
+        "hand": near(said["width"], 0.05) and said["air"] is False,
+        "gravity is felt": said["gravity"] > 5,
+    }
+
+
+def check_ur_rtde(said: dict[str, Any]) -> dict[str, bool]:
+    """Freedrive with nobody there moves nothing; force mode goes down, where nothing resists."""
+    return {
+        "moveJ": near(said["moveJ"], 0.1),
+        "moveL": near(said["moveL"], [0, 0, 0.05]),
+        "servoJ": near(said["servoJ"], [0.05, 0, 0, 0, 0, 0]),
+        "servoC": near(said["servoC"], [0, 0, 0.03]),
+        "forceMode": said["force"][2] < -2e-3 and near(said["force"][:2], 0.0),
+        "freedrive": said["freedrive"] == 0 and near(said["still"], 0.0, 0.02),
+        "outputs": said["output"] is True and said["output off"] is False,
+        "dashboard": said["dashboard"] == ["Robotmode: RUNNING", "Safetystatus: NORMAL", True],
+    }
+
+
+CLIENTS: dict[str, tuple[str, Callable[[dict[str, Any]], dict[str, bool]]]] = {
+    "pylibfranka": ("fr3", check_pylibfranka),
+    "franky": ("fr3", check_franky),
+    "ur_rtde": ("ur5e", check_ur_rtde),
+}
+
+
+def run(name: str, number: int) -> bool:
+    """One client on a twin of its own; whether all is as it should be."""
+    arm, check = CLIENTS[name]
+    cell = ["--env.objects", "wooden_block", "--seed", "3", "--env.cameras", "--env.no-tactile"]
+    lock_step = ["--lock-step"] if arm == "fr3" else []
+    with tempfile.TemporaryDirectory() as folder:
+        twin = RunningTwin(["--arm", arm, *lock_step, *cell], Path(folder), number)
+        try:
+            done = subprocess.run(
+                [str(PYTHON), str(HERE / f"{name}_client.py"), twin.cell.address],
+                capture_output=True,
+                text=True,
+                timeout=_TIMEOUT,
+            )
+        finally:
+            twin.close()
+    if done.returncode != 0:
+        print(f"{name}: it failed: {done.stderr.strip().splitlines()[-1:]}", flush=True)
+        return False
+    said = json.loads(done.stdout.splitlines()[-1])
+    found = check(said)
+    print(
+        f"{name}: " + ", ".join(f"{what} {'ok' if ok else 'WRONG'}" for what, ok in found.items())
+    )
+    if not all(found.values()):
+        print(f"  {said}", flush=True)
+    return all(found.values())
+
+
+if __name__ == "__main__":
+    names = sys.argv[1:] or list(CLIENTS)
+    results = [run(name, 20 + list(CLIENTS).index(name)) for name in names]
+    sys.exit(0 if all(results) else 1)
