@@ -42,6 +42,7 @@ from touchgoal.sim_envs.twin.control_port import ask_twin
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 
 _TIMEOUT = 300.0  # s for anything to happen, on a machine however loaded
+_IN_THE_AIR = 0.08  # m: height of an object that is carried
 _UNLIMITED = resource.RLIM_INFINITY
 _FORKSERVER = multiprocessing.get_context("forkserver")  # one import of everything serves every row
 _FORKSERVER.set_forkserver_preload([__name__])
@@ -56,11 +57,13 @@ class FaultCase:
     policy: str = "expert"
     kills: bool = False
     full: bool = False
+    carrying: bool = False  # it comes once the object is in the air, not as soon as the arm moves
 
 
 CASES = (
     FaultCase("none"),
     FaultCase("server killed in motion", "kill"),
+    FaultCase("arm's link lost alone", "drop"),
     FaultCase("link frozen 0.1 s", "freeze 0.1"),
     FaultCase("link frozen 0.5 s", "freeze 0.5"),
     FaultCase("link frozen 2 s", "freeze 2"),
@@ -70,6 +73,8 @@ CASES = (
     FaultCase("fingertip: half pictures", "halve tactile_left 60"),
     FaultCase("speeds are no numbers", "nonsense on"),
     FaultCase("fingertip unplugged", "lose tactile_left 60"),
+    FaultCase("gripper silent", "silence-gripper on"),
+    FaultCase("object lost on the way", "take-object", carrying=True),
     FaultCase("load cell garbled", "garble load_cell 1.0"),
     FaultCase("policy: not a number", policy="nan"),
     FaultCase("policy hangs", policy="hangs"),
@@ -166,9 +171,12 @@ def _inject(
     def truth() -> dict[str, Any]:
         return ask_twin(port, "truth")
 
-    _wait_until(
-        lambda: max(np.abs(truth()["dq"])) > 0.1 or report.exists() or not deploy.is_alive()
-    )
+    def begun(now: dict[str, Any]) -> bool:
+        if case.carrying:
+            return now["layout"]["object"][2] > _IN_THE_AIR
+        return max(np.abs(now["dq"])) > 0.1
+
+    _wait_until(lambda: begun(truth()) or report.exists() or not deploy.is_alive())
     moment = truth()["time"]
     if case.kills:
         deploy.kill()

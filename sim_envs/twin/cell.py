@@ -7,12 +7,15 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from touchgoal.control.errors import UserError
 from touchgoal.control.safety.braking import braked_velocity
 from touchgoal.sim_envs.base import FrankaTactileEnv
+from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE, SERVO_DAMPING
 
 DT = 1e-3  # s, of the Franka control interface and of the physics
 AT_REST = 0.01  # rad/s
+_ASIDE = 0.25, 0.4  # m, where on the table an object is put that is taken away
 _TORQUE_FILTER_TIME = (
     0.02  # s, first order: how fast the arm's estimate of external torque follows; our choice
 )
@@ -130,6 +133,15 @@ class SimulatedCell:
     def nudge(self, force: Float[np.ndarray, "3"], seconds: float) -> None:
         """Push the hand with a force (N, base frame) for a while, as a person might."""
         self._nudge_force, self._nudged_until = force, self.time + seconds
+
+    def take_object(self) -> None:
+        """Put the object of pick-and-place aside, wherever it is; UserError in another task."""
+        if not isinstance(self.env, PickPlace):
+            raise UserError("there is no object to take in this task")
+        body = self.env.bodies[0]
+        joint = self.env.data.joint(body.name)
+        joint.qpos[:3] = *_ASIDE, body.rest_height + 0.001
+        joint.qvel[:] = 0.0
 
     # Time.
 

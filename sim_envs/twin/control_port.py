@@ -16,6 +16,8 @@ for the truth.
     nudge FX FY FZ SECONDS        push the hand, N in the base frame
     stall|repeat|lose NAME SECONDS  a camera or sensor sends nothing, one picture, cuts clients off
     break|halve NAME SECONDS      its JPEGs come with wrong bytes, or cut in half
+    silence-gripper on|off  a Franka Hand says nothing any more
+    take-object                   take the object of pick-and-place out of the hand, or from its place
     nonsense on|off               the arm says that its joints' speeds are not numbers
     garble NAME SHARE             a serial port's messages lose bytes
     unplug|plug NAME              a serial port
@@ -78,6 +80,9 @@ class FaultyArm(Protocol):
 
     def abort(self, error: str) -> None:
         """Stop with an error; UserError if there is none of that name."""
+
+    def silence_gripper(self, silent: bool) -> None:
+        """Let nothing through to and from the gripper alone, or let it through again."""
 
     def set_nonsense(self, on: bool) -> None:
         """Say that the joints' speeds are not numbers, or say them again."""
@@ -162,6 +167,8 @@ class ControlPort:
             "lose": lambda: self._set_stream_fault("lost", *rest.split()),
             "break": lambda: self._set_stream_fault("broken", *rest.split()),
             "halve": lambda: self._set_stream_fault("halved", *rest.split()),
+            "silence-gripper": lambda: self._arm.silence_gripper({"on": True, "off": False}[rest]),
+            "take-object": self._cell.take_object,
             "nonsense": lambda: self._arm.set_nonsense({"on": True, "off": False}[rest]),
             "garble": lambda: self._garble(*rest.split()),
             "unplug": lambda: self._ports[rest].unplug(),

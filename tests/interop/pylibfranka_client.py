@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 
 import numpy as np
-import pylibfranka as lib
+import pylibfranka as lib  # pyright: ignore[reportMissingImports]
 
 _DT = 1e-3
 _STIFFNESS = np.array([600, 600, 600, 600, 250, 150, 50.0])  # Nm/rad

@@ -146,6 +146,10 @@ class FrankaArm:
         if self.mode == RobotMode.REFLEX:
             self.mode, self.error = RobotMode.IDLE, ""
 
+    def silence_gripper(self, silent: bool) -> None:
+        """Let nothing through to and from the hand, or let it through again."""
+        self._hand.frozen = silent
+
     def freeze(self, frozen: bool) -> None:
         """Let nothing through in either direction, or let it through again."""
         self.link.frozen = self._hand.frozen = frozen

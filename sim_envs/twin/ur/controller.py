@@ -145,6 +145,10 @@ class UrController:
             self._mode = _POWER_OFF
             self._program.end()
 
+    def silence_gripper(self, silent: bool) -> None:
+        """Its gripper is on a serial port: UserError."""
+        raise UserError("this gripper is a serial device: unplug gripper")
+
     def set_nonsense(self, on: bool) -> None:
         """Say that the joints' speeds are not numbers, or say them again."""
         self._nonsense = on
