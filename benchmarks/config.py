@@ -122,10 +122,10 @@ class PolicyDelayOptions(BenchmarkOptions):
     policy: str = "shipped"
     """Which policy, named as for run-policy."""
     causes: bool = False
-    """In place of the delays: each part of what lies between policy and arm, alone and left out."""
+    """Instead of the delays, an ablation: each effect of a deployment alone, then all but it."""
     delay: tuple[NotNegative, ...] = (0.0, 50.0, 100.0, 150.0)
-    """From what is measured to the command that follows from it, ms, beside the tick for which plans are
-    asked ahead: half of it before the policy, half after."""
+    """Total delay from sensing to command, ms, half of it before the policy and half after; planning adds
+    a tick."""
     jitter: tuple[NotNegative, ...] = (0.0, 50.0)
     """By how much each half may be longer, drawn tick by tick, ms."""
     rates: tuple[Positive, ...] = (30.0, 15.0)

@@ -107,7 +107,7 @@ QUOTED = {
     ),
     "bead-maze": Quoted(
         "touchgoal benchmark bead-maze --held-out 40",
-        "the shipped policy leads a bead along wires it has not seen, by touch alone",
+        "the shipped policy leads a bead along wires it has not seen, by touch and joint state",
         _maze,
     ),
     "reward-quality": Quoted(

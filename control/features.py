@@ -8,6 +8,7 @@ is the robot's first link. Keys follow LeRobot's naming.
 from dataclasses import dataclass
 
 STATE = "observation.state"
+COMMAND = "observation.command"
 TCP_POSE = "observation.tcp_pose"
 WRENCH = "observation.wrench"
 LOAD = "observation.load"
@@ -55,7 +56,7 @@ _IMAGE_NAMES = ("height", "width", "channels")
 
 
 def _of_joints(joints: int) -> dict[str, Feature]:
-    """The two columns that differ between arms."""
+    """The columns that differ between arms."""
     names = [f"joint_{i}" for i in range(1, joints + 1)]
     return {
         STATE: Feature(
@@ -63,6 +64,13 @@ def _of_joints(joints: int) -> dict[str, Feature]:
             (2 * joints + 1,),
             (*(f"{j}.pos" for j in names), *(f"{j}.vel" for j in names), "gripper.pos"),
             "joint positions (rad), joint velocities (rad/s), gripper width (m)",
+        ),
+        COMMAND: Feature(
+            "float32",
+            (2 * joints,),
+            (*(f"{j}.pos" for j in names), *(f"{j}.vel" for j in names)),
+            "joint positions (rad) commanded up to now, and by how much they changed in the last "
+            "tick (rad/s): no delay lies in it, nor what the arm meets",
         ),
         ACTION: Feature(
             "float32",
@@ -75,6 +83,7 @@ def _of_joints(joints: int) -> dict[str, Feature]:
 
 FEATURES: dict[str, Feature] = {
     STATE: _of_joints(N_JOINTS)[STATE],
+    COMMAND: _of_joints(N_JOINTS)[COMMAND],
     TCP_POSE: Feature("float32", (7,), _POSE, "tool centre point in the base frame: m, wxyz"),
     WRENCH: Feature(
         "float32", (6,), _WRENCH, "external force (N) and torque (Nm) at the TCP, base frame"

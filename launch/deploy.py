@@ -31,7 +31,7 @@ class Config:
     sim: bool = False
     """Use a simulated arm in place of the cell file's."""
     seed: Seed | None = None
-    """Random seed of the scene, in place of the cell file's; of a simulated arm or a twin."""
+    """Random seed of the scene, in place of the cell file's (simulated arm or twin only)."""
     out: Path | None = None
     """Folder of the run; the episode goes to its `episodes/`, after those already there."""
 

@@ -15,6 +15,7 @@ from touchgoal.control.option_types import (
 from touchgoal.launch.training_options import TrainingOptions
 from touchgoal.policies.config import (
     ActionRepresentation,
+    ArmState,
     Head,
     SamplerConfig,
     TouchReading,
@@ -43,9 +44,10 @@ class Config(TrainingOptions):
     task: TaskName | None = None
     """Task of the episodes, in which snapshots are tried; default: what the episodes say."""
     encoder: Path | None = None
-    """Folder of a frozen touch encoder (train-encoder); without one the policy does not feel."""
+    """Folder of a frozen touch encoder (train-encoder), or the name of one that ships; without one the
+    policy does not feel."""
     end_to_end: bool = False
-    """Feel through a touch ViT that is trained along, instead of a frozen encoder."""
+    """Feel through a touch ViT that is trained jointly with the policy, instead of a frozen encoder."""
     estimator: Path | None = None
     """Folder of a state estimator (train-estimators): the policy acts on its estimates of contact and
     of where things lie at the start, and learns on the truth, so its episodes need no pictures."""
@@ -60,6 +62,9 @@ class Config(TrainingOptions):
     the plan's start), absolute (joint positions), base_twist or body_twist (displacement and turn of
     the hand along the base's or the hand's own axes). body_twist also sees what moves along the hand's
     axes; with a state estimator take base_twist."""
+    arm_state: ArmState = "measured"
+    """How the policy knows where the arm is: measured, or commanded (where it has been sent), into which
+    no delay comes; episodes need the column observation.command for that."""
     touch_reading: TouchReading = "wrench"
     """What the policy takes from a frozen touch embedding: wrench, the forces and torques on both
     fingertips, which a small network learns from what the simulator says; or free, a projection that is
@@ -67,10 +72,10 @@ class Config(TrainingOptions):
     touch_projection_dim: Annotated[Count, RARE] = 64
     """Numbers to which a frozen embedding is projected, with --touch-reading free."""
     touch_noise: Annotated[NotNegative, RARE] = 0.1
-    """Noise added to touch embeddings while learning, in standard deviations of theirs."""
+    """Noise added to touch embeddings while learning, relative to their standard deviation."""
     position_noise: Annotated[NotNegative, RARE] = 0.3
-    """Noise added to joint and hand positions while learning, where the policy sees them, in standard
-    deviations of theirs."""
+    """Noise added to joint and hand positions while learning, where the policy sees them, relative to
+    their standard deviation."""
     observation_horizon: Annotated[Count, RARE] = 2
     """Control ticks that the policy sees, the latest included."""
     execution_horizon: Count = 2

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from touchgoal.control.features import N_JOINTS
@@ -60,11 +61,27 @@ def _base_jacobian_and_elbow(joints: Float[Tensor, "b 7"]) -> Float[Tensor, "b 7
     return torch.cat([torch.from_numpy(rows).float(), elbow], 1).to(joints)
 
 
+def nearest(widths: Float[Tensor, "b h"], allowed: tuple[float, ...]) -> Float[Tensor, "b h"]:
+    """Of each width (m) the nearest that is allowed."""
+    levels = torch.tensor(allowed).to(widths)
+    return levels[(widths[..., None] - levels).abs().argmin(-1)]
+
+
 def body_jacobian(joints: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 6 7"]:
     """From small changes of the joints to the TCP's displacement and turn along the TCP's axes."""
     J, R = _kinematics().jacobians(joints.reshape(-1, N_JOINTS).cpu().numpy().astype(np.float64))
     own = R.mT[:, None] @ J.reshape(-1, 2, 3, N_JOINTS)
     return torch.from_numpy(own).float().to(joints).reshape(*joints.shape[:-1], 6, N_JOINTS)
+
+
+def tcp_poses(joints: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7"]:
+    """Where the TCP is, `features.TCP_POSE`, with the joints there (rad)."""
+    position, R = _kinematics().forward_many(
+        joints.reshape(-1, N_JOINTS).cpu().numpy().astype(np.float64)
+    )
+    quaternions = Rotation.from_matrix(R).as_quat(scalar_first=True)
+    poses = np.concatenate([position, quaternions], 1)
+    return torch.from_numpy(poses).to(joints).reshape(joints.shape)
 
 
 def _damped_pseudoinverse(J: Float[Tensor, "b 6 7"]) -> Float[Tensor, "b 7 6"]:

@@ -235,7 +235,8 @@ def _config(fields: dict[str, Any]) -> PolicyConfig:
     head = fields.pop("head")
     if end_to_end := fields.pop("end_to_end", None):
         fields["end_to_end"] = EndToEndConfig(**end_to_end | {"size": tuple(end_to_end["size"])})
-    fields["proprioception"] = tuple(fields["proprioception"])
+    for key in ("proprioception", "gripper_widths"):
+        fields[key] = tuple(fields.get(key, ()))
     return PolicyConfig(**fields, head=_read_head(head))
 
 

@@ -18,6 +18,8 @@ from touchgoal.control.option_types import (
 
 Head = Literal["small", "published", "tiny", "regression"]
 """A diffusion head with a U-Net of that size, or one that predicts a plan directly."""
+ArmState = Literal["measured", "commanded"]
+"""What a policy sees of the arm: where it was measured, or where it has been sent."""
 TouchReading = Literal["wrench", "free"]
 """See PolicyConfig."""
 ActionRepresentation = Literal["delta", "chunk", "absolute", "base_twist", "body_twist"]

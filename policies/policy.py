@@ -9,7 +9,13 @@ from torch import Tensor, nn
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.policies.actions import ACTION_DIM, Normalizer, to_actions, to_representation
+from touchgoal.policies.actions import (
+    ACTION_DIM,
+    Normalizer,
+    nearest,
+    to_actions,
+    to_representation,
+)
 from touchgoal.policies.config import ActionRepresentation, TouchReading
 from touchgoal.policies.heads.diffusion import (
     Diffusion,
@@ -43,6 +49,9 @@ class PolicyConfig:
         position_noise: likewise of the joint and TCP positions, one draw for all ticks seen: where on
             the table a wire ran shall not tell how it goes on. Velocities and the hand's
             orientation stay as they are. "body_twist" sees no positions.
+        gripper_widths: m, all that the demonstrations ask for, if those are two: what is predicted in
+            between, where the network is not sure, becomes the nearer one, for a hand that is sent a
+            width on the way goes there. Empty: any width.
         end_to_end: for fingertips that no frozen encoder reads; None for a policy without.
         proprioception: columns of `features.FEATURES`, the state first. Where it acts, those that
             only a simulator knows come from its senses, see `senses.py`. The force on the hand is seen
@@ -65,6 +74,7 @@ class PolicyConfig:
     touch_projection_dim: int = 64
     touch_noise: float = 0.1
     position_noise: float = 0.3
+    gripper_widths: tuple[float, ...] = ()
     end_to_end: EndToEndConfig | None = None
     proprioception: tuple[str, ...] = (ft.STATE, ft.TCP_POSE)
     observation_horizon: int = 2
@@ -82,9 +92,10 @@ class PolicyConfig:
             ft.FEATURES
         ):
             raise UserError(f"proprioception must be known columns, {ft.STATE} first")
-        if self.representation == "body_twist" and self.proprioception != (ft.STATE, ft.TCP_POSE):
+        seen = set(self.proprioception) - {ft.COMMAND}
+        if self.representation == "body_twist" and seen != {ft.STATE, ft.TCP_POSE}:
             raise UserError(
-                f'representation "body_twist" sees {ft.STATE} and {ft.TCP_POSE} alone: choose "base_twist"'
+                'representation "body_twist" sees the arm alone, neither force nor object: choose "base_twist"'
             )
         if not 1 <= self.execution_horizon <= self.prediction_horizon:
             raise UserError(
@@ -136,7 +147,7 @@ class ObservationBatch:
 
     @property
     def joints(self) -> Float[Tensor, "b 7"]:
-        """Joint positions at the latest tick, rad."""
+        """Joint positions measured at the latest tick, rad."""
         return self.state[:, -1, : ft.N_JOINTS]
 
 
@@ -235,7 +246,10 @@ class Policy(nn.Module):
         """
         encoded = self._encode(batch, self._encode_touch(batch))
         chunk = self.action_normalizer.inverse(self.head.sample(encoded, generator))
-        return to_actions(chunk, batch.joints, self.config.representation)
+        actions = to_actions(chunk, batch.joints, self.config.representation)
+        if self.config.gripper_widths:
+            actions[..., -1] = nearest(actions[..., -1], self.config.gripper_widths)
+        return actions
 
     def _encode_touch(
         self, batch: ObservationBatch, noise: torch.Generator | None = None

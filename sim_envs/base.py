@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
@@ -20,6 +20,7 @@ from touchgoal.sim_envs.scene.build import ROBOTS, SIDES, arm_joints, build
 from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, ContactReader, PadContact
 from touchgoal.sim_envs.scene.objects import Body
 from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
+from touchgoal.sim_envs.spaces import action_space, observation_space
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
@@ -35,8 +36,8 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     """An FR3 with two fingertip sensors at a table; a task adds objects, progress and success.
 
     Observations are a flat dict with the keys of `control/features.py`; truth (`truth.*`) is in
-    `info`; that of the pads is of when the pictures were taken. The action is the joint change (rad) for this tick, added to the commanded joint
-    positions, and the gripper width target (m). The gripper closes at its own speed and then
+    `info`; that of the pads refers to the time the pictures were taken. The action is the joint change
+    (rad) for this tick, added to the commanded joint positions, and the gripper width target (m). The gripper closes at its own speed and then
     holds with `grasp_force` N on each finger, as the Franka Hand's `grasp` does.
     """
 
@@ -52,10 +53,8 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.robot = ROBOTS[config.arm]
         self.n_joints = self.robot.arm.home.size
         self.kinematics = Kinematics(self.robot.arm, self.robot.tool.tcp_offset)
-        self.action_space = self._limits = self._action_space()
-        self.observation_space = gym.spaces.Dict(
-            {key: _space(ft.FEATURES[key], self._shape(key)) for key in self._observed()}
-        )
+        self.action_space = self._limits = action_space(self.robot, config.control_hz)
+        self.observation_space = observation_space(config, self.n_joints, self.sensor)
         self.grasp_force = 15.0
         self.bodies: list[Body] = []
         self._renderer: Renderer | None = None
@@ -95,7 +94,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.sample_episode(rng, dict(options or {}))
         self._compile_scene(rng)
         self.place_objects(rng)
-        self.command = self.start_joints(rng)
+        self.command = self._commanded = self.start_joints(rng)
         self._disturbance_state = np.zeros(6)
         self._finger_target = self.robot.tool.stroke[1] / 2
         self.data.qpos[self.arm_positions] = self.command
@@ -118,6 +117,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         low, high = self._limits.low, self._limits.high
         action = np.clip(action, low, high)
         before = self._progress
+        self._commanded = self.command
         self.begin_tick()
         if self._deployed:
             self._deployed.run_tick(action[:-1], action[-1])
@@ -314,9 +314,14 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
             self._deployed = DeployedArm(self, between, self.np_random.spawn(1)[0])
 
     def _observe(self) -> Observation:
+        command = {ft.COMMAND: self._read_command()}
         if self._deployed:
-            return self._deployed.observation()
-        return self.read_proprioception() | self.take_pictures()
+            return self._deployed.observation() | command
+        return self.read_proprioception() | self.take_pictures() | command
+
+    def _read_command(self) -> Float32[np.ndarray, " c"]:
+        velocity = (self.command - self._commanded) * self.config.control_hz
+        return np.concatenate([self.command, velocity]).astype(np.float32)
 
     def read_proprioception(self) -> Observation:
         """State, TCP pose and wrench as they are; `update_contacts` first."""
@@ -372,29 +377,3 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     def object_pose(self, name: str = "object") -> Float[np.ndarray, "7"]:
         """Pose of an object in the base frame: m, quaternion wxyz."""
         return self.data.joint(name).qpos.copy()
-
-    def _observed(self) -> list[str]:
-        keys = [ft.STATE, ft.TCP_POSE, ft.WRENCH]
-        keys += [ft.IMAGE_PREFIX + camera for camera in self.config.cameras]
-        return keys + (list(ft.TACTILE) if self.config.tactile else [])
-
-    def _shape(self, key: str) -> tuple[int, ...]:
-        if key in ft.CAMERAS:
-            return (*self.config.camera_size, 3)
-        if key in ft.TACTILE:
-            return (*self.sensor.image_shape, 3)
-        return ft.features_of(self.n_joints)[key].shape
-
-    def _action_space(self) -> gym.spaces.Box:
-        step = self.robot.hardware.velocity / self.config.control_hz
-        return gym.spaces.Box(
-            np.append(-step, 0.0).astype(np.float32),
-            np.append(step, self.robot.tool.stroke[1]).astype(np.float32),
-            dtype=np.float32,
-        )
-
-
-def _space(feature: ft.Feature, shape: tuple[int, ...]) -> gym.spaces.Box:
-    if feature.dtype == "uint8":
-        return gym.spaces.Box(0, 255, shape, np.uint8)
-    return gym.spaces.Box(-np.inf, np.inf, shape, np.float32)

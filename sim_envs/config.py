@@ -106,9 +106,9 @@ TickRange = Annotated[tuple[Annotated[int, Field(ge=0, le=2)], ...], Field(min_l
 
 @checked_dataclass
 class DeploymentConfig:
-    """What lies between a policy and a real arm; each is drawn anew for each episode.
+    """Delays and dynamics of a real arm, drawn anew for each episode.
 
-    What is not given is as `as_deployed` says: all of it as over the wire (`AS_DEPLOYED`), or none.
+    What is not given follows `as_deployed`: all of it as over the wire (`AS_DEPLOYED`), or none.
     """
 
     tracked: bool | None = None
@@ -118,8 +118,7 @@ class DeploymentConfig:
     """The hand is a Franka Hand: one command at a time, each runs to its end; closing to 0 grasps
     what it meets, any other width is a move. Its width is read every 50 ms."""
     wrench: bool | None = None
-    """The force on the hand is a real arm's estimate: with noise, bias, lag, and now and then exactly
-    zero, which means unknown."""
+    """The force on the hand is a real arm's estimate: with noise, bias, drift and lag."""
     state_delay: DelayRange | None = None
     """Age of joint positions, velocities and force when the policy sees them, s."""
     picture_delay: DelayRange | None = None
@@ -187,7 +186,7 @@ class EnvConfig(SceneConfig):
     as_deployed: bool = False
     """Behave as the arm does when it is deployed: driven, delayed and sensed as over the wire."""
     deployment: DeploymentConfig = DeploymentConfig()
-    """Single options behind `as-deployed`, each in place of what that says."""
+    """Overrides of single as-deployed settings."""
 
     def between(self) -> DeploymentConfig:
         """What lies between policy and arm, every field of it given."""

@@ -8,17 +8,14 @@ _NOISE = np.array([0.1] * 3 + [0.01] * 3)  # N, N m, standard deviation of each 
 _BIAS = np.array([1.5] * 3 + [0.3] * 3)  # N, N m, at most, of an episode
 _WANDER = np.array([0.5] * 3 + [0.1] * 3)  # N, N m, standard deviation of what drifts
 _WANDER_TIME = 1.0  # s
-_UNKNOWN = 0.005  # share of readings that begin a spell without an estimate
-_SPELL = 10  # readings that such a spell lasts on average
 
 Wrench = Float[np.ndarray, "6"]
 
 
 class EstimatedWrench:
-    """Noise, bias, drift and lag on the true wrench, drawn for one episode; at times exactly zero.
+    """Noise, bias, drift and lag on the true wrench, drawn for one episode.
 
     The sizes are guesses: no data sheet and no recording of an arm was at hand to check them by.
-    libfranka gives zero near singularities: unknown, not no force.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -26,7 +23,6 @@ class EstimatedWrench:
         self._bias = rng.uniform(-_BIAS, _BIAS)
         self._wandering = rng.normal(0, _WANDER)
         self._filtered = np.zeros(6)
-        self._unknown = False
 
     def update(self, true: Wrench, seconds: float) -> None:
         """The true wrench (N, N m) so long after the last one."""
@@ -38,8 +34,4 @@ class EstimatedWrench:
 
     def read(self) -> Wrench:
         """The estimate (N, N m)."""
-        change = 1 / _SPELL if self._unknown else _UNKNOWN
-        self._unknown ^= bool(self._rng.random() < change)
-        if self._unknown:
-            return np.zeros(6)
         return self._filtered + self._bias + self._wandering + self._rng.normal(0, _NOISE)

@@ -43,6 +43,22 @@ def test_it_comes_back_from_where_it_never_went() -> None:
     assert success
 
 
+def test_it_gives_way_to_what_it_presses_on() -> None:
+    env = PickPlace(BLIND)
+    observation, _ = env.reset(seed=JOB.seed, options=JOB.options)
+    expert, forces = FeedbackExpert(env), []
+    for tick in range(160):
+        action = expert.act(observation)
+        if tick < 50:  # somebody else presses the closed hand on the table
+            down = env.kinematics.joint_change(env.command, np.array([0, 0, -0.008, 0, 0, 0]))
+            action = np.append(down if env.external_wrench()[2] < 40 else np.zeros(7), 0.0)
+        elif tick < 60:
+            assert env.kinematics.jacobian(env.command)[2] @ action[:7] > 0 or forces[-1] < 4
+        observation, *_ = env.step(action)
+        forces.append(env.external_wrench()[2])
+    assert max(forces) > 30 and forces[-1] < 10
+
+
 def test_a_learner_acts_and_is_corrected(tmp_path: Path) -> None:
     config = replace(
         TOY,

@@ -36,7 +36,7 @@ from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.perception.proprioception import network_input
 from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
 from touchgoal.policies.training import train as train_module
-from touchgoal.policies.training.sequence_dataset import load_recordings
+from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
 from touchgoal.policies.training.train import ema_decay, train
 
 import mujoco  # isort: skip - after touchgoal, which chooses the OpenGL platform
@@ -238,6 +238,20 @@ def test_a_saved_policy_plans_the_same(
     assert loaded.config == config
     condition, _ = windows.take(torch.arange(3))
     assert torch.equal(loaded.plan(condition, torch_rng()), policy.plan(condition, torch_rng()))
+
+
+def test_a_hand_that_only_opens_and_closes_is_sent_nothing_in_between(tmp_path: Path) -> None:
+    config = replace(TOY, head=RegressionConfig(32, 1))
+    recorded = toy_dataset(config).recorded
+    actions = recorded.actions.clone()
+    actions[:, 7] = 0.08 * (torch.arange(len(actions)) % 2)
+    windows = SequenceDataset(replace(recorded, actions=actions), config)
+    train(config, windows, windows, CONFIG, tmp_path, SEED, {})
+    policy = checkpoint.load(tmp_path / "policy")
+    condition, _ = windows.take(torch.arange(8))
+    widths = policy.plan(condition, torch_rng())[..., 7]
+    assert set(widths.unique().tolist()) <= set(policy.config.gripper_widths)
+    assert sorted(policy.config.gripper_widths) == pytest.approx([0.0, 0.08])
 
 
 def test_a_turn_looks_the_same_by_either_quaternion() -> None:

@@ -152,6 +152,13 @@ class Kinematics:
         _, R, J = (side_by_side.full() for side_by_side in self._chain.map(len(q))(q.T))
         return J.reshape(6, *q.shape).transpose(1, 0, 2), R.reshape(3, len(q), 3).transpose(1, 0, 2)
 
+    def forward_many(
+        self, q: Float[np.ndarray, "b n"]
+    ) -> tuple[Float[np.ndarray, "b 3"], Float[np.ndarray, "b 3 3"]]:
+        """`forward` of many joint positions at once."""
+        position, R, _ = (side_by_side.full() for side_by_side in self._chain.map(len(q))(q.T))
+        return position.T, R.reshape(3, len(q), 3).transpose(1, 0, 2)
+
     def solve_ik_near(
         self,
         position: Vector3,

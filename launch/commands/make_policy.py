@@ -65,6 +65,7 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
     estimator = config.touch / "estimator" if config.touch else SHIPPED["pick-place"] / ESTIMATOR
     learn = shlex.split(
         "--task pick-place --head regression --representation base_twist --position-noise 0 "
+        "--arm-state commanded "
         f"--train.lr 1e-3 --train.epochs {config.epochs or 16} --train.snapshot-epochs 16"
     )
     learn += ["--estimator", str(estimator)]
@@ -78,14 +79,16 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
                      ["--feedback", *wired, "--env.disturbance", "0.02"], config)]
             if disturbed else []
         ),
-        *_corrected(config, out, learn, learn, wired, 3, 80),
+        *_corrected(config, out, learn, learn, wired, 2, 80),
     ]  # fmt: skip
 
 
 def _bead_maze(config: Config, out: Path) -> list[list[str]]:
     """A diffusion policy of what a regression, which learns fast, has gathered corrections with."""
     encoder = config.touch / "encoder" if config.touch else SHIPPED["bead-maze"] / TOUCH
-    learn = shlex.split("--representation body_twist --train.lr 1e-3 --env.start-angle 10")
+    learn = shlex.split(
+        "--representation body_twist --arm-state commanded --train.lr 1e-3 --env.start-angle 10"
+    )
     learn += ["--encoder", str(encoder), "--task", "bead-maze"]
     learn += ["--train.epochs", str(config.epochs or 10), "--train.snapshot-epochs", "5"]
     wired = [*_MAZE, *_DEPLOYED]

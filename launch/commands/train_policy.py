@@ -37,9 +37,6 @@ from touchgoal.policies.training.training_data import (
 from touchgoal.sim_envs.config import TASKS, TaskConfig, TaskName
 from touchgoal.sim_envs.tasks import task_name
 
-_COLUMNS = ft.STATE, ft.TCP_POSE
-
-
 _TRIALS = 2_000_000  # seed of the first trial
 
 
@@ -102,13 +99,19 @@ def _policy_config(
         touch_noise=config.touch_noise,
         position_noise=config.position_noise,
         end_to_end=EndToEndConfig() if config.end_to_end else None,
-        proprioception=_COLUMNS + (ft.WRENCH, *ESTIMATED) if config.estimator else _COLUMNS,
+        proprioception=_columns(config),
         representation=config.representation,
         observation_horizon=config.observation_horizon,
         execution_horizon=config.execution_horizon,
         control_hz=episodes.fps,
         head=head,
     )
+
+
+def _columns(config: Config) -> tuple[str, ...]:
+    """Of the episodes, that the policy sees."""
+    arm = (ft.STATE, ft.TCP_POSE) + (ft.COMMAND,) * (config.arm_state == "commanded")
+    return arm + (ft.WRENCH, *ESTIMATED) if config.estimator else arm
 
 
 def _task(config: Config, chosen: list[tuple[EpisodeSet, list[int]]]) -> TaskName:

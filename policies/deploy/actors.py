@@ -44,7 +44,8 @@ class LearnedActor(RealTimeActor):
     """A policy's plans in the loop; it never ends by itself.
 
     It has learned on an arm whose servo follows with a lag. One that follows at once answers its
-    corrections too soon, and in contact the two then shake each other: so the lag is put back.
+    corrections too soon, and in contact the two then shake each other: so the lag is put back. What
+    was wanted and has not been passed on yet counts as commanded.
     """
 
     done = False
@@ -52,11 +53,18 @@ class LearnedActor(RealTimeActor):
     def __init__(self, planner: ChunkPlanner, timeout: float | None = None) -> None:
         """See RealTimeActor."""
         super().__init__(planner, timeout)
-        self._lag = ServoLag(1 / planner.config.control_hz, ft.N_JOINTS)
+        self._hz = planner.config.control_hz
+        self._lag = ServoLag(1 / self._hz, ft.N_JOINTS)
+        self._before: np.ndarray | None = None
 
     def act(self, observation: Observation) -> np.ndarray:
         """See DeployedActor."""
-        action = super().act(observation)
+        command = observation[ft.COMMAND].copy()
+        command[: ft.N_JOINTS] += self._lag.remaining
+        before = command if self._before is None else self._before
+        command[ft.N_JOINTS :] = (command - before)[: ft.N_JOINTS] * self._hz
+        self._before = command
+        action = super().act({**observation, ft.COMMAND: command})
         return np.append(self._lag.update(action[:-1]), action[-1])
 
 

@@ -226,7 +226,7 @@ class ControlLoop:
     def _loop(self, actor: DeployedActor, seconds: float, log: RunLog) -> Ending:
         clock = self._connection.clock
         if isinstance(actor, RealTimeActor):
-            actor.start(self.reader.read().observation)
+            actor.start(self._read().observation)
         begin = due = clock.now()
         first = True
         while True:
@@ -280,7 +280,7 @@ class ControlLoop:
     def _tick(
         self, actor: DeployedActor, log: RunLog, seconds: float, late: float
     ) -> Ending | None:
-        sensed = self.reader.read()
+        sensed = self._read()
         log.clocks.append((self._connection.clock.now(), sensed.arm.time))
         if not self._execute:
             sensed = self._as_commanded(sensed)
@@ -327,6 +327,12 @@ class ControlLoop:
             row[ft.COST] = np.array([cost], np.float32)
         log.rows.append(row)
         return None
+
+    def _read(self) -> CellReading:
+        """What the devices say, and where the arm has been sent."""
+        sensed = self.reader.read()
+        command = np.concatenate([self.state.q, self.state.velocity]).astype(np.float32)
+        return replace(sensed, observation={**sensed.observation, ft.COMMAND: command})
 
     def _stop_for_fault(self, sensed: CellReading, arm_pace: float) -> Ending:
         fault = self.state.fault

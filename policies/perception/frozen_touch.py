@@ -49,11 +49,12 @@ class TouchEmbedder:
         return self.encoder.embed_touch(torch.from_numpy(np.concatenate(sides))).numpy().ravel()
 
 
-def load_touch(directory: Path) -> TouchEmbedder:
-    """The embedder of an encoder on disk, aligned or self-supervised; UserError if there is none.
+def load_touch(name_or_path: str | Path) -> TouchEmbedder:
+    """The embedder of an encoder, a folder or one that ships; UserError if there is none.
 
     Embeddings are named after the weights, not after the folder, which may move.
     """
+    directory = pretrained.find_encoder(name_or_path)
     encoder = pretrained.load_encoder(directory)
     digest = hashlib.sha256(pretrained.ENCODER.weights_path(directory).read_bytes()).hexdigest()[
         :12

@@ -3,6 +3,10 @@
 Two views of the same columns. From the base: joints and hand as they are. Along the hand's own axes
 ("body_twist"): how the hand moves and which way is up, and nothing of where on the table it is or which way
 it faces, so that what was learnt on one wire holds for every wire that bends as much.
+
+With `observation.command` among the columns the arm is seen where it has been sent, not where it was last
+measured: how late a measurement is, and how far the arm lags, then makes no difference to what the
+network sees, and a correction is not made twice.
 """
 
 import numpy as np
@@ -11,28 +15,30 @@ from jaxtyping import Float
 from torch import Tensor
 
 from touchgoal.control import features as ft
-from touchgoal.policies.actions import body_jacobian
+from touchgoal.policies.actions import body_jacobian, tcp_poses
 from touchgoal.policies.config import ActionRepresentation
 
 _LENGTH_SCALE = 0.02  # m
-_BODY_FRAME_WIDTHS = {ft.STATE: 7, ft.TCP_POSE: 3}  # columns there are, and their input_widths
+_BODY_FRAME_WIDTHS = {
+    ft.STATE: 7,
+    ft.TCP_POSE: 3,
+    ft.COMMAND: 0,
+}  # columns there are, and their input_widths
 
 
 def tare(wrench: np.ndarray, first: np.ndarray) -> np.ndarray:
     """The force on the hand since an episode's first tick, when nothing touched it: (..., 6).
 
-    An arm's estimate has a bias of some newtons that stays for a while. Exactly zero means that the
-    arm knows no estimate, and stays zero.
+    An arm's estimate has a bias of some newtons that stays for a while.
     """
-    known = wrench.any(-1, keepdims=True)
-    return np.where(known, wrench - first, 0.0).astype(np.float32)
+    return (wrench - first).astype(np.float32)
 
 
 def input_widths(columns: tuple[str, ...], kind: ActionRepresentation) -> list[int]:
     """Of what `network_input` makes of each column; KeyError for one that "body_twist" does not know."""
     if kind == "body_twist":
         return [_BODY_FRAME_WIDTHS[key] for key in columns]
-    more = {ft.TCP_POSE: 2, ft.TRUTH_START: 5}
+    more = {ft.TCP_POSE: 2, ft.TRUTH_START: 5, ft.COMMAND: -ft.FEATURES[ft.COMMAND].shape[0]}
     return [ft.FEATURES[key].shape[0] + more.get(key, 0) for key in columns]
 
 
@@ -61,6 +67,8 @@ def network_input(
     parts, start = {}, 0
     for key in columns:
         parts[key] = state[..., start : (start := start + ft.FEATURES[key].shape[0])]
+    if ft.COMMAND in parts:
+        _put_where_sent(parts)
     if kind == "body_twist":
         parts[ft.STATE] = _body_twist(parts[ft.STATE])
         if ft.TCP_POSE in parts:
@@ -74,7 +82,15 @@ def network_input(
                 parts[ft.TRUTH_START], pose[..., :3], turned, held
             )
         parts[ft.TCP_POSE] = torch.cat([pose[..., :3], turned], -1)
-    return torch.cat([parts[key] for key in columns], -1)
+    return torch.cat([parts[key] for key in columns if key in parts], -1)
+
+
+def _put_where_sent(parts: dict[str, Tensor]) -> None:
+    """Joints, velocities and the TCP as commanded, in place of what was measured."""
+    command = parts.pop(ft.COMMAND)
+    parts[ft.STATE] = torch.cat([command, parts[ft.STATE][..., -1:]], -1)
+    if ft.TCP_POSE in parts:
+        parts[ft.TCP_POSE] = tcp_poses(command[..., : ft.N_JOINTS])
 
 
 def _body_twist(state: Float[Tensor, "... 15"]) -> Float[Tensor, "... 7"]:

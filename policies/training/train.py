@@ -1,7 +1,7 @@
 """Training a policy on recorded sequences (the recipe of Chi et al. 2023)."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -53,10 +53,12 @@ def train(
     Raises:
         UserError: no such device, or a directory that does not fit `options.resume`.
     """
+    recorded = windows.recorded
+    widths = recorded.actions[:, -1].unique().tolist()
+    policy = replace(policy, gripper_widths=tuple(widths) if len(widths) == 2 else ())
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
         network = Policy(policy)
-    recorded = windows.recorded
     network.fit_normalizers(
         recorded.touch.float(), recorded.state, windows.joints, windows.actions,
         recorded.wrench, windows.action_is_pad,

@@ -16,10 +16,15 @@ from touchgoal.sim_envs.pick_place import PickPlace
 _STEEP = 3.0  # m of height per m that the hand is beside its place
 _NEAR, _GRIPPING = 0.006, 0.015  # m beside the object: for fingers to begin to close, to go on
 _OVER, _PLACED = 0.008, 0.014  # m beside the goal: for the object to go down, to stay there
+_PLACING = 3.0  # N, upwards on the hand, with which an object is held down where it is placed
+_FELT = 1.0  # N that an arm feels for sure
 _BEGUN = GRIPPER_MAX_WIDTH - 0.006  # m of width below which the fingers have begun to close
 _STILL = 0.006  # m/s of width: fingers that something stops
 _SPEED, _CLIMB, _TOUCHDOWN = 0.3, 0.2, 0.01  # m/s: at most over the table, up and down, near it
-_CLOSE = 0.006  # m above its place at which the object is lowered no faster than that
+_CLOSE = 0.012  # m above its place at which the object is lowered no faster than that
+_PRESS = 5.0  # N, upwards on the hand, above which it gives way
+# m/s per N: slow enough for a hand that feels the table (about 10 N/mm) 0.15 s late not to bounce
+_GIVE, _FASTEST_GIVE = 4e-4, 0.02
 _ACCELERATION = 4.0  # m/s^2
 _RETURN, _LOWER = 5.0, 3.0  # 1/s: speed towards a place per distance to it; down, with the object
 _TURN = 1.0  # rad/s
@@ -29,7 +34,7 @@ class FeedbackExpert:
     """Picks and places, to be asked in any state, whoever led the arm there.
 
     It follows a funnel over the object, and once it holds it, over the goal: the farther beside, the
-    higher. What it does depends on nothing but how the episode began and what can be sensed of the
+    higher. Whatever it presses on, it gives way to. What it does depends on nothing but how the episode began and what can be sensed of the
     present tick and the one before, so a policy that observes as much can do the same. An object
     that is pushed away it does not follow, and it never lets go.
     """
@@ -60,6 +65,8 @@ class FeedbackExpert:
         else:
             turn = float((self._yaw - yaw + np.pi / 2) % np.pi - np.pi / 2)
             velocity, turn, grip = self._fetch(here, turn, width)
+        pressed = max(0.0, float(env.external_wrench()[2]) - _PRESS)
+        velocity[2] += min(_GIVE * pressed, _FASTEST_GIVE)
         change = velocity - pace
         change *= min(1.0, _ACCELERATION / hz / max(float(np.linalg.norm(change)), 1e-9))
         turn = float(np.clip(_RETURN * turn, -_TURN, _TURN)) / hz
@@ -87,11 +94,11 @@ class FeedbackExpert:
         """Velocity (m/s) of a hand that holds the object."""
         off = self._goal - here
         beside = float(np.linalg.norm(off[:2]))
-        if beside < _PLACED and self._env.object_on_table():
-            return np.zeros(3)
-        if beside < _OVER and off[2] > -_CLOSE:
+        force = float(self._env.external_wrench()[2])
+        if beside < (_PLACED if force > _FELT else _OVER) and off[2] > -_CLOSE:
             deepest = max(self._goal[2] - TOUCHDOWN_DEPTH, LOWEST_PLACE)
-            return np.array([0, 0, -_TOUCHDOWN if here[2] > deepest else 0.0])
+            lower = np.clip(1 - force / _PLACING, 0, 1) * (here[2] > deepest)
+            return np.array([0, 0, -_TOUCHDOWN * lower])
         return _funnel(off, beside - _OVER, _LOWER)
 
 
