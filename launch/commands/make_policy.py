@@ -12,6 +12,7 @@ from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED, TOUCH
 
 RECIPE = "recipe.json"
+_ROUNDS = 2
 
 # What lies between policy and arm, wider than what was measured on the wire: see `DeploymentConfig`.
 _DEPLOYED = shlex.split(
@@ -79,7 +80,7 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
                      ["--feedback", *wired, "--env.disturbance", "0.02"], config)]
             if disturbed else []
         ),
-        *_corrected(config, out, learn, learn, wired, 2, 80),
+        *_corrected(config, out, learn, learn, wired, 80),
     ]  # fmt: skip
 
 
@@ -96,19 +97,19 @@ def _bead_maze(config: Config, out: Path) -> list[list[str]]:
     return [
         _record(out / "val", max(1, many // 13), 20_000, [*_VALIDATION, *_DEPLOYED], config),
         _record(out / "train", many, 0, wired, config),
-        *_corrected(config, out, [*learn, "--head", "regression"], learn, wired, 2, 60),
+        *_corrected(config, out, [*learn, "--head", "regression"], learn, wired, 60),
     ]
 
 
 def _corrected(
     config: Config, out: Path, first: list[str], last: list[str], env: list[str],
-    rounds: int, episodes: int,
+    episodes: int,
 ) -> list[list[str]]:  # fmt: skip
     """Rounds of learning and correcting (DAgger), and the last training."""
     data = ["--data", str(out / "train/episodes"), "--validation", str(out / "val/episodes")]
     learn = ["train-policy", *data, "--workers", str(config.workers)]
     steps = []
-    for k in range(rounds if config.rounds is None else config.rounds):
+    for k in range(_ROUNDS if config.rounds is None else config.rounds):
         folder = out / f"round-{k + 1}"
         steps.append([*learn, *first, "--trials", "0", "--out", str(folder)])
         acts = ["--policy", str(folder / "policy"), *env]
