@@ -26,7 +26,8 @@ class Config:
     """Episodes of each round in which the policy acts and the expert answers; default: 80 of pick-place,
     60 of the maze."""
     rounds: CountOrNone | None = None
-    """Rounds of corrections; default: 2."""
+    """Rounds of corrections, at most; default: 3 of pick-place, the last of them in the plain environment,
+    and 2 of the maze."""
     epochs: Count | None = None
     """Passes over the data in each training; default: 16 for pick-place, 10 for the maze."""
     trials: CountOrNone = 24

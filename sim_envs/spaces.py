@@ -1,5 +1,7 @@
 """What an environment's observations and actions are, for Gymnasium."""
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 
@@ -12,7 +14,7 @@ from touchgoal.sim_envs.config import EnvConfig
 def observation_space(config: EnvConfig, joints: int, sensor: SensorModel) -> gym.spaces.Dict:
     """Of an arm with so many joints, the cameras that are observed, and these fingertips."""
     of_arm = ft.features_of(joints)
-    spaces = {
+    spaces: dict[str, gym.Space[Any]] = {
         key: gym.spaces.Box(-np.inf, np.inf, of_arm[key].shape, np.float32)
         for key in (ft.STATE, ft.COMMAND, ft.TCP_POSE, ft.WRENCH)
     }

@@ -161,9 +161,10 @@ def test_a_policy_that_sees_commands_sees_no_delay() -> None:
     late = {"state_delay": (0.1, 0.1), "command_delay": (0.1, 0.1)}
     actions = moving()
     rows = [roll(actions, between=between) for between in (None, {}, late)]
-    seen = []
+    seen, states = [], []
     for observations in rows:
         state = np.concatenate([column(observations, key) for key in columns], 1)
+        states.append(state)
         seen.append(network_input(torch.from_numpy(state), columns, "base_twist").numpy())
         command = column(observations, ft.COMMAND)
         np.testing.assert_allclose(np.diff(command[:, :7], axis=0), actions[:, :7], atol=1e-6)
@@ -174,7 +175,7 @@ def test_a_policy_that_sees_commands_sees_no_delay() -> None:
     # At rest the arm is where it was sent: MuJoCo's own pose of the TCP is the oracle.
     at_rest = rows[0][0][ft.TCP_POSE]
     np.testing.assert_allclose(seen[0][0, 15:18], at_rest[:3], atol=2e-3)
-    measured = network_input(torch.from_numpy(state[:1, :22]), columns[:2], "base_twist")
+    measured = network_input(torch.from_numpy(states[-1][:1, :22]), columns[:2], "base_twist")
     np.testing.assert_allclose(seen[0][0, 18:], measured[0, 18:].numpy(), atol=5e-3)
 
 

@@ -12,7 +12,6 @@ from touchgoal.launch.run_folder import open_run, write_json
 from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED, TOUCH
 
 RECIPE = "recipe.json"
-_ROUNDS = 2
 
 # What lies between policy and arm, wider than what was measured on the wire: see `DeploymentConfig`.
 _DEPLOYED = shlex.split(
@@ -80,7 +79,8 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
                      ["--feedback", *wired, "--env.disturbance", "0.02"], config)]
             if disturbed else []
         ),
-        *_corrected(config, out, learn, learn, wired, 80),
+        # Where nothing is late or estimated it is to act, too.
+        *_corrected(config, out, learn, learn, [wired, wired, _BLIND], 80),
     ]  # fmt: skip
 
 
@@ -97,19 +97,19 @@ def _bead_maze(config: Config, out: Path) -> list[list[str]]:
     return [
         _record(out / "val", max(1, many // 13), 20_000, [*_VALIDATION, *_DEPLOYED], config),
         _record(out / "train", many, 0, wired, config),
-        *_corrected(config, out, [*learn, "--head", "regression"], learn, wired, 60),
+        *_corrected(config, out, [*learn, "--head", "regression"], learn, [wired, wired], 60),
     ]
 
 
 def _corrected(
-    config: Config, out: Path, first: list[str], last: list[str], env: list[str],
-    episodes: int,
+    config: Config, out: Path, first: list[str], last: list[str],
+    envs: list[list[str]], episodes: int,
 ) -> list[list[str]]:  # fmt: skip
     """Rounds of learning and correcting (DAgger), and the last training."""
     data = ["--data", str(out / "train/episodes"), "--validation", str(out / "val/episodes")]
     learn = ["train-policy", *data, "--workers", str(config.workers)]
     steps = []
-    for k in range(_ROUNDS if config.rounds is None else config.rounds):
+    for k, env in enumerate(envs[: config.rounds]):
         folder = out / f"round-{k + 1}"
         steps.append([*learn, *first, "--trials", "0", "--out", str(folder)])
         acts = ["--policy", str(folder / "policy"), *env]
