@@ -68,8 +68,13 @@ def judge_grasps(grasps: list[ForceGrasp], embedders: dict[str, Embedder]) -> di
             str(n): float(np.median(error[pressed & (thing == n)])) for n in np.unique(thing)
         },
         "contact_delay": contact,
-        "cost": {name: judge_cost(seen) for name, seen in embedded.items()},
+        # Of things grasped once there is no other grasp to compare with.
+        "cost": {n: judge_cost(seen) for n, seen in embedded.items()} if _again(grasps) else {},
     }
+
+
+def _again(grasps: list[ForceGrasp]) -> bool:
+    return len({grasp.object for grasp in grasps}) < len(grasps)
 
 
 def force_table(result: dict[str, Any]) -> str:

@@ -157,3 +157,18 @@ def test_the_cost_falls_with_the_touch_and_tells_the_wrong_thing() -> None:
     assert result["delays"] == [0] * 4 and result["near"] == 1
     assert result["auc"] == 1 and set(result["auc_of_pairs"]) == {"thing 0", "thing 1"}
     assert "within 3 frames in 100 % of 4 pairs" in cost_table(result, "ours")
+
+
+def test_things_grasped_once_have_forces_and_no_cost(tmp_path: Path) -> None:
+    """There is no other grasp whose end could be the goal."""
+    table = ["trial,object"]
+    for thing in range(3):
+        table.append(f"grasp_{thing},thing_{thing}")
+        frames = press(thing, 40)
+        write_video(tmp_path / f"grasp_{thing}.avi", frames, 25)
+        rows = [f"{0.5 * max(i - 5, 0)},0.04" for i in range(40)]
+        text = "\n".join(["force_newtons,gripper_width_m", *rows])
+        (tmp_path / f"grasp_{thing}.csv").write_text(text)
+    (tmp_path / "grasps.csv").write_text("\n".join(table))
+    result = run(RealTouchOptions(data=tmp_path, encoders=("pixels",)))
+    assert result["cost"] == {} and result["things"] == 3
