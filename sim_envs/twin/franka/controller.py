@@ -128,9 +128,7 @@ class FrankaArm:
     def abort(self, error: str) -> None:
         """Stop with an error, in any motion or none: the arm brakes and waits for recovery."""
         if error not in messages.ERRORS:
-            raise UserError(
-                f"there is no error {error!r}; choose from: {', '.join(messages.ERRORS)}"
-            )
+            raise UserError(f"there is no error {error!r}; there are: {', '.join(messages.ERRORS)}")
         self.error, self.mode = error, RobotMode.REFLEX
         self._end(MoveStatus.REFLEX_ABORTED)
         if error in ("joint_reflex", "cartesian_reflex"):
