@@ -96,8 +96,13 @@ QUOTED = {
         _real_force,
     ),
     "pick-place": Quoted(
-        "touchgoal run-policy --episodes 100",
+        "touchgoal run-policy --episodes 100 --no-video",
         "the shipped policy picks and places, of 100 scenes it has not seen",
+        _successes,
+    ),
+    "pick-place-as-deployed": Quoted(
+        "touchgoal run-policy --episodes 100 --env.as-deployed --no-video",
+        "the same with a real arm's delays, lags, hand and force estimate",
         _successes,
     ),
     "pick-place-expert": Quoted(
