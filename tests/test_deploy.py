@@ -34,7 +34,7 @@ from touchgoal.policies.deploy.session import Session
 from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.twin.in_process import simulate_cell
 
-_PATIENCE = 300  # s for a loop, on a machine however loaded
+_PATIENCE = 600  # s for a loop, on a machine however loaded
 SIM = """
 arm = "sim"
 gripper = { kind = "franka_hand" }
@@ -77,7 +77,7 @@ def write_cell_file(folder: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.realtime
+@pytest.mark.slow
 def test_picks_and_places_on_the_twin_and_the_episode_has_reward_curves(
     twin: RunningTwin, tmp_path: Path
 ) -> None:
@@ -92,7 +92,7 @@ def test_picks_and_places_on_the_twin_and_the_episode_has_reward_curves(
     assert touch_comes_nearer(tmp_path)
 
 
-@pytest.mark.realtime
+@pytest.mark.slow
 def test_the_shipped_policy_leads_a_bead_on_the_twin(tmp_path: Path) -> None:
     pytest.importorskip("franky", reason="pip install 'touchgoal[franka]'")
     cell = ["--lock-step", "--task", "bead-maze", "--env.wires", "helix-3"]
@@ -106,7 +106,7 @@ def test_the_shipped_policy_leads_a_bead_on_the_twin(tmp_path: Path) -> None:
     assert touch_comes_nearer(tmp_path)
 
 
-@pytest.mark.realtime
+@pytest.mark.slow
 def test_a_stalled_camera_stops_the_arm_and_the_episode_is_kept(
     twin: RunningTwin, tmp_path: Path
 ) -> None:

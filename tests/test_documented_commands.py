@@ -100,7 +100,7 @@ def test_commands_run(desk: Path) -> None:
             assert done.returncode == 0, command
 
 
-@pytest.mark.realtime
+@pytest.mark.slow
 def test_deploying_runs(desk: Path) -> None:
     """The first twin that a page starts stays, for all that is deployed on it."""
     twin = None

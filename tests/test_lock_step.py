@@ -47,6 +47,7 @@ def swing(cell: CellConfig, pause: float) -> list[np.ndarray]:
     return seen
 
 
+@pytest.mark.slow
 def test_a_lock_step_twin_gives_the_same_run_to_the_last_bit(tmp_path: Path) -> None:
     """Its time stands but while the deployment waits; afterwards it goes on by itself."""
     pytest.importorskip("franky", reason="pip install 'touchgoal[franka]'")
@@ -70,6 +71,7 @@ def test_a_lock_step_cell_without_a_twin_is_one_line(address: str) -> None:
         connect_control_port(address)
 
 
+@pytest.mark.slow
 def test_benchmark_deploy_counts_what_deploy_did(tmp_path: Path) -> None:
     """From the maze's example file, without a twin; a wire is not led to its end within half a second."""
     run = [
@@ -88,6 +90,7 @@ def test_benchmark_deploy_counts_what_deploy_did(tmp_path: Path) -> None:
     assert "time is up" in done[0]["ending"] and done[0]["progress"] < 0.2
 
 
+@pytest.mark.slow
 def test_a_simulated_arm_gives_the_same_recording_again(tmp_path: Path) -> None:
     """The shipped policy plans in a thread of its own: it is waited for."""
     text = (EXAMPLES / "sim.toml").read_text().replace("seconds = 40.0", "seconds = 0.8")

@@ -121,9 +121,9 @@ class Twin:
         """One millisecond of everything, unless time stands."""
         lock_step = self._lock_step
         if lock_step is not None and lock_step.standing:
+            lock_step.wait(self._commands.sockets)
             for service in self._services:
                 service.hold()
-            lock_step.wait(self._commands.sockets)
             return
         for service in self._services:
             service.receive()
