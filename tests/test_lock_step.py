@@ -41,7 +41,9 @@ def swing(cell: CellConfig, pause: float) -> list[np.ndarray]:
         connection.clock.wait(connection.clock.now() + 1 / ft.CONTROL_HZ)
         time.sleep(pause * (k % 2))  # a machine that is busy now and then
         arm, width = connection.arm.read(), connection.gripper.read().width
-        seen.append(np.concatenate([arm.q, arm.velocity, arm.torque, [arm.time, width]]))
+        assert connection.load_cell is not None
+        load = connection.load_cell.read().force
+        seen.append(np.concatenate([arm.q, arm.velocity, arm.torque, [load, arm.time, width]]))
         seen += [camera.read().image for camera in connection.cameras.values()]
     connection.close()
     return seen

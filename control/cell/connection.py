@@ -160,7 +160,7 @@ def connect_cell(cell: CellConfig, hz: float) -> CellConnection:
         arm = keep(_arm(cell, robot, hz))
         clock: Clock = RealClock()
         if cell.lock_step and isinstance(gripper, FrankaHand):
-            clock = LockStepClock(cell.task.twin, arm, gripper, cameras)
+            clock = LockStepClock(cell.task.twin, arm, gripper, cameras, load_cell)
             clock.reset(cell.task.seed)
         elif cell.lock_step:
             clock = ArmClock(arm)

@@ -18,6 +18,7 @@ from touchgoal.control.arms.streaming import ArmProcess
 from touchgoal.control.errors import UserError
 from touchgoal.control.grippers.franka_hand import PERIOD, FrankaHand
 from touchgoal.control.interfaces import Camera, DriverError
+from touchgoal.control.sensors.load_cell import SerialLoadCell
 
 _DT = 1e-3  # s of a step of the twin
 _STREAM_STEPS = 5  # of them between two commands of the arm's stream, `arms.franka.RATE`
@@ -42,7 +43,12 @@ class LockStepClock:
     """See Clock. Once a twin has ended, time goes on as on the wall, so that ages tell."""
 
     def __init__(
-        self, address: str, arm: ArmProcess, gripper: FrankaHand, cameras: dict[str, Camera]
+        self,
+        address: str,
+        arm: ArmProcess,
+        gripper: FrankaHand,
+        cameras: dict[str, Camera],
+        load_cell: SerialLoadCell | None,
     ) -> None:
         """Let the twin's time stand; `address` (token@host:port) is of its control port.
 
@@ -50,6 +56,7 @@ class LockStepClock:
             UserError: no twin is there, or it is not in lock-step.
         """
         self._arm, self._gripper, self._cameras = arm, gripper, cameras
+        self._load_cell = load_cell
         self._token, self._connection = address.rpartition("@")[0], connect_control_port(address)
         self._answers = self._connection.makefile()
         self._lost = self._driven = False
@@ -82,6 +89,7 @@ class LockStepClock:
     def wait(self, until: float) -> None:
         """See Clock."""
         sent: dict[str, int] = {}
+        weighed = -np.inf
         while (steps := round((until - self._time) / _DT)) > 0 and not self._lost:
             # Steps end where the stream's commands are due, whatever is waited for.
             steps = min(steps, _STREAM_STEPS - round(self._time / _DT) % _STREAM_STEPS)
@@ -89,12 +97,14 @@ class LockStepClock:
             if self._lost:
                 break
             self._time, self._answered, sent = (answer[key] for key in ("time", "hand", "pictures"))
+            weighed = answer["load"]
             self._history.append((time.monotonic(), self._time))
             if not answer["frozen"]:
                 self._let_drivers_tick()
         if self._lost:
             self._wait_without_twin(until)
         self._await_pictures(sent)
+        self._await_load(weighed)
 
     def close(self) -> None:
         """Let the twin's time go on by itself."""
@@ -144,6 +154,15 @@ class LockStepClock:
                         self._swallowed[key] += missing
                         break
                     time.sleep(_DT / 2)
+
+    def _await_load(self, sent: float) -> None:
+        """Until the load cell's line of that time is here. One whose lines are lost is not waited for
+        again."""
+        end = time.monotonic() + _PICTURE_TIMEOUT
+        while self._load_cell is not None and self._load_cell.clock < sent:
+            if time.monotonic() > end:
+                self._load_cell = None
+            time.sleep(_DT / 2)
 
     def _ask(self, line: str) -> dict[str, Any]:
         try:

@@ -103,6 +103,11 @@ class SerialLoadCell:
         """See LoadCell."""
         return self._latest.read()
 
+    @property
+    def clock(self) -> float:
+        """The device's own, of the newest line; minus infinity before the first, or without one."""
+        return self._clock
+
     def close(self) -> None:
         """See LoadCell."""
         self._latest.close()

@@ -11,6 +11,7 @@ from touchgoal.sim_envs.twin.cell import SimulatedCell
 from touchgoal.sim_envs.twin.franka.controller import FrankaArm
 from touchgoal.sim_envs.twin.franka.hand import FrankaHand
 from touchgoal.sim_envs.twin.mjpeg import Streams
+from touchgoal.sim_envs.twin.serial.devices import LoadCell
 from touchgoal.sim_envs.twin.tcp_ports import ClientConnection
 
 _POLL_INTERVAL = 5e-3  # s between looks at the links while time stands and nothing comes
@@ -27,8 +28,14 @@ class LockStep:
     """
 
     def __init__(
-        self, cell: SimulatedCell, arm: FrankaArm, hand: FrankaHand, streams: Streams
+        self,
+        cell: SimulatedCell,
+        arm: FrankaArm,
+        hand: FrankaHand,
+        streams: Streams,
+        load_cell: LoadCell,
     ) -> None:
+        self._load_cell = load_cell
         self._cell, self._arm, self._hand, self._streams = cell, arm, hand, streams
         self._holder: ClientConnection | None = None
         self._left = 0  # steps asked for and not yet made
@@ -96,5 +103,6 @@ class LockStep:
             "time": self._cell.time,
             "hand": self._hand.answers - self._answers_before,
             "pictures": self._streams.sent(),
+            "load": self._load_cell.sent,
             "frozen": self._arm.link.frozen,
         }

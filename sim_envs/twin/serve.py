@@ -178,11 +178,12 @@ class Twin:
 
         def reset() -> None:
             streams.reset()
+            load_cell.reset()
             if hand is not None:
                 hand.reset()
 
         if config.lock_step and hand is not None and isinstance(arm, FrankaArm):
-            lock_step = self._lock_step = LockStep(cell, arm, hand, streams)
+            lock_step = self._lock_step = LockStep(cell, arm, hand, streams, load_cell)
             streams.time_is_held = lambda: lock_step.held
         self._commands = ControlPort(
             cell, arm, streams.streams, ports, host, control, self._lock_step, reset

@@ -75,12 +75,20 @@ class LoadCell:
 
     Force in N is `NEWTONS_PER_COUNT * (counts - ZERO)`; CRC is Modbus' CRC-16 of all bytes before
     the star, as four hexadecimal digits.
+
+    Attributes:
+        sent: milliseconds of the last line.
     """
 
     def __init__(self, cell: SimulatedCell, path: Path) -> None:
         self.cell, self.port = cell, SerialPort(path)
         self._rng = np.random.default_rng(1)
-        self._milliseconds = 0
+        self._milliseconds = self.sent = 0
+
+    def reset(self) -> None:
+        """From here on its noise and the times of its lines are those of a twin that begins."""
+        self._rng = np.random.default_rng(1)
+        self._milliseconds += -self._milliseconds % 1000  # a clock that goes back is a restart
 
     def receive(self) -> None:
         """Nothing is said to a load cell."""
@@ -98,6 +106,7 @@ class LoadCell:
         counts += self._rng.normal(0.0, _LOAD_NOISE)
         line = f"{self._milliseconds},{round(counts)}".encode()
         self.port.write(with_checksum(line, "crc16") + b"\r\n")
+        self.sent = self._milliseconds
 
     def close(self) -> None:
         """Pull the plug."""
