@@ -60,7 +60,7 @@ class FrankaArm:
         self._state = np.zeros((), messages.ROBOT_STATE)
         self._state["O_ddP_O"] = 0.0, 0.0, -9.81  # robot_state.h: "hard-coded for now"
         self._reset_setpoint()
-        self._describe_hand()
+        describe_hand(self._state, self._ee, self._k)
 
     # The twin's loop.
 
@@ -219,10 +219,10 @@ class FrankaArm:
             )
         elif request.command == RobotCommand.SET_NE_TO_EE:
             self._ee = np.frombuffer(payload, "<f8", 16).reshape(4, 4).T
-            self._describe_hand()
+            describe_hand(self._state, self._ee, self._k)
         elif request.command == RobotCommand.SET_EE_TO_K:
             self._k = np.frombuffer(payload, "<f8", 16).reshape(4, 4).T
-            self._describe_hand()
+            describe_hand(self._state, self._ee, self._k)
         elif request.command == RobotCommand.SET_LOAD:
             load = np.frombuffer(payload, "<f8", 13)
             self._state["m_load"], self._state["F_x_Cload"] = load[0], load[1:4]
@@ -349,9 +349,6 @@ class FrankaArm:
         zero = np.zeros(7)
         self._setpoint = Setpoint(self.cell.q_d.copy(), zero, zero)
         self._torque = zero
-
-    def _describe_hand(self) -> None:
-        describe_hand(self._state, self._ee, self._k)
 
     def _pose_and_jacobian(self, q: np.ndarray) -> tuple[Pose, Float[np.ndarray, "6 7"]]:
         """Pose and Jacobian of the end effector, which a client may have moved off the TCP."""
