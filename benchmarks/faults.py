@@ -28,7 +28,7 @@ from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import cell_watchdogs, connect_cell
 from touchgoal.control.errors import UserError
-from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.episodes.metadata import write_file
 from touchgoal.episodes.repair import validate
 from touchgoal.episodes.store import EpisodeSet
@@ -203,7 +203,7 @@ def _deploy(
 ) -> None:
     """The deployment's process; a first, short episode is there before the fault comes."""
     connection = connect_cell(cell, ft.CONTROL_HZ)
-    safety = Safety(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
+    safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
     truth = partial(ask_twin, cell.task.twin, "truth")
 
     def session(make: Callable[[ControlLoop], DeployedActor], seconds: float) -> Session:

@@ -13,7 +13,7 @@ from touchgoal.policies.by_name import choose_policy, env_config_for
 from touchgoal.policies.evaluation.evaluate import Evaluation, Trial, run_trials, trial_specs
 from touchgoal.sim_envs.config import (
     AS_DEPLOYED,
-    NOTHING_BETWEEN,
+    IDEAL_DEPLOYMENT,
     BeadMazeConfig,
     DeploymentConfig,
     PickPlaceConfig,
@@ -22,9 +22,9 @@ from touchgoal.sim_envs.config import (
 
 # Parts of `--env.as-deployed`, by what a person would call them.
 _PARTS = {
-    "lag, limits and tracker": ("tracked",),
-    "a Franka Hand": ("hand",),
-    "an estimated wrench": ("wrench",),
+    "lag, limits and tracker": ("tracker",),
+    "a Franka Hand": ("franka_hand",),
+    "an estimated wrench": ("estimated_wrench",),
     "late states and pictures": ("state_delay", "picture_delay", "picture_rate", "jitter"),
     "late commands": ("command_delay",),
     "late plans": ("plan_ticks",),
@@ -68,7 +68,7 @@ def _causes() -> Iterator[tuple[str, bool, DeploymentConfig]]:
         yield f"only {what}", False, DeploymentConfig(**own)
     yield "as deployed", True, DeploymentConfig()
     for what, fields in _PARTS.items():
-        own = {field: getattr(NOTHING_BETWEEN, field) for field in fields}
+        own = {field: getattr(IDEAL_DEPLOYMENT, field) for field in fields}
         yield f"as deployed, but for {what}", True, DeploymentConfig(**own)
 
 

@@ -41,9 +41,3 @@ def terminable() -> Iterator[None]:
 
 def _terminate(number: int, frame: FrameType | None) -> None:
     raise Terminated
-
-
-def leave_to_parent() -> None:
-    """Initialiser of a worker process: Ctrl-C reaches all processes, the parent alone answers it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)

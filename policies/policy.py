@@ -54,8 +54,8 @@ class PolicyConfig:
             width on the way goes there. Empty: any width.
         end_to_end: for fingertips that no frozen encoder reads; None for a policy without.
         proprioception: columns of `features.FEATURES`, the state first. Where it acts, those that
-            only a simulator knows come from its senses, see `senses.py`. The force on the hand is seen
-            less that of the episode's first tick, see `proprioception.tare`.
+            only a simulator knows come from its state estimator, see `state_estimation.py`. The force on
+            the hand is seen less that of the episode's first tick, see `proprioception.tare`.
         observation_horizon: ticks seen, the latest included.
         prediction_horizon: ticks planned. The first is the latest observation's, so that all of
             them can be done; diffusion_policy counts from the oldest observation instead.

@@ -44,12 +44,12 @@ class Contact:
 
     Attributes:
         frame: first frame in contact, None if there is none.
-        known_from: "truth" (the simulator's), "detected" (from the tactile images), "no touch" (the
+        label_source: "truth" (the simulator's), "detected" (from the tactile images), "no touch" (the
             source has no tactile images) or "not looked for" (a single tick).
     """
 
     frame: int | None
-    known_from: Literal["truth", "detected", "no touch", "not looked for"]
+    label_source: Literal["truth", "detected", "no touch", "not looked for"]
 
 
 @dataclass(frozen=True)

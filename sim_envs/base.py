@@ -14,7 +14,7 @@ from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.motion.tool import FRANKA_HAND
 from touchgoal.control.tactile.sensor_models import find_sensor
-from touchgoal.sim_envs.config import NOTHING_BETWEEN, SETPOINT_PERIOD, EnvConfig, SceneConfig
+from touchgoal.sim_envs.config import IDEAL_DEPLOYMENT, SETPOINT_PERIOD, EnvConfig, SceneConfig
 from touchgoal.sim_envs.deployed_arm import DeployedArm
 from touchgoal.sim_envs.scene.build import ROBOTS, SIDES, arm_joints, build
 from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, ContactReader, PadContact
@@ -309,8 +309,8 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
 
     def _begin_deployment(self) -> None:
         """From here on the arm is as it is deployed, if it is to be."""
-        between = self.config.between()
-        if between != NOTHING_BETWEEN:
+        between = self.config.resolved_deployment()
+        if between != IDEAL_DEPLOYMENT:
             self._deployed = DeployedArm(self, between, self.np_random.spawn(1)[0])
 
     def _observe(self) -> Observation:
@@ -346,14 +346,14 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
                 pictures[key] = frame.image
         return pictures
 
-    def contacts_shown(self) -> tuple[PadContact, PadContact]:
+    def observed_contacts(self) -> tuple[PadContact, PadContact]:
         """The pads' contacts when the pictures of the last observation were taken."""
         return self._deployed.contacts if self._deployed else self._contacts
 
     @property
-    def fastest(self) -> Float[np.ndarray, " n"] | None:
+    def max_joint_step(self) -> Float[np.ndarray, " n"] | None:
         """Joint changes (rad) in a tick that a safety layer does not clamp; None: there is none."""
-        tracked, velocity = self.config.between().tracked, self.robot.policy.velocity
+        tracked, velocity = self.config.resolved_deployment().tracker, self.robot.policy.velocity
         return velocity / self.config.control_hz if tracked else None
 
     @property
@@ -363,7 +363,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
 
     def _info(self, progress: float, success: bool) -> dict[str, Any]:
         self._progress = progress
-        pads = self.contacts_shown()
+        pads = self.observed_contacts()
         wrench = np.concatenate([w for pad in pads for w in (pad.force, pad.torque)])
         return {
             ft.TRUTH_PAD_WRENCH: wrench.astype(np.float32),

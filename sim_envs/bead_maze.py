@@ -117,7 +117,7 @@ class BeadMaze(FrankaTactileEnv):
     def add_task_objects(self, spec: mujoco.MjSpec) -> None:
         """Add the wire, and thread the bead on it."""
         add_wire(spec, self.wire, self._friction)
-        thread_bead(spec, self.wire, self._friction)
+        add_bead_on_wire(spec, self.wire, self._friction)
 
     def place_objects(self, rng: np.random.Generator) -> None:
         """The bead sits at the start, as the scene was built."""
@@ -202,7 +202,7 @@ def add_wire(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
         maze.add_geom(size=[1.5 * WIRE_RADIUS, 0, 0], fromto=post, **steel)
 
 
-def thread_bead(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
+def add_bead_on_wire(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
     """Give the bead its hole, a ring of capsules along its axis (z), and put it on the wire.
 
     The hole's clearance, friction and binding then follow from contacts. Eight capsules drag 8 %

@@ -111,13 +111,13 @@ class DeploymentConfig:
     What is not given follows `as_deployed`: all of it as over the wire (`AS_DEPLOYED`), or none.
     """
 
-    tracked: bool | None = None
+    tracker: bool | None = None
     """The arm is driven as `deploy` drives it: the lag of deploy's loop, the safety layer's limits,
     the 1 kHz tracker, and an arm that follows its set-point without a lag of its own."""
-    hand: bool | None = None
+    franka_hand: bool | None = None
     """The hand is a Franka Hand: one command at a time, each runs to its end; closing to 0 grasps
     what it meets, any other width is a move. Its width is read every 50 ms."""
-    wrench: bool | None = None
+    estimated_wrench: bool | None = None
     """The force on the hand is a real arm's estimate: with noise, bias, drift and lag."""
     state_delay: DelayRange | None = None
     """Age of joint positions, velocities and force when the policy sees them, s."""
@@ -133,10 +133,10 @@ class DeploymentConfig:
     """Control ticks by which a learned policy's plans come late: one of these."""
 
 
-NOTHING_BETWEEN = DeploymentConfig(
-    tracked=False,
-    hand=False,
-    wrench=False,
+IDEAL_DEPLOYMENT = DeploymentConfig(
+    tracker=False,
+    franka_hand=False,
+    estimated_wrench=False,
     state_delay=(0.0, 0.0),
     picture_delay=(0.0, 0.0),
     picture_rate=1000.0,
@@ -148,9 +148,9 @@ NOTHING_BETWEEN = DeploymentConfig(
 # 25 ms of which the tracker has its share; fingertips and cameras send 25 to 30 pictures a second; a
 # plan is asked for a tick early.
 AS_DEPLOYED = DeploymentConfig(
-    tracked=True,
-    hand=True,
-    wrench=True,
+    tracker=True,
+    franka_hand=True,
+    estimated_wrench=True,
     state_delay=(0.005, 0.02),
     picture_delay=(0.005, 0.02),
     picture_rate=30.0,
@@ -188,9 +188,9 @@ class EnvConfig(SceneConfig):
     deployment: DeploymentConfig = DeploymentConfig()
     """Overrides of single as-deployed settings."""
 
-    def between(self) -> DeploymentConfig:
+    def resolved_deployment(self) -> DeploymentConfig:
         """What lies between policy and arm, every field of it given."""
-        base = AS_DEPLOYED if self.as_deployed else NOTHING_BETWEEN
+        base = AS_DEPLOYED if self.as_deployed else IDEAL_DEPLOYMENT
         own = {name: value for name, value in vars(self.deployment).items() if value is not None}
         return replace(base, **own)
 
@@ -202,7 +202,7 @@ class EnvConfig(SceneConfig):
                 "control_hz must divide 500, for set-points come every 2 ms (10, 20, 25, 50, 100, "
                 f"...), not {self.control_hz}"
             )
-        if self.between() != NOTHING_BETWEEN and not _is_multiple(1e-3, self.timestep):
+        if self.resolved_deployment() != IDEAL_DEPLOYMENT and not _is_multiple(1e-3, self.timestep):
             raise ValueError(
                 f"as deployed, time goes by in ms: timestep 0.001, not {self.timestep:g}"
             )

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from touchgoal.control import features as ft
 from touchgoal.control.motion.tracker import Tracker
-from touchgoal.control.safety.action_filter import Measurements, Safety
+from touchgoal.control.safety.action_filter import ActionFilter, Measurements
 from touchgoal.sim_envs.config import DeploymentConfig
 from touchgoal.sim_envs.deployed_hand import DeployedHand
 from touchgoal.sim_envs.estimated_wrench import EstimatedWrench
@@ -73,7 +73,7 @@ class _DirectDrive:
 class _TrackedDrive:
     """As deployed: lag, safety layer, tracker, and an arm that follows its set-point at once."""
 
-    def __init__(self, start: Joints, safety: Safety) -> None:
+    def __init__(self, start: Joints, safety: ActionFilter) -> None:
         self._safety, self._state = safety, safety.start(start)
         self._tracker = Tracker(safety.limits.interface, safety.dt, _DT)
         self._track = self._tracker.start(start)
@@ -112,15 +112,15 @@ class DeployedArm:
         self._tick_ms = round(1000 / hz)
         start = env.command.copy()
         n = env.n_joints
-        if between.tracked:
+        if between.tracker:
             # Set-points with feed-forward reach beyond the joints' range; the tracker keeps to it.
             env.model.actuator_ctrllimited[:n] = 0
-            self._drive: _Drive = _TrackedDrive(start, Safety(env.robot, hz))
+            self._drive: _Drive = _TrackedDrive(start, ActionFilter(env.robot, hz))
         else:
             limits = env.model.actuator_ctrlrange[:n]
             self._drive = _DirectDrive(start, limits, self._tick_ms)
-        self._hand = DeployedHand(env, rng) if between.hand else None
-        self._wrench = EstimatedWrench(rng) if between.wrench else None
+        self._hand = DeployedHand(env, rng) if between.franka_hand else None
+        self._wrench = EstimatedWrench(rng) if between.estimated_wrench else None
         self.plan_ticks = int(rng.choice(between.plan_ticks))
         ticks = round(env.config.max_seconds * hz) + _AHEAD
         jitter = rng.uniform(*_range(between.jitter))
@@ -210,7 +210,7 @@ def _all_well(q: Joints) -> Measurements:
 
 
 def _range(given: tuple[float, float] | None) -> tuple[float, float]:
-    assert given is not None, "a config that is resolved, see EnvConfig.between"
+    assert given is not None, "a config that is resolved, see EnvConfig.resolved_deployment"
     return given
 
 

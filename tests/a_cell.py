@@ -8,7 +8,7 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.interfaces import ArmReading, Frame, GripperReading, LoadReading
-from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.policies.deploy.control_loop import ControlLoop, Ending, RunLog
 
@@ -137,7 +137,7 @@ class MadeUpCell:
         connection = CellConnection(
             FR3, self.arm, self.gripper, self.cameras, self.load_cell, self.clock
         )
-        safety = Safety(FR3, ft.CONTROL_HZ)
+        safety = ActionFilter(FR3, ft.CONTROL_HZ)
         loop = ControlLoop(connection, safety, execute, lambda: "", lambda _: None)
         self.log = RunLog()
 

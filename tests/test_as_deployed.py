@@ -45,7 +45,7 @@ def test_nothing_between_is_the_plain_environment() -> None:
     plain, through = (column(roll(moving(), between=between)) for between in (None, {}))
     # Set-points every ms in place of every 2: no more than that.
     assert np.abs(plain - through)[:, :7].max() < 2e-4
-    assert not BLIND.between().tracked
+    assert not BLIND.resolved_deployment().tracker
 
 
 @pytest.mark.parametrize("option", ["state_delay", "picture_delay"])
@@ -90,7 +90,7 @@ def test_a_seed_repeats_and_keeps_its_scene() -> None:
 
 
 def test_the_tracked_arm_comes_to_rest_where_it_is_sent() -> None:
-    env = PickPlace(replace(BLIND, deployment=DeploymentConfig(tracked=True)))
+    env = PickPlace(replace(BLIND, deployment=DeploymentConfig(tracker=True)))
     env.reset(seed=3)
     start = env.command.copy()
     for action in [*moving(10), *np.zeros((20, 8))]:
@@ -108,17 +108,19 @@ def test_the_tracked_arm_comes_to_rest_where_it_is_sent() -> None:
 
 def test_an_expert_asks_for_no_more_than_passes() -> None:
     """Clamped joint by joint, the hand tilts; answers that mend that at once taught ever larger ones."""
-    env = PickPlace(replace(BLIND, deployment=DeploymentConfig(tracked=True)))
+    env = PickPlace(replace(BLIND, deployment=DeploymentConfig(tracker=True)))
     env.reset(seed=3)
     expert, rng = FeedbackExpert(env), np.random.default_rng(0)
     for _ in range(40):
         answer = expert.act({})
-        assert env.fastest is not None and np.all(np.abs(answer[:7]) <= env.fastest + 1e-9)
+        assert env.max_joint_step is not None and np.all(
+            np.abs(answer[:7]) <= env.max_joint_step + 1e-9
+        )
         env.step(np.append(rng.normal(0, 0.1, 7), 0.08))
 
 
 def test_a_hand_ends_a_move_before_it_takes_the_next() -> None:
-    env = PickPlace(replace(BLIND, deployment=DeploymentConfig(hand=True)))
+    env = PickPlace(replace(BLIND, deployment=DeploymentConfig(franka_hand=True)))
     env.reset(seed=3)
     still = np.zeros(7)
     widths = []

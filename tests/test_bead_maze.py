@@ -11,7 +11,7 @@ from touchgoal.control.tactile.contact import detect_contact
 from touchgoal.episodes.recording import run
 from touchgoal.policies.evaluation.evaluate import run_trials, trial_specs
 from touchgoal.policies.follower import WireFollower
-from touchgoal.sim_envs.bead_maze import BeadMaze, add_wire, thread_bead
+from touchgoal.sim_envs.bead_maze import BeadMaze, add_bead_on_wire, add_wire
 from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.scene import wires
@@ -100,7 +100,7 @@ def test_bead_slides_as_coulomb_says(degrees: float, slides: bool) -> None:
     bead.add_freejoint()
     bead.add_geom(name="object", size=[0.01, 0, 0], mass=0.01, contype=0, conaffinity=0)
     add_wire(spec, straight, friction=0.2)
-    thread_bead(spec, straight, friction=0.2)
+    add_bead_on_wire(spec, straight, friction=0.2)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, nstep=500)

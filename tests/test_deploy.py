@@ -19,7 +19,7 @@ from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import cell_limits, cell_watchdogs
 from touchgoal.control.errors import UserError
-from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.control.tactile.indentation import require_readable
 from touchgoal.control.tactile.sensor_models import find_sensor
@@ -205,7 +205,7 @@ def test_without_a_simulator_the_operator_says_whether_it_is_done(
 ) -> None:
     """A plan that ends by itself is no success: nobody has seen it."""
     connection = simulate_cell(bare, ft.CONTROL_HZ)
-    safety = Safety(connection.robot, ft.CONTROL_HZ, cell_watchdogs(bare))
+    safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(bare))
     actor, ticks = Acts(0, 0.0), []
 
     def on_tick(status: TickStatus) -> None:
@@ -289,7 +289,7 @@ def deployed(cell: CellConfig, actor: Acts, stop_after: int = 10_000) -> tuple[s
     def show(status: TickStatus) -> None:
         far[0] = max(far[0], float(status.sensed.arm.q[0]))
 
-    safety = Safety(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
+    safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
     loop = ControlLoop(connection, safety, True, wanted, show)
     ending = loop.run(actor, 20.0, RunLog())
     assert np.abs(connection.arm.read().velocity).max() < 0.01
@@ -350,7 +350,7 @@ def test_the_cells_tool_is_the_one_that_is_watched(tmp_path: Path) -> None:
     limits = cell_limits(replace(cell, tool=longer))
     assert limits.tool.tcp_offset == 0.3 and limits.tool.mass == cell.tool.mass
     before, after = (
-        Safety(each, 20).monitored_points(limits.arm.home[None])[0, 1:, 2].min()
+        ActionFilter(each, 20).monitored_points(limits.arm.home[None])[0, 1:, 2].min()
         for each in (cell_limits(cell), limits)
     )
     assert before - after > 0.1

@@ -367,7 +367,7 @@ def test_contact_is_the_simulators_or_detected() -> None:
     assert first_contact(episode) == Contact(7, "truth")
     seen = {k: v for k, v in episode.frames.items() if k != TRUTH_CONTACT}
     assert first_contact(replace(episode, frames=seen)) == Contact(7, "detected")
-    assert first_contact(replace(episode, frames={FRONT: seen[FRONT]})).known_from == "no touch"
+    assert first_contact(replace(episode, frames={FRONT: seen[FRONT]})).label_source == "no touch"
 
 
 def test_episode_is_embedded_once_for_all_goals(embedder: EpisodeEmbedder) -> None:

@@ -16,12 +16,18 @@ from hypothesis.extra.numpy import arrays
 from touchgoal.control.errors import UserError
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety import limits as robots
-from touchgoal.control.safety.action_filter import Limit, Measurements, Mode, Safety, SafetyState
+from touchgoal.control.safety.action_filter import (
+    ActionFilter,
+    Limit,
+    Measurements,
+    Mode,
+    SafetyState,
+)
 from touchgoal.control.safety.limits import RobotLimits
 
 HZ = 20
 TICKS = int(os.environ.get("TOUCHGOAL_SAFETY_TICKS", "400"))
-LAYERS = {robot.arm.name: Safety(robot, HZ) for robot in (robots.FR3, robots.UR5E)}
+LAYERS = {robot.arm.name: ActionFilter(robot, HZ) for robot in (robots.FR3, robots.UR5E)}
 EPS = 1e-9
 
 
@@ -30,7 +36,7 @@ def reading(q: np.ndarray, **changes: object) -> Measurements:
     return replace(calm, **changes)  # pyright: ignore[reportArgumentType]
 
 
-def check(layer: Safety, path: list[SafetyState]) -> None:
+def check(layer: ActionFilter, path: list[SafetyState]) -> None:
     """Nothing that comes out after the first is beyond any limit, the maker's taper included."""
     j, dt = layer.joints, layer.dt
     q, velocity = np.stack([s.q for s in path]), np.stack([s.velocity for s in path])
@@ -49,7 +55,7 @@ def check(layer: Safety, path: list[SafetyState]) -> None:
     assert (fastest <= 1.15 * layer.limits.tip_speed).all()
 
 
-def run(layer: Safety, actions: list[np.ndarray]) -> SafetyState:
+def run(layer: ActionFilter, actions: list[np.ndarray]) -> SafetyState:
     path = [layer.start(layer.limits.arm.home)]
     for action in actions:
         path.append(layer.filter_action(path[-1], action, reading(path[-1].q)))
@@ -120,7 +126,7 @@ def test_eight_corners_of_the_fingertips_are_watched_5_mm_above_the_table(
 
 @pytest.mark.parametrize("robot", [robots.FR3, robots.UR5E], ids=lambda r: r.arm.name)
 def test_fingertips_keep_to_their_speed(robot: RobotLimits) -> None:
-    layer = Safety(replace(robot, tip_speed=0.1), HZ)
+    layer = ActionFilter(replace(robot, tip_speed=0.1), HZ)
     n, named = robot.arm.home.size, set()
     path = [layer.start(robot.arm.home)]
     for _ in range(30):

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.tracker import Tracker
-from touchgoal.control.safety.action_filter import Measurements, Safety
+from touchgoal.control.safety.action_filter import ActionFilter, Measurements
 from touchgoal.control.safety.limits import FR3, UR5E
 
 DT = 1e-3
@@ -74,7 +74,7 @@ def test_a_regular_policy_is_followed_without_ripple() -> None:
 
 def test_behind_the_safety_layer_the_fingers_stay_in_their_box() -> None:
     """A wild policy with a tenth of its ticks lost, at 1 kHz: less than 2 mm outside, ever."""
-    layer, rng = Safety(FR3, 20), np.random.default_rng(1)
+    layer, rng = ActionFilter(FR3, 20), np.random.default_rng(1)
     state = layer.start(FR3.arm.home)
     targets, push, ticks = [], np.zeros(7), 0
     for tick in range(200):

@@ -17,7 +17,7 @@ from touchgoal.control.motion.trajectories import (
     straight_line,
 )
 from touchgoal.control.safety import limits as robots
-from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import RobotLimits
 
 ROBOTS = [(robots.FR3, Fr3Kinematics()), (robots.UR5E, Ur5eKinematics())]
@@ -104,5 +104,5 @@ def test_what_cannot_be_done_is_refused_in_a_line() -> None:
         straight_line(arm, home, np.array([1.5, 0, 0.3]), fingers_down(0), limits)
     with pytest.raises(UserError, match="workspace box"):
         require_inside_workspace(
-            joint_move(home, home + 1.5 * np.eye(7)[0], limits), Safety(robot, 20)
+            joint_move(home, home + 1.5 * np.eye(7)[0], limits), ActionFilter(robot, 20)
         )

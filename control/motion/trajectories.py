@@ -21,7 +21,7 @@ from touchgoal.control.motion.rotations import (
     rotation_vector,
 )
 from touchgoal.control.motion.s_curve import SCurve, s_curve
-from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.safety.action_filter import ActionFilter
 
 _DEGREE = 16  # of a straight line's joints; 0.4 m are then straight within 0.1 mm
 _STRAIGHT = 5e-4  # m off the line that are refused
@@ -114,7 +114,7 @@ def straight_line(
     return trajectory
 
 
-def require_inside_workspace(trajectory: Trajectory, safety: Safety) -> None:
+def require_inside_workspace(trajectory: Trajectory, safety: ActionFilter) -> None:
     """UserError if the flange or the fingers leave their boxes on the way (looked at 100 Hz)."""
     inside = safety.inside_workspace(trajectory.sample(100))
     if not inside.all():

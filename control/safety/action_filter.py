@@ -135,7 +135,7 @@ _SHARES = np.array([0.8, 0.6, 0.4, 0.2])
 _ROUNDING = 1e-12  # rad/s; a smaller change is no clamp
 
 
-class Safety:
+class ActionFilter:
     """The limits of one robot at one control rate (Hz)."""
 
     def __init__(self, limits: RobotLimits, hz: float, watchdogs: Watchdogs | None = None) -> None:

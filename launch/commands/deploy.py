@@ -17,7 +17,7 @@ from touchgoal.control.cell.connection import CellConnection, cell_watchdogs, co
 from touchgoal.control.checks import require_all_ok
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError
-from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.towers.towers import load_towers
@@ -119,7 +119,7 @@ def _deploy(
     connection: CellConnection,
     out: Path,
 ) -> Result:
-    safety = Safety(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
+    safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
     print("checks before anything moves:", flush=True)
     results = preflight(cell, connection, safety, out / "episodes")
     print("\n".join(str(f) for f in results), flush=True)

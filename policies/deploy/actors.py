@@ -10,7 +10,7 @@ from jaxtyping import Float32
 from touchgoal.control import features as ft
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.errors import UserError
-from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.policies.acting import Observation
 from touchgoal.policies.by_name import OwnPolicy, find_own
 from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy, find_policy
@@ -146,7 +146,7 @@ def pick_place_poses(
 def make_actor(
     cell: CellConfig,
     policy: CellPolicy | None,
-    safety: Safety,
+    safety: ActionFilter,
     truth: Callable[[], dict[str, Any]] | None,
     commanded: Callable[[], np.ndarray],
 ) -> DeployedActor:

@@ -18,7 +18,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.connection import CellConnection, RealClock
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import STOPPED_ON_REQUEST, ArmReading, DriverError
-from touchgoal.control.safety.action_filter import Limit, Measurements, Safety, SafetyState
+from touchgoal.control.safety.action_filter import ActionFilter, Limit, Measurements, SafetyState
 from touchgoal.policies.deploy.held_object import HeldObject
 from touchgoal.policies.deploy.observation import CellReading, ObservationReader
 from touchgoal.policies.deploy.realtime import RealTimeActor
@@ -179,7 +179,7 @@ class ControlLoop:
     def __init__(
         self,
         connection: CellConnection,
-        safety: Safety,
+        safety: ActionFilter,
         execute: bool,
         operator_request: Callable[[], Request],
         on_tick: Callable[[TickStatus], None],

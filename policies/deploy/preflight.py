@@ -15,7 +15,7 @@ from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.checks import CheckResult
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import Camera, DriverError, Gripper, TactileSensor
-from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.task_ceilings import TASK_FORCES
 from touchgoal.control.tactile.contact import contact_strength
 from touchgoal.control.tactile.indentation import require_readable
@@ -40,7 +40,7 @@ _INSTALL = {
 
 
 def preflight(
-    cell: CellConfig, connection: CellConnection, safety: Safety, episodes: Path
+    cell: CellConfig, connection: CellConnection, safety: ActionFilter, episodes: Path
 ) -> list[CheckResult]:
     """Every check, in the order of the table."""
     rates = measure_rates(connection)
@@ -100,7 +100,7 @@ def check_client(cell: CellConfig) -> str:
         raise UserError(f"{name} is not installed: {_INSTALL[name]}") from error
 
 
-def _arm(connection: CellConnection, safety: Safety) -> str:
+def _arm(connection: CellConnection, safety: ActionFilter) -> str:
     reading = connection.arm.read()
     if reading.fault:
         raise UserError(reading.fault)
@@ -118,7 +118,7 @@ def _arm(connection: CellConnection, safety: Safety) -> str:
     return f"{connection.robot.arm.name} at {np.round(reading.q, 2).tolist()} rad, {force:.1f} N"
 
 
-def _limits(cell: CellConfig, safety: Safety) -> str:
+def _limits(cell: CellConfig, safety: ActionFilter) -> str:
     if cell.fingertips is not None:
         require_readable(find_sensor(cell.sensor), safety.limits.touch)
     limits, dogs = safety.limits, safety.watchdogs
@@ -129,7 +129,7 @@ def _limits(cell: CellConfig, safety: Safety) -> str:
     )
 
 
-def _ceilings(cell: CellConfig, safety: Safety) -> str:
+def _ceilings(cell: CellConfig, safety: ActionFilter) -> str:
     """Where the arm is stopped by force, and where that comes from."""
     task = TASK_FORCES[cell.task.name]
     own = [name for name in ("force", "torque") if getattr(cell.safety, name) is not None]

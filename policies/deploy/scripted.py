@@ -16,7 +16,7 @@ from touchgoal.control.motion.trajectories import (
     require_inside_workspace,
     straight_line,
 )
-from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.sim_envs.base import Observation
 
 _SPEED_SHARE = 0.9  # of what the safety layer lets a policy do: a plan should not be clamped
@@ -125,7 +125,7 @@ class ScriptedActor:
 
 
 def start_move(
-    goal: np.ndarray, width: float, safety: Safety, commanded: Callable[[], np.ndarray]
+    goal: np.ndarray, width: float, safety: ActionFilter, commanded: Callable[[], np.ndarray]
 ) -> ScriptedActor:
     """Slowly to a posture (rad), the gripper staying at `width` (m).
 
@@ -139,7 +139,7 @@ def start_move(
 
 
 def pick_and_place(
-    place: PickPlacePoses, safety: Safety, commanded: Callable[[], np.ndarray]
+    place: PickPlacePoses, safety: ActionFilter, commanded: Callable[[], np.ndarray]
 ) -> ScriptedActor:
     """Grasp, carry, set down until the table is felt, and keep holding.
 

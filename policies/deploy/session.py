@@ -12,7 +12,7 @@ from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError
-from touchgoal.control.safety.action_filter import Safety
+from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.policies.deploy.control_loop import (
@@ -70,7 +70,7 @@ class Session:
 
     cell: CellConfig
     connection: CellConnection
-    safety: Safety
+    safety: ActionFilter
     episodes: Path
     execute: bool
     make_actor: MakeActor

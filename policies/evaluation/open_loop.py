@@ -49,7 +49,7 @@ def open_loop_errors(plan: Plan, demonstration: SequenceDataset, control_hz: int
     Args:
         plan: observation batches to actions, such as `Policy.plan` or a baseline.
         demonstration: windows of one episode, whose state is `features.STATE` and TCP pose.
-        control_hz: ticks per second, which turns joint changes to velocities for `free`.
+        control_hz: ticks per second, which turns joint changes to velocities for `free_running`.
     """
     count = len(demonstration)
     batch, actions = demonstration.take(torch.arange(count))

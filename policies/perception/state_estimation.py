@@ -32,7 +32,7 @@ class StateEstimatorConfig:
     """What is felt and seen through.
 
     Attributes:
-        touch: names the embedder of the fingertips, see `touch.py`.
+        touch: names the embedder of the fingertips, see `frozen_touch.py`.
         touch_dim: of its embedding of both fingertips.
         pose_estimator: of the cameras.
     """

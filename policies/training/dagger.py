@@ -53,5 +53,5 @@ class _TrueState:
         self, observation: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray]
     ) -> dict[str, np.ndarray]:
         """See StateEstimator."""
-        contact = np.array([pad.touching for pad in self._env.contacts_shown()], np.float32)
+        contact = np.array([pad.touching for pad in self._env.observed_contacts()], np.float32)
         return {ft.TRUTH_CONTACT: contact, ft.TRUTH_START: self._env.start}

@@ -66,7 +66,7 @@ def report_json(
         "goal": dict(curves.goal),
         "frames": len(curves),
         "fps": curves.fps,
-        "contact": {"frame": curves.contact.frame, "known_from": curves.contact.known_from},
+        "contact": {"frame": curves.contact.frame, "label_source": curves.contact.label_source},
         "unit": curves.unit,
         "metrics": {name: m.as_dict() for name, m in curves.metrics().items()},
         "cost": {
@@ -214,7 +214,7 @@ def _mark_contact(axes: Axes, curves: Curves, named: bool) -> None:
         return
     right = time > 0.85 * axes.get_xlim()[1]
     axes.annotate(
-        f"contact ({contact.known_from})",
+        f"contact ({contact.label_source})",
         (time, 1),
         xycoords=("data", "axes fraction"),
         xytext=(-6 if right else 6, -2),

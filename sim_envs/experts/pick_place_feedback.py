@@ -75,8 +75,10 @@ class FeedbackExpert:
             here + (pace + change) / hz, fingers_down(yaw + turn), env.command
         )
         delta = solution.q - env.command
-        if env.fastest is not None:  # the whole of it slower, not bent by a clamp of single joints
-            delta *= min(1.0, float((env.fastest / np.maximum(np.abs(delta), 1e-9)).min()))
+        if (
+            env.max_joint_step is not None
+        ):  # the whole of it slower, not bent by a clamp of single joints
+            delta *= min(1.0, float((env.max_joint_step / np.maximum(np.abs(delta), 1e-9)).min()))
         return np.append(delta, grip)
 
     def _fetch(

@@ -306,7 +306,7 @@ class FrankaArm:
             self._go_by_tcp(motion, order)
 
     def _go_to(self, motion: Motion, q: np.ndarray) -> None:
-        now = limits.after(self._setpoint, q)
+        now = limits.next_setpoint(self._setpoint, q)
         fault = limits.joint_fault(self._setpoint, now, motion.generator in (_POSE, _TWIST))
         if fault is not None:
             self.abort(fault)

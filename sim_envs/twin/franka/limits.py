@@ -30,7 +30,7 @@ class Setpoint:
     ddq: Joints
 
 
-def after(before: Setpoint, q: Joints) -> Setpoint:
+def next_setpoint(before: Setpoint, q: Joints) -> Setpoint:
     """The set-point a millisecond later at `q`, with its derivatives."""
     dq = (q - before.q) / DT
     return Setpoint(q, dq, (dq - before.dq) / DT)
