@@ -132,8 +132,9 @@ QUOTED = {
     ),
     "env-speed": Quoted(
         "touchgoal benchmark env-speed",
-        "steps of the environment with both tactile pictures, one core",
-        _median_rate("env step (50 physics steps), two tactile images, holding", "per second"),
+        headline=_median_rate(
+            "env step (50 physics steps), two tactile images, holding", "per second"
+        ),
     ),
     "policy-latency": Quoted(
         "touchgoal benchmark policy-latency",
