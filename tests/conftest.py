@@ -19,6 +19,11 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 _CELL = ["--env.objects", "wooden_block", "--seed", "3"]
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The slow ones first: at the end one of them would keep a single core busy for minutes."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+
+
 @pytest.fixture(scope="module")
 def fr3(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningTwin]:
     """An FR3 that waits for its client, so that runs repeat."""
