@@ -26,7 +26,7 @@ TOY = {
     "train-encoder mae": "--frames 8 --mae.vit tiny --mae.epochs 1 --mae.batch-size 8",
     "train-encoder surfaces": "--surfaces 16 --presses 2",
     "train-policy": "--head tiny --train.epochs 1 --trials 0 --workers 1",
-    "twin": "--port 0 --lock-step --env.camera-size 128 128",
+    "twin": "--port 0 --lock-step",
     "deploy": "--yes",
 }
 # What is not run here, and where it is, or why not.
