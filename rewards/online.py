@@ -43,7 +43,16 @@ class CostMeter:
         normalizer: DistanceNormalizer | None,
         goals: Sequence[GoalSpec],
     ) -> None:
-        """See OnlineCost."""
+        """For one run.
+
+        Args:
+            towers: frozen image and text towers.
+            encoder: touch encoder trained with them.
+            normalizer: fitted with these encoders on episodes of this scene; None for the raw
+                cosine distance, of goals that speak for one modality alone.
+            goals: each modality takes the first that speaks for it; what none speaks for is left
+                out. Frames of the episode itself are not known yet and cannot be goals.
+        """
         self._normalizer, self._goals = normalizer, goals
         self._embedder = EpisodeEmbedder(towers, encoder)
         self._goal: EmbeddedGoal | None = None
@@ -89,24 +98,9 @@ class CostMeter:
 class OnlineCost:
     """Measures ticks in a thread: the newest one whenever it is through with the last."""
 
-    def __init__(
-        self,
-        towers: Towers,
-        encoder: TouchEncoder,
-        normalizer: DistanceNormalizer | None,
-        goals: Sequence[GoalSpec],
-    ) -> None:
-        """Starts the thread; `close` ends it.
-
-        Args:
-            towers: frozen image and text towers.
-            encoder: touch encoder trained with them.
-            normalizer: fitted with these encoders on episodes of this scene; None for the raw
-                cosine distance, of goals that speak for one modality alone.
-            goals: each modality takes the first that speaks for it; what none speaks for is left
-                out. Frames of the episode itself are not known yet and cannot be goals.
-        """
-        self._meter = CostMeter(towers, encoder, normalizer, goals)
+    def __init__(self, meter: CostMeter) -> None:
+        """Starts the thread; `close` ends it."""
+        self._meter = meter
         self._first: tuple[Observation, ...] = ()  # ticks in which nothing is touched
         self._newest: tuple[Observation, tuple[Observation, ...]] | None = None
         self._latest = LatestValue("cost", self._measure_newest, _FIRST_COST_TIMEOUT)

@@ -37,8 +37,9 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
 
     Observations are a flat dict with the keys of `control/features.py`; truth (`truth.*`) is in
     `info`; that of the pads refers to the time the pictures were taken. The action is the joint change
-    (rad) for this tick, added to the commanded joint positions, and the gripper width target (m). The gripper closes at its own speed and then
-    holds with `grasp_force` N on each finger, as the Franka Hand's `grasp` does.
+    (rad) for this tick, added to the commanded joint positions, and the gripper width target (m). The
+    gripper closes at its own speed and then holds with `grasp_force` N on each finger, as the Franka
+    Hand's `grasp` does.
     """
 
     task: str  # the commands' and the episodes' name of it
@@ -94,7 +95,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.sample_episode(rng, dict(options or {}))
         self._compile_scene(rng)
         self.place_objects(rng)
-        self.command = self._commanded = self.start_joints(rng)
+        self.command = self._command_before = self.start_joints(rng)
         self._disturbance_state = np.zeros(6)
         self._finger_target = self.robot.tool.stroke[1] / 2
         self.data.qpos[self.arm_positions] = self.command
@@ -117,7 +118,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         low, high = self._limits.low, self._limits.high
         action = np.clip(action, low, high)
         before = self._progress
-        self._commanded = self.command
+        self._command_before = self.command
         self.begin_tick()
         if self._deployed:
             self._deployed.run_tick(action[:-1], action[-1])
@@ -320,7 +321,7 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         return self.read_proprioception() | self.take_pictures() | command
 
     def _read_command(self) -> Float32[np.ndarray, " c"]:
-        velocity = (self.command - self._commanded) * self.config.control_hz
+        velocity = (self.command - self._command_before) * self.config.control_hz
         return np.concatenate([self.command, velocity]).astype(np.float32)
 
     def read_proprioception(self) -> Observation:
@@ -353,8 +354,8 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
     @property
     def max_joint_step(self) -> Float[np.ndarray, " n"] | None:
         """Joint changes (rad) in a tick that a safety layer does not clamp; None: there is none."""
-        tracked, velocity = self.config.resolved_deployment().tracker, self.robot.policy.velocity
-        return velocity / self.config.control_hz if tracked else None
+        clamped = self.config.resolved_deployment().tracker
+        return self.robot.policy.velocity / self.config.control_hz if clamped else None
 
     @property
     def plan_ticks(self) -> int:

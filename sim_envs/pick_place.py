@@ -77,7 +77,7 @@ class PickPlace(FrankaTactileEnv):
             mujoco.mju_mulQuat(
                 pose[3:], np.array([np.cos(turn / 2), 0, 0, np.sin(turn / 2)]), pose[3:].copy()
             )
-        self.command = self._commanded = self.start_joints(rng)
+        self.command = self._command_before = self.start_joints(rng)
         data.qpos[self.arm_positions] = self.command
         data.qvel[:] = 0
         self._deployed = None

@@ -241,11 +241,11 @@ def test_cost_during_a_run_is_raw_where_no_scale_applies(
     Image.fromarray(IMAGES[9]).save(tmp_path / "end.png")
     picture, words = PictureFile(tmp_path / "end.png"), Sentence("soft")
     tick = {FRONT: IMAGES[0], TACTILE_LEFT: TOUCH["left"][0], TACTILE_RIGHT: TOUCH["right"][0]}
-    cost = OnlineCost(PaintTowers(), encoder, None, [picture])
+    cost = OnlineCost(CostMeter(PaintTowers(), encoder, None, [picture]))
     expected = reward_curve(IMAGES, goal=IMAGES[9], towers=PaintTowers()).costs["image"][0]
     assert cost.latest_cost(tick) == pytest.approx(expected, abs=1e-6)
     cost.close()
-    both = OnlineCost(PaintTowers(), encoder, None, [picture, words])
+    both = OnlineCost(CostMeter(PaintTowers(), encoder, None, [picture, words]))
     with pytest.raises(DriverError, match="raw distances of several modalities"):
         both.latest_cost(tick)
     both.close()

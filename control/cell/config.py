@@ -202,6 +202,11 @@ class CellConfig:
     """Whether the arm is a twin that waits for its client; the control loop then goes by its clock."""
 
     @property
+    def time_waits(self) -> bool:
+        """Whether the arm's time stands still while this program works: all goes by that time."""
+        return self.arm == "sim" or self.lock_step
+
+    @property
     def sensor(self) -> str:
         """The fingertips' model."""
         return self.fingertips.sensor if self.fingertips else "gelsight_mini"

@@ -30,7 +30,7 @@ from touchgoal.policies.deploy.preflight import check_client, preflight
 from touchgoal.policies.deploy.session import Result, Session
 from touchgoal.rewards.goals import parse_goal
 from touchgoal.rewards.normalizer import DistanceNormalizer
-from touchgoal.rewards.online import OnlineCost
+from touchgoal.rewards.online import CostMeter, OnlineCost
 from touchgoal.sim_envs.config import EnvConfig
 from touchgoal.sim_envs.twin.control_port import ask_twin, put_scene_back
 from touchgoal.sim_envs.twin.in_process import simulate_cell
@@ -133,9 +133,7 @@ def _deploy(
     # Scripts end by themselves; of others only a simulator knows when the task is done.
     endless = cell.task.policy != "expert"
     watcher = watch = None
-    if (
-        endless and truth and (cell.arm == "sim" or cell.lock_step)
-    ):  # in its time, not in the wall's
+    if endless and truth and cell.time_waits:
         watch = partial(_success, truth)
     elif endless and truth:
         watcher = LatestValue("simulator", partial(_ask_now_and_then, truth))
@@ -176,7 +174,8 @@ def _load_cost(cell: CellConfig) -> OnlineCost | None:
     simulated = cell.arm == "sim" or bool(cell.task.twin)
     scale = Path(cell.task.scale) if cell.task.scale else directory / "scale.json"
     normalizer = DistanceNormalizer.load(scale) if simulated or cell.task.scale else None
-    return OnlineCost(load_towers(encoder.config.towers), encoder, normalizer, goals)
+    towers = load_towers(encoder.config.towers)
+    return OnlineCost(CostMeter(towers, encoder, normalizer, goals))
 
 
 def _success(truth: Callable[[], dict[str, Any]]) -> Request:

@@ -55,17 +55,19 @@ class LearnedActor(RealTimeActor):
         super().__init__(planner, timeout)
         self._hz = planner.config.control_hz
         self._lag = ServoLag(1 / self._hz, ft.N_JOINTS)
-        self._before: np.ndarray | None = None
+        self._before: np.ndarray | None = None  # joints (rad) wanted at the last tick
 
     def act(self, observation: Observation) -> np.ndarray:
         """See DeployedActor."""
-        command = observation[ft.COMMAND].copy()
-        command[: ft.N_JOINTS] += self._lag.remaining
-        before = command if self._before is None else self._before
-        command[ft.N_JOINTS :] = (command - before)[: ft.N_JOINTS] * self._hz
-        self._before = command
-        action = super().act({**observation, ft.COMMAND: command})
+        action = super().act({**observation, ft.COMMAND: self._wanted(observation)})
         return np.append(self._lag.update(action[:-1]), action[-1])
+
+    def _wanted(self, observation: Observation) -> Float32[np.ndarray, "14"]:
+        """`features.COMMAND` with what has not been passed on yet."""
+        q = observation[ft.COMMAND][: ft.N_JOINTS] + self._lag.remaining
+        velocity = (q - (q if self._before is None else self._before)) * self._hz
+        self._before = q
+        return np.concatenate([q, velocity]).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -153,8 +155,7 @@ def make_actor(
     """The actor for one run, from where the arm is now."""
     if policy is not None:
         # So a run on a simulated arm repeats on any machine.
-        waits = cell.arm == "sim" or cell.lock_step
-        return LearnedActor(policy.planner, _SIMULATED_PLAN_TIMEOUT if waits else None)
+        return LearnedActor(policy.planner, _SIMULATED_PLAN_TIMEOUT if cell.time_waits else None)
     if cell.task.policy == "follower":
         return FollowerActor(ft.CONTROL_HZ)
     return pick_and_place(pick_place_poses(cell, truth), safety, commanded)

@@ -19,11 +19,8 @@ from touchgoal.policies.actions import body_jacobian, tcp_poses
 from touchgoal.policies.config import ActionRepresentation
 
 _LENGTH_SCALE = 0.02  # m
-_BODY_FRAME_WIDTHS = {
-    ft.STATE: 7,
-    ft.TCP_POSE: 3,
-    ft.COMMAND: 0,
-}  # columns there are, and their input_widths
+# Columns that there are along the hand's axes, and their `input_widths`.
+_BODY_FRAME_WIDTHS = {ft.STATE: 7, ft.TCP_POSE: 3, ft.COMMAND: 0}
 
 
 def tare(wrench: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -35,7 +32,10 @@ def tare(wrench: np.ndarray, first: np.ndarray) -> np.ndarray:
 
 
 def input_widths(columns: tuple[str, ...], kind: ActionRepresentation) -> list[int]:
-    """Of what `network_input` makes of each column; KeyError for one that "body_twist" does not know."""
+    """Of what `network_input` makes of each column; KeyError for one that "body_twist" does not know.
+
+    The command has no width of its own: it stands in the place of state and pose.
+    """
     if kind == "body_twist":
         return [_BODY_FRAME_WIDTHS[key] for key in columns]
     more = {ft.TCP_POSE: 2, ft.TRUTH_START: 5, ft.COMMAND: -ft.FEATURES[ft.COMMAND].shape[0]}

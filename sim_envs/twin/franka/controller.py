@@ -66,13 +66,8 @@ class FrankaArm:
 
     def receive(self) -> None:
         """Take what the client has sent, and set the cell's target for the next millisecond."""
-        for request in self.link.requests():
-            self._handle(request)
-        self._take_orders()
-        motion = self._motion
-        if motion is not None and not self.link.connected:
-            self._end(None)
-        elif motion is not None and motion.begun:
+        motion = self._take_messages()
+        if motion is not None and motion.begun:
             self._wait_for_client(motion)
         if self._recovery is not None:
             self._try_recovery(self._recovery)
@@ -92,12 +87,7 @@ class FrankaArm:
         A client that drives the arm is sent the last state again, which it has answered: to it, too,
         no time passes. One that does not looks for new states; so does one whose motion begins.
         """
-        for request in self.link.requests():
-            self._handle(request)
-        self._take_orders()
-        motion = self._motion
-        if motion is not None and not self.link.connected:
-            self._end(None)
+        motion = self._take_messages()
         interval = _HELD_INTERVALS[0 if motion is None else 1 + motion.begun]
         if time.monotonic() - self._sent_at < interval:
             return
@@ -259,9 +249,7 @@ class FrankaArm:
             and (left := deadline - time.monotonic()) > 0
         ):
             self.link.wait(left)
-            for request in self.link.requests():
-                self._handle(request)
-            self._take_orders()
+            self._take_requests_and_orders()
         if self._motion is not motion:
             return
         lost = self._echoed < self._sent - 1
@@ -271,6 +259,18 @@ class FrankaArm:
             self.abort("communication_constraints_violation")
         elif lost and motion.generator != _TORQUE:
             self._go_to(motion, self._setpoint.q + DT * self._setpoint.dq)
+
+    def _take_messages(self) -> Motion | None:
+        """Requests and set-points; then the motion there is, which ends with its client."""
+        self._take_requests_and_orders()
+        if self._motion is not None and not self.link.connected:
+            self._end(None)
+        return self._motion
+
+    def _take_requests_and_orders(self) -> None:
+        for request in self.link.requests():
+            self._handle(request)
+        self._take_orders()
 
     def _take_orders(self) -> None:
         for datagram in self.link.orders():
