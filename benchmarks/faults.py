@@ -24,12 +24,12 @@ import numpy as np
 
 from touchgoal.benchmarks.config import FaultsOptions
 from touchgoal.control import features as ft
+from touchgoal.control.atomic_write import write_file
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import cell_watchdogs, connect_cell
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import ActionFilter
-from touchgoal.episodes.metadata import write_file
 from touchgoal.episodes.repair import validate
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.acting import Observation

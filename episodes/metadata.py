@@ -6,7 +6,6 @@ its video.
 """
 
 import json
-import os
 import sys
 import zlib
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from touchgoal.control.atomic_write import write_file
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import FEATURES
 from touchgoal.episodes.bytes_on_disk import json_bytes, parquet_bytes
@@ -68,20 +68,6 @@ def video_path(key: str, file_number: int) -> str:
 def file_number_of(row: Row) -> int:
     """Number of an episode's files; repair leaves gaps, so it may exceed its position."""
     return row["data/chunk_index"] * CHUNK + row["data/file_index"]
-
-
-def write_file(path: Path, data: bytes) -> None:
-    """Writes a file that is afterwards there in full, power cut or not, or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(path.name + ".tmp")
-    with unfinished.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(unfinished, path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    os.fsync(folder)
-    os.close(folder)
 
 
 @dataclass(frozen=True)

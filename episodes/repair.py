@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from touchgoal.control.atomic_write import write_file
 from touchgoal.control.errors import UserError
 from touchgoal.control.progress import track
 from touchgoal.episodes import metadata
@@ -238,7 +239,7 @@ def _rewrite_index_columns(
 ) -> None:
     for key, values in indices.items():
         table = table.set_column(table.column_names.index(key), key, pa.array(values))
-    metadata.write_file(path, write_table(table, description))
+    write_file(path, write_table(table, description))
 
 
 def _move_to_repaired(root: Path, name: str) -> str:

@@ -19,6 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import UInt8
 
+from touchgoal.control.atomic_write import write_file
 from touchgoal.control.errors import UserError
 from touchgoal.episodes import metadata
 from touchgoal.episodes.encoding import (
@@ -109,8 +110,8 @@ class EpisodeWriter:
                 f"{metadata.repair_command(self._root)}"
             )
         for key, video in encoded.videos.items():
-            metadata.write_file(self._root / metadata.video_path(key, file_number), video)
-        metadata.write_file(path, data_file(encoded, current.index_columns_for(description)))
+            write_file(self._root / metadata.video_path(key, file_number), video)
+        write_file(path, data_file(encoded, current.index_columns_for(description)))
         updated.write(self._root)
         self._metadata = updated
         return len(self) - 1

@@ -1,13 +1,13 @@
 """Where a command leaves its results: one folder with the record of the run beside them."""
 
 import json
-import os
 import tempfile
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from touchgoal.control.atomic_write import atomic_write
 from touchgoal.control.errors import UserError
 from touchgoal.control.provenance import hardware, provenance, versions
 
@@ -93,9 +93,8 @@ def _refuse_other_run(folder: Path, record: dict[str, Any], records: list[Path])
 
 def write_json(path: Path, value: Any) -> None:
     """Write atomically, so that a reader never sees half a file."""
-    partial = path.with_suffix(path.suffix + ".part")
-    partial.write_text(json.dumps(value, indent=2, default=_plain) + "\n")
-    os.replace(partial, path)
+    with atomic_write(path) as unfinished:
+        unfinished.write_text(json.dumps(value, indent=2, default=_plain) + "\n")
 
 
 def _plain(value: Any) -> Any:

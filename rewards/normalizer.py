@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from touchgoal.control.atomic_write import write_file
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import TRUTH_FAILURE, TRUTH_PROGRESS, TRUTH_START
-from touchgoal.episodes.metadata import write_file
 
 REMEDY = "fit one with touchgoal fit-scale, or give --scale none for raw distances"
 REAL_SCENE = "recorded, not simulated"

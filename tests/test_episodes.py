@@ -19,6 +19,7 @@ import pytest
 from PIL import Image
 
 from touchgoal.control import features as ft
+from touchgoal.control.atomic_write import write_file
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.errors import UserError
 from touchgoal.episodes import metadata, statistics
@@ -324,7 +325,7 @@ def test_the_run_folder_around_a_set_will_do(
 
 def test_hidden_files_are_no_damage(small: Path) -> None:
     for name in (".cache/huggingface/lock", "data/.cache/embeddings/a.parquet", "meta/.DS_Store"):
-        metadata.write_file(small / name, b"")
+        write_file(small / name, b"")
     assert validate(small) == []
     assert EpisodeWriter(small, FPS).append(make_episode(3)) == 3
 

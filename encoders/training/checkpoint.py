@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from touchgoal.control.atomic_write import atomic_write
 from touchgoal.control.errors import UserError
 
 _CHECKPOINT, _METRICS = "checkpoint.pt", "metrics.jsonl"
@@ -71,9 +71,8 @@ class Record:
             state: Modules, optimizers and the like, by name.
         """
         states = {name: part.state_dict() for name, part in state.items()}
-        temporary = self._dir / f"{_CHECKPOINT}.tmp"
-        torch.save({**self._head, "history": history, **states}, temporary)
-        os.replace(temporary, self._dir / _CHECKPOINT)
+        with atomic_write(self._dir / _CHECKPOINT) as unfinished:
+            torch.save({**self._head, "history": history, **states}, unfinished)
         lines = "".join(json.dumps(epoch) + "\n" for epoch in history)
         (self._dir / _METRICS).write_text(lines)
         for name, value in history[-1].items():

@@ -5,7 +5,6 @@ weights give numbers that look like any others.
 """
 
 import json
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from touchgoal.control.atomic_write import atomic_write
 from touchgoal.control.errors import UserError
 
 FORMAT = 1
@@ -48,14 +48,13 @@ class WeightsFormat:
         provenance: dict[str, Any],
     ) -> None:
         """Writes both files; older ones in the directory, made if needed, are replaced."""
-        directory.mkdir(parents=True, exist_ok=True)
-        paths = self.weights_path(directory), self._json_path(directory)
-        partial = [path.with_suffix(f"{path.suffix}.tmp") for path in paths]
         description = {"format": FORMAT, "config": config, "provenance": provenance}
-        save_file({name: weight.contiguous() for name, weight in weights.items()}, partial[0])
-        partial[1].write_text(json.dumps(description, indent=2) + "\n")
-        for temporary, path in zip(partial, paths, strict=True):
-            os.replace(temporary, path)
+        with (
+            atomic_write(self._json_path(directory)) as json_file,
+            atomic_write(self.weights_path(directory)) as weights_file,
+        ):
+            save_file({name: w.contiguous() for name, w in weights.items()}, weights_file)
+            json_file.write_text(json.dumps(description, indent=2) + "\n")
 
     def read_json(self, directory: Path) -> dict[str, Any]:
         """The JSON; UserError if there is none, or it is damaged or of another format."""

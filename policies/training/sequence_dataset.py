@@ -4,7 +4,6 @@ Touch is embedded once, by a frozen encoder, and kept on disk inside the set tha
 """
 
 import hashlib
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +15,7 @@ from jaxtyping import Bool, Float, Float16, Float32, Int, UInt8
 from torch import Tensor
 
 from touchgoal.control import features as ft
+from touchgoal.control.atomic_write import atomic_write
 from touchgoal.control.errors import UserError
 from touchgoal.control.progress import track
 from touchgoal.episodes.recording import one_core_workers
@@ -186,9 +186,8 @@ def _fill_cache(
 def _embed(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> None:
     torch.set_num_threads(1)
     rows, path = embedder.embed(episodes, i).astype(np.float16), _cache_path(episodes, embedder, i)
-    with open(temporary := path.with_suffix(".tmp"), "wb") as file:
+    with atomic_write(path) as unfinished, unfinished.open("wb") as file:
         np.save(file, rows)
-    os.replace(temporary, path)
 
 
 class SequenceDataset:

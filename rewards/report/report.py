@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from touchgoal.episodes.metadata import write_file
+from touchgoal.control.atomic_write import write_file
 from touchgoal.rewards.curves import GAMMA, Curves
 
 # Okabe and Ito, "Color universal design" (2008): told apart by colour-blind readers; the dashes
