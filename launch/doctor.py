@@ -103,11 +103,11 @@ def cameras() -> CheckResult:
 
 def arms() -> CheckResult:
     """Client libraries of real arms."""
-    from touchgoal.control.arms import franka, ur
+    from touchgoal.control.arms.client_libraries import FRANKY, UR_RTDE
 
-    clients = (("franky-control", "Franka", franka.INSTALL), ("ur-rtde", "UR", ur.INSTALL))
-    found = [f"{arm} by {name} {_version(name)}" for name, arm, _ in clients if _version(name)]
-    missing = [f"for a {arm}: {install}" for name, arm, install in clients if not _version(name)]
+    clients = {"Franka": FRANKY, "UR": UR_RTDE}
+    found = [f"{arm} by {c.package} {c.version}" for arm, c in clients.items() if c.version]
+    missing = [f"for a {arm}: {c.install}" for arm, c in clients.items() if not c.version]
     detail = ", ".join(found) or "none (not needed in sim)"
     return CheckResult("arm clients", None if missing else True, detail, "; ".join(missing))
 

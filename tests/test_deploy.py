@@ -15,6 +15,7 @@ import pytest
 from running_twin import RunningTwin
 
 from touchgoal.control import features as ft
+from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import cell_limits, cell_watchdogs
@@ -49,7 +50,7 @@ def run(*arguments: object) -> None:
 
 @pytest.fixture(scope="module")
 def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningTwin]:
-    pytest.importorskip("franky", reason="pip install 'touchgoal[franka]'")
+    pytest.importorskip("franky", reason=FRANKY.install)
     cell = ["--lock-step", "--env.objects", "wooden_block", "--seed", "3", "--env.cameras", "front"]
     twin = RunningTwin(cell, tmp_path_factory.mktemp("twin"), 2)
     yield twin
@@ -94,7 +95,7 @@ def test_picks_and_places_on_the_twin_and_the_episode_has_reward_curves(
 
 @pytest.mark.slow
 def test_the_shipped_policy_leads_a_bead_on_the_twin(tmp_path: Path) -> None:
-    pytest.importorskip("franky", reason="pip install 'touchgoal[franka]'")
+    pytest.importorskip("franky", reason=FRANKY.install)
     cell = ["--lock-step", "--task", "bead-maze", "--env.wires", "helix-3"]
     small = ["--env.cameras", "front", "--env.camera-size", "128", "128"]
     twin = RunningTwin([*cell, *small], tmp_path, 3)

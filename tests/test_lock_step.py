@@ -9,6 +9,7 @@ import pytest
 from running_twin import RunningTwin
 
 from touchgoal.control import features as ft
+from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import connect_cell
 from touchgoal.control.cell.lock_step import connect_control_port
@@ -52,7 +53,7 @@ def swing(cell: CellConfig, pause: float) -> list[np.ndarray]:
 @pytest.mark.slow
 def test_a_lock_step_twin_gives_the_same_run_to_the_last_bit(tmp_path: Path) -> None:
     """Its time stands but while the deployment waits; afterwards it goes on by itself."""
-    pytest.importorskip("franky", reason="pip install 'touchgoal[franka]'")
+    pytest.importorskip("franky", reason=FRANKY.install)
     twin = RunningTwin(["--lock-step", *_SMALL, "--seed", "3"], tmp_path, 4)
     first = swing(twin.cell, 0.0)
     states = [seen for seen in first if seen.ndim == 1]

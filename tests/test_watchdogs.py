@@ -232,7 +232,7 @@ class Hand:
 def hand(monkeypatch: pytest.MonkeyPatch) -> tuple[FrankaHandClient, Hand]:
     made = Hand()
     monkeypatch.setattr(
-        "touchgoal.control.grippers.franka_hand.import_client",
+        "touchgoal.control.arms.client_libraries.ClientLibrary.load",
         lambda *_: type("Client", (), {"Gripper": staticmethod(lambda address: made)}),
     )
     return FrankaHandClient("here", 30.0), made

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.arms.streaming import (
     ArmClient,
     ArmConfig,
     ArmProcess,
-    import_client,
     shift_wrench,
 )
 from touchgoal.control.interfaces import ArmReading, DriverError, Joints
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     import franky
 
 RATE = 200.0  # Hz of velocity commands
-INSTALL = "pip install franky-control"
 STATE_TIMEOUT = 0.5  # s; libfranka itself gives up after 1 s
 _COMMAND_MS = 100  # of each
 _POSITION_GAIN = 10.0  # 1/s towards the commanded position
@@ -37,7 +36,7 @@ class FrankaClient(ArmClient):
     """In the child: one FR3."""
 
     def _connect(self, recover: bool) -> JointLimits:
-        self._franky = client = import_client("franky", INSTALL)
+        self._franky = client = FRANKY.load("franky")
         self._aborted = ""
         model = self.config.robot
         self._kinematics = Kinematics(model.arm, model.tool.tcp_offset)

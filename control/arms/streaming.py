@@ -4,12 +4,10 @@ The policy's targets (10 to 20 Hz) go through the tracker, so whatever comes whe
 inside the interface's limits and ends at rest at the last target.
 """
 
-import importlib
 import time
 from abc import ABC, abstractmethod
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -228,14 +226,6 @@ class ArmProcess:
     def close(self) -> None:
         """See Arm."""
         self._process.close()
-
-
-def import_client(module: str, install: str) -> Any:
-    """A vendor's client library; UserError with how to install it where it is missing."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise UserError(f"the arm's client library {module} is missing: {install}") from error
 
 
 def shift_wrench(

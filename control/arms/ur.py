@@ -10,11 +10,11 @@ import time
 
 import numpy as np
 
+from touchgoal.control.arms.client_libraries import UR_RTDE
 from touchgoal.control.arms.streaming import (
     ArmClient,
     ArmConfig,
     ArmProcess,
-    import_client,
     shift_wrench,
 )
 from touchgoal.control.interfaces import ArmReading, DriverError, Joints
@@ -22,7 +22,6 @@ from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.kinematics import Kinematics
 
 RATE = 125.0  # Hz of servoJ; 20 to 500
-INSTALL = "pip install ur-rtde, with Python 3.12 or earlier (there is no wheel for later ones)"
 STATE_TIMEOUT = 0.05  # s
 _GAIN = 300.0  # of servoJ, 100 to 2000; URScript's default
 _LOOKAHEAD = 0.03, 0.2  # s, servoJ's range; the arm lags by about this much
@@ -38,16 +37,12 @@ class UrClient(ArmClient):
         robot = self.config.robot
         self._kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)
         self._refused = False
-        self._receive = import_client("rtde_receive", INSTALL).RTDEReceiveInterface(
-            self.config.address
-        )
+        self._receive = UR_RTDE.load("rtde_receive").RTDEReceiveInterface(self.config.address)
         if recover and self._receive.isProtectiveStopped():
             self._unlock()
         if self._stopped():
             raise DriverError(self._stopped())
-        self._control = import_client("rtde_control", INSTALL).RTDEControlInterface(
-            self.config.address
-        )
+        self._control = UR_RTDE.load("rtde_control").RTDEControlInterface(self.config.address)
         self._control.setPayload(robot.tool.mass, list(robot.tool.centre_of_mass))
         if not recover:  # what presses after a stop is to be felt
             self._control.zeroFtSensor()
@@ -57,7 +52,7 @@ class UrClient(ArmClient):
 
     def _unlock(self) -> None:
         """As a person does it at the pendant; the controller refuses for the first 5 s."""
-        dashboard = import_client("dashboard_client", INSTALL).DashboardClient(self.config.address)
+        dashboard = UR_RTDE.load("dashboard_client").DashboardClient(self.config.address)
         dashboard.connect(int(1e3 * _UNLOCKING))
         dashboard.closeSafetyPopup()
         dashboard.unlockProtectiveStop()

@@ -12,9 +12,8 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.arms.driver_process import NEVER, DriverProcess
-from touchgoal.control.arms.franka import INSTALL
-from touchgoal.control.arms.streaming import import_client
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError, GripperReading
 
@@ -37,7 +36,7 @@ class FrankaHandClient:
         self.period = NEVER if lock_step else PERIOD
         self._issued = 0  # commands sent to the hand
         self._answered: int | None = None  # of them, as a twin says
-        self._franky, self._force = import_client("franky", INSTALL), force
+        self._franky, self._force = FRANKY.load("franky"), force
         self._hand = self._franky.Gripper(address)
         self._max_width = self._hand.state.max_width
         if self._max_width <= 0:

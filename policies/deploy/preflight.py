@@ -1,6 +1,5 @@
 """What is looked at before an arm moves: one finding a line; nothing goes on with one that fails."""
 
-import importlib.metadata
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from touchgoal.control import features as ft
+from touchgoal.control.arms.client_libraries import FRANKY, UR_RTDE, ClientLibrary
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.checks import CheckResult
@@ -31,12 +31,8 @@ _TOUCHED_COUNTS = 12.0
 _WATCH_SECONDS = 1.0  # s for which cameras are watched
 _MAX_REST_FORCE = 7.5  # N felt at rest above which the arm does not begin
 _MIN_FREE_BYTES = 2e9  # bytes: a 40 s episode with both fingertips takes 0.4 GB at most
-_CLIENTS = {"fr3": "franky-control", "ur5e": "ur-rtde", "sim": "mujoco"}
-_INSTALL = {
-    "franky-control": "pip install 'franky-control>=2.0,<2.1'",
-    "ur-rtde": "pip install ur-rtde (it has no wheel for Python 3.13 yet: use 3.11 or 3.12)",
-    "mujoco": "pip install 'mujoco>=4.0,<4.1'",
-}
+_MUJOCO = ClientLibrary("mujoco", "pip install mujoco")
+_CLIENTS = {"fr3": FRANKY, "ur5e": UR_RTDE, "sim": _MUJOCO}
 
 
 def preflight(
@@ -93,11 +89,10 @@ def _run_checks(checks: list[tuple[str, Callable[[], str]]]) -> Iterator[CheckRe
 
 def check_client(cell: CellConfig) -> str:
     """The maker's client library and its version; UserError if it is not installed."""
-    name = _CLIENTS[cell.arm]
-    try:
-        return f"{name} {importlib.metadata.version(name)}"
-    except importlib.metadata.PackageNotFoundError as error:
-        raise UserError(f"{name} is not installed: {_INSTALL[name]}") from error
+    client = _CLIENTS[cell.arm]
+    if client.version is None:
+        raise UserError(f"{client.package} is not installed: {client.install}")
+    return f"{client.package} {client.version}"
 
 
 def _arm(connection: CellConnection, safety: ActionFilter) -> str:

@@ -1,0 +1,44 @@
+"""The makers' client libraries through which arms are driven: their names, and how to install them."""
+
+import importlib
+import importlib.metadata
+from dataclasses import dataclass
+from typing import Any
+
+from touchgoal.control.errors import UserError, install_extra
+
+
+@dataclass(frozen=True)
+class ClientLibrary:
+    """One library.
+
+    Attributes:
+        package: its name on PyPI.
+        install: how to get it, for messages.
+    """
+
+    package: str
+    install: str
+
+    @property
+    def version(self) -> str | None:
+        """Of what is installed; None where it is not."""
+        try:
+            return importlib.metadata.version(self.package)
+        except importlib.metadata.PackageNotFoundError:
+            return None
+
+    def load(self, module: str) -> Any:
+        """One of its modules; UserError with how to install it where it is missing."""
+        try:
+            return importlib.import_module(module)
+        except ImportError as error:
+            raise UserError(
+                f"the arm's client library {module} is missing: {self.install}"
+            ) from error
+
+
+FRANKY = ClientLibrary("franky-control", install_extra("franka"))
+UR_RTDE = ClientLibrary(
+    "ur-rtde", "pip install ur-rtde, with Python 3.12 or earlier (there is no wheel for later ones)"
+)
