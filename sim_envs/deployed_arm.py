@@ -201,7 +201,7 @@ def _all_well(q: Joints) -> Measurements:
         q=q,
         force=np.zeros(3),
         torque=np.zeros(q.size),
-        touch=np.zeros(2),
+        indentation=np.zeros(2),
         observation_age=0.0,
         action_age=0.0,
         state_age=0.0,

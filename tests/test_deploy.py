@@ -359,7 +359,7 @@ def test_the_cells_tool_is_the_one_that_is_watched(tmp_path: Path) -> None:
 
 def test_a_touch_ceiling_that_no_picture_can_show_is_refused() -> None:
     require_readable(find_sensor("digit"), 1.5e-3)
-    require_readable(find_sensor("gelsight_mini"), FR3.touch)
+    require_readable(find_sensor("gelsight_mini"), FR3.indentation)
     with pytest.raises(UserError, match="deeper than the gelsight_mini's sensor file can read"):
         require_readable(find_sensor("gelsight_mini"), 5e-3)
 
@@ -395,6 +395,10 @@ def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
         ),
         (SIM + "speed = 3", "speed is unknown: There are: arm, "),
         (SIM.replace("cameras.front", "cameras.back"), "cameras.back must be 'front' or 'wrist'"),
+        (
+            SIM + "safety = { touch = 0.001 }",
+            "safety.touch is called safety.indentation now: rename",
+        ),
         (SIM.replace("policy =", "polcy ="), "task.polcy is unknown: did you mean policy?"),
         (SIM.replace("seed = 3", 'seed = "3"'), "task.seed must be a valid integer, not '3'"),
         (SIM.replace("seed = 3", "start = [0.0]"), "task.start must be 7 joint positions"),

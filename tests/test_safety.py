@@ -160,7 +160,7 @@ def test_the_joint_margin_is_reached_and_named() -> None:
 FAULTS = [
     ("force", np.array([0, 0, -16.0]), Limit.FORCE),
     ("torque", np.full(7, -11.0), Limit.TORQUE),
-    ("touch", np.array([0.0, 2e-3]), Limit.TOUCH),
+    ("indentation", np.array([0.0, 2e-3]), Limit.INDENTATION),
     ("force", np.full(3, np.nan), Limit.FORCE),
     ("q", np.full(7, np.nan), Limit.TRACKING),
     ("observation_age", 0.6, Limit.STALE_OBSERVATION),
@@ -179,7 +179,7 @@ def test_the_first_fault_brakes_within_limits_and_stays(
     bad = replace(reading(state.q), **{field: value})
     for tick in range(12):
         # Later faults and calm readings change nothing.
-        now = bad if tick == 0 else reading(state.q, touch=np.full(2, 99.0 * (tick % 2)))
+        now = bad if tick == 0 else reading(state.q, indentation=np.full(2, 99.0 * (tick % 2)))
         after = layer.filter_action(state, np.full(7, -0.02), now)
         check(layer, [state, after])
         state = after

@@ -13,6 +13,7 @@ from touchgoal.control.cell.config import CellConfig, check
 from touchgoal.control.errors import UserError
 
 _CELL = TypeAdapter(CellConfig)
+_RENAMED = {"safety.touch": "safety.indentation"}  # keys of older cell files
 
 
 def read_cell_file(path: Path, policy: str = "") -> CellConfig:
@@ -64,6 +65,8 @@ def _explain(error: ValidationError) -> str:
     first = (unknown or found)[0]
     *where, key = (str(part) for part in first["loc"] if part != "[key]")
     name = ".".join((*where, key))
+    if name in _RENAMED:
+        return f"{name} is called {_RENAMED[name]} now: rename it"
     if unknown:
         keys = list(_section(where).__pydantic_fields__)
         near = get_close_matches(key, keys, 1)

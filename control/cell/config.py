@@ -166,7 +166,7 @@ class SafetySection:
     task's own, which is above what its demonstrations reach and below the arm's reflex."""
     torque: Annotated[float, Field(gt=0, le=100)] | None = None
     """Torque from outside in a joint that stops the arm, Nm; not given: the task's own."""
-    touch: Annotated[float, Field(gt=0, le=0.005)] | None = None
+    indentation: Annotated[float, Field(gt=0, le=0.005)] | None = None
     """Depth that a gel is pressed in at which the arm stops and the hand opens, m."""
     observation_age: Seconds = 0.1
     """Age of a picture at which the arm holds, s; five times that stops it."""

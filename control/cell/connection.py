@@ -176,7 +176,7 @@ def cell_limits(cell: CellConfig) -> RobotLimits:
     forces = TASK_FORCES[cell.task.name]
     given = {"force": forces.force_ceiling, "torque": forces.torque_ceiling} | {
         name: value
-        for name in ("tip_speed", "velocity_share", "force", "torque", "touch")
+        for name in ("tip_speed", "velocity_share", "force", "torque", "indentation")
         if (value := getattr(own, name)) is not None
     }
     boxes = {name: _box(getattr(robot, name), own, name) for name in ("flange", "fingertips")}

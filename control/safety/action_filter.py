@@ -44,7 +44,7 @@ class Limit(StrEnum):
     FORCE = "external force"
     TORQUE = "external torque"
     LOAD = "load on the table"
-    TOUCH = "gel indentation"
+    INDENTATION = "gel indentation"
     TRACKING = "distance of joints from command"
 
 
@@ -93,7 +93,7 @@ class Measurements:
         q: measured joint positions, rad.
         force: N on the TCP from outside.
         torque: Nm in each joint from outside.
-        touch: m that each fingertip's gel is pressed in.
+        indentation: m that each fingertip's gel is pressed in.
         observation_age, action_age, state_age, gripper_age: s since the oldest of each was taken.
         load: N more or less on the table than at first; 0 without a load cell.
     """
@@ -101,7 +101,7 @@ class Measurements:
     q: Joints
     force: Float[np.ndarray, "3"]
     torque: Joints
-    touch: Float[np.ndarray, "2"]
+    indentation: Float[np.ndarray, "2"]
     observation_age: float
     action_age: float
     state_age: float
@@ -225,7 +225,7 @@ class ActionFilter:
             (Limit.FORCE, np.linalg.norm(reading.force), limits.force),
             (Limit.TORQUE, np.abs(reading.torque).max(), limits.torque),
             (Limit.LOAD, abs(reading.load), limits.force),
-            (Limit.TOUCH, np.abs(reading.touch).max(), limits.touch),
+            (Limit.INDENTATION, np.abs(reading.indentation).max(), limits.indentation),
             (Limit.TRACKING, np.abs(reading.q - state.q).max(), limits.tracking),
             (Limit.NOT_A_NUMBER, state.bad_actions * self.dt, self.watchdogs.action.stop),
         ]

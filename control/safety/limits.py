@@ -36,7 +36,7 @@ class RobotLimits:
         flange, fingertips: where the flange and the corners of the fingertips may be.
         tip_speed: m/s, of the flange and of each of those corners.
         force, torque: N and Nm from outside at the TCP and in a joint, below the reflex.
-        touch: m that anything may press into a gel, as seen (`control.tactile.indentation`).
+        indentation: m that anything may press into a gel, as seen (`control.tactile.indentation`).
     """
 
     arm: ArmModel
@@ -51,7 +51,7 @@ class RobotLimits:
     tip_speed: float = 0.5
     force: float = 15.0
     torque: float = 10.0
-    touch: float = 1.5e-3
+    indentation: float = 1.5e-3
 
     @property
     def hardware(self) -> JointLimits:
@@ -71,7 +71,7 @@ class RobotLimits:
 
 # Shares, margin, step, forces: proposals of shared/research/drivers.md 6, after what DROID (0.1 rad
 # margin, 20 N) and LeRobot (0.05 per step) do; Franka's reflex is set at 20 N and above. Half the
-# acceleration, not 30 %, because it also brakes. Tracking: our choice, without a source. Touch: twice
+# acceleration, not 30 %, because it also brakes. Tracking: our choice, without a source. Indentation: twice
 # what FEATS pressed into a Mini (0.86 mm); simulated, a golf ball at 30 N, the least that a Franka
 # Hand grasps with, goes in by 1.2 mm, a pebble's edge by 2 mm. Compare it with your sensor's sheet.
 

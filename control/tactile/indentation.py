@@ -15,7 +15,7 @@ from touchgoal.control.tactile.sensor_models import SensorModel
 # within a tenth for blocks and balls; a pebble's edges, steeper than any calibration press, at 60 %.
 # Printed dots are left in: they change it by less than a tenth.
 _CELL = 8  # px
-_BALL = 4e-3  # m, radius of the ball that a touch ceiling is tried with
+_BALL = 4e-3  # m, radius of the ball that a ceiling is tried with
 _READABLE = 0.8  # share of a depth that must be read
 
 
@@ -39,7 +39,7 @@ class IndentationMeter:
 
 
 def require_readable(sensor: SensorModel, ceiling: float) -> None:
-    """UserError unless the sensor file can read a ball pressed in by a touch ceiling (m).
+    """UserError unless the sensor file can read a ball pressed in by a ceiling (m).
 
     A ball is drawn by the sensor file's own model and read back: with the walls that its presses never
     showed, a deep one reads too shallow, and a ceiling above that would never be met.
@@ -49,7 +49,7 @@ def require_readable(sensor: SensorModel, ceiling: float) -> None:
     steps = np.arange(1, 21) * 1e-4
     deepest = max((d for d in steps if _read_ball(sensor, d) >= _READABLE * d), default=0.0)
     raise UserError(
-        f"safety.touch is {1e3 * ceiling:g} mm, deeper than the {sensor.name}'s sensor file can read "
+        f"safety.indentation is {1e3 * ceiling:g} mm, deeper than the {sensor.name}'s sensor file can read "
         f"({1e3 * deepest:.1f} mm): lower it, or calibrate with deeper presses"
     )
 

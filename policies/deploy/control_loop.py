@@ -39,7 +39,7 @@ ADVICE = {
     "by itself needs a higher safety.force in the cell file; an FR3 itself stops at 30",
     Limit.TORQUE: "something pressed on the arm: clear it, then start again",
     Limit.LOAD: "something pressed on the table: clear it, then start again",
-    Limit.TOUCH: "a gel was pressed too deep: look at it, lower gripper.force; the hand let go, unless "
+    Limit.INDENTATION: "a gel was pressed too deep: look at it, lower gripper.force; the hand let go, unless "
     "it was carrying something",
     Limit.TRACKING: "the arm does not follow: look for what blocks it",
 }
@@ -300,7 +300,7 @@ class ControlLoop:
             q=sensed.arm.q,
             force=sensed.arm.wrench[:3],
             torque=sensed.arm.torque,
-            touch=sensed.indentation,
+            indentation=sensed.indentation,
             observation_age=sensed.age,
             action_age=actor.action_age,
             state_age=self._connection.clock.age(sensed.arm.stamp) if self._execute else 0.0,
@@ -343,9 +343,9 @@ class ControlLoop:
         elif self.reader.unsound and fault.limit in (Limit.STALE_STATE, Limit.STALE_GRIPPER):
             reason += f" s ({self.reader.unsound})"
         release_to = None
-        if fault.limit == Limit.TOUCH and not self._held.carried:
+        if fault.limit == Limit.INDENTATION and not self._held.carried:
             # Open by as much as both gels give way; what is carried would fall.
-            width = sensed.gripper.width + 2 * self._safety.limits.touch
+            width = sensed.gripper.width + 2 * self._safety.limits.indentation
             release_to = min(width, self._safety.limits.tool.stroke[1])
         advice = ADVICE.get(fault.limit, "look at what it names")
         if fault.limit == Limit.FORCE and np.isnan(fault.value):

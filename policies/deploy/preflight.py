@@ -115,10 +115,10 @@ def _arm(connection: CellConnection, safety: ActionFilter) -> str:
 
 def _limits(cell: CellConfig, safety: ActionFilter) -> str:
     if cell.fingertips is not None:
-        require_readable(find_sensor(cell.sensor), safety.limits.touch)
+        require_readable(find_sensor(cell.sensor), safety.limits.indentation)
     limits, dogs = safety.limits, safety.watchdogs
     return (
-        f"joints up to {safety.joints.velocity.max():.2f} rad/s; stops above {1e3 * limits.touch:g} mm "
+        f"joints up to {safety.joints.velocity.max():.2f} rad/s; stops above {1e3 * limits.indentation:g} mm "
         f"into a gel; holds when pictures are older than {1e3 * dogs.observation.hold:.0f} ms or the "
         f"arm's state than {1e3 * dogs.state.hold:.0f}"
     )
