@@ -62,7 +62,7 @@ weights: $(READY)
 	$(BIN)/touchgoal collect-demos --episodes 80 --seed 100000 --out runs/weights/val
 	$(BIN)/touchgoal collect-demos --episodes 240 --seed 0 --out runs/weights/train
 	$(BIN)/touchgoal train-encoder align --data runs/weights/train/episodes \
-		--validation runs/weights/val/episodes --scale-episodes 60 --out runs/weights/run
+		--validation runs/weights/val/episodes --normalizer-episodes 60 --out runs/weights/run
 	cp runs/weights/run/encoder/* encoders/weights/gelsight_mini_offline/
 
 # The same for the Mini with markers.
@@ -71,7 +71,7 @@ weights-markers: $(READY)
 	$(BIN)/touchgoal collect-demos $(MARKERS) --episodes 80 --seed 100000 --out runs/markers/val
 	$(BIN)/touchgoal collect-demos $(MARKERS) --episodes 240 --seed 0 --out runs/markers/train
 	$(BIN)/touchgoal train-encoder align --data runs/markers/train/episodes \
-		--validation runs/markers/val/episodes --scale-episodes 60 --out runs/markers/run
+		--validation runs/markers/val/episodes --normalizer-episodes 60 --out runs/markers/run
 	cp runs/markers/run/encoder/* encoders/weights/gelsight_mini_markers_offline/
 
 # How a shipped policy is made anew, by one command each that says what it did (recipe.json beside the

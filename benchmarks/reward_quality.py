@@ -28,9 +28,8 @@ from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EpisodeEmbedder, compute_curves
 from touchgoal.rewards.goals import EpisodeEnd, Goal, LastFrame, Sentence
 from touchgoal.rewards.metrics import CurveMetrics, measure_curve
-from touchgoal.rewards.normalizer import DistanceNormalizer
+from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
 from touchgoal.rewards.report.summary import metrics_table
-from touchgoal.rewards.setup import SCALE
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import OUTCOMES
 from touchgoal.sim_envs.scene.objects import CATALOGUE
@@ -83,10 +82,12 @@ def run(config: RewardQualityOptions) -> dict[str, Any]:
     """Record, measure, judge."""
     directory = pretrained.find_encoder(config.encoder)
     encoder = pretrained.load_aligned(directory)
-    scale = DistanceNormalizer.load(directory / SCALE)
+    normalizer = DistanceNormalizer.load(directory / NORMALIZER)
     embedder = EpisodeEmbedder(load_towers(encoder.config.towers), encoder)
     with tempfile.TemporaryDirectory() as folder:
-        tests = record_and_measure(config, encoder.config.sensor, embedder, scale, Path(folder))
+        tests = record_and_measure(
+            config, encoder.config.sensor, embedder, normalizer, Path(folder)
+        )
     successes = [t for t in tests if t.outcome == "success"]
     claims = judge_claims(successes, [t for t in tests if t.outcome == "never_touch"])
     parts = [
@@ -114,7 +115,7 @@ def record_and_measure(
     config: RewardQualityOptions,
     sensor: str,
     embedder: EpisodeEmbedder,
-    scale: DistanceNormalizer,
+    normalizer: DistanceNormalizer,
     folder: Path,
 ) -> list[HeldOutEpisode]:
     """Simulate goal and test episodes, felt with one sensor, and measure each test."""
@@ -131,7 +132,7 @@ def record_and_measure(
             episode = embedder.embed_episode(episodes.read(i), episodes.fps, f"{outcome}#{i}")
             sentence = Sentence(SENTENCES[names[i]])
             own, words, other = (
-                _curves(embedder, scale, episode, goal)
+                _curves(embedder, normalizer, episode, goal)
                 for goal in (
                     Goal(image=LastFrame(), tactile=LastFrame()),
                     Goal(image=LastFrame(), text=sentence),
@@ -179,9 +180,9 @@ def is_goal(meta: Mapping[str, MetaValue], sensor: str) -> bool:
 
 
 def _curves(
-    embedder: EpisodeEmbedder, scale: DistanceNormalizer, episode: EmbeddedEpisode, goal: Goal
+    embedder: EpisodeEmbedder, normalizer: DistanceNormalizer, episode: EmbeddedEpisode, goal: Goal
 ) -> Curves:
-    return compute_curves(episode, embedder.embed_goal(goal, episode), scale)
+    return compute_curves(episode, embedder.embed_goal(goal, episode), normalizer)
 
 
 @dataclass(frozen=True)

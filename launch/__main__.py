@@ -25,7 +25,7 @@ COMMANDS = {
     "make-policy": "make a shipped policy anew: recordings, corrections, training, choice",
     "run-policy": "run a policy in a task: success rate, video",
     "reward-curves": "costs and rewards along episodes or plain videos",
-    "fit-scale": "fit the normalization of reward-curves to your own episodes",
+    "fit-normalizer": "fit what normalises reward-curves to successful episodes of your own",
     "record-presses": "record presses of a ball all over a sensor's gel, and calibrate from them",
     "check-sensor": "try a sensor on frames of one's own: noise, drift, contact, depth, force, markers",
     "calibrate": "fit a sensor's light and gel to presses of a ball",

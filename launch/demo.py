@@ -44,14 +44,14 @@ def main(config: Config) -> None:
     from touchgoal.launch.run_folder import open_run
     from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
     from touchgoal.rewards.goals import assign_goals, parse_goal
-    from touchgoal.rewards.normalizer import DistanceNormalizer
+    from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
     from touchgoal.rewards.report.report import write_report
     from touchgoal.sim_envs.pick_place import PickPlace
 
     sensor = find_sensor(config.env.sensor).name
     directory = pretrained.shipped_encoder_for(sensor)
     encoder = pretrained.load_aligned(directory, sensor=sensor)
-    scale = DistanceNormalizer.load(directory / "scale.json")
+    normalizer = DistanceNormalizer.load(directory / NORMALIZER)
     embedder = EpisodeEmbedder(load_towers(encoder.config.towers), encoder)
     out = open_run(config.out, "demo", config)
 
@@ -65,7 +65,7 @@ def main(config: Config) -> None:
     embedded = embedder.embed_episode(episode, config.env.control_hz, str(episode.meta["object"]))
     specs = [parse_goal("last"), parse_goal(f"text:{config.words}")]
     goal = embedder.embed_goal(assign_goals(specs, embedded.modalities), embedded)
-    curves = compute_curves(embedded, goal, scale)
+    curves = compute_curves(embedded, goal, normalizer)
     write_report(curves, out, "curves", {"encoder": directory.name, **asdict(embedder.made_with)})
     print(f"\n{episode.task}: {episode.meta['outcome']} in {len(episode) - 1} ticks")
     report_all([curves], out)

@@ -79,13 +79,13 @@ def towers() -> CheckResult:
 
 
 def weights() -> CheckResult:
-    """The shipped touch encoder and the scale of its costs."""
+    """The shipped touch encoder and the normalizer of its costs."""
     from touchgoal.encoders.pretrained import ENCODER, SHIPPED, load_aligned
-    from touchgoal.rewards.normalizer import DistanceNormalizer
+    from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
 
     try:
         encoder = load_aligned(SHIPPED)
-        DistanceNormalizer.load(SHIPPED / "scale.json")
+        DistanceNormalizer.load(SHIPPED / NORMALIZER)
     except UserError as error:
         return CheckResult("touch encoder", False, SHIPPED.name, str(error))
     count = sum(p.numel() for p in encoder.parameters()) / 1e6

@@ -37,8 +37,8 @@ class Config:
     towers: str | None = None
     """Image and text networks: offline, or a CLIP (Hugging Face id or folder), which also takes
     sentences as goals of plain videos. Without --encoder, pictures alone are measured with them."""
-    scale: str | None = None
-    """What normalises distances: a scale.json of fit-scale, or none. Default: the scale of the
+    normalizer: str | None = None
+    """What normalises distances: a normalizer.json of fit-normalizer, or none. Default: the one of the
     encoder's own training episodes, if these are such episodes, else none."""
     gamma: Annotated[float, Field(gt=0, le=1)] = 0.99
     """Discount of the potential-based reward, above 0, at most 1."""
@@ -61,10 +61,10 @@ def main(config: Config) -> None:
     elif source.path != config.source:
         print(f"{config.source} is no set of episodes; {source.path} is: it is measured")
     goals = config.goal or ("last",)
-    setup = prepare(source, goals, config.encoder, config.towers, config.scale)
+    setup = prepare(source, goals, config.encoder, config.towers, config.normalizer)
     print(setup.note)
     out = open_run(config.out, "reward-curves", config)
-    provenance = asdict(setup.embedder.made_with) | {"scale": setup.note}
+    provenance = asdict(setup.embedder.made_with) | {"normalizer": setup.note}
     measured: list[Curves] = []
     total = len(source.names)
     try:

@@ -28,9 +28,9 @@ class Align(TrainingOptions):
     """Frames in contact taken from each episode."""
     no_contact_frames: CountOrNone = 8
     """Frames without contact taken from each episode."""
-    scale_episodes: Count = 40
+    normalizer_episodes: Count = 40
     """Successful training episodes whose distances to their goals fix what counts as far and as near
-    in reward curves (encoder/scale.json)."""
+    in reward curves (encoder/normalizer.json)."""
     align: AlignConfig = ALIGN_PRESETS["default"]
     """How the encoder is trained."""
 

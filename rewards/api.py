@@ -42,7 +42,7 @@ def reward_curve(
     encoder: str | Path | TouchEncoder | None = None,
     *,
     towers: str | Towers | None = None,
-    scale: str | Path | DistanceNormalizer | None = None,
+    normalizer: str | Path | DistanceNormalizer | None = None,
     camera: str = FRONT,
     fps: float = CONTROL_HZ,
 ) -> Curves:
@@ -68,9 +68,9 @@ def reward_curve(
             the one that ships for the GelSight Mini.
         towers: "offline", a CLIP's Hugging Face id or folder, or loaded ones. Default: those that
             the encoder was trained with, "offline" without tactile.
-        scale: what normalises distances and lets them be fused: a file that `touchgoal fit-scale`
+        normalizer: what normalises distances and lets them be fused: a file that `touchgoal fit-normalizer`
             wrote, or one already read. Default: none, raw cosine distances.
-        camera: vocabulary key of the camera, for the scale.
+        camera: vocabulary key of the camera, for the normalizer.
         fps: frames per second.
 
     Returns:
@@ -92,11 +92,11 @@ def reward_curve(
         towers = load_towers(towers)
     assigned = assign_goals(specs, modalities, towers.pretrained_together)
     check_goal(assigned, len(episode), "this trajectory", camera, sides)
-    if isinstance(scale, str | Path):
-        scale = DistanceNormalizer.load(Path(scale))
+    if isinstance(normalizer, str | Path):
+        normalizer = DistanceNormalizer.load(Path(normalizer))
     embedder = EpisodeEmbedder(towers, touch_encoder, camera)
     embedded = embedder.embed_episode(episode, fps, "this trajectory")
-    return compute_curves(embedded, embedder.embed_goal(assigned, embedded), scale)
+    return compute_curves(embedded, embedder.embed_goal(assigned, embedded), normalizer)
 
 
 def _as_episode(

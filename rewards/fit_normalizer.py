@@ -21,7 +21,7 @@ END_FRAMES = 5
 
 MIN_SEPARATED = 0.75
 """Least share of (episode, goal) pairs whose end must be nearer the goal than its start; 0.5 is
-chance. Below it, one unit of the scale would mostly be noise."""
+chance. Below it, one unit of the normalised distance would mostly be noise."""
 
 MIN_GAP = 1e-4
 """Least raw distance between the start and the goal median; float32 resolves about 1e-6."""
@@ -61,7 +61,7 @@ def fit_normalizer(
 def _check_separation(
     name: str, starts: Float[np.ndarray, " pairs"], ends: Float[np.ndarray, " pairs"]
 ) -> float:
-    """Share of pairs whose end is nearer than its start; UserError if too few to scale by."""
+    """Share of pairs whose end is nearer than its start; UserError if too few to normalise by."""
     if not len(starts):
         raise UserError(
             f"no two training episodes can be compared in '{name}' (for touch they must share an "
@@ -81,7 +81,7 @@ def _check_separation(
 
 def _check_training(episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Modality]) -> None:
     if not episodes:
-        raise UserError("a scale needs at least one successful training episode, got none")
+        raise UserError("a normalizer needs at least one successful training episode, got none")
     for e in episodes:
         missing = [m for m in modalities if m not in e.modalities]
         if "text" in modalities and e.descriptions is None:
@@ -92,7 +92,7 @@ def _check_training(episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Mo
                 "of --modalities"
             )
         if e.success is False:
-            raise UserError(f"{e.source} failed; fit a scale on successful episodes alone")
+            raise UserError(f"{e.source} failed; fit a normalizer on successful episodes alone")
         if len(e) < START_FRAMES + END_FRAMES + 1:
             raise UserError(
                 f"{e.source} has {len(e)} frames; a training episode needs at least "

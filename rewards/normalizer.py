@@ -7,7 +7,7 @@ Scaling each episode by its own extremes instead would turn the noise of an epis
 touches anything into a perfect curve.
 
 It holds for what it was fitted on alone: the same towers, camera, fingertip sensor and touch
-encoder, and the same scene. People know it as the scale: `--scale PATH`, a file `scale.json`.
+encoder, and the same scene. In commands it is `--normalizer PATH`, a file `normalizer.json`.
 """
 
 import json
@@ -22,7 +22,9 @@ from touchgoal.control.atomic_write import write_file
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import TRUTH_FAILURE, TRUTH_PROGRESS, TRUTH_START
 
-REMEDY = "fit one with touchgoal fit-scale, or give --scale none for raw distances"
+NORMALIZER = "normalizer.json"
+"""The normalizer in an encoder's folder: of the episodes that the encoder was trained on."""
+REMEDY = "fit one with touchgoal fit-normalizer, or give --normalizer none for raw distances"
 REAL_SCENE = "recorded, not simulated"
 
 
@@ -133,7 +135,7 @@ class DistanceNormalizer:
         """
         reason = self.mismatch(source, raw, own)
         if reason:
-            raise UserError(f"this scale does not apply: {reason}; {REMEDY}")
+            raise UserError(f"this normalizer does not apply: {reason}; {REMEDY}")
         normalised = {}
         for m, d in raw.items():
             name = median_name(m, m in own)
@@ -149,14 +151,18 @@ class DistanceNormalizer:
         """Read what `save` wrote.
 
         Raises:
-            UserError: no such file, or not a scale.
+            UserError: no such file, or not a normalizer.
         """
         if not path.is_file():
-            raise UserError(f"there is no scale at {path}: make one with touchgoal fit-scale")
+            raise UserError(
+                f"there is no normalizer at {path}: make one with touchgoal fit-normalizer"
+            )
         try:
             content = json.loads(path.read_text())
             if content.keys() != {f.name for f in fields(cls)}:
                 raise ValueError
             return cls(**content | {"source": EmbeddingSource(**content["source"])})
         except (ValueError, RecursionError, AttributeError, TypeError):
-            raise UserError(f"{path} is not a scale: make one with touchgoal fit-scale") from None
+            raise UserError(
+                f"{path} is not a normalizer: make one with touchgoal fit-normalizer"
+            ) from None

@@ -68,7 +68,7 @@ class CostMeter:
             if self._normalizer is None and len(goal.as_dict()) > 1:
                 raise UserError(
                     "task.rewards: raw distances of several modalities cannot be averaged: give "
-                    "one goal of one modality (image:PATH or text:SENTENCE), or a scale"
+                    "one goal of one modality (image:PATH or text:SENTENCE), or a normalizer"
                 )
         curves = compute_curves(episode, self._goal, self._normalizer)
         return float(np.mean([curves.costs[name][0] for name in curves.raw]))

@@ -11,11 +11,8 @@ from touchgoal.encoders.towers.towers import OfflineTowers, load_towers
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
 from touchgoal.rewards.goals import Goal, parse_goal
-from touchgoal.rewards.normalizer import REMEDY, DistanceNormalizer
+from touchgoal.rewards.normalizer import NORMALIZER, REMEDY, DistanceNormalizer
 from touchgoal.rewards.sources import EpisodeSource, VideoSource
-
-SCALE = "scale.json"
-"""The normalizer in an encoder's folder: of the episodes that the encoder was trained on."""
 
 Source = EpisodeSource | VideoSource
 
@@ -46,15 +43,19 @@ class Setup:
 
 
 def prepare(
-    source: Source, goals: Sequence[str], encoder: str | None, towers: str | None, scale: str | None
+    source: Source,
+    goals: Sequence[str],
+    encoder: str | None,
+    towers: str | None,
+    normalizer: str | None,
 ) -> Setup:
-    """Check goals and scale, then load the encoders.
+    """Check goals and normalizer, then load the encoders.
 
     Args:
         source: what to measure.
         goals: in the forms of rewards/goals.py.
         encoder, towers: see `load_encoders`.
-        scale: a file of `fit-scale`, "none", or None for the one beside the encoder where it
+        normalizer: a file of `fit-normalizer`, "none", or None for the one beside the encoder where it
             applies.
 
     Raises:
@@ -62,17 +63,19 @@ def prepare(
     """
     picture_words = towers not in (None, OfflineTowers.name)
     goal = source.check_goals([parse_goal(text) for text in goals], picture_words)
-    given = DistanceNormalizer.load(Path(scale)) if scale not in (None, "none") else None
+    given = DistanceNormalizer.load(Path(normalizer)) if normalizer not in (None, "none") else None
     embedder, folder = load_encoders(source, encoder, towers)
     made_with = source.made_with(embedder)
     if given is not None:
         reason = given.mismatch(made_with, goal.as_dict(), goal.own)
         if reason:
-            raise UserError(f"{scale} does not apply here: {reason}; {REMEDY}")
-        return Setup(source, goal, embedder, given, f"scale: {scale}")
-    if scale == "none":
-        return Setup(source, goal, embedder, None, "scale: none, raw cosine distances")
-    path = (folder or pretrained.SHIPPED) / SCALE
+            raise UserError(f"{normalizer} does not apply here: {reason}; {REMEDY}")
+        return Setup(source, goal, embedder, given, f"normalizer: {normalizer}")
+    if normalizer == "none":
+        return Setup(source, goal, embedder, None, "normalizer: none, raw cosine distances")
+    path = (folder or pretrained.SHIPPED) / NORMALIZER
+    if not path.is_file() and (older := path.with_name("scale.json")).is_file():
+        raise UserError(f"{older} is called {NORMALIZER} now: mv {older} {path}")
     if not path.is_file():
         note = f"raw cosine distances, for there is no {path}; to normalise them: {_FIT}"
         return Setup(source, goal, embedder, None, note)
@@ -83,10 +86,10 @@ def prepare(
     if reason:
         note = f"raw cosine distances, for {path} does not apply: {reason}; to normalise: {_FIT}"
         return Setup(source, goal, embedder, None, note)
-    return Setup(source, goal, embedder, beside, f"scale: {path}")
+    return Setup(source, goal, embedder, beside, f"normalizer: {path}")
 
 
-_FIT = "touchgoal fit-scale, on successful episodes of your own"
+_FIT = "touchgoal fit-normalizer, on successful episodes of your own"
 
 
 def load_encoders(

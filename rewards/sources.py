@@ -233,7 +233,7 @@ def open_successes(
         raise UserError("give one set of episodes, or several videos")
     if videos:
         if len(videos) < 2:
-            raise UserError("a scale needs at least two successful videos; give more of them")
+            raise UserError("a normalizer needs at least two successful videos; give more of them")
         return videos
     episodes = sets[0].episodes
     success = {i: episodes.meta(i).get("success") for i in sets[0].indices}
@@ -246,6 +246,6 @@ def open_successes(
     chosen = tuple(i for i, reached in success.items() if reached is None or reached)
     if len(chosen) < 2:
         raise UserError(
-            f"a scale needs at least two successful episodes, {sets[0].path} has {len(chosen)}"
+            f"a normalizer needs at least two successful episodes, {sets[0].path} has {len(chosen)}"
         )
     return [replace(sets[0], indices=chosen)]

@@ -22,7 +22,7 @@ TOY = {
     "collect-demos --episodes 80": "--episodes 2 --workers 2 --env.objects glass_ball",
     "collect-demos": "--episodes 4 --workers 2 --env.objects glass_ball",
     "reward-curves data/episodes": "--index 0",
-    "train-encoder align": "--align.vit tiny --align.epochs 1 --align.batch-size 8 --scale-episodes 2",
+    "train-encoder align": "--align.vit tiny --align.epochs 1 --align.batch-size 8 --normalizer-episodes 2",
     "train-encoder mae": "--frames 8 --mae.vit tiny --mae.epochs 1 --mae.batch-size 8",
     "train-encoder surfaces": "--surfaces 16 --presses 2",
     "train-policy": "--head tiny --train.epochs 1 --trials 0 --workers 1",

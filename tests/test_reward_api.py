@@ -99,7 +99,10 @@ def test_a_sentence_is_a_goal_for_pictures_with_towers_that_know_words() -> None
         (lambda: reward_curve(IMAGES, goal=IMAGES), "the goal must be RGB"),
         (lambda: reward_curve(IMAGES, goal={"left": IMAGES[0]}), "must be the trajectory's"),
         (lambda: reward_curve(IMAGES, TOUCH, encoder="nobody"), "no touch encoder 'nobody'"),
-        (lambda: reward_curve(IMAGES, scale="none.json"), "there is no scale at none.json"),
+        (
+            lambda: reward_curve(IMAGES, normalizer="none.json"),
+            "there is no normalizer at none.json",
+        ),
     ],
 )
 def test_mistakes_are_told_in_one_line(call: Callable[[], Any], message: str) -> None:
@@ -154,7 +157,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["0.mp4", "--index", "0"], "is no set of episodes: leave --index out"),
         (["0.mp4", "--encoder", "gelsight_mini"], "has no touch: leave --encoder out"),
         (["0.mp4", "--gamma", "1.5"], "gamma"),
-        (["0.mp4", "--scale", "none.json"], "there is no scale at none.json"),
+        (["0.mp4", "--normalizer", "none.json"], "there is no normalizer at none.json"),
         (["one.mp4"], "has one frame: a curve needs at least 2"),
         (["episodes", "--camera", "wrist"], "choose --camera observation.images.front"),
         (["episodes", "--camera", "top"], "there is no camera 'top'"),
@@ -182,10 +185,10 @@ def test_a_run_folder_stands_for_its_episodes(run_folder: Path) -> None:
     assert source.path == run_folder / "episodes" and len(source.names) == 3
 
 
-def test_foreign_data_are_drawn_raw_until_a_scale_is_fitted(
+def test_foreign_data_are_drawn_raw_until_a_normalizer_is_fitted(
     run_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    """The shipped scale is of the simulated scene; fit-scale makes one of any successes."""
+    """The shipped normalizer is of the simulated scene; fit-normalizer makes one of any successes."""
     pytest.importorskip("transformers")
     monkeypatch.chdir(run_folder)
     for source in ("episodes", "0.mp4"):
@@ -198,34 +201,34 @@ def test_foreign_data_are_drawn_raw_until_a_scale_is_fitted(
         "tactile",
     }
 
-    main(["fit-scale", "episodes", "--modalities", "tactile", "--out", "touch"])
-    fitted = DistanceNormalizer.load(Path("touch/scale.json"))
+    main(["fit-normalizer", "episodes", "--modalities", "tactile", "--out", "touch"])
+    fitted = DistanceNormalizer.load(Path("touch/normalizer.json"))
     assert fitted.episodes == 2 and fitted.scene == "recorded, not simulated"
     assert fitted.source.sensor == "gelsight_mini" and set(fitted.start) == {
         "tactile",
         "own tactile",
     }
     with pytest.raises(SystemExit, match="does not apply here: it has no 'own image'"):
-        main(["reward-curves", "episodes", "--scale", "touch/scale.json", "--out", "x"])
+        main(["reward-curves", "episodes", "--normalizer", "touch/normalizer.json", "--out", "x"])
 
-    main(["fit-scale", "0.mp4", "1.mp4", "--out", "videos"])
-    main(["reward-curves", "0.mp4", "--scale", "videos/scale.json", "--out", "scaled"])
+    main(["fit-normalizer", "0.mp4", "1.mp4", "--out", "videos"])
+    main(["reward-curves", "0.mp4", "--normalizer", "videos/normalizer.json", "--out", "scaled"])
     scaled = json.loads(Path("scaled/0.json").read_text())
     assert scaled["unit"] == "distance to goal (normalised)"
     assert scaled["metrics"]["image"]["start"] == pytest.approx(1, abs=0.2)
 
 
-def test_fit_scale_wants_successes(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fit_normalizer_wants_successes(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(run_folder)
     with pytest.raises(SystemExit, match="at least two successful videos"):
-        main(["fit-scale", "0.mp4", "--out", "y"])
+        main(["fit-normalizer", "0.mp4", "--out", "y"])
     with pytest.raises(SystemExit, match="one set of episodes, or several videos"):
-        main(["fit-scale", "0.mp4", "episodes", "--out", "y"])
+        main(["fit-normalizer", "0.mp4", "episodes", "--out", "y"])
     meta = {"sensor": "gelsight_mini"}
     for _ in range(2):
         EpisodeWriter(Path("unknown")).append(replace(EPISODE, meta=meta))
     with pytest.raises(SystemExit, match="nobody recorded whether 2 of 2 episodes"):
-        main(["fit-scale", "unknown", "--out", "y"])
+        main(["fit-normalizer", "unknown", "--out", "y"])
 
 
 def test_goal_picture_from_a_file(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -235,7 +238,7 @@ def test_goal_picture_from_a_file(run_folder: Path, monkeypatch: pytest.MonkeyPa
     assert curves.costs["image"].argmin() == 9
 
 
-def test_cost_during_a_run_is_raw_where_no_scale_applies(
+def test_cost_during_a_run_is_raw_where_no_normalizer_applies(
     encoder: TouchEncoder, tmp_path: Path
 ) -> None:
     Image.fromarray(IMAGES[9]).save(tmp_path / "end.png")
@@ -258,14 +261,14 @@ def test_cost_during_a_run_is_that_of_its_recording(encoder: TouchEncoder, tmp_p
     left = np.concatenate([TOUCH["left"][:5] + noise, TOUCH["left"][5:]])
     embedder = EpisodeEmbedder(PaintTowers(), encoder)
     ends = {"image": 1.0, "text": 1.0}, {"image": 0.1, "text": 0.2}
-    scale = DistanceNormalizer(*ends, {}, embedder.made_with, "recorded, not simulated", 3)
+    normalizer = DistanceNormalizer(*ends, {}, embedder.made_with, "recorded, not simulated", 3)
     goals = [PictureFile(tmp_path / "end.png"), Sentence("soft")]
     frames = {FRONT: IMAGES, TACTILE_LEFT: left, TACTILE_RIGHT: TOUCH["right"]}
     recording = embedder.embed_episode(Episode(frames=frames, task="", meta={}), 20.0, "recording")
     goal = embedder.embed_goal(assign_goals(goals, recording.modalities), recording)
-    expected = compute_curves(recording, goal, scale).costs["image+text"]
+    expected = compute_curves(recording, goal, normalizer).costs["image+text"]
     meter, ticks = (
-        CostMeter(PaintTowers(), encoder, scale, goals),
+        CostMeter(PaintTowers(), encoder, normalizer, goals),
         [{key: values[i] for key, values in frames.items()} for i in range(len(IMAGES))],
     )
     during = [meter.measure(tick, ticks[: min(i + 1, 5)]) for i, tick in enumerate(ticks)]

@@ -1,4 +1,4 @@
-"""Goals, embedding distances, the scale, curves and reports, on tiny encoders and drawn touches."""
+"""Goals, embedding distances, the normalizer, curves and reports, on tiny encoders and drawn touches."""
 
 import csv
 import json
@@ -200,23 +200,23 @@ def test_distances_by_hand() -> None:
 
 def test_scale_maps_the_usual_start_to_one_and_end_to_zero(tmp_path: Path) -> None:
     training = [embedded("a" * (k + 1), jitter=1.0) for k in range(4)]
-    scale = fit_scene(training, ["image", "tactile"])
+    normalizer = fit_scene(training, ["image", "tactile"])
     new = embedded("new episode", jitter=1.0)
-    curves = compute_curves(new, goal_of(training[0]), replace_text(scale))
+    curves = compute_curves(new, goal_of(training[0]), replace_text(normalizer))
     for name in ("image", "tactile", "image+tactile"):
         assert curves.costs[name][:3] == pytest.approx(np.ones(3), abs=0.1)
         assert curves.costs[name][-1] == pytest.approx(0, abs=0.1)
-    scale.save(tmp_path / "scale.json")
-    assert DistanceNormalizer.load(tmp_path / "scale.json") == scale
-    assert [p.name for p in tmp_path.iterdir()] == ["scale.json"]
+    normalizer.save(tmp_path / "normalizer.json")
+    assert DistanceNormalizer.load(tmp_path / "normalizer.json") == normalizer
+    assert [p.name for p in tmp_path.iterdir()] == ["normalizer.json"]
 
 
-def replace_text(scale: DistanceNormalizer) -> DistanceNormalizer:
-    """The scale with an entry for text, which the drawn words cannot fit (their ends are alike)."""
+def replace_text(normalizer: DistanceNormalizer) -> DistanceNormalizer:
+    """The normalizer with an entry for text, which the drawn words cannot fit (their ends are alike)."""
     return replace(
-        scale,
-        start=scale.start | {"text": 1.0},
-        goal=scale.goal | {"text": 0.0},
+        normalizer,
+        start=normalizer.start | {"text": 1.0},
+        goal=normalizer.goal | {"text": 0.0},
     )
 
 
@@ -224,15 +224,15 @@ def test_own_ends_and_those_of_others_have_their_own_medians() -> None:
     """The five frames before the last lie at 8 8 4 2 2 and at 40 degrees, the goals at 0, 40."""
     still = replace(embedded("a"), image=direction([90.0] * 34 + [8.0, 8.0, 4.0, 2.0, 2.0, 0.0]))
     turned = replace(embedded("b"), image=direction([90.0] * 30 + [40.0] * 10))
-    scale = fit_scene([still, turned], ["image"])
+    normalizer = fit_scene([still, turned], ["image"])
 
     def median(*degrees: float) -> object:
         return pytest.approx(np.median(1 - np.cos(np.radians(degrees))), abs=1e-6)
 
-    assert scale.start == {"image": median(50, 90), "own image": median(90, 50)}
-    assert scale.goal == {"image": median(36, 40), "own image": median(4, 0)}
+    assert normalizer.start == {"image": median(50, 90), "own image": median(90, 50)}
+    assert normalizer.goal == {"image": median(36, 40), "own image": median(4, 0)}
     assert compute_curves(
-        still, replace(goal_of(still), own=frozenset(ALL), touch=None, text=None), scale
+        still, replace(goal_of(still), own=frozenset(ALL), touch=None, text=None), normalizer
     )
 
 
@@ -240,8 +240,8 @@ def test_touch_goals_are_ends_with_the_same_object() -> None:
     apple = embedded("apple")
     assert apple.touch is not None
     pear = replace(apple, touch=-apple.touch, object="pear")
-    scale = fit_scene([apple, replace(apple), pear], ["tactile"])
-    assert scale.goal["tactile"] == pytest.approx(0, abs=1e-6)
+    normalizer = fit_scene([apple, replace(apple), pear], ["tactile"])
+    assert normalizer.goal["tactile"] == pytest.approx(0, abs=1e-6)
     with pytest.raises(UserError, match="nearer the goal in 0% of 2 pairs"):
         fit_scene([apple, replace(pear, object="apple")], ["tactile"])
     with pytest.raises(UserError, match="they must share an object"):
@@ -266,9 +266,9 @@ def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
         fit_scene([good, replace(good, made_with=EmbeddingSource("z", "camera"))], ["image"])
     with pytest.raises(UserError, match="at least one"):
         fit_scene([], ["image"])
-    scale = fit_scene([good, replace(good)], ["image"])
+    normalizer = fit_scene([good, replace(good)], ["image"])
     with pytest.raises(UserError, match="it has no 'tactile', only image, own image"):
-        compute_curves(good, goal_of(good), scale)
+        compute_curves(good, goal_of(good), normalizer)
     for change, message in (
         ({"towers": "z"}, "with the towers towers, not z"),
         ({"camera": "z"}, "with the camera camera, not z"),
@@ -282,24 +282,24 @@ def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
             )
     own_camera = replace(good, made_with=EmbeddingSource("towers", camera=""))
     picture = replace(goal_of(good), touch=None, text=None)
-    assert compute_curves(own_camera, picture, scale).normalised  # a plain video, vouched for
+    assert compute_curves(own_camera, picture, normalizer).normalised  # a plain video, vouched for
     (tmp_path / "broken.json").write_text("{")
-    with pytest.raises(UserError, match="is not a scale"):
+    with pytest.raises(UserError, match="is not a normalizer"):
         DistanceNormalizer.load(tmp_path / "broken.json")
-    with pytest.raises(UserError, match="there is no scale"):
+    with pytest.raises(UserError, match="there is no normalizer"):
         DistanceNormalizer.load(tmp_path / "none.json")
 
 
 def test_an_episode_that_never_touches_stays_away_from_the_goal() -> None:
     """Its picture ends at the goal, its touch does not; its own last frame would hide that."""
     training = [embedded("a" * (k + 1), jitter=1.0) for k in range(4)]
-    scale = replace_text(fit_scene(training, ["image", "tactile"]))
+    normalizer = replace_text(fit_scene(training, ["image", "tactile"]))
     miss = embedded("never touches", touches=False, jitter=1.0)
-    other = compute_curves(miss, goal_of(training[0]), scale).metrics()
+    other = compute_curves(miss, goal_of(training[0]), normalizer).metrics()
     assert other["image"].end < 0.1
     assert other["tactile"].end > 0.9 and other["tactile"].t_drop_50 is None
     assert other["image+tactile"].end > 0.4
-    assert compute_curves(miss, goal_of(miss), scale).metrics()["image+tactile"].end < 0.1
+    assert compute_curves(miss, goal_of(miss), normalizer).metrics()["image+tactile"].end < 0.1
 
 
 def test_a_modality_with_a_larger_range_does_not_win() -> None:

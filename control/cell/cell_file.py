@@ -13,7 +13,8 @@ from touchgoal.control.cell.config import CellConfig, check
 from touchgoal.control.errors import UserError
 
 _CELL = TypeAdapter(CellConfig)
-_RENAMED = {"safety.touch": "safety.indentation"}  # keys of older cell files
+# Keys of older cell files.
+_RENAMED = {"safety.touch": "safety.indentation", "task.scale": "task.normalizer"}
 
 
 def read_cell_file(path: Path, policy: str = "") -> CellConfig:

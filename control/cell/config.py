@@ -140,9 +140,9 @@ class TaskSection:
     rewards: tuple[str, ...] = ()
     """Goals whose distance is shown and recorded during the run, as those of reward-curves:
     episode:FOLDER#K, image:PATH, text:SENTENCE."""
-    scale: str = ""
-    """What normalises that distance: a scale.json that fit-scale made of successes in this cell. Not
-    given: the scale of the simulated scene on a simulated arm or a twin, the raw distance elsewhere."""
+    normalizer: str = ""
+    """What normalises that distance: a normalizer.json that fit-normalizer made of successes in this cell. Not
+    given: that of the simulated scene on a simulated arm or a twin, the raw distance elsewhere."""
 
 
 @dataclass(frozen=True, config=STRICT)

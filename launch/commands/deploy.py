@@ -29,7 +29,7 @@ from touchgoal.policies.deploy.control_loop import Request
 from touchgoal.policies.deploy.preflight import check_client, preflight
 from touchgoal.policies.deploy.session import Result, Session
 from touchgoal.rewards.goals import parse_goal
-from touchgoal.rewards.normalizer import DistanceNormalizer
+from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
 from touchgoal.rewards.online import CostMeter, OnlineCost
 from touchgoal.sim_envs.config import EnvConfig
 from touchgoal.sim_envs.twin.control_port import ask_twin, put_scene_back
@@ -172,8 +172,9 @@ def _load_cost(cell: CellConfig) -> OnlineCost | None:
     directory = pretrained.shipped_encoder_for(cell.sensor)
     encoder = pretrained.load_aligned(directory, sensor=cell.sensor)
     simulated = cell.arm == "sim" or bool(cell.task.twin)
-    scale = Path(cell.task.scale) if cell.task.scale else directory / "scale.json"
-    normalizer = DistanceNormalizer.load(scale) if simulated or cell.task.scale else None
+    given = cell.task.normalizer
+    path = Path(given) if given else directory / NORMALIZER
+    normalizer = DistanceNormalizer.load(path) if simulated or given else None
     towers = load_towers(encoder.config.towers)
     return OnlineCost(CostMeter(towers, encoder, normalizer, goals))
 

@@ -27,7 +27,7 @@ from touchgoal.launch.training_run import (
 )
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder
 from touchgoal.rewards.fit_normalizer import fit_normalizer
-from touchgoal.rewards.normalizer import scene_of
+from touchgoal.rewards.normalizer import NORMALIZER, scene_of
 
 
 def run_command(config: Align | Mae | Surfaces) -> None:
@@ -101,8 +101,8 @@ def _align(config: Align, sensor: str, data: EpisodeSet, validation: EpisodeSet)
     embedder = EpisodeEmbedder(towers, encoder)
     embedded = [
         embedder.embed_episode(data.read(i), data.fps, f"{data.root}#{i}", True)
-        for i in track(successes[: config.scale_episodes], "scale", "episode")
+        for i in track(successes[: config.normalizer_episodes], "normalizer", "episode")
     ]
-    scale = fit_normalizer(embedded, ("image", "tactile", "text"), scene_of(data.features))
-    scale.save(out / "encoder" / "scale.json")
-    print(f"encoder and scale: {out / 'encoder'}")
+    normalizer = fit_normalizer(embedded, ("image", "tactile", "text"), scene_of(data.features))
+    normalizer.save(out / "encoder" / NORMALIZER)
+    print(f"encoder and normalizer: {out / 'encoder'}")

@@ -91,7 +91,9 @@ def report_json(
 _COST_NORMALISED = (
     "0 as near the goal as successful episodes usually end, or nearer; 1 where they usually start"
 )
-_COST_RAW = "cosine distance 1 - cos between embeddings, 0 to 2; no scale was fitted on such data"
+_COST_RAW = (
+    "cosine distance 1 - cos between embeddings, 0 to 2; no normalizer was fitted on such data"
+)
 
 
 def _causality(curves: Curves) -> str:

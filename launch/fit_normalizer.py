@@ -1,8 +1,8 @@
-"""Fit the scale that makes distances comparable, on successful episodes of your own.
+"""Fit the normalizer that makes distances comparable, on successful episodes of your own.
 
 Distances to a goal differ in size between cameras, encoders and scenes. From episodes that reached
-their goal this finds where they usually start and end, for each modality, and writes scale.json: with
-`reward-curves --scale` a cost of 1 is then the usual start and 0 the usual end. Any camera will do;
+their goal this finds where they usually start and end, for each modality, and writes normalizer.json: with
+`reward-curves --normalizer` a cost of 1 is then the usual start and 0 the usual end. Any camera will do;
 plain videos will do for the pictures.
 """
 
@@ -16,7 +16,7 @@ from touchgoal.control.option_types import checked_dataclass
 
 @checked_dataclass
 class Config:
-    """Options of fit-scale."""
+    """Options of fit-normalizer."""
 
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """A set of episodes; or at least two video files or folders of pictures, each of one success."""
@@ -33,7 +33,7 @@ class Config:
     assume_success: bool = False
     """Take episodes whose outcome nobody recorded for successes."""
     out: Path | None = None
-    """Folder of the run; the scale goes to its scale.json."""
+    """Folder of the run; the normalizer goes to its normalizer.json."""
 
 
 def main(config: Config) -> None:
@@ -41,13 +41,14 @@ def main(config: Config) -> None:
     from touchgoal.control.progress import track
     from touchgoal.launch.run_folder import open_run
     from touchgoal.rewards.fit_normalizer import fit_normalizer
-    from touchgoal.rewards.setup import SCALE, load_encoders
+    from touchgoal.rewards.normalizer import NORMALIZER
+    from touchgoal.rewards.setup import load_encoders
     from touchgoal.rewards.sources import open_successes
 
     with_touch = config.towers is None or config.encoder is not None
     sources = open_successes(config.sources, config.camera, with_touch, config.assume_success)
     embedder, _ = load_encoders(sources[0], config.encoder, config.towers)
-    out = open_run(config.out, "fit-scale", config)
+    out = open_run(config.out, "fit-normalizer", config)
     total = sum(len(source.names) for source in sources)
     trajectories = (one for source in sources for one in source.embed(embedder, descriptions=True))
     embedded = list(track(trajectories, "embedding", "trajectory", total=total))
@@ -56,7 +57,7 @@ def main(config: Config) -> None:
         m for m in embedded[0].modalities if m != "text" or has_words
     )
     normalizer = fit_normalizer(embedded, modalities, sources[0].scene)
-    normalizer.save(out / SCALE)
+    normalizer.save(out / NORMALIZER)
     print(f"{'fitted':<15}{'usual start':>15}{'usual end':>15}{'told apart':>15}")
     for name, start in normalizer.start.items():
         end, told = normalizer.goal[name], normalizer.separated[name]
@@ -65,4 +66,4 @@ def main(config: Config) -> None:
     print("  usual end      the same at its end")
     print("  told apart     share of (episode, goal) pairs whose end is nearer than its start")
     print("  own            goals from the episode itself; the others from other episodes or words")
-    print(f"use it: touchgoal reward-curves {config.sources[0]} --scale {out / SCALE}")
+    print(f"use it: touchgoal reward-curves {config.sources[0]} --normalizer {out / NORMALIZER}")
