@@ -58,7 +58,7 @@ class Config(TrainingOptions):
     head: Head = "small"
     """Size of the U-Net of a diffusion policy, or regression, which predicts plans directly."""
     representation: ActionRepresentation = "body_twist"
-    """How actions are written while learning: delta (joint change of each control tick), chunk (since
+    """How actions are written while learning: delta (joint change of each control tick), relative (since
     the plan's start), absolute (joint positions), base_twist or body_twist (displacement and turn of
     the hand along the base's or the hand's own axes). body_twist also sees what moves along the hand's
     axes; with a state estimator take base_twist."""

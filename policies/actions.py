@@ -1,7 +1,8 @@
-"""What a policy predicts of a chunk of actions, and the scales it learns in.
+"""What a policy predicts: chunks of actions, and the scales it learns in.
 
 An action (8,) is the joint change (7) of one tick, rad, and the gripper width target, m
-(`features.ACTION`). A chunk is the actions of h ticks from the latest observation on.
+(`features.ACTION`). A chunk, or plan, is the actions of h ticks from the latest
+observation on; a network learns and draws it in a representation, each tick of it normalised.
 """
 
 from functools import cache

@@ -22,12 +22,12 @@ ArmState = Literal["measured", "commanded"]
 """What a policy sees of the arm: where it was measured, or where it has been sent."""
 TouchReading = Literal["wrench", "free"]
 """See PolicyConfig."""
-ActionRepresentation = Literal["delta", "chunk", "absolute", "base_twist", "body_twist"]
-"""Of the joints: each tick's change; the change since the chunk's start; the joint positions that
-these changes lead to from the measured ones; the hand's displacement and turn since the chunk's start
-(m, rad, base frame, to first order) with the third joint's change for the elbow, which is nearly the
-same wherever on the table the hand does the same; the hand's displacement and turn along its own axes,
-the elbow going where the joints move least. The gripper's width is a target in all five."""
+ActionRepresentation = Literal["delta", "relative", "absolute", "base_twist", "body_twist"]
+"""Of the joints: each tick's change; the change since the plan's start (UMI's word, Chi et al. 2024); the
+joint positions that these changes lead to from the measured ones; the hand's displacement and turn
+since the plan's start (m, rad, base frame, to first order) with the third joint's change for the elbow,
+which is nearly the same wherever on the table the hand does the same; the hand's displacement and turn
+along its own axes, the elbow going where the joints move least. The gripper's width is a target in all five."""
 Box = tuple[int, int, int, int]
 
 

@@ -63,7 +63,7 @@ class PolicyConfig:
         representation: of the actions while learning; "body_twist" also sees along the hand's own axes,
             see `proprioception.py`.
         control_hz: ticks per second.
-        head: what draws the chunk.
+        head: what draws the plan.
         task: of the episodes learned from, such as "bead-maze"; "" if unknown.
         sensor: of the fingertips in them; "" for a policy without touch.
     """
@@ -80,7 +80,7 @@ class PolicyConfig:
     observation_horizon: int = 2
     prediction_horizon: int = 8
     execution_horizon: int = 2
-    representation: ActionRepresentation = "chunk"
+    representation: ActionRepresentation = "relative"
     control_hz: int = ft.CONTROL_HZ
     head: DiffusionConfig | RegressionConfig = field(default_factory=DiffusionConfig)
     task: str = ""
@@ -198,7 +198,7 @@ class Policy(nn.Module):
         """Fits the scales to training data: n ticks, and the chunks of m windows.
 
         Inputs get variance 1, actions the range -1 to 1, for each tick of the chunk by itself: the
-        first of a chunk-relative plan moves an eighth of what the last does. Padded actions do not
+        first of a relative plan moves an eighth of what the last does. Padded actions do not
         count.
         """
         if self.config.touch_dim:

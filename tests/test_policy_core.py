@@ -42,7 +42,7 @@ from touchgoal.policies.training.train import ema_decay, train
 import mujoco  # isort: skip - after touchgoal, which chooses the OpenGL platform
 
 
-@pytest.mark.parametrize("kind", ["delta", "chunk", "absolute", "base_twist"])
+@pytest.mark.parametrize("kind", ["delta", "relative", "absolute", "base_twist"])
 def test_representations_round_trip(kind: ActionRepresentation) -> None:
     actions, joints = (
         torch.randn(5, 8, 8, generator=torch_rng()),
@@ -160,7 +160,7 @@ def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
         replace(TOY, head=FLOW, representation="absolute"),
         replace(TOY, head=RegressionConfig(64, 2), representation="delta", touch_reading="free"),
     ],
-    ids=["ddim-chunk", "flow-absolute", "regression-delta"],
+    ids=["ddim-relative", "flow-absolute", "regression-delta"],
 )
 def test_a_toy_batch_is_learned_by_heart(config: PolicyConfig) -> None:
     windows = toy_dataset(config, (6, 6))
@@ -259,8 +259,8 @@ def test_a_turn_looks_the_same_by_either_quaternion() -> None:
     state[:, 18:] /= state[:, 18:].norm(dim=1, keepdim=True)
     other = torch.cat([state[:, :18], -state[:, 18:]], 1)
     columns = ft.STATE, ft.TCP_POSE
-    seen = network_input(state, columns, "chunk")
-    torch.testing.assert_close(seen, network_input(other, columns, "chunk"))
+    seen = network_input(state, columns, "relative")
+    torch.testing.assert_close(seen, network_input(other, columns, "relative"))
     turned = network_input(state, columns, "body_twist")
     torch.testing.assert_close(turned, network_input(other, columns, "body_twist"))
     matrix = np.zeros(9)
