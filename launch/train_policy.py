@@ -18,7 +18,7 @@ from touchgoal.policies.config import (
     ArmState,
     Head,
     SamplerConfig,
-    TouchReading,
+    TouchInput,
     TrainConfig,
 )
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
@@ -65,12 +65,12 @@ class Config(TrainingOptions):
     arm_state: ArmState = "measured"
     """How the policy knows where the arm is: measured, or commanded (where it has been sent), into which
     no delay comes; episodes need the column observation.command for that."""
-    touch_reading: TouchReading = "wrench"
+    touch_input: TouchInput = "wrench"
     """What the policy takes from a frozen touch embedding: wrench, the forces and torques on both
-    fingertips, which a small network learns from what the simulator says; or free, a projection that is
-    learned from the actions alone."""
+    fingertips, which a small network learns from what the simulator says; or embedding, a projection of it
+    that is learned from the actions alone."""
     touch_projection_dim: Annotated[Count, RARE] = 64
-    """Numbers to which a frozen embedding is projected, with --touch-reading free."""
+    """Numbers to which a frozen embedding is projected, with --touch-input embedding."""
     touch_noise: Annotated[NotNegative, RARE] = 0.1
     """Noise added to touch embeddings while learning, relative to their standard deviation."""
     position_noise: Annotated[NotNegative, RARE] = 0.3

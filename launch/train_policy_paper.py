@@ -14,7 +14,7 @@ from touchgoal.policies.config import (
     ActionRepresentation,
     Head,
     SamplerConfig,
-    TouchReading,
+    TouchInput,
     TrainConfig,
 )
 
@@ -25,7 +25,7 @@ class Config(train_policy.Config):
 
     head: Head = "published"
     representation: ActionRepresentation = "delta"
-    touch_reading: TouchReading = "free"
+    touch_input: TouchInput = "embedding"
     touch_projection_dim: Annotated[Count, RARE] = 256
     touch_noise: Annotated[NotNegative, RARE] = 0.0
     position_noise: Annotated[NotNegative, RARE] = 0.0

@@ -234,6 +234,8 @@ def suggestion(name: str, names: tuple[str, ...] = tuple(SHIPPED)) -> str:
 def _config(fields: dict[str, Any]) -> PolicyConfig:
     if fields.get("representation") == "chunk":  # in older policies
         fields["representation"] = "relative"
+    if older := fields.pop("touch_reading", None):
+        fields["touch_input"] = "embedding" if older == "free" else older
     head = fields.pop("head")
     if end_to_end := fields.pop("end_to_end", None):
         fields["end_to_end"] = EndToEndConfig(**end_to_end | {"size": tuple(end_to_end["size"])})

@@ -20,8 +20,8 @@ Head = Literal["small", "published", "tiny", "regression"]
 """A diffusion head with a U-Net of that size, or one that predicts a plan directly."""
 ArmState = Literal["measured", "commanded"]
 """What a policy sees of the arm: where it was measured, or where it has been sent."""
-TouchReading = Literal["wrench", "free"]
-"""See PolicyConfig."""
+TouchInput = Literal["wrench", "embedding"]
+"""What of a frozen touch embedding reaches the head: the wrenches read out of it, or it itself, projected."""
 ActionRepresentation = Literal["delta", "relative", "absolute", "base_twist", "body_twist"]
 """Of the joints: each tick's change; the change since the plan's start (UMI's word, Chi et al. 2024); the
 joint positions that these changes lead to from the measured ones; the hand's displacement and turn

@@ -16,7 +16,7 @@ from touchgoal.policies.actions import (
     to_actions,
     to_representation,
 )
-from touchgoal.policies.config import ActionRepresentation, TouchReading
+from touchgoal.policies.config import ActionRepresentation, TouchInput
 from touchgoal.policies.heads.diffusion import (
     Diffusion,
     DiffusionConfig,
@@ -38,11 +38,11 @@ class PolicyConfig:
         touch_dim: of the frozen embedding of both fingertips together; 0 for a policy without
             touch.
         touch: names what made the embeddings: encoder, sensor, background.
-        touch_reading: how embeddings reach the head. "wrench": a small network reads the wrenches on
+        touch_input: what of the embeddings reaches the head. "wrench": a small network reads the wrenches on
             both pads out of them, which learns from what the simulator says acted there and from
             nothing else (TacBench's force estimation, T1), and the head sees the 12 numbers.
-            "free": a projection that learns from the actions alone, for episodes without that truth.
-        touch_projection_dim: to which an embedding is projected, if freely.
+            "embedding": a projection that learns from the actions alone, for episodes without that truth.
+        touch_projection_dim: to which an embedding is projected, with "embedding".
         touch_noise: standard deviation of noise added to the touch while learning, of embeddings
             scaled to variance 1. Without it a network knows each recorded episode again by its
             sensors, and learns its wire by heart.
@@ -70,7 +70,7 @@ class PolicyConfig:
 
     touch_dim: int
     touch: str
-    touch_reading: TouchReading = "wrench"
+    touch_input: TouchInput = "wrench"
     touch_projection_dim: int = 64
     touch_noise: float = 0.1
     position_noise: float = 0.3
@@ -113,7 +113,7 @@ class PolicyConfig:
     @property
     def reads_wrench(self) -> bool:
         """Whether its training needs `truth.pad_wrench`."""
-        return self.touch_dim > 0 and self.touch_reading == "wrench"
+        return self.touch_dim > 0 and self.touch_input == "wrench"
 
     @property
     def estimated(self) -> tuple[str, ...]:

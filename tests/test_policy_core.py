@@ -158,7 +158,7 @@ def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
     [
         TOY,
         replace(TOY, head=FLOW, representation="absolute"),
-        replace(TOY, head=RegressionConfig(64, 2), representation="delta", touch_reading="free"),
+        replace(TOY, head=RegressionConfig(64, 2), representation="delta", touch_input="embedding"),
     ],
     ids=["ddim-relative", "flow-absolute", "regression-delta"],
 )
@@ -290,7 +290,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
 
 def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writer, embedder = EpisodeWriter(tmp_path / "set/episodes"), toy_touch_embedder()
-    config = replace(TOY, touch_dim=embedder.dim, touch_reading="free")
+    config = replace(TOY, touch_dim=embedder.dim, touch_input="embedding")
     for n in (4, 6):
         ticks = [{**tick, ft.ACTION: tick[ft.STATE][:8]} for tick in toy_observations(n)]
         writer.append(Episode({k: np.stack([t[k] for t in ticks]) for k in ticks[0]}, "feel"))
@@ -311,8 +311,8 @@ def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         np.save(path, np.load(path)[1:])
     with pytest.raises(UserError, match="is damaged: delete"):
         load_recordings(episodes, [0], config, embedder)
-    with pytest.raises(UserError, match='choose touch_reading "free"'):
-        load_recordings(episodes, [0], replace(config, touch_reading="wrench"), embedder)
+    with pytest.raises(UserError, match='choose touch_input "embedding"'):
+        load_recordings(episodes, [0], replace(config, touch_input="wrench"), embedder)
     with pytest.raises(UserError, match="make its config"):
         load_recordings(episodes, [0], config, None)
     blind = load_recordings(episodes, [0], replace(config, touch_dim=0, touch=""), None)
@@ -324,7 +324,7 @@ def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_two_sets_beside_each_other_share_no_embeddings(tmp_path: Path) -> None:
     embedder = toy_touch_embedder()
-    config = replace(TOY, touch_dim=embedder.dim, touch_reading="free")
+    config = replace(TOY, touch_dim=embedder.dim, touch_input="embedding")
     touches = []
     for name, first in (("one", 0), ("two", 1)):
         ticks = [
@@ -337,3 +337,12 @@ def test_two_sets_beside_each_other_share_no_embeddings(tmp_path: Path) -> None:
         fresh = torch.from_numpy(embedder.embed(episodes, 0)).half()
         assert torch.equal(touches[-1], fresh)
     assert not torch.equal(*touches)
+
+
+def test_policies_of_older_names_load(tmp_path: Path) -> None:
+    config = replace(TOY, touch_input="embedding", representation="relative")
+    checkpoint.save(Policy(config), tmp_path, {})
+    text = (tmp_path / "policy.json").read_text()
+    older = text.replace('"touch_input": "embedding"', '"touch_reading": "free"')
+    (tmp_path / "policy.json").write_text(older.replace('"relative"', '"chunk"'))
+    assert "touch_reading" in older and checkpoint.load(tmp_path).config == config

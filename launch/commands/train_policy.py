@@ -94,7 +94,7 @@ def _policy_config(
     return PolicyConfig(
         touch_dim=touch.dim if touch else 0,
         touch=touch.name if touch else "",
-        touch_reading=config.touch_reading,
+        touch_input=config.touch_input,
         touch_projection_dim=config.touch_projection_dim,
         touch_noise=config.touch_noise,
         position_noise=config.position_noise,

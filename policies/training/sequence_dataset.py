@@ -132,7 +132,7 @@ def _check(
     if config.reads_wrench and ft.TRUTH_PAD_WRENCH not in episodes.features:
         raise UserError(
             f"{episodes.root} has no {ft.TRUTH_PAD_WRENCH}, which only simulated episodes have: "
-            'choose touch_reading "free"'
+            'choose touch_input "embedding"'
         )
     made = (embedder.name, embedder.dim) if embedder else ("", 0)
     if made != (config.touch, config.touch_dim):
