@@ -80,7 +80,7 @@ class ShuffledTouch:
         rows = other_wires(self.episodes, env.wire.name)
         chosen = rows[int(env.np_random.integers(len(rows)))]
         planner.recorded_touch = cached_embeddings(self.episodes, chosen, touch).astype(np.float32)
-        return PolicyActor(planner, self.policy.latency)
+        return PolicyActor(planner, self.policy.plan_ticks)
 
 
 def other_wires(episodes: EpisodeSet, wire: str) -> list[int]:
@@ -159,9 +159,9 @@ def _closed_loop(
             shuffled = [ShuffledTouch(maker, recorded) for maker in makers]
             run_arm(f"{name}, shuffled", blind, shuffled, jobs)
     first = config.policies[0]
-    for latency in config.latencies:
-        late = SavedPolicy(first, latency=latency)
-        run_arm(f"first policy, {latency} ticks late", late.env_config(maze), [late], jobs)
+    for ticks in config.plan_ticks:
+        late = SavedPolicy(first, plan_ticks=ticks)
+        run_arm(f"first policy, {ticks} ticks late", late.env_config(maze), [late], jobs)
     return results
 
 

@@ -45,7 +45,7 @@ class BeadMazeOptions(BenchmarkOptions):
     """Number of test wires of the family held out; 0 leaves it out."""
     demonstrations: Annotated[int, Field(ge=2)] = 20
     """Number of test wires on which open-loop errors are measured."""
-    latencies: tuple[CountOrNone, ...] = (1, 2)
+    plan_ticks: tuple[CountOrNone, ...] = (1, 2)
     """Control ticks by which plans come late, tried besides 0 on the first policy."""
     env: BeadMazeConfig = BeadMazeConfig(split="test")
     """Options of the maze, e.g. a disturbance; demonstrations are recorded with the same."""

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from touchgoal.control.option_types import Count, CountOrNone, Seed, checked_dataclass
+from touchgoal.control.option_types import Count, Seed, checked_dataclass
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 
 ENVS: dict[TaskName, TaskConfig] = {
@@ -24,8 +24,6 @@ class Config:
     """Which policy: shipped; a folder that train-policy made; expert, which sees the simulator's
     state; follower (bead-maze), the classical one, which feels the force on the hand; or a class of
     your own, as module:Class or file.py:Class (docs: policies/by_name.py)."""
-    latency: CountOrNone = 0
-    """Control ticks by which a learned policy's plans come late, to try what a slow computer does."""
     out: Path | None = None
     """Folder of the run."""
     episodes: Count = 20

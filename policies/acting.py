@@ -120,29 +120,29 @@ class Planner:
 class PolicyActor:
     """Does `execution_horizon` ticks of a plan, then the next plan's.
 
-    An inference that takes `latency` ticks is asked for so much earlier, and the ticks that have
+    An inference that takes `plan_ticks` control ticks is asked for so much earlier, and the ticks that have
     gone by when its plan arrives are left out: no tick is done twice, none waits.
     """
 
-    def __init__(self, planner: Planner, latency: int = 0) -> None:
+    def __init__(self, planner: Planner, plan_ticks: int = 0) -> None:
         """Starts an episode.
 
         Args:
             planner: of this episode.
-            latency: ticks from an observation to its plan. On the first tick the arm stands, and
+            plan_ticks: ticks from an observation to its plan. On the first tick the arm stands, and
                 the plan is waited for.
 
         Raises:
-            UserError: plans too short for the latency.
+            UserError: plans too short to come so late.
         """
         config = planner.config
         spare = config.prediction_horizon - config.execution_horizon
-        if not 0 <= latency <= min(spare, config.execution_horizon):
+        if not 0 <= plan_ticks <= min(spare, config.execution_horizon):
             raise UserError(
                 f"a plan of {config.prediction_horizon} ticks, {config.execution_horizon} of them "
-                f"done, cannot come {latency} ticks late: change execution_horizon"
+                f"done, cannot come {plan_ticks} ticks late: change execution_horizon"
             )
-        self._planner, self._latency = planner, latency
+        self._planner, self._plan_ticks = planner, plan_ticks
         self._seen: list[Observation] = []
         self._todo: list[np.ndarray] = []  # actions of the present plan
         self._next: list[np.ndarray] = []  # of the one that is on its way
@@ -155,9 +155,9 @@ class PolicyActor:
         if first:
             self._todo = list(self._planner.plan(self._seen)[: config.execution_horizon])
         self._take_over()
-        if len(self._todo) == self._latency:
-            upto = self._latency + config.execution_horizon
-            self._next = list(self._planner.plan(self._seen)[self._latency : upto])
+        if len(self._todo) == self._plan_ticks:
+            upto = self._plan_ticks + config.execution_horizon
+            self._next = list(self._planner.plan(self._seen)[self._plan_ticks : upto])
             self._take_over()
         return self._todo.pop(0)
 

@@ -106,13 +106,12 @@ def scripted(task: TaskName) -> str:
     return "follower" if task == "bead-maze" else "expert"
 
 
-def choose_policy(name: str | Path, task: TaskConfig, latency: int = 0) -> PolicyMaker:
+def choose_policy(name: str | Path, task: TaskConfig) -> PolicyMaker:
     """What makes the policy that a command or a script names.
 
     Args:
         name: one of `BUILT_IN`, a folder that train-policy made, `module:Class` or `file.py:Class`.
         task: options of the task it is to act in.
-        latency: ticks that a learned policy's plans come late.
 
     Raises:
         UserError: no such policy, or it cannot act in the task. Nothing was simulated yet.
@@ -127,7 +126,7 @@ def choose_policy(name: str | Path, task: TaskConfig, latency: int = 0) -> Polic
     if (own := find_own(chosen)) is not None:
         return own
     if chosen == "shipped":
-        return SavedPolicy(SHIPPED[where], latency).check_task(task)
+        return SavedPolicy(SHIPPED[where]).check_task(task)
     try:
         folder = find_policy(chosen)
     except UserError as error:
@@ -139,7 +138,7 @@ def choose_policy(name: str | Path, task: TaskConfig, latency: int = 0) -> Polic
             f"there is no policy {chosen!r}: {suggestion(chosen, tuple(BUILT_IN))}, or a class of your "
             "own as module:Class or file.py:Class"
         ) from error
-    return SavedPolicy(folder, latency).check_task(task)
+    return SavedPolicy(folder).check_task(task)
 
 
 def find_own(name: str) -> ImportedPolicy | None:

@@ -87,16 +87,16 @@ class SavedPolicy:
     Attributes:
         directory: of the policy, with its touch encoder in `touch/`, its state estimator in
             `estimator/`.
-        latency: see `PolicyActor`.
+        plan_ticks: see `PolicyActor`.
     """
 
     directory: Path
-    latency: int = 0
+    plan_ticks: int = 0
 
     def __call__(self, env: FrankaTactileEnv | None = None) -> PolicyActor:
         """An actor for one episode, on one core; its plans come as late as the environment says."""
         torch.set_num_threads(1)  # two lose badly when the other core is taken
-        return PolicyActor(self.planner(), max(self.latency, env.plan_ticks if env else 0))
+        return PolicyActor(self.planner(), max(self.plan_ticks, env.plan_ticks if env else 0))
 
     def planner(self) -> Planner:
         """What makes its plans in one episode."""
@@ -130,7 +130,8 @@ class SavedPolicy:
                 f"{sensor}: choose {other} (--env.sensor {other}), or another policy"
             )
         planner = Planner(policy, touch, estimator)
-        PolicyActor(planner, self.latency)
+        latest = max(task.resolved_deployment().plan_ticks or (0,))
+        PolicyActor(planner, max(self.plan_ticks, latest))  # refuses plans that are too short
         return planner, _observed(task, config, estimator)
 
     def env_config(self, task: Task) -> Task:
@@ -176,7 +177,7 @@ class LoadedPolicy:
             seed: of the plans' noise.
         """
         self._planner.reset(seed)
-        self._actor = PolicyActor(self._planner, self.saved.latency)
+        self._actor = PolicyActor(self._planner, self.saved.plan_ticks)
 
     def act(self, observation: Observation) -> Float32[np.ndarray, "8"]:
         """The action (`features.ACTION`) for the next tick."""
@@ -200,18 +201,18 @@ class LoadedPolicy:
         return self.saved.check_task(config).env_config(config)
 
 
-def load_policy(name_or_path: str | Path, latency: int = 0) -> LoadedPolicy:
+def load_policy(name_or_path: str | Path, plan_ticks: int = 0) -> LoadedPolicy:
     """A policy to act with.
 
     Args:
         name_or_path: name of a shipped policy ("pick-place", "bead-maze"), or a folder that
             train-policy made.
-        latency: ticks that its plans come late, see `PolicyActor`.
+        plan_ticks: ticks that its plans come late, see `PolicyActor`.
 
     Raises:
         UserError: no such policy, or it is damaged.
     """
-    return LoadedPolicy(SavedPolicy(find_policy(name_or_path), latency))
+    return LoadedPolicy(SavedPolicy(find_policy(name_or_path), plan_ticks))
 
 
 def find_policy(name_or_path: str | Path) -> Path:

@@ -23,24 +23,24 @@ from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.policy import ObservationBatch, Policy
 
 
-@pytest.mark.parametrize("latency", [0, 1, 3])
-def test_an_actor_does_its_plans_in_order_and_on_time(latency: int) -> None:
+@pytest.mark.parametrize("plan_ticks", [0, 1, 3])
+def test_an_actor_does_its_plans_in_order_and_on_time(plan_ticks: int) -> None:
     touch = toy_touch_embedder()
     config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
     policy, ticks = toy_policy(config, toy_dataset(config)).eval(), toy_observations(8)
-    actor = PolicyActor(Planner(policy, touch, seed=5), latency)
+    actor = PolicyActor(Planner(policy, touch, seed=5), plan_ticks)
     done = [actor.act(dict(tick)) for tick in ticks]  # nobody else keeps them
     rows = np.stack([touch.embed_tick(tick, ticks[0]) for tick in ticks])
     states = np.stack([np.concatenate([tick[ft.STATE], tick[ft.TCP_POSE]]) for tick in ticks])
     generator, expected = torch_rng(5), []
     for asked in range(0, 8, 3):  # ticks on whose observation a plan is made
-        asked = max(asked - latency, 0)
+        asked = max(asked - plan_ticks, 0)
         seen = [max(asked - 1, 0), asked]
         batch = ObservationBatch(
             torch.from_numpy(rows[seen])[None], torch.from_numpy(states[seen])[None]
         )
         plan = policy.plan(batch, generator)[0].numpy()
-        first = latency if expected else 0
+        first = plan_ticks if expected else 0
         expected += list(plan[first : first + 3])
     np.testing.assert_allclose(done, expected[:8], rtol=1e-5)
 
@@ -53,7 +53,7 @@ def test_an_actor_refuses_what_it_cannot_do() -> None:
     with pytest.raises(UserError, match="encoder toy, this is another"):
         Planner(policy, TouchEmbedder(touch.encoder, "another"))
     with pytest.raises(UserError, match="5 ticks late"):
-        PolicyActor(Planner(policy, touch), latency=5)
+        PolicyActor(Planner(policy, touch), plan_ticks=5)
 
 
 class SlowPlanner(Planner):
@@ -107,7 +107,7 @@ def test_however_quick_the_machine_a_plan_is_done_from_the_tick_after_its_observ
     config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
     policy = toy_policy(config, toy_dataset(config)).eval()
     threaded = RealTimeActor(Planner(policy, touch), timeout=20.0)
-    plain = PolicyActor(Planner(policy, touch), latency=1)
+    plain = PolicyActor(Planner(policy, touch), plan_ticks=1)
     for i, tick in enumerate(toy_observations(10)):
         time.sleep(0.03 * (i % 3))
         np.testing.assert_array_equal(threaded.act(tick), plain.act(tick))

@@ -166,10 +166,10 @@ def test_learning_the_bead_maze(
     assert set(tried) == {"epoch-0001", "epoch-0002"}
     capsys.readouterr()
     run("run-policy", "--task", "bead-maze", "--policy", "policy/policy", "--episodes", 1, *one,
-        "--latency", 2, "--no-video", "--env.max-seconds", 1)  # fmt: skip
+        "--env.deployment.plan-ticks", 2, "--no-video", "--env.max-seconds", 1)  # fmt: skip
     assert "0/1" in capsys.readouterr().out
     run("benchmark", "bead-maze", "--policies", "policy/policy", "--wires", 1, "--held-out", 0,
-        "--demonstrations", 2, "--latencies", "--env.max-seconds", 3, *one)  # fmt: skip
+        "--demonstrations", 2, "--plan-ticks", "--env.max-seconds", 3, *one)  # fmt: skip
     printed = capsys.readouterr().out
     assert "frozen touch, 1 demos, shuffled" in printed and "zero motion" in printed
     run("benchmark", "policy-delay", "--policy", "expert", "--episodes", 1, "--delay", 0, "--jitter", 0, "--rates",

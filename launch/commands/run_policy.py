@@ -21,7 +21,7 @@ TRIALS = "trials.jsonl"
 
 def run_command(config: Config) -> None:
     """Run the episodes, print the table, film three of them."""
-    policy = choose_policy(config.policy, config.env, config.latency)
+    policy = choose_policy(config.policy, config.env)
     env = env_config_for(policy, config.env)
     specs = trial_specs(env, config.episodes, config.seed)
     out = open_run(config.out, "run-policy", config)
