@@ -188,7 +188,7 @@ class TactileRealismOptions(BenchmarkOptions):
     """Ways to part the presses into fitted and held-out ones; the median over them is printed."""
     sensors: tuple[Literal["gelsight", "gelsight_mini"], ...] = ("gelsight", "gelsight_mini")
     """Sensors whose presses are taken."""
-    presses: Path | None = None
+    save_presses: Path | None = None
     """Also write the real presses into this folder, as `touchgoal calibrate` reads them."""
 
 

@@ -51,8 +51,8 @@ def run(config: TactileRealismOptions) -> dict[str, Any]:
     examples: list[tuple[Colours, Colours]] = []
     for sensor in config.sensors:
         presses = real_presses(sensor)
-        if config.presses is not None:
-            write_presses(presses, config.presses / sensor)
+        if config.save_presses is not None:
+            write_presses(presses, config.save_presses / sensor)
         taxim = TaximRenderer(sensor) if has_jax() else None
         for seed in track(range(config.splits), sensor, "split"):
             train, test = split(presses, N_TEST_PRESSES[sensor], seed)

@@ -30,7 +30,7 @@ class Config:
     """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); a device needs it."""
     white_balance: Annotated[int, Field(ge=1000, le=15_000)] | None = None
     """White balance to lock, K; not given: as it is set."""
-    presses: Count = 2
+    presses_per_part: Count = 2
     """Presses wanted in each of the 12 parts of the picture."""
     port: Port = 8095
     """Where a browser on this computer finds the live picture."""

@@ -65,7 +65,7 @@ class Surfaces:
     """Sensor that is simulated: a name, or the folder of a sensor file."""
     surfaces: Annotated[int, Field(ge=16)] = 5000
     """Random surfaces."""
-    presses: Annotated[int, Field(ge=2)] = 4
+    presses_per_surface: Annotated[int, Field(ge=2)] = 4
     """Presses of each, on other units, places, turns and depths."""
     seed: Seed = 0
     """Random seed of surfaces, units and presses."""

@@ -24,7 +24,7 @@ TOY = {
     "reward-curves data/episodes": "--index 0",
     "train-encoder align": "--align.vit tiny --align.epochs 1 --align.batch-size 8 --normalizer-episodes 2",
     "train-encoder mae": "--frames 8 --mae.vit tiny --mae.epochs 1 --mae.batch-size 8",
-    "train-encoder surfaces": "--surfaces 16 --presses 2",
+    "train-encoder surfaces": "--surfaces 16 --presses-per-surface 2",
     "train-policy": "--head tiny --train.epochs 1 --trials 0 --workers 1",
     "twin": "--port 0 --lock-step",
     "deploy": "--yes",

@@ -31,7 +31,7 @@ def run_command(config: Config) -> None:
     if config.resume and config.out is None:
         raise UserError("to go on with a recording, name its folder with --out")
     model = SENSORS[config.sensor]
-    recorder = PressRecorder(model.image_shape, config.presses)
+    recorder = PressRecorder(model.image_shape, config.presses_per_part)
     if is_recorded(config.source):
         out = open_run(config.out, "record-presses", config, adds=config.resume)
         _record(recorded_frames(Path(config.source), model), recorder, None)
@@ -47,7 +47,7 @@ def run_command(config: Config) -> None:
     folder = out / "presses"
     earlier = len(list(folder.glob("press_*.png")))
     write_presses(recorder.presses(config.ball_mm * 1e-3, earlier), folder, adds=config.resume)
-    missing, every = int((config.presses - recorder.counts).clip(0).sum()), earlier + kept
+    missing, every = int((config.presses_per_part - recorder.counts).clip(0).sum()), earlier + kept
     print(f"{kept} presses kept, {missing} missing of the map; {every} in all: {folder}")
     if not config.calibrate:
         return

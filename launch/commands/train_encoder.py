@@ -49,7 +49,7 @@ def _fit_to_surfaces(config: Surfaces) -> None:
     sensor = find_sensor(config.sensor)
     name = load(sensor.sensor_file).sensor
     out = open_run(config.out, "train-encoder", config)
-    whitening = WhiteningConfig(config.surfaces, config.presses, config.seed)
+    whitening = WhiteningConfig(config.surfaces, config.presses_per_surface, config.seed)
     encoder = train(sensor, name, whitening)
     source = {"data": "simulated: random surfaces pressed", "simulated_sensor": config.sensor}
     save(encoder, out / "encoder", {**source, **asdict(whitening), **provenance()}, half=False)
