@@ -21,7 +21,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import Observation, Planner, PolicyActor
 from touchgoal.policies.by_name import follower
-from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy
+from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.evaluation import open_loop
 from touchgoal.policies.evaluation.evaluate import Trial, run_trials
 from touchgoal.policies.evaluation.open_loop import OpenLoopErrors, Plan, open_loop_errors
@@ -99,7 +99,7 @@ def run(config: BeadMazeOptions) -> dict[str, Any]:
     Returns:
         `table`, and the numbers behind it.
     """
-    config = replace(config, policies=config.policies or (SHIPPED["bead-maze"],))
+    config = replace(config, policies=config.policies or (SHIPPED_POLICIES["bead-maze"],))
     arms = _group_by_recipe(config.policies)
     with tempfile.TemporaryDirectory() as folder:
         recorded = _record(config, Path(folder) / "episodes")
@@ -119,7 +119,7 @@ def _group_by_recipe(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
         config = checkpoint.load(directory).config
         inputs = ["frozen touch"] * (config.touch_dim > 0)
         inputs += ["end-to-end touch"] * (config.end_to_end is not None)
-        episodes = checkpoint.POLICY.provenance(directory)["episodes"]
+        episodes = checkpoint.POLICY_FORMAT.provenance(directory)["episodes"]
         name = f"{' and '.join(inputs) or 'state only'}, {episodes} demos"
         if config.touch_dim and config.touch_input == "embedding":
             name += ", not taught by wrenches"

@@ -17,7 +17,7 @@ from touchgoal.benchmarks.speed import one_core
 from touchgoal.control import features as ft
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.policies import checkpoint
-from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy
+from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.diffusion import Diffusion, DiffusionConfig
 from touchgoal.policies.heads.unet import PRESETS
@@ -59,7 +59,7 @@ def run(config: PolicyLatencyOptions) -> dict[str, Any]:
 
 
 def _stages(config: PolicyLatencyOptions) -> list[Stage]:
-    folder = config.policy or SHIPPED["bead-maze"]
+    folder = config.policy or SHIPPED_POLICIES["bead-maze"]
     maker = SavedPolicy(folder)
     planner = maker.planner()
     policy = checkpoint.load(folder)

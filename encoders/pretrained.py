@@ -16,8 +16,10 @@ from touchgoal.encoders.towers.towers import same_towers
 from touchgoal.encoders.training.weights import WeightsFormat
 
 _WEIGHTS = Path(__file__).parent / "weights"
-SHIPPED = _WEIGHTS / "gelsight_mini_offline"
-ENCODER = WeightsFormat("encoder", "touch encoder", "train one with: touchgoal train-encoder")
+DEFAULT_ENCODER = _WEIGHTS / "gelsight_mini_offline"
+ENCODER_FORMAT = WeightsFormat(
+    "encoder", "touch encoder", "train one with: touchgoal train-encoder"
+)
 
 
 def save(
@@ -36,18 +38,18 @@ def save(
     """
     dtype = torch.float16 if half else torch.float32
     weights = {name: w.detach().cpu().to(dtype) for name, w in encoder.state_dict().items()}
-    ENCODER.save(directory, weights, asdict(encoder.config), provenance)
+    ENCODER_FORMAT.save(directory, weights, asdict(encoder.config), provenance)
 
 
 def shipped_encoder_for(sensor: str | None) -> Path:
-    """The encoder that ships for a sensor, on the offline towers; `SHIPPED` if it is unknown.
+    """The encoder that ships for a sensor, on the offline towers; `DEFAULT_ENCODER` if it is unknown.
 
     Raises:
         UserError: none ships.
     """
-    directory = _WEIGHTS / f"{sensor}_offline" if sensor else SHIPPED
+    directory = _WEIGHTS / f"{sensor}_offline" if sensor else DEFAULT_ENCODER
     if not directory.is_dir():
-        raise UserError(f"no touch encoder ships for {sensor}: {ENCODER.remedy}")
+        raise UserError(f"no touch encoder ships for {sensor}: {ENCODER_FORMAT.remedy}")
     return directory
 
 
@@ -57,7 +59,7 @@ def load_aligned(
     """Reads an encoder for inference, as float32 on the CPU.
 
     Args:
-        directory: What `save` wrote, e.g. `SHIPPED`.
+        directory: What `save` wrote, e.g. `DEFAULT_ENCODER`.
         sensor: Name of the sensor it is meant for, if that matters here.
         towers: `Towers.name` it is meant for, if that matters here.
 
@@ -65,7 +67,7 @@ def load_aligned(
         UserError: Nothing there, damaged, or not made for this sensor, these towers or this
             version of the preprocessor.
     """
-    config = ENCODER.read_config(directory, _aligned_config)
+    config = ENCODER_FORMAT.read_config(directory, _aligned_config)
     if towers is not None and not same_towers(towers, config.towers):
         raise UserError(
             f"the encoder in {directory} was trained with the towers {config.towers}, not {towers}: "
@@ -73,25 +75,25 @@ def load_aligned(
         )
     _check_sensor(config, directory, sensor)
     encoder = TouchEncoder(config)
-    ENCODER.load_weights(encoder, directory)
+    ENCODER_FORMAT.load_weights(encoder, directory)
     return encoder
 
 
 def load_touch_backbone(directory: Path, sensor: str | None = None) -> TouchBackbone:
     """Reads a self-supervised backbone for inference, as float32 on the CPU; UserError as `load_aligned`."""
-    config = ENCODER.read_config(directory, _backbone_config)
+    config = ENCODER_FORMAT.read_config(directory, _backbone_config)
     _check_sensor(config, directory, sensor)
     encoder = TouchBackbone(config)
-    ENCODER.load_weights(encoder, directory)
+    ENCODER_FORMAT.load_weights(encoder, directory)
     return encoder
 
 
 def load_pooled(directory: Path, sensor: str | None = None) -> PooledEncoder:
     """Reads a whitened ImageNet network for inference, on the CPU; UserError as `load_aligned`."""
-    config = ENCODER.read_config(directory, lambda fields: PooledEncoderConfig(**fields))
+    config = ENCODER_FORMAT.read_config(directory, lambda fields: PooledEncoderConfig(**fields))
     _check_sensor(config, directory, sensor)
     encoder = PooledEncoder(config)
-    ENCODER.load_weights(encoder, directory)
+    ENCODER_FORMAT.load_weights(encoder, directory)
     return encoder
 
 
@@ -115,7 +117,7 @@ def find_encoder(name_or_path: str | Path) -> Path:
         if (directory / "encoder.json").is_file():
             return directory
     if Path(name).is_dir():
-        raise UserError(f"no touch encoder in {name}: {ENCODER.remedy}")
+        raise UserError(f"no touch encoder in {name}: {ENCODER_FORMAT.remedy}")
     raise UserError(
         f"there is no touch encoder '{name}': give the folder of one, or a name of those that "
         f"ship: {', '.join(encoder_names())}"
@@ -132,7 +134,7 @@ def load_encoder(name_or_path: str | Path) -> TouchEncoder | TouchBackbone | Poo
         UserError: no such encoder, or as `load_aligned`.
     """
     directory = find_encoder(name_or_path)
-    config = ENCODER.read_json(directory).get("config", {})
+    config = ENCODER_FORMAT.read_json(directory).get("config", {})
     if "features" in config:
         return load_pooled(directory)
     return load_aligned(directory) if "towers" in config else load_touch_backbone(directory)
@@ -145,14 +147,14 @@ def _check_sensor(
 ) -> None:
     if sensor is not None and sensor != config.sensor:
         raise UserError(
-            f"the encoder in {directory} is for {config.sensor}, not {sensor}: {ENCODER.remedy}"
+            f"the encoder in {directory} is for {config.sensor}, not {sensor}: {ENCODER_FORMAT.remedy}"
         )
     steady = isinstance(config, PooledEncoderConfig)
     current = (steady_preprocessor_for if steady else preprocessor_for)(config.sensor).id
     if config.preprocessor != current:
         raise UserError(
             f"the encoder in {directory} needs the preprocessor {config.preprocessor}, this is "
-            f"{current}: {ENCODER.remedy}"
+            f"{current}: {ENCODER_FORMAT.remedy}"
         )
 
 

@@ -80,17 +80,19 @@ def towers() -> CheckResult:
 
 def weights() -> CheckResult:
     """The shipped touch encoder and the normalizer of its costs."""
-    from touchgoal.encoders.pretrained import ENCODER, SHIPPED, load_aligned
+    from touchgoal.encoders.pretrained import DEFAULT_ENCODER, ENCODER_FORMAT, load_aligned
     from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
 
     try:
-        encoder = load_aligned(SHIPPED)
-        DistanceNormalizer.load(SHIPPED / NORMALIZER)
+        encoder = load_aligned(DEFAULT_ENCODER)
+        DistanceNormalizer.load(DEFAULT_ENCODER / NORMALIZER)
     except UserError as error:
-        return CheckResult("touch encoder", False, SHIPPED.name, str(error))
+        return CheckResult("touch encoder", False, DEFAULT_ENCODER.name, str(error))
     count = sum(p.numel() for p in encoder.parameters()) / 1e6
-    trained = ENCODER.provenance(SHIPPED).get("episodes", "?")
-    return CheckResult("touch encoder", True, f"{SHIPPED.name}, {count:.1f} M, {trained} episodes")
+    trained = ENCODER_FORMAT.provenance(DEFAULT_ENCODER).get("episodes", "?")
+    return CheckResult(
+        "touch encoder", True, f"{DEFAULT_ENCODER.name}, {count:.1f} M, {trained} episodes"
+    )
 
 
 def cameras() -> CheckResult:

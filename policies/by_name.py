@@ -26,7 +26,7 @@ import numpy as np
 
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import Actor
-from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy, find_policy, suggestion
+from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy, find_policy, suggestion
 from touchgoal.policies.follower import WireFollower
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.config import TaskConfig, TaskName
@@ -36,7 +36,7 @@ BUILT_IN = {
     "expert": "the task's expert, which sees the simulator's state",
     "follower": "bead-maze: the classical one, which feels the force on the hand",
     "shipped": "the policy that ships for the task",
-    **{name: f"the policy that ships for {name}" for name in SHIPPED},
+    **{name: f"the policy that ships for {name}" for name in SHIPPED_POLICIES},
 }
 """Names of policies, and what they are."""
 
@@ -126,7 +126,7 @@ def choose_policy(name: str | Path, task: TaskConfig) -> PolicyMaker:
     if (own := find_own(chosen)) is not None:
         return own
     if chosen == "shipped":
-        return SavedPolicy(SHIPPED[where]).check_task(task)
+        return SavedPolicy(SHIPPED_POLICIES[where]).check_task(task)
     try:
         folder = find_policy(chosen)
     except UserError as error:

@@ -36,10 +36,10 @@ from touchgoal.sim_envs.tasks import task_name
 
 TOUCH, ESTIMATOR = "touch", "estimator"  # folders beside a policy's weights
 _WEIGHTS = Path(__file__).parent / "weights"
-SHIPPED = {"pick-place": _WEIGHTS / "pick_place", "bead-maze": _WEIGHTS / "bead_maze"}
+SHIPPED_POLICIES = {"pick-place": _WEIGHTS / "pick_place", "bead-maze": _WEIGHTS / "bead_maze"}
 """The shipped policies: each is named after its task."""
 Task = TypeVar("Task", bound=EnvConfig)
-POLICY = WeightsFormat("policy", "policy", "train one with: touchgoal train-policy")
+POLICY_FORMAT = WeightsFormat("policy", "policy", "train one with: touchgoal train-policy")
 
 
 def save(policy: Policy, directory: Path, provenance: dict[str, Any]) -> None:
@@ -56,7 +56,7 @@ def save(policy: Policy, directory: Path, provenance: dict[str, Any]) -> None:
     weights = {name: tensor.detach().cpu() for name, tensor in policy.state_dict().items()}
     for name, _ in policy.named_parameters():
         weights[name] = weights[name].half()
-    POLICY.save(directory, weights, asdict(policy.config), provenance)
+    POLICY_FORMAT.save(directory, weights, asdict(policy.config), provenance)
 
 
 def load(directory: Path, control_hz: int | None = None) -> Policy:
@@ -69,14 +69,14 @@ def load(directory: Path, control_hz: int | None = None) -> Policy:
     Raises:
         UserError: nothing there, damaged, or made for another rate.
     """
-    config = POLICY.read_config(directory, _config)
+    config = POLICY_FORMAT.read_config(directory, _config)
     if control_hz is not None and control_hz != config.control_hz:
         raise UserError(
             f"the policy in {directory} acts at {config.control_hz} Hz, not {control_hz}: run it "
-            f"at its own rate, or {POLICY.remedy}"
+            f"at its own rate, or {POLICY_FORMAT.remedy}"
         )
     policy = Policy(config)
-    POLICY.load_weights(policy, directory)
+    POLICY_FORMAT.load_weights(policy, directory)
     return policy
 
 
@@ -217,15 +217,15 @@ def load_policy(name_or_path: str | Path, plan_ticks: int = 0) -> LoadedPolicy:
 
 def find_policy(name_or_path: str | Path) -> Path:
     """Folder of a shipped policy, by its name, or of one on disk; UserError if there is none."""
-    if str(name_or_path) in SHIPPED:
-        return SHIPPED[str(name_or_path)]
+    if str(name_or_path) in SHIPPED_POLICIES:
+        return SHIPPED_POLICIES[str(name_or_path)]
     for folder in (Path(name_or_path), Path(name_or_path) / "policy"):  # train-policy's --out, too
-        if POLICY.weights_path(folder).is_file():
+        if POLICY_FORMAT.weights_path(folder).is_file():
             return folder
     raise UserError(f"there is no policy {str(name_or_path)!r}: {suggestion(str(name_or_path))}")
 
 
-def suggestion(name: str, names: tuple[str, ...] = tuple(SHIPPED)) -> str:
+def suggestion(name: str, names: tuple[str, ...] = tuple(SHIPPED_POLICIES)) -> str:
     """The end of a message about an unknown policy: what was meant perhaps, and what there is."""
     close = get_close_matches(name, names, 1)
     guess = f"did you mean {close[0]}? " if close else ""

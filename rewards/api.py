@@ -155,5 +155,5 @@ def _array_specs(goal: Mapping[str, np.ndarray], episode: Episode) -> list[GoalS
 def _touch_encoder(encoder: str | Path | TouchEncoder | None) -> TouchEncoder:
     if isinstance(encoder, TouchEncoder):
         return encoder
-    found = pretrained.SHIPPED if encoder is None else pretrained.find_encoder(encoder)
+    found = pretrained.DEFAULT_ENCODER if encoder is None else pretrained.find_encoder(encoder)
     return pretrained.load_aligned(found)

@@ -73,7 +73,7 @@ def prepare(
         return Setup(source, goal, embedder, given, f"normalizer: {normalizer}")
     if normalizer == "none":
         return Setup(source, goal, embedder, None, "normalizer: none, raw cosine distances")
-    path = (folder or pretrained.SHIPPED) / NORMALIZER
+    path = (folder or pretrained.DEFAULT_ENCODER) / NORMALIZER
     if not path.is_file() and (older := path.with_name("scale.json")).is_file():
         raise UserError(f"{older} is called {NORMALIZER} now: mv {older} {path}")
     if not path.is_file():

@@ -246,7 +246,7 @@ def test_what_is_returned_is_what_is_saved(tmp_path: Path) -> None:
     )
     saved = pretrained.load_aligned(tmp_path / "encoder", sensor="gelsight_mini", towers="fake")
     assert torch.equal(weights(saved), weights(encoder))
-    provenance = pretrained.ENCODER.provenance(tmp_path / "encoder")
+    provenance = pretrained.ENCODER_FORMAT.provenance(tmp_path / "encoder")
     assert (
         provenance["data"] == "toy"
         and provenance["seed"] == 0

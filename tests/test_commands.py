@@ -96,7 +96,7 @@ def test_train_encoder_then_use_it(episodes: Path, tmp_path: Path) -> None:
     validation = shutil.copytree(episodes, tmp_path / "validation")
     run("train-encoder", "align", "--data", episodes, "--validation", validation, "--out", out,
         "--align.vit", "tiny", "--align.epochs", 12, "--align.batch-size", 32)  # fmt: skip
-    kept = pretrained.ENCODER.provenance(out / "encoder")
+    kept = pretrained.ENCODER_FORMAT.provenance(out / "encoder")
     assert kept["data"]["train"]["episodes"] == 2 and kept["command"].startswith("touchgoal")
     run("reward-curves", episodes, "--encoder", out / "encoder", "--out", tmp_path / "curves")
     report = json.loads((tmp_path / "curves" / "episode_001.json").read_text())
@@ -285,7 +285,7 @@ def test_wrong_encoder_for_the_sensor(
     episodes: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     other = tmp_path / "encoder"
-    shutil.copytree(pretrained.SHIPPED, other)
+    shutil.copytree(pretrained.DEFAULT_ENCODER, other)
     text = (other / "encoder.json").read_text()
     (other / "encoder.json").write_text(text.replace("gelsight_mini", "digit"))
     out = tmp_path / "out"

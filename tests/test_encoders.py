@@ -246,7 +246,7 @@ def test_saved_encoder_is_the_same(tmp_path: Path) -> None:
     full = pretrained.load_aligned(tmp_path / "full", sensor="gelsight_mini", towers="fake")
     assert torch.equal(full.embed_touch(touch), encoder.embed_touch(touch))
     assert full.config == encoder.config and not full.training
-    assert pretrained.ENCODER.provenance(tmp_path / "full") == {"seed": 3}
+    assert pretrained.ENCODER_FORMAT.provenance(tmp_path / "full") == {"seed": 3}
 
     pretrained.save(encoder, tmp_path / "half", {})
     half = pretrained.load_aligned(tmp_path / "half")
@@ -361,8 +361,8 @@ def test_embed_takes_one_picture_or_many() -> None:
 def test_encoders_are_found_by_name_or_path(tmp_path: Path) -> None:
     shipped = pretrained.load_encoder("gelsight_mini")
     assert shipped.config.sensor == "gelsight_mini"
-    assert pretrained.find_encoder("gelsight_mini_offline") == pretrained.SHIPPED
-    assert pretrained.find_encoder(pretrained.SHIPPED) == pretrained.SHIPPED
+    assert pretrained.find_encoder("gelsight_mini_offline") == pretrained.DEFAULT_ENCODER
+    assert pretrained.find_encoder(pretrained.DEFAULT_ENCODER) == pretrained.DEFAULT_ENCODER
     with pytest.raises(UserError, match="there is no touch encoder 'gelsigt': .*gelsight_mini_off"):
         pretrained.load_encoder("gelsigt")
     with pytest.raises(UserError, match="no touch encoder in"):

@@ -37,7 +37,7 @@ def test_the_mean_of_the_tokens_learns_where_and_how_strong(tmp_path: Path) -> N
     train, val = blobs(256, 0), blobs(64, 1)
     config = replace(TOY, epochs=8)
     backbone = train_mae(train, val, config, tmp_path, RunOptions(), {"data": "toy"})
-    metrics = pretrained.ENCODER.provenance(tmp_path / "encoder")["metrics"]
+    metrics = pretrained.ENCODER_FORMAT.provenance(tmp_path / "encoder")["metrics"]
     assert metrics["validation_loss"] < metrics["validation_loss_of_blank"]
     assert min(metrics[f"force_{axis}_r2"] for axis in "xyz") > 0.8
     frames = np.full((2, 120, 160, 3), 100, np.uint8)
@@ -121,4 +121,4 @@ def test_an_encoder_of_the_other_kind_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="is damaged"):
         pretrained.load_aligned(tmp_path)
     with pytest.raises(UserError, match="is damaged"):
-        pretrained.load_touch_backbone(pretrained.SHIPPED)
+        pretrained.load_touch_backbone(pretrained.DEFAULT_ENCODER)

@@ -219,7 +219,7 @@ def test_a_killed_training_ends_as_an_uninterrupted_one(
     assert (tmp_path / "whole/snapshots/epoch-0002/policy.json").is_file()
     lines = [(tmp_path / run / "metrics.jsonl").read_text() for run in ("whole", "killed")]
     assert lines[0] == lines[1] and len(lines[0].splitlines()) == 3
-    provenance = checkpoint.POLICY.provenance(tmp_path / "whole/policy")
+    provenance = checkpoint.POLICY_FORMAT.provenance(tmp_path / "whole/policy")
     assert provenance["data"] == "toy" and provenance["seed"] == 4
     assert math.isfinite(provenance["metrics"]["validation_error"])
 

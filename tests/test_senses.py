@@ -19,7 +19,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.encoders.config import RunOptions
 from touchgoal.policies.acting import Planner
-from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy
+from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.config import EstimatorTrainConfig, PoseEstimatorConfig
 from touchgoal.policies.perception.placements import Placements
 from touchgoal.policies.perception.proprioception import network_input
@@ -147,8 +147,8 @@ def test_a_rearrangement_is_a_beginning() -> None:
     assert np.linalg.norm(observation[ft.TCP_POSE][:3] - [0.45, 0, 0.26]) < 0.06
 
 
-@pytest.mark.parametrize("task", SHIPPED)
+@pytest.mark.parametrize("task", SHIPPED_POLICIES)
 def test_what_ships_fits_its_task(task: str) -> None:
     config = BeadMazeConfig() if task == "bead-maze" else PickPlaceConfig()
-    maker = SavedPolicy(SHIPPED[task]).check_task(config)
+    maker = SavedPolicy(SHIPPED_POLICIES[task]).check_task(config)
     assert maker.env_config(config).tactile

@@ -9,7 +9,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.launch.__main__ import read_options
 from touchgoal.launch.make_policy import Config
 from touchgoal.launch.run_folder import open_run, write_json
-from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED, TOUCH
+from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES, TOUCH
 
 RECIPE = "recipe.json"
 
@@ -62,7 +62,9 @@ def _run(step: list[str]) -> None:
 def _pick_place(config: Config, out: Path) -> list[list[str]]:
     """A regression of the feedback expert, corrected where it has got to by itself."""
     wired = [*_BLIND, *_DEPLOYED]
-    estimator = config.touch / "estimator" if config.touch else SHIPPED["pick-place"] / ESTIMATOR
+    estimator = (
+        config.touch / "estimator" if config.touch else SHIPPED_POLICIES["pick-place"] / ESTIMATOR
+    )
     learn = shlex.split(
         "--task pick-place --head regression --representation base_twist --position-noise 0 "
         "--arm-state commanded "
@@ -86,7 +88,7 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
 
 def _bead_maze(config: Config, out: Path) -> list[list[str]]:
     """A diffusion policy of what a regression, which learns fast, has gathered corrections with."""
-    encoder = config.touch / "encoder" if config.touch else SHIPPED["bead-maze"] / TOUCH
+    encoder = config.touch / "encoder" if config.touch else SHIPPED_POLICIES["bead-maze"] / TOUCH
     learn = shlex.split(
         "--representation body_twist --arm-state commanded --train.lr 1e-3 --env.start-angle 10"
     )

@@ -42,7 +42,7 @@ def run_command(config: Config) -> None:
     """Place, embed, train, judge."""
     check_training(config.run, config.out, _CONTACT)
     sets = open_sets(config.data, config.validation)
-    encoder = config.encoder or pretrained.SHIPPED
+    encoder = config.encoder or pretrained.DEFAULT_ENCODER
     touch = load_touch(encoder)
     out = open_training(config, "train-estimators")
     torch.manual_seed(config.seed)
@@ -74,7 +74,7 @@ def run_command(config: Config) -> None:
     )
     errors |= pose_errors(network.pose_estimator, others)
     save_estimator(network, out / "estimator", provenance | {"errors": errors})
-    if encoder.resolve() != pretrained.SHIPPED.resolve():
+    if encoder.resolve() != pretrained.DEFAULT_ENCODER.resolve():
         shutil.copytree(encoder, out / "estimator" / "touch", dirs_exist_ok=True)
     write_json(out / "metrics.json", errors)
     print(f"contact: {errors['contact']:.2%} of ticks misread")

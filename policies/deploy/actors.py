@@ -13,7 +13,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.policies.acting import Observation
 from touchgoal.policies.by_name import OwnPolicy, find_own
-from touchgoal.policies.checkpoint import SHIPPED, SavedPolicy, find_policy
+from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy, find_policy
 from touchgoal.policies.deploy.control_loop import DeployedActor
 from touchgoal.policies.deploy.realtime import ChunkPlanner, RealTimeActor
 from touchgoal.policies.deploy.scripted import PickPlacePoses, pick_and_place
@@ -122,7 +122,7 @@ def load_cell_policy(cell: CellConfig) -> CellPolicy | None:
         planner, needed = OwnPlanner(own()), own.env_config(task)
     else:
         shipped = cell.task.policy == "shipped"
-        directory = SHIPPED[cell.task.name] if shipped else find_policy(cell.task.policy)
+        directory = SHIPPED_POLICIES[cell.task.name] if shipped else find_policy(cell.task.policy)
         planner, needed = SavedPolicy(directory).planner_for(task)
     if needed.tactile and cell.fingertips is None:
         raise UserError("the policy feels with fingertips, the cell has none: add [fingertips]")

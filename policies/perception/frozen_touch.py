@@ -56,7 +56,7 @@ def load_touch(name_or_path: str | Path) -> TouchEmbedder:
     """
     directory = pretrained.find_encoder(name_or_path)
     encoder = pretrained.load_encoder(directory)
-    digest = hashlib.sha256(pretrained.ENCODER.weights_path(directory).read_bytes()).hexdigest()[
-        :12
-    ]
+    digest = hashlib.sha256(
+        pretrained.ENCODER_FORMAT.weights_path(directory).read_bytes()
+    ).hexdigest()[:12]
     return TouchEmbedder(encoder, f"{encoder.config.preprocessor}/{digest}")

@@ -23,7 +23,9 @@ from touchgoal.policies.config import PoseEstimatorConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
 from touchgoal.policies.perception.pose_estimator import PoseEstimator
 
-ESTIMATOR = WeightsFormat("estimator", "estimator", "train one with: touchgoal train-estimators")
+ESTIMATOR_FORMAT = WeightsFormat(
+    "estimator", "estimator", "train one with: touchgoal train-estimators"
+)
 ESTIMATED = (ft.TRUTH_CONTACT, ft.TRUTH_START)
 
 
@@ -117,7 +119,7 @@ def save_estimator(
     weights = {name: tensor.detach().cpu() for name, tensor in network.state_dict().items()}
     for name, _ in network.named_parameters():
         weights[name] = weights[name].half()
-    ESTIMATOR.save(directory, weights, asdict(network.config), provenance)
+    ESTIMATOR_FORMAT.save(directory, weights, asdict(network.config), provenance)
 
 
 def load_estimator(directory: Path) -> StateEstimator:
@@ -128,10 +130,10 @@ def load_estimator(directory: Path) -> StateEstimator:
     Raises:
         UserError: nothing there, damaged, or another touch encoder than the training's.
     """
-    network = StateEstimatorNetwork(ESTIMATOR.read_config(directory, _config))
-    ESTIMATOR.load_weights(network, directory)
+    network = StateEstimatorNetwork(ESTIMATOR_FORMAT.read_config(directory, _config))
+    ESTIMATOR_FORMAT.load_weights(network, directory)
     own = directory / "touch"
-    return StateEstimator(network, load_touch(own if own.is_dir() else pretrained.SHIPPED))
+    return StateEstimator(network, load_touch(own if own.is_dir() else pretrained.DEFAULT_ENCODER))
 
 
 def _config(fields: dict[str, Any]) -> StateEstimatorConfig:

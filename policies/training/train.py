@@ -20,7 +20,7 @@ from touchgoal.policies.config import TrainConfig
 from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
-POLICY, SNAPSHOTS = "policy", "snapshots"
+POLICY, SNAPSHOTS = "policy", "snapshots"  # folders of a run
 
 
 def train(
