@@ -45,8 +45,8 @@ PolicyMaker = Callable[[Any], Actor]
 
 
 @runtime_checkable
-class OwnPolicy(Protocol):
-    """A policy of one's own."""
+class UserPolicy(Protocol):
+    """What a user's own policy is to the rest: two methods."""
 
     def reset(self) -> None:
         """An episode begins."""
@@ -69,7 +69,7 @@ class ImportedPolicy:
     module: str
     attribute: str
 
-    def __call__(self, env: object = None) -> OwnPolicy:
+    def __call__(self, env: object = None) -> UserPolicy:
         """One for an episode."""
         policy = self.load()()
         policy.reset()
@@ -77,9 +77,9 @@ class ImportedPolicy:
 
     def env_config(self, config: TaskConfig) -> TaskConfig:
         """Options of the environment that the policy asks for, if it does."""
-        return own_env_config(self.load()(), config)
+        return preferred_env_config(self.load()(), config)
 
-    def load(self) -> Callable[[], OwnPolicy]:
+    def load(self) -> Callable[[], UserPolicy]:
         """The class; UserError if there is none, or it lacks a method."""
         module = _import_file(Path(self.module)) if self._is_file else _import(self.module)
         found = getattr(module, self.attribute, None)
@@ -123,8 +123,8 @@ def choose_policy(name: str | Path, task: TaskConfig) -> PolicyMaker:
         if where != "bead-maze":
             raise UserError("the follower is for the bead maze; add: --task bead-maze")
         return follower
-    if (own := find_own(chosen)) is not None:
-        return own
+    if (found := find_user_policy(chosen)) is not None:
+        return found
     if chosen == "shipped":
         return SavedPolicy(SHIPPED_POLICIES[where]).check_task(task)
     try:
@@ -141,7 +141,7 @@ def choose_policy(name: str | Path, task: TaskConfig) -> PolicyMaker:
     return SavedPolicy(folder).check_task(task)
 
 
-def find_own(name: str) -> ImportedPolicy | None:
+def find_user_policy(name: str) -> ImportedPolicy | None:
     """A policy of one's own, named `module:Class` or `file.py:Class`; None of any other name.
 
     UserError if the class is not there, or lacks a method.
@@ -149,20 +149,20 @@ def find_own(name: str) -> ImportedPolicy | None:
     module, colon, attribute = name.rpartition(":")
     if not colon or not attribute.isidentifier():
         return None
-    own = ImportedPolicy(module, attribute)
-    own.load()
-    return own
+    policy = ImportedPolicy(module, attribute)
+    policy.load()
+    return policy
 
 
 def env_config_for(policy: PolicyMaker, config: TaskConfig) -> TaskConfig:
     """The task's options with the pictures that the policy looks at: no others are rendered."""
     if policy in (make_expert, follower):
         return replace(config, tactile=False, cameras=())
-    return own_env_config(policy, config)
+    return preferred_env_config(policy, config)
 
 
-def own_env_config(policy: object, config: TaskConfig) -> TaskConfig:
-    """What a policy's `env_config` makes of the options; without one they stay."""
+def preferred_env_config(policy: object, config: TaskConfig) -> TaskConfig:
+    """The options that a policy prefers: what its `env_config` makes of them; without one they stay."""
     make = getattr(policy, "env_config", None)
     return config if make is None else make(config)
 
@@ -183,7 +183,7 @@ def _import_file(path: Path) -> Any:
     path = path.resolve()
     if not path.is_file():
         raise UserError(f"there is no file {path} to take the policy from")
-    name = f"touchgoal_own_{path.stem}"
+    name = f"touchgoal_user_{path.stem}"
     known = sys.modules.get(name)
     if known is not None and known.__file__ == str(path):
         return known

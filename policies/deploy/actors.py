@@ -12,7 +12,7 @@ from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.policies.acting import Observation
-from touchgoal.policies.by_name import OwnPolicy, find_own
+from touchgoal.policies.by_name import UserPolicy, find_user_policy
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy, find_policy
 from touchgoal.policies.deploy.control_loop import DeployedActor
 from touchgoal.policies.deploy.realtime import ChunkPlanner, RealTimeActor
@@ -79,12 +79,12 @@ class _EveryTick:
     control_hz: int = ft.CONTROL_HZ
 
 
-class OwnPlanner:
+class UserPolicyPlanner:
     """A policy of one's own as plans of one tick, so that the loop never waits for a slow one."""
 
     config = _EveryTick()
 
-    def __init__(self, policy: OwnPolicy) -> None:
+    def __init__(self, policy: UserPolicy) -> None:
         self._policy = policy
 
     def embed(self, seen: Sequence[Observation]) -> None:
@@ -118,8 +118,8 @@ def load_cell_policy(cell: CellConfig) -> CellPolicy | None:
         raise UserError("the policy commands the seven joints of an FR3, not a UR5e's: use expert")
     # Cameras send larger pictures than are recorded and, if a policy asks for nothing else, observed.
     task = replace(env_config_of(cell), camera_size=ft.CAMERA_SHAPE[:2])
-    if (own := find_own(cell.task.policy)) is not None:
-        planner, needed = OwnPlanner(own()), own.env_config(task)
+    if (found := find_user_policy(cell.task.policy)) is not None:
+        planner, needed = UserPolicyPlanner(found()), found.env_config(task)
     else:
         shipped = cell.task.policy == "shipped"
         directory = SHIPPED_POLICIES[cell.task.name] if shipped else find_policy(cell.task.policy)

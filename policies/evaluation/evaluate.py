@@ -18,11 +18,11 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.progress import track
 from touchgoal.episodes.recording import EpisodeSpec, one_core_workers, run
 from touchgoal.policies.by_name import (
-    OwnPolicy,
     PolicyMaker,
+    UserPolicy,
     choose_policy,
     env_config_for,
-    own_env_config,
+    preferred_env_config,
 )
 from touchgoal.policies.checkpoint import LoadedPolicy
 from touchgoal.policies.evaluation.success_rate import SuccessRate
@@ -87,7 +87,7 @@ class Evaluation:
 
 
 def evaluate(
-    policy: str | Path | LoadedPolicy | OwnPolicy | type,
+    policy: str | Path | LoadedPolicy | UserPolicy | type,
     task: str | TaskConfig = "pick-place",
     *,
     episodes: int = 20,
@@ -117,7 +117,7 @@ def evaluate(
     elif isinstance(policy, str | Path):
         maker = choose_policy(policy, config)
     else:
-        maker = _Own(policy)
+        maker = _UserPolicyMaker(policy)
     config = env_config_for(maker, config)
     specs = trial_specs(config, episodes, seed)
     return Evaluation(tuple(run_trials(config, maker, specs, workers)))
@@ -199,18 +199,18 @@ def _task_config(task: str | TaskConfig) -> TaskConfig:
 
 
 @dataclass(frozen=True)
-class _Own:
+class _UserPolicyMaker:
     """Makes actors of a class or an object of one's own."""
 
     policy: Any
 
-    def __call__(self, env: object = None) -> OwnPolicy:
+    def __call__(self, env: object = None) -> UserPolicy:
         policy = self._object()
         policy.reset()
         return policy
 
     def env_config(self, config: TaskConfig) -> TaskConfig:
-        return own_env_config(self._object(), config)
+        return preferred_env_config(self._object(), config)
 
-    def _object(self) -> OwnPolicy:
+    def _object(self) -> UserPolicy:
         return self.policy() if isinstance(self.policy, type) else self.policy

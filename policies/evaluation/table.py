@@ -22,8 +22,8 @@ def table(trials: Sequence[Trial]) -> str:
         if some:
             lines.append(_row(group, some, placed))
     if placed:
-        facts = [t.episode for t in trials]
-        masses, forces = [f["mass"] for f in facts], [f["grasp_force"] for f in facts]
+        episodes = [t.episode for t in trials]
+        masses, forces = [e["mass"] for e in episodes], [e["grasp_force"] for e in episodes]
         lines.append(
             f"masses {1e3 * min(masses):.0f} to {1e3 * max(masses):.0f} g, "
             f"grasp forces {min(forces):.1f} to {max(forces):.1f} N"

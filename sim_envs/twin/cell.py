@@ -225,7 +225,7 @@ class SimulatedCell:
             "failures": sorted(self.failures),
             "layout": self.env.scene_layout(),
             "pad_forces": [pad.normal_force for pad in self.env.pad_contacts()],
-            "facts": self.env.episode_info(),
+            "episode_info": self.env.episode_info(),
             "q": self.q.tolist(),
             "dq": self.dq.tolist(),
             "q_d": self.q_d.tolist(),
