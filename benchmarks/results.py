@@ -18,9 +18,9 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from touchgoal.benchmarks.hardware import hardware
 from touchgoal.benchmarks.quoted import QUOTED
 from touchgoal.control.errors import UserError
+from touchgoal.control.provenance import hardware
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "benchmarks" / "results"
