@@ -114,6 +114,16 @@ class MotionOptions(BenchmarkOptions):
 
 
 @checked_dataclass
+class SentStreamOptions(BenchmarkOptions):
+    """Does what is sent to the arm stay inside the box and every limit, whatever a policy says?"""
+
+    seconds: Positive = 3600.0
+    """Simulated seconds of motion, over both arms, 20, 50 and 125 Hz; an hour takes about 8 minutes."""
+    seed: Seed = 0
+    """Random seed of what the policy wants."""
+
+
+@checked_dataclass
 class PolicyDelayOptions(BenchmarkOptions):
     """How often does a policy succeed when everything comes late?"""
 

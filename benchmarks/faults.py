@@ -224,7 +224,7 @@ def _deploy(
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, _UNLIMITED))
     makers: dict[str, Callable[[ControlLoop], DeployedActor]] = {
         "expert": expert,
-        "hangs": lambda d: LearnedActor(HangingPlanner(d.width, mark_broken)),
+        "hangs": lambda d: LearnedActor(HangingPlanner(d.width, mark_broken), connection.robot),
     }
     make = makers.get(case.policy, lambda d: BrokenPolicy(case.policy, d, mark_broken))
     result = session(make, 10.0 if case.policy == "outwards" else 40.0).run()

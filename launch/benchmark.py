@@ -21,6 +21,7 @@ BENCHMARKS: dict[str, type[options.BenchmarkOptions]] = {
     "policy-latency": options.PolicyLatencyOptions,
     "real-touch": options.RealTouchOptions,
     "reward-quality": options.RewardQualityOptions,
+    "sent-stream": options.SentStreamOptions,
     "tactile-realism": options.TactileRealismOptions,
     "tactile-speed": options.TactileSpeedOptions,
     "touch-probes": options.TouchProbesOptions,
@@ -37,6 +38,7 @@ Config = (
     | Annotated[options.PolicyLatencyOptions, tyro.conf.subcommand("policy-latency")]
     | Annotated[options.RealTouchOptions, tyro.conf.subcommand("real-touch")]
     | Annotated[options.RewardQualityOptions, tyro.conf.subcommand("reward-quality")]
+    | Annotated[options.SentStreamOptions, tyro.conf.subcommand("sent-stream")]
     | Annotated[options.TactileRealismOptions, tyro.conf.subcommand("tactile-realism")]
     | Annotated[options.TactileSpeedOptions, tyro.conf.subcommand("tactile-speed")]
     | Annotated[options.TouchProbesOptions, tyro.conf.subcommand("touch-probes")]

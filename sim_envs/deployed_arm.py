@@ -75,9 +75,11 @@ class _TrackedDrive:
 
     def __init__(self, start: Joints, safety: ActionFilter) -> None:
         self._safety, self._state = safety, safety.start(start)
-        self._tracker = Tracker(safety.limits.interface, safety.dt, _DT)
+        self._tracker = Tracker(
+            safety.limits.interface, safety.limits.policy.velocity, safety.dt, _DT
+        )
         self._track = self._tracker.start(start)
-        self._lag = ServoLag(safety.dt, start.size)
+        self._lag = ServoLag(safety.limits, safety.dt)
 
     @property
     def command(self) -> Joints:

@@ -61,7 +61,9 @@ class ArmClient(ABC):
         self.period = NEVER if config.lock_step else self._stream_period
         self._state: TrackerState | None = None
         self._twin_time: float | None = None
-        self._tracker = Tracker(self._connect(recover), 1 / config.hz, self._stream_period)
+        self._tracker = Tracker(
+            self._connect(recover), config.robot.policy.velocity, 1 / config.hz, self._stream_period
+        )
         self._clock, self._stamp = -1.0, time.monotonic()
         self._reading = self._measure()
         self._refusal = self._reading.fault

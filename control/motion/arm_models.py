@@ -138,14 +138,15 @@ UR5E_ARM = ArmModel(
     flange_offset=0.0996,
     hand_yaw=0.0,
     # Range and speed: Universal_Robots_ROS2_Description ur5e/joint_limits.yaml (180 deg/s).
-    # Acceleration is unpublished; 3.14 is our choice (drivers.md 6). So is jerk, which the controller
-    # does not enforce: full acceleration in 20 ms; its lookahead at the shortest is 30.
+    # Acceleration has no limit of its own (only torques have); 5 is the MoveIt configuration's of the
+    # UR driver for ROS 2. Jerk, which the controller does not enforce, is our choice: full acceleration
+    # in 20 ms; its lookahead at the shortest is 30.
     limits=JointLimits(
         lower=-_UR5E_UPPER,
         upper=_UR5E_UPPER,
         velocity=np.full(6, 3.14),
-        acceleration=np.full(6, 3.14),
-        jerk=np.full(6, 157.0),
+        acceleration=np.full(6, 5.0),
+        jerk=np.full(6, 250.0),
     ),
     home=np.array([0.0, -1.9, -1.8, 3.7 - 1.5 * np.pi, np.pi / 2, -np.pi / 2]),
 )

@@ -1,10 +1,10 @@
-"""From a policy's 10 to 20 Hz to a 1 kHz interface: smooth, inside all limits, never beyond.
+"""From a policy's 10 to 20 Hz to a 1 kHz interface: smooth, inside all limits, on the path checked.
 
-Three stages a millisecond. A reference walks in a straight line to each new target within the
-policy's period. A follower approaches it as fast as velocity and acceleration let it and always
-able to stop there, so it never overshoots. A short mean over the follower's positions bounds the
-jerk; a mean never leaves the range of what it averages, nor do its speed and acceleration. A late
-target needs no case of its own: the reference has arrived and the follower stops there.
+A reference walks in straight lines from target to target, each within the policy's period; what goes
+out is its mean over the last moments. A mean never leaves the range of what it averages, all joints
+are late by the same time, and so the arm keeps to the path that the safety layer has checked, whatever
+comes when. Where the reference would have to stop or turn faster than the limits allow, it walks
+slower: it never leaves its path.
 """
 
 from dataclasses import dataclass, replace
@@ -13,9 +13,12 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control.motion.arm_models import JointLimits
-from touchgoal.control.safety.braking import max_stoppable_speed
 
 Joints = Float[np.ndarray, "n"]
+
+_RESERVE = 1.1  # by which the reference may be faster than targets come, to make up for late ones
+_ROUNDING = 1e-12  # rad
+_MOST = 8  # targets on the way; more come from a clock that is not the policy's, and are cut short
 
 
 @dataclass(frozen=True)
@@ -24,65 +27,77 @@ class TrackerState:
 
     Attributes:
         q: commanded joint positions, rad.
-        reference: where the straight line to the target is, rad.
-        target: the policy's last target, rad.
-        reference_step: rad a millisecond of the reference.
-        velocity: of the follower, rad/s.
-        window: the follower's last positions, oldest first, rad.
+        targets: on the reference's way, the next one first, rad.
+        step: of the reference in a millisecond, at the pace at which targets come, rad.
+        window: the reference's last positions, oldest first, rad.
     """
 
     q: Joints
-    reference: Joints
-    target: Joints
-    reference_step: Joints
-    velocity: Joints
+    targets: tuple[Joints, ...]
+    step: Joints
     window: Float[np.ndarray, "m n"]
 
 
 class Tracker:
     """Inside `limits` for targets that come every `period` s; `dt` s is the interface's tick.
 
-    Give it `RobotLimits.interface`. Joints lag by themselves, so the path between two targets is
-    not quite straight: behind the safety layer the fingers then leave the box by up to 1 mm;
-    inside `RobotLimits.policy` it would be 6 mm.
+    Give it `RobotLimits.interface`, and as `speed` (rad/s) the highest of the targets,
+    `RobotLimits.policy`'s; beyond a tenth above it the reference falls behind.
+
+    Attributes:
+        lag: s by which what goes out is behind the reference.
     """
 
-    def __init__(self, limits: JointLimits, period: float, dt: float = 1e-3) -> None:
-        self.limits, self.dt = limits, dt
+    def __init__(self, limits: JointLimits, speed: Joints, period: float, dt: float = 1e-3) -> None:
+        self.limits = limits
         self._ticks = round(period / dt)
-        # Of a mean over m ticks the acceleration changes by at most 2 a / m in one.
-        self._window = max(1, int(np.ceil((2 * limits.acceleration / limits.jerk / dt).max())))
+        # The mean over m ticks accelerates by (u - u_m) / m, with the reference's speed u and that
+        # of m ticks before: from full speed to rest within the limits.
+        self._m = int(np.ceil((_RESERVE * speed / limits.acceleration / dt).max()))
+        # A mean of k such means changes its acceleration by at most 2 a / k in a tick.
+        k = max(1, int(np.ceil((2 * limits.acceleration / limits.jerk / dt).max())))
+        self._weights = np.convolve(np.full(self._m, 1 / self._m), np.full(k, 1 / k))
+        self.lag = (self._weights.size - 1) / 2 * dt
+        self._reach = limits.acceleration * self._m * dt**2  # rad a tick that may be gained or lost
+        self._fastest = np.minimum(limits.velocity * dt, self._reach)
 
     def start(self, q: Joints) -> TrackerState:
         """At rest in `q` (rad)."""
-        still = np.zeros(q.size)
-        return TrackerState(q, q, q, still, still, np.tile(q, (self._window, 1)))
+        window = np.tile(q, (max(self._weights.size, self._m + 1), 1))
+        return TrackerState(q, (), np.zeros(q.size), window)
 
     def set_target(self, state: TrackerState, target: Joints) -> TrackerState:
         """A new target (rad) from the policy, clamped to the limits; not a number: it is left out.
 
-        It is to be reached one period from now, or as soon after as the limits allow.
+        It is to be reached one period after the last one, or as soon after as the limits allow.
         """
         if not np.isfinite(target).all():
             return state
         target = np.clip(target, self.limits.lower, self.limits.upper)
-        return replace(
-            state, target=target, reference_step=np.abs(target - state.reference) / self._ticks
-        )
+        reference = state.window[-1]
+        if np.array_equal(state.targets[-1] if state.targets else reference, target):
+            return state
+        if state.targets and len(state.targets) < _MOST:
+            return replace(state, targets=(*state.targets, target))
+        return replace(state, targets=(target,), step=(target - reference) / self._ticks)
 
     def step(self, state: TrackerState) -> TrackerState:
         """One tick of the interface; `q` of the result is the command."""
-        limits, dt = self.limits, self.dt
-        left = state.target - state.reference
-        reference = state.reference + np.clip(left, -state.reference_step, state.reference_step)
-        last = state.window[-1]
-        gap = reference - last
-        speed = np.minimum(
-            max_stoppable_speed(np.abs(gap), limits.acceleration, dt), limits.velocity
-        )
-        reach = limits.acceleration * dt
-        wanted = np.sign(gap) * speed
-        velocity = np.clip(wanted, state.velocity - reach, state.velocity + reach)
-        window = np.vstack([state.window[1:], last + velocity * dt])
-        q = window.mean(axis=0)
-        return replace(state, q=q, reference=reference, velocity=velocity, window=window)
+        reference, targets, step = state.window[-1], state.targets, state.step
+        if targets:
+            pace = min(float(len(targets)), self._highest_pace(state))
+            if (np.abs(targets[0] - reference) <= pace * np.abs(step) + _ROUNDING).all():
+                reference, targets = targets[0], targets[1:]
+                step = (targets[0] - reference) / self._ticks if targets else np.zeros(step.size)
+            else:
+                reference = reference + pace * step
+        window = np.vstack([state.window[1:], reference])
+        q = self._weights @ window[-self._weights.size :]
+        return TrackerState(q, targets, step, window)
+
+    def _highest_pace(self, state: TrackerState) -> float:
+        """How many times its step the reference may go, so that its mean keeps to the limits."""
+        before = state.window[-self._m] - state.window[-self._m - 1]
+        most = np.minimum(np.abs(before + np.sign(state.step) * self._reach), self._fastest)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return float(np.nanmin(most / np.abs(state.step)))

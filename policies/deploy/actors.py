@@ -11,6 +11,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.control.safety.limits import RobotLimits
 from touchgoal.policies.acting import Observation
 from touchgoal.policies.by_name import UserPolicy, find_user_policy
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy, find_policy
@@ -50,11 +51,13 @@ class LearnedActor(RealTimeActor):
 
     done = False
 
-    def __init__(self, planner: ChunkPlanner, timeout: float | None = None) -> None:
-        """See RealTimeActor."""
+    def __init__(
+        self, planner: ChunkPlanner, robot: RobotLimits, timeout: float | None = None
+    ) -> None:
+        """For the robot that acts; see RealTimeActor."""
         super().__init__(planner, timeout)
         self._hz = planner.config.control_hz
-        self._lag = ServoLag(1 / self._hz, ft.N_JOINTS)
+        self._lag = ServoLag(robot, 1 / self._hz)
         self._before: np.ndarray | None = None  # joints (rad) wanted at the last tick
 
     def act(self, observation: Observation) -> np.ndarray:
@@ -155,7 +158,8 @@ def make_actor(
     """The actor for one run, from where the arm is now."""
     if policy is not None:
         # So a run on a simulated arm repeats on any machine.
-        return LearnedActor(policy.planner, _SIMULATED_PLAN_TIMEOUT if cell.time_waits else None)
+        timeout = _SIMULATED_PLAN_TIMEOUT if cell.time_waits else None
+        return LearnedActor(policy.planner, safety.limits, timeout)
     if cell.task.policy == "follower":
         return FollowerActor(ft.CONTROL_HZ)
     return pick_and_place(pick_place_poses(cell, truth), safety, commanded)

@@ -66,7 +66,7 @@ class SimulatedArm:
 
     def __init__(self, cell: SimulatedCell, hz: float) -> None:
         self._cell, self._limits = cell, cell.env.robot.interface
-        self._tracker = Tracker(self._limits, 1 / hz, DT)
+        self._tracker = Tracker(self._limits, cell.env.robot.policy.velocity, 1 / hz, DT)
         self._state: TrackerState | None = None
         self._refused_because = ""
 
