@@ -46,18 +46,24 @@ def moves(address: str, home: list[float]) -> dict:
     robot.joint_acceleration_limit.set([15.0, 7.5, 10, 12.5, 15, 20, 20])  # the Panda's
     panda = refused(np.array(home) + 0.4)
     robot.joint_acceleration_limit.set([9.9, 7.5, 9.9, 9.9, 9.9, 9.9, 9.9])
+
+    def settle() -> None:
+        end = robot.state.time.to_sec() + 0.2  # the arm's time, which may be slower than the wall's
+        while robot.state.time.to_sec() < end:
+            time.sleep(0.01)
+
     errors, rng = [], np.random.default_rng(0)
     for i in range(4):
         target = np.array(home) + (rng.uniform(-0.5, 0.5, 7) if i % 2 else 0)
         robot.move(franky.JointMotion(target.tolist()))
-        time.sleep(0.2)
+        settle()
         errors.append(float(np.abs(np.array(robot.state.q) - target).max()))
     robot.move(franky.JointMotion(home))
-    time.sleep(0.2)
+    settle()
     pose = np.array(robot.state.O_T_EE.translation)
     down = franky.Affine([0, 0, 0.03])
     robot.move(franky.CartesianMotion(down, franky.ReferenceType.Relative))
-    time.sleep(0.2)
+    settle()
     fell = pose - np.array(robot.state.O_T_EE.translation)
     robot.move(franky.JointMotion(home))
     before = np.array(robot.state.q)

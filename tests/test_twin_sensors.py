@@ -3,6 +3,7 @@
 from typing import Literal
 
 import cv2
+import mujoco
 import numpy as np
 import pytest
 import serial
@@ -33,6 +34,24 @@ def test_arm_follows_without_lag(arm: Literal["fr3", "ur5e"]) -> None:
     for _ in range(300):
         cell.step()
     assert not cell.moving and cell.worst.excess <= 0
+
+
+@pytest.mark.parametrize("arm", ["fr3", "ur5e"])
+def test_compiled_arm_agrees_with_mujoco(arm: Literal["fr3", "ur5e"]) -> None:
+    env = PickPlace(PickPlaceConfig(cameras=(), tactile=False, arm=arm))
+    cell, rng = SimulatedCell(env, 3), np.random.default_rng(0)
+    for _ in range(20):
+        q, offset = rng.uniform(-3, 3, env.n_joints), rng.normal(0.0, 0.1, 3)
+        env.data.qpos[env.arm_positions] = q
+        mujoco.mj_forward(env.model, env.data)
+        site = env.data.site("tcp")
+        R = site.xmat.reshape(3, 3)
+        p, J = site.xpos + R @ offset, np.zeros((6, env.model.nv))
+        mujoco.mj_jac(env.model, env.data, J[:3], J[3:], p, env.model.site_bodyid[site.id])
+        for mine, theirs in zip(
+            cell.kinematics(q, offset), (p, R, J[:, env.arm_dofs]), strict=True
+        ):
+            np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-12)
 
 
 def test_fixture_waits_for_the_first_grasp() -> None:

@@ -1,9 +1,10 @@
 """Whether a picture is what the camera saw: decoded without errors, whole, and new in all its parts."""
 
 import av
+import cv2
 import numpy as np
 from av.error import FFmpegError
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Int16, Int32, UInt8
 
 Picture = UInt8[np.ndarray, "h w 3"]
 
@@ -13,6 +14,7 @@ _JUMPS = 5  # the largest so many count: one block has four sides
 _SMOOTH = (
     4.0  # counts; 47 presses of a real Mini stay below 1, nine in ten broken frames are above 7
 )
+_ALL_CHANNELS = np.ones((1, 3))  # their sum
 _BANDS = 8  # that a picture is cut into to look for frozen parts
 _STRIDE = 4  # pixels; every so many are compared
 _LEARNING = 20  # pictures that tell which bands change all the time, as sensor noise makes them
@@ -44,14 +46,13 @@ def jumps_at_blocks(image: Picture, before: Picture) -> float:
     A decoder cannot see every wrong byte. It shows as blocks of another brightness, which a smooth
     gel never has: its real changes do not know where blocks end.
     """
-    change = image.mean(2, dtype=np.float32) - before.mean(2, dtype=np.float32)
+    change = cv2.transform(cv2.subtract(image, before, dtype=cv2.CV_16S), _ALL_CHANNELS)
     worst = 0.0
-    for grey in (change, change.T):
-        steps = np.abs(np.diff(grey, axis=0))
-        between = _per_block(steps[_BLOCK - 1 :: _BLOCK])
-        inside = np.concatenate([_per_block(steps[k - 1 :: _BLOCK]) for k in (2, 4, 6)])
-        worst = max(worst, _largest(between, _JUMPS) - _largest(inside, 3 * _JUMPS))
-    return worst
+    for grey in (change, np.ascontiguousarray(change.T)):
+        between, *inside = (_steps(grey, row) for row in (_BLOCK, 2, 4, 6))
+        jump = _largest(between, _JUMPS) - _largest(np.concatenate(inside), 3 * _JUMPS)
+        worst = max(worst, jump)
+    return worst / (3 * _BLOCK)
 
 
 def is_broken_gel(image: Picture, before: Picture) -> bool:
@@ -94,10 +95,15 @@ def _differs(image: Picture, before: Picture) -> Bool[np.ndarray, " bands"]:
     return np.array([band.any() for band in np.array_split(rows, _BANDS)])
 
 
-def _per_block(steps: Float32[np.ndarray, "k w"]) -> Float32[np.ndarray, " n"]:
+def _steps(grey: Int16[np.ndarray, "h w"], row: int) -> Int32[np.ndarray, " n"]:
+    """From each block's row before `row` to that row, summed over the block's width."""
+    before, after = grey[row - 1 : -1 : _BLOCK], grey[row::_BLOCK]
+    steps = cv2.absdiff(np.ascontiguousarray(after), np.ascontiguousarray(before[: len(after)]))
     whole = steps.shape[1] // _BLOCK * _BLOCK
-    return steps[:, :whole].reshape(-1, _BLOCK).mean(1)
+    return steps[:, :whole].reshape(-1, _BLOCK).sum(1, dtype=np.int32)
 
 
-def _largest(values: Float32[np.ndarray, " n"], count: int) -> float:
-    return float(np.sort(values)[-count:].mean()) if values.size else 0.0
+def _largest(values: Int32[np.ndarray, " n"], count: int) -> float:
+    if not values.size:
+        return 0.0
+    return float(np.partition(values, -min(count, values.size))[-count:].mean())

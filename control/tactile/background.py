@@ -1,6 +1,7 @@
 """The untouched picture of a sensor: taken, followed as its light drifts, and judged."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -137,15 +138,18 @@ def _blurred(image: np.ndarray) -> Float32[np.ndarray, "H W 3"]:
 
 def _high_pass(image: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
     """The image without its lowest cosines."""
-    down, across = (
-        cosines(size, waves) for size, waves in zip(image.shape[:2], _WAVES, strict=True)
-    )
-    waves = np.einsum("ih,hwc,jw->ijc", down, image, across, optimize=True)
-    return image - np.einsum("ih,ijc,jw->hwc", down, waves, across, optimize=True)
+    height, width, channels = image.shape
+    down, across = cosines(height, _WAVES[0]), cosines(width, _WAVES[1])
+    waves = across @ (down @ image.reshape(height, -1)).reshape(-1, width, channels)
+    smooth = down.T @ (across.T @ waves).reshape(len(down), -1)
+    return image - smooth.reshape(image.shape)
 
 
+@lru_cache
 def cosines(size: int, count: int) -> Float32[np.ndarray, "k size"]:
     """The lowest waves of the cosine transform (type II): orthonormal rows, at most `size`."""
     k, n = np.arange(min(count, size))[:, None], np.arange(size) + 0.5
     rows = np.cos(np.pi * k * n / size)
-    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    rows.setflags(write=False)  # it is given to everyone who asks
+    return rows

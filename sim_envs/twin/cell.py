@@ -1,17 +1,19 @@
 """The simulated cell behind the wire: physics at 1 kHz, set-points and gripper from outside."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, no_type_check
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
+from numba import njit
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.braking import braked_velocity
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE, SERVO_DAMPING
+from touchgoal.sim_envs.twin.serial_arm import SerialArm
 
 DT = 1e-3  # s, of the Franka control interface and of the physics
 AT_REST = 0.01  # rad/s
@@ -23,6 +25,8 @@ _YIELD_TIME = 0.02  # s, likewise: how fast an arm that was hit gives way; our c
 # rad/s^2 of a reflex: four times what motions may use. At once, a wrist would be asked for more torque
 # than it has, and chatter between both ends of it for good.
 _REFLEX_DECELERATION = 40.0
+
+_NO_FORCE = np.zeros(3)
 
 Joints = Float[np.ndarray, " n"]
 
@@ -76,7 +80,8 @@ class SimulatedCell:
         n = env.n_joints
         model = env.model
         model.actuator_ctrllimited[:n] = 0  # feed-forward reaches beyond the range; arms check it
-        self._scratch = mujoco.MjData(model)
+        self._serial_arm = SerialArm(model)
+        self._hand = model.body("hand").id
         self._servo = model.actuator_gainprm[:n].copy(), model.actuator_biasprm[:n].copy()
         self._friction = model.dof_frictionloss.copy()
         self._torque: Joints | None = None
@@ -95,6 +100,7 @@ class SimulatedCell:
             False  # nobody knows when a client comes: the clock waits for the first grasp
         )
         self._rest_since = 0.0
+        self._note_extremes()
 
     # What arms and grippers command.
 
@@ -199,21 +205,8 @@ class SimulatedCell:
     def kinematics(
         self, q: Joints, offset: Float[np.ndarray, "3"]
     ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], Float[np.ndarray, "6 n"]]:
-        """Position (m), rotation and Jacobian, base frame, of a point `offset` (m) from the TCP.
-
-        By MuJoCo: ten times as fast as CasADi's interpreter, which a millisecond does not allow.
-        """
-        env, data = self.env, self._scratch
-        data.qpos[env.arm_positions] = q
-        mujoco.mj_kinematics(env.model, data)
-        mujoco.mj_comPos(env.model, data)
-        site = data.site("tcp")
-        R = site.xmat.reshape(3, 3).copy()
-        point = site.xpos + R @ offset
-        jacobian = np.zeros((6, env.model.nv))
-        body = env.model.site_bodyid[site.id]
-        mujoco.mj_jac(env.model, data, jacobian[:3], jacobian[3:], point, body)
-        return point, R, jacobian[:, env.arm_dofs]
+        """Position (m), rotation and Jacobian, base frame, of a point `offset` (m) from the TCP."""
+        return self._serial_arm.pose_and_jacobian(q, offset)
 
     def truth(self) -> dict[str, Any]:
         """What only a simulator knows, as plain numbers; also where arm and gripper are."""
@@ -243,26 +236,29 @@ class SimulatedCell:
     def _apply_nudge(self) -> Joints:
         """Apply the nudge; its torque (N m) on each joint."""
         env = self.env
-        force = self._nudge_force if self.time < self._nudged_until else np.zeros(3)
-        hand = env.model.body("hand").id
-        env.data.xfrc_applied[hand, :3] = force
+        force = self._nudge_force if self.time < self._nudged_until else _NO_FORCE
+        env.data.xfrc_applied[self._hand, :3] = force
         if not force.any():
             return np.zeros(env.n_joints)
         jacobian = np.zeros((3, env.model.nv))
-        mujoco.mj_jac(env.model, env.data, jacobian, None, env.data.xipos[hand], hand)
+        mujoco.mj_jac(env.model, env.data, jacobian, None, env.data.xipos[self._hand], self._hand)
         return force @ jacobian[:, env.arm_dofs]
 
     def _update_measurements(self, pushed: Joints) -> None:
-        env, limits = self.env, self.env.robot.hardware
+        env = self.env
         self.q, self.dq = env.joints()
         now = env.joint_contact_torque() + pushed
         self.tau_ext = self.tau_ext + (DT / _TORQUE_FILTER_TIME) * (now - self.tau_ext)
-        if self.moving:
+        self._note_extremes()
+
+    def _note_extremes(self) -> None:
+        limits, worst = self.env.robot.hardware, self.worst
+        excess, speed, fastest = _extremes(
+            self.q, self.dq, limits.lower, limits.upper, limits.velocity
+        )
+        worst.excess, worst.speed = max(worst.excess, excess), max(worst.speed, speed)
+        if fastest > AT_REST:
             self._rest_since = self.time
-        worst = self.worst
-        outside = np.maximum(limits.lower - self.q, self.q - limits.upper).max()
-        worst.excess = max(worst.excess, float(outside))
-        worst.speed = max(worst.speed, float((np.abs(self.dq) / limits.velocity).max()))
 
     def _enter_control_mode(self, torque: bool) -> None:
         """Leave braking and yielding, and change between position servo and torque control."""
@@ -277,3 +273,15 @@ class SimulatedCell:
         self._torque = None
         if not torque:
             env.data.qfrc_applied[env.arm_dofs] = 0.0
+
+
+@njit(cache=True)
+@no_type_check
+def _extremes(q, dq, lower, upper, velocity):
+    """Greatest excess over a joint's range (rad), share of its speed, and speed (rad/s)."""
+    excess, share, fastest = -np.inf, 0.0, 0.0
+    for i in range(len(q)):
+        excess = max(excess, lower[i] - q[i], q[i] - upper[i])
+        share = max(share, abs(dq[i]) / velocity[i])
+        fastest = max(fastest, abs(dq[i]))
+    return excess, share, fastest

@@ -9,7 +9,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.motion.rotations import rotation_vector
@@ -17,14 +16,15 @@ from touchgoal.control.safety.limits import FR3
 from touchgoal.sim_envs.scene.build import robot_model
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.franka import limits, messages
-from touchgoal.sim_envs.twin.franka.hand_frames import Pose, describe_hand
+from touchgoal.sim_envs.twin.franka.arm_state import OTHER, ArmState, end_effector
+from touchgoal.sim_envs.twin.franka.hand_frames import describe_hand
 from touchgoal.sim_envs.twin.franka.limits import Setpoint, Thresholds
 from touchgoal.sim_envs.twin.franka.messages import MoveStatus, RobotCommand, RobotMode
 from touchgoal.sim_envs.twin.franka.motion import Motion
 
 _MAX_LOST_PACKETS = 20  # packets in a row after which the arm stops: Franka's documentation
 _POSITION, _VELOCITY, _POSE, _TWIST, _TORQUE = range(5)  # motion generators; 4 is none
-_EXTERNAL, _OTHER = 2, 3  # controllers
+_EXTERNAL = 2  # controller: torque; the others are the robot's own
 _SETTERS = {*range(RobotCommand.SET_COLLISION_BEHAVIOUR, RobotCommand.SET_LOAD + 1)}
 # s between states while time stands: to a client that does not drive the arm, whose motion begins, that
 # drives it (libfranka gives up after 1 s).
@@ -45,7 +45,6 @@ class FrankaArm:
     def __init__(self, cell: SimulatedCell, host: str, timeout: float, hand: messages.Link) -> None:
         """`hand`: the hand's link, which shares the arm's cable."""
         self.cell, self.timeout = cell, timeout
-        self.link = messages.Link(host, messages.ROBOT_PORT, messages.ROBOT_VERSION, wide=True)
         self.mode, self.error = RobotMode.IDLE, ""
         self._hand = hand
         self._motion: Motion | None = None
@@ -57,10 +56,11 @@ class FrankaArm:
         self._success_rate = 1.0
         self._thresholds = Thresholds.default()
         self._ee, self._k = np.eye(4), np.eye(4)  # NE_T_EE and EE_T_K
-        self._state = np.zeros((), messages.ROBOT_STATE)
-        self._state["O_ddP_O"] = 0.0, 0.0, -9.81  # robot_state.h: "hard-coded for now"
+        self._state = ArmState()
         self._reset_setpoint()
-        describe_hand(self._state, self._ee, self._k)
+        describe_hand(self._state.record, self._ee, self._k)
+        self._load_code()
+        self.link = messages.Link(host, messages.ROBOT_PORT, messages.ROBOT_VERSION, wide=True)
 
     # The twin's loop.
 
@@ -93,7 +93,7 @@ class FrankaArm:
             return
         if motion is not None and motion.begun:
             self._sent_at = time.monotonic()
-            self.link.send(self._state.tobytes())
+            self.link.send(self._state.record.tobytes())
         else:
             self._send_state(self._estimate_wrench())
 
@@ -209,14 +209,14 @@ class FrankaArm:
             )
         elif request.command == RobotCommand.SET_NE_TO_EE:
             self._ee = np.frombuffer(payload, "<f8", 16).reshape(4, 4).T
-            describe_hand(self._state, self._ee, self._k)
+            describe_hand(self._state.record, self._ee, self._k)
         elif request.command == RobotCommand.SET_EE_TO_K:
             self._k = np.frombuffer(payload, "<f8", 16).reshape(4, 4).T
-            describe_hand(self._state, self._ee, self._k)
+            describe_hand(self._state.record, self._ee, self._k)
         elif request.command == RobotCommand.SET_LOAD:
             load = np.frombuffer(payload, "<f8", 13)
-            self._state["m_load"], self._state["F_x_Cload"] = load[0], load[1:4]
-            self._state["I_load"] = load[4:]
+            record = self._state.record
+            record["m_load"], record["F_x_Cload"], record["I_load"] = load[0], load[1:4], load[4:]
 
     def _move(self, request: messages.Request) -> None:
         if self.mode != RobotMode.IDLE or self._motion is not None:
@@ -225,7 +225,7 @@ class FrankaArm:
             self.link.answer(request, status)
             return
         controller, generator = (int(n) for n in np.frombuffer(request.payload, "<u4", 2))
-        if controller > _OTHER or (controller != _EXTERNAL and generator > _TWIST):
+        if controller > OTHER or (controller != _EXTERNAL and generator > _TWIST):
             self.link.answer(request, MoveStatus.INVALID_ARGUMENT)
             return
         if controller == _EXTERNAL:
@@ -258,7 +258,9 @@ class FrankaArm:
         if motion.lost > _MAX_LOST_PACKETS:
             self.abort("communication_constraints_violation")
         elif lost and motion.generator != _TORQUE:
-            self._go_to(motion, self._setpoint.q + DT * self._setpoint.dq)
+            # As Franka's documentation says of a lost packet: acceleration stays as it was.
+            last = self._setpoint
+            self._go_to(motion, last.q + DT * (last.dq + DT * last.ddq))
 
     def _take_messages(self) -> Motion | None:
         """Requests and set-points; then the motion there is, which ends with its client."""
@@ -317,7 +319,7 @@ class FrankaArm:
     def _go_by_tcp(self, motion: Motion, order: np.void) -> None:
         """One step of differential inverse kinematics from the last set-point."""
         q = self._setpoint.q
-        now, jacobian = self._pose_and_jacobian(q)
+        now, jacobian = end_effector(self.cell, self._ee, q)
         if motion.generator == _POSE:
             target = order["O_T_EE_c"].reshape(4, 4).T
             R = target[:3, :3]
@@ -344,54 +346,30 @@ class FrankaArm:
 
     # State.
 
+    def _load_code(self) -> None:
+        """Compile what a millisecond needs, or load it, before a client waits for it."""
+        contact = self._estimate_wrench()
+        self._state.write_tcp(self.cell, self._ee, self._pose, self._wrench, contact)
+        limits.joint_fault(self._setpoint, self._setpoint, cartesian=False)
+
     def _reset_setpoint(self) -> None:
         """What the next set-point is compared with, and the torque the next one."""
         zero = np.zeros(7)
         self._setpoint = Setpoint(self.cell.q_d.copy(), zero, zero)
         self._torque = zero
 
-    def _pose_and_jacobian(self, q: np.ndarray) -> tuple[Pose, Float[np.ndarray, "6 7"]]:
-        """Pose and Jacobian of the end effector, which a client may have moved off the TCP."""
-        T = np.eye(4)
-        T[:3, 3], R, jacobian = self.cell.kinematics(q, self._ee[:3, 3])
-        T[:3, :3] = R @ self._ee[:3, :3]
-        return T, jacobian
-
     def _estimate_wrench(self) -> limits.Contact:
         """Estimate the wrench from outside and judge it; joint torques say what it is."""
-        pose, jacobian = self._pose_and_jacobian(self.cell.q)
-        self._pose, self._wrench = pose, limits.pseudo_inverse(jacobian) @ self.cell.tau_ext
+        self._pose, jacobian = end_effector(self.cell, self._ee, self.cell.q)
+        self._wrench = limits.wrench_behind(self.cell.tau_ext, jacobian)
         return self._thresholds.judge(self.cell.tau_ext, self._wrench, self._setpoint.ddq)
 
     def _send_state(self, contact: limits.Contact) -> None:
-        cell, state, motion = self.cell, self._state, self._motion
-        state["message_id"] = self._sent
-        state["q"], state["dq"] = cell.q, np.nan if self._nonsense else cell.dq
-        state["q_d"], state["dq_d"] = cell.q_d, cell.dq_d
-        state["ddq_d"] = self._setpoint.ddq
-        state["theta"], state["dtheta"] = cell.q, cell.dq
-        state["tau_J"] = cell.joint_torque
-        state["tau_J_d"] = self._torque
-        state["O_T_EE"] = self._pose.T.ravel()
-        wanted, jacobian = self._pose_and_jacobian(cell.q_d)
-        state["O_T_EE_d"] = state["O_T_EE_c"] = wanted.T.ravel()
-        state["O_dP_EE_d"] = state["O_dP_EE_c"] = jacobian @ cell.dq_d
-        state["elbow"] = cell.q[2], np.sign(cell.q[3])
-        state["elbow_d"] = state["elbow_c"] = cell.q_d[2], np.sign(cell.q_d[3])
-        # The maker's signs: what the robot does to the environment. `cell` has it the other way round.
-        sent = limits.estimate_sent(self._wrench, jacobian)
-        state["tau_ext_hat_filtered"], state["O_F_ext_hat_K"] = -cell.tau_ext, sent
-        turned = sent.reshape(2, 3) @ self._pose[:3, :3]
-        state["K_F_ext_hat_K"] = turned.ravel()
-        for name, value in vars(contact).items():
-            state[name] = value
-        state["errors"] = state["reflex_reason"] = [name == self.error for name in messages.ERRORS]
-        moving = motion is not None
-        state["robot_mode"] = RobotMode.MOVE if moving else self.mode
-        state["controller_mode"] = motion.controller if moving else _OTHER
-        # On this side of the wire 0 is idle, and none, which goes with torque, is 5.
-        state["motion_generator_mode"] = motion.generator + 1 if moving else 0
-        state["control_command_success_rate"] = self._success_rate if moving else 0.0
-        self.link.send(state.tobytes())
+        state = self._state
+        state.fields["message_id"][:] = self._sent
+        state.write_joints(self.cell, self._setpoint.ddq, self._torque, self._nonsense)
+        state.write_tcp(self.cell, self._ee, self._pose, self._wrench, contact)
+        state.write_mode(self.mode, self.error, self._motion, self._success_rate)
+        self.link.send(state.record.tobytes())
         self._sent += 1
         self._sent_at = time.monotonic()

@@ -1,9 +1,11 @@
 """What the Franka control interface refuses: limits of set-points, of the arm, of contact."""
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
+from numba import njit
 
 from touchgoal.control.safety.limits import FR3
 from touchgoal.sim_envs.twin.cell import DT
@@ -18,6 +20,7 @@ _SLACK = 1.01  # for the wire's rounding
 _STEADY = 0.1  # rad/s^2: below it the thresholds for nominal motion hold
 # Least singular value of the Jacobian below which the arm gives no wrench; the maker's is unpublished.
 _SINGULAR = 0.02
+_DAMPING = 1e-8  # m^2: makes the wrench at a singular pose finite
 _NEVER_ZERO = 1e-6  # N: what a measured estimate differs from 0 by, with nothing touching
 
 
@@ -45,18 +48,40 @@ def joint_fault(before: Setpoint, now: Setpoint, cartesian: bool) -> str | None:
     name = "cartesian_motion_generator_joint" if cartesian else "joint_motion_generator"
     hardware = FR3.hardware
     lowest, highest = hardware.speed_range(now.q)
-    outward = np.where(now.q > hardware.upper, now.dq, np.where(now.q < hardware.lower, -now.dq, 0))
-    if not np.isfinite(now.q).all() or (outward > 1e-3).any():
-        return f"{name}_position_limits_violation"
-    if (now.dq > _SLACK * highest + 1e-3).any() or (now.dq < _SLACK * lowest - 1e-3).any():
-        return f"{name}_velocity_limits_violation"
-    if cartesian:
+    broken = _broken_limit(
+        *(now.q, now.dq, now.ddq, before.ddq, hardware.lower, hardware.upper, lowest, highest),
+        *(hardware.acceleration, hardware.jerk),
+    )
+    if broken < 0 or (cartesian and broken > _SPEED):
         return None
-    if (np.abs(now.ddq) > _SLACK * hardware.acceleration).any():
-        return f"{name}_velocity_discontinuity"
-    if (np.abs(now.ddq - before.ddq) > _SLACK * DT * hardware.jerk).any():
-        return f"{name}_acceleration_discontinuity"
-    return None
+    return f"{name}_{_LIMITS[broken]}"
+
+
+_LIMITS = (
+    "position_limits_violation",
+    "velocity_limits_violation",
+    "velocity_discontinuity",
+    "acceleration_discontinuity",
+)
+_SPEED = 1  # place of the last of them that holds for set-points in Cartesian space
+
+
+@njit(cache=True)
+@no_type_check
+def _broken_limit(q, dq, ddq, ddq_before, lower, upper, lowest, highest, acceleration, jerk):
+    """The first of `_LIMITS` that any joint breaks; -1: none."""
+    worst = len(_LIMITS)
+    for i in range(len(q)):
+        outward = dq[i] if q[i] > upper[i] else -dq[i] if q[i] < lower[i] else 0.0
+        if not np.isfinite(q[i]) or outward > 1e-3:
+            worst = 0
+        elif dq[i] > _SLACK * highest[i] + 1e-3 or dq[i] < _SLACK * lowest[i] - 1e-3:
+            worst = min(worst, 1)
+        elif abs(ddq[i]) > _SLACK * acceleration[i]:
+            worst = min(worst, 2)
+        elif abs(ddq[i] - ddq_before[i]) > _SLACK * DT * jerk[i]:
+            worst = min(worst, 3)
+    return worst if worst < len(_LIMITS) else -1
 
 
 def tcp_fault(twist: Wrench) -> str | None:
@@ -92,7 +117,7 @@ def estimate_sent(wrench: Wrench, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
     libfranka, robot_state.h: what the robot applies to the environment is positive, and all is 0 near
     or in a singularity.
     """
-    if np.linalg.eigvalsh(jacobian @ jacobian.T)[0] < _SINGULAR**2:
+    if _is_singular(jacobian):
         return np.zeros(6)
     return -wrench + _NEVER_ZERO
 
@@ -150,4 +175,52 @@ class Thresholds:
 
 def pseudo_inverse(jacobian: Float[np.ndarray, "6 7"]) -> Float[np.ndarray, "6 7"]:
     """Of J^T: joint torques to the wrench behind them; damped against singular poses."""
-    return np.linalg.solve(jacobian @ jacobian.T + 1e-8 * np.eye(6), jacobian)
+    return np.linalg.solve(jacobian @ jacobian.T + _DAMPING * np.eye(6), jacobian)
+
+
+@njit(cache=True)
+@no_type_check
+def wrench_behind(torque: Joints, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
+    """`pseudo_inverse(jacobian) @ torque`: the wrench (N, N m) that explains joint torques (N m) best."""
+    L, _ = _cholesky(jacobian, _DAMPING)
+    wrench = np.zeros(6)
+    for i in range(6):
+        for j in range(len(torque)):
+            wrench[i] += jacobian[i, j] * torque[j]
+    for i in range(6):
+        for k in range(i):
+            wrench[i] -= L[i, k] * wrench[k]
+        wrench[i] /= L[i, i]
+    for i in range(5, -1, -1):
+        for k in range(i + 1, 6):
+            wrench[i] -= L[k, i] * wrench[k]
+        wrench[i] /= L[i, i]
+    return wrench
+
+
+@njit(cache=True)
+@no_type_check
+def _is_singular(jacobian):
+    """Whether the least singular value is below `_SINGULAR`, without finding it."""
+    return not _cholesky(jacobian, -(_SINGULAR**2))[1]
+
+
+@njit(cache=True)
+@no_type_check
+def _cholesky(jacobian, added):
+    """The factor of J J^T + `added` I, and whether that is positive definite."""
+    L = np.zeros((6, 6))
+    for i in range(6):
+        for j in range(i + 1):
+            rest = added if i == j else 0.0
+            for k in range(jacobian.shape[1]):
+                rest += jacobian[i, k] * jacobian[j, k]
+            for k in range(j):
+                rest -= L[i, k] * L[j, k]
+            if i > j:
+                L[i, j] = rest / L[j, j]
+            elif rest > 0:
+                L[i, i] = np.sqrt(rest)
+            else:
+                return L, False
+    return L, True

@@ -1,0 +1,90 @@
+"""The arm's state as the wire has it, written in place every millisecond."""
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.sim_envs.twin.cell import SimulatedCell
+from touchgoal.sim_envs.twin.franka import limits, messages
+from touchgoal.sim_envs.twin.franka.hand_frames import Pose
+from touchgoal.sim_envs.twin.franka.messages import RobotMode
+from touchgoal.sim_envs.twin.franka.motion import Motion
+
+OTHER = 3  # controller of a motion that is not the client's own
+
+
+class ArmState:
+    """A `messages.ROBOT_STATE`.
+
+    Attributes:
+        record: its one element.
+        fields: a view of each field by name; writing there is ten times as fast as by the record.
+    """
+
+    def __init__(self) -> None:
+        records = np.zeros(1, messages.ROBOT_STATE)
+        self.record = records.reshape(())
+        names = records.dtype.names or ()
+        self.fields = {
+            name: records[name][0] if records[name].ndim > 1 else records[name] for name in names
+        }
+        self.fields["O_ddP_O"][:] = 0.0, 0.0, -9.81  # robot_state.h: "hard-coded for now"
+        self._error = ""
+
+    def write_joints(
+        self, cell: SimulatedCell, ddq_d: limits.Joints, torque: limits.Joints, nonsense: bool
+    ) -> None:
+        """Joints as they are and as they are to be; with `nonsense` their speeds are no numbers."""
+        fields = self.fields
+        fields["q"][:] = fields["theta"][:] = q = cell.q
+        fields["dtheta"][:] = dq = cell.dq
+        fields["dq"][:] = np.nan if nonsense else dq
+        fields["q_d"][:] = q_d = cell.q_d
+        fields["dq_d"][:], fields["ddq_d"][:] = cell.dq_d, ddq_d
+        fields["tau_J"][:], fields["tau_J_d"][:] = cell.joint_torque, torque
+        fields["elbow"][:] = q[2], np.sign(q[3])
+        fields["elbow_d"][:] = fields["elbow_c"][:] = q_d[2], np.sign(q_d[3])
+
+    def write_tcp(
+        self,
+        cell: SimulatedCell,
+        ee: Pose,
+        now: Pose,
+        wrench: limits.Wrench,
+        contact: limits.Contact,
+    ) -> None:
+        """The end effector `ee` (on the TCP): its pose, where it is to be, and what it meets."""
+        fields = self.fields
+        fields["O_T_EE"][:] = now.T.ravel()
+        wanted, jacobian = end_effector(cell, ee, cell.q_d)
+        fields["O_T_EE_d"][:] = fields["O_T_EE_c"][:] = wanted.T.ravel()
+        fields["O_dP_EE_d"][:] = fields["O_dP_EE_c"][:] = jacobian @ cell.dq_d
+        # The maker's signs: what the robot does to the environment. `cell` has it the other way round.
+        sent = limits.estimate_sent(wrench, jacobian)
+        fields["tau_ext_hat_filtered"][:] = -cell.tau_ext
+        fields["O_F_ext_hat_K"][:] = sent
+        fields["K_F_ext_hat_K"][:] = (sent.reshape(2, 3) @ now[:3, :3]).ravel()
+        for name, value in vars(contact).items():
+            fields[name][:] = value
+
+    def write_mode(self, mode: int, error: str, motion: Motion | None, success_rate: float) -> None:
+        """What the arm is doing, and what is wrong with it."""
+        fields = self.fields
+        if error != self._error:
+            self._error = error
+            fields["errors"][:] = [name == error for name in messages.ERRORS]
+            fields["reflex_reason"][:] = fields["errors"]
+        fields["robot_mode"][:] = RobotMode.MOVE if motion else mode
+        fields["controller_mode"][:] = motion.controller if motion else OTHER
+        # On this side of the wire 0 is idle, and none, which goes with torque, is 5.
+        fields["motion_generator_mode"][:] = motion.generator + 1 if motion else 0
+        fields["control_command_success_rate"][:] = success_rate if motion else 0.0
+
+
+def end_effector(
+    cell: SimulatedCell, ee: Pose, q: limits.Joints
+) -> tuple[Pose, Float[np.ndarray, "6 7"]]:
+    """Pose and Jacobian of the end effector, which a client may have moved off the TCP."""
+    T = np.eye(4)
+    T[:3, 3], R, jacobian = cell.kinematics(q, ee[:3, 3])
+    T[:3, :3] = R @ ee[:3, :3]
+    return T, jacobian
