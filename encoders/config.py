@@ -21,15 +21,15 @@ MaskRatio = Annotated[float, Field(ge=0, lt=1)]
 
 
 @checked_dataclass
-class RunOptions:
-    """What every training command lets its user choose, whatever is trained."""
+class TrainerOptions:
+    """What the trainer is told, whatever it trains."""
 
     seed: Seed = 0
     """Random seed of initial weights, order of the data and noise."""
     device: str = "cpu"
     """Where to train: cpu, cuda, cuda:<number> or mps. Under torchrun each process takes a GPU of its
     own."""
-    precision: Precision = "no"
+    precision: Annotated[Precision, RARE] = "no"
     """Mixed precision: bf16 computes in bfloat16 where that is safe; weights stay float32. Meant for
     GPUs: a CPU without AVX-512 is 20 times slower with it."""
     resume: bool = False

@@ -1,15 +1,14 @@
 """Options of every training command."""
 
 from pathlib import Path
-from typing import Annotated
 
-from touchgoal.control.option_types import RARE, Seed, checked_dataclass
-from touchgoal.encoders.config import Precision, RunOptions
+from touchgoal.control.option_types import checked_dataclass
+from touchgoal.encoders.config import TrainerOptions
 
 
 @checked_dataclass
-class TrainingOptions:
-    """Options of every training command."""
+class DataOptions:
+    """What a training learns from, and where it leaves what it learned."""
 
     data: Path
     """Set of episodes to learn from."""
@@ -17,18 +16,13 @@ class TrainingOptions:
     """Set of other episodes, on which what was learned is measured."""
     out: Path | None = None
     """Folder of the run."""
-    seed: Seed = 0
-    """Random seed of initial weights, order of the data and noise."""
-    device: str = "cpu"
-    """Where to train: cpu, cuda, cuda:<number> or mps. Under torchrun each process takes a GPU of its
-    own."""
-    precision: Annotated[Precision, RARE] = "no"
-    """Mixed precision: bf16 computes in bfloat16 where that is safe. Meant for GPUs: a CPU without
-    AVX-512 is 20 times slower with it."""
-    resume: bool = False
-    """Go on after the last finished epoch of the run in --out."""
+
+
+@checked_dataclass
+class TrainingOptions(TrainerOptions, DataOptions):
+    """Options of every training command; in its help those of the last base come first."""
 
     @property
-    def run(self) -> RunOptions:
-        """For the trainer."""
-        return RunOptions(self.seed, self.device, self.precision, self.resume)
+    def trainer(self) -> TrainerOptions:
+        """The trainer's part."""
+        return TrainerOptions(self.seed, self.device, self.precision, self.resume)

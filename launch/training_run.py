@@ -6,7 +6,7 @@ from typing import Any
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.provenance import provenance
-from touchgoal.encoders.config import RunOptions
+from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.training.checkpoint import check_run_folder
 from touchgoal.encoders.training.trainer import check_device
 from touchgoal.episodes.store import EpisodeSet
@@ -14,7 +14,7 @@ from touchgoal.launch.run_folder import open_run
 from touchgoal.launch.training_options import TrainingOptions
 
 
-def check_training(options: RunOptions, out: Path | None, first: str = "") -> None:
+def check_training(options: TrainerOptions, out: Path | None, first: str = "") -> None:
     """Checks what can be checked before any data are read.
 
     Args:

@@ -27,7 +27,7 @@ from touchgoal.encoders.alignment.retrieval import (
 )
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS as PRESETS_VIT
-from touchgoal.encoders.config import ALIGN_PRESETS, AlignConfig, Augmentation, RunOptions
+from touchgoal.encoders.config import ALIGN_PRESETS, AlignConfig, Augmentation, TrainerOptions
 from touchgoal.episodes.touches import Touches
 
 DESCRIPTIONS = {
@@ -62,7 +62,7 @@ class FakeTowers:
         return torch.tensor([[float(t.count(letter)) for letter in letters] for t in texts])
 
 
-SENSOR, FRESH = "gelsight_mini", RunOptions()
+SENSOR, FRESH = "gelsight_mini", TrainerOptions()
 
 
 def run_align(
@@ -72,7 +72,7 @@ def run_align(
     config: AlignConfig,
     out_dir: Path,
     recipe: dict,
-    options: RunOptions = FRESH,
+    options: TrainerOptions = FRESH,
 ) -> TouchEncoder:
     return align(train, val, towers, config, SENSOR, out_dir, options, recipe)
 
@@ -260,7 +260,7 @@ def test_same_seed_same_weights(tmp_path: Path) -> None:
     config = replace(CONFIG, epochs=1)
     finals = []
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        run_align(TRAIN, VAL, FakeTowers(), config, tmp_path / name, {}, RunOptions(seed))
+        run_align(TRAIN, VAL, FakeTowers(), config, tmp_path / name, {}, TrainerOptions(seed))
         finals.append(final_weights(tmp_path / name))
         torch.rand(1)  # what others draw in between must not matter
     assert torch.equal(finals[0], finals[1]) and not torch.equal(finals[0], finals[2])
@@ -284,7 +284,7 @@ def test_killed_and_resumed_is_bit_identical(
         run_align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "parts", {})
     monkeypatch.undo()
     torch.set_num_threads(1)
-    run_align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "parts", {}, RunOptions(resume=True))
+    run_align(TRAIN, VAL, FakeTowers(), CONFIG, tmp_path / "parts", {}, TrainerOptions(resume=True))
     assert torch.equal(final_weights(tmp_path / "parts"), final_weights(tmp_path / "whole"))
     for name in ("metrics.jsonl", "encoder/encoder.safetensors", "encoder/encoder.json"):
         assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
@@ -304,11 +304,11 @@ def test_bad_directories_and_configs_are_refused(tmp_path: Path) -> None:
     def start(
         config: AlignConfig = CONFIG, resume: bool = False, train: Touches = TRAIN
     ) -> Callable[[], TouchEncoder]:
-        options = RunOptions(resume=resume)
+        options = TrainerOptions(resume=resume)
         return lambda: run_align(train, VAL, FakeTowers(), config, tmp_path, {}, options)
 
     def nose() -> TouchEncoder:
-        return align(TRAIN, VAL, FakeTowers(), CONFIG, "nose", tmp_path, RunOptions(), {})
+        return align(TRAIN, VAL, FakeTowers(), CONFIG, "nose", tmp_path, TrainerOptions(), {})
 
     for message, call in (
         ("nothing to resume", start(resume=True)),

@@ -10,7 +10,7 @@ import torch
 from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.vit import random_masking
-from touchgoal.encoders.config import MaeConfig, RunOptions
+from touchgoal.encoders.config import MaeConfig, TrainerOptions
 from touchgoal.encoders.probes.ridge import ridge_r2
 from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.mae import MaskedAutoencoder, patchify, train_mae
@@ -36,7 +36,7 @@ def blobs(count: int, seed: int) -> TouchFrames:
 def test_the_mean_of_the_tokens_learns_where_and_how_strong(tmp_path: Path) -> None:
     train, val = blobs(256, 0), blobs(64, 1)
     config = replace(TOY, epochs=8)
-    backbone = train_mae(train, val, config, tmp_path, RunOptions(), {"data": "toy"})
+    backbone = train_mae(train, val, config, tmp_path, TrainerOptions(), {"data": "toy"})
     metrics = pretrained.ENCODER_FORMAT.provenance(tmp_path / "encoder")["metrics"]
     assert metrics["validation_loss"] < metrics["validation_loss_of_blank"]
     assert min(metrics[f"force_{axis}_r2"] for axis in "xyz") > 0.8
@@ -49,7 +49,7 @@ def test_a_killed_training_ends_with_the_same_weights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bottleneck: bool
 ) -> None:
     data, config = blobs(32, 0), replace(TOY, bottleneck=bottleneck)
-    whole = train_mae(data, data, config, tmp_path / "whole", RunOptions(), {})
+    whole = train_mae(data, data, config, tmp_path / "whole", TrainerOptions(), {})
     with monkeypatch.context() as patch:
         train_epoch = trainer._train_epoch
 
@@ -60,13 +60,13 @@ def test_a_killed_training_ends_with_the_same_weights(
 
         patch.setattr(trainer, "_train_epoch", dies)
         with pytest.raises(KeyboardInterrupt):
-            train_mae(data, data, config, tmp_path / "killed", RunOptions(), {})
-    go_on = RunOptions(resume=True)
+            train_mae(data, data, config, tmp_path / "killed", TrainerOptions(), {})
+    go_on = TrainerOptions(resume=True)
     resumed = train_mae(data, data, config, tmp_path / "killed", go_on, {})
     for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(a, b)
     with pytest.raises(UserError, match="holds a run already"):
-        train_mae(data, data, config, tmp_path / "killed", RunOptions(), {})
+        train_mae(data, data, config, tmp_path / "killed", TrainerOptions(), {})
     with pytest.raises(UserError, match=r"of another data set.*mae.lr was 0.003, is 0.001"):
         train_mae(data, data, replace(config, lr=1e-3), tmp_path / "killed", go_on, {})
     with pytest.raises(UserError, match=r"of another data set.*\(data was"):
@@ -84,7 +84,7 @@ def test_one_visible_patch_is_enough(tmp_path: Path) -> None:
         assert model.loss(data.touch.float(), ids_keep).isfinite()
     nothing_masked = replace(TOY, mask_ratio=0.01, bottleneck=False)
     with pytest.raises(UserError, match="masks none of 12 patches"):
-        train_mae(data, data, nothing_masked, tmp_path, RunOptions(), {})
+        train_mae(data, data, nothing_masked, tmp_path, TrainerOptions(), {})
 
 
 def test_only_masked_patches_count_where_tokens_are_seen() -> None:

@@ -25,7 +25,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import FR3_ARM
 from touchgoal.control.motion.kinematics import Fr3Kinematics
-from touchgoal.encoders.config import RunOptions
+from touchgoal.encoders.config import TrainerOptions
 from touchgoal.episodes.repair import validate
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
@@ -185,7 +185,7 @@ def test_a_toy_batch_is_learned_by_heart(config: PolicyConfig) -> None:
 CONFIG = TrainConfig(epochs=3, batch_size=8, lr=1e-3, snapshot_epochs=2)
 
 
-SEED = RunOptions(seed=4)
+SEED = TrainerOptions(seed=4)
 
 
 def test_a_killed_training_ends_as_an_uninterrupted_one(

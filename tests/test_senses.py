@@ -17,7 +17,7 @@ from toy_policies import (
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
-from touchgoal.encoders.config import RunOptions
+from touchgoal.encoders.config import TrainerOptions
 from touchgoal.policies.acting import Planner
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.config import EstimatorTrainConfig, PoseEstimatorConfig
@@ -84,7 +84,7 @@ def test_contact_is_learnt(tmp_path: Path) -> None:
         contact,
         EstimatorTrainConfig(contact_epochs=100, touch_noise=0.1),
         tmp_path,
-        RunOptions(),
+        TrainerOptions(),
         {},
     )
     assert ((network.contact(touch) > 0) == contact).float().mean() > 0.9
@@ -103,7 +103,7 @@ def test_a_place_is_learnt(tmp_path: Path) -> None:
     placements = Placements({ft.FRONT: pictures}, torch.randn(256, 7, generator=torch_rng()), start)
     sight = StateEstimatorNetwork(StateEstimatorConfig("toy", 6, SMALL)).pose_estimator
     config = EstimatorTrainConfig(epochs=75, lr=1e-2)
-    train_pose_estimator(sight, placements, config, tmp_path, RunOptions(), {})
+    train_pose_estimator(sight, placements, config, tmp_path, TrainerOptions(), {})
     assert pose_errors(sight, placements)["object_mm"][0] < 15  # 60 by chance
 
 

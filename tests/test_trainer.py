@@ -11,7 +11,7 @@ from torch import nn
 
 from touchgoal.control.errors import UserError
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
-from touchgoal.encoders.config import MaeConfig, RunOptions
+from touchgoal.encoders.config import MaeConfig, TrainerOptions
 from touchgoal.encoders.ssl.mae import MaskedAutoencoder
 from touchgoal.encoders.training.trainer import (
     OptimizerConfig,
@@ -66,11 +66,11 @@ def test_biases_norms_and_tokens_do_not_decay() -> None:
 
 
 def test_tensorboard_lies_beside_the_metrics_and_resuming_is_recorded(tmp_path: Path) -> None:
-    fit(line(), tmp_path, RunOptions(), {"command": "train"})
+    fit(line(), tmp_path, TrainerOptions(), {"command": "train"})
     assert (tmp_path / "metrics.jsonl").read_text().count("\n") == 2
     (events,) = tmp_path.glob("events.out.tfevents.*")
     assert b"loss" in events.read_bytes()
-    go_on = RunOptions(resume=True)
+    go_on = TrainerOptions(resume=True)
     fit(line(), tmp_path, go_on, {"command": "go on"})
     history, provenance = fit(line(), tmp_path, go_on, {"command": "go on"})
     assert len(history) == 2 and provenance["command"] == "train"
@@ -81,11 +81,11 @@ def test_bfloat16_computes_in_it_and_keeps_float32(tmp_path: Path) -> None:
     training, seen = line(), []
     assert isinstance(training.loss, Line)
     training.loss.linear.register_forward_hook(lambda *args: seen.append(args[2].dtype))
-    fit(training, tmp_path, RunOptions(precision="bf16"), {})
+    fit(training, tmp_path, TrainerOptions(precision="bf16"), {})
     assert set(seen) == {torch.bfloat16}
     assert {p.dtype for p in training.loss.parameters()} == {torch.float32}
     with pytest.raises(UserError, match="precision was bf16, is no"):
-        fit(line(), tmp_path, RunOptions(resume=True), {})
+        fit(line(), tmp_path, TrainerOptions(resume=True), {})
 
 
 def test_devices_that_are_not_there_are_refused() -> None:
@@ -102,7 +102,7 @@ from pathlib import Path
 import torch
 sys.path.insert(0, {tests!r})
 import test_align, test_mae, toy_policies
-from touchgoal.encoders.config import Augmentation, RunOptions
+from touchgoal.encoders.config import Augmentation, TrainerOptions
 from touchgoal.encoders.ssl.mae import train_mae
 from touchgoal.encoders.training.trainer import OptimizerConfig
 from touchgoal.policies.config import TrainConfig
@@ -113,13 +113,13 @@ OptimizerConfig.build = lambda self, module: torch.optim.SGD(module.parameters()
 out = Path(sys.argv[1])
 config = replace(test_mae.TOY, mask_ratio=0.0, epochs=2, lr=0.1)
 data = test_mae.blobs(32, 0)
-train_mae(data, data, config, out / "mae", RunOptions(), {{}})
+train_mae(data, data, config, out / "mae", TrainerOptions(), {{}})
 names = {{name: texts[:1] for name, texts in test_align.DESCRIPTIONS.items()}}
 touches = replace(test_align.TRAIN, descriptions=names)
 config = replace(test_align.CONFIG, lr=0.1, mask_ratio=0.0, augmentation=Augmentation(), no_contact_texts=("free",))
 test_align.run_align(touches, test_align.VAL, test_align.FakeTowers(), config, out / "align", {{}})
 windows, config = toy_policies.toy_dataset(toy_policies.TOY), TrainConfig(epochs=2, batch_size=8)
-train(toy_policies.TOY, windows, windows, config, out / "policy", RunOptions(), {{}})
+train(toy_policies.TOY, windows, windows, config, out / "policy", TrainerOptions(), {{}})
 """
 
 

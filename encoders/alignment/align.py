@@ -24,7 +24,7 @@ from touchgoal.encoders.alignment.retrieval import evaluate_retrieval
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS as VIT_PRESETS
 from touchgoal.encoders.backbones.vit import random_masking
-from touchgoal.encoders.config import AlignConfig, RunOptions
+from touchgoal.encoders.config import AlignConfig, TrainerOptions
 from touchgoal.encoders.towers.towers import Towers
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.trainer import (
@@ -46,7 +46,7 @@ def align(
     config: AlignConfig,
     sensor: str,
     out_dir: Path,
-    options: RunOptions,
+    options: TrainerOptions,
     recipe: dict[str, Any],
 ) -> TouchEncoder:
     """Trains a touch encoder.

@@ -19,7 +19,7 @@ from touchgoal.encoders.backbones.vit import (
     random_masking,
     sinusoidal_positions,
 )
-from touchgoal.encoders.config import MaeConfig, RunOptions
+from touchgoal.encoders.config import MaeConfig, TrainerOptions
 from touchgoal.encoders.probes.ridge import ridge_r2
 from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.training.checkpoint import checksum
@@ -108,7 +108,7 @@ def train_mae(
     val: TouchFrames,
     config: MaeConfig,
     out_dir: Path,
-    options: RunOptions,
+    options: TrainerOptions,
     recipe: dict[str, Any],
 ) -> TouchBackbone:
     """Trains a backbone.

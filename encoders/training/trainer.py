@@ -27,7 +27,7 @@ from tqdm import tqdm
 from touchgoal.control.errors import UserError
 from touchgoal.control.interruption import kept
 from touchgoal.control.provenance import command_line
-from touchgoal.encoders.config import RunOptions
+from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.training import checkpoint
 
 Metrics = dict[str, Any]
@@ -137,7 +137,7 @@ class Training:
 
 
 def fit(
-    training: Training, out_dir: Path, options: RunOptions, recipe: Mapping[str, Any]
+    training: Training, out_dir: Path, options: TrainerOptions, recipe: Mapping[str, Any]
 ) -> tuple[list[Metrics], dict[str, Any]]:
     """Trains; Ctrl-C keeps the finished epochs.
 
@@ -299,7 +299,7 @@ def check_device(device: str) -> None:
         raise UserError("there is no device mps here: choose the device cpu")
 
 
-def _accelerator(options: RunOptions) -> Accelerator:
+def _accelerator(options: TrainerOptions) -> Accelerator:
     check_device(options.device)
     kind, _, index = options.device.partition(":")
     if index:

@@ -35,7 +35,7 @@ def run_command(config: Align | Mae | Surfaces) -> None:
     if isinstance(config, Surfaces):
         _fit_to_surfaces(config)
         return
-    check_training(config.run, config.out)
+    check_training(config.trainer, config.out)
     sets = open_sets(config.data, config.validation)
     sensor = _sensor_of(config.sensor, *sets)
     if isinstance(config, Mae):
@@ -74,7 +74,7 @@ def _train_mae(config: Mae, sensor: str, data: EpisodeSet, validation: EpisodeSe
         sample_frames(episodes, sensor, config.frames, config.seed)
         for episodes in (data, validation)
     )
-    train_mae(train, val, config.mae, out, config.run, recipe(data, validation))
+    train_mae(train, val, config.mae, out, config.trainer, recipe(data, validation))
     print(f"encoder: {out / 'encoder'}")
 
 
@@ -94,7 +94,7 @@ def _align(config: Align, sensor: str, data: EpisodeSet, validation: EpisodeSet)
     )
     print(f"{len(train)} touches of {len(train.descriptions)} objects; {len(val)} for validation")
     encoder = align(
-        train, val, towers, config.align, sensor, out, config.run, recipe(data, validation)
+        train, val, towers, config.align, sensor, out, config.trainer, recipe(data, validation)
     )
     if not is_first_process():
         return

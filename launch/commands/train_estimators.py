@@ -40,7 +40,7 @@ _SEED, _VALIDATION_SEED = 4_000_000, 4_900_000  # of the things placed
 
 def run_command(config: Config) -> None:
     """Place, embed, train, judge."""
-    check_training(config.run, config.out, _CONTACT)
+    check_training(config.trainer, config.out, _CONTACT)
     sets = open_sets(config.data, config.validation)
     encoder = config.encoder or pretrained.DEFAULT_ENCODER
     touch = load_touch(encoder)
@@ -54,7 +54,7 @@ def run_command(config: Config) -> None:
         embed_touch_and_contact(episodes, touch, config.workers) for episodes in sets
     )
     contact_out, pose_out = out / _CONTACT, out / _POSE
-    train_contact_estimator(network, *rows, config.train, contact_out, config.run, provenance)
+    train_contact_estimator(network, *rows, config.train, contact_out, config.trainer, provenance)
     errors: dict = {"contact": contact_error_rate(network, *validation)}
     cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key, _ in config.pose_estimator.crops)
     size = config.pose_estimator.size
@@ -64,7 +64,7 @@ def run_command(config: Config) -> None:
         render_placements(env, config.objects, config.placements, _SEED, config.workers),
         config.train,
         pose_out,
-        replace(config.run, resume=config.resume and has_checkpoint(pose_out)),
+        replace(config.trainer, resume=config.resume and has_checkpoint(pose_out)),
         provenance,
     )
     if not is_first_process():

@@ -42,7 +42,7 @@ _TRIALS = 2_000_000  # seed of the first trial
 
 def run_command(config: Config) -> None:
     """Embed, train, choose."""
-    check_training(config.run, config.out)
+    check_training(config.trainer, config.out)
     if config.end_to_end and config.encoder:
         raise UserError("end-to-end touch takes no frozen encoder: leave it out")
     parts = {
@@ -75,7 +75,7 @@ def run_command(config: Config) -> None:
     )
     print(f"{len(windows)} windows of {len(chosen[0])} episodes; {len(validation)} for validation")
     provenance = recipe(*sets) | {"episodes": len(chosen[0])}
-    train(policy, windows, validation, config.train, out, config.run, provenance)
+    train(policy, windows, validation, config.train, out, config.trainer, provenance)
     if not is_first_process():
         return
     add_parts(out / POLICY, parts)

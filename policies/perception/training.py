@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
 from touchgoal.control import features as ft
-from touchgoal.encoders.config import RunOptions
+from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
 from touchgoal.episodes.store import EpisodeSet
@@ -41,7 +41,7 @@ def train_contact_estimator(
     contact: Bool[Tensor, "n 2"],
     config: EstimatorTrainConfig,
     out_dir: Path,
-    options: RunOptions,
+    options: TrainerOptions,
     recipe: dict[str, Any],
 ) -> None:
     """Trains the reader of contact; writes what `trainer.fit` does."""
@@ -83,7 +83,7 @@ def train_pose_estimator(
     placements: Placements,
     config: EstimatorTrainConfig,
     out_dir: Path,
-    options: RunOptions,
+    options: TrainerOptions,
     recipe: dict[str, Any],
 ) -> None:
     """Trains the pose estimator; writes what `trainer.fit` does."""

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
-from touchgoal.encoders.config import RunOptions
+from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
 from touchgoal.policies import checkpoint
@@ -29,7 +29,7 @@ def train(
     validation: SequenceDataset,
     config: TrainConfig,
     out_dir: Path,
-    options: RunOptions,
+    options: TrainerOptions,
     recipe: dict[str, Any],
 ) -> Policy:
     """Trains a policy; the moving average of its weights is what is kept.
