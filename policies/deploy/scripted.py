@@ -51,8 +51,8 @@ class PickPlacePoses:
 
 
 @dataclass(frozen=True)
-class Segment:
-    """A move (or, without one, a wait) with the gripper going to `width` (m); may end by feeling.
+class PlannedMove:
+    """A move along a path (without one: a wait) with the gripper going to `width` (m); may end by feeling.
 
     It takes `seconds`, which is the path's own duration or longer.
     """
@@ -64,20 +64,20 @@ class Segment:
 
 
 class ScriptedActor:
-    """An actor that walks through segments; the plan waits while the arm is held.
+    """An actor that walks through moves; the plan waits while the arm is held.
 
     Attributes:
-        done: whether the last segment is over.
+        done: whether the last move is over.
         action_age: always 0: a script is never late.
     """
 
     action_age = 0.0
 
-    def __init__(self, segments: list[Segment], commanded: Callable[[], np.ndarray], hz: float):
+    def __init__(self, moves: list[PlannedMove], commanded: Callable[[], np.ndarray], hz: float):
         """An actor.
 
         Args:
-            segments: in their order; each begins where the one before ends.
+            moves: in their order; each begins where the one before ends.
             commanded: the joint positions (rad) commanded now.
             hz: ticks per second.
         """
@@ -85,7 +85,7 @@ class ScriptedActor:
         self._wrench, self._measured = np.zeros(6), commanded()
         self._width, self._gripper_still = np.inf, False
         self.done = False
-        self._actions = self._run(segments)
+        self._actions = self._run(moves)
 
     def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
         """The action for the next tick."""
@@ -98,25 +98,25 @@ class ScriptedActor:
     def close(self) -> None:
         """Nothing is left behind."""
 
-    def _run(self, segments: list[Segment]) -> Iterator[np.ndarray]:
+    def _run(self, moves: list[PlannedMove]) -> Iterator[np.ndarray]:
         still, width = np.zeros(self._commanded().size), 0.0
-        for segment in segments:
-            width, t, weight = segment.width, 0.0, self._wrench[2]
-            while t < segment.seconds:
-                if segment.until_supported and self._wrench[2] - weight > _TABLE_FORCE:
+        for move in moves:
+            width, t, weight = move.width, 0.0, self._wrench[2]
+            while t < move.seconds:
+                if move.until_supported and self._wrench[2] - weight > _TABLE_FORCE:
                     # Command what is, not what was asked: the lag would press on the table.
                     yield np.append(self._measured - self._commanded(), width)
                     break
                 wanted = still
                 lag = np.abs(self._commanded() - self._measured).max()
-                if segment.path is None:  # seconds in which nothing moves
+                if move.path is None:  # seconds in which nothing moves
                     t = t + self._tick if self._gripper_still and lag < _HELD_ERROR else 0.0
                 else:
-                    pace = segment.path.duration / segment.seconds
-                    at = segment.path.at(pace * t)
+                    pace = move.path.duration / move.seconds
+                    at = move.path.at(pace * t)
                     if np.abs(at - self._commanded()).max() < _HELD_ERROR and lag < _MAX_LAG:
                         t += self._tick
-                        at = segment.path.at(pace * t)
+                        at = move.path.at(pace * t)
                     wanted = at - self._commanded()
                 yield np.append(wanted, width)
         self.done = True
@@ -135,7 +135,7 @@ def start_move(
     path = joint_move(commanded(), goal, limits)
     require_inside_workspace(path, safety)
     require_no_self_collision(path, SelfDistance(safety.limits.arm))
-    return ScriptedActor([Segment(path, width, path.duration)], commanded, 1 / safety.dt)
+    return ScriptedActor([PlannedMove(path, width, path.duration)], commanded, 1 / safety.dt)
 
 
 def pick_and_place(
@@ -159,21 +159,21 @@ def pick_and_place(
 
     def line(
         to: np.ndarray, width: float, least: float = 0.0, until_supported: bool = False
-    ) -> Segment:
+    ) -> PlannedMove:
         nonlocal q
         path = straight_line(kinematics, q, to, fingers_down(yaw), limits)
         require_inside_workspace(path, safety)
         q = path.at(path.duration)
-        return Segment(path, width, max(path.duration, least), until_supported)
+        return PlannedMove(path, width, max(path.duration, least), until_supported)
 
-    segments = [
+    moves = [
         line(pick + up, opened),
         line(pick, opened),
-        Segment(None, 0.0, _CLOSE_SECONDS),
+        PlannedMove(None, 0.0, _CLOSE_SECONDS),
         line(pick + up, 0.0),
         line(put + up, 0.0),
         line(put + [0, 0, 0.004], 0.0),
         line(deepest, 0.0, _PROBE_SECONDS, until_supported=True),
-        Segment(None, 0.0, _HOLD_SECONDS),
+        PlannedMove(None, 0.0, _HOLD_SECONDS),
     ]
-    return ScriptedActor(segments, commanded, 1 / safety.dt)
+    return ScriptedActor(moves, commanded, 1 / safety.dt)

@@ -21,8 +21,8 @@ TOUCHDOWN_DEPTH = 0.010  # m below the grasp's height to look for the table when
 
 
 @dataclass(frozen=True)
-class Segment:
-    """A straight minimum-jerk move of the TCP, fingers down, while the gripper goes to `width`.
+class Waypoint:
+    """Where the hand goes next, fingers down, straight and with minimum jerk, the gripper at `width`.
 
     Attributes:
         position: of the TCP at the end, m, base frame; None: stay.
@@ -66,29 +66,29 @@ class PickPlaceExpert:
         yaw, target_yaw = self._yaw_now(), self._env.grasp_yaw(self._picked)
         stop = self._freeze_tick()
         tick, width = 0, GRIPPER_MAX_WIDTH
-        for segment in self._plan():
-            ticks = round(segment.seconds * env.config.control_hz)
+        for waypoint in self._plan():
+            ticks = round(waypoint.seconds * env.config.control_hz)
             start, start_yaw = position, yaw
             for k in range(1, ticks + 1):
-                if segment.until_supported and env.object_on_table(self._picked):
+                if waypoint.until_supported and env.object_on_table(self._picked):
                     # Command what is, not what was asked: the lag would press on the table.
                     position = env.data.site("tcp").xpos.copy()
                     break
                 s = _minimum_jerk(k / ticks)
-                if segment.position is not None:
-                    position = start + s * (segment.position - start)
+                if waypoint.position is not None:
+                    position = start + s * (waypoint.position - start)
                 yaw = start_yaw + s * (target_yaw - start_yaw)
                 tick += 1
                 if tick > stop:
                     break
-                yield self._towards(position, yaw, segment.width)
+                yield self._towards(position, yaw, waypoint.width)
             if tick > stop:
                 break
-            width = segment.width
+            width = waypoint.width
         while True:
             yield np.append(np.zeros(env.n_joints), width)
 
-    def _plan(self) -> list[Segment]:
+    def _plan(self) -> list[Waypoint]:
         env = self._env
         pick = env.object_pose(self._picked)[:3]
         pick[2] = max(pick[2], LOWEST_GRASP)
@@ -101,23 +101,23 @@ class PickPlaceExpert:
         # Closed on air the pads would touch each other, which is no absence of touch.
         closed = 0.03 if self._outcome == "never_touch" else 0.0
         carried = GRIPPER_MAX_WIDTH if self._outcome == "drop" else closed
-        segments = [
-            Segment("approach", above, GRIPPER_MAX_WIDTH, 1.0),
-            Segment("descend", pick, GRIPPER_MAX_WIDTH, 0.7),
-            Segment("close", None, closed, 0.8),
-            Segment("lift", above, closed, 0.7),
-            Segment("carry", middle, closed, 0.6),
-            Segment("carry", over, carried, 0.6),
-            Segment("lower", place + [0, 0, 0.004], carried, 0.9, until_supported=True),
-            Segment("touch down", deepest, carried, 0.8, until_supported=True),
-            Segment("hold", None, carried, 0.8),
+        waypoints = [
+            Waypoint("approach", above, GRIPPER_MAX_WIDTH, 1.0),
+            Waypoint("descend", pick, GRIPPER_MAX_WIDTH, 0.7),
+            Waypoint("close", None, closed, 0.8),
+            Waypoint("lift", above, closed, 0.7),
+            Waypoint("carry", middle, closed, 0.6),
+            Waypoint("carry", over, carried, 0.6),
+            Waypoint("lower", place + [0, 0, 0.004], carried, 0.9, until_supported=True),
+            Waypoint("touch down", deepest, carried, 0.8, until_supported=True),
+            Waypoint("hold", None, carried, 0.8),
         ]
         if env.config.release:
-            segments[-1:] = [
-                Segment("release", None, GRIPPER_MAX_WIDTH, 0.5),
-                Segment("retreat", over, GRIPPER_MAX_WIDTH, 0.8),
+            waypoints[-1:] = [
+                Waypoint("release", None, GRIPPER_MAX_WIDTH, 0.5),
+                Waypoint("retreat", over, GRIPPER_MAX_WIDTH, 0.8),
             ]
-        return segments
+        return waypoints
 
     @property
     def _picked(self) -> str:
