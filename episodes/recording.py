@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -169,15 +170,18 @@ def collect(
 
 @contextmanager
 def one_core_workers(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Workers that use one core each; spawned, because OpenGL contexts do not survive a fork.
+    """Workers that use one core each.
+
+    OpenGL contexts do not survive a fork, so they are forked from a server that never renders; it
+    imports once, for all workers of this process, what this process has imported.
 
     Should anything end the block early, Ctrl-C for example, the workers end at once: what they
     have in hand is lost.
     """
     others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(
-        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_work
-    )
+    forkserver = multiprocessing.get_context("forkserver")
+    forkserver.set_forkserver_preload([m for m in sys.modules if m.startswith("touchgoal.")])
+    pool = ProcessPoolExecutor(workers, mp_context=forkserver, initializer=_begin_work)
     try:
         yield pool
     except BaseException:
