@@ -29,7 +29,7 @@ class Config:
     """Model of the sensor (`touchgoal list sensors`)."""
     ball_mm: Positive | None = None
     """Radius of the ball, mm, of presses for which presses.csv gives none."""
-    light_power: Positive | None = None
+    illumination_exponent: Positive | None = None
     """Power of the background's brightness by which the response varies over the image; default: the
     one with which the balls come out at their size (four fits, a few minutes)."""
     out: Path | None = None
@@ -48,10 +48,10 @@ def main(config: Config) -> None:
 
     from touchgoal.control.calibration import report
     from touchgoal.control.calibration.calibrate import (
-        LIGHT_POWERS,
+        ILLUMINATION_EXPONENTS,
         STEPS,
         fit,
-        select_light_power,
+        select_illumination_exponent,
     )
     from touchgoal.control.calibration.held_out_depth import depth_errors, median_by_ball
     from touchgoal.control.calibration.pictures import light_compass
@@ -73,13 +73,13 @@ def main(config: Config) -> None:
         )
     out = open_run(config.out, "calibrate", config)
     train, test = split(presses, round(config.held_out * len(presses)), config.seed)
-    power = config.light_power
+    power = config.illumination_exponent
     if power is None:
-        with Progress("finding how the light varies", len(LIGHT_POWERS), "fit") as bar:
-            power = select_light_power(train, pitch, config.sensor, bar.update)
+        with Progress("finding how the light varies", len(ILLUMINATION_EXPONENTS), "fit") as bar:
+            power = select_illumination_exponent(train, pitch, config.sensor, bar.update)
     with Progress("fitting", 2 * STEPS, "step") as bar:
-        judged = fit(train, pitch, config.sensor, bar.update, light_power=power)
-        fitted = fit(presses, pitch, config.sensor, bar.update, light_power=power)
+        judged = fit(train, pitch, config.sensor, bar.update, illumination_exponent=power)
+        fitted = fit(presses, pitch, config.sensor, bar.update, illumination_exponent=power)
     errors = report.held_out_errors(judged, test)
     print(report.errors_table(errors, len(test)))
     report.refuse_useless(errors)

@@ -104,7 +104,7 @@ def test_calibrate_finds_known_lights(
     presses: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     main(["calibrate", str(presses), "--mm-per-pixel", "0.118", "--out", str(tmp_path),
-          "--light-power", "1"])  # fmt: skip
+          "--illumination-exponent", "1"])  # fmt: skip
     found = sensor_calibration.load(tmp_path / "sensor_file")
     for azimuth, true in zip(found.light_azimuths, AZIMUTHS, strict=True):
         assert off_by(azimuth, true) < 10
@@ -293,9 +293,11 @@ def test_a_background_is_filled_in_without_a_seam() -> None:
     assert change.min() >= 5 and change.max() <= 7
 
 
-def test_sensor_files_from_before_the_lights_power_are_read(tmp_path: Path) -> None:
+def test_sensor_files_of_older_formats_are_read(tmp_path: Path) -> None:
     sensor_calibration.save(known_sensor(), tmp_path, {})
     old = json.loads((tmp_path / "sensor.json").read_text())
-    del old["light_power"]
+    del old["illumination_exponent"]
     (tmp_path / "sensor.json").write_text(json.dumps(old | {"format": 1}))
-    assert sensor_calibration.load(tmp_path).light_power == 1
+    assert sensor_calibration.load(tmp_path).illumination_exponent == 1
+    (tmp_path / "sensor.json").write_text(json.dumps(old | {"light_power": 2}))
+    assert sensor_calibration.load(tmp_path).illumination_exponent == 2

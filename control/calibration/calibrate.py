@@ -25,8 +25,8 @@ from touchgoal.control.tactile.sensor_calibration import (
     shape_features,
 )
 
-LIGHT_POWERS = (1.0, 1.5, 2.0, 2.5)
-"""What `select_light_power` chooses from."""
+ILLUMINATION_EXPONENTS = (1.0, 1.5, 2.0, 2.5)
+"""What `select_illumination_exponent` chooses from."""
 STEPS = 7
 """How often `fit` reports progress."""
 
@@ -90,7 +90,12 @@ class FittedCalibration:
         `correct_labels` the labels' as well.
         """
         p = self.calibration
-        steps = PressFit(presses, p.background, self.varies_over_image, light_power=p.light_power)
+        steps = PressFit(
+            presses,
+            p.background,
+            self.varies_over_image,
+            illumination_exponent=p.illumination_exponent,
+        )
         state = FitState(self.calibration, self.correct_labels(presses), self.ball_radii(presses))
         for _ in range(8):
             state = steps.fit_circles(state)
@@ -107,7 +112,7 @@ def fit(
     sensor: str,
     on_progress: Callable[[], object] = lambda: None,
     trust_labels: bool = False,
-    light_power: float = 1.0,
+    illumination_exponent: float = 1.0,
 ) -> FittedCalibration:
     """Calibrate a sensor.
 
@@ -117,13 +122,13 @@ def fit(
         sensor: name of the sensor model.
         on_progress: called STEPS times as the work proceeds.
         trust_labels: leave the circles as they are, but for one common scale of their radii.
-        light_power: see `SensorCalibration.light_power` and `select_light_power`.
+        illumination_exponent: see `SensorCalibration.illumination_exponent` and `select_illumination_exponent`.
     """
     background, varies_over_image = median_background(presses), _spread_out(presses)
-    steps = PressFit(presses, background, varies_over_image, trust_labels, light_power)
+    steps = PressFit(presses, background, varies_over_image, trust_labels, illumination_exponent)
     ball_fitted = bool(np.isnan(presses.ball_radius).any())
     initial = _initial_calibration(background, pitch, sensor, noise(presses))
-    initial = replace(initial, light_power=light_power)
+    initial = replace(initial, illumination_exponent=illumination_exponent)
     state = steps.initialise(initial, presses.ball_radius)
     on_progress()
     for _ in range(2):
@@ -145,7 +150,7 @@ def fit(
     )
 
 
-def select_light_power(
+def select_illumination_exponent(
     presses: PressSet, pitch: float, sensor: str, on_progress: Callable[[], object] = lambda: None
 ) -> float:
     """The power of light with which the balls of these presses come out at their size.
@@ -160,8 +165,8 @@ def select_light_power(
     """
     wrong = {}
     chosen = np.arange(0, len(presses), max(1, len(presses) // _DEPTH_PRESSES))
-    for power in LIGHT_POWERS:
-        fitted = fit(presses, pitch, sensor, light_power=power)
+    for power in ILLUMINATION_EXPONENTS:
+        fitted = fit(presses, pitch, sensor, illumination_exponent=power)
         errors = depth_errors(
             fitted.calibration,
             presses.take(chosen),

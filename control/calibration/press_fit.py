@@ -89,7 +89,7 @@ class PressFit:
         background: the untouched sensor (RGB) that changes are taken against.
         varies_over_image: whether the response may vary over the image.
         trust_labels: whether circles stay as they are.
-        light_power: of the background's brightness (`SensorCalibration.light_power`).
+        illumination_exponent: of the background's brightness (`SensorCalibration.illumination_exponent`).
     """
 
     def __init__(
@@ -98,11 +98,11 @@ class PressFit:
         background: UInt8[np.ndarray, "h w 3"],
         varies_over_image: bool,
         trust_labels: bool = False,
-        light_power: float = 1.0,
+        illumination_exponent: float = 1.0,
     ) -> None:
         self._labels = presses.circles
         self._trust_labels = trust_labels
-        self._light = illumination(background, light_power).reshape(-1, 3)
+        self._light = illumination(background, illumination_exponent).reshape(-1, 3)
         self._samples = [
             _sample(image, background, circle)
             for image, circle in zip(presses.images, presses.circles, strict=True)

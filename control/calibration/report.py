@@ -132,7 +132,7 @@ def record(
         "held_out_presses": n_test,
         "held_out": {name: asdict(e) for name, e in errors.items()},
         "held_out_depth": depths,
-        "light_power": fitted.calibration.light_power,
+        "illumination_exponent": fitted.calibration.illumination_exponent,
         "ball_mm": sorted({round(float(r) * 1e3, 3) for r in fitted.ball_radius}),
         "ball_fitted": fitted.ball_fitted,
         "response_varies_over_image": fitted.varies_over_image,

@@ -101,7 +101,7 @@ class _Level:
         rows, columns, _ = p.background.shape
         h, w = self._shape = rows // cell, columns // cell
         self._pitch = p.pixel_pitch * cell
-        gain = illumination(p.background, p.light_power)
+        gain = illumination(p.background, p.illumination_exponent)
         light = cv2.resize(gain, (w, h), interpolation=cv2.INTER_AREA)
         self._gain = np.ascontiguousarray(np.moveaxis(light, 2, 0))
         self._noise = np.float32(np.hypot(p.noise / cell, _MODEL_ERROR))

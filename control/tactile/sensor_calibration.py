@@ -9,7 +9,7 @@ across columns and rows, and the shadow depths s_l of `gel.shadow_depth`, channe
         sum over k, m of response[c,k,m] f_k p_m  +  sum over l of shadow[c,l] s_l / (s_l + penumbra)
     )
 
-The gain is the blurred background divided by its mean, to the power `light_power`: where little light
+The gain is the blurred background divided by its mean, to the power `illumination_exponent`: where little light
 falls, slopes change the picture little. (Of a real Mini 2 fits, not 1: the gel's scattered light fills
 the background where the lamps themselves no longer reach. With 1 its balls read up to 40 % too flat
 in the corners.) The polynomial holds for what the presses showed and no further: a normal steeper
@@ -34,7 +34,7 @@ from touchgoal.control.tactile import gel
 
 N_FEATURES = 10
 FORMAT = 2
-_WITHOUT_LIGHT_POWER = 1  # the format before `light_power`, which was 1
+_WITHOUT_EXPONENT = 1  # the format before `illumination_exponent`, which was 1
 _JSON, _BACKGROUND = "sensor.json", "background.png"
 _MAKE = "make one with: touchgoal calibrate PRESSES"
 
@@ -53,11 +53,13 @@ class SensorCalibration:
             (down).
         shadow_slope: tangent of the lights' height above the gel plane.
         shadow: counts per channel in the deepest shadow of each light.
-        penumbra: shadow depth (`gel.shadow_depth`) at which half of that is reached, m.
+        penumbra: how soft the shadows' edges are, as a half-shadow is called in optics: the shadow depth
+            (`gel.shadow_depth`) at which half of that is reached, m.
         max_slope, max_depth: largest length of (nx, ny), and depth in m, in the presses.
         blur_sigmas: standard deviations of the gel's bulge, coarse to fine, m (`gel.deform`).
         noise: standard deviation of the camera's noise, counts.
-        light_power: of the background's brightness, by which the response varies over the image.
+        illumination_exponent: power of the background's brightness by which the response varies over
+            the image (`illumination`).
     """
 
     sensor: str
@@ -72,15 +74,15 @@ class SensorCalibration:
     max_depth: float
     blur_sigmas: tuple[float, ...]
     noise: float
-    light_power: float = 1.0
+    illumination_exponent: float = 1.0
 
 
 def illumination(
-    background: UInt8[np.ndarray, "h w 3"], light_power: float = 1.0
+    background: UInt8[np.ndarray, "h w 3"], illumination_exponent: float = 1.0
 ) -> Float32[np.ndarray, "h w 3"]:
     """How strongly slopes change the picture over the image, per channel relative to the mean."""
     light = cv2.GaussianBlur(background.astype(np.float32), (0, 0), background.shape[1] / 40)
-    light = (light / light.mean((0, 1))) ** np.float32(light_power)
+    light = (light / light.mean((0, 1))) ** np.float32(illumination_exponent)
     return light / light.mean((0, 1))
 
 
@@ -170,7 +172,7 @@ def shade(
     """
     terms = design_matrix(calibration, surface, np.arange(surface.size))
     change = (coefficients(calibration) @ terms).T.reshape(*surface.shape, 3)
-    gain = illumination(calibration.background, calibration.light_power)
+    gain = illumination(calibration.background, calibration.illumination_exponent)
     return calibration.background + gain * change
 
 
@@ -224,7 +226,7 @@ def load(folder: Path) -> SensorCalibration:
         "penumbra",
         "max_slope",
         "max_depth",
-        "light_power",
+        "illumination_exponent",
     ):
         if not values[name] > 0:
             raise UserError(f"{path}: {name} must be positive, not {values[name]}: {_MAKE}")
@@ -245,10 +247,12 @@ def _read_description(folder: Path) -> dict[str, Any]:
         version, _ = description["format"], description["provenance"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise UserError(f"{path} is no sensor file: {_MAKE}") from error
-    if version == _WITHOUT_LIGHT_POWER:
-        description.setdefault("light_power", 1.0)
+    if version == _WITHOUT_EXPONENT:
+        description.setdefault("illumination_exponent", 1.0)
     elif version != FORMAT:
         raise UserError(f"{path} has format {version}, this touchgoal reads {FORMAT}: {_MAKE}")
+    elif "light_power" in description:  # its older name
+        description["illumination_exponent"] = description.pop("light_power")
     return description
 
 
@@ -287,6 +291,6 @@ _NUMBERS: dict[str, Callable[[Any], Any]] = {
     "max_depth": _number,
     "blur_sigmas": _numbers,
     "noise": _number,
-    "light_power": _number,
+    "illumination_exponent": _number,
 }
 _INNERMOST = re.compile(r"\[[^\[\]{}]*\]")  # lists of numbers go on one line

@@ -82,7 +82,7 @@ def sample_instance(
     noise = common * rng.normal(size=(*tile[:2], 1)) + np.sqrt(0.7) * rng.normal(size=tile)
     markers, radius = _markers(sensor, pitch, randomization.markers, rng)
     light = cv2.resize(
-        illumination(typical.background, typical.light_power),
+        illumination(typical.background, typical.illumination_exponent),
         (w // 2, h // 2),
         interpolation=cv2.INTER_AREA,
     )
