@@ -1,21 +1,19 @@
-"""A Franka Hand behind its driver: one command at a time, as `control/grippers/franka_hand.py` sends them."""
+"""A Franka Hand behind its driver, in an environment: told what the driver would tell it."""
 
 from typing import Any
 
 import numpy as np
 
-_PERIOD = 50  # ms between exchanges with the hand
-_SHUT = 2e-3  # m: between commands that differ, and up to which a width means a grasp
+from touchgoal.control.grippers.hand_commands import PERIOD, SHUT, HandCommands, LastCommand
+
+_PERIOD = round(1000 * PERIOD)  # ms
 _ARRIVED = 1e-3  # m
-_STILL = 2e-4  # m by which fingers move in an exchange, and count as stopped
-_LEAST = 2  # exchanges that any command takes
+_STILL = 2e-4  # m by which fingers move between two looks, and count as stopped
+_LEAST = 2  # looks for which any command runs
 
 
 class DeployedHand:
     """The hand in one episode, open and at rest at first.
-
-    A move runs to its end before the next command is looked at; closing to 0 grasps: it goes on
-    until it meets something, and then holds by force. A move inwards that is stopped grasps, too.
 
     Attributes:
         width: as last read, m.
@@ -24,29 +22,29 @@ class DeployedHand:
     def __init__(self, env: Any, rng: np.random.Generator) -> None:
         self._env = env
         self._phase = int(rng.integers(_PERIOD))
-        self._sent = self._goal = env.width()
-        self.width = env.width()
-        self._busy, self._age = False, 0
+        self._goal = self.width = env.width()
+        self._commands = HandCommands(self.width)
+        self._last: LastCommand = "arrived"
+        self._grasps, self._age = False, 0
 
     def step(self, ms: int, wanted: float) -> float:
         """The width (m) that the fingers go to in this millisecond, while `wanted` is the newest."""
         if ms % _PERIOD == self._phase:
-            self._exchange(wanted)
+            self._look(wanted)
         return self._goal
 
-    def _exchange(self, wanted: float) -> None:
+    def _look(self, wanted: float) -> None:
         before, self.width = self.width, self._env.width()
         self._age += 1
-        if self._busy and self._age > _LEAST:
-            arrived = abs(self.width - self._goal) < _ARRIVED
-            stopped = abs(self.width - before) < _STILL
-            if stopped and not arrived and self._goal < self.width:
-                self._goal = 0.0  # what a move meets on its way in is grasped
-            self._busy = not (arrived or stopped)
-        if not self._busy and abs(wanted - self._sent) > _SHUT:
-            self._sent = wanted
-            holds = self._goal == 0.0 and self.width > _SHUT
-            if holds and wanted < self.width:
-                return  # the grasp goes on
-            self._goal = 0.0 if wanted <= _SHUT else wanted
-            self._busy, self._age = True, 0
+        if self._last == "runs" and self._age > _LEAST:
+            if abs(self.width - self._goal) < _ARRIVED:
+                self._last = "arrived"
+            elif abs(self.width - before) < _STILL:
+                self._last = "stopped short"
+        grasped = self._grasps and self._last != "runs" and self.width > SHUT
+        target = min(max(wanted, 0.0), self._env.robot.tool.stroke[1])
+        command = self._commands.next(target, self.width, grasped, self._last)
+        if command is not None:
+            self._grasps = command.grasp
+            self._goal = 0.0 if command.grasp else command.width
+            self._last, self._age = "runs", 0

@@ -124,7 +124,10 @@ def test_a_hand_ends_a_move_before_it_takes_the_next() -> None:
     env.reset(seed=3)
     still = np.zeros(7)
     widths = []
-    for width in [0.03, *[0.08] * 29]:  # passed through: the ideal hand would open again at once
+    for width in [0.03, *[0.08] * 9]:  # passed through: no such move is begun
+        env.step(np.append(still, width))
+        assert env.width() > 0.078
+    for width in [0.03, 0.03, *[0.08] * 29]:  # the ideal hand would open again at once
         env.step(np.append(still, width))
         widths.append(env.width())
     assert min(widths) < 0.032 and widths[-1] > 0.078

@@ -1,5 +1,6 @@
 """Cameras over a real MJPEG stream and real files: newest frame, rate, stall, freeze, return."""
 
+import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -13,7 +14,7 @@ import pytest
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError, TactileSensor
-from touchgoal.control.sensors.fingertip_source import fingertip_view
+from touchgoal.control.sensors.fingertip_source import fingertip_video, fingertip_view
 from touchgoal.control.sensors.pictures import FrozenParts, JpegDecoder, is_broken_gel
 from touchgoal.control.sensors.tactile_camera import (
     DIGIT_CROP,
@@ -183,13 +184,8 @@ def test_broken_jpegs_of_a_gel_are_refused_and_presses_of_a_real_one_are_not() -
     """Random bytes; decoders show them as blocks, which read as millimetres of indentation."""
     rng, decoder, passed = np.random.default_rng(0), JpegDecoder(), 0
     for k in range(100):
-        data = bytearray(
-            cv2.imencode(".jpg", noisy(k), [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
-        )
-        start = data.index(b"\xff\xda") + 14
-        for _ in range(20):
-            data[rng.integers(start, len(data) - 2)] = rng.integers(256)
-        image = decoder.decode(bytes(data))
+        data = cv2.imencode(".jpg", noisy(k), [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+        image = decoder.decode(damaged(data, 20, rng))
         if image is not None and not is_broken_gel(image[..., ::-1], noisy(1000)):
             seen = cv2.blur(np.abs(image[..., ::-1].astype(np.float32) - GEL), (8, 8))
             passed += seen.max() > 20
@@ -198,6 +194,60 @@ def test_broken_jpegs_of_a_gel_are_refused_and_presses_of_a_real_one_are_not() -
     real = sorted(Path("/work/shared/data/mini_presses").glob("ball*.png"))
     pictures = [p for path in real if (p := cv2.imread(str(path))) is not None]
     assert not any(is_broken_gel(p, pictures[0]) for p in pictures)
+
+
+def damaged(data: bytes, count: int, rng: np.random.Generator) -> bytes:
+    """A JPEG with so many bytes of its picture replaced."""
+    broken = bytearray(data)
+    start = broken.index(b"\xff\xda") + 14
+    for _ in range(count):
+        broken[rng.integers(start, len(broken) - 2)] = rng.integers(256)
+    return bytes(broken)
+
+
+def with_dots(seed: int) -> np.ndarray:
+    """A picture of a gel with dots that have moved by a few pixels, BGR."""
+    picture, dots = noisy(seed, 0.0), GELSIGHT_MINI_MARKERS.markers
+    assert dots is not None
+    pitch, radius = dots.pitch / GELSIGHT_MINI.pixel_pitch, dots.diameter / 2
+    shift = np.random.default_rng(seed).uniform(-6, 6, 2)
+    for row in range(dots.rows):
+        for column in range(dots.columns):
+            x, y = np.array([column + 0.5, row + 0.5]) * pitch + shift
+            centre = (round(x), round(y))
+            cv2.circle(picture, centre, round(radius / GELSIGHT_MINI.pixel_pitch), (25,) * 3, -1)
+    picture = cv2.GaussianBlur(picture, (0, 0), 1.0).astype(np.float64)  # as optics do
+    picture += np.random.default_rng(seed).normal(0, 1.5, picture.shape)
+    return np.clip(picture, 0, 255).astype(np.uint8)
+
+
+def test_broken_jpegs_of_a_gel_with_dots_are_refused_and_moving_dots_are_not() -> None:
+    real = sorted(Path("/work/shared/data/mini_markers").glob("*.png"))
+    clips = [[with_dots(k) for k in range(30)]]
+    clips += [[p for path in real if (p := cv2.imread(str(path))) is not None]] * bool(real)
+    dots = fingertip_video("http://left", GELSIGHT_MINI_MARKERS).dots
+    decoder, rng = JpegDecoder(), np.random.default_rng(0)
+    for clip in clips:
+        jpegs = {
+            quality: [
+                cv2.imencode(".jpg", p, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+                for p in clip
+            ]
+            for quality in (75, 95)
+        }
+        for sent in jpegs.values():
+            whole = [decoder.decode(data) for data in sent]
+            for before, image in itertools.pairwise(whole):
+                assert before is not None and image is not None
+                assert not is_broken_gel(image, before, dots)
+        passed = 0
+        for k in range(100):
+            before, good = (decoder.decode(jpegs[95][(k + i) % len(clip)]) for i in (0, 1))
+            image = decoder.decode(damaged(jpegs[95][(k + 1) % len(clip)], 20, rng))
+            assert before is not None and good is not None
+            if image is not None and not is_broken_gel(image, before, dots):
+                passed += cv2.blur(np.abs(image.astype(np.float32) - good), (8, 8)).max() > 20
+        assert passed <= 5  # in 100 with visible damage
 
 
 def test_a_lost_stream_is_joined_again(streamer: Streamer) -> None:

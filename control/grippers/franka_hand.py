@@ -1,12 +1,4 @@
-"""Franka Hand through franky-control, in a child process.
-
-The hand takes one slow command at a time, while a policy asks for a width every tick. The newest
-width is sent when the last command is done, which is after 0.8 s at most; `stop` ends one at once.
-So a width that merely passes on the way to another is not sent: one that changes faster than the hand
-could follow, unless it goes on doing so. A hand's grasp closes until it meets something, whatever width
-it is told, so only closing all the way grasps; any other width is a move, and one that meets something
-on its way in grasps that.
-"""
+"""Franka Hand through franky-control, in a child process; `hand_commands.py` says what it is told when."""
 
 import time
 from dataclasses import replace
@@ -15,17 +7,14 @@ from typing import TYPE_CHECKING
 from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.arms.driver_process import NEVER, DriverProcess
 from touchgoal.control.errors import UserError
+from touchgoal.control.grippers.hand_commands import PERIOD, SPEED, HandCommands, LastCommand
 from touchgoal.control.interfaces import DriverError, GripperReading
 
 if TYPE_CHECKING:
     import franky
 
-_STEP = 2e-3  # m between commands that differ, and up to which a width is shut
-_SPEED = 0.1  # m/s; the hand's fastest
 _STOP_TIMEOUT = 0.5  # s that a stop may take; 0.06 on the twin
 _ANSWER_TIMEOUT = 1.0  # s for an answer that a twin has sent to arrive
-PERIOD = 0.05  # s between looks at the hand
-_MOST_PASSING = 3  # of them for which widths may pass
 
 
 class FrankaHandClient:
@@ -42,9 +31,8 @@ class FrankaHandClient:
         if self._max_width <= 0:
             raise UserError("the Franka Hand does not know its stroke: home it in Desk first")
         self._running: franky.BoolFuture | None = None
-        self._inwards = False  # whether that is a move that closes
-        self._sent = self._target = self._last_target = self._hand.state.width
-        self._passing = 0  # ticks for which widths have passed
+        self._target = self._hand.state.width
+        self._commands = HandCommands(self._target)
         self._fault, self._clock = "", -1
         self._stopped = False
         self._reading = self._measure()
@@ -63,21 +51,17 @@ class FrankaHandClient:
         """End the command that runs and send no other, except to let go (m)."""
         if not self._stopped and self._running is not None and not self._running.wait(0.0):
             self._hand.stop_async().wait(_STOP_TIMEOUT)
-        self._stopped, self._running, self._inwards = True, None, False
-        self._target = self._sent
+        self._stopped, self._running = True, None
         if release_to is not None:
             width = min(max(release_to, 0.0), self._max_width)
-            self._running = self._hand.move_async(width, _SPEED)
+            self._running = self._hand.move_async(width, SPEED)
 
     def tick(self) -> None:
-        """Read the state; send the target if it is news."""
+        """Read the state; send what there is to send."""
         try:
             self._reading = self._measure()
-            if self._fault or self._stopped:
-                return
-            news = not self._passes() and abs(self._target - self._sent) > _STEP
-            if self._idle() and news:
-                self._go(self._target)
+            if not self._fault and not self._stopped:
+                self._send()
         except Exception as error:
             self._fault = f"{type(error).__name__}: {' '.join(str(error).split())}"
 
@@ -90,13 +74,6 @@ class FrankaHandClient:
     def close(self) -> None:
         """See Gripper."""
 
-    def _passes(self) -> bool:
-        """Whether the target only passes, faster than the hand could follow; once a tick."""
-        changed, self._last_target = abs(self._target - self._last_target), self._target
-        passes = self._target > _STEP and changed > _SPEED * PERIOD
-        self._passing = self._passing + 1 if passes else 0
-        return 0 < self._passing <= _MOST_PASSING
-
     def _measure(self) -> GripperReading:
         state = self._hand.state
         clock, stamp = state.time.to_msec(), time.monotonic()
@@ -105,35 +82,32 @@ class FrankaHandClient:
         self._clock = clock
         return GripperReading(state.width, state.is_grasped, self._fault, stamp)
 
-    def _idle(self) -> bool:
-        """Whether the last command is done; what it met on its way in is grasped."""
+    def _last_command(self) -> LastCommand:
+        """Raises what went wrong with it."""
         if self._running is None:
-            return True
+            return "arrived"
         arrives = self._answered is not None and self._answered >= self._issued
         if not self._running.wait(_ANSWER_TIMEOUT if arrives else 0.0):
-            return False
-        arrived, self._running = self._running.get(), None  # raises what went wrong
-        if not arrived and self._inwards:
-            self._grasp(self._sent)
-        return self._running is None
+            return "runs"
+        arrived, self._running = self._running.get(), None
+        return "arrived" if arrived else "stopped short"
 
-    def _go(self, width: float) -> None:
-        self._sent = width
-        if self._reading.grasped and width < self._reading.width:
-            return  # the grasp goes on: it holds by force
-        if width <= _STEP:
-            self._grasp(width)
-        else:
-            self._inwards = width < self._reading.width
-            self._issued += 1
-            self._running = self._hand.move_async(width, _SPEED)
-
-    def _grasp(self, width: float) -> None:
-        # What is met before `width` counts as grasped, whatever its size.
-        self._inwards = False
+    def _send(self) -> None:
+        state, last = self._reading, self._last_command()
+        command = self._commands.next(self._target, state.width, state.grasped, last)
+        if command is None:
+            return
         self._issued += 1
+        if not command.grasp:
+            self._running = self._hand.move_async(command.width, SPEED)
+            return
+        # What is met before that width counts as grasped, whatever its size.
         self._running = self._hand.grasp_async(
-            width, _SPEED, self._force, epsilon_inner=width, epsilon_outer=self._max_width
+            command.width,
+            SPEED,
+            self._force,
+            epsilon_inner=command.width,
+            epsilon_outer=self._max_width,
         )
 
 

@@ -46,7 +46,8 @@ def fingertip_video(source: str, model: SensorModel) -> VideoConfig:
     return VideoConfig(
         source,
         rate=model.frame_rate,
-        gel=model.markers is None,  # dots that move look like broken blocks
+        gel=True,
+        dots=_dots(model, fingertip_view(model, source)),
         device=None if "/" in source else partial(_device_of, model, source),
     )
 
@@ -97,6 +98,14 @@ def live_frames(config: VideoConfig, model: SensorModel) -> Generator[Frame, Non
             time.sleep(_POLL_INTERVAL)
     finally:
         camera.close()
+
+
+def _dots(model: SensorModel, view: Crop) -> float:
+    """Diameter of its markers as a share of the diagonal of its camera's picture; 0 without any."""
+    if model.markers is None:
+        return 0.0
+    diagonal = model.pixel_pitch * float(np.hypot(*model.image_shape))  # m, of what is cut out
+    return model.markers.diameter / diagonal * (1 - 2 * view.border)
 
 
 def _folder(folder: Path) -> Generator[Frame, None, None]:

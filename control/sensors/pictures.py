@@ -4,16 +4,20 @@ import av
 import cv2
 import numpy as np
 from av.error import FFmpegError
-from jaxtyping import Bool, Int16, Int32, UInt8
+from jaxtyping import Bool, Float, Int16, UInt8
 
 Picture = UInt8[np.ndarray, "h w 3"]
 
 _STRICT = "explode+crccheck+bitstream+buffer"
 _BLOCK = 8  # px of JPEG
 _JUMPS = 5  # the largest so many count: one block has four sides
-_SMOOTH = (
-    4.0  # counts; 47 presses of a real Mini stay below 1, nine in ten broken frames are above 7
-)
+_USUAL = 2.0  # times by which the largest exceed what is usual, in a coarse picture that is whole
+_SMOOTH = 3.5  # counts; real and simulated pictures at JPEG quality 75 and above stay below 3.4
+_MEASURED = 5  # px of a block's side that must lie clear of dots for it to count
+_DOT = 8.0  # px across, to which pictures with larger dots are scaled down to find them
+_WIDER = 1.6  # diameters that a dark spot may be wide and count as a dot
+_RIM = 0.25  # diameters around a dot that count as part of it
+_DARKER = 0.12  # of the usual brightness by which a dot is darker
 _ALL_CHANNELS = np.ones((1, 3))  # their sum
 _BANDS = 8  # that a picture is cut into to look for frozen parts
 _STRIDE = 4  # pixels; every so many are compared
@@ -40,24 +44,37 @@ class JpegDecoder:
         return frames[0].to_ndarray(format="rgb24")
 
 
-def jumps_at_blocks(image: Picture, before: Picture) -> float:
+def jumps_at_blocks(image: Picture, before: Picture, dots: float = 0.0) -> float:
     """By how many counts the change since `before` jumps more between JPEG's blocks than inside them.
 
     A decoder cannot see every wrong byte. It shows as blocks of another brightness, which a smooth
-    gel never has: its real changes do not know where blocks end.
+    gel never has: its real changes do not know where blocks end. Dots that move do look like such
+    blocks: the change is looked at where neither picture has one.
+
+    Args:
+        image, before: RGB.
+        dots: diameter of printed dots as a share of the picture's diagonal; 0: there are none.
     """
     change = cv2.transform(cv2.subtract(image, before, dtype=cv2.CV_16S), _ALL_CHANNELS)
+    clear = _clear_of_dots(image, before, dots) if dots > 0 else None
     worst = 0.0
-    for grey in (change, np.ascontiguousarray(change.T)):
-        between, *inside = (_steps(grey, row) for row in (_BLOCK, 2, 4, 6))
-        jump = _largest(between, _JUMPS) - _largest(np.concatenate(inside), 3 * _JUMPS)
+    for turned in (False, True):
+        grey = np.ascontiguousarray(change.T) if turned else change
+        counts = clear.T if turned and clear is not None else clear
+        between, *inside = (_steps(grey, counts, row) for row in (_BLOCK, 2, 4, 6))
+        within = np.concatenate(inside)
+        usual = _median(between) - _median(within)  # coarse JPEG lets every block show
+        jump = _largest(between, _JUMPS) - _largest(within, 3 * _JUMPS) - _USUAL * usual
         worst = max(worst, jump)
     return worst / (3 * _BLOCK)
 
 
-def is_broken_gel(image: Picture, before: Picture) -> bool:
-    """Whether a gel's picture came through a broken JPEG, judged by the last good one."""
-    return jumps_at_blocks(image, before) > _SMOOTH
+def is_broken_gel(image: Picture, before: Picture, dots: float = 0.0) -> bool:
+    """Whether a gel's picture came through a broken JPEG, judged by the last good one.
+
+    Arguments: see `jumps_at_blocks`.
+    """
+    return jumps_at_blocks(image, before, dots) > _SMOOTH
 
 
 class FrozenParts:
@@ -95,15 +112,49 @@ def _differs(image: Picture, before: Picture) -> Bool[np.ndarray, " bands"]:
     return np.array([band.any() for band in np.array_split(rows, _BANDS)])
 
 
-def _steps(grey: Int16[np.ndarray, "h w"], row: int) -> Int32[np.ndarray, " n"]:
-    """From each block's row before `row` to that row, summed over the block's width."""
+def _clear_of_dots(image: Picture, before: Picture, dots: float) -> Bool[np.ndarray, "h w"]:
+    """Where neither picture has a spot that is darker than around it and no larger than a dot."""
+    height, width = image.shape[:2]
+    diameter = dots * float(np.hypot(height, width))
+    scale = min(1.0, _DOT / diameter)
+    size = round(width * scale), round(height * scale)
+    small = [
+        cv2.cvtColor(cv2.resize(x, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+        for x in (image, before)
+    ]
+    widest = int(_WIDER * diameter * scale) | 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (widest, widest))
+    darker = _DARKER * float(np.median(small[1]))
+    spots = np.maximum(*(cv2.morphologyEx(grey, cv2.MORPH_BLACKHAT, disc) for grey in small))
+    rim = 2 * round(_RIM * diameter * scale) + 1
+    spotted = cv2.dilate((spots > darker).astype(np.uint8), np.ones((rim, rim), np.uint8))
+    return cv2.resize(spotted, (width, height), interpolation=cv2.INTER_NEAREST) == 0
+
+
+def _steps(
+    grey: Int16[np.ndarray, "h w"], counts: Bool[np.ndarray, "h w"] | None, row: int
+) -> Float[np.ndarray, " n"]:
+    """From each block's row before `row` to that row, summed over the block's width.
+
+    Of blocks that count in part only, what counts stands for the rest, unless it is too little.
+    """
     before, after = grey[row - 1 : -1 : _BLOCK], grey[row::_BLOCK]
     steps = cv2.absdiff(np.ascontiguousarray(after), np.ascontiguousarray(before[: len(after)]))
     whole = steps.shape[1] // _BLOCK * _BLOCK
-    return steps[:, :whole].reshape(-1, _BLOCK).sum(1, dtype=np.int32)
+    sides = steps[:, :whole].reshape(-1, _BLOCK)
+    if counts is None:
+        return sides.sum(1, dtype=np.float32)
+    kept = (counts[row - 1 : -1 : _BLOCK] & counts[row::_BLOCK])[:, :whole].reshape(-1, _BLOCK)
+    measured = kept.sum(1)
+    enough = measured >= _MEASURED
+    return (sides * kept).sum(1, dtype=np.float32)[enough] * _BLOCK / measured[enough]
 
 
-def _largest(values: Int32[np.ndarray, " n"], count: int) -> float:
+def _largest(values: Float[np.ndarray, " n"], count: int) -> float:
     if not values.size:
         return 0.0
     return float(np.partition(values, -min(count, values.size))[-count:].mean())
+
+
+def _median(values: Float[np.ndarray, " n"]) -> float:
+    return float(np.median(values)) if values.size else 0.0

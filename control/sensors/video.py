@@ -47,7 +47,8 @@ class VideoConfig:
         frozen_after: s of pixel-for-pixel the same picture, or part of it, after which it counts as
             old. Sensor noise makes real pictures differ; rendered ones may rightly stand still: then
             infinity.
-        gel: whether it is a fingertip's without markers, whose pictures are smooth: broken ones show.
+        gel: whether it is a fingertip's, whose pictures are smooth but for its dots: broken ones show.
+        dots: diameter of its printed dots as a share of the picture's diagonal; 0: it has none.
         device: finds the camera's device whenever it is opened, when `source` is a serial number.
     """
 
@@ -59,6 +60,7 @@ class VideoConfig:
     timeout: float = 1.0
     frozen_after: float = 0.5
     gel: bool = False
+    dots: float = 0.0
     device: Callable[[], str] | None = None
 
     @property
@@ -156,12 +158,15 @@ class VideoCamera:
             was, now = (f"{x.shape[1]}x{x.shape[0]}" for x in (before, decoded))
             self._refused = f"sends {now} pixels instead of {was}: another camera, or set anew?"
             return None
-        elif before is not None and self.config.gel and is_broken_gel(decoded, before):
+        elif before is not None and self._is_broken_gel(decoded, before):
             self._refused = "sends broken pictures: check its cable"
             return None
         else:
             self._refused = ""
         return decoded
+
+    def _is_broken_gel(self, image: np.ndarray, before: np.ndarray) -> bool:
+        return self.config.gel and is_broken_gel(image, before, self.config.dots)
 
     def _wait_for_turn(self) -> None:
         self._next_frame_at = max(

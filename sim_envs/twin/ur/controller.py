@@ -244,6 +244,7 @@ class UrController:
                     flush=True,
                 )
                 self.protective_stop()
+                self._program.say_done()
 
     def _new_program(self) -> UrProgram:
         return UrProgram(

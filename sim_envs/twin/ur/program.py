@@ -192,6 +192,14 @@ class UrProgram:
         self._waiting, self.ints[0] = False, 0
         self.cell.brake(UR5E.hardware.acceleration)
 
+    def say_done(self) -> None:
+        """Of a script of the client's own, which it waits 300 s for.
+
+        It then uploads the control program again, and its call raises because that does not run within
+        5 s: a protective stop is what a UR does to a script that it cannot go on with.
+        """
+        self.ints[0] = _DONE
+
     def _go(self, activity: Activity) -> None:
         """Stream: what is going on in the same way goes on with the new numbers."""
         self.activity = activity

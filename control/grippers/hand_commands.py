@@ -1,0 +1,68 @@
+"""What a Franka Hand is told, and when: of its driver and of the environment that trains for it.
+
+The hand takes one slow command at a time, while a policy asks for a width every tick. The newest width
+is sent when the last command has ended, which takes 0.8 s at most. So a width that merely passes on the
+way to another is not sent: one that changes faster than the hand could follow, unless it goes on doing
+so. A hand's grasp closes until it meets something, whatever width it is told, so only closing all the
+way grasps; any other width is a move, and one that meets something on its way in grasps that.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+PERIOD = 0.05  # s between looks at the hand
+SPEED = 0.1  # m/s; the hand's fastest
+SHUT = 2e-3  # m between commands that differ, and up to which a width is shut
+_MOST_PASSING = 3  # looks in a row for which widths may pass
+
+LastCommand = Literal["runs", "arrived", "stopped short"]
+"""How the command before stands; "arrived" before the first, too."""
+
+
+@dataclass(frozen=True)
+class HandCommand:
+    """A move to a width (m), or a grasp: closing until something is met, before that width or after it."""
+
+    width: float
+    grasp: bool
+
+
+class HandCommands:
+    """What to send, look by look: every `PERIOD`, and at every one of them."""
+
+    def __init__(self, width: float) -> None:
+        """The hand rests at that width (m)."""
+        self._sent = self._last_target = width
+        self._moves_inwards = False  # the last command
+        self._passing = 0  # looks for which widths have passed
+
+    def next(
+        self, target: float, width: float, grasped: bool, last: LastCommand
+    ) -> HandCommand | None:
+        """The command to send now, if any.
+
+        Args:
+            target: newest width asked for, m.
+            width, grasped: what the hand says, m, and whether it holds something.
+            last: how the command before stands.
+        """
+        passes = self._passes(target)
+        if last == "runs":
+            return None
+        met, self._moves_inwards = self._moves_inwards and last == "stopped short", False
+        if met:
+            return HandCommand(self._sent, grasp=True)
+        if passes or abs(target - self._sent) <= SHUT:
+            return None
+        self._sent = target
+        if grasped and target < width:
+            return None  # the grasp goes on: it holds by force
+        self._moves_inwards = SHUT < target < width
+        return HandCommand(target, grasp=target <= SHUT)
+
+    def _passes(self, target: float) -> bool:
+        """Whether it only passes, faster than the hand could follow."""
+        changed, self._last_target = abs(target - self._last_target), target
+        passes = target > SHUT and changed > SPEED * PERIOD
+        self._passing = self._passing + 1 if passes else 0
+        return 0 < self._passing <= _MOST_PASSING

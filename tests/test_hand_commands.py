@@ -1,0 +1,136 @@
+"""A Franka Hand's driver and the environment that trains for it tell the hand the same."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from touchgoal.control.grippers.franka_hand import FrankaHandClient
+from touchgoal.control.safety.limits import FR3
+from touchgoal.sim_envs.deployed_hand import DeployedHand
+
+LOOK = 50  # ms
+OPEN = 0.08  # m
+
+
+class Fingers:
+    """Fingers with something between them, in steps of 1 ms; also all that an environment is asked for."""
+
+    robot = SimpleNamespace(tool=FR3.tool)
+
+    def __init__(self, between: float) -> None:
+        self.between, self.at = between, OPEN
+
+    def width(self) -> float:
+        return self.at
+
+    def go(self, goal: float) -> None:
+        step = min(max(goal - self.at, -1e-4), 1e-4)  # 0.1 m/s
+        self.at = max(self.at + step, min(self.between, self.at))
+
+
+class Franky:
+    """franky's gripper over such fingers; a command has ended once they have arrived or stand still."""
+
+    def __init__(self, fingers: Fingers) -> None:
+        self.fingers, self.goal, self.said = fingers, fingers.at, []
+        self._before, self._age, self._grasps, self._ended = fingers.at, 0, False, True
+        self._looks = 0
+
+    @property
+    def state(self) -> Any:
+        self._looks += 1
+        time = SimpleNamespace(to_msec=lambda: self._looks)
+        grasped = self._grasps and self._ended and self.fingers.at > 0.002
+        return SimpleNamespace(width=self.fingers.at, max_width=OPEN, is_grasped=grasped, time=time)
+
+    def look(self) -> None:
+        self._age += 1
+        still = abs(self.fingers.at - self._before) < 2e-4
+        self._ended |= self._age > 2 and (abs(self.fingers.at - self.goal) < 1e-3 or still)
+        self._before = self.fingers.at
+
+    def wait(self, seconds: float) -> bool:
+        return self._ended
+
+    def get(self) -> bool:
+        return abs(self.fingers.at - self.goal) < 1e-3
+
+    def _begin(self, goal: float, grasps: bool) -> "Franky":
+        self.goal, self._grasps, self._ended, self._age = goal, grasps, False, 0
+        self.said.append(("grasp" if grasps else "move", round(goal, 4)))
+        return self
+
+    def move_async(self, width: float, speed: float) -> "Franky":
+        return self._begin(width, False)
+
+    def grasp_async(self, *_: float, **__: float) -> "Franky":
+        return self._begin(0.0, True)
+
+
+def driven(monkeypatch: pytest.MonkeyPatch, wanted: list[float], between: float) -> tuple:
+    """Widths (m, every ms) that the driver makes of these, one a look, and what it told the hand."""
+    hand = Franky(Fingers(between))
+    monkeypatch.setattr(
+        "touchgoal.control.arms.client_libraries.ClientLibrary.load",
+        lambda *_: SimpleNamespace(Gripper=lambda address: hand),
+    )
+    client, widths = FrankaHandClient("here", 30.0), []
+    for width in wanted:
+        client.command(width)
+        hand.look()
+        client.tick()
+        for _ in range(LOOK):
+            hand.fingers.go(hand.goal)
+            widths.append(hand.fingers.at)
+    assert not client.read().fault
+    return np.array(widths), hand.said
+
+
+def simulated(wanted: list[float], between: float) -> np.ndarray:
+    """The same of the environment's hand."""
+    fingers, widths = Fingers(between), []
+    hand = DeployedHand(fingers, np.random.default_rng(0))
+    phase = int(np.random.default_rng(0).integers(LOOK))  # of its looks
+    for ms in range(LOOK * len(wanted)):
+        fingers.go(hand.step(ms + phase, wanted[ms // LOOK]))
+        widths.append(fingers.at)
+    return np.array(widths)
+
+
+SEQUENCES = {
+    "passes": [OPEN, 0.03, OPEN, OPEN, OPEN, OPEN],
+    "goes on passing": [OPEN, 0.07, 0.06, 0.05, 0.04, 0.03, *[0.02] * 20],
+    "stays": [OPEN, *[0.03] * 12, *[OPEN] * 20],
+    "a move meets something": [OPEN, *[0.03] * 20, 0.02, 0.02, 0.02, *[0.07] * 10],
+    "a grasp goes on": [OPEN, *[0.0] * 20, *[0.01] * 5, *[0.03] * 5, *[OPEN] * 20],
+}
+TOLD = {
+    "passes": [],
+    "goes on passing": [("move", 0.04), ("move", 0.02)],
+    "stays": [("move", 0.03), ("move", 0.08)],
+    "a move meets something": [("move", 0.03), ("grasp", 0.0), ("move", 0.07)],
+    "a grasp goes on": [("grasp", 0.0), ("move", 0.08)],
+}
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_a_hand_is_told_so(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    between = 0.04 if name.startswith("a ") else 0.0
+    widths, said = driven(monkeypatch, SEQUENCES[name], between)
+    assert said == TOLD[name]
+    np.testing.assert_array_equal(simulated(SEQUENCES[name], between), widths)
+
+
+def test_driver_and_environment_do_the_same_whatever_is_asked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        widths = rng.choice([0.0, 0.001, 0.01, 0.03, 0.05, OPEN, 0.2], 12)
+        wanted = np.repeat(widths, rng.integers(1, 12, 12)).tolist()
+        between = float(rng.choice([0.0, 0.02, 0.045]))
+        expected, said = driven(monkeypatch, wanted, between)
+        assert said
+        np.testing.assert_array_equal(simulated(wanted, between), expected)
