@@ -80,8 +80,8 @@ def _run(name: str, *options: str) -> None:
 
 def read_options(name: str, options: list[str]) -> tuple[Any, Any]:
     """A command's module and its Config. What can be checked before any work is checked here."""
-    from touchgoal.launch.command_line import parse
-    from touchgoal.launch.run_folder import check_writable
+    from touchgoal.launch.support.command_line import parse
+    from touchgoal.launch.support.run_folder import check_writable
 
     module = importlib.import_module(f"touchgoal.launch.{name.replace('-', '_')}")
     config = parse(

@@ -9,7 +9,7 @@ import tyro
 from touchgoal.benchmarks import config as options
 from touchgoal.control.errors import UserError
 from touchgoal.control.provenance import hardware, provenance
-from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.launch.support.run_folder import open_run, write_json
 
 BENCHMARKS: dict[str, type[options.BenchmarkOptions]] = {
     "bead-maze": options.BeadMazeOptions,

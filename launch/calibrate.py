@@ -60,7 +60,7 @@ def main(config: Config) -> None:
     from touchgoal.control.provenance import provenance
     from touchgoal.control.tactile.sensor_calibration import save
     from touchgoal.control.tactile.sensor_models import SENSORS
-    from touchgoal.launch.run_folder import open_run, write_json
+    from touchgoal.launch.support.run_folder import open_run, write_json
 
     if config.sensor not in SENSORS:
         raise UserError(f"unknown sensor {config.sensor!r}; choose from: {', '.join(SENSORS)}")

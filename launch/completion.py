@@ -22,7 +22,7 @@ class Config:
 def main(config: Config) -> None:
     """Print the script."""
     from touchgoal.launch.__main__ import COMMANDS
-    from touchgoal.launch.command_line import print_completion
+    from touchgoal.launch.support.command_line import print_completion
 
     kinds: list[Any] = []
     for name, meaning in COMMANDS.items():

@@ -41,7 +41,7 @@ def main(config: Config) -> None:
     from touchgoal.episodes.recording import EpisodeSpec, record_with_film
     from touchgoal.episodes.store import EpisodeWriter
     from touchgoal.launch.reward_curves import report_all
-    from touchgoal.launch.run_folder import open_run
+    from touchgoal.launch.support.run_folder import open_run
     from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
     from touchgoal.rewards.goals import assign_goals, parse_goal
     from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer

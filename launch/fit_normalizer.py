@@ -39,7 +39,7 @@ class Config:
 def main(config: Config) -> None:
     """Check, embed, fit."""
     from touchgoal.control.progress import track
-    from touchgoal.launch.run_folder import open_run
+    from touchgoal.launch.support.run_folder import open_run
     from touchgoal.rewards.fit_normalizer import fit_normalizer
     from touchgoal.rewards.normalizer import NORMALIZER
     from touchgoal.rewards.setup import load_encoders

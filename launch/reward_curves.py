@@ -49,7 +49,7 @@ class Config:
 def main(config: Config) -> None:
     """Check, embed, measure, and write a plot, a CSV and a JSON for each trajectory."""
     from touchgoal.control.progress import track
-    from touchgoal.launch.run_folder import open_run
+    from touchgoal.launch.support.run_folder import open_run
     from touchgoal.rewards.report.report import write_report
     from touchgoal.rewards.setup import prepare
     from touchgoal.rewards.sources import VideoSource, open_source
@@ -81,7 +81,7 @@ def main(config: Config) -> None:
 
 def report_all(curves: list["Curves"], out: Path) -> None:
     """Print the table of all curves and write it to metrics.json."""
-    from touchgoal.launch.run_folder import write_json
+    from touchgoal.launch.support.run_folder import write_json
     from touchgoal.rewards.report.summary import metrics_table
 
     write_json(

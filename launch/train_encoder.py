@@ -8,7 +8,7 @@ from pydantic import Field
 
 from touchgoal.control.option_types import Count, CountOrNone, Seed, checked_dataclass
 from touchgoal.encoders.config import ALIGN_PRESETS, AlignConfig, MaeConfig
-from touchgoal.launch.training_options import TrainingOptions
+from touchgoal.launch.support.training_options import TrainingOptions
 
 
 @checked_dataclass

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from touchgoal.control.option_types import RARE, Count, checked_dataclass
-from touchgoal.launch.training_options import TrainingOptions
+from touchgoal.launch.support.training_options import TrainingOptions
 from touchgoal.policies.config import EstimatorTrainConfig, PoseEstimatorConfig
 from touchgoal.sim_envs.config import PickPlaceConfig
 

@@ -12,7 +12,7 @@ from touchgoal.control.option_types import (
     NotNegative,
     checked_dataclass,
 )
-from touchgoal.launch.training_options import TrainingOptions
+from touchgoal.launch.support.training_options import TrainingOptions
 from touchgoal.policies.config import (
     ActionRepresentation,
     ArmState,

@@ -20,9 +20,9 @@ from touchgoal.control.interruption import Terminated, kept, terminable
 from touchgoal.control.option_types import checked_dataclass
 from touchgoal.control.progress import track
 from touchgoal.launch.__main__ import COMMANDS, main
-from touchgoal.launch.command_line import SHOWN, _all_options, _members, docstrings, parse
 from touchgoal.launch.list import KINDS
-from touchgoal.launch.run_folder import check_writable, open_run
+from touchgoal.launch.support.command_line import SHOWN, _all_options, _members, docstrings, parse
+from touchgoal.launch.support.run_folder import check_writable, open_run
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 
 ENVS = {"pick-place": PickPlaceConfig(), "bead-maze": BeadMazeConfig(split="validation")}
@@ -199,7 +199,7 @@ def test_progress_in_a_pipe_is_a_line_now_and_then(
 def test_help_imports_nothing_heavy() -> None:
     modules = [f"touchgoal.launch.{name.replace('-', '_')}" for name in COMMANDS]
     program = f"""
-import sys, touchgoal.launch.__main__, touchgoal.launch.command_line, {", ".join(modules)}
+import sys, touchgoal.launch.__main__, touchgoal.launch.support.command_line, {", ".join(modules)}
 heavy = {{"torch", "mujoco", "casadi", "numba", "gymnasium", "matplotlib", "scipy"}} & set(sys.modules)
 assert not heavy, heavy"""
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -10,7 +10,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import EpisodeSpec, Roles, collect, expert_alone
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.collect_demos import Config
-from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.launch.support.run_folder import open_run, write_json
 from touchgoal.policies.by_name import choose_policy, env_config_for
 from touchgoal.policies.checkpoint import SavedPolicy, load
 from touchgoal.policies.evaluation.success_rate import SuccessRate

@@ -22,8 +22,8 @@ from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.launch.deploy import Config
-from touchgoal.launch.run_folder import open_run, write_json
-from touchgoal.launch.terminal import HELP, Terminal
+from touchgoal.launch.support.run_folder import open_run, write_json
+from touchgoal.launch.support.terminal import HELP, Terminal
 from touchgoal.policies.deploy.actors import CellPolicy, load_cell_policy, make_actor
 from touchgoal.policies.deploy.control_loop import Request
 from touchgoal.policies.deploy.preflight import check_client, preflight

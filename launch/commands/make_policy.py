@@ -8,7 +8,7 @@ from pathlib import Path
 from touchgoal.control.errors import UserError
 from touchgoal.launch.__main__ import read_options
 from touchgoal.launch.make_policy import Config
-from touchgoal.launch.run_folder import open_run, write_json
+from touchgoal.launch.support.run_folder import open_run, write_json
 from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES, TOUCH
 
 RECIPE = "recipe.json"

@@ -21,7 +21,7 @@ from touchgoal.control.sensors.live_picture import LivePicture
 from touchgoal.control.tactile.sensor_models import SENSORS, SensorModel
 from touchgoal.launch import calibrate
 from touchgoal.launch.record_presses import Config
-from touchgoal.launch.run_folder import open_run
+from touchgoal.launch.support.run_folder import open_run
 
 
 def run_command(config: Config) -> None:

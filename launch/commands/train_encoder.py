@@ -17,14 +17,14 @@ from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.training.trainer import is_first_process
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import collect_touches
-from touchgoal.launch.run_folder import open_run
-from touchgoal.launch.train_encoder import Align, Mae, Surfaces
-from touchgoal.launch.training_run import (
+from touchgoal.launch.support.run_folder import open_run
+from touchgoal.launch.support.training_run import (
     check_training,
     open_sets,
     open_training,
     recipe,
 )
+from touchgoal.launch.train_encoder import Align, Mae, Surfaces
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder
 from touchgoal.rewards.fit_normalizer import fit_normalizer
 from touchgoal.rewards.normalizer import NORMALIZER, scene_of

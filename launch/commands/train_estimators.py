@@ -9,14 +9,14 @@ from touchgoal.control import features as ft
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.training.checkpoint import has_checkpoint
 from touchgoal.encoders.training.trainer import is_first_process
-from touchgoal.launch.run_folder import write_json
-from touchgoal.launch.train_estimators import Config
-from touchgoal.launch.training_run import (
+from touchgoal.launch.support.run_folder import write_json
+from touchgoal.launch.support.training_run import (
     check_training,
     open_sets,
     open_training,
     recipe,
 )
+from touchgoal.launch.train_estimators import Config
 from touchgoal.policies.perception.frozen_touch import load_touch
 from touchgoal.policies.perception.placements import render_placements
 from touchgoal.policies.perception.state_estimation import (

@@ -8,14 +8,14 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.training.trainer import is_first_process
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.launch.run_folder import write_json
-from touchgoal.launch.train_policy import ENVS, Config
-from touchgoal.launch.training_run import (
+from touchgoal.launch.support.run_folder import write_json
+from touchgoal.launch.support.training_run import (
     check_training,
     open_sets,
     open_training,
     recipe,
 )
+from touchgoal.launch.train_policy import ENVS, Config
 from touchgoal.policies import checkpoint
 from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.policies.evaluation.evaluate import Evaluation, run_trials, trial_specs

@@ -10,8 +10,8 @@ from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.training.checkpoint import check_run_folder
 from touchgoal.encoders.training.trainer import check_device
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.launch.run_folder import open_run
-from touchgoal.launch.training_options import TrainingOptions
+from touchgoal.launch.support.run_folder import open_run
+from touchgoal.launch.support.training_options import TrainingOptions
 
 
 def check_training(options: TrainerOptions, out: Path | None, first: str = "") -> None:
