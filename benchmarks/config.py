@@ -114,6 +114,16 @@ class MotionOptions(BenchmarkOptions):
 
 
 @checked_dataclass
+class ReplayOptions(BenchmarkOptions):
+    """The same actions in the environment as deployed and over the wire: how far do the arms part?"""
+
+    episodes: Count = 3
+    """Waves in free air, and presses onto the table."""
+    seed: Seed = 8_000_000
+    """Random seed of the first."""
+
+
+@checked_dataclass
 class SentStreamOptions(BenchmarkOptions):
     """Does what is sent to the arm stay inside the box and every limit, whatever a policy says?"""
 

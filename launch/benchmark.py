@@ -20,6 +20,7 @@ BENCHMARKS: dict[str, type[options.BenchmarkOptions]] = {
     "policy-delay": options.PolicyDelayOptions,
     "policy-latency": options.PolicyLatencyOptions,
     "real-touch": options.RealTouchOptions,
+    "replay": options.ReplayOptions,
     "reward-quality": options.RewardQualityOptions,
     "sent-stream": options.SentStreamOptions,
     "tactile-realism": options.TactileRealismOptions,
@@ -37,6 +38,7 @@ Config = (
     | Annotated[options.PolicyDelayOptions, tyro.conf.subcommand("policy-delay")]
     | Annotated[options.PolicyLatencyOptions, tyro.conf.subcommand("policy-latency")]
     | Annotated[options.RealTouchOptions, tyro.conf.subcommand("real-touch")]
+    | Annotated[options.ReplayOptions, tyro.conf.subcommand("replay")]
     | Annotated[options.RewardQualityOptions, tyro.conf.subcommand("reward-quality")]
     | Annotated[options.SentStreamOptions, tyro.conf.subcommand("sent-stream")]
     | Annotated[options.TactileRealismOptions, tyro.conf.subcommand("tactile-realism")]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from running_twin import RunningTwin
 
+from touchgoal.benchmarks.replay import replay_both
 from touchgoal.control import features as ft
 from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.cell.config import CellConfig
@@ -66,6 +67,16 @@ def test_a_lock_step_twin_gives_the_same_run_to_the_last_bit(tmp_path: Path) -> 
     time.sleep(0.1)
     assert twin.ask("truth")["time"] > left_at
     twin.close()
+
+
+@pytest.mark.slow
+def test_the_same_actions_lead_to_the_same_place_in_the_environment_and_over_the_wire() -> None:
+    pytest.importorskip("franky", reason=FRANKY.install)
+    wave, press = replay_both(seed=8_000_000)
+    for row in (wave, press):
+        assert row["joints"] < 0.01 and row["tool"] < 2e-3  # rad, m
+    assert wave["force here"] == 0 and press["force here"] > 5
+    assert press["force there"] == pytest.approx(press["force here"], rel=0.2)
 
 
 @pytest.mark.parametrize("address", ["", "127.0.0.1:1"])
