@@ -32,7 +32,7 @@ _DELAY = 0.005  # s from a command to the arm: half of the two streams' periods
 _WAVE_SECONDS, _WAVE = 2.0, 0.012  # s, and rad a tick at most
 _ABOVE = 0.005  # m of the fingers' lowest corner above the table when it goes on slowly
 _PRESSED = -5e-4  # m, the same as commanded at the end
-_DOWN_SECONDS, _PRESS_SECONDS, _HOLD_SECONDS = 1.5, 1.5, 0.5  # s
+_DOWN_SECONDS, _PRESS_SECONDS, _HOLD_SECONDS = 2.5, 2.5, 0.5  # s; faster, and the reflex ends it
 _TOUCHING = 1.0  # N
 
 
