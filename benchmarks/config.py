@@ -77,6 +77,8 @@ class DeployOptions(BenchmarkOptions):
     """After which a deployment ends."""
     seed: Seed = 6_000_000
     """Random seed of the first episode; each further one adds one."""
+    workers: Count = CORES
+    """Deployments side by side, in process and in lock-step."""
 
 
 @checked_dataclass

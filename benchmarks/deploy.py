@@ -7,6 +7,7 @@ cell file that it writes. The same seeds, objects and wires in every row of a ta
 import json
 import tempfile
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from touchgoal.benchmarks.deployed_episode import Deployment, Scene, deploy, lim
 from touchgoal.benchmarks.deployed_twin import DeployedTwin
 from touchgoal.benchmarks.deployments_in_a_row import run_in_a_row
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
+from touchgoal.control.progress import track
 from touchgoal.episodes.recording import EpisodeSpec
 from touchgoal.policies.by_name import choose_policy, env_config_for, scripted
 from touchgoal.policies.evaluation.evaluate import run_trial, trial_specs
@@ -26,6 +28,7 @@ from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskName
 
 EXAMPLES = {"pick-place": "sim.toml", "bead-maze": "sim_maze.toml"}
+_OWN_TIME = ("in-process", "lock-step")  # in processes of their own, however slow the machine
 _CELLS = Path(__file__).parents[1] / "launch" / "cells"
 
 
@@ -40,9 +43,16 @@ def run(config: DeployOptions) -> dict[str, Any]:
         for name in config.policies:
             policy = scripted(task) if name == "scripted" else name
             for arm in config.arms:
-                rows = [
-                    _deploy(scene, policy, arm, i, config.seconds) for i, scene in enumerate(scenes)
-                ]
+                side_by_side = config.workers if arm in _OWN_TIME else 1
+                with ThreadPoolExecutor(side_by_side) as pool:
+                    begun = [
+                        pool.submit(_deploy, scene, policy, arm, i, config.seconds)
+                        for i, scene in enumerate(scenes)
+                    ]
+                    rows = [
+                        deployment.result()
+                        for deployment in track(begun, f"{task}, {policy}, {arm}", "deployment")
+                    ]
                 lines += _lines(rows)
                 print("\n".join(lines[-1 - sum(not row.success for row in rows) :]), flush=True)
                 done += rows
