@@ -29,6 +29,7 @@ from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import cell_watchdogs, connect_cell
 from touchgoal.control.errors import UserError
+from touchgoal.control.interfaces import DriverError
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.episodes.repair import validate
 from touchgoal.episodes.store import EpisodeSet
@@ -218,23 +219,29 @@ def _deploy(
     def mark_broken() -> None:
         broken_at.write_text(str(truth()["time"]))
 
-    session(lambda d: BrokenPolicy("still", d, mark_broken), 0.5).run()
-    if case.full:  # a file that may not grow fails as on a full disk, in the middle of a write
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, _UNLIMITED))
-    makers: dict[str, Callable[[ControlLoop], DeployedActor]] = {
-        "expert": expert,
-        "hangs": lambda d: LearnedActor(HangingPlanner(d.width, mark_broken), connection.robot),
-    }
-    make = makers.get(case.policy, lambda d: BrokenPolicy(case.policy, d, mark_broken))
-    result = session(make, 10.0 if case.policy == "outwards" else 40.0).run()
-    late = 1e3 * np.percentile(result.log.lateness or [np.nan], 99)
+    def faulty(loop: ControlLoop) -> DeployedActor:
+        if case.policy == "expert":
+            return expert(loop)
+        if case.policy == "hangs":
+            return LearnedActor(HangingPlanner(loop.width, mark_broken), connection.robot)
+        return BrokenPolicy(case.policy, loop, mark_broken)
+
+    late, message = float("nan"), ""
+    try:
+        session(lambda d: BrokenPolicy("still", d, mark_broken), 0.5).run()
+        if case.full:  # a file that may not grow fails as on a full disk, in the middle of a write
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, _UNLIMITED))
+        result = session(faulty, 10.0 if case.policy == "outwards" else 40.0).run()
+        late = 1e3 * float(np.percentile(result.log.lateness or [np.nan], 99))
+        message = result.recording_error or result.ending.reason
+        if case.policy == "outwards":
+            message += "; clamped: " + ", ".join(
+                f"{name} {n}" for name, n in result.log.limit_counts.items()
+            )
+    except (DriverError, UserError) as error:  # nothing has moved
+        message = f"it did not begin: {error}"
     resource.setrlimit(resource.RLIMIT_FSIZE, (_UNLIMITED, _UNLIMITED))
-    message = result.recording_error or result.ending.reason
-    if case.policy == "outwards":
-        message += "; clamped: " + ", ".join(
-            f"{name} {n}" for name, n in result.log.limit_counts.items()
-        )
     report.write_text(f"{late}\n{message}")
     connection.close()
 

@@ -23,6 +23,7 @@ from touchgoal.control.tactile.markers import find_markers, without_markers
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.store import EpisodeWriter
+from touchgoal.policies.deploy.exchanged import Picture, fingertips_exchanged
 
 _MIN_RATE_SHARE = 0.8  # of what the cell says of a camera
 # Counts by which a fingertip may differ from its sensor file's. Simulated units differ by 1 to 2, a
@@ -51,6 +52,8 @@ def preflight(
         nominal = _nominal_rate(cell, key)
         check = partial(_camera, camera, rates[key], nominal, connection.gripper)
         checks.append((key.removeprefix(ft.IMAGE_PREFIX), check))
+    if cell.fingertips and cell.fingertips.sensor_files:
+        checks.append(("fingertips", lambda: _fingertips(connection)))
     if connection.load_cell:
         checks.append(("load cell", lambda: _load_cell(connection)))
     checks += [
@@ -156,11 +159,7 @@ def _camera(camera: Camera, rate: float, nominal: float, gripper: Gripper) -> st
         raise UserError(camera.problem)
     untouched = ""
     if isinstance(camera, TactileSensor):
-        frame, model = camera.read().image, camera.model
-        if model.markers is not None:  # every unit's dots lie elsewhere
-            dots = find_markers(frame, model.markers, model.pixel_pitch).positions
-            frame = without_markers(frame, dots, model.markers.diameter / model.pixel_pitch / 2)
-        background = load(model.sensor_file).background
+        frame, background = _fingertip(camera)
         # A unit differs from the sensor file's; a contact is told by far more than that.
         strength = float(contact_strength(frame[None], background)[0])
         if strength > _TOUCHED_COUNTS:
@@ -181,6 +180,30 @@ def _camera(camera: Camera, rate: float, nominal: float, gripper: Gripper) -> st
             "else this computer does"
         )
     return f"{rate:.1f} pictures a second{untouched}"
+
+
+def _fingertip(camera: TactileSensor) -> tuple[Picture, Picture]:
+    """What it shows and its sensor file's background, both without dots."""
+    frame, model = camera.read().image, camera.model
+    if model.markers is not None:  # every unit's dots lie elsewhere
+        dots = find_markers(frame, model.markers, model.pixel_pitch).positions
+        frame = without_markers(frame, dots, model.markers.diameter / model.pixel_pitch / 2)
+    return frame, load(model.sensor_file).background
+
+
+def _fingertips(connection: CellConnection) -> str:
+    """Whether each is the one that its own sensor file was made of."""
+    left, right = (
+        _fingertip(camera)
+        for key in ft.TACTILE
+        if isinstance(camera := connection.cameras[key], TactileSensor)
+    )
+    if fingertips_exchanged((left[0], right[0]), (left[1], right[1])):
+        raise UserError(
+            "they look exchanged, each like the other's sensor file: exchange fingertips.left and "
+            "fingertips.right in the cell file, or the two sensors"
+        )
+    return "neither looks like the other's sensor file"
 
 
 def _load_cell(connection: CellConnection) -> str:

@@ -23,6 +23,7 @@ from touchgoal.policies.deploy.control_loop import (
     RunLog,
     TickStatus,
 )
+from touchgoal.policies.deploy.exchanged import Picture, cameras_exchanged
 from touchgoal.policies.deploy.scripted import start_move
 from touchgoal.sim_envs.base import Observation
 
@@ -125,6 +126,7 @@ class Session:
         start = np.array(self.cell.task.start)
         if np.abs(start - loop.commanded()).max() > _CLOSE_TO_START:
             move = start_move(start, loop.width, self.safety, loop.commanded)
+            before = self._views()
             ending = loop.run(move, 60.0, RunLog())
             if not move.done or ending.stopped:
                 return ending
@@ -134,7 +136,18 @@ class Session:
                     f"the start pose was missed by {off:.3f} rad",
                     "look for what holds the arm back",
                 )
+            views = [(view, self._views()[key]) for key, view in before.items()]
+            if len(views) == len(ft.CAMERAS) and cameras_exchanged(*views):
+                return loop.stop(
+                    "the front and the wrist camera look exchanged: what is called front moves with the arm",
+                    "exchange cameras.front and cameras.wrist in the cell file",
+                )
         return None
+
+    def _views(self) -> dict[str, Picture]:
+        """What front and wrist camera show now, in this order, of those that there are."""
+        cameras = self.connection.cameras
+        return {key: cameras[key].read().image for key in ft.CAMERAS if key in cameras}
 
     def _run_actor(self, loop: ControlLoop, log: RunLog) -> Ending:
         actor = self.make_actor(loop)

@@ -1,0 +1,55 @@
+"""Whether two cameras, or the two fingertips, are each where the other should be, told by what they show."""
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from touchgoal.control.tactile.background import local_change
+
+_CLEARLY = 1.5  # times that a fingertip is more like the other's sensor file
+_SMALL = 32  # px of a side at which pictures of cameras are compared
+_MOVED = (
+    2.5  # counts by which half of a picture's pixels change at least, when its camera has moved
+)
+_TIMES = 3.0  # that the other one's must change less
+
+Picture = UInt8[np.ndarray, "h w 3"]
+
+
+def fingertips_exchanged(
+    frames: tuple[Picture, Picture], backgrounds: tuple[Picture, Picture]
+) -> bool:
+    """Whether each of two untouched fingertips looks clearly more like the other one's sensor file.
+
+    Both must: light drifts, and a file may be old.
+
+    Args:
+        frames: of the left and of the right finger.
+        backgrounds: of the left one's and of the right one's sensor file.
+    """
+    unlike = [
+        [float(local_change(frame, background).mean()) for background in backgrounds]
+        for frame in frames
+    ]
+    return all(_CLEARLY * unlike[side][1 - side] < unlike[side][side] for side in (0, 1))
+
+
+def cameras_exchanged(front: tuple[Picture, Picture], wrist: tuple[Picture, Picture]) -> bool:
+    """Whether the front camera has moved with the arm and the wrist camera has not.
+
+    A view without structure tells nothing, and then nothing is said.
+
+    Args:
+        front, wrist: pictures before and after a move of the arm.
+    """
+    moved = usual_change(*front)
+    return moved > _MOVED and moved > _TIMES * usual_change(*wrist)
+
+
+def usual_change(before: Picture, after: Picture) -> float:
+    """By how many counts half of the pixels change at least, beyond a factor on all, as of exposure."""
+    size = _SMALL, _SMALL
+    small = [cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (before, after)]
+    first, second = (x.astype(np.float32) for x in small)
+    gain = np.median(second, axis=(0, 1)) / np.maximum(np.median(first, axis=(0, 1)), 1.0)
+    return float(np.median(np.abs(second - gain * first).max(2)))

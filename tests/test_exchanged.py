@@ -1,0 +1,134 @@
+"""Exchanged cameras and fingertips are noticed at the start, and right ones are not."""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from a_cell import MadeUpArm, MadeUpCamera, MadeUpClock, MadeUpGripper
+
+from touchgoal.control import features as ft
+from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.cell.connection import CellConnection
+from touchgoal.control.interfaces import Camera, Frame
+from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.control.safety.limits import FR3
+from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
+from touchgoal.policies.deploy.control_loop import ControlLoop
+from touchgoal.policies.deploy.exchanged import cameras_exchanged, fingertips_exchanged
+from touchgoal.policies.deploy.scripted import ScriptedActor
+from touchgoal.policies.deploy.session import Session
+from touchgoal.sim_envs.config import PickPlaceConfig
+from touchgoal.sim_envs.pick_place import PickPlace
+from touchgoal.sim_envs.tactile.optics import render_untouched
+from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
+
+STARTS = 20
+
+
+def drifted(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """As on another day: brighter or darker, and by a smooth pattern (spreads of `background.py`)."""
+    height = picture.shape[0]
+    wave = np.cos(np.pi * rng.integers(1, 4) * np.arange(height) / height)[:, None, None]
+    changed = picture * (1 + 0.047 * rng.normal(size=3)) + 2.4 * rng.normal(size=3)
+    return np.clip(changed + 2.4 * rng.normal() * wave, 0, 255).astype(np.uint8)
+
+
+def test_exchanged_fingertips_are_noticed_at_every_start() -> None:
+    for seed in range(STARTS):
+        rng = np.random.default_rng(seed)
+        units = [sample_instance(GELSIGHT_MINI, rng) for _ in range(2)]
+        left, right = (render_untouched(unit, rng) for unit in units)
+        frames = [drifted(render_untouched(unit, rng), rng) for unit in units]
+        assert not fingertips_exchanged((frames[0], frames[1]), (left, right))
+        assert fingertips_exchanged((frames[1], frames[0]), (left, right))
+        assert not fingertips_exchanged((frames[0], frames[1]), (left, left)), "one file for both"
+
+
+@cache
+def moves() -> list[tuple]:
+    """Pictures of (front, wrist), each before and after a move of the arm."""
+    rng, found = np.random.default_rng(0), []
+    env = PickPlace(
+        PickPlaceConfig(cameras=("front", "wrist"), camera_size=(256, 256), tactile=False)
+    )
+    for seed in range(STARTS):
+        env.reset(seed=seed)
+        before = [env.render_camera(name).copy() for name in ("front", "wrist")]
+        way = rng.normal(size=7)
+        env.data.qpos[env.arm_positions] += way * rng.uniform(0.1, 0.4) / np.abs(way).max()
+        mujoco.mj_forward(env.model, env.data)
+        after = [env.render_camera(name).copy() for name in ("front", "wrist")]
+        found.append(tuple(zip(before, after, strict=True)))
+    env.close()
+    return found
+
+
+def test_exchanged_cameras_are_noticed_where_there_is_something_to_see() -> None:
+    rng = np.random.default_rng(0)
+
+    def taken(pictures: tuple) -> tuple[np.ndarray, np.ndarray]:
+        before, after = (
+            np.clip(p * rng.uniform(0.9, 1.1) + rng.normal(0, 3, p.shape), 0, 255).astype(np.uint8)
+            for p in pictures
+        )
+        return before, after
+
+    noticed = 0
+    for front, wrist in moves():
+        front, wrist = taken(front), taken(wrist)
+        assert not cameras_exchanged(front, wrist)
+        noticed += cameras_exchanged(wrist, front)
+    assert noticed >= 15  # of 20: a bare table tells nothing
+
+
+@dataclass
+class CameraOnTheArm(MadeUpCamera):
+    """Shows a picture that moves as the first joint does."""
+
+    arm: MadeUpArm | None = None
+
+    def read(self) -> Frame:
+        assert self.arm is not None
+        moved = np.roll(self.image, round(100 * self.arm.reading.q[0]), 1)
+        return Frame(moved, round(1000 * self.clock.time), self.clock.time)
+
+
+@pytest.mark.parametrize("exchanged", [False, True])
+def test_a_run_with_exchanged_cameras_ends_after_the_start_move(
+    exchanged: bool, tmp_path: Path
+) -> None:
+    start = FR3.arm.home + np.array([0.3, *[0.0] * 6])
+    file = tmp_path / "cell.toml"
+    file.write_text(
+        'arm = "sim"\ngripper = { kind = "franka_hand" }\n'
+        f'task = {{ name = "pick-place", policy = "expert", start = {start.tolist()} }}\n'
+    )
+    clock, scene = MadeUpClock(), np.random.default_rng(0).integers(0, 255, (128, 128, 3), np.uint8)
+    arm = MadeUpArm(clock)
+    fixed, carried = MadeUpCamera(clock, scene), CameraOnTheArm(clock, scene, arm=arm)
+    views = (carried, fixed) if exchanged else (fixed, carried)
+    cameras: dict[str, Camera] = dict(zip(ft.CAMERAS, views, strict=True))
+    connection = CellConnection(FR3, arm, MadeUpGripper(clock), cameras, None, clock)
+
+    def actor(loop: ControlLoop) -> ScriptedActor:
+        return ScriptedActor([], loop.commanded, ft.CONTROL_HZ)
+
+    ending = (
+        Session(
+            read_cell_file(file),
+            connection,
+            ActionFilter(FR3, ft.CONTROL_HZ),
+            tmp_path / "episodes",
+            True,
+            actor,
+            lambda: "",
+            lambda _: None,
+            None,
+        )
+        .run()
+        .ending
+    )
+    assert ending.stopped == exchanged and ("look exchanged" in ending.reason) == exchanged
