@@ -1,9 +1,11 @@
 """Exchanged cameras and fingertips are noticed at the start, and right ones are not."""
 
+import shutil
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import cv2
 import mujoco
 import numpy as np
 import pytest
@@ -12,12 +14,15 @@ from a_cell import MadeUpArm, MadeUpCamera, MadeUpClock, MadeUpGripper
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.connection import CellConnection
+from touchgoal.control.checks import CheckResult
 from touchgoal.control.interfaces import Camera, Frame
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
-from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
+from touchgoal.control.sensors.tactile_camera import NO_CROP, TactileCamera
+from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, find_sensor
 from touchgoal.policies.deploy.control_loop import ControlLoop
 from touchgoal.policies.deploy.exchanged import cameras_exchanged, fingertips_exchanged
+from touchgoal.policies.deploy.preflight import preflight
 from touchgoal.policies.deploy.scripted import ScriptedActor
 from touchgoal.policies.deploy.session import Session
 from touchgoal.sim_envs.config import PickPlaceConfig
@@ -45,6 +50,48 @@ def test_exchanged_fingertips_are_noticed_at_every_start() -> None:
         assert not fingertips_exchanged((frames[0], frames[1]), (left, right))
         assert fingertips_exchanged((frames[1], frames[0]), (left, right))
         assert not fingertips_exchanged((frames[0], frames[1]), (left, left)), "one file for both"
+
+
+def preflighted(
+    pictures: list[np.ndarray], untouched: list[np.ndarray], tmp_path: Path
+) -> dict[str, CheckResult]:
+    """The pre-flight's lines on two fingertips that show these, each with a sensor file of its own."""
+    clock, folders = MadeUpClock(), []
+    for side, background in enumerate(untouched):
+        folders.append(tmp_path / f"finger_{side}")
+        tmp_path.mkdir(exist_ok=True)
+        shutil.copytree(GELSIGHT_MINI.sensor_file, folders[-1])
+        cv2.imwrite(str(folders[-1] / "background.png"), background[..., ::-1])
+    file = tmp_path / "cell.toml"
+    file.write_text(
+        'arm = "sim"\ngripper = { kind = "franka_hand" }\n[fingertips]\n'
+        'sensor = "gelsight_mini"\nleft = "http://left"\nright = "http://right"\n'
+        f"sensor_files = {[str(folder) for folder in folders]}\n"
+        '[task]\nname = "pick-place"\npolicy = "expert"\n'
+    )
+    cameras: dict[str, Camera] = {
+        key: TactileCamera(MadeUpCamera(clock, picture), find_sensor(str(folder)), NO_CROP)
+        for key, picture, folder in zip(ft.TACTILE, pictures, folders, strict=True)
+    }
+    connection = CellConnection(FR3, MadeUpArm(clock), MadeUpGripper(clock), cameras, None, clock)
+    safety = ActionFilter(FR3, ft.CONTROL_HZ)
+    lines = preflight(read_cell_file(file), connection, safety, tmp_path / "episodes")
+    return {line.name: line for line in lines}
+
+
+def test_the_preflight_names_exchanged_and_touched_fingertips(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    units = [sample_instance(GELSIGHT_MINI, rng) for _ in range(2)]
+    files = [render_untouched(unit, rng) for unit in units]
+    now = [render_untouched(unit, rng) for unit in units]
+    lines = preflighted(now, files, tmp_path / "right")
+    assert lines["fingertips"].ok and lines["tactile_left"].ok
+    lines = preflighted(now[::-1], files, tmp_path / "wrong")
+    assert not lines["fingertips"].ok and "exchange fingertips.left" in lines["fingertips"].remedy
+    now[0][100:140, 140:180] += 60
+    lines = preflighted(now, files, tmp_path / "touched")
+    assert not lines["tactile_left"].ok and "touched" in lines["tactile_left"].remedy
+    assert lines["tactile_right"].ok
 
 
 @cache
