@@ -6,6 +6,9 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 CODE := control sim_envs episodes encoders rewards policies benchmarks launch tests
 
+# Without compiled files each of the tests' many processes would compile everything anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: setup demo test interop lint check format build typings weights weights-markers maze-policy pick-place-policy clean
 
 setup: $(READY)

@@ -3,9 +3,12 @@
 import re
 import shlex
 import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+from touchgoal.launch.__main__ import main
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -18,9 +21,9 @@ TOY = {
     "collect-demos --task bead-maze --policy": "--episodes 1 --workers 1 --env.max-seconds 1",
     "collect-demos --task bead-maze": "--episodes 1 --workers 1 --env.cameras --env.disturbance 0",
     "collect-demos --feedback": "--episodes 1 --workers 1 --env.max-seconds 1",
-    "collect-demos --episodes 240": "--episodes 2 --workers 2 --env.objects glass_ball",
-    "collect-demos --episodes 80": "--episodes 2 --workers 2 --env.objects glass_ball",
-    "collect-demos": "--episodes 4 --workers 2 --env.objects glass_ball",
+    "collect-demos --episodes 240": "--episodes 2 --workers 2 --env.objects glass_ball --env.control-hz 10",
+    "collect-demos --episodes 80": "--episodes 2 --workers 2 --env.objects glass_ball --env.control-hz 10",
+    "collect-demos": "--episodes 4 --workers 2 --env.objects glass_ball --env.cameras front --env.control-hz 10",
     "reward-curves data/episodes": "--index 0",
     "train-encoder align": "--align.vit tiny --align.epochs 1 --align.batch-size 8 --normalizer-episodes 2",
     "train-encoder mae": "--frames 8 --mae.vit tiny --mae.epochs 1 --mae.batch-size 8",
@@ -83,6 +86,19 @@ def commands() -> Iterator[Command]:
             if line not in met and line.split()[0] in ("touchgoal", "launch/deploy.sh", "make"):
                 met.add(line)
                 yield Command(page.name, line, whole)
+
+
+def exit_status(words: list[str]) -> int:
+    """What a command ends with, in a process that stays for the next one."""
+    print("touchgoal", shlex.join(words), flush=True)
+    try:
+        main(words)
+    except SystemExit as end:
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
+            return 1
+        return end.code or 0
+    return 0
 
 
 def _lines(text: str) -> Iterator[tuple[str, bool]]:

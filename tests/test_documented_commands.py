@@ -7,19 +7,30 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from documented_commands import NOT_RUN, PAGES, ROOT, Command, commands, recipes, snippets
+from documented_commands import (
+    NOT_RUN,
+    PAGES,
+    ROOT,
+    Command,
+    commands,
+    exit_status,
+    recipes,
+    snippets,
+)
 
 from touchgoal.control.tactile import sensor_models
 from touchgoal.episodes.media import write_video
+from touchgoal.episodes.recording import one_core_workers
 from touchgoal.launch.__main__ import COMMANDS, read_options
 from touchgoal.launch.commands.deploy import NOT_DONE
 
+Shell = Callable[[list[str]], int]
 ALL = list(commands())
 # own_*.md: test_own_pages.py
 SNIPPET_PAGES = [p for p in PAGES if snippets(p) and not p.stem.startswith("own_")]
@@ -88,16 +99,22 @@ DEPLOYING = [
 ]
 
 
-@pytest.mark.slow
-def test_commands_run(desk: Path) -> None:
-    """One after the other, as a person would who reads the pages from the first to the last.
+@pytest.fixture(scope="module")
+def shell(desk: Path) -> Iterator[Shell]:
+    """Another process, in which commands run one after the other; it returns how one ends.
 
-    In processes of their own: in here their types would be checked meanwhile, which takes longer.
+    What they import is imported once; in here their types would be checked meanwhile, which takes longer.
     """
+    with one_core_workers(1) as pool:
+        yield lambda words: pool.submit(exit_status, words).result()
+
+
+@pytest.mark.slow
+def test_commands_run(shell: Shell) -> None:
+    """One after the other, as a person would who reads the pages from the first to the last."""
     for command in TYPED:
         if command not in DEPLOYING:
-            done = subprocess.run([*SHELL, *command.small])
-            assert done.returncode == 0, command
+            assert shell(command.small) == 0, command
 
 
 @pytest.mark.slow
