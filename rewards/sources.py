@@ -186,7 +186,8 @@ def open_source(
         raise UserError(f"{path} does not exist: give a set of episodes, a video or a folder")
     key = camera if camera.startswith(IMAGE_PREFIX) else f"{IMAGE_PREFIX}{camera}"
     if key not in CAMERAS:
-        raise UserError(f"there is no camera '{camera}': choose {' or '.join(CAMERAS)}")
+        names = " or ".join(name.removeprefix(IMAGE_PREFIX) for name in CAMERAS)
+        raise UserError(f"there is no camera '{camera}': choose {names}")
     for root in (path, path / "episodes"):
         if (root / INFO).exists():
             return _open_episodes(root, key, index, with_touch)
