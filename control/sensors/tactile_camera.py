@@ -18,12 +18,10 @@ class Crop:
     Attributes:
         border: share cut off at each of the four sides; 0 of a stream that is cut already.
         quarter_turns: counter-clockwise, before cutting; a DIGIT's camera lies on its side.
-        mirrored: left to right, after turning.
     """
 
     border: float = 0.0
     quarter_turns: int = 0
-    mirrored: bool = False
 
 
 # Of a whole GelSight Mini picture its SDK cuts a seventh off each side, the case's edge, and scales
@@ -75,8 +73,6 @@ def crop_to_sensor(
 ) -> UInt8[np.ndarray, "H W 3"]:
     """The sensor's picture in its camera's, at the model's shape."""
     image = np.rot90(image, crop.quarter_turns)
-    if crop.mirrored:
-        image = image[:, ::-1]
     height, width = image.shape[:2]
     top, left = int(crop.border * height), int(crop.border * width)
     image = image[top : height - top, left : width - left]

@@ -1,6 +1,6 @@
 """The same pictures in torch: batched, on any device, differentiable in the height of the object.
 
-Follows `control.touch.gel.deform` and `optics.render` step by step, without noise tile and markers;
+Follows `control.tactile.gel.deform` and `optics.render` step by step, without noise tile and markers;
 `tests/test_tactile.py` holds both to the same picture.
 """
 
