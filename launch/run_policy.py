@@ -23,7 +23,7 @@ class Config:
     policy: str = "shipped"
     """Which policy: shipped; a folder that train-policy made; expert, which sees the simulator's
     state; follower (bead-maze), the classical one, which feels the force on the hand; or a class of
-    your own, as module:Class or file.py:Class (docs: policies/by_name.py)."""
+    your own, as module:Class or file.py:Class (docs/own_policy.md)."""
     out: Path | None = None
     """Folder of the run."""
     episodes: Count = 20
