@@ -1,5 +1,6 @@
 """Every command and snippet of README and docs: understood as printed, run at toy size."""
 
+import json
 import os
 import re
 import runpy
@@ -8,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import cv2
@@ -24,11 +26,13 @@ from documented_commands import (
     snippets,
 )
 
+from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.tactile import sensor_models
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.recording import one_core_workers
 from touchgoal.launch.__main__ import COMMANDS, read_options
 from touchgoal.launch.commands.deploy import NOT_DONE
+from touchgoal.sim_envs.twin.control_port import ask_twin
 
 Shell = Callable[[list[str]], int]
 ALL = list(commands())
@@ -97,6 +101,8 @@ TYPED = [c for c in ALL if c.whole and c.words[0] != "make" and c.words[1] not i
 DEPLOYING = [
     c for c in TYPED if c.words[0] == "launch/deploy.sh" or c.words[1] in ("twin", "deploy")
 ]
+THE_JOB = "touchgoal deploy runs/twin/cell.json --execute"  # what the package is for
+CUT = 3.0  # s, of a run whose end is not the subject
 
 
 @pytest.fixture(scope="module")
@@ -118,26 +124,63 @@ def test_commands_run(shell: Shell) -> None:
 
 
 @pytest.mark.slow
-def test_deploying_runs(desk: Path) -> None:
+def test_deploying_without_a_twin_runs(desk: Path, shell: Shell) -> None:
+    for command in DEPLOYING:
+        words = command.small
+        if command.words[0] == "launch/deploy.sh":
+            program = [str(ROOT / command.words[0]), *words, "--yes"]
+            with _cut(desk / words[0]) if "--execute" not in words else nullcontext():
+                done = subprocess.run(program, env={**os.environ, "PATH": _path()})
+            assert done.returncode == 0, command
+        elif words[0] == "deploy" and not words[1].startswith("runs/twin"):
+            assert shell(words) == 0, command
+
+
+@pytest.mark.slow
+def test_deploying_on_the_twin_runs(desk: Path, shell: Shell) -> None:
     """The first twin that a page starts stays, for all that is deployed on it."""
-    twin = None
+    cell_file = desk / "runs" / "twin" / "cell.json"
+    twin = _serve(next(c.small for c in DEPLOYING if c.words[1] == "twin"), cell_file)
     try:
+        _the_job_is_done(desk, cell_file, shell)
         for command in DEPLOYING:
             words = command.small
-            if words[0] == "twin":
-                twin = twin or _serve(words, desk / "runs" / "twin" / "cell.json")
+            if words[:2] != ["deploy", "runs/twin/cell.json"] or command.line == THE_JOB:
                 continue
-            if command.words[0] == "launch/deploy.sh":
-                program = [str(ROOT / command.words[0]), *words, "--yes"]
-            else:
-                program = [*SHELL, *words]
-            done = subprocess.run(program, env={**os.environ, "PATH": _path()})
+            learned = "--policy" in words
+            with _cut(cell_file) if learned or "--execute" not in words else nullcontext():
+                ended = shell(words)
             # A learned policy may fail; it says so.
-            assert done.returncode in ((0, NOT_DONE) if "--policy" in words else (0,)), command
+            assert ended in ((0, NOT_DONE) if learned else (0,)), command
     finally:
-        if twin is not None:
-            twin.terminate()
-            twin.wait(30)
+        twin.terminate()
+        twin.wait(30)
+
+
+def _the_job_is_done(desk: Path, cell_file: Path, shell: Shell) -> None:
+    """The expert's block is held and placed within all limits, as the twin knows, and felt."""
+    [job] = [command for command in DEPLOYING if command.line == THE_JOB]
+    run = desk / "runs" / "job"
+    assert shell([*job.small, "--out", str(run)]) == 0
+    said = json.loads((run / "metrics.json").read_text())
+    assert said["success"] and not said["stopped"] and said["episode"] == 0
+    assert 0.03 < said["held_width"] < 0.07
+    worst = ask_twin(read_cell_file(cell_file).task.twin, "truth")["worst"]
+    assert worst["excess"] == 0 and worst["speed"] < 1
+    assert shell(["reward-curves", str(run / "episodes"), "--out", str(run / "curves")]) == 0
+    report = json.loads((run / "curves" / "episode_000.json").read_text())
+    assert report["metrics"]["tactile"]["end"] < report["metrics"]["tactile"]["start"]
+
+
+@contextmanager
+def _cut(cell_file: Path) -> Iterator[None]:
+    """Meanwhile what the cell file starts ends after CUT."""
+    text = cell_file.read_text()
+    shorter, found = re.subn(r'\b(seconds"?\s*[=:]\s*)[\d.]+', rf"\g<1>{CUT}", text)
+    assert found == 1
+    cell_file.write_text(shorter)
+    yield
+    cell_file.write_text(text)
 
 
 def _path() -> str:
