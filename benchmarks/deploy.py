@@ -36,7 +36,7 @@ def run(config: DeployOptions) -> dict[str, Any]:
     """The table, and every deployment behind it."""
     if config.in_a_row:
         return run_in_a_row(config)
-    head = f"{'task, policy, arm':<34}{'success [95 % Wilson]':<23}{'peak N':>12}{'late ms':>9}  clamped"
+    head = f"{'task, policy, arm':<34}{'success [95 % Wilson]':<23}{'peak N':>12}{'late ms':>9}{'pace':>6}  clamped"
     lines, done = [head], []
     for task in config.tasks:
         scenes = list(_scenes(task, config))
@@ -117,8 +117,8 @@ def _lines(rows: list[Deployment]) -> list[str]:
     clamped = ", ".join(f"{name} {share:.0%}" for name, share in shares.items() if share >= 5e-3)
     what = f"{first.task}, {first.policy}, {first.arm}"
     peak = f"{np.median(peaks):.0f} to {max(peaks):.0f}"
-    late = max(row.late for row in rows)
-    lines = [f"{what:<34}{rate!s:<23}{peak:>12}{late:>9.1f}  {clamped or 'never'}"]
+    late, pace = max(row.late for row in rows), min(row.pace for row in rows)
+    lines = [f"{what:<34}{rate!s:<23}{peak:>12}{late:>9.1f}{pace:>6.2f}  {clamped or 'never'}"]
     for row in rows:
         if not row.success:
             at = "" if row.progress is None else f", progress {row.progress:.2f}"

@@ -41,6 +41,7 @@ class Deployment:
         peak_force: greatest external force on the hand, N.
         clamped: share of the ticks in which each limit changed the command.
         late: ms by which 99 % of the ticks were late at most.
+        pace: of the arm's clock by the clock on the wall, in the median second; 1 where it waits.
     """
 
     task: str
@@ -56,6 +57,7 @@ class Deployment:
     peak_force: float
     clamped: dict[str, float]
     late: float
+    pace: float = 1.0
 
 
 def limited(cell: Path, seconds: float) -> Path:
@@ -93,6 +95,7 @@ def deploy(cell: Path, scene: Scene, policy: str, arm: str, out: Path) -> Deploy
         said["force_max_newtons"],
         {name: count / ticks for name, count in said["clamped"].items()},
         said["late_p99_ms"],
+        said["arm_pace"],
     )
 
 

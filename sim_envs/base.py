@@ -178,6 +178,10 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         """The last reading of the left and right sensor, with depth and contact mask."""
         return self._frames
 
+    def tactile_pads(self) -> list[TactilePad]:
+        """The left and the right sensor; none without touch."""
+        return self._pads
+
     def pad_contacts(self) -> tuple[PadContact, PadContact]:
         """Exact wrench and slip of the left and right pad after the last tick."""
         return self._contacts

@@ -88,7 +88,6 @@ class LockStepClock:
 
     def wait(self, until: float) -> None:
         """See Clock."""
-        sent: dict[str, int] = {}
         weighed = -np.inf
         while (steps := round((until - self._time) / _DT)) > 0 and not self._lost:
             # Steps end where the stream's commands are due, whatever is waited for.
@@ -96,14 +95,13 @@ class LockStepClock:
             answer = self._ask(f"advance {steps} {int(self._driven)} {self._issued}")
             if self._lost:
                 break
-            self._time, self._answered, sent = (answer[key] for key in ("time", "hand", "pictures"))
-            weighed = answer["load"]
+            self._time, self._answered, weighed = (answer[key] for key in ("time", "hand", "load"))
             self._history.append((time.monotonic(), self._time))
             if not answer["frozen"]:
                 self._let_drivers_tick()
         if self._lost:
             self._wait_without_twin(until)
-        self._await_pictures(sent)
+        self._await_pictures({} if self._lost else self._ask("pictures"))
         self._await_load(weighed)
 
     def close(self) -> None:

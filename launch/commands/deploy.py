@@ -25,7 +25,7 @@ from touchgoal.launch.deploy import Config
 from touchgoal.launch.support.run_folder import open_run, write_json
 from touchgoal.launch.support.terminal import HELP, Terminal
 from touchgoal.policies.deploy.actors import CellPolicy, load_cell_policy, make_actor
-from touchgoal.policies.deploy.control_loop import Request
+from touchgoal.policies.deploy.control_loop import SLOW_ARM, Request, slow_arm
 from touchgoal.policies.deploy.preflight import check_client, preflight
 from touchgoal.policies.deploy.session import Result, Session
 from touchgoal.rewards.goals import parse_goal
@@ -219,6 +219,7 @@ def _report(result: Result, out: Path) -> None:
         "answered_p95_ms": 1e3 * float(np.percentile(log.answer_times or [0.0], 95)),
         "force_max_newtons": float(max(forces, default=0.0)),
         "clamped": log.limit_counts,
+        "arm_pace": log.arm_pace,
     }
     unwritten = ""
     try:
@@ -231,6 +232,8 @@ def _report(result: Result, out: Path) -> None:
     print(
         f"largest force on the hand: {numbers['force_max_newtons']:.1f} N; commands limited: {clamped}"
     )
+    if log.arm_pace < SLOW_ARM:
+        print(slow_arm(log.arm_pace))
     if result.held_width is not None:
         print(f"the hand still holds something, {1e3 * result.held_width:.0f} mm wide")
     if result.episode is not None:

@@ -41,7 +41,28 @@ def run_command(config: Config) -> None:
         twin.run()
     finally:
         twin.close()
-    print("\nstopped")
+    numbers: dict[str, float] = {
+        **twin.pace.summary(),
+        "pictures_taken": twin.pictures.taken,
+        "pictures_left_out": twin.pictures.left_out,
+    }
+    write_json(out / "metrics.json", numbers)
+    print("\n" + "\n".join(_pace_lines(numbers)) + "stopped")
+
+
+def _pace_lines(numbers: dict[str, float]) -> list[str]:
+    """What a person is told of the twin's pace."""
+    if not numbers["seconds"]:
+        return [""]
+    return [
+        f"{numbers['seconds']} s with a client that drives the arm: simulated over wall time "
+        f"{numbers['pace_median']:.2f} in the median second, {numbers['pace_slowest']:.2f} in the slowest",
+        f"pictures left out to keep pace: {numbers['pictures_left_out']} of "
+        f"{numbers['pictures_taken'] + numbers['pictures_left_out']}",
+        f"processor time a simulated second: {numbers['processor_twin']:.2f} s, and "
+        f"{numbers['processor_pictures']:.2f} s for pictures",
+        "",
+    ]
 
 
 def table(cell: CellConfig) -> str:

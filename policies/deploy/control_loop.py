@@ -27,7 +27,7 @@ from touchgoal.sim_envs.base import Observation
 _REST_SPEED = 0.01  # rad/s
 _REST_TIMEOUT = 3.0  # s to wait for that by the loop's clock
 _REST_WALL_TIMEOUT = 10.0  # s on the wall for the same
-_SLOW_ARM = 0.95  # share of real time below which an arm's clock means a twin that cannot keep up
+SLOW_ARM = 0.95  # share of real time below which an arm's clock means a twin that cannot keep up
 
 ADVICE = {
     Limit.NOT_A_NUMBER: "the policy's output is broken: do not use this checkpoint",
@@ -350,11 +350,8 @@ class ControlLoop:
         advice = ADVICE.get(fault.limit, "look at what it names")
         if fault.limit == Limit.FORCE and np.isnan(fault.value):
             advice = "the arm is near a singularity, where it feels no forces: keep the task away"
-        if arm_pace < _SLOW_ARM:
-            advice = (
-                f"the arm's clock goes at {arm_pace:.2f} of real time: this twin cannot keep up, and "
-                "everything comes late in its time; free the machine, or start it with --lock-step"
-            )
+        if arm_pace < SLOW_ARM:
+            advice = slow_arm(arm_pace)
         return self.stop(reason, advice, release_to)
 
     def _as_commanded(self, sensed: CellReading) -> CellReading:
@@ -364,6 +361,14 @@ class ControlLoop:
         felt = replace(arm, wrench=np.zeros(6))
         imagined = self.reader.proprioception(felt, gripper)
         return replace(sensed, arm=arm, observation={**sensed.observation, **imagined})
+
+
+def slow_arm(pace: float) -> str:
+    """What to do about an arm whose clock goes at this share of real time."""
+    return (
+        f"the arm's clock goes at {pace:.2f} of real time: this twin cannot keep up, and "
+        "everything comes late in its time; free the machine, or start it with --lock-step"
+    )
 
 
 def _speed(before: ArmReading, now: ArmReading) -> float:

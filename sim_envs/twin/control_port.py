@@ -5,6 +5,7 @@ for the truth.
     hold                          let the time of a lock-step twin stand until this connection closes
     advance STEPS DRIVEN COMMANDS let it go on by so many ms, once a client drives the arm if DRIVEN is
                                   1, and once so many commands have come to the hand since `hold`
+    pictures                      how many of each stream are on their way, once all are that were due
     reset SEED [OPTIONS]          put the scene, the arm and the open hand where an episode starts, and
                                   clear an error as a person does in Desk; OPTIONS is a JSON object
                                   of the task's
@@ -48,7 +49,7 @@ from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.lock_step import LockStep
-from touchgoal.sim_envs.twin.mjpeg import Stream
+from touchgoal.sim_envs.twin.pictures import Pictures
 from touchgoal.sim_envs.twin.serial.devices import SerialPort
 from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort
 
@@ -95,7 +96,7 @@ class ControlPort:
         self,
         cell: SimulatedCell,
         arm: FaultyArm,
-        streams: dict[str, Stream],
+        pictures: Pictures,
         ports: dict[str, SerialPort],
         host: str,
         port: int,
@@ -103,7 +104,7 @@ class ControlPort:
         on_reset: Callable[[], None],
     ) -> None:
         self._lock_step, self._on_reset = lock_step, on_reset
-        self._cell, self._arm, self._streams, self._ports = cell, arm, streams, ports
+        self._cell, self._arm, self._pictures, self._ports = cell, arm, pictures, ports
         self._listener = ListeningPort(host, port)
         self._frozen_seconds = (
             0.0  # s left, simulated: a slow machine would end it before a packet is lost
@@ -156,6 +157,7 @@ class ControlPort:
             "truth": self._cell.truth,
             "hold": lambda: self._held_time().hold(client),
             "advance": None,
+            "pictures": lambda: self._held_time().pictures(),
             "reset": lambda: self._reset(*rest.split(" ", 1)),
             "freeze": lambda: self._freeze(float(rest)),
             "drop": self._arm.drop,
@@ -215,7 +217,7 @@ class ControlPort:
         self._cell.nudge(np.array([x, y, z]), seconds)
 
     def _set_stream_fault(self, fault: str, name: str, seconds: str) -> None:
-        setattr(self._streams[name], fault, time.monotonic() + float(seconds))
+        self._pictures.set_fault(name, fault, float(seconds))
 
     def _garble(self, name: str, share: str) -> None:
         self._ports[name].garble = float(share)

@@ -10,7 +10,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.sim_envs.twin.cell import SimulatedCell
 from touchgoal.sim_envs.twin.franka.controller import FrankaArm
 from touchgoal.sim_envs.twin.franka.hand import FrankaHand
-from touchgoal.sim_envs.twin.mjpeg import Streams
+from touchgoal.sim_envs.twin.pictures import Pictures
 from touchgoal.sim_envs.twin.serial.devices import LoadCell
 from touchgoal.sim_envs.twin.tcp_ports import ClientConnection
 
@@ -23,8 +23,8 @@ class LockStep:
     """Time stands while a client holds it, and goes on by what that asks for.
 
     A few steps begin once the arm's client drives it, if it is said to, and once the hand has got as
-    many commands as were sent; they are over once the arm's client has answered the last state and
-    all pictures that were due are sent.
+    many commands as were sent; they are over once the arm's client has answered the last state. Pictures
+    are taken meanwhile, and waited for when a client asks how many there are.
     """
 
     def __init__(
@@ -32,11 +32,11 @@ class LockStep:
         cell: SimulatedCell,
         arm: FrankaArm,
         hand: FrankaHand,
-        streams: Streams,
+        pictures: Pictures,
         load_cell: LoadCell,
     ) -> None:
         self._load_cell = load_cell
-        self._cell, self._arm, self._hand, self._streams = cell, arm, hand, streams
+        self._cell, self._arm, self._hand, self._pictures = cell, arm, hand, pictures
         self._holder: ClientConnection | None = None
         self._left = 0  # steps asked for and not yet made
         self._driven, self._issued, self._until = False, 0, 0.0
@@ -49,7 +49,12 @@ class LockStep:
             raise UserError("another program holds the time of this twin")
         self._holder, self._left, self._asked = client, 0, False
         self._commands_before, self._answers_before = self._hand.commands, self._hand.answers
-        return self._report()
+        self._pictures.held = True
+        return self._report() | {"pictures": self.pictures()}
+
+    def pictures(self) -> dict[str, int]:
+        """How many pictures of each stream are on their way to whoever watches, once all are that were due."""
+        return self._pictures.sent()
 
     def advance(self, client: ClientConnection, steps: int, driven: bool, issued: int) -> None:
         """Go on by so many steps; the answer follows when they are made."""
@@ -63,7 +68,8 @@ class LockStep:
     @property
     def held(self) -> bool:
         """Whether a client holds the time."""
-        return self._holder is not None and self._holder.open
+        held = self._pictures.held = self._holder is not None and self._holder.open
+        return held
 
     @property
     def standing(self) -> bool:
@@ -102,7 +108,6 @@ class LockStep:
         return {
             "time": self._cell.time,
             "hand": self._hand.answers - self._answers_before,
-            "pictures": self._streams.sent(),
             "load": self._load_cell.sent,
             "frozen": self._arm.link.frozen,
         }

@@ -29,7 +29,8 @@ from touchgoal.sim_envs.twin.control_port import ControlPort
 from touchgoal.sim_envs.twin.franka.controller import FrankaArm
 from touchgoal.sim_envs.twin.franka.hand import FrankaHand
 from touchgoal.sim_envs.twin.lock_step import LockStep
-from touchgoal.sim_envs.twin.mjpeg import CAMERA_RATE, Streams
+from touchgoal.sim_envs.twin.pace import Pace
+from touchgoal.sim_envs.twin.pictures import CAMERA_RATE, Pictures
 from touchgoal.sim_envs.twin.serial import devices as serial_ports
 from touchgoal.sim_envs.twin.ur.controller import UrController
 
@@ -88,6 +89,8 @@ class Twin:
 
     Attributes:
         cell_config: where everything is, for whoever deploys on it.
+        pace: of its time.
+        pictures: its cameras and fingertips.
         stopped: set it to end `run`.
     """
 
@@ -100,6 +103,7 @@ class Twin:
         self._lock_step: LockStep | None = None
         self._next_step_at = time.monotonic()
         self.stopped = False
+        self.pace = Pace()
         self._services: list[Service] = []
         with ExitStack() as undo:
             undo.callback(self.close)
@@ -130,6 +134,7 @@ class Twin:
         self.cell.step()
         for service in self._services:
             service.send()
+        self.pace.count_step(self._arm.driven, self.pictures.processor_time)
         if lock_step is not None and lock_step.held:
             lock_step.count_step()
         else:
@@ -173,26 +178,27 @@ class Twin:
                 widths=(tool.stroke[1], tool.stroke[0]),
                 force=max(force, tool.force[0]),
             )
-        services.append(streams := Streams(cell, host, config.port))
+        self.pictures = pictures = Pictures(cell, host, config.port)
+        services.append(pictures)
         control = config.port + 1 if config.port else 0
 
         def reset() -> None:
-            streams.reset()
+            pictures.reset()
             load_cell.reset()
             if hand is not None:
                 hand.reset()
 
         if config.lock_step and hand is not None and isinstance(arm, FrankaArm):
-            lock_step = self._lock_step = LockStep(cell, arm, hand, streams, load_cell)
-            streams.time_is_held = lambda: lock_step.held
+            self._lock_step = LockStep(cell, arm, hand, pictures, load_cell)
+        self._arm = arm
         self._commands = ControlPort(
-            cell, arm, streams.streams, ports, host, control, self._lock_step, reset
+            cell, arm, pictures, ports, host, control, self._lock_step, reset
         )
         services.append(self._commands)
         return _cell_config(
             config,
             gripper,
-            streams.addresses(),
+            pictures.addresses(),
             LoadCellConfig(
                 str(load_cell.port.path), serial_ports.NEWTONS_PER_COUNT, serial_ports.ZERO
             ),

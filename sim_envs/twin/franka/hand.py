@@ -14,6 +14,8 @@ from touchgoal.sim_envs.twin.franka.messages import HandCommand, HandStatus
 _STILL = 1e-3  # m/s of width
 _SETTLED = 0.1  # s without motion after which a move is over
 _SOMETHING = 1e-3  # m: narrower than this the fingers have met
+_STATE_INTERVAL = 20  # ms between states; a real hand takes 20 to 50
+_FIRST_STATE = 5  # ms: none is on its way when a lock-step client looks, every 50 ms
 _HELD_INTERVAL = 0.004  # s between states while time stands
 _KEPT = 2e-3  # m by which the width may change while something is held
 
@@ -48,6 +50,7 @@ class FrankaHand:
         self.cell = cell
         self.link = messages.Link(host, messages.HAND_PORT, messages.HAND_VERSION, wide=False)
         self.commands = self.answers = 0
+        self._milliseconds = 0
         self._held_at = 0.0  # monotonic s, of the last state while time stands
         self._job: Job | None = None
         self._grasped, self._held = False, 0.0  # m, the width of what is held
@@ -62,13 +65,13 @@ class FrankaHand:
             self._update_job(self._job)
 
     def send(self) -> None:
-        """Send the state."""
-        width = self.cell.env.width()
-        self._grasped &= abs(width - self._held) < _KEPT
-        self._state["width"] = max(0.0, width)
-        self._state["is_grasped"] = self._grasped
-        self.link.send(self._state.tobytes())
-        self._state["message_id"] += 1
+        """Send the state when it is due."""
+        self._milliseconds += 1
+        if self._grasped:
+            self._grasped = abs(self.cell.env.width() - self._held) < _KEPT
+        if self.cell.steps % _STATE_INTERVAL == _FIRST_STATE:
+            self._write_state()
+            self.link.send(self._state.tobytes())
 
     def hold(self) -> None:
         """While time stands: take commands, and let the client see the state as it is."""
@@ -84,6 +87,7 @@ class FrankaHand:
         if self._job is not None:
             self.link.answer(self._job.request, HandStatus.ABORTED)  # whoever asked is gone
         self._job = None
+        self._write_state()
 
     def close(self) -> None:
         """Free the port."""
@@ -136,6 +140,11 @@ class FrankaHand:
         elif abs(width - reached) > 2e-3:
             status = HandStatus.UNSUCCESSFUL  # something was in the way
         self._answer(job.request, status)
+
+    def _write_state(self) -> None:
+        self._state["message_id"] = self._milliseconds
+        self._state["width"] = max(0.0, self.cell.env.width())
+        self._state["is_grasped"] = self._grasped
 
     def _answer(self, request: messages.Request, status: HandStatus) -> None:
         self.link.answer(request, status)

@@ -1,0 +1,177 @@
+"""The process in which a twin's pictures are taken and served: physics and clients do not wait for them.
+
+It holds a copy of the scene's model and follows the physics by its state. It ends with the twin, whose
+end of the pipe then closes.
+"""
+
+import signal
+import sys
+import time
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from touchgoal.control import features as ft
+from touchgoal.sim_envs.scene.contacts import PadContact
+from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
+from touchgoal.sim_envs.tactile.pad import TactilePad
+from touchgoal.sim_envs.twin.mjpeg import Stream, StreamServer
+
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # of the physics: all that a picture could depend on
+_CAMERA_NOISE = 1.5  # counts: by it a driver tells a still scene from a frozen camera
+_TACTILE = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.TACTILE]
+
+Picture = UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where to serve which streams; `port` 0: at any that is free."""
+
+    host: str
+    port: int
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What pictures are taken of until the next one comes.
+
+    Attributes:
+        camera_size: rows and columns, px.
+        pads: left and right fingertip; empty without them.
+        rng: of the fingertips' noise.
+    """
+
+    model: mujoco.MjModel
+    camera_size: tuple[int, int]
+    pads: list[TactilePad]
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Pictures to take.
+
+    Attributes:
+        due: names of the streams that are to have one.
+        state: of the physics (`STATE`).
+        contacts: of the left and right pad.
+        held: whether to answer when they are on their way to whoever watches, not before.
+    """
+
+    due: tuple[str, ...]
+    state: Float[np.ndarray, " n"]
+    contacts: tuple[PadContact, PadContact]
+    held: bool
+
+
+@dataclass(frozen=True)
+class Progress:
+    """So far: how many pictures of each stream are on their way, and processor time taken (s)."""
+
+    sent: dict[str, int]
+    processor_time: float
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong with a stream until when (s, time.monotonic); `kind` is an attribute of Stream."""
+
+    name: str
+    kind: str
+    until: float
+
+
+class PictureTaker:
+    """Takes the pictures of one scene."""
+
+    def __init__(self, scene: Scene, cameras: bool) -> None:
+        self._scene, self._data = scene, mujoco.MjData(scene.model)
+        self._renderer: Renderer | None = None
+        if cameras:
+            self._renderer = open_renderer(scene.model, *scene.camera_size)
+        self._noise_rng = np.random.default_rng(0)
+        shape = *scene.camera_size, 3
+        self._noise = self._noise_rng.normal(0.0, _CAMERA_NOISE, shape).astype(np.float32)
+
+    def follow(self, moment: Moment) -> None:
+        """Be where the physics is."""
+        model, data = self._scene.model, self._data
+        mujoco.mj_setState(model, data, moment.state, STATE)
+        mujoco.mj_forward(model, data)
+        self._contacts = moment.contacts
+
+    def take(self, name: str) -> Picture:
+        """What a camera or a fingertip shows."""
+        if name in _TACTILE:
+            side = _TACTILE.index(name)
+            pad = self._scene.pads[side]
+            return pad.sense(self._data, self._contacts[side], self._scene.rng).image
+        assert self._renderer is not None
+        self._renderer.update_scene(self._data, name)
+        picture = self._renderer.render()
+        # one field of noise, shifted: drawing anew takes longer than the picture
+        shift = self._noise_rng.integers(0, picture.shape[:2])
+        noise = np.roll(self._noise, shift, axis=(0, 1))
+        return np.clip(picture + noise, 0, 255).astype(np.uint8)
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        if self._renderer is not None:
+            self._renderer.close()
+
+
+def serve(pipe: Connection) -> None:
+    """Take pictures when told to, until the twin has gone.
+
+    The first message is an Address, whose port is answered, or the OSError. Of the others a Moment is
+    answered.
+    """
+    at: Address = pipe.recv()
+    streams = {name: Stream() for name in at.names}
+    try:
+        server = StreamServer(streams, at.host, at.port)
+    except OSError as error:
+        pipe.send(error)
+        return
+    pipe.send(server.port)
+    taker: PictureTaker | None = None
+    while True:
+        message: Scene | Moment | Fault = pipe.recv()
+        if isinstance(message, Fault):
+            setattr(streams[message.name], message.kind, message.until)
+        elif isinstance(message, Scene):
+            if taker is not None:
+                taker.close()
+            taker = PictureTaker(message, cameras=bool(streams.keys() - set(_TACTILE)))
+        else:
+            assert taker is not None
+            _publish(taker, message, streams)
+            sent = {name: stream.sent for name, stream in streams.items()}
+            pipe.send(Progress(sent, time.process_time()))
+
+
+def _publish(taker: PictureTaker, moment: Moment, streams: dict[str, Stream]) -> None:
+    wanted = [streams[name] for name in moment.due if streams[name].wanted]
+    if not wanted:
+        return
+    taker.follow(moment)
+    for name in moment.due:
+        if streams[name] in wanted:
+            streams[name].publish(taker.take(name))
+    if moment.held:
+        for stream in wanted:
+            stream.wait_until_sent()
+
+
+def main() -> None:
+    """Serve the twin at the pipe whose number is the command's first argument."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        serve(Connection(int(sys.argv[1])))
+    except (EOFError, OSError):  # the twin has ended
+        pass

@@ -1,0 +1,156 @@
+"""The twin's cameras and fingertip sensors: when their pictures are due, and of what."""
+
+import subprocess
+import sys
+import time
+from multiprocessing.connection import Pipe
+
+import mujoco
+import numpy as np
+
+from touchgoal.control import features as ft
+from touchgoal.control.errors import UserError
+from touchgoal.sim_envs.twin.cell import SimulatedCell
+from touchgoal.sim_envs.twin.picture_process import (
+    STATE,
+    Address,
+    Fault,
+    Moment,
+    Progress,
+    Scene,
+)
+
+CAMERA_RATE = 30  # Hz, a webcam's
+_START_TIMEOUT, _ANSWER_TIMEOUT, _END_TIMEOUT = 120.0, 60.0, 5.0  # s, on a machine however loaded
+_MOST_BEHIND = 2  # moments that wait to be taken, in real time; then some are left out
+_PROGRAM = "from touchgoal.sim_envs.twin.picture_process import main; main()"
+_FAULTS = ("stalled", "frozen", "lost", "broken", "halved")
+
+
+class Pictures:
+    """Streams every camera and sensor of the cell at `http://host:port/NAME`, by `picture_process`.
+
+    Attributes:
+        rates: Hz, simulated, of each stream by its name, such as tactile_left.
+        held: whether a client lets time go on, which must get a picture before it does.
+        taken, left_out: pictures that were due and taken, or not taken for the process was behind.
+    """
+
+    def __init__(self, cell: SimulatedCell, host: str, port: int) -> None:
+        """OSError if it cannot serve there."""
+        self._cell, self._host = cell, host
+        self.held = False
+        self.taken = self.left_out = 0
+        env = cell.env
+        self.rates = dict.fromkeys(env.config.cameras, CAMERA_RATE)
+        if env.config.tactile:
+            names = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.TACTILE]
+            self.rates |= dict.fromkeys(names, round(env.sensor.frame_rate))
+        self._progress = Progress(dict.fromkeys(self.rates, 0), 0.0)
+        self._unanswered = 0
+        self._pipe, theirs = Pipe()
+        # Its own session: Ctrl-C is for the twin, which then ends it.
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _PROGRAM, str(theirs.fileno())],
+            pass_fds=[theirs.fileno()],
+            start_new_session=True,
+        )
+        theirs.close()
+        self._port = self._open(Address(host, port, tuple(self.rates)))
+        self.reset()
+
+    def addresses(self) -> dict[str, str]:
+        """Address of each stream, by its name."""
+        return {name: f"http://{self._host}:{self._port}/{name}" for name in self.rates}
+
+    def receive(self) -> None:
+        """Nobody says anything here."""
+
+    def hold(self) -> None:
+        """No picture is due while time stands."""
+
+    def send(self) -> None:
+        """Have the pictures taken that are due."""
+        steps = self._cell.steps
+        due = tuple(name for name, rate in self.rates.items() if _is_due(steps, rate))
+        if due:
+            env = self._cell.env
+            env.update_contacts()  # watched or not: watching must not change the physics
+            self._hear()
+            if self._unanswered >= _MOST_BEHIND and not self.held:
+                self.left_out += len(due)
+                return
+            state = np.empty(mujoco.mj_stateSize(env.model, STATE))
+            mujoco.mj_getState(env.model, env.data, state, STATE)
+            self._tell(Moment(due, state, env.pad_contacts(), self.held))
+            self._unanswered += 1
+            self.taken += len(due)
+
+    def sent(self) -> dict[str, int]:
+        """How many pictures of each stream are on their way, once all are that were due."""
+        while self._unanswered:
+            self._hear(_ANSWER_TIMEOUT)
+        return self._progress.sent
+
+    @property
+    def processor_time(self) -> float:
+        """Processor s that their process has taken, as far as it has said."""
+        return self._progress.processor_time
+
+    def set_fault(self, name: str, kind: str, seconds: float) -> None:
+        """Let a stream be `stalled`, `frozen`, `lost`, `broken` or `halved`; KeyError if there is none."""
+        if name not in self.rates or kind not in _FAULTS:
+            raise KeyError(name)
+        self._tell(Fault(name, kind, time.monotonic() + seconds))
+
+    def reset(self) -> None:
+        """Another episode has begun; the cameras' noise is from here on that of a twin that begins."""
+        env = self._cell.env
+        self._tell(Scene(env.model, env.config.camera_size, env.tactile_pads(), env.np_random))
+
+    def close(self) -> None:
+        """Hang up on everyone."""
+        self._pipe.close()
+        try:
+            self._process.wait(_END_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _open(self, at: Address) -> int:
+        """The port at which it serves."""
+        self._tell(at)
+        try:
+            answer = self._pipe.recv() if self._pipe.poll(_START_TIMEOUT) else None
+        except EOFError:
+            answer = None
+        if isinstance(answer, int):
+            return answer
+        self.close()
+        raise answer or UserError("the process for the twin's pictures did not start")
+
+    def _tell(self, message: Address | Scene | Moment | Fault) -> None:
+        try:
+            self._pipe.send(message)
+        except OSError as error:
+            raise _ended() from error
+
+    def _hear(self, timeout: float = 0.0) -> None:
+        """Take the answers that have come; with a time-out (s), wait for one."""
+        try:
+            if timeout and not self._pipe.poll(timeout):
+                raise TimeoutError
+            while self._unanswered and self._pipe.poll():
+                self._progress = self._pipe.recv()
+                self._unanswered -= 1
+        except (OSError, EOFError) as error:
+            raise _ended() from error
+
+
+def _ended() -> UserError:
+    return UserError("the process that takes the twin's pictures has ended; what it said is above")
+
+
+def _is_due(steps: int, rate: int) -> bool:
+    """Whether something at `rate` Hz is due in this millisecond."""
+    return steps * rate // 1000 > (steps - 1) * rate // 1000
