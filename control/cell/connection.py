@@ -34,8 +34,8 @@ from touchgoal.control.sensors.tactile_camera import TactileCamera
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_models import find_sensor
 
-# Hz, and s without a picture, on the wall: what a loaded machine still manages.
-_LOCK_STEP_RATE, _LOCK_STEP_TIMEOUT = 1.0, 10.0
+# Hz, and s without a picture, on the wall: what a machine however loaded still manages.
+_LOCK_STEP_RATE, _LOCK_STEP_TIMEOUT = 0.1, 10.0
 _STOP_FACTOR = 5  # times the age at which the arm holds
 _CLOCK_TIMEOUT = 1.0  # s on the wall for which an arm's clock may stand
 _POLL_INTERVAL = 0.002  # s between looks at it

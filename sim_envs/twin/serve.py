@@ -165,7 +165,8 @@ class Twin:
         if config.arm == "fr3":
             timeout = _LOCK_STEP_TIMEOUT if config.lock_step else _CLIENT_TIMEOUT
             services.append(hand := FrankaHand(cell, host))
-            services.append(arm := FrankaArm(cell, host, timeout, hand.link))
+            # First, so that its client works while the others are served.
+            services.insert(0, arm := FrankaArm(cell, host, timeout, hand.link))
             gripper = GripperSection("franka_hand", address=host, force=force)
         else:
             services.append(arm := UrController(cell, host))
