@@ -17,9 +17,10 @@ from touchgoal.control.option_types import (
     Seed,
     checked_dataclass,
 )
-from touchgoal.sim_envs.config import BeadMazeConfig, TaskName
+from touchgoal.sim_envs.config import BeadMazeConfig, RigConfig, TaskName
 
 CORES = os.cpu_count() or 1
+Share = Annotated[float, Field(gt=0, le=1)]
 
 
 @checked_dataclass
@@ -198,6 +199,47 @@ class RewardQualityOptions(BenchmarkOptions):
     """Touch encoder, by name or folder; the simulated sensor is the one that it was trained on."""
     episodes: Count = 20
     """Number of held-out episodes of each outcome."""
+    workers: Count = CORES
+    """Processes that simulate."""
+
+
+@checked_dataclass
+class TacbenchOptions(BenchmarkOptions):
+    """What do encoders know of force and slip (TacBench T1 and T2, Sparsh Tables 5 to 7), in simulation?"""
+
+    tasks: tuple[Literal["force", "slip"], ...] = ("force", "slip")
+    """T1, the force on the pad, and T2, whether it slips."""
+    encoders: tuple[str, ...] = (
+        "gelsight_mini_markers",
+        "random:gelsight_mini_markers",
+        "end-to-end:gelsight_mini_markers",
+    )
+    """Touch encoders with a ViT, frozen, by name or folder; `random:NAME` for the same network untrained,
+    `end-to-end:NAME` for the same one trained with the probe, from random weights."""
+    shares: tuple[Share, ...] = (1.0, 0.33, 0.1, 0.01)
+    """Shares of the training labels."""
+    rig: RigConfig = RigConfig()
+    """The simulated indenter rig."""
+    strokes: Annotated[int, Field(ge=15)] = 300
+    """Presses and slides simulated; of every five of a probe three are for training, one for validation,
+    one for the test."""
+    data: Path | None = None
+    """Folder whose episodes/ are the strokes: recorded there if it is new, gone on with if some are missing.
+    Default: runs/tacbench_<sensor>_<seed>."""
+    seeds: Count = 3
+    """Training seeds of each row: of labels drawn, initial weights and order."""
+    seed: Seed = 0
+    """The first of them."""
+    steps: Annotated[Count, RARE] = 400
+    """Updates of a probe on a frozen encoder."""
+    end_to_end_steps: Annotated[Count, RARE] = 400
+    """Updates of an encoder with its probe."""
+    batch_size: Annotated[Count, RARE] = 32
+    """Pairs of frames in each update."""
+    lr: Annotated[Positive, RARE] = 1e-3
+    """Highest learning rate of a probe."""
+    end_to_end_lr: Annotated[Positive, RARE] = 5e-4
+    """Highest learning rate of an encoder with its probe."""
     workers: Count = CORES
     """Processes that simulate."""
 

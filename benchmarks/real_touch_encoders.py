@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float32, UInt8
 
 from touchgoal.control.errors import UserError, install_extra
+from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_pixels
@@ -43,14 +44,20 @@ def find_embedder(name: str, seed: int) -> Embedder:
         network = load_efficientnet_lite0()
         return _of_pictures(lambda batch: network.features(imagenet_pixels(batch)))
     if name.startswith("random:"):
-        encoder = load_encoder(name.removeprefix("random:"))
-        torch.manual_seed(seed)
-        fresh = type(encoder)(encoder.config)  # pyright: ignore[reportArgumentType]
-        return fresh.eval().embed_frames
+        return untrained(name.removeprefix("random:"), seed).embed_frames
     # Names on Hugging Face are OWNER/MODEL; ours are plain, and a folder says what it holds.
     if (Path(name) / "config.json").is_file() or ("/" in name and not Path(name).exists()):
         return _hugging_face(name)
     return load_encoder(name).eval().embed_frames
+
+
+def untrained(name: str, seed: int) -> BaseTouchEncoder:
+    """The network of a touch encoder, by name or folder, with random weights."""
+    encoder = load_encoder(name)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        fresh = type(encoder)(encoder.config)  # pyright: ignore[reportArgumentType]
+    return fresh.eval()
 
 
 def difference_pictures(frames: Frames, background: UInt8[np.ndarray, "h w 3"]) -> Frames:

@@ -23,6 +23,7 @@ BENCHMARKS: dict[str, type[options.BenchmarkOptions]] = {
     "replay": options.ReplayOptions,
     "reward-quality": options.RewardQualityOptions,
     "sent-stream": options.SentStreamOptions,
+    "tacbench": options.TacbenchOptions,
     "tactile-realism": options.TactileRealismOptions,
     "tactile-speed": options.TactileSpeedOptions,
     "touch-probes": options.TouchProbesOptions,
@@ -41,6 +42,7 @@ Config = (
     | Annotated[options.ReplayOptions, tyro.conf.subcommand("replay")]
     | Annotated[options.RewardQualityOptions, tyro.conf.subcommand("reward-quality")]
     | Annotated[options.SentStreamOptions, tyro.conf.subcommand("sent-stream")]
+    | Annotated[options.TacbenchOptions, tyro.conf.subcommand("tacbench")]
     | Annotated[options.TactileRealismOptions, tyro.conf.subcommand("tactile-realism")]
     | Annotated[options.TactileSpeedOptions, tyro.conf.subcommand("tactile-speed")]
     | Annotated[options.TouchProbesOptions, tyro.conf.subcommand("touch-probes")]

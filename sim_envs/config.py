@@ -13,6 +13,8 @@ from touchgoal.control.option_types import (
     Fraction,
     NotNegative,
     Positive,
+    PositiveRange,
+    Seed,
     checked_dataclass,
 )
 from touchgoal.sim_envs.scene.objects import find as find_object
@@ -23,6 +25,8 @@ Outcome = Literal["success", "never_touch", "drop", "wrong_object", "freeze"]
 """How an expert of pick-place ends: it succeeds, or fails in one of four ways."""
 TaskName = Literal["pick-place", "bead-maze"]
 Camera = Literal["front", "wrist"]
+Indenter = Literal["sphere", "sharp", "flat"]
+"""A probe of the indenter rig."""
 ObjectName = Annotated[str, AfterValidator(lambda name: find_object(name).name)]
 """A name of the catalogue of objects."""
 WireName = Annotated[str, AfterValidator(lambda name: find_wire(name).name)]
@@ -319,3 +323,18 @@ class TeleoperatorConfig:
     hold_seconds: Positive = 0.5
     """How long a typed key counts as held, s. A terminal does not report that a key was released; it
     repeats a held one after about 0.4 s, and only the last of several."""
+
+
+@checked_dataclass
+class RigConfig:
+    """What is pressed into what."""
+
+    sensor: str = "gelsight_mini_markers"
+    """Fingertip sensor, by name or folder of a sensor file. In this simulator shear shows in printed dots
+    alone: without them neither shear nor slip can be told."""
+    indenters: tuple[Indenter, ...] = ("sphere", "sharp", "flat")
+    """Probes, which strokes take in turn."""
+    load: Annotated[PositiveRange, RARE] = (0.5, 5.0)
+    """Least and most normal load, N."""
+    seed: Seed = 0
+    """Random seed of the sensor's unit and of all strokes."""

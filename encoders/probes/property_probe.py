@@ -108,7 +108,7 @@ def most_of_three(
 
 
 def interval(
-    values: Bool[np.ndarray, " n"] | Float[np.ndarray, " n"],
+    values: Bool[np.ndarray, "n ..."] | Float[np.ndarray, "n ..."],
     things: Things,
     statistic: Callable[[np.ndarray], float] = lambda v: float(np.mean(v)),
 ) -> tuple[float, float]:

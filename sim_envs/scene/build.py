@@ -59,7 +59,7 @@ def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpe
     _add_actuators(spec, config.arm)
     _add_cameras_and_table(spec, ROBOTS[config.arm].tool)
     for body in bodies:
-        _add_body(spec, body)
+        add_body(spec, body)
     return spec
 
 
@@ -280,7 +280,8 @@ _GEOM_TYPES = {
 }
 
 
-def _add_body(spec: mujoco.MjSpec, body: Body) -> None:
+def add_body(spec: mujoco.MjSpec, body: Body) -> None:
+    """Put an object, free to move, into a scene."""
     kind = body.kind
     item = spec.worldbody.add_body(name=body.name)
     item.add_freejoint(name=body.name)

@@ -1,11 +1,11 @@
-"""One object held in front of one fingertip sensor, without physics: presses for any use."""
+"""One object held in front of one fingertip sensor, without robot or physics: presses for any use."""
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control.tactile.sensor_models import SensorModel
-from touchgoal.sim_envs.scene.build import build
+from touchgoal.sim_envs.scene.build import add_body
 from touchgoal.sim_envs.scene.contacts import PadContact
 from touchgoal.sim_envs.scene.objects import Body
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
@@ -19,7 +19,7 @@ class PressBench:
     """
 
     def __init__(self, body: Body, sensor: SensorModel, instance: SensorInstance) -> None:
-        self._model = build([body]).compile()
+        self._model = _scene(body)
         self._data = mujoco.MjData(self._model)
         mujoco.mj_forward(self._model, self._data)
         self._name = body.name
@@ -44,6 +44,7 @@ class PressBench:
         rng: np.random.Generator,
         shear: tuple[float, float] = (0.0, 0.0),
         centre: tuple[float, float] = (0.0, 0.0),
+        depth: float = 0.0,
     ) -> TactileFrame:
         """The sensor's reading.
 
@@ -51,12 +52,30 @@ class PressBench:
             force: with which the body presses, N.
             rng: of the camera's noise.
             shear: force along the sensor's x and y, N.
-            centre: where the forces act, m in the sensor's frame.
+            centre: where the forces act, m in the sensor's frame, and
+            depth: how far below the gel's rest plane, m.
         """
+        return self._pad.sense(self._data, self.contact(force, shear, centre, depth), rng)
+
+    def contact(
+        self,
+        force: float,
+        shear: tuple[float, float],
+        centre: tuple[float, float],
+        depth: float,
+    ) -> PadContact:
+        """The pad's contact with the body; see `sense`."""
         (x, y), (sx, sy) = centre, shear
-        torque = np.array([-y * force, x * force, x * sy - y * sx])
-        contact = PadContact(np.array([sx, sy, -force]), torque, 0.0, self._geoms)
-        return self._pad.sense(self._data, contact, rng)
+        torque = np.array([-y * force + depth * sy, x * force - depth * sx, x * sy - y * sx])
+        return PadContact(np.array([sx, sy, -force]), torque, 0.0, self._geoms)
+
+
+def _scene(body: Body) -> mujoco.MjModel:
+    """The body and the left sensor's frame, nothing else."""
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_site(name="left_sensor")
+    add_body(spec, body)
+    return spec.compile()
 
 
 def warm_up(bodies: list[Body], sensor: SensorModel) -> None:

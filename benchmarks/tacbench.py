@@ -1,0 +1,260 @@
+"""TacBench (Sparsh, Higuera et al. 2024) on a simulated bench: T1, force, and T2, slip.
+
+An attentive probe reads each encoder's tokens of two frames 83 ms apart; encoders stay frozen, or are
+trained end to end with the probe from random weights. Labels are thinned to shares of all. Snapshots
+and thresholds are chosen on validation strokes; test strokes are for the table alone. Intervals are a
+bootstrap over test strokes, of the mean over seeds.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from touchgoal.benchmarks.config import TacbenchOptions
+from touchgoal.benchmarks.tacbench_data import RigFrames, Rows, read_strokes
+from touchgoal.benchmarks.tacbench_figures import Read, draw, table
+from touchgoal.benchmarks.tacbench_probes import (
+    END_TO_END,
+    Inputs,
+    PairTokens,
+    ProbeTraining,
+    Reader,
+    find_encoder_of,
+    frozen_tokens,
+    read,
+    train_reader,
+)
+from touchgoal.benchmarks.tacbench_tasks import TASKS, ForceTask, SlipTask, Task, f1_score
+from touchgoal.control.errors import UserError
+from touchgoal.control.interruption import kept
+from touchgoal.control.progress import Progress
+from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
+from touchgoal.encoders.probes.property_probe import interval
+from touchgoal.episodes.stroke_recording import record_strokes
+from touchgoal.sim_envs.indenter_rig import FRICTION
+
+_LEAST_SAMPLES = 8
+_LOG = "training.log"
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """One encoder of the table.
+
+    Attributes:
+        name: as the user gave it.
+        encoder: the frozen one; of one trained end to end only its kind counts.
+        frames: of the rig, as its preprocessor makes them.
+        inputs_of: rows of the frames to what a reader reads.
+        trained: whether it is trained with each probe.
+    """
+
+    name: str
+    encoder: BaseTouchEncoder
+    frames: RigFrames
+    inputs_of: Callable[[Rows], Inputs]
+    trained: bool
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Predictions of the seeds of one row of the table, on one set of test frames."""
+
+    outputs: list[torch.Tensor]
+    thresholds: list[float]
+
+
+def run(config: TacbenchOptions) -> dict[str, Any]:
+    """Record strokes, train every probe, judge it on test strokes."""
+    encoders = {name: _encoder(name, config) for name in config.encoders}
+    sensor = Path(config.rig.sensor).name  # of a sensor file's folder, too
+    folder = config.data or Path("runs") / f"tacbench_{sensor}_{config.rig.seed}"
+    strokes = record_strokes(folder / "episodes", config.rig, config.strokes, config.workers)
+    preprocessors = {encoder.preprocess.id: encoder.preprocess for encoder in encoders.values()}
+    frames_of = {
+        name: read_strokes(strokes, config.strokes, preprocess)
+        for name, preprocess in preprocessors.items()
+    }
+    rows: list[dict[str, Any]] = []
+    reads: list[Read] = []
+    trainings = len(encoders) * len(config.tasks) * len(config.shares) * config.seeds
+    with (
+        kept(lambda: f"strokes are kept in {folder}, trained probes are not"),
+        (folder / _LOG).open("a") as log,
+        Progress("probes", trainings, "training") as bar,
+    ):
+        for name, encoder in encoders.items():
+            subject = _subject(name, encoder, frames_of[encoder.preprocess.id])
+            for task_name in config.tasks:
+                for share in config.shares:
+                    judged = _train_and_judge(subject, task_name, share, config, log, bar)
+                    rows += judged[0]
+                    reads += judged[1]
+    frames = next(iter(frames_of.values()))
+    rows += [row for task in config.tasks for row in _references(TASKS[task](frames), task, frames)]
+    return {
+        "table": table(rows, find_sensor(config.rig.sensor).name, config),
+        "rows": rows,
+        "picture": draw(reads, frames),
+    }
+
+
+def _encoder(name: str, config: TacbenchOptions) -> BaseTouchEncoder:
+    """An encoder that fits the rig's sensor; UserError for another."""
+    encoder = find_encoder_of(name, config.seed)
+    PairTokens(encoder)
+    sensor = find_sensor(config.rig.sensor).name
+    if encoder.preprocess.sensor != sensor:
+        raise UserError(
+            f"the encoder {name} is for {encoder.preprocess.sensor}, the rig has {sensor}: choose "
+            "--rig.sensor or --encoders"
+        )
+    return encoder
+
+
+def _subject(name: str, encoder: BaseTouchEncoder, frames: RigFrames) -> Subject:
+    """An encoder with what its probes read; only a frozen one's tokens are known beforehand."""
+    if name.startswith(END_TO_END):
+        return Subject(name, encoder, frames, frames.pairs, True)
+    return Subject(name, encoder, frames, frozen_tokens(encoder, frames), False)
+
+
+def _train_and_judge(
+    subject: Subject,
+    task_name: str,
+    share: float,
+    config: TacbenchOptions,
+    log: TextIO,
+    bar: Progress,
+) -> tuple[list[dict[str, Any]], list[Read]]:
+    """The rows of one encoder, task and share, one for each set of test frames."""
+    task = TASKS[task_name](subject.frames)
+    count = max(round(share * len(task.split.train)), _LEAST_SAMPLES)
+    scored = {test: Scored([], []) for test in task.split.tests}
+    trained = subject.trained
+    for seed in range(config.seed, config.seed + config.seeds):
+        reader = _reader(subject, task, seed)
+        training = ProbeTraining(
+            config.end_to_end_steps if trained else config.steps,
+            config.batch_size,
+            config.end_to_end_lr if trained else config.lr,
+            seed,
+        )
+        train = _thinned(task.split.train, count, seed)
+        train_reader(reader, task, subject.inputs_of, train, training, log)
+        _score(task, reader, subject.inputs_of, scored)
+        bar.update()
+    rows, reads = [], []
+    for test, results in scored.items():
+        chosen = task.split.tests[test]
+        facts = {"task": task_name, "encoder": subject.name, "test": test}
+        facts |= {"share": share, "samples": count, "test_samples": len(chosen)}
+        rows.append(facts | _judge(task, results, chosen, subject.frames))
+        reads.append(Read(task, subject.name, share, test, chosen, results.outputs[0]))
+    return rows, reads
+
+
+def _reader(subject: Subject, task: Task, seed: int) -> Reader:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        encoder = find_encoder_of(subject.name, seed) if subject.trained else subject.encoder
+        tokens = PairTokens(encoder)
+        return Reader(task, tokens.features, tokens if subject.trained else None)
+
+
+def _thinned(rows: Rows, count: int, seed: int) -> Rows:
+    """So many rows, drawn at random; of one seed fewer rows are part of more."""
+    order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
+    return rows[order[:count]]
+
+
+def _score(
+    task: Task,
+    reader: Reader,
+    inputs_of: Callable[[Rows], Inputs],
+    scored: dict[str, Scored],
+) -> None:
+    threshold = 0.0
+    if isinstance(task, SlipTask):
+        validation = task.split.validation
+        threshold = task.threshold(read(reader, inputs_of, validation), validation)
+    for test, results in scored.items():
+        results.outputs.append(read(reader, inputs_of, task.split.tests[test]))
+        results.thresholds.append(threshold)
+
+
+def _judge(task: Task, scored: Scored, rows: Rows, frames: RigFrames) -> dict[str, Any]:
+    things = frames.stroke[rows.numpy()]
+    if isinstance(task, ForceTask):
+        return force_metrics(np.stack([task.errors(o, rows) for o in scored.outputs]), things)
+    assert isinstance(task, SlipTask)
+    pairs = zip(scored.outputs, scored.thresholds, strict=True)
+    said = np.stack([o[:, 0].numpy() > t for o, t in pairs])
+    changes = np.mean([task.change_error(o, rows) for o in scored.outputs], 0)
+    metrics = slip_metrics(said, task.truth(rows), things)
+    return metrics | {"change_mae_mn": 1e3 * float(changes.mean()), "thresholds": scored.thresholds}
+
+
+def force_metrics(
+    errors: Float[np.ndarray, "seeds n 3"], things: np.ndarray
+) -> dict[str, float | list[float]]:
+    """Root mean square and mean absolute errors (mN): of each axis and of all, with intervals."""
+    squares, sizes = 1e6 * (errors**2).mean(0), 1e3 * np.abs(errors).mean(0)
+
+    def root(values: np.ndarray) -> float:
+        return float(np.sqrt(values.mean()))
+
+    return {
+        "rmse_mn": root(squares),
+        "rmse_mn_interval": list(interval(squares, things, root)),
+        "mae_mn": float(sizes.mean()),
+        "mae_mn_interval": list(interval(sizes, things)),
+        "rmse_mn_by_axis": np.sqrt(squares.mean(0)).tolist(),
+        "mae_mn_by_axis": sizes.mean(0).tolist(),
+    }
+
+
+def slip_metrics(
+    said: Bool[np.ndarray, "seeds n"], truth: Bool[np.ndarray, " n"], things: np.ndarray
+) -> dict[str, float | list[float]]:
+    """F1 of slipping, the mean over seeds, with its interval."""
+    together = np.vstack([truth, said]).T
+
+    def f1(values: np.ndarray) -> float:
+        return float(np.mean([f1_score(column, values[:, 0]) for column in values.T[1:]]))
+
+    return {"f1": f1(together), "f1_interval": list(interval(together, things, f1))}
+
+
+def _references(task: Task, name: str, frames: RigFrames) -> list[dict[str, Any]]:
+    """What needs no touch: the mean force; slip always, and by the nominal friction cone."""
+    rows = []
+    for test, chosen in task.split.tests.items():
+        things, force = frames.stroke[chosen.numpy()], frames.force[chosen].double().numpy()
+        facts = {
+            "task": name,
+            "test": test,
+            "share": 1.0,
+            "samples": 0,
+            "test_samples": len(chosen),
+        }
+        if isinstance(task, ForceTask):
+            mean = frames.force[task.split.train].mean(0).double().numpy()
+            metrics = force_metrics((mean - force)[None], things)
+            rows.append(facts | {"encoder": "(mean force of training)"} | metrics)
+            continue
+        assert isinstance(task, SlipTask)
+        cone = np.hypot(force[:, 0], force[:, 1]) >= FRICTION * force[:, 2]
+        for reference, said in (
+            ("(always slips)", np.ones(len(chosen), bool)),
+            ("(true forces, nominal cone)", cone),
+        ):
+            metrics = slip_metrics(said[None], task.truth(chosen), things)
+            rows.append(facts | {"encoder": reference} | metrics)
+    return rows

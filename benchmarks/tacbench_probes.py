@@ -1,0 +1,179 @@
+"""Probes on frozen encoders, and encoders trained end to end with them: one network and one training."""
+
+import contextlib
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from touchgoal.benchmarks.real_touch_encoders import untrained
+from touchgoal.benchmarks.tacbench_data import RigFrames, Rows
+from touchgoal.benchmarks.tacbench_tasks import Outputs, Task
+from touchgoal.control.errors import UserError
+from touchgoal.control.progress import track
+from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
+from touchgoal.encoders.backbones.touch_backbone import BATCH, BaseTouchEncoder, TouchBackbone
+from touchgoal.encoders.backbones.vit import ViT
+from touchgoal.encoders.config import TrainerOptions
+from touchgoal.encoders.pretrained import load_encoder
+from touchgoal.encoders.probes.attentive import AttentiveProbe
+from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
+
+END_TO_END, RANDOM = "end-to-end:", "random:"
+_SNAPSHOTS = 10  # of a training, of which the best on validation frames is kept
+_MAX_VALIDATION = 512  # frames, evenly drawn
+_WEIGHT_DECAY = 0.05
+
+Inputs = Float[Tensor, "b ..."]
+
+
+@dataclass(frozen=True)
+class ProbeTraining:
+    """How a probe is trained.
+
+    Attributes:
+        steps: updates.
+        batch_size: pairs of frames of each, drawn with replacement.
+        lr: highest learning rate of AdamW.
+        seed: of initial weights and the order of the data.
+    """
+
+    steps: int
+    batch_size: int
+    lr: float
+    seed: int
+
+
+class PairTokens(nn.Module):
+    """An encoder's tokens of a frame and of the one before it, side by side at every place."""
+
+    def __init__(self, encoder: BaseTouchEncoder) -> None:
+        """Of an encoder with a ViT; UserError for any other."""
+        super().__init__()
+        self.vit = _vit(encoder)
+        stacked = self.vit.config.channels == 6
+        self.features = self.vit.config.width * (1 if stacked else 2)
+
+    def forward(self, pairs: Float[Tensor, "b 2 3 h w"]) -> Float[Tensor, "b t f"]:
+        """The tokens; from a ViT of two stacked frames those of both."""
+        if self.vit.config.channels == 6:
+            return self.vit(pairs.flatten(1, 2))
+        tokens = self.vit(pairs.flatten(0, 1)).unflatten(0, (len(pairs), 2))
+        return tokens.transpose(1, 2).flatten(2)
+
+
+def _vit(encoder: BaseTouchEncoder) -> ViT:
+    if isinstance(encoder, TouchEncoder):
+        return encoder.backbone
+    if isinstance(encoder, TouchBackbone):
+        return encoder.vit
+    raise UserError(
+        f"a {type(encoder).__name__} has no tokens to probe: give an encoder with a ViT"
+    )
+
+
+def find_encoder_of(name: str, seed: int) -> BaseTouchEncoder:
+    """An encoder by the name that the benchmark gives it: NAME, random:NAME or end-to-end:NAME."""
+    for prefix in (RANDOM, END_TO_END):
+        if name.startswith(prefix):
+            return untrained(name.removeprefix(prefix), seed)
+    return load_encoder(name).eval()
+
+
+@torch.no_grad()
+def frozen_tokens(encoder: BaseTouchEncoder, frames: RigFrames) -> Callable[[Rows], Inputs]:
+    """A frozen encoder's tokens of every pair, by row; each frame is embedded once."""
+    tokens = PairTokens(encoder).eval()
+    every = torch.arange(len(frames.before))
+    if tokens.vit.config.channels == 6:
+        known = torch.cat([tokens(frames.pairs(rows)).half() for rows in _batches(every)])
+        return lambda rows: known[rows].float()
+    alone = torch.cat([tokens.vit(frames.touch[rows].float()).half() for rows in _batches(every)])
+    return lambda rows: torch.cat([alone[rows], alone[frames.before[rows]]], 2).float()
+
+
+def _batches(rows: Rows) -> list[Rows]:
+    return list(track(rows.split(BATCH), "embedding", "batch"))
+
+
+class Reader(nn.Module):
+    """A probe, with or without the encoder that it is trained with."""
+
+    def __init__(self, task: Task, features: int, encoder: PairTokens | None) -> None:
+        """Builds a randomly initialised probe of a task."""
+        super().__init__()
+        self.encoder = encoder
+        self.probe = AttentiveProbe(features, task.outputs)
+        self._task = [task]  # in a list: no part of the state
+
+    def outputs(self, inputs: Inputs) -> Outputs:
+        """Of tokens, or of pairs of frames if it has an encoder."""
+        return self.probe(inputs if self.encoder is None else self.encoder(inputs))
+
+    def forward(self, inputs: Inputs, targets: Tensor) -> dict[str, Tensor]:
+        """The loss, for the trainer."""
+        return {"loss": self._task[0].loss(self.outputs(inputs), targets)}
+
+
+def train_reader(
+    reader: Reader,
+    task: Task,
+    inputs_of: Callable[[Rows], Inputs],
+    train: Rows,
+    training: ProbeTraining,
+    log: TextIO,
+) -> None:
+    """Trains a reader on some frames, and leaves the snapshot that does best on validation frames.
+
+    Args:
+        reader: what is trained.
+        task: by whose loss.
+        inputs_of: rows to what the reader reads.
+        train: rows to learn from.
+        training: for how long.
+        log: for the trainer's lines.
+    """
+    per_snapshot = max(training.steps // _SNAPSHOTS, 1) * training.batch_size
+    every = max(len(task.split.validation) // _MAX_VALIDATION, 1)
+    validation = task.split.validation[::every]
+    best: dict[str, Tensor] = {}
+    least = float("inf")
+
+    def batch(rows: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+        drawn = train[torch.randint(len(train), (len(rows),), generator=generator)]
+        return {"inputs": inputs_of(drawn), "targets": task.targets(drawn)}
+
+    def evaluate() -> dict[str, float]:
+        nonlocal least
+        error = task.error(read(reader, inputs_of, validation), validation)
+        if error < least:
+            least = error
+            best.update({name: value.clone() for name, value in reader.state_dict().items()})
+        return {"validation_error": error}
+
+    optimizer = OptimizerConfig(
+        min(training.steps, _SNAPSHOTS),
+        training.batch_size,
+        training.lr,
+        _WEIGHT_DECAY,
+        max_grad_norm=1.0,
+    )
+    work = Training(reader, per_snapshot, batch, optimizer, identity={}, evaluate=evaluate)
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(log):
+        try:
+            fit(work, Path(folder) / "probe", TrainerOptions(seed=training.seed), {})
+        except KeyboardInterrupt as stopped:
+            raise type(stopped) from None  # its note names a folder that goes with it
+    reader.load_state_dict(best)
+
+
+@torch.no_grad()
+def read(reader: Reader, inputs_of: Callable[[Rows], Inputs], rows: Rows) -> Outputs:
+    """A reader's raw outputs of some frames."""
+    reader.eval()
+    return torch.cat([reader.outputs(inputs_of(part)) for part in rows.split(BATCH)])

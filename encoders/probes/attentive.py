@@ -1,0 +1,66 @@
+"""Attentive probing (Sparsh's appendix C.1, after V-JEPA): a learned query looks at an encoder's tokens.
+
+One block of cross-attention, then two linear layers. With tokens of width 768, twelve heads and a width
+of 768 the block has 7,088,640 parameters, as published.
+"""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+_NARROWER = 4  # than the block: the hidden layer of the head, 192 of 768 as published
+
+
+class AttentivePooler(nn.Module):
+    """Tokens to one vector: a learned query attends to them, then an MLP; both with residuals."""
+
+    def __init__(self, features: int, width: int, heads: int, mlp_ratio: float = 4.0) -> None:
+        """Builds a randomly initialised block.
+
+        Args:
+            features: width of the tokens.
+            width: of the query and of what comes out; a multiple of `heads`.
+            heads: of the attention.
+            mlp_ratio: hidden width of the MLP over `width`.
+        """
+        super().__init__()
+        self.heads = heads
+        self.query = nn.Parameter(torch.zeros(1, 1, width))
+        self.norm1 = nn.LayerNorm(features)
+        self.q = nn.Linear(width, width)
+        self.kv = nn.Linear(features, 2 * width)
+        self.proj = nn.Linear(width, width)
+        self.norm2 = nn.LayerNorm(width)
+        self.mlp_in = nn.Linear(width, int(width * mlp_ratio))
+        self.mlp_out = nn.Linear(int(width * mlp_ratio), width)
+        for linear in (self.q, self.kv, self.proj, self.mlp_in, self.mlp_out):
+            nn.init.trunc_normal_(linear.weight, std=0.02)
+            nn.init.zeros_(linear.bias)
+        nn.init.trunc_normal_(self.query, std=0.02)
+
+    def forward(self, tokens: Float[Tensor, "b t f"]) -> Float[Tensor, "b d"]:
+        """What the query finds in the tokens."""
+        b, t, _ = tokens.shape
+        query = self.query.expand(b, -1, -1)
+        k, v = self.kv(self.norm1(tokens)).view(b, t, 2, self.heads, -1).permute(2, 0, 3, 1, 4)
+        q = self.q(query).view(b, 1, self.heads, -1).transpose(1, 2)
+        seen = F.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(b, 1, -1)
+        pooled = query + self.proj(seen)
+        pooled = pooled + self.mlp_out(F.gelu(self.mlp_in(self.norm2(pooled))))
+        return pooled[:, 0]
+
+
+class AttentiveProbe(nn.Module):
+    """Tokens to the numbers of a task: the pooled vector through a hidden layer of a quarter of its width."""
+
+    def __init__(self, features: int, outputs: int, width: int = 128, heads: int = 4) -> None:
+        """Builds a randomly initialised probe; see AttentivePooler."""
+        super().__init__()
+        self.pooler = AttentivePooler(features, width, heads)
+        self.hidden = nn.Linear(width, width // _NARROWER)
+        self.out = nn.Linear(width // _NARROWER, outputs)
+
+    def forward(self, tokens: Float[Tensor, "b t f"]) -> Float[Tensor, "b k"]:
+        """The outputs, unbounded."""
+        return self.out(F.relu(self.hidden(self.pooler(tokens))))

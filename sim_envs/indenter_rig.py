@@ -1,0 +1,176 @@
+"""An indenter rig: a probe pressed into one fingertip sensor and drawn over it, without a robot.
+
+Follows the normal and shear load test of Sparsh (Higuera et al. 2024, appendix C.4): a press up to a
+random load of at most 5 N, then a slide of at most 2 mm in a random direction. What differs: a slide is
+about as long as friction holds, so that sticking and slipping are both common, and there is no
+dynamics. Pictures are the pad simulator's.
+
+Stick and slip are the pad's own. The gel is one plate on springs: while the probe sticks, the gel goes
+along and its shear force grows; at the friction cone the probe slides.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
+from touchgoal.sim_envs.config import Indenter, RigConfig
+from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Shape, Texture
+from touchgoal.sim_envs.tactile.press_bench import PressBench
+from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
+
+FPS = 60
+"""Pictures a second, a DIGIT's."""
+FRICTION = 0.6
+"""Coefficient that the experimenter takes for all strokes: the nominal friction cone."""
+FRICTION_SPREAD = 0.15
+"""By which share a stroke's own coefficient may differ: labels by the nominal cone err near it."""
+REST = 6
+"""Untouched frames at the start of a stroke: one more than the 5 that lie between two frames of a pair."""
+MAX_SLIDE = 2e-3  # m
+_PLACES = 3e-3  # m from the middle of the picture, along x and y
+_PRESS_FRAMES = 8, 16
+_SLIDE_FRAMES = 12, 25
+_SLIDES = 0.5, 3.0  # of the way that friction holds
+_WOBBLE = 0.05  # of the load while sliding
+_TIP, _CONE, _OPENING = 0.3e-3, 4e-3, math.radians(120)  # of the sharp probe: m, m, rad
+
+
+@dataclass(frozen=True, eq=False)
+class Stroke:
+    """One press and slide.
+
+    Attributes:
+        frames: the sensor's pictures, RGB, of which the first `REST` are untouched.
+        wrench: force (N) and torque (Nm) of the probe on the pad, sensor frame; pressed is -z.
+        slip: whether the probe slides over the gel.
+        indenter: which probe.
+        load: that the press went up to, N.
+        friction: coefficient of this stroke.
+    """
+
+    frames: UInt8[np.ndarray, "t h w 3"]
+    wrench: Float32[np.ndarray, "t 6"]
+    slip: Bool[np.ndarray, " t"]
+    indenter: Indenter
+    load: float
+    friction: float
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """What the rig does in one stroke, frame by frame.
+
+    Attributes:
+        load: normal force, N; 0 is untouched.
+        moved: how far the probe has been drawn since it touched, m.
+        start: where it touches, m in the sensor's frame.
+        direction: of the slide, a unit vector.
+    """
+
+    load: Float[np.ndarray, " t"]
+    moved: Float[np.ndarray, " t"]
+    start: Float[np.ndarray, "2"]
+    direction: Float[np.ndarray, "2"]
+
+
+def simulate(config: RigConfig, index: int) -> Stroke:
+    """One stroke; the same config and index always give the same one."""
+    sensor, rng = find_sensor(config.sensor), np.random.default_rng([config.seed, index, 1])
+    indenter = config.indenters[index % len(config.indenters)]
+    friction = FRICTION * (1 + FRICTION_SPREAD * rng.uniform(-1, 1))
+    path = _draw_path(config, sensor, friction, rng)
+    bench = PressBench(_probe(indenter, friction), sensor, rig_unit(config))
+    frames, wrenches, slips = [], [], []
+    for load, shear, place, slip in _loads(path, sensor, friction):
+        bench.place(np.array([*place, 0.0]))
+        depth = -load / sensor.normal_stiffness
+        pull = float(shear[0]), float(shear[1])
+        centre = float(place[0]), float(place[1])
+        frames.append(bench.sense(load, rng, pull, centre, depth).image)
+        contact = bench.contact(load, pull, centre, depth)
+        wrenches.append(np.concatenate([contact.force, contact.torque]))
+        slips.append(slip)
+    wrench = np.array(wrenches, np.float32)
+    return Stroke(np.stack(frames), wrench, np.array(slips), indenter, path.load.max(), friction)
+
+
+def rig_unit(config: RigConfig) -> SensorInstance:
+    """The rig's one sensor."""
+    return sample_instance(find_sensor(config.sensor), np.random.default_rng([config.seed, 0]))
+
+
+def shear_force(
+    moved: Float[np.ndarray, " t"], load: Float[np.ndarray, " t"], stiffness: float, friction: float
+) -> tuple[Float[np.ndarray, " t"], Bool[np.ndarray, " t"]]:
+    """Tangential force (N) on a gel of so many N/m, and whether the probe slides, frame by frame.
+
+    The gel follows the probe until friction gives way; what the probe has slid stays slid.
+
+    Args:
+        moved: how far the probe has been drawn, m.
+        load: normal force, N.
+        stiffness: of the gel in shear, N/m.
+        friction: coefficient.
+    """
+    force, slides, slid = np.zeros(len(moved)), np.zeros(len(moved), bool), 0.0
+    for i, (way, normal) in enumerate(zip(moved, load, strict=True)):
+        limit = friction * normal
+        force[i] = stiffness * (way - slid)
+        if force[i] > limit:
+            force[i], slid, slides[i] = limit, way - limit / stiffness, normal > 0
+    return force, slides
+
+
+def _loads(
+    path: Path, sensor: SensorModel, friction: float
+) -> Iterator[tuple[float, np.ndarray, np.ndarray, bool]]:
+    """Of each frame: load (N), shear (N, 2), where the probe is (m, 2), whether it slides."""
+    force, slides = shear_force(path.moved, path.load, sensor.shear_stiffness, friction)
+    for load, moved, pull, slip in zip(path.load, path.moved, force, slides, strict=True):
+        yield float(load), pull * path.direction, path.start + moved * path.direction, bool(slip)
+
+
+def _draw_path(
+    config: RigConfig, sensor: SensorModel, friction: float, rng: np.random.Generator
+) -> Path:
+    load = rng.uniform(*config.load)
+    pressing, sliding = int(rng.integers(*_PRESS_FRAMES)), int(rng.integers(*_SLIDE_FRAMES))
+    held = friction * load / sensor.shear_stiffness
+    length = min(rng.uniform(*_SLIDES) * held, MAX_SLIDE)
+    press = np.linspace(0, 1, pressing + 1)[1:]
+    slide = np.linspace(0, 1, sliding + 1)[1:]
+    phase, turns = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 2)
+    wobble = 1 + _WOBBLE * (np.sin(phase + 2 * np.pi * turns * slide) - np.sin(phase))
+    way = rng.uniform(0, 2 * np.pi)
+    return Path(
+        load=load * np.concatenate([np.zeros(REST), press, wobble]),
+        moved=length * np.concatenate([np.zeros(REST + pressing), slide]),
+        start=rng.uniform(-_PLACES, _PLACES, 2),
+        direction=np.array([np.cos(way), np.sin(way)]),
+    )
+
+
+def _probe(indenter: Indenter, friction: float) -> Body:
+    """A hard smooth probe, its tip towards the gel (the body's -z)."""
+    material = Material(Texture.SMOOTH, 0.0, 1e-3, HARD, friction, (0.6, 0.6, 0.6, 1.0))
+    shapes: dict[Indenter, tuple[Shape, tuple[float, ...]]] = {
+        "sphere": ("sphere", (4e-3,)),
+        "flat": ("cylinder", (3e-3, 4e-3)),
+        "sharp": ("mesh", (1.0,)),
+    }
+    shape, size = shapes[indenter]
+    hull = _blunt_cone() if shape == "mesh" else None
+    return Body(ObjectKind(indenter, shape, material, ()), size, 0.1, "probe", hull)
+
+
+def _blunt_cone() -> Float[np.ndarray, "n 3"]:
+    """Points of a cone about z, its blunt tip at z = 0 and its base above."""
+    angle = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    rings = ((_TIP, 0.0), (_CONE, (_CONE - _TIP) / math.tan(_OPENING / 2)))
+    return np.concatenate(
+        [np.column_stack([r * np.cos(angle), r * np.sin(angle), 0 * angle + z]) for r, z in rings]
+    )

@@ -1,0 +1,183 @@
+"""The indenter rig and TacBench on it: mechanics against closed forms, metrics by hand, toy runs."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from touchgoal.benchmarks.config import TacbenchOptions
+from touchgoal.benchmarks.tacbench import force_metrics, run, slip_metrics
+from touchgoal.benchmarks.tacbench_data import (
+    STRIDE,
+    RigFrames,
+    read_strokes,
+    split_force,
+    split_slip,
+)
+from touchgoal.benchmarks.tacbench_tasks import f1_score
+from touchgoal.control.errors import UserError
+from touchgoal.control.features import TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP
+from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS as MINI
+from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
+from touchgoal.encoders.backbones.vit import PRESETS
+from touchgoal.encoders.preprocess import preprocessor_for
+from touchgoal.encoders.pretrained import save
+from touchgoal.encoders.probes.attentive import AttentivePooler, AttentiveProbe
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.episodes.stroke_recording import record_strokes
+from touchgoal.sim_envs.config import RigConfig
+from touchgoal.sim_envs.indenter_rig import REST, rig_unit, shear_force, simulate
+from touchgoal.sim_envs.scene.objects import CATALOGUE, Body
+from touchgoal.sim_envs.tactile.press_bench import PressBench
+
+RIG = RigConfig(seed=3)
+STROKES = 15
+
+
+@pytest.fixture(scope="session")
+def strokes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five strokes of each probe, the last two of them after an interruption."""
+    folder = tmp_path_factory.mktemp("rig") / "episodes"
+    record_strokes(folder, RIG, STROKES - 2, workers=1)
+    record_strokes(folder, RIG, STROKES, workers=1)
+    return folder
+
+
+def test_shear_grows_with_the_slide_until_friction_gives_way() -> None:
+    moved, load = np.array([0.0, 1e-4, 3e-4, 4e-4, 5e-4]), np.array([0.0, 2.0, 2.0, 2.0, 4.0])
+    force, slides = shear_force(moved, load, stiffness=6000.0, friction=0.5)
+    # k x = 0.6 N, then the cone at 0.5 * 2 N twice; with twice the load 1 + 6000 * 1e-4 N hold again
+    assert force == pytest.approx([0.0, 0.6, 1.0, 1.0, 1.6])
+    assert slides.tolist() == [False, False, True, True, False]
+
+
+def test_the_pad_slips_where_the_rig_slides() -> None:
+    """An elastic foundation under a ball: of the load, x^2 slips where a pull of 2x - x^2 is borne."""
+    bench = PressBench(Body(CATALOGUE["glass_ball"], (4e-3,), 0.1), MINI, rig_unit(RIG))
+    friction = CATALOGUE["glass_ball"].material.friction
+    bench.place(np.zeros(3))
+    for x in (0.3, 0.6, 0.9):
+        bench.sense(0.0, np.random.default_rng(0))
+        pull = friction * 2.0 * (2 * x - x * x)
+        depth = -2.0 / MINI.normal_stiffness
+        field = bench.sense(2.0, np.random.default_rng(0), (pull, 0.0), depth=depth).field
+        assert field is not None
+        assert field.slip_fraction == pytest.approx(x * x, abs=0.06)
+        assert field.wrench()[:3] == pytest.approx([pull, 0, -2.0], abs=1e-3)
+
+
+def test_a_stroke_is_untouched_pressed_and_drawn_the_same_each_time() -> None:
+    stroke, again = simulate(RIG, 4), simulate(RIG, 4)
+    assert np.array_equal(stroke.frames, again.frames) and stroke.indenter == "sharp"
+    normal, shear = -stroke.wrench[:, 2], np.linalg.norm(stroke.wrench[:, :2], axis=1)
+    assert (normal[:REST] == 0).all() and (normal[REST:] > 0).all()
+    assert (shear <= stroke.friction * normal + 1e-6).all()
+    on_cone = np.isclose(shear, stroke.friction * normal, rtol=1e-5) & (normal > 0)
+    assert np.array_equal(on_cone, stroke.slip)
+    change = np.abs(stroke.frames[-1].astype(int) - stroke.frames[0]).max()
+    assert change > 30
+
+
+def test_strokes_go_on_where_they_stopped(strokes: Path) -> None:
+    found = EpisodeSet(strokes)
+    assert [found.meta(i)["object"] for i in (0, 1, 2, 3)] == ["sphere", "sharp", "flat", "sphere"]
+    whole = simulate(RIG, STROKES - 1)
+    read = found.read(STROKES - 1).frames
+    assert np.array_equal(read[TACTILE_LEFT], whole.frames)
+    assert np.array_equal(read[TRUTH_PAD_WRENCH][:, :6], whole.wrench)
+    assert np.array_equal(read[TRUTH_SLIP][:, 0], whole.slip)
+    with pytest.raises(UserError, match="strokes of another rig"):
+        record_strokes(strokes, RigConfig(seed=4), STROKES, workers=1)
+
+
+def test_the_pooler_is_the_published_one() -> None:
+    pooler = AttentivePooler(features=768, width=768, heads=12)
+    assert sum(p.numel() for p in pooler.parameters()) == 7_088_640
+
+
+def test_a_probe_finds_the_one_token_that_matters() -> None:
+    """No linear reading of the mean can: the token's place is random, its marker says which."""
+    torch.manual_seed(0)
+    probe, generator = AttentiveProbe(features=6, outputs=1, width=32, heads=2), torch.Generator()
+    optimizer = torch.optim.Adam(probe.parameters(), lr=3e-3)
+
+    def batch(n: int) -> tuple[torch.Tensor, torch.Tensor]:
+        tokens = torch.randn(n, 12, 6, generator=generator)
+        marked = torch.randint(12, (n,), generator=generator)
+        tokens[:, :, 0] = -2.0
+        tokens[torch.arange(n), marked, 0] = 2.0
+        return tokens, tokens[torch.arange(n), marked, 1]
+
+    for _ in range(400):
+        tokens, wanted = batch(64)
+        loss = (probe(tokens)[:, 0] - wanted).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    tokens, wanted = batch(512)
+    assert (probe(tokens)[:, 0] - wanted).square().mean() < 0.3  # of the mean token: 11/12
+
+
+def test_metrics_are_what_they_are_called() -> None:
+    errors = np.array([[[3e-3, 4e-3, 0.0], [-3e-3, 4e-3, 6e-3]]])
+    metrics = force_metrics(errors, np.array([0, 1]))
+    assert metrics["rmse_mn_by_axis"] == pytest.approx([3, 4, np.sqrt(18)])
+    assert metrics["mae_mn"] == pytest.approx(20 / 6)
+    assert metrics["rmse_mn"] == pytest.approx(np.sqrt((9 + 16 + 9 + 16 + 36) / 6))
+    truth, said = np.array([1, 1, 0, 0, 1], bool), np.array([1, 0, 1, 0, 1], bool)
+    assert f1_score(said, truth) == pytest.approx(2 / 3)
+    assert slip_metrics(np.stack([said, truth]), truth, np.arange(5))["f1"] == pytest.approx(5 / 6)
+
+
+def test_test_strokes_are_not_learned_from() -> None:
+    stroke = np.repeat(np.arange(30), 4)
+    frames = RigFrames(
+        touch=torch.zeros(120, 3, 1, 1).half(),
+        before=torch.arange(120),
+        force=torch.ones(120, 3),
+        slip=torch.zeros(120, dtype=torch.bool),
+        stroke=stroke,
+        indenter=np.array(["sphere", "sharp", "flat"])[stroke % 3],
+    )
+    for split in (split_force(frames), split_slip(frames)):
+        uses = [split.train, split.validation, *split.tests.values()]
+        sets = [set(stroke[rows.numpy()]) for rows in uses]
+        assert sum(len(s) for s in sets) == len(set().union(*sets))
+        assert "flat" not in frames.indenter[torch.cat(uses[:2]).numpy()]
+        assert len(split.train) == 3 * len(split.validation)
+
+
+def test_the_benchmark_judges_every_encoder(
+    strokes: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    config = TouchBackboneConfig.for_sensor(PRESETS["tiny"], "gelsight_mini_markers")
+    save(TouchBackbone(config), tmp_path / "tiny", {})
+    name = str(tmp_path / "tiny")
+    result = run(
+        TacbenchOptions(
+            encoders=(name, f"end-to-end:{name}"), shares=(1.0, 0.1), rig=RIG, strokes=STROKES,
+            data=strokes.parent, seeds=1, steps=20, end_to_end_steps=10, batch_size=8, workers=1,
+        )
+    )  # fmt: skip
+    force = [row for row in result["rows"] if row["task"] == "force"]
+    assert len(force) == 2 * 2 * 2 + 2 and len(result["rows"]) == len(force) + 2 * 2 + 2
+    for row in force:
+        low, high = row["rmse_mn_interval"]
+        assert low <= row["rmse_mn"] <= high and row["mae_mn"] <= row["rmse_mn"]
+    cone = next(row for row in result["rows"] if "nominal cone" in row["encoder"])
+    assert cone["f1"] > 0.5
+    assert "paper, real gelsight_mini" in result["table"] and result["picture"].ndim == 3
+    assert "epoch" not in capsys.readouterr().out
+    assert "epoch 10/10" in (strokes.parent / "training.log").read_text()
+    wrong = TacbenchOptions(encoders=("gelsight_mini",), rig=RIG, data=strokes.parent)
+    with pytest.raises(UserError, match="the rig has gelsight_mini_markers"):
+        run(wrong)
+
+
+def test_pairs_lie_a_stride_apart(strokes: Path) -> None:
+
+    frames = read_strokes(EpisodeSet(strokes), STROKES, preprocessor_for("gelsight_mini_markers"))
+    gap = np.arange(len(frames.before)) - frames.before.numpy()
+    assert (gap[frames.pressed] == STRIDE).all()
+    assert (frames.stroke[frames.before.numpy()] == frames.stroke).all()
