@@ -205,10 +205,10 @@ class RewardQualityOptions(BenchmarkOptions):
 
 @checked_dataclass
 class TacbenchOptions(BenchmarkOptions):
-    """What do encoders know of force and slip (TacBench T1 and T2, Sparsh Tables 5 to 7), in simulation?"""
+    """What do encoders know of force, slip and pose (TacBench T1 to T3, Sparsh Tables 5 to 8), in simulation?"""
 
-    tasks: tuple[Literal["force", "slip"], ...] = ("force", "slip")
-    """T1, the force on the pad, and T2, whether it slips."""
+    tasks: tuple[Literal["force", "slip", "pose"], ...] = ("force", "slip", "pose")
+    """T1, the force on the pad; T2, whether it slips; T3, how the pose of a held object changes."""
     encoders: tuple[str, ...] = (
         "gelsight_mini_markers",
         "random:gelsight_mini_markers",
@@ -223,9 +223,11 @@ class TacbenchOptions(BenchmarkOptions):
     strokes: Annotated[int, Field(ge=15)] = 300
     """Presses and slides simulated; of every five of a probe three are for training, one for validation,
     one for the test."""
+    slides: Annotated[int, Field(ge=10)] = 100
+    """Slides of held objects simulated, for T3; used as the strokes are."""
     data: Path | None = None
-    """Folder whose episodes/ are the strokes: recorded there if it is new, gone on with if some are missing.
-    Default: runs/tacbench_<sensor>_<seed>."""
+    """Folder of strokes/ and slides/: recorded there if it is new, gone on with if some are missing. Default:
+    runs/tacbench_<sensor>_<seed>."""
     seeds: Count = 3
     """Training seeds of each row: of labels drawn, initial weights and order."""
     seed: Seed = 0

@@ -1,4 +1,4 @@
-"""TacBench (Sparsh, Higuera et al. 2024) on a simulated bench: T1, force, and T2, slip.
+"""TacBench (Sparsh, Higuera et al. 2024) on a simulated bench: T1, force; T2, slip; T3, pose.
 
 An attentive probe reads each encoder's tokens of two frames 83 ms apart; encoders stay frozen, or are
 trained end to end with the probe from random weights. Labels are thinned to shares of all. Snapshots
@@ -8,12 +8,13 @@ bootstrap over test strokes, of the mean over seeds.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from touchgoal.benchmarks.config import TacbenchOptions
 from touchgoal.benchmarks.tacbench_data import RigFrames, Rows, read_strokes
@@ -29,18 +30,27 @@ from touchgoal.benchmarks.tacbench_probes import (
     read,
     train_reader,
 )
-from touchgoal.benchmarks.tacbench_tasks import TASKS, ForceTask, SlipTask, Task, f1_score
+from touchgoal.benchmarks.tacbench_tasks import (
+    CLASSES,
+    TASKS,
+    ForceTask,
+    PoseTask,
+    SlipTask,
+    Task,
+    f1_score,
+)
 from touchgoal.control.errors import UserError
 from touchgoal.control.interruption import kept
 from touchgoal.control.progress import Progress
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.probes.property_probe import interval
-from touchgoal.episodes.stroke_recording import record_strokes
+from touchgoal.episodes.stroke_recording import record_slides, record_strokes
 from touchgoal.sim_envs.indenter_rig import FRICTION
 
 _LEAST_SAMPLES = 8
 _LOG = "training.log"
+_RECORDING = {"force": "strokes", "slip": "strokes", "pose": "slides"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +85,13 @@ def run(config: TacbenchOptions) -> dict[str, Any]:
     encoders = {name: _encoder(name, config) for name in config.encoders}
     sensor = Path(config.rig.sensor).name  # of a sensor file's folder, too
     folder = config.data or Path("runs") / f"tacbench_{sensor}_{config.rig.seed}"
-    strokes = record_strokes(folder / "episodes", config.rig, config.strokes, config.workers)
-    preprocessors = {encoder.preprocess.id: encoder.preprocess for encoder in encoders.values()}
-    frames_of = {
-        name: read_strokes(strokes, config.strokes, preprocess)
-        for name, preprocess in preprocessors.items()
+    recordings = {
+        what: record(folder / what, config.rig, count, config.workers)
+        for what, record, count in (
+            ("strokes", record_strokes, config.strokes),
+            ("slides", record_slides, config.slides),
+        )
+        if what in {_RECORDING[task] for task in config.tasks}
     }
     rows: list[dict[str, Any]] = []
     reads: list[Read] = []
@@ -89,19 +101,25 @@ def run(config: TacbenchOptions) -> dict[str, Any]:
         (folder / _LOG).open("a") as log,
         Progress("probes", trainings, "training") as bar,
     ):
-        for name, encoder in encoders.items():
-            subject = _subject(name, encoder, frames_of[encoder.preprocess.id])
-            for task_name in config.tasks:
-                for share in config.shares:
-                    judged = _train_and_judge(subject, task_name, share, config, log, bar)
+        for what, episodes in recordings.items():
+            tasks = [task for task in config.tasks if _RECORDING[task] == what]
+            count = config.strokes if what == "strokes" else config.slides
+            seen: dict[str, RigFrames] = {}
+            for name, encoder in encoders.items():
+                preprocess = encoder.preprocess
+                if preprocess.id not in seen:
+                    seen[preprocess.id] = read_strokes(episodes, count, preprocess)
+                subject = _subject(name, encoder, seen[preprocess.id])
+                for task, share in product(tasks, config.shares):
+                    judged = _train_and_judge(subject, task, share, config, log, bar)
                     rows += judged[0]
                     reads += judged[1]
-    frames = next(iter(frames_of.values()))
-    rows += [row for task in config.tasks for row in _references(TASKS[task](frames), task, frames)]
+            for task in tasks:
+                rows += _references(TASKS[task](subject.frames), task, subject.frames)
     return {
         "table": table(rows, find_sensor(config.rig.sensor).name, config),
         "rows": rows,
-        "picture": draw(reads, frames),
+        "picture": draw(reads),
     }
 
 
@@ -156,7 +174,8 @@ def _train_and_judge(
         facts = {"task": task_name, "encoder": subject.name, "test": test}
         facts |= {"share": share, "samples": count, "test_samples": len(chosen)}
         rows.append(facts | _judge(task, results, chosen, subject.frames))
-        reads.append(Read(task, subject.name, share, test, chosen, results.outputs[0]))
+        outputs = results.outputs[0]
+        reads.append(Read(task, subject.frames, subject.name, share, test, chosen, outputs))
     return rows, reads
 
 
@@ -193,6 +212,9 @@ def _judge(task: Task, scored: Scored, rows: Rows, frames: RigFrames) -> dict[st
     things = frames.stroke[rows.numpy()]
     if isinstance(task, ForceTask):
         return force_metrics(np.stack([task.errors(o, rows) for o in scored.outputs]), things)
+    if isinstance(task, PoseTask):
+        said = np.stack([task.read(outputs).numpy() for outputs in scored.outputs])
+        return pose_metrics(said, task.classes[rows].numpy(), things)
     assert isinstance(task, SlipTask)
     pairs = zip(scored.outputs, scored.thresholds, strict=True)
     said = np.stack([o[:, 0].numpy() > t for o, t in pairs])
@@ -232,8 +254,21 @@ def slip_metrics(
     return {"f1": f1(together), "f1_interval": list(interval(together, things, f1))}
 
 
+def pose_metrics(
+    said: Int[np.ndarray, "seeds n 3"], truth: Int[np.ndarray, "n 3"], things: np.ndarray
+) -> dict[str, float | list[float]]:
+    """Accuracy, the mean over axes, with its interval; by axis; and within one class of the truth."""
+    right = (said == truth).mean(0)
+    return {
+        "accuracy": float(right.mean()),
+        "accuracy_interval": list(interval(right, things)),
+        "accuracy_by_axis": right.mean(0).tolist(),
+        "within_one_class": float((np.abs(said - truth) <= 1).mean()),
+    }
+
+
 def _references(task: Task, name: str, frames: RigFrames) -> list[dict[str, Any]]:
-    """What needs no touch: the mean force; slip always, and by the nominal friction cone."""
+    """What needs no encoder: the mean force; slip always, and by the nominal friction cone; common classes."""
     rows = []
     for test, chosen in task.split.tests.items():
         things, force = frames.stroke[chosen.numpy()], frames.force[chosen].double().numpy()
@@ -248,6 +283,15 @@ def _references(task: Task, name: str, frames: RigFrames) -> list[dict[str, Any]
             mean = frames.force[task.split.train].mean(0).double().numpy()
             metrics = force_metrics((mean - force)[None], things)
             rows.append(facts | {"encoder": "(mean force of training)"} | metrics)
+            continue
+        if isinstance(task, PoseTask):
+            known = task.classes[task.split.train]
+            common = [
+                int(torch.bincount(known[:, k], minlength=CLASSES).argmax()) for k in range(3)
+            ]
+            truth = task.classes[chosen].numpy()
+            metrics = pose_metrics(np.broadcast_to(common, truth.shape)[None], truth, things)
+            rows.append(facts | {"encoder": "(commonest classes)"} | metrics)
             continue
         assert isinstance(task, SlipTask)
         cone = np.hypot(force[:, 0], force[:, 1]) >= FRICTION * force[:, 2]

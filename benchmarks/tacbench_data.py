@@ -1,13 +1,18 @@
-"""Strokes of the indenter rig as the samples of TacBench T1 and T2: pairs of frames, and their labels."""
+"""Strokes of the indenter rig as the samples of TacBench T1 to T3: pairs of frames, and their labels."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float16, Int
+from jaxtyping import Bool, Float, Float16, Float32, Int
 from torch import Tensor
 
-from touchgoal.control.features import TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP
+from touchgoal.control.features import (
+    TACTILE_LEFT,
+    TRUTH_OBJECT_POSE,
+    TRUTH_PAD_WRENCH,
+    TRUTH_SLIP,
+)
 from touchgoal.control.progress import track
 from touchgoal.encoders.preprocess import TactilePreprocessor
 from touchgoal.episodes.store import EpisodeSet
@@ -30,7 +35,8 @@ class RigFrames:
         force: of the probe on the pad, N: shear x and y, and the normal force, positive when pressed.
         slip: whether the probe slides.
         stroke: which.
-        indenter: name of the probe.
+        indenter: name of the probe or object.
+        pose: of the object on the gel, x and y (mm) and turn (degrees); None if the set does not say.
     """
 
     touch: Float16[Tensor, "n 3 h w"]
@@ -39,6 +45,7 @@ class RigFrames:
     slip: Bool[Tensor, " n"]
     stroke: Int[np.ndarray, " n"]
     indenter: np.ndarray
+    pose: Float[Tensor, "n 3"] | None = None
 
     def pairs(self, rows: Rows) -> Float[Tensor, "k 2 3 h w"]:
         """The frames and those before them."""
@@ -67,13 +74,17 @@ class Split:
 
 def read_strokes(strokes: EpisodeSet, count: int, preprocess: TactilePreprocessor) -> RigFrames:
     """All frames of the first so many strokes; a stroke's background is its first frame."""
-    touch, force, slip = [], [], []
+    keys = [TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP]
+    keys += [TRUTH_OBJECT_POSE] if TRUTH_OBJECT_POSE in strokes.features else []
+    touch, force, slip, pose = [], [], [], []
     for i in track(range(count), "strokes", "stroke"):
-        frames = strokes.read(i, [TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP]).frames
+        frames = strokes.read(i, keys).frames
         pictures = frames[TACTILE_LEFT]
         touch.append(torch.from_numpy(preprocess(pictures, pictures[0])).half())
         force.append(torch.from_numpy(frames[TRUTH_PAD_WRENCH][:, :3] * _PRESSED_IS_POSITIVE))
         slip.append(torch.from_numpy(frames[TRUTH_SLIP][:, 0]))
+        if TRUTH_OBJECT_POSE in frames:
+            pose.append(torch.from_numpy(_planar(frames[TRUTH_OBJECT_POSE])))
     lengths = np.array([len(f) for f in force])
     starts = np.repeat(np.cumsum(lengths) - lengths, lengths)
     before = np.maximum(np.arange(lengths.sum()) - STRIDE, starts)
@@ -85,7 +96,14 @@ def read_strokes(strokes: EpisodeSet, count: int, preprocess: TactilePreprocesso
         torch.cat(slip),
         np.repeat(np.arange(len(lengths)), lengths),
         np.repeat(names, lengths),
+        torch.cat(pose) if pose else None,
     )
+
+
+def _planar(pose: Float32[np.ndarray, "t 7"]) -> Float32[np.ndarray, "t 3"]:
+    """x and y, mm; turn about z, degrees."""
+    turn = 2 * np.degrees(np.arctan2(pose[:, 6], pose[:, 3]))
+    return np.column_stack([1e3 * pose[:, :2], turn]).astype(np.float32)
 
 
 def split_force(frames: RigFrames) -> Split:
@@ -106,6 +124,13 @@ def split_slip(frames: RigFrames) -> Split:
     ball = frames.pressed & (frames.indenter == "sphere")
     tests = {"sphere": _of_use(frames, ball, _TEST)}
     return Split(_training(frames, ball), _of_use(frames, ball, _VALIDATION), tests)
+
+
+def split_pose(frames: RigFrames) -> Split:
+    """Pairs in which the object touches both times; every object in each use."""
+    both = frames.pressed & frames.pressed[frames.before.numpy()]
+    tests = {"known objects": _of_use(frames, both, _TEST)}
+    return Split(_training(frames, both), _of_use(frames, both, _VALIDATION), tests)
 
 
 def _use(frames: RigFrames) -> Int[np.ndarray, " n"]:

@@ -1,4 +1,4 @@
-"""What TacBench asks of a touch encoder: T1, the force on the pad; T2, whether it slips."""
+"""What TacBench asks of a touch encoder: T1, the force on the pad; T2, whether it slips; T3, how it moves."""
 
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
@@ -6,16 +6,28 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from touchgoal.benchmarks.tacbench_data import RigFrames, Rows, Split, split_force, split_slip
+from touchgoal.benchmarks.tacbench_data import (
+    RigFrames,
+    Rows,
+    Split,
+    split_force,
+    split_pose,
+    split_slip,
+)
 
 _BETA = 0.02  # of the smooth L1 loss, in shares of the force's range: Sparsh's
 _THRESHOLDS = 200
+_SHIFT_BINS, _TURN_BINS = (
+    (0.1, 0.5, 1.0, 2.0, 5.0),
+    (0.03, 0.2, 0.5, 1.0, 2.0),
+)  # mm, degrees: Sparsh's
+CLASSES = 2 * len(_SHIFT_BINS) + 1
 
 Outputs = Float[Tensor, "b k"]
-Targets = Float[Tensor, "b k"]
+Targets = Float[Tensor, "b _"]
 
 
 @runtime_checkable
@@ -122,6 +134,53 @@ class SlipTask:
         return (read - self._change[rows]).abs().mean(1).double().numpy()
 
 
+class PoseTask:
+    """T3: the change of an object's pose in the pair, along x and y and about z, in 11 classes each."""
+
+    outputs = 3 * CLASSES
+
+    def __init__(self, frames: RigFrames) -> None:
+        """Of the frames of slides."""
+        assert frames.pose is not None
+        self.split = split_pose(frames)
+        bins = (_SHIFT_BINS, _SHIFT_BINS, _TURN_BINS)
+        change = frames.pose - frames.pose[frames.before]
+        self.classes = torch.stack([_classes(change[:, k], bins[k]) for k in range(3)], 1)
+        known = [
+            torch.bincount(self.classes[self.split.train, k], minlength=CLASSES) for k in range(3)
+        ]
+        # rare classes count more; none more than one of a hundredth of the frames
+        least = len(self.split.train) / 100
+        self._weights = [len(self.split.train) / CLASSES / n.clamp(min=least) for n in known]
+
+    def targets(self, rows: Rows) -> Targets:
+        """Classes, by axis."""
+        return self.classes[rows].float()
+
+    def loss(self, outputs: Outputs, targets: Targets) -> Float[Tensor, ""]:
+        """Sum over axes of the weighted cross entropy."""
+        parts = outputs.unflatten(1, (3, CLASSES)).unbind(1)
+        losses = [
+            F.cross_entropy(part, targets[:, k].long(), self._weights[k])
+            for k, part in enumerate(parts)
+        ]
+        return torch.stack(losses).sum()
+
+    def read(self, outputs: Outputs) -> Int[Tensor, "b 3"]:
+        """The likeliest classes."""
+        return outputs.unflatten(1, (3, CLASSES)).argmax(2)
+
+    def error(self, outputs: Outputs, rows: Rows) -> float:
+        """1 less the accuracy, the mean over axes."""
+        return float((self.read(outputs) != self.classes[rows]).float().mean())
+
+
+def _classes(change: Float[Tensor, " n"], bins: tuple[float, ...]) -> Int[Tensor, " n"]:
+    """0 to 10: how many of the bounds -5 to 5 lie at or below a change."""
+    bounds = torch.tensor([*(-b for b in reversed(bins)), *bins])
+    return torch.bucketize(change, bounds, right=True)
+
+
 def _cuts(outputs: Outputs) -> list[float]:
     """Places between raw outputs."""
     return torch.quantile(outputs[:, 0], torch.linspace(0, 1, _THRESHOLDS)[:-1]).tolist()
@@ -133,4 +192,8 @@ def f1_score(said: Bool[np.ndarray, " n"], truth: Bool[np.ndarray, " n"]) -> flo
     return 2 * right / max(float(said.sum() + truth.sum()), 1.0)
 
 
-TASKS: dict[str, Callable[[RigFrames], Task]] = {"force": ForceTask, "slip": SlipTask}
+TASKS: dict[str, Callable[[RigFrames], Task]] = {
+    "force": ForceTask,
+    "slip": SlipTask,
+    "pose": PoseTask,
+}

@@ -1,17 +1,20 @@
-"""Strokes of the indenter rig as a set of episodes: one stroke an episode, made on all cores.
+"""Strokes of the indenter rig, and slides of held objects, as sets of episodes, made on all cores.
 
 The rig's one sensor is the left fingertip; of the right one the truth is zeros, and there are no pictures.
 """
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, Float32, UInt8
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import (
     TACTILE_LEFT,
     TRUTH_CONTACT,
+    TRUTH_OBJECT_POSE,
     TRUTH_PAD_WRENCH,
     TRUTH_SLIP,
 )
@@ -22,6 +25,9 @@ from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.indenter_rig import FPS, simulate
+from touchgoal.sim_envs.object_slides import HELD, simulate_slide
+
+_RIG = "rig"  # meta: what tells one rig's recordings from another's
 
 
 def record_strokes(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
@@ -32,48 +38,46 @@ def record_strokes(root: Path, config: RigConfig, count: int, workers: int) -> E
     Raises:
         UserError: the folder holds strokes of another rig, or cannot be written to.
     """
+    rig = _description(config, config.indenters)
+    return _record_missing(root, rig, partial(_stroke, config, rig), count, workers)
+
+
+def record_slides(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
+    """The first so many slides of held objects; as `record_strokes`."""
+    rig = _description(config, HELD)
+    return _record_missing(root, rig, partial(_slide, config, rig), count, workers)
+
+
+def _description(config: RigConfig, things: tuple[str, ...]) -> str:
+    low, high = config.load
+    return f"{config.sensor}, {'+'.join(things)}, {low:g} to {high:g} N, seed {config.seed}"
+
+
+def _record_missing(
+    root: Path, rig: str, record: Callable[[int], EncodedEpisode], count: int, workers: int
+) -> EpisodeSet:
     writer = EpisodeWriter(root, fps=FPS)
     try:
-        if len(writer):
-            _check_rig(EpisodeSet(root), config)
+        if len(writer) and (said := EpisodeSet(root).meta(0).get(_RIG)) != rig:
+            raise UserError(
+                f"{root} holds strokes of another rig ({said}), not {rig}: give another folder"
+            )
         if len(writer) < count:
             with one_core_workers(workers) as pool:
                 missing = range(len(writer), count)
-                strokes = pool.map(partial(_record, config), missing)
-                for stroke in track(strokes, "indenter rig", "stroke", total=len(missing)):
-                    writer.append(stroke)
+                made = pool.map(record, missing)
+                for episode in track(made, "indenter rig", "stroke", total=len(missing)):
+                    writer.append(episode)
     finally:
         writer.close()
     return EpisodeSet(root)
 
 
-def _check_rig(known: EpisodeSet, config: RigConfig) -> None:
-    said = known.meta(0).get("rig")
-    if said != _description(config):
-        raise UserError(
-            f"{known.root} holds strokes of another rig ({said}), not {_description(config)}: give "
-            "another folder"
-        )
-
-
-def _description(config: RigConfig) -> str:
-    low, high = config.load
-    probes = "+".join(config.indenters)
-    return f"{config.sensor}, {probes}, {low:g} to {high:g} N, seed {config.seed}"
-
-
-def _record(config: RigConfig, index: int) -> EncodedEpisode:
+def _stroke(config: RigConfig, rig: str, index: int) -> EncodedEpisode:
     stroke = simulate(config, index)
-    n = len(stroke.frames)
-    pressed = stroke.wrench[:, 2] < 0
-    frames = {
-        TACTILE_LEFT: stroke.frames,
-        TRUTH_PAD_WRENCH: np.hstack([stroke.wrench, np.zeros((n, 6), np.float32)]),
-        TRUTH_CONTACT: np.column_stack([pressed, np.zeros(n, bool)]),
-        TRUTH_SLIP: np.column_stack([stroke.slip, np.zeros(n, bool)]),
-    }
+    frames = _frames(stroke.frames, stroke.wrench, stroke.slip)
     meta = {
-        "rig": _description(config),
+        _RIG: rig,
         "sensor": config.sensor,
         "object": stroke.indenter,
         "load": float(stroke.load),
@@ -82,3 +86,35 @@ def _record(config: RigConfig, index: int) -> EncodedEpisode:
     }
     task = f"press a {stroke.indenter} probe into the sensor and slide it"
     return encode(Episode(frames, task, meta), FPS)
+
+
+def _slide(config: RigConfig, rig: str, index: int) -> EncodedEpisode:
+    slide = simulate_slide(config, index)
+    half, zero = slide.pose[:, 2] / 2, np.zeros(len(slide.pose), np.float32)
+    turned = np.column_stack([np.cos(half), zero, zero, np.sin(half)])
+    frames = _frames(slide.frames, slide.wrench, slide.slip)
+    frames[TRUTH_OBJECT_POSE] = np.column_stack([slide.pose[:, :2], zero, turned]).astype("f4")
+    meta = {
+        _RIG: rig,
+        "sensor": config.sensor,
+        "object": slide.held,
+        "load": slide.load,
+        "stroke": index,
+    }
+    return encode(Episode(frames, f"slide and turn a {slide.held} on the sensor", meta), FPS)
+
+
+def _frames(
+    pictures: UInt8[np.ndarray, "t h w 3"],
+    wrench: Float32[np.ndarray, "t 6"],
+    slip: Bool[np.ndarray, " t"],
+) -> dict[str, np.ndarray]:
+    """Columns of the left fingertip, and of a right one that nothing touches."""
+    n = len(pictures)
+    nothing = np.zeros(n, bool)
+    return {
+        TACTILE_LEFT: pictures,
+        TRUTH_PAD_WRENCH: np.hstack([wrench, np.zeros((n, 6), np.float32)]),
+        TRUTH_CONTACT: np.column_stack([wrench[:, 2] < 0, nothing]),
+        TRUTH_SLIP: np.column_stack([slip, nothing]),
+    }

@@ -15,9 +15,10 @@ from touchgoal.benchmarks.tacbench_data import (
     split_force,
     split_slip,
 )
-from touchgoal.benchmarks.tacbench_tasks import f1_score
+from touchgoal.benchmarks.tacbench_tasks import CLASSES, PoseTask, f1_score
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP
+from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS as MINI
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS
@@ -28,6 +29,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.stroke_recording import record_strokes
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.indenter_rig import REST, rig_unit, shear_force, simulate
+from touchgoal.sim_envs.object_slides import FRAMES, pulled, simulate_slide
 from touchgoal.sim_envs.scene.objects import CATALOGUE, Body
 from touchgoal.sim_envs.tactile.press_bench import PressBench
 
@@ -38,7 +40,7 @@ STROKES = 15
 @pytest.fixture(scope="session")
 def strokes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five strokes of each probe, the last two of them after an interruption."""
-    folder = tmp_path_factory.mktemp("rig") / "episodes"
+    folder = tmp_path_factory.mktemp("rig") / "strokes"
     record_strokes(folder, RIG, STROKES - 2, workers=1)
     record_strokes(folder, RIG, STROKES, workers=1)
     return folder
@@ -119,6 +121,57 @@ def test_a_probe_finds_the_one_token_that_matters() -> None:
     assert (probe(tokens)[:, 0] - wanted).square().mean() < 0.3  # of the mean token: 11/12
 
 
+def test_a_slide_pulls_at_the_gel_up_to_the_cone() -> None:
+    places = np.array([[0.0, 0.0], [1e-4, 0.0], [3e-4, 0.0], [2e-4, 0.0], [2e-4, 4e-4]])
+    force, slip = pulled(places, stiffness=1e4, limit=2.0)
+    # 1 N; 3 N is too much; back by 0.1 mm: 1 N less; across: (1, 4) N cut to 2 N
+    assert force[:4, 0] == pytest.approx([0, 1, 2, 1]) and slip.tolist() == [0, 0, 1, 0, 1]
+    assert np.linalg.norm(force[4]) == pytest.approx(2) and force[4, 1] / force[4, 0] == 4
+    slide = simulate_slide(RIG, 1)
+    assert slide.held == "can" and len(slide.frames) == REST + FRAMES
+    assert np.allclose(np.diff(slide.pose[: REST + 1], axis=0), 0)
+    field = np.abs(slide.pose).max(0)
+    assert (field < [3.6e-3, 3.6e-3, np.radians(31)]).all()
+
+
+def test_an_object_is_seen_where_it_lies() -> None:
+    """The middle and the turn of what changes in the picture are those of the pose."""
+    slide = simulate_slide(RigConfig(sensor="gelsight_mini", seed=5, load=(3.0, 3.0)), 0)
+    h, w, _ = slide.frames.shape[1:]
+    y, x = np.mgrid[:h, :w]
+    for k in (REST, REST + 20, REST + 59):
+        change = np.abs(slide.frames[k].astype(float) - slide.frames[0]).sum(2)
+        seen = np.where(change > 60, 1.0, 0.0)
+        mx, my = (seen * x).sum() / seen.sum(), (seen * y).sum() / seen.sum()
+        place = np.array([mx - (w - 1) / 2, my - (h - 1) / 2]) * GELSIGHT_MINI.pixel_pitch
+        assert np.linalg.norm(place - slide.pose[k, :2]) < 0.5e-3
+        xx, yy, xy = (
+            (seen * a * b).sum() for a, b in ((x - mx, x - mx), (y - my, y - my), (x - mx, y - my))
+        )
+        assert np.degrees(np.arctan2(2 * xy, xx - yy) / 2 - slide.pose[k, 2]) == pytest.approx(
+            0, abs=4
+        )
+
+
+def test_classes_of_a_change_are_the_papers() -> None:
+    frames = RigFrames(
+        touch=torch.zeros(10, 3, 1, 1).half(),
+        before=torch.tensor([0, *range(9)]),
+        force=torch.ones(10, 3),
+        slip=torch.zeros(10, dtype=torch.bool),
+        stroke=np.arange(10),
+        indenter=np.array(["bar"] * 10),
+        pose=torch.tensor([0, 0.05, -0.25, 0.45, 5.5, -4, -4.15, -3.6, -2.15, -4.75])[:, None]
+        * torch.tensor([1, 1, 0.4]),
+    )
+    task = PoseTask(frames)
+    # changes, mm: 0, .05, -.3, .7, 5.05, -9.5, -.15, .55, 1.45, -2.6; turns are 0.4 of them, degrees
+    assert task.classes[:, 0].tolist() == [5, 5, 4, 7, 10, 0, 4, 7, 8, 1]
+    assert task.classes[:, 2].tolist() == [5, 5, 4, 7, 10, 0, 4, 7, 8, 1]
+    wanted = torch.nn.functional.one_hot(task.classes, CLASSES).flatten(1).float()
+    assert task.error(wanted, torch.arange(10)) == 0
+
+
 def test_metrics_are_what_they_are_called() -> None:
     errors = np.array([[[3e-3, 4e-3, 0.0], [-3e-3, 4e-3, 6e-3]]])
     metrics = force_metrics(errors, np.array([0, 1]))
@@ -156,12 +209,13 @@ def test_the_benchmark_judges_every_encoder(
     name = str(tmp_path / "tiny")
     result = run(
         TacbenchOptions(
-            encoders=(name, f"end-to-end:{name}"), shares=(1.0, 0.1), rig=RIG, strokes=STROKES,
+            encoders=(name, f"end-to-end:{name}"), shares=(1.0, 0.1), rig=RIG, strokes=STROKES, slides=10,
             data=strokes.parent, seeds=1, steps=20, end_to_end_steps=10, batch_size=8, workers=1,
         )
     )  # fmt: skip
     force = [row for row in result["rows"] if row["task"] == "force"]
-    assert len(force) == 2 * 2 * 2 + 2 and len(result["rows"]) == len(force) + 2 * 2 + 2
+    others = 2 * 2 + 2 + 2 * 2 + 1  # T2 with two references, T3 with one
+    assert len(force) == 2 * 2 * 2 + 2 and len(result["rows"]) == len(force) + others
     for row in force:
         low, high = row["rmse_mn_interval"]
         assert low <= row["rmse_mn"] <= high and row["mae_mn"] <= row["rmse_mn"]

@@ -1,0 +1,126 @@
+"""Objects held against one fingertip sensor and slid and turned under it, for TacBench T3 (pose).
+
+As in Sparsh's appendix C.5, the load holds and the object is moved by hand: every fraction of a second
+with another velocity. Changes of the pose over five frames are drawn log-uniformly, so that small and
+large ones are as common. Two things: the face of a bar, and a can on its side. The gel's stick and slip
+are those of the indenter rig; torsion is left out.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.sim_envs.config import RigConfig
+from touchgoal.sim_envs.indenter_rig import FRICTION, REST, rig_unit
+from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Texture
+from touchgoal.sim_envs.tactile.press_bench import PressBench
+
+HeldObject = Literal["bar", "can"]
+HELD: tuple[HeldObject, ...] = ("bar", "can")
+FRAMES = 60
+"""Of a slide, after the untouched ones."""
+_SEGMENT = 6, 13  # frames of one velocity, least and one more than most
+_WINDOW = 5  # frames over which changes are drawn
+_SHIFTS, _TURNS = (0.03e-3, 8e-3), (math.radians(0.02), math.radians(4))  # least and most change
+_FIELD, _TURN = 3.5e-3, math.radians(30)  # m and rad from the middle, at most
+
+
+@dataclass(frozen=True, eq=False)
+class Slide:
+    """One object moved over the sensor.
+
+    Attributes:
+        frames: the sensor's pictures, RGB, of which the first `REST` are untouched.
+        wrench: force (N) and torque (Nm) of the object on the pad, sensor frame.
+        slip: whether it slides over the gel.
+        pose: of the object in the sensor frame: x and y (m), and its turn about z (rad).
+        held: which object.
+        load: with which it is held, N.
+    """
+
+    frames: UInt8[np.ndarray, "t h w 3"]
+    wrench: Float32[np.ndarray, "t 6"]
+    slip: Bool[np.ndarray, " t"]
+    pose: Float32[np.ndarray, "t 3"]
+    held: HeldObject
+    load: float
+
+
+def simulate_slide(config: RigConfig, index: int) -> Slide:
+    """One slide; the same config and index always give the same one."""
+    sensor, rng = find_sensor(config.sensor), np.random.default_rng([config.seed, index, 2])
+    held = HELD[index % len(HELD)]
+    load = float(rng.uniform(*config.load))
+    pose = _draw_poses(rng)
+    pull, slip = pulled(pose[:, :2], sensor.shear_stiffness, FRICTION * load)
+    body, flat = _body(held)
+    bench = PressBench(body, sensor, rig_unit(config))
+    frames, wrenches = [], []
+    for i in range(REST + FRAMES):
+        k = max(i - REST, 0)
+        normal = load if i >= REST else 0.0
+        shear = (float(pull[k, 0]), float(pull[k, 1])) if normal else (0.0, 0.0)
+        centre = float(pose[k, 0]), float(pose[k, 1])
+        bench.place(np.array([*centre, 0.0]), _turned(pose[k, 2]) @ flat)
+        depth = -normal / sensor.normal_stiffness
+        frames.append(bench.sense(normal, rng, shear, centre, depth).image)
+        contact = bench.contact(normal, shear, centre, depth)
+        wrenches.append(np.concatenate([contact.force, contact.torque]))
+    wrench = np.array(wrenches, np.float32)
+    whole = np.vstack([np.repeat(pose[:1], REST, 0), pose]).astype(np.float32)
+    slides = np.concatenate([np.zeros(REST, bool), slip])
+    return Slide(np.stack(frames), wrench, slides, whole, held, load)
+
+
+def pulled(
+    places: Float[np.ndarray, "t 2"], stiffness: float, limit: float
+) -> tuple[Float[np.ndarray, "t 2"], Bool[np.ndarray, " t"]]:
+    """Shear force (N, 2) on a gel of so many N/m under an object at these places (m), and its slip.
+
+    The gel's point of rest is drawn along as soon as it would pull with more than `limit` N.
+    """
+    rest = places[0].astype(float)
+    force, slip = np.zeros(places.shape), np.zeros(len(places), bool)
+    for i, place in enumerate(places):
+        force[i] = stiffness * (place - rest)
+        size = float(np.linalg.norm(force[i]))
+        if size > limit:
+            force[i] *= limit / size
+            rest, slip[i] = place - force[i] / stiffness, True
+    return force, slip
+
+
+def _draw_poses(rng: np.random.Generator) -> Float[np.ndarray, "t 3"]:
+    """x, y (m) and turn (rad), frame by frame; velocities turn round where the field ends."""
+    most = np.array([_FIELD, _FIELD, _TURN])
+    ranges = np.log([_SHIFTS, _SHIFTS, _TURNS])
+    pose = np.empty((FRAMES, 3))
+    pose[0] = rng.uniform(-0.5, 0.5, 3) * most
+    left, velocity = 0, np.zeros(3)
+    for i in range(1, FRAMES):
+        if left == 0:
+            left = int(rng.integers(*_SEGMENT))
+            size = np.exp(rng.uniform(ranges[:, 0], ranges[:, 1])) / _WINDOW
+            velocity = size * rng.choice([-1, 1], 3)
+        velocity = np.where(np.abs(pose[i - 1] + velocity) > most, -velocity, velocity)
+        pose[i] = pose[i - 1] + velocity
+        left -= 1
+    return pose
+
+
+def _body(held: HeldObject) -> tuple[Body, Float[np.ndarray, "3 3"]]:
+    """The object, and how it lies on the gel when it is not turned."""
+    material = Material(Texture.SMOOTH, 0.0, 1e-3, HARD, FRICTION, (0.6, 0.6, 0.6, 1.0))
+    if held == "bar":
+        return Body(ObjectKind(held, "box", material, ()), (4e-3, 1.5e-3, 4e-3), 0.1), np.eye(3)
+    lying = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # its axis along the sensor's x
+    return Body(ObjectKind(held, "cylinder", material, ()), (8e-3, 3.5e-3), 0.1), lying
+
+
+def _turned(angle: float) -> Float[np.ndarray, "3 3"]:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
