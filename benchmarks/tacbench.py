@@ -45,6 +45,7 @@ from touchgoal.control.progress import Progress
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.probes.property_probe import interval
+from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.stroke_recording import record_slides, record_strokes
 from touchgoal.sim_envs.indenter_rig import FRICTION
 
@@ -85,14 +86,10 @@ def run(config: TacbenchOptions) -> dict[str, Any]:
     encoders = {name: _encoder(name, config) for name in config.encoders}
     sensor = Path(config.rig.sensor).name  # of a sensor file's folder, too
     folder = config.data or Path("runs") / f"tacbench_{sensor}_{config.rig.seed}"
-    recordings = {
-        what: record(folder / what, config.rig, count, config.workers)
-        for what, record, count in (
-            ("strokes", record_strokes, config.strokes),
-            ("slides", record_slides, config.slides),
-        )
-        if what in {_RECORDING[task] for task in config.tasks}
-    }
+    recordings: dict[str, EpisodeSet] = {}
+    for what in dict.fromkeys(_RECORDING[task] for task in config.tasks):
+        record, count = _recorder(what, config)
+        recordings[what] = record(folder / what, config.rig, count, config.workers)
     rows: list[dict[str, Any]] = []
     reads: list[Read] = []
     trainings = len(encoders) * len(config.tasks) * len(config.shares) * config.seeds
@@ -103,7 +100,7 @@ def run(config: TacbenchOptions) -> dict[str, Any]:
     ):
         for what, episodes in recordings.items():
             tasks = [task for task in config.tasks if _RECORDING[task] == what]
-            count = config.strokes if what == "strokes" else config.slides
+            count = _recorder(what, config)[1]
             seen: dict[str, RigFrames] = {}
             for name, encoder in encoders.items():
                 preprocess = encoder.preprocess
@@ -114,13 +111,21 @@ def run(config: TacbenchOptions) -> dict[str, Any]:
                     judged = _train_and_judge(subject, task, share, config, log, bar)
                     rows += judged[0]
                     reads += judged[1]
+            frames = next(iter(seen.values()))
             for task in tasks:
-                rows += _references(TASKS[task](subject.frames), task, subject.frames)
+                rows += _references(TASKS[task](frames), task, frames)
     return {
         "table": table(rows, find_sensor(config.rig.sensor).name, config),
         "rows": rows,
         "picture": draw(reads),
     }
+
+
+def _recorder(what: str, config: TacbenchOptions) -> tuple[Callable[..., EpisodeSet], int]:
+    """By what strokes or slides are recorded, and how many."""
+    if what == "strokes":
+        return record_strokes, config.strokes
+    return record_slides, config.slides
 
 
 def _encoder(name: str, config: TacbenchOptions) -> BaseTouchEncoder:
