@@ -207,16 +207,20 @@ class RewardQualityOptions(BenchmarkOptions):
 class TacbenchOptions(BenchmarkOptions):
     """What do encoders know of force, slip and pose (TacBench T1 to T3, Sparsh Tables 5 to 8), in simulation?"""
 
-    tasks: tuple[Literal["force", "slip", "pose"], ...] = ("force", "slip", "pose")
+    tasks: Annotated[tuple[Literal["force", "slip", "pose"], ...], Field(min_length=1)] = (
+        "force",
+        "slip",
+        "pose",
+    )
     """T1, the force on the pad; T2, whether it slips; T3, how the pose of a held object changes."""
-    encoders: tuple[str, ...] = (
+    encoders: Annotated[tuple[str, ...], Field(min_length=1)] = (
         "gelsight_mini_markers",
         "random:gelsight_mini_markers",
         "end-to-end:gelsight_mini_markers",
     )
     """Touch encoders with a ViT, frozen, by name or folder; `random:NAME` for the same network untrained,
     `end-to-end:NAME` for the same one trained with the probe, from random weights."""
-    shares: tuple[Share, ...] = (1.0, 0.33, 0.1, 0.01)
+    shares: Annotated[tuple[Share, ...], Field(min_length=1)] = (1.0, 0.33, 0.1, 0.01)
     """Shares of the training labels."""
     rig: RigConfig = RigConfig()
     """The simulated indenter rig."""
