@@ -126,7 +126,9 @@ def test_a_slide_pulls_at_the_gel_up_to_the_cone() -> None:
     force, slip = pulled(places, stiffness=1e4, limit=2.0)
     # 1 N; 3 N is too much; back by 0.1 mm: 1 N less; across: (1, 4) N cut to 2 N
     assert force[:4, 0] == pytest.approx([0, 1, 2, 1]) and slip.tolist() == [0, 0, 1, 0, 1]
-    assert np.linalg.norm(force[4]) == pytest.approx(2) and force[4, 1] / force[4, 0] == 4
+    assert np.linalg.norm(force[4]) == pytest.approx(2) and force[4, 1] / force[
+        4, 0
+    ] == pytest.approx(4)
     slide = simulate_slide(RIG, 1)
     assert slide.held == "can" and len(slide.frames) == REST + FRAMES
     assert np.allclose(np.diff(slide.pose[: REST + 1], axis=0), 0)
