@@ -178,7 +178,7 @@ class PoseTask:
 def _classes(change: Float[Tensor, " n"], bins: tuple[float, ...]) -> Int[Tensor, " n"]:
     """0 to 10: how many of the bounds -5 to 5 lie at or below a change."""
     bounds = torch.tensor([*(-b for b in reversed(bins)), *bins])
-    return torch.bucketize(change, bounds, right=True)
+    return torch.bucketize(change.contiguous(), bounds, right=True)
 
 
 def _cuts(outputs: Outputs) -> list[float]:

