@@ -24,6 +24,15 @@ class ViTConfig:
         heads: Attention heads; must divide `width`.
         mlp_ratio: Hidden size of a block's MLP over `width`.
         class_token: Prepend a learned token and pool by it; otherwise pool by the mean.
+        registers: Learned tokens without a position that only attention sees; left out of the
+            output (Darcet et al. 2024).
+        layer_scale: Initial value of a learned factor on each channel of both branches of a block
+            (Touvron et al. 2021); none when None.
+        tubelet: Frames a token; 1 takes images, more take clips of any multiple of it.
+        frames: Frames of the clips that the backbone is meant for; 1 for images.
+        learned_positions: Keep the position codes as parameters that training changes. The backbone
+            then takes the configured size only.
+        norm_epsilon: Of every LayerNorm.
     """
 
     image_size: tuple[int, int] = (120, 160)
@@ -34,6 +43,12 @@ class ViTConfig:
     heads: int = 3
     mlp_ratio: float = 4.0
     class_token: bool = False
+    registers: int = 0
+    layer_scale: float | None = None
+    tubelet: int = 1
+    frames: int = 1
+    learned_positions: bool = False
+    norm_epsilon: float = 1e-5
 
     def __post_init__(self) -> None:
         """Raises UserError for sizes that cannot be built."""
@@ -41,6 +56,16 @@ class ViTConfig:
             raise UserError(
                 f"ViT width {self.width} must be divisible by 4 x heads ({self.heads}): "
                 "choose another width or number of heads"
+            )
+        if self.tubelet > 1 and self.width % 6:
+            raise UserError(
+                f"ViT width {self.width} must be divisible by 6 for clips (sine and cosine of time, "
+                "row and column): choose another width"
+            )
+        if self.tubelet < 1 or self.registers < 0 or self.frames % self.tubelet:
+            raise UserError(
+                f"no ViT has {self.registers} registers and {self.frames} frames of {self.tubelet} a "
+                "token: registers from 0, tubelet from 1, frames a multiple of it"
             )
 
 
@@ -53,36 +78,51 @@ PRESETS: dict[str, ViTConfig] = {
 }
 
 
-def sinusoidal_positions(rows: int, columns: int, width: int) -> Float[Tensor, "n {width}"]:
-    """Fixed 2-D position codes, as in MAE (He et al. 2022): half for the row, half for the column.
+def sinusoidal_positions(
+    rows: int, columns: int, width: int, times: int | None = None
+) -> Float[Tensor, "n {width}"]:
+    """Fixed position codes, as in MAE (He et al. 2022): a half for the row, a half for the column.
 
     Args:
         rows: Patches from top to bottom.
         columns: Patches from left to right.
-        width: Size of a code, a multiple of 4.
+        width: Size of a code, a multiple of 4, of 6 for clips.
+        times: Tubelets from the first to the last, which then have the first of three thirds.
 
     Returns:
-        One code a patch, row by row (n = rows * columns).
+        One code a patch, time by time and row by row (n = times * rows * columns).
     """
-    frequency = 10000.0 ** -(torch.arange(width // 4) / (width // 4))
-    y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
-    angles = torch.stack([y.flatten(), x.flatten()], 1)[:, :, None] * frequency
+    sides = [rows, columns] if times is None else [times, rows, columns]
+    bands = width // (2 * len(sides))
+    frequency = 10000.0 ** -(torch.arange(bands) / bands)
+    places = torch.meshgrid(*(torch.arange(side) for side in sides), indexing="ij")
+    angles = torch.stack([place.flatten() for place in places], 1)[:, :, None] * frequency
     return torch.cat([angles.sin(), angles.cos()], -1).flatten(1)
 
 
 class Block(nn.Module):
     """Pre-norm self-attention and MLP."""
 
-    def __init__(self, width: int, heads: int, mlp_ratio: float) -> None:
-        """Builds the two residual branches."""
+    def __init__(
+        self,
+        width: int,
+        heads: int,
+        mlp_ratio: float,
+        norm_epsilon: float = 1e-5,
+        layer_scale: float | None = None,
+    ) -> None:
+        """Builds the two residual branches; see `ViTConfig`."""
         super().__init__()
         self.heads = heads
-        self.norm1 = nn.LayerNorm(width)
+        self.norm1 = nn.LayerNorm(width, norm_epsilon)
         self.qkv = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
-        self.norm2 = nn.LayerNorm(width)
+        self.norm2 = nn.LayerNorm(width, norm_epsilon)
         self.mlp_in = nn.Linear(width, int(width * mlp_ratio))
         self.mlp_out = nn.Linear(int(width * mlp_ratio), width)
+        scaled = layer_scale is not None
+        self.scale1 = nn.Parameter(torch.full((width,), layer_scale)) if scaled else None
+        self.scale2 = nn.Parameter(torch.full((width,), layer_scale)) if scaled else None
 
     def attention(self, x: Float[Tensor, "b n d"]) -> Float[Tensor, "b n d"]:
         """Multi-head self-attention over the tokens."""
@@ -93,12 +133,14 @@ class Block(nn.Module):
 
     def forward(self, x: Float[Tensor, "b n d"]) -> Float[Tensor, "b n d"]:
         """One transformer block."""
-        x = x + self.attention(self.norm1(x))
-        return x + self.mlp_out(F.gelu(self.mlp_in(self.norm2(x))))
+        attended = self.attention(self.norm1(x))
+        x = x + (attended if self.scale1 is None else attended * self.scale1)
+        changed = self.mlp_out(F.gelu(self.mlp_in(self.norm2(x))))
+        return x + (changed if self.scale2 is None else changed * self.scale2)
 
 
 class ViT(nn.Module):
-    """Images to tokens.
+    """Images, or clips, to tokens.
 
     An input whose sides are no multiples of the patch is padded with zeros at the right and the
     bottom. For background-subtracted touch, zero means an untouched gel.
@@ -109,33 +151,62 @@ class ViT(nn.Module):
         super().__init__()
         self.config = config
         c = config
-        self.patch = nn.Conv2d(c.channels, c.width, c.patch_size, stride=c.patch_size)
+        self.patch = _patch_projection(c)
         self.class_token = nn.Parameter(torch.zeros(1, 1, c.width)) if c.class_token else None
-        self.blocks = nn.ModuleList(Block(c.width, c.heads, c.mlp_ratio) for _ in range(c.depth))
-        self.norm = nn.LayerNorm(c.width)
+        self.registers = nn.Parameter(torch.empty(1, c.registers, c.width)) if c.registers else None
+        self.positions = nn.Parameter(_codes(c)[None]) if c.learned_positions else None
+        self.blocks = nn.ModuleList(
+            Block(c.width, c.heads, c.mlp_ratio, c.norm_epsilon, c.layer_scale)
+            for _ in range(c.depth)
+        )
+        self.norm = nn.LayerNorm(c.width, c.norm_epsilon)
         self.apply(_initialise)
         for name, weight in self.named_parameters():
             if name.endswith((".out.weight", ".mlp_out.weight")):
                 # keeps the variance of the residual stream independent of depth, as in GPT-2
                 nn.init.xavier_uniform_(weight, gain=1 / math.sqrt(2 * c.depth))
+        if self.registers is not None:
+            # equal ones would stay equal: nothing but their values tells them apart
+            nn.init.normal_(self.registers, std=0.02)
 
-    def embed_patches(self, images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b n d"]:
-        """Patch embeddings with positions, row by row, without the class token."""
-        size = self.config.patch_size
-        h, w = images.shape[2:]
+    def embed_patches(self, images: Float[Tensor, "b c *t h w"]) -> Float[Tensor, "b n d"]:
+        """Patch embeddings with positions, row by row, without class token and registers.
+
+        Raises:
+            UserError: Clips of a length that is no multiple of `tubelet`, or a size other than the
+                configured one with learned positions.
+        """
+        size, tubelet = self.config.patch_size, self.config.tubelet
+        h, w = images.shape[-2:]
+        if tubelet > 1 and (images.ndim != 5 or images.shape[2] % tubelet):
+            raise UserError(
+                f"this ViT takes clips (batch, channels, frames, height, width) of a multiple of "
+                f"{tubelet} frames, not {tuple(images.shape)}"
+            )
         tokens = self.patch(F.pad(images, (0, -w % size, 0, -h % size)))
-        rows, columns = tokens.shape[2:]
-        positions = sinusoidal_positions(rows, columns, self.config.width)
+        positions = self._positions(*tokens.shape[2:])
         return tokens.flatten(2).transpose(1, 2) + positions.to(tokens)
 
+    def _positions(self, *grid: int) -> Float[Tensor, "n d"]:
+        """Codes for times (of clips), rows and columns of patches."""
+        if self.positions is None:
+            *times, rows, columns = grid
+            return sinusoidal_positions(rows, columns, self.config.width, *times)
+        if grid != (expected := _grid(self.config)):
+            raise UserError(
+                f"this ViT has learned positions for {expected} patches, not {grid}: give it the "
+                f"size that it was trained with, {self.config.image_size}"
+            )
+        return self.positions[0]
+
     def forward(
-        self, images: Float[Tensor, "b c h w"], ids_keep: Int[Tensor, "b k"] | None = None
-    ) -> Float[Tensor, "b t d"]:
+        self, images: Float[Tensor, "b c *t h w"], ids_keep: Int[Tensor, "b k"] | None = None
+    ) -> Float[Tensor, "b n d"]:
         """Normalised output tokens.
 
         Args:
-            images: Preprocessed images.
-            ids_keep: Indices (row by row) of the patches each image keeps; all when None. The dropped
+            images: Preprocessed images, or clips if the tubelet has several frames.
+            ids_keep: Indices (time by time, row by row) of the patches each image keeps; all when None. The dropped
                 ones are never computed, as masked self-supervision wants.
 
         Returns:
@@ -146,12 +217,14 @@ class ViT(nn.Module):
             tokens = tokens.gather(1, ids_keep[:, :, None].expand(-1, -1, tokens.shape[2]))
         if self.class_token is not None:
             tokens = torch.cat([self.class_token.expand(len(tokens), -1, -1), tokens], 1)
+        if self.registers is not None:
+            tokens = torch.cat([self.registers.expand(len(tokens), -1, -1), tokens], 1)
         for block in self.blocks:
             tokens = block(tokens)
-        return self.norm(tokens)
+        return self.norm(tokens[:, self.config.registers :])
 
     def features(
-        self, images: Float[Tensor, "b c h w"], ids_keep: Int[Tensor, "b k"] | None = None
+        self, images: Float[Tensor, "b c *t h w"], ids_keep: Int[Tensor, "b k"] | None = None
     ) -> Float[Tensor, "b d"]:
         """One vector an image: the class token if there is one, else the mean of the tokens."""
         tokens = self(images, ids_keep)
@@ -162,6 +235,25 @@ def patch_grid(config: ViTConfig) -> tuple[int, int]:
     """Rows and columns of patches in an image of the configured size."""
     rows, columns = (-(-side // config.patch_size) for side in config.image_size)
     return rows, columns
+
+
+def _grid(config: ViTConfig) -> tuple[int, ...]:
+    """Tubelets of the configured clips, if they are such; rows; columns."""
+    times = () if config.tubelet == 1 else (config.frames // config.tubelet,)
+    return (*times, *patch_grid(config))
+
+
+def _codes(config: ViTConfig) -> Float[Tensor, "n d"]:
+    *times, rows, columns = _grid(config)
+    return sinusoidal_positions(rows, columns, config.width, *times)
+
+
+def _patch_projection(config: ViTConfig) -> nn.Conv2d | nn.Conv3d:
+    size = config.patch_size
+    if config.tubelet == 1:
+        return nn.Conv2d(config.channels, config.width, size, stride=size)
+    tube = (config.tubelet, size, size)
+    return nn.Conv3d(config.channels, config.width, tube, stride=tube)
 
 
 def random_masking(
@@ -186,7 +278,7 @@ def _initialise(module: nn.Module) -> None:
             module.weight
         )  # as MAE: right for narrow backbones as for wide ones
         nn.init.zeros_(module.bias)
-    elif isinstance(module, nn.Conv2d) and module.bias is not None:
+    elif isinstance(module, nn.Conv2d | nn.Conv3d) and module.bias is not None:
         fan_in = module.weight[0].numel()
         nn.init.trunc_normal_(module.weight, std=fan_in**-0.5)
         nn.init.zeros_(module.bias)
