@@ -28,6 +28,11 @@ def _successes(metrics: Metrics) -> str:
     return f"{SuccessRate(metrics['successes'], metrics['trials'])} (95 % Wilson)"
 
 
+def _deployed(metrics: Metrics) -> str:
+    done = [row["success"] for row in metrics["deployments"]]
+    return f"{SuccessRate(sum(done), len(done))} (95 % Wilson)"
+
+
 def _maze(metrics: Metrics) -> str:
     trials = metrics["closed_loop"]
     shuffled = next(name for name in trials if name.endswith(", shuffled"))
@@ -110,6 +115,16 @@ QUOTED = {
         "the scripted expert, which sees the simulator's state",
         _successes,
     ),
+    "deploy-real-time": Quoted(
+        "touchgoal benchmark deploy --tasks pick-place --policies shipped --arms real-time --episodes 20",
+        "the shipped policy through libfranka's protocol, on fresh twins in real time",
+        _deployed,
+    ),
+    "deploy-lock-step": Quoted(
+        "touchgoal benchmark deploy --tasks pick-place --policies shipped --arms lock-step --episodes 40",
+    ),
+    "sent-stream": Quoted("touchgoal benchmark sent-stream"),
+    "replay": Quoted("touchgoal benchmark replay"),
     "bead-maze": Quoted(
         "touchgoal benchmark bead-maze --held-out 40",
         "the shipped policy leads a bead along wires it has not seen, by touch and joint state",
