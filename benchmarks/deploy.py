@@ -5,6 +5,7 @@ cell file that it writes. The same seeds, objects and wires in every row of a ta
 """
 
 import json
+import sys
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -54,7 +55,9 @@ def run(config: DeployOptions) -> dict[str, Any]:
                         for deployment in track(begun, f"{task}, {policy}, {arm}", "deployment")
                     ]
                 lines += _lines(rows)
-                print("\n".join(lines[-1 - sum(not row.success for row in rows) :]), flush=True)
+                print(
+                    "\n".join(lines[-1 - sum(not row.success for row in rows) :]), file=sys.stderr
+                )
                 done += rows
     return {"table": "\n".join(lines), "deployments": [asdict(row) for row in done]}
 
