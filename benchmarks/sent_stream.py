@@ -19,6 +19,7 @@ Path = Float[np.ndarray, "t n"]
 _DT = 1e-3  # s
 _LATE = 0.3  # share of the commands that come late, by up to a tick
 _PUSH_SECONDS = 1.25  # for which a wild policy pushes one way
+_ROUNDING = 1e-12  # rad
 _PIECE = 10.0  # s of motion that are looked at together
 
 
@@ -99,7 +100,8 @@ def _row(robot: RobotLimits, hz: int, late: bool, seconds: float, seed: int) -> 
         commands = wild_commands(layer, ticks, rng)
         delays = late_by(ticks, 1000 // hz, rng) if late else np.zeros(ticks, int)
         q = np.array(list(send(robot, hz, commands, delays.tolist())))
-        inside_range = (q >= limits.lower).all() and (q <= limits.upper).all()
+        low, high = limits.lower - _ROUNDING, limits.upper + _ROUNDING
+        inside_range = (q >= low).all() and (q <= high).all()
         outside = max(outside, outside_box(layer, q[::5]) if inside_range else np.inf)
         shares = np.maximum(shares, shares_of_limits(limits, q))
     return {

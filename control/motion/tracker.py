@@ -99,5 +99,5 @@ class Tracker:
         """How many times its step the reference may go, so that its mean keeps to the limits."""
         before = state.window[-self._m] - state.window[-self._m - 1]
         most = np.minimum(np.abs(before + np.sign(state.step) * self._reach), self._fastest)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             return float(np.nanmin(most / np.abs(state.step)))
