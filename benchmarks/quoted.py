@@ -111,9 +111,7 @@ QUOTED = {
         _successes,
     ),
     "pick-place-expert": Quoted(
-        "touchgoal run-policy --episodes 100 --policy expert",
-        "the scripted expert, which sees the simulator's state",
-        _successes,
+        "touchgoal run-policy --episodes 100 --policy expert", headline=_successes
     ),
     "deploy-real-time": Quoted(
         "touchgoal benchmark deploy --tasks pick-place --policies shipped --arms real-time --episodes 20",
