@@ -19,9 +19,10 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import connect_cell
-from touchgoal.control.safety.action_filter import ActionFilter, Measurements
+from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import Box, RobotLimits
 from touchgoal.sim_envs.config import DeploymentConfig, PickPlaceConfig
+from touchgoal.sim_envs.deployed_arm import all_well
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.servo_lag import ServoLag
 
@@ -157,11 +158,8 @@ def _over_the_wire(cell: CellConfig, actions: list[np.ndarray], seed: int) -> Re
     state = safety.start(arm.read().q)
     try:
         for action in actions:
-            calm = Measurements(
-                state.q, np.zeros(3), np.zeros(state.q.size), np.zeros(2), *[0.0] * 4
-            )
             step = lag.update(action[:-1].astype(np.float32).astype(np.float64))
-            state = safety.filter_action(state, step, calm)
+            state = safety.filter_action(state, step, all_well(state.q))
             arm.command(state.q)
             connection.gripper.command(float(action[-1]))
             connection.clock.wait(connection.clock.now() + 1 / _HZ)

@@ -10,8 +10,9 @@ from touchgoal.benchmarks.config import SentStreamOptions
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.tracker import Tracker
 from touchgoal.control.progress import track
-from touchgoal.control.safety.action_filter import ActionFilter, Measurements
+from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3, UR5E, RobotLimits
+from touchgoal.sim_envs.deployed_arm import all_well
 
 Joints = Float[np.ndarray, " n"]
 Path = Float[np.ndarray, "t n"]
@@ -30,8 +31,7 @@ def wild_commands(layer: ActionFilter, ticks: int, rng: np.random.Generator) -> 
     for tick in range(ticks):
         if tick % round(_PUSH_SECONDS / layer.dt) == 0:
             push = rng.choice([0.05, 1.0, 1e300]) * rng.standard_normal(n)
-        calm = Measurements(state.q, np.zeros(3), np.zeros(n), np.zeros(2), *[0.0] * 4)
-        state = layer.filter_action(state, push, calm)
+        state = layer.filter_action(state, push, all_well(state.q))
         commands.append(state.q)
     return commands
 

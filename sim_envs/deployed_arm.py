@@ -87,7 +87,7 @@ class _TrackedDrive:
 
     def accept(self, delta: Joints) -> Joints:
         step = self._lag.update(delta)
-        self._state = self._safety.filter_action(self._state, step, _all_well(self._state.q))
+        self._state = self._safety.filter_action(self._state, step, all_well(self._state.q))
         return self._state.q
 
     def set_target(self, target: Joints) -> None:
@@ -197,7 +197,7 @@ class DeployedArm:
         return set(at[(at > self._ms) & (at <= end)].tolist())
 
 
-def _all_well(q: Joints) -> Measurements:
+def all_well(q: Joints) -> Measurements:
     """So that the safety layer clamps, as it does on the wire, and never stops: tasks do that here."""
     return Measurements(
         q=q,

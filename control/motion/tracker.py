@@ -1,9 +1,9 @@
-"""From a policy's 10 to 20 Hz to a 1 kHz interface: smooth, inside all limits, on the path checked.
+"""From a policy's 10 to 20 Hz to a 1 kHz interface: smooth, inside all limits, near the path checked.
 
 A reference walks in straight lines from target to target, each within the policy's period; what goes
 out is its mean over the last moments. A mean never leaves the range of what it averages, all joints
-are late by the same time, and so the arm keeps to the path that the safety layer has checked, whatever
-comes when. Where the reference would have to stop or turn faster than the limits allow, it walks
+are late by the same time, and so the arm keeps near the path that the safety layer has checked, whatever
+comes when: it cuts that path's corners, see `touchgoal benchmark sent-stream`. Where the reference would have to stop or turn faster than the limits allow, it walks
 slower: it never leaves its path.
 """
 
