@@ -20,14 +20,12 @@ class Config:
     """Which policy."""
     out: Path | None = None
     """Folder of the run; the policy goes to its `policy/policy`."""
-    demonstrations: Count | None = None
-    """Episodes of the expert; default: 160 of pick-place, 120 of the maze."""
-    corrections: Count | None = None
-    """Episodes of each round in which the policy acts and the expert answers; default: 80 of pick-place,
-    60 of the maze."""
-    rounds: CountOrNone | None = None
-    """Rounds of corrections, at most; default: 3 of pick-place, the last of them in the plain environment,
-    and 2 of the maze."""
+    demonstrations: Count = 160
+    """Episodes of the expert."""
+    corrections: Count = 80
+    """Episodes of each round in which the policy acts and the expert answers."""
+    rounds: CountOrNone = 3
+    """Rounds of corrections, three at most; the last of pick-place is in the plain environment."""
     epochs: Count | None = None
     """Passes over the data in each training; default: 16 for pick-place, 10 for the maze."""
     trials: CountOrNone = 24

@@ -71,7 +71,7 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
         f"--train.lr 1e-3 --train.epochs {config.epochs or 16} --train.snapshot-epochs 16"
     )
     learn += ["--estimator", str(estimator)]
-    many = config.demonstrations or 160
+    many = config.demonstrations
     disturbed = many * 7 // 16  # so that the expert shows how to come back
     return [
         _record(out / "val", max(1, many // 13), 120_000, ["--feedback", *wired], config),
@@ -82,7 +82,7 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
             if disturbed else []
         ),
         # Where nothing is late or estimated it is to act, too.
-        *_corrected(config, out, learn, learn, [wired, wired, _BLIND], 80),
+        *_corrected(config, out, learn, learn, [wired, wired, _BLIND]),
     ]  # fmt: skip
 
 
@@ -95,17 +95,17 @@ def _bead_maze(config: Config, out: Path) -> list[list[str]]:
     learn += ["--encoder", str(encoder), "--task", "bead-maze"]
     learn += ["--train.epochs", str(config.epochs or 10), "--train.snapshot-epochs", "5"]
     wired = [*_MAZE, *_DEPLOYED]
-    many = config.demonstrations or 120
+    many = config.demonstrations
     return [
         _record(out / "val", max(1, many // 13), 20_000, [*_VALIDATION, *_DEPLOYED], config),
         _record(out / "train", many, 0, wired, config),
-        *_corrected(config, out, [*learn, "--head", "regression"], learn, [wired, wired], 60),
+        *_corrected(config, out, [*learn, "--head", "regression"], learn, [wired] * 3),
     ]
 
 
 def _corrected(
     config: Config, out: Path, first: list[str], last: list[str],
-    envs: list[list[str]], episodes: int,
+    envs: list[list[str]],
 ) -> list[list[str]]:  # fmt: skip
     """Rounds of learning and correcting (DAgger), and the last training."""
     data = ["--data", str(out / "train/episodes"), "--validation", str(out / "val/episodes")]
@@ -115,8 +115,8 @@ def _corrected(
         folder = out / f"round-{k + 1}"
         steps.append([*learn, *first, "--trials", "0", "--out", str(folder)])
         acts = ["--policy", str(folder / "policy"), *env]
-        many = config.corrections or episodes
-        steps.append(_record(out / "train", many, 31_000 + 1000 * k, acts, config))
+        seed = 31_000 + 1000 * k
+        steps.append(_record(out / "train", config.corrections, seed, acts, config))
     final = [*learn, *last, "--trials", str(config.trials), "--env.as-deployed"]
     return [*steps, [*final, "--out", str(out / "policy")]]
 
