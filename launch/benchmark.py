@@ -28,6 +28,7 @@ BENCHMARKS: dict[str, type[options.BenchmarkOptions]] = {
     "tactile-speed": options.TactileSpeedOptions,
     "touch-probes": options.TouchProbesOptions,
 }
+IN_FOLDERS = {"tacbench": "tacbench.benchmark"}
 RESULTS = Path(__file__).resolve().parents[1] / "benchmarks" / "results"
 
 Config = (
@@ -54,7 +55,8 @@ def main(config: options.BenchmarkOptions) -> None:
     name = next(name for name, kind in BENCHMARKS.items() if type(config) is kind)
     if config.save_result and not (RESULTS.parents[1] / "pyproject.toml").exists():
         raise UserError("--save-result writes into a checkout, and this is an installed package")
-    benchmark = importlib.import_module(f"touchgoal.benchmarks.{name.replace('-', '_')}")
+    module = IN_FOLDERS.get(name, name.replace("-", "_"))
+    benchmark = importlib.import_module(f"touchgoal.benchmarks.{module}")
     out = open_run(config.out, f"benchmark-{name}", config)
     result = benchmark.run(config)
     print(result.pop("table"))

@@ -7,15 +7,15 @@ import pytest
 import torch
 
 from touchgoal.benchmarks.config import TacbenchOptions
-from touchgoal.benchmarks.tacbench import force_metrics, run, slip_metrics
-from touchgoal.benchmarks.tacbench_data import (
+from touchgoal.benchmarks.tacbench.benchmark import force_metrics, run, slip_metrics
+from touchgoal.benchmarks.tacbench.data import (
     STRIDE,
     RigFrames,
     read_strokes,
     split_force,
     split_slip,
 )
-from touchgoal.benchmarks.tacbench_tasks import CLASSES, PoseTask, f1_score
+from touchgoal.benchmarks.tacbench.tasks import CLASSES, PoseTask, f1_score
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from touchgoal.benchmarks.real_touch_encoders import untrained
-from touchgoal.benchmarks.tacbench_data import RigFrames, Rows
-from touchgoal.benchmarks.tacbench_tasks import Outputs, Task
+from touchgoal.benchmarks.tacbench.data import RigFrames, Rows
+from touchgoal.benchmarks.tacbench.tasks import Outputs, Task
 from touchgoal.control.errors import UserError
 from touchgoal.control.progress import track
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder

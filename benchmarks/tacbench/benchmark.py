@@ -17,9 +17,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from touchgoal.benchmarks.config import TacbenchOptions
-from touchgoal.benchmarks.tacbench_data import RigFrames, Rows, read_strokes
-from touchgoal.benchmarks.tacbench_figures import Read, draw, table
-from touchgoal.benchmarks.tacbench_probes import (
+from touchgoal.benchmarks.tacbench.data import RigFrames, Rows, read_strokes
+from touchgoal.benchmarks.tacbench.figures import Read, draw
+from touchgoal.benchmarks.tacbench.probes import (
     END_TO_END,
     Inputs,
     PairTokens,
@@ -30,7 +30,8 @@ from touchgoal.benchmarks.tacbench_probes import (
     read,
     train_reader,
 )
-from touchgoal.benchmarks.tacbench_tasks import (
+from touchgoal.benchmarks.tacbench.tables import table
+from touchgoal.benchmarks.tacbench.tasks import (
     CLASSES,
     TASKS,
     ForceTask,

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from touchgoal.benchmarks.tacbench_data import (
+from touchgoal.benchmarks.tacbench.data import (
     RigFrames,
     Rows,
     Split,
