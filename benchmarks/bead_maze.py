@@ -6,7 +6,7 @@ test wires that nothing disturbs unless asked.
 """
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,7 @@ class ShuffledTouchPlanner(Planner):
         self.tick = min(self.tick + self.config.execution_horizon, len(self.recorded_touch) - 1)
         return super().plan(seen)
 
-    def _embed_touch(self, observation: Observation) -> Float[np.ndarray, " e"]:
+    def _embed_touch(self, seen: Sequence[Observation]) -> Float[np.ndarray, " e"]:
         return self.recorded_touch[max(self.tick, 0)]
 
 

@@ -69,7 +69,8 @@ def _stages(config: PolicyLatencyOptions) -> list[Stage]:
         encoder = planner.touch.encoder
         frame = ticks[0][ft.TACTILE_LEFT]
         both = np.concatenate([encoder.preprocess(frame[None], frame)] * 2)
-        touch = torch.from_numpy(both)
+        alike = [torch.from_numpy(both)] * len(encoder.offsets)
+        touch = encoder.stack(torch.stack(alike, 1))
         stages += [
             _time(
                 "preprocess both fingertips",
@@ -92,7 +93,7 @@ def _stages(config: PolicyLatencyOptions) -> list[Stage]:
     stages.append(
         _time("denoising", config.repeats, lambda: policy.head.sample(condition, generator))
     )
-    turn, seen = iter(range(10**9)), planner.config.observation_horizon
+    turn, seen = iter(range(10**9)), planner.ticks_seen
 
     def tick() -> None:
         i = next(turn)

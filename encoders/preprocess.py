@@ -1,6 +1,7 @@
 """Raw fingertip frames to network input: the same numbers in training, tests and deployment."""
 
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -10,6 +11,32 @@ from touchgoal.control.errors import UserError
 
 _BRIGHTNESS_CELL = 4  # px
 _ASPECT_TOLERANCE = 0.02  # a GelSight Mini's own 3280 x 2464 differs from 4:3 by 0.2 %
+
+
+@runtime_checkable  # beartype checks arguments in tests
+class Preprocessor(Protocol):
+    """What makes a network's numbers of raw frames, whatever they are."""
+
+    @property
+    def id(self) -> str:
+        """Changes whenever the numbers do."""
+        ...
+
+    @property
+    def sensor(self) -> str | None:
+        """The only sensor that it is for, if there is but one."""
+        ...
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the output, px."""
+        ...
+
+    def __call__(
+        self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
+    ) -> Float32[np.ndarray, "n 3 H W"]:
+        """Frames of one sensor, given the same sensor untouched; UserError for another's."""
+        ...
 
 
 @dataclass(frozen=True)

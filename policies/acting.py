@@ -33,6 +33,12 @@ class Planner:
     """From the last observations of an episode to a plan.
 
     The same seed and observations give the same plans.
+
+    Attributes:
+        config: of the policy.
+        touch: embedder of the fingertips.
+        ticks_seen: observations to be handed over: the policy's own, and those before them that the embedder looks
+            back to.
     """
 
     def __init__(
@@ -62,6 +68,7 @@ class Planner:
         if config.estimated and estimator is None:
             raise UserError(f"the policy acts on {config.estimated[0]}: give it a state estimator")
         self._policy, self.touch, self._estimator = policy, touch, estimator
+        self.ticks_seen = config.observation_horizon + (touch.reach if touch else 0)
         self.reset(seed)
 
     def reset(self, seed: int = 0) -> None:
@@ -74,8 +81,8 @@ class Planner:
         """Actions from the latest observation on.
 
         Args:
-            seen: the last `observation_horizon` observations, oldest first. The oldest one of the
-                first call is the episode's first, untouched one.
+            seen: the last `ticks_seen` observations, oldest first. The oldest one of the first
+                call is the episode's first, untouched one.
         """
         self.embed(seen)
         _, touch, state = zip(*self._embedded, strict=True)
@@ -86,10 +93,12 @@ class Planner:
     def embed(self, seen: Sequence[Observation]) -> None:
         """Embed these ahead of a `plan` that begins with some of them: most of the work."""
         self._first = self._first or seen[0]
-        self._embedded = [(observation, *self._embed_tick(observation)) for observation in seen]
+        ends = range(len(seen) - self.config.observation_horizon + 1, len(seen) + 1)
+        self._embedded = [(seen[end - 1], *self._embed_tick(seen[:end])) for end in ends]
 
-    def _embed_tick(self, observation: Observation) -> tuple[np.ndarray, np.ndarray]:
-        """The embedding (e,) and the proprioception (s,) of one tick."""
+    def _embed_tick(self, seen: Sequence[Observation]) -> tuple[np.ndarray, np.ndarray]:
+        """The embedding (e,) and the proprioception (s,) of the newest tick."""
+        observation = seen[-1]
         for before, touch, state in self._embedded:
             if before is observation:
                 return touch, state
@@ -99,12 +108,12 @@ class Planner:
         if ft.WRENCH in self.config.proprioception:
             known[ft.WRENCH] = tare(observation[ft.WRENCH], self._first[ft.WRENCH])
         state = np.concatenate([known[key] for key in self.config.proprioception])
-        return self._embed_touch(observation), state
+        return self._embed_touch(seen), state
 
-    def _embed_touch(self, observation: Observation) -> Float32[np.ndarray, " e"]:
+    def _embed_touch(self, seen: Sequence[Observation]) -> Float32[np.ndarray, " e"]:
         if self.touch is None:
             return np.empty(0, np.float32)
-        return self.touch.embed_tick(observation, self._first)
+        return self.touch.embed_tick(seen, self._first)
 
     def _difference_images(self, observation: Observation) -> UInt8[Tensor, "1 k h w 3"] | None:
         end_to_end = self.config.end_to_end
@@ -150,7 +159,7 @@ class PolicyActor:
     def act(self, observation: Observation) -> Float32[np.ndarray, "8"]:
         """The action for the next tick."""
         config, first = self._planner.config, not self._seen
-        before = self._seen or [observation] * config.observation_horizon
+        before = self._seen or [observation] * self._planner.ticks_seen
         self._seen = [*before[1:], observation]
         if first:
             self._todo = list(self._planner.plan(self._seen)[: config.execution_horizon])

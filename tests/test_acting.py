@@ -30,7 +30,7 @@ def test_an_actor_does_its_plans_in_order_and_on_time(plan_ticks: int) -> None:
     policy, ticks = toy_policy(config, toy_dataset(config)).eval(), toy_observations(8)
     actor = PolicyActor(Planner(policy, touch, seed=5), plan_ticks)
     done = [actor.act(dict(tick)) for tick in ticks]  # nobody else keeps them
-    rows = np.stack([touch.embed_tick(tick, ticks[0]) for tick in ticks])
+    rows = np.stack([touch.embed_tick([tick], ticks[0]) for tick in ticks])
     states = np.stack([np.concatenate([tick[ft.STATE], tick[ft.TCP_POSE]]) for tick in ticks])
     generator, expected = torch_rng(5), []
     for asked in range(0, 8, 3):  # ticks on whose observation a plan is made

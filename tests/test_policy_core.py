@@ -302,7 +302,7 @@ def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert torch.equal(first.touch[4:], again.touch)
     assert first.state.shape == (10, 22) and torch.equal(first.actions[4:], again.actions)
     frames = toy_observations(4)
-    row = torch.from_numpy(embedder.embed_tick(frames[3], frames[0])).half()
+    row = torch.from_numpy(embedder.embed_tick([frames[3]], frames[0])).half()
     torch.testing.assert_close(first.touch[3], row, rtol=1e-2, atol=1e-2)
     assert validate(tmp_path / "set/episodes") == []  # what is kept inside the set is no damage
     kept = list((tmp_path / "set/episodes/.cache/embeddings/toy").iterdir())

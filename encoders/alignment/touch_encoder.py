@@ -76,7 +76,7 @@ class TouchEncoder(BaseTouchEncoder):
 
     def __init__(self, config: TouchEncoderConfig) -> None:
         """Builds a randomly initialised encoder; UserError for an unknown sensor."""
-        super().__init__(config.sensor, config.embedding_dim)
+        super().__init__(preprocessor_for(config.sensor), config.embedding_dim)
         self.config = config
         self.backbone = ViT(config.vit)
         d = config.embedding_dim

@@ -70,9 +70,9 @@ class PooledEncoder(BaseTouchEncoder):
     whitening: Float[Tensor, "d d"]
 
     def __init__(self, config: PooledEncoderConfig) -> None:
-        super().__init__(config.sensor, config.features)
-        self.config = config
-        self.preprocess = steady_preprocessor_for(config.sensor)
+        preprocess = steady_preprocessor_for(config.sensor)
+        super().__init__(preprocess, config.features)
+        self.config, self._scale = config, preprocess.scale
         self.register_buffer("mean", torch.zeros(config.features))
         self.register_buffer("whitening", torch.eye(config.features))
         self._network = [load_efficientnet_lite0()]  # in a list: no part of the state
@@ -90,7 +90,7 @@ class PooledEncoder(BaseTouchEncoder):
         return self._length(touch)[:, None] * direction
 
     def _length(self, touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, " n"]:
-        square = (self.preprocess.scale * touch).square().sum(1)
+        square = (self._scale * touch).square().sum(1)
         strength = F.adaptive_avg_pool2d(square, _CELLS).amax((1, 2)).sqrt()
         return strength**4 / (strength**4 + _HALF_LENGTH**4)
 
@@ -106,7 +106,7 @@ class PooledEncoder(BaseTouchEncoder):
     @torch.no_grad()
     def _stages(self, touch: Float[Tensor, "n 3 h w"]) -> list[Float[Tensor, "n _ _ _"]]:
         network = self._network[0].to(touch.device)
-        drawn = (128 + _CONTRAST * self.preprocess.scale * touch).clamp(0, 255) / 255
+        drawn = (128 + _CONTRAST * self._scale * touch).clamp(0, 255) / 255
         x = network.stem(imagenet_normalised(drawn).contiguous(memory_format=torch.channels_last))
         stages, wanted = [], {block for block, _ in STAGES}
         for i in range(STAGES[-1][0] + 1):

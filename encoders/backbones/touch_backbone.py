@@ -8,8 +8,9 @@ from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor, nn
 
 from touchgoal.control.errors import UserError
+from touchgoal.encoders.backbones.frame_history import frame_offsets, past_rows, stack_frames
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
-from touchgoal.encoders.preprocess import TactilePreprocessor, check_pictures, preprocessor_for
+from touchgoal.encoders.preprocess import Preprocessor, check_pictures, preprocessor_for
 
 BATCH = 64  # frames at once
 
@@ -22,16 +23,19 @@ class TouchBackboneConfig:
         vit: Its size.
         sensor: Name of the fingertip sensor.
         preprocessor: `TactilePreprocessor.id` in use at training.
+        stride: Frames from one that an embedding sees to the one before, where it sees several: two on top of each
+            other (a ViT of six channels) or a clip (one with tubelets).
     """
 
     vit: ViTConfig
     sensor: str
     preprocessor: str
+    stride: int = 1
 
     @classmethod
-    def for_sensor(cls, vit: ViTConfig, sensor: str) -> "TouchBackboneConfig":
+    def for_sensor(cls, vit: ViTConfig, sensor: str, stride: int = 1) -> "TouchBackboneConfig":
         """The configuration for a sensor; UserError for an unknown one."""
-        return cls(vit, sensor, preprocessor_for(sensor).id)
+        return cls(vit, sensor, preprocessor_for(sensor).id, stride)
 
     @property
     def embedding_dim(self) -> int:
@@ -40,19 +44,31 @@ class TouchBackboneConfig:
 
 
 class BaseTouchEncoder(nn.Module):
-    """What embeds touch, of any kind: subclasses say how preprocessed frames become embeddings."""
+    """What embeds touch, of any kind: subclasses say how preprocessed frames become embeddings.
 
-    def __init__(self, sensor: str, embedding_dim: int) -> None:
-        """For a sensor; UserError for an unknown one."""
+    Attributes:
+        preprocess: raw frames to a network's numbers.
+        offsets: how many frames before the newest one lies each that an embedding sees, the newest first: (0,) of
+            an encoder of single frames, (0, 5) of one of two that lie 5 apart.
+    """
+
+    def __init__(
+        self, preprocess: Preprocessor, embedding_dim: int, offsets: tuple[int, ...] = (0,)
+    ) -> None:
+        """Keeps these."""
         super().__init__()
-        self.preprocess: TactilePreprocessor = preprocessor_for(sensor)
+        self.preprocess, self.offsets = preprocess, offsets
         self._width = embedding_dim
 
     def embed_touch(
-        self, touch: Float[Tensor, "n 3 h w"], ids_keep: Int[Tensor, "n k"] | None = None
+        self, touch: Float[Tensor, "n c *t h w"], ids_keep: Int[Tensor, "n k"] | None = None
     ) -> Float[Tensor, "n d"]:
-        """Embeds preprocessed frames, of which only the patches in `ids_keep` are seen if given."""
+        """Embeds what `stack` made, of which only the patches in `ids_keep` are seen if given."""
         raise NotImplementedError
+
+    def stack(self, frames: Float[Tensor, "n t 3 h w"]) -> Float[Tensor, "n c *t h w"]:
+        """The network's input: preprocessed frames at `offsets`, put together."""
+        return frames[:, 0]
 
     @property
     def device(self) -> torch.device:
@@ -68,7 +84,9 @@ class BaseTouchEncoder(nn.Module):
 
         Args:
             images: One RGB picture, uint8 (height, width, 3), values 0 to 255, or several of them
-                in time, (n, height, width, 3), as the sensor gives them: any size of its shape.
+                in time, (n, height, width, 3), as the sensor gives them: any size of its shape. An
+                encoder that sees several frames takes the true earlier ones among these; for a
+                single picture, and before the first, the earliest there is stands for them.
             background: The same sensor untouched, (height, width, 3). Default: the first of several
                 pictures, which must then be free of contact.
 
@@ -98,18 +116,31 @@ class BaseTouchEncoder(nn.Module):
 
     @torch.no_grad()
     def embed_frames(
-        self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
-    ) -> Float32[np.ndarray, "n d"]:
+        self,
+        frames: UInt8[np.ndarray, "n h w 3"],
+        background: UInt8[np.ndarray, "h w 3"],
+        rows: Int[np.ndarray, " k"] | None = None,
+    ) -> Float32[np.ndarray, "k d"]:
         """Embeds raw frames of one sensor, given the same sensor untouched.
+
+        Args:
+            frames: One after the other, as they were recorded. An encoder that sees several takes
+                the earlier ones at its `offsets` among these; before the first, that one again.
+            background: The sensor untouched.
+            rows: Which to embed; all when None.
 
         Raises:
             UserError: The frames are not of this encoder's sensor.
         """
-        rows = np.empty((len(frames), self._width), np.float32)
-        for i in range(0, len(frames), BATCH):
-            touch = torch.from_numpy(self.preprocess(frames[i : i + BATCH], background))
-            rows[i : i + BATCH] = self.embed_touch(touch.to(self.device)).cpu().numpy()
-        return rows
+        rows = np.arange(len(frames)) if rows is None else rows
+        embedded = np.empty((len(rows), self._width), np.float32)
+        for i in range(0, len(rows), BATCH):
+            seen = past_rows(rows[i : i + BATCH], self.offsets)
+            once, where = np.unique(seen, return_inverse=True)
+            touch = torch.from_numpy(self.preprocess(frames[once], background))
+            stacked = self.stack(touch[torch.from_numpy(where.reshape(seen.shape))])
+            embedded[i : i + BATCH] = self.embed_touch(stacked.to(self.device)).cpu().numpy()
+        return embedded
 
 
 class TouchBackbone(BaseTouchEncoder):
@@ -117,12 +148,17 @@ class TouchBackbone(BaseTouchEncoder):
 
     def __init__(self, config: TouchBackboneConfig) -> None:
         """Builds a randomly initialised backbone; UserError for an unknown sensor."""
-        super().__init__(config.sensor, config.embedding_dim)
+        offsets = frame_offsets(config.vit, config.stride)
+        super().__init__(preprocessor_for(config.sensor), config.embedding_dim, offsets)
         self.config = config
         self.vit = ViT(config.vit)
 
     def embed_touch(
-        self, touch: Float[Tensor, "n 3 h w"], ids_keep: Int[Tensor, "n k"] | None = None
+        self, touch: Float[Tensor, "n c *t h w"], ids_keep: Int[Tensor, "n k"] | None = None
     ) -> Float[Tensor, "n d"]:
         """See BaseTouchEncoder."""
         return self.vit.features(touch, ids_keep)
+
+    def stack(self, frames: Float[Tensor, "n t 3 h w"]) -> Float[Tensor, "n c *t h w"]:
+        """See BaseTouchEncoder."""
+        return stack_frames(frames, self.config.vit)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 
 from touchgoal.control import features as ft
+from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.training.checkpoint import has_checkpoint
 from touchgoal.encoders.training.trainer import is_first_process
@@ -44,6 +45,8 @@ def run_command(config: Config) -> None:
     sets = open_sets(config.data, config.validation)
     encoder = config.encoder or pretrained.DEFAULT_ENCODER
     touch = load_touch(encoder)
+    if touch.reach:
+        raise UserError(f"an estimator reads single frames, {encoder} looks back: give another")
     out = open_training(config, "train-estimators")
     torch.manual_seed(config.seed)
     network = StateEstimatorNetwork(

@@ -86,6 +86,7 @@ class UserPolicyPlanner:
     """A policy of one's own as plans of one tick, so that the loop never waits for a slow one."""
 
     config = _EveryTick()
+    ticks_seen = 1
 
     def __init__(self, policy: UserPolicy) -> None:
         self._policy = policy

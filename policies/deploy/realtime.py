@@ -50,6 +50,8 @@ class ChunkPlanner(Protocol):
 
     @property
     def config(self) -> Horizons: ...  # noqa: D102
+    @property
+    def ticks_seen(self) -> int: ...  # noqa: D102
     def embed(self, seen: Sequence[Observation]) -> None: ...  # noqa: D102
     def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]: ...  # noqa: D102
 
@@ -102,7 +104,7 @@ class RealTimeActor:
             UserError: there is none in 20 s.
         """
         with self._condition:
-            self._history = [observation] * self._config.observation_horizon
+            self._history = [observation] * self._planner.ticks_seen
             self._request = _Request(0, self._history, time.monotonic())
             self._thread.start()
             if not self._condition.wait_for(self._nothing_asked, _FIRST_PLAN_TIMEOUT):

@@ -1,7 +1,7 @@
 """What a policy feels: both fingertips through a frozen touch encoder."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from jaxtyping import Float32
 from touchgoal.control import features as ft
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
+from touchgoal.encoders.backbones.frame_history import RecentFrames
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.ssl.frames import check_sensor
@@ -26,12 +27,17 @@ class TouchEmbedder:
         name: changes whenever the embeddings would; becomes `PolicyConfig.touch`.
         dim: of a row.
         sensor: name of the fingertip sensor.
+        reach: how many ticks back an embedding sees; 0 of an encoder of single frames.
     """
 
     def __init__(self, encoder: TouchEncoder | TouchBackbone | PooledEncoder, name: str) -> None:
         self.encoder, self.name = encoder, name
         self.dim = len(ft.TACTILE) * encoder.config.embedding_dim
         self.sensor = encoder.config.sensor
+        self.reach = max(encoder.offsets)
+        self._recent = {
+            key: RecentFrames(encoder.preprocess, encoder.offsets) for key in ft.TACTILE
+        }
 
     def embed(self, episodes: EpisodeSet, i: int) -> Float32[np.ndarray, "t e"]:
         """All ticks of an episode; UserError if it was recorded with another sensor."""
@@ -42,11 +48,21 @@ class TouchEmbedder:
 
     @torch.no_grad()
     def embed_tick(
-        self, observation: Mapping[str, np.ndarray], untouched: Mapping[str, np.ndarray]
+        self, seen: Sequence[Mapping[str, np.ndarray]], untouched: Mapping[str, np.ndarray]
     ) -> Float32[np.ndarray, " e"]:
-        """One tick, given an observation without touch."""
-        sides = [self.encoder.preprocess(observation[k][None], untouched[k]) for k in ft.TACTILE]
-        return self.encoder.embed_touch(torch.from_numpy(np.concatenate(sides))).numpy().ravel()
+        """The newest tick, as `embed` would have it.
+
+        Args:
+            seen: the last `1 + reach` observations, oldest first; if fewer, the oldest stands for
+                those before. Frames of one that was seen before, the same object, are not
+                preprocessed again.
+            untouched: an observation without touch.
+        """
+        sides = [
+            self._recent[key].latest([tick[key] for tick in seen], untouched[key])
+            for key in ft.TACTILE
+        ]
+        return self.encoder.embed_touch(self.encoder.stack(torch.cat(sides))).numpy().ravel()
 
 
 def load_touch(name_or_path: str | Path) -> TouchEmbedder:
@@ -59,4 +75,6 @@ def load_touch(name_or_path: str | Path) -> TouchEmbedder:
     digest = hashlib.sha256(
         pretrained.ENCODER_FORMAT.weights_path(directory).read_bytes()
     ).hexdigest()[:12]
-    return TouchEmbedder(encoder, f"{encoder.config.preprocessor}/{digest}")
+    offsets = encoder.offsets
+    seen = f"/frames{'-'.join(map(str, offsets))}" if len(offsets) > 1 else ""
+    return TouchEmbedder(encoder, f"{encoder.config.preprocessor}/{digest}{seen}")

@@ -97,7 +97,7 @@ class StateEstimator:
             pictures = {key: self._picture(key, first[key]) for key in self.cameras}
             tcp = torch.from_numpy(first[ft.TCP_POSE])[None]
             self._start = first, self.network.pose_estimator(pictures, tcp)[0].numpy()
-        touch = torch.from_numpy(self.touch.embed_tick(observation, first))[None]
+        touch = torch.from_numpy(self.touch.embed_tick([observation], first))[None]
         contact = self.network.contact(touch).sigmoid()[0].numpy()
         return {ft.TRUTH_CONTACT: contact, ft.TRUTH_START: self._start[1]}
 
