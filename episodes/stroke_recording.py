@@ -50,7 +50,8 @@ def record_slides(root: Path, config: RigConfig, count: int, workers: int) -> Ep
 
 def _description(config: RigConfig, things: tuple[str, ...]) -> str:
     low, high = config.load
-    return f"{config.sensor}, {'+'.join(things)}, {low:g} to {high:g} N, seed {config.seed}"
+    loads = f"{low:g} to {high:g} N{', no relief' * (not config.shear_relief)}"
+    return f"{config.sensor}, {'+'.join(things)}, {loads}, seed {config.seed}"
 
 
 def _record_missing(

@@ -330,11 +330,13 @@ class RigConfig:
     """What is pressed into what."""
 
     sensor: str = "gelsight_mini_markers"
-    """Fingertip sensor, by name or folder of a sensor file. In this simulator shear shows in printed dots
-    alone: without them neither shear nor slip can be told."""
+    """Fingertip sensor, by name or folder of a sensor file."""
     indenters: tuple[Indenter, ...] = ("sphere", "sharp", "flat")
     """Probes, which strokes take in turn."""
     load: Annotated[PositiveRange, RARE] = (0.5, 5.0)
     """Least and most normal load, N."""
+    shear_relief: bool = True
+    """The gel piles up in front of what is drawn over it and sinks behind, the one trace of shear in pictures without
+    printed dots. Shipped encoders were trained on pictures without it."""
     seed: Seed = 0
     """Random seed of the sensor's unit and of all strokes."""

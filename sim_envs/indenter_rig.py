@@ -83,7 +83,7 @@ def simulate(config: RigConfig, index: int) -> Stroke:
     indenter = config.indenters[index % len(config.indenters)]
     friction = FRICTION * (1 + FRICTION_SPREAD * rng.uniform(-1, 1))
     path = _draw_path(config, sensor, friction, rng)
-    bench = PressBench(_probe(indenter, friction), sensor, rig_unit(config))
+    bench = PressBench(_probe(indenter, friction), sensor, rig_unit(config), config.shear_relief)
     frames, wrenches, slips = [], [], []
     for load, shear, place, slip in _loads(path, sensor, friction):
         bench.place(np.array([*place, 0.0]))

@@ -58,7 +58,7 @@ def simulate_slide(config: RigConfig, index: int) -> Slide:
     pose = _draw_poses(rng)
     pull, slip = pulled(pose[:, :2], sensor.shear_stiffness, FRICTION * load)
     body, flat = _body(held)
-    bench = PressBench(body, sensor, rig_unit(config))
+    bench = PressBench(body, sensor, rig_unit(config), config.shear_relief)
     frames, wrenches = [], []
     for i in range(REST + FRAMES):
         k = max(i - REST, 0)

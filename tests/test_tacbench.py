@@ -69,6 +69,25 @@ def test_the_pad_slips_where_the_rig_slides() -> None:
         assert field.wrench()[:3] == pytest.approx([pull, 0, -2.0], abs=1e-3)
 
 
+def test_shear_shows_on_a_gel_without_dots_and_only_there() -> None:
+    pictures = {}
+    for relief in (False, True):
+        bench = PressBench(
+            Body(CATALOGUE["glass_ball"], (4e-3,), 0.1), GELSIGHT_MINI, rig_unit(RIG), relief
+        )
+        bench.place(np.zeros(3))
+        for pull in (0.0, 1.5):
+            sensed = bench.sense(3.0, np.random.default_rng(0), (pull, 0.0), depth=-1.5e-4)
+            pictures[relief, pull] = sensed.image.astype(int), 1e6 * sensed.surface
+    assert np.array_equal(pictures[True, 0.0][0], pictures[False, 0.0][0])
+    added = pictures[True, 1.5][1] - pictures[False, 1.5][1]
+    half = added.shape[1] // 2
+    assert (
+        added[:, :half].max() > 5 and added[:, half:].min() < -5
+    )  # um: sunk behind, piled up in front
+    assert np.abs(pictures[True, 1.5][0] - pictures[False, 1.5][0]).max() >= 4
+
+
 def test_a_stroke_is_untouched_pressed_and_drawn_the_same_each_time() -> None:
     stroke, again = simulate(RIG, 4), simulate(RIG, 4)
     assert np.array_equal(stroke.frames, again.frames) and stroke.indenter == "sharp"

@@ -29,6 +29,7 @@ from touchgoal.sim_envs.tactile.markers import GelMotion, draw
 from touchgoal.sim_envs.tactile.optics import render, render_untouched
 from touchgoal.sim_envs.tactile.press import Press, press_until_balanced
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance
+from touchgoal.sim_envs.tactile.shear_relief import ShearRelief
 from touchgoal.sim_envs.tactile.texture import add_texture
 
 _PRIMITIVES = {
@@ -90,7 +91,9 @@ class TactilePad:
         sensor: SensorModel,
         instance: SensorInstance,
         bodies: list[Body],
+        relief: bool = False,
     ) -> None:
+        """Of one fingertip; with `relief` its surface rises and sinks where friction pulls along it."""
         self._model, self._sensor, self._instance = model, sensor, instance
         self._site = model.site(f"{side}_sensor").id
         self._materials = {int(model.body(b.name).id): b.kind.material for b in bodies}
@@ -107,6 +110,7 @@ class TactilePad:
         self._gel_grid = _gel_grid(sensor, pitch * _COARSE)
         self._field: ForceField | None = None
         self._motion = self._gel_motion() if len(instance.markers) else None
+        self._relief = ShearRelief(sensor, self._gel_grid, self._image_grid) if relief else None
 
     def sense(
         self, data: mujoco.MjData, contact: PadContact, rng: np.random.Generator
@@ -121,6 +125,8 @@ class TactilePad:
             press, self._field, contact, self._friction(contact), self._sensor
         )
         surface = deform(overlap, self._image_grid.pitch, self._instance.calibration.blur_sigmas)
+        if self._relief is not None:
+            surface += self._relief(self._field, overlap)
         image = render(surface, self._instance, rng)
         if self._motion is not None:
             moved = self._motion(self._field) / np.float32(self._instance.pixel_pitch)

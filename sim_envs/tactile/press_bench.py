@@ -18,13 +18,16 @@ class PressBench:
     Forces are taken as given, not solved for: any press can be asked for, possible or not.
     """
 
-    def __init__(self, body: Body, sensor: SensorModel, instance: SensorInstance) -> None:
+    def __init__(
+        self, body: Body, sensor: SensorModel, instance: SensorInstance, relief: bool = False
+    ) -> None:
+        """With one object; see TactilePad for `relief`."""
         self._model = _scene(body)
         self._data = mujoco.MjData(self._model)
         mujoco.mj_forward(self._model, self._data)
         self._name = body.name
         self._geoms = frozenset({int(self._model.body(body.name).geomadr[0])})
-        self._pad = TactilePad(self._model, "left", sensor, instance, [body])
+        self._pad = TactilePad(self._model, "left", sensor, instance, [body], relief)
 
     def place(
         self, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"] | None = None

@@ -1,0 +1,75 @@
+"""How a gel's surface rises and sinks where friction pulls along it.
+
+In front of what is drawn over a gel its surface piles up, behind it sinks: the trace of shear in the
+picture of a gel without printed dots. The gel is the elastic layer of `markers.layer_compliance`. A load
+there squeezes the surface aside by minus S times the pressure's gradient; by Betti's reciprocity
+the surface sinks by S times the traction's divergence.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32
+
+from touchgoal.control.tactile.sensor_models import SensorModel
+from touchgoal.sim_envs.tactile.forces import ForceField
+from touchgoal.sim_envs.tactile.geometry import Grid
+from touchgoal.sim_envs.tactile.markers import layer_compliance
+
+_RIM = 0.3e-3  # m: how softly the relief ends where an object holds the surface
+
+
+class ShearRelief:
+    """Depth that a contact's shear adds to a gel's surface.
+
+    As in `markers.GelMotion` shear is scaled so that the patch moves, on the average over the pressure,
+    as far as MuJoCo's plate.
+    """
+
+    def __init__(self, sensor: SensorModel, gel: Grid, image: Grid) -> None:
+        """Prepare for forces on the gel's cells, two by two of `gel`, and surfaces on `image`."""
+        self._stiffness, self._pitch = sensor.shear_stiffness, 2 * gel.pitch
+        self._image = image
+        size = 2.2 * max(sensor.gel_size)  # apart, or the transform would wrap around
+        self._n = 1 << int(np.ceil(np.log2(size / self._pitch)))
+        self._kx = 2 * np.pi * np.fft.rfftfreq(self._n, self._pitch)[None]
+        self._ky = 2 * np.pi * np.fft.fftfreq(self._n, self._pitch)[:, None]
+        wave = np.hypot(self._kx, self._ky)
+        along, across, self._squeeze = layer_compliance(sensor, wave)
+        share = np.stack([self._kx + 0 * self._ky, self._ky + 0 * self._kx])
+        self._give = across + (along - across) * (share / np.maximum(wave, 1e-3)) ** 2
+
+    def __call__(
+        self, field: ForceField, overlap: Float32[np.ndarray, "h w"]
+    ) -> Float32[np.ndarray, "h w"]:
+        """Depth (m) to be added to the surface; none where the object itself holds it.
+
+        Args:
+            field: of the contact.
+            overlap: of the object with the undeformed gel, on the image's grid.
+        """
+        sinks = self.depth(field)
+        h, w = overlap.shape
+        cells = self._pitch / self._image.pitch  # of the image, for one of the forces
+        # A force cell, displaced with its gel, over a pixel of the surface.
+        middle = np.array(sinks.shape[::-1]) / 2 - 0.5
+        middle -= np.array(field.displacement[:2]) / self._pitch
+        shift = middle - (np.array([w, h]) / 2 - 0.5) / cells
+        to_cells = np.column_stack([np.eye(2) / cells, shift])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        relief = cv2.warpAffine(sinks.astype(np.float32), to_cells, (w, h), flags=flags)
+        free = (overlap <= 0).astype(np.float32)
+        return relief * cv2.GaussianBlur(free, (0, 0), _RIM / self._image.pitch)
+
+    def depth(self, field: ForceField) -> Float[np.ndarray, "h w"]:
+        """How far the surface would sink under the shear alone, m, on the field's cells."""
+        h, w = field.normal.shape
+        area, shape = self._pitch**2, (self._n, self._n)
+        if not field.normal.any():
+            return np.zeros((h, w))
+        pressure = np.fft.rfft2(field.normal / area, shape)
+        yielding = np.fft.irfft2(self._give * pressure, shape)[:, :h, :w]
+        give = (yielding * field.normal).sum((1, 2))  # of the patch under unit-like traction
+        scale = field.normal.sum() ** 2 / (self._stiffness * give)
+        x, y = np.fft.rfft2(field.tangential * scale[:, None, None] / area, shape)
+        spectrum = 1j * self._squeeze * (self._kx * x + self._ky * y)
+        return np.fft.irfft2(spectrum, shape)[:h, :w]
