@@ -12,6 +12,7 @@ from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEnc
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import ViTConfig
 from touchgoal.encoders.preprocess import preprocessor_for, steady_preprocessor_for
+from touchgoal.encoders.published import is_published, load_published
 from touchgoal.encoders.towers.towers import same_towers
 from touchgoal.encoders.training.weights import WeightsFormat
 
@@ -116,6 +117,11 @@ def find_encoder(name_or_path: str | Path) -> Path:
     for directory in (Path(name), _WEIGHTS / name, _WEIGHTS / f"{name}_offline"):
         if (directory / "encoder.json").is_file():
             return directory
+    if is_published(name):
+        raise UserError(
+            f"{name} are published weights, and this takes a folder of ours: make one of them, see "
+            "load_published in touchgoal.encoders.published"
+        )
     if Path(name).is_dir():
         raise UserError(f"no touch encoder in {name}: {ENCODER_FORMAT.remedy}")
     raise UserError(
@@ -125,14 +131,19 @@ def find_encoder(name_or_path: str | Path) -> Path:
 
 
 def load_encoder(name_or_path: str | Path) -> TouchEncoder | TouchBackbone | PooledEncoder:
-    """A touch encoder of either kind, on the CPU, ready for `embed`; see `find_encoder`.
+    """A touch encoder of any kind, on the CPU, ready for `embed`; see `find_encoder`.
 
         encoder = load_encoder("gelsight_mini")
         embeddings = encoder.embed(pictures)  # uint8 (n, 240, 320, 3); the first one untouched
 
+    Published Sparsh encoders, too: a file in their layout, a folder with one, or an id of Hugging Face such as
+    "facebook/sparsh-dino-base"; see `published.load_published` for their options.
+
     Raises:
-        UserError: no such encoder, or as `load_aligned`.
+        UserError: no such encoder, or as `load_aligned` or `load_published`.
     """
+    if is_published(name_or_path):
+        return load_published(name_or_path)
     directory = find_encoder(name_or_path)
     config = ENCODER_FORMAT.read_json(directory).get("config", {})
     if "features" in config:
@@ -145,12 +156,16 @@ def _check_sensor(
     directory: Path,
     sensor: str | None,
 ) -> None:
-    if sensor is not None and sensor != config.sensor:
+    if sensor is not None and config.sensor not in (None, sensor):
         raise UserError(
             f"the encoder in {directory} is for {config.sensor}, not {sensor}: {ENCODER_FORMAT.remedy}"
         )
-    steady = isinstance(config, PooledEncoderConfig)
-    current = (steady_preprocessor_for if steady else preprocessor_for)(config.sensor).id
+    if isinstance(config, PooledEncoderConfig):
+        current = steady_preprocessor_for(config.sensor).id
+    elif config.sensor is None:  # of Sparsh: made for what the config names
+        return
+    else:
+        current = preprocessor_for(config.sensor).id
     if config.preprocessor != current:
         raise UserError(
             f"the encoder in {directory} needs the preprocessor {config.preprocessor}, this is "

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from touchgoal.control.errors import UserError
 from touchgoal.encoders.backbones.frame_history import frame_offsets, past_rows, stack_frames
+from touchgoal.encoders.backbones.sparsh_input import SparshPreprocessor
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.encoders.preprocess import Preprocessor, check_pictures, preprocessor_for
 
@@ -21,14 +22,14 @@ class TouchBackboneConfig:
 
     Attributes:
         vit: Its size.
-        sensor: Name of the fingertip sensor.
-        preprocessor: `TactilePreprocessor.id` in use at training.
+        sensor: Name of the fingertip sensor; None of a published Sparsh encoder, which takes any.
+        preprocessor: `TactilePreprocessor.id` in use at training, or one of `sparsh_input.py`.
         stride: Frames from one that an embedding sees to the one before, where it sees several: two on top of each
             other (a ViT of six channels) or a clip (one with tubelets).
     """
 
     vit: ViTConfig
-    sensor: str
+    sensor: str | None
     preprocessor: str
     stride: int = 1
 
@@ -41,6 +42,12 @@ class TouchBackboneConfig:
     def embedding_dim(self) -> int:
         """Width of an embedding."""
         return self.vit.width
+
+    def find_preprocessor(self) -> Preprocessor:
+        """The current one of the sensor; UserError for an unknown sensor."""
+        if self.sensor is None:
+            return SparshPreprocessor.of(self.preprocessor, self.vit.image_size)
+        return preprocessor_for(self.sensor)
 
 
 class BaseTouchEncoder(nn.Module):
@@ -146,12 +153,12 @@ class BaseTouchEncoder(nn.Module):
 class TouchBackbone(BaseTouchEncoder):
     """Touch as the mean of a ViT's tokens."""
 
-    def __init__(self, config: TouchBackboneConfig) -> None:
-        """Builds a randomly initialised backbone; UserError for an unknown sensor."""
+    def __init__(self, config: TouchBackboneConfig, vit: ViT | None = None) -> None:
+        """Around a ViT, or a randomly initialised one; UserError for an unknown sensor."""
         offsets = frame_offsets(config.vit, config.stride)
-        super().__init__(preprocessor_for(config.sensor), config.embedding_dim, offsets)
+        super().__init__(config.find_preprocessor(), config.embedding_dim, offsets)
         self.config = config
-        self.vit = ViT(config.vit)
+        self.vit = ViT(config.vit) if vit is None else vit
 
     def embed_touch(
         self, touch: Float[Tensor, "n c *t h w"], ids_keep: Int[Tensor, "n k"] | None = None

@@ -1,0 +1,133 @@
+"""Published Sparsh encoders from raw frames on: input made by hand from the specification, plain torch behind it."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from safetensors.torch import save_file
+from sparsh_files import plain_forward, published
+
+import touchgoal
+from touchgoal.control.errors import UserError
+from touchgoal.encoders.pretrained import find_encoder, load_encoder, save
+from touchgoal.encoders.published import load_published
+from touchgoal.policies.perception.frozen_touch import load_touch
+
+UPRIGHT, SQUARE = (320, 240), (224, 224)
+# What the weights are, the size of their pictures, and how many frames before the newest each one lies.
+METHODS: dict[str, tuple[dict[str, Any], tuple[int, int], tuple[int, ...]]] = {
+    "mae": ({}, UPRIGHT, (0, 5)),
+    "dino": ({"registers": 1}, UPRIGHT, (0, 5)),
+    "ijepa": ({"layer_scale": False, "stored": 196}, SQUARE, (0, 5)),
+    "vjepa": (
+        {"channels": 3, "tubelet": 2, "layer_scale": False, "stored": 392},
+        SQUARE,
+        (0, 2, 4, 6),
+    ),
+}
+
+
+def video(n: int = 9, shape: tuple[int, int] = (240, 320)) -> np.ndarray:
+    """A ramp of colours that no flip or turn leaves alone, and changes that reach the ends of the scale."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    still = np.stack([x % 256, y, (x + y) // 3], 2)
+    change = rng.integers(-200, 200, (n, *shape, 3)) * (np.arange(n) > 1)[:, None, None, None]
+    return (still + change).clip(0, 255).astype(np.uint8)
+
+
+def prepared(frame: np.ndarray, background: np.ndarray | None, size: tuple[int, int]) -> np.ndarray:
+    """One frame, (3, H, W): background removed, turned clockwise, resized, 0 to 1."""
+    if background is not None:
+        change = (frame.astype(float) - background.astype(float)) / 255 + 0.5
+        frame = (255 * np.clip(change, 0, 1)).astype(np.uint8)
+    turned = np.stack([frame[::-1, :, c].T for c in range(3)], 2)  # row r becomes column h - 1 - r
+    resized = Image.fromarray(turned).resize((size[1], size[0]), Image.Resampling.BILINEAR)
+    return (np.asarray(resized) / 255).transpose(2, 0, 1).astype(np.float32)
+
+
+def expected(
+    weights: dict[str, torch.Tensor], frames: np.ndarray, i: int, method: str, subtract: bool = True
+) -> np.ndarray:
+    _, size, offsets = METHODS[method]
+    background = frames[0] if subtract else None
+    seen = [prepared(frames[max(i - back, 0)], background, size) for back in offsets]
+    touch = np.stack(seen, 1) if method == "vjepa" else np.concatenate(seen)
+    return plain_forward(weights, torch.from_numpy(touch)).mean(0).numpy()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_raw_frames_give_the_published_features(tmp_path: Path, method: str) -> None:
+    weights, frames = published(**METHODS[method][0]), video()
+    path = tmp_path / f"{method}_vittiny.safetensors"
+    save_file(weights, path)
+    encoder = touchgoal.load_encoder(path)
+    found = encoder.embed(frames)
+    for i in (0, 3, 8):
+        np.testing.assert_allclose(found[i], expected(weights, frames, i, method), atol=2e-5)
+    single = encoder.embed(frames[3], background=frames[0])
+    alone = np.stack([frames[0], *[frames[3]] * 8])  # a single picture is its own past
+    np.testing.assert_allclose(single, expected(weights, alone, 8, method), atol=2e-5)
+
+
+def test_options_and_a_folder_of_ours(tmp_path: Path) -> None:
+    weights, frames = published(), video()
+    save_file(weights, tmp_path / "mae_vittiny.safetensors")
+    encoder = load_published(tmp_path, stride=1, subtract=False)
+    shifted = np.stack([frames[3]] * 4 + [frames[8]])
+    wanted = expected(weights, shifted, 4, "mae", subtract=False)
+    both = np.stack([frames[3], frames[8]])
+    np.testing.assert_allclose(encoder.embed(both)[1], wanted, atol=2e-5)
+    with pytest.raises(UserError, match="this takes a folder of ours"):
+        find_encoder(tmp_path)
+    save(encoder, tmp_path / "ours", {}, half=False)
+    again = load_touch(tmp_path / "ours")
+    assert again.reach == 1 and again.sensor is None
+    np.testing.assert_array_equal(again.encoder.embed(both), encoder.embed(both))
+
+
+def test_pictures_of_any_sensor_become_upright_four_by_three(tmp_path: Path) -> None:
+    save_file(published(), tmp_path / "mae_vittiny.safetensors")
+    preprocess = load_encoder(tmp_path).preprocess
+    lying = video(3, (48, 100))[2:]  # 64 columns about the centre are 4:3
+    cut = np.ascontiguousarray(lying[:, :, 18:82])
+    assert preprocess(lying, lying[0]).shape == (1, 3, *UPRIGHT)
+    np.testing.assert_array_equal(preprocess(lying, lying[0] // 2), preprocess(cut, cut[0] // 2))
+    upright = np.ascontiguousarray(np.rot90(cut[0], -1))
+    np.testing.assert_array_equal(
+        preprocess(upright[None], upright // 2), preprocess(cut, cut[0] // 2)
+    )
+
+
+def test_ids_of_hugging_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its client's own cache, filled as by a download; nothing is fetched."""
+    constants = pytest.importorskip("huggingface_hub.constants")
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(UserError, match="sparsh-mae-toy is neither in") as refusal:
+        load_encoder("facebook/sparsh-mae-toy")
+    assert "\n" not in str(refusal.value) and "hf download" in str(refusal.value)
+    commit = "0" * 40
+    folder = tmp_path / "models--facebook--sparsh-mae-toy"
+    (folder / "snapshots" / commit).mkdir(parents=True)
+    (folder / "refs").mkdir()
+    (folder / "refs" / "main").write_text(commit)
+    save_file(published(), folder / "snapshots" / commit / "mae_vittiny.safetensors")
+    assert load_encoder("facebook/sparsh-mae-toy").offsets == (0, 5)
+    save_file(published(), folder / "snapshots" / commit / "mae_vitsmall.safetensors")
+    with pytest.raises(UserError, match=r"mae_vitsmall.safetensors, mae_vittiny.safetensors: give"):
+        load_encoder("facebook/sparsh-mae-toy")
+
+
+def test_a_wrong_file_is_refused_in_one_line(tmp_path: Path) -> None:
+    save_file({"conv1.weight": torch.zeros(3)}, tmp_path / "model.safetensors")
+    with pytest.raises(UserError, match="but conv1.weight") as refusal:
+        load_encoder(tmp_path / "model.safetensors")
+    assert "\n" not in str(refusal.value)
+    with pytest.raises(UserError, match="no such file"):
+        load_encoder(tmp_path / "lost.ckpt")
+    with pytest.raises(UserError, match="there is no touch encoder"):
+        load_encoder("facebook/dino")
