@@ -1,0 +1,178 @@
+"""Published layouts of unlabelled touch, written here as their makers write them."""
+
+import io
+import pickle
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from touchgoal.control.errors import UserError
+from touchgoal.episodes.importers.plain_pickle import StoredBytes
+from touchgoal.episodes.importers.pretraining_clips import read_recordings
+from touchgoal.episodes.importers.touch_clip import TouchClip, decode, read_pictures
+
+UNTOUCHED = {"red": (150, 120, 90), "blue": (80, 110, 160)}
+
+
+def gel(seed: int, shape: tuple[int, int] = (320, 240), light: str = "red") -> np.ndarray:
+    """A smooth picture with a bump somewhere."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    place = rng.uniform((0.2, 0.2), (0.8, 0.8)) * shape
+    bump = 70 * np.exp(-((y - place[0]) ** 2 + (x - place[1]) ** 2) / 15**2)
+    return (np.array(UNTOUCHED[light]) + bump[:, :, None] * (1, -0.5, 0.3)).astype(np.uint8)
+
+
+def encoded(picture: np.ndarray, kind: str = "JPEG") -> bytes:
+    """By PIL, which takes RGB."""
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, kind, **({"quality": 95} if kind == "JPEG" else {}))
+    return file.getvalue()
+
+
+def write(path: Path, pictures: list[bytes]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(pickle.dumps(pictures))
+
+
+def write_slides(folder: Path, objects: tuple[str, ...] = ("004_sugar_box", "bread")) -> None:
+    """Sliding touch as YCB-Slide and Touch-Slide come from Sparsh's page: five recordings an object."""
+    for k, name in enumerate(objects):
+        light = ("red", "blue")[k % 2]
+        for i in range(5):
+            frames = [encoded(gel(100 * k + 10 * i + t, light=light)) for t in range(8 + i)]
+            write(folder / name / f"dataset_{i}.pkl", frames)
+    (folder / "bgs").mkdir()
+    for k, light in ((0, "blue"), (10, "red")):
+        plain = np.full((320, 240, 3), UNTOUCHED[light], np.uint8)
+        (folder / "bgs" / f"bg_{k}.jpg").write_bytes(encoded(plain))
+
+
+def near(picture: np.ndarray, true: np.ndarray) -> bool:
+    """As near as JPEG keeps it."""
+    return bool(np.abs(picture.astype(int) - true).mean() < 2)
+
+
+def test_slides_are_upright_digits_with_their_own_untouched_gel(tmp_path: Path) -> None:
+    write_slides(tmp_path)
+    recordings = read_recordings(tmp_path)
+    assert [r.held_out for r in recordings] == 2 * [False, False, False, False, True]
+    assert [len(r.clip) for r in recordings] == 2 * [8, 9, 10, 11, 12]
+    for k, light in ((0, "red"), (1, "blue")):
+        recording = recordings[5 * k + 2]
+        assert recording.clip.sensor == "digit"
+        frames = recording.clip.frames([3, 0])
+        assert frames.shape == (2, 320, 240, 3)
+        assert near(frames[0], gel(100 * k + 23, light=light))
+        assert near(recording.background(), np.full((320, 240, 3), UNTOUCHED[light]))
+    for path in (tmp_path / "bgs").iterdir():
+        path.unlink()  # then a recording's usual picture is its background: bumps are nowhere twice
+    background = read_recordings(tmp_path)[0].background()
+    assert near(background, np.full((320, 240, 3), UNTOUCHED["red"]))
+
+
+def test_a_lying_digit_is_turned_upright(tmp_path: Path) -> None:
+    upright = gel(1)
+    lying = np.rot90(upright)  # what a clockwise quarter turn brings back
+    for i in range(2):
+        write(tmp_path / "mug" / f"dataset_{i}.pkl", [encoded(lying, "PNG")])
+    assert np.array_equal(read_recordings(tmp_path)[0].clip.frames([0])[0], upright)
+
+
+def test_touch_and_go_has_red_and_blue_put_back(tmp_path: Path) -> None:
+    """Its converter gave RGB to OpenCV's writer, which takes BGR."""
+    clips = {f"2022041{i}_031604.pkl": 3 + i for i in range(4)}
+    for name, count in clips.items():
+        pictures = [gel(t, (480, 640)) for t in range(count)]
+        stored = [cv2.imencode(".jpg", picture)[1].tobytes() for picture in pictures]
+        write(tmp_path / name, stored)
+    recordings = read_recordings(tmp_path)
+    assert {r.clip.sensor for r in recordings} == {"gelsight_markers"}
+    assert [r.held_out for r in recordings] == [True, False, False, False]  # the shortest quarter
+    assert near(recordings[2].clip.frames([4])[0], gel(4, (480, 640)))
+    assert read_recordings(tmp_path, "gelsight")[0].clip.sensor == "gelsight"
+    with pytest.raises(UserError, match=r"with gelsight_markers or gelsight, not digit"):
+        read_recordings(tmp_path, "digit")
+
+
+def test_object_folder_is_a_mini(tmp_path: Path) -> None:
+    for i in (1, 2, 3):
+        write(tmp_path / f"{i:03d}.pkl", [encoded(gel(i, (240, 320)))])
+    recordings = read_recordings(tmp_path)
+    assert [r.clip.sensor for r in recordings] == 3 * ["gelsight_mini"]
+    assert [r.held_out for r in recordings] == [False, False, True]
+    assert near(recordings[2].clip.frames([0])[0], gel(3, (240, 320)))
+    assert read_recordings(tmp_path, "gelsight_mini_markers")
+
+
+def test_what_is_no_such_folder_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="is no folder"):
+        read_recordings(tmp_path / "none")
+    with pytest.raises(UserError, match="none of the published layouts"):
+        read_recordings(tmp_path)
+    write(tmp_path / "001.pkl", [encoded(gel(1))])
+    with pytest.raises(UserError, match="one recording: two at least"):
+        read_recordings(tmp_path)
+    write(tmp_path / "002.pkl", [])
+    with pytest.raises(UserError, match="002.pkl holds no picture"):
+        read_recordings(tmp_path)
+    (tmp_path / "002.pkl").write_bytes(pickle.dumps({"gelsightA_before": [b""]}))
+    with pytest.raises(UserError, match="something else than a list of encoded pictures"):
+        read_recordings(tmp_path)
+    write(tmp_path / "002.pkl", [encoded(gel(1)), encoded(gel(1, (240, 240)))])
+    with pytest.raises(UserError, match="pictures of different sizes"):
+        read_recordings(tmp_path)[1].clip.frames([0, 1])
+
+
+def test_pictures_stay_in_their_file_until_asked_for(tmp_path: Path) -> None:
+    """However large a file is: what is kept of it says where, not what."""
+    big = bytes(3_000_000)
+    write(tmp_path / "big.pkl", [big] * 2 + [encoded(gel(1))])
+    with (tmp_path / "big.pkl").open("ab"):
+        pictures = read_pictures(tmp_path / "big.pkl")
+    assert all(isinstance(p, StoredBytes) for p in pictures)
+    assert [p.size for p in pictures][:2] == [len(big)] * 2
+    assert near(TouchClip("big", "digit", pictures).frames([2])[0], gel(1))
+    (tmp_path / "big.pkl").write_bytes(b"short")
+    with pytest.raises(UserError, match="became shorter"):
+        pictures[2].read()
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG"])
+def test_whatever_byte_is_wrong_frames_are_the_same_or_refused(tmp_path: Path, kind: str) -> None:
+    """A PNG's checksums tell every wrong byte; a JPEG that still decodes is whole but for that one."""
+    true = [gel(i, (32, 24)) for i in range(4)]
+    write(tmp_path / "true.pkl", [encoded(picture, kind) for picture in true])
+    whole = TouchClip("true", "digit", read_pictures(tmp_path / "true.pkl"))
+    expected = whole.frames(range(4))
+    data = (tmp_path / "true.pkl").read_bytes()
+    rng = np.random.default_rng(1)
+    path = tmp_path / "broken.pkl"
+    refused = 0
+    for at in rng.permutation(len(data))[:200]:
+        broken = bytearray(data)
+        broken[at] ^= int(rng.integers(1, 256))
+        path.write_bytes(broken)
+        try:
+            frames = TouchClip("broken", "digit", read_pictures(path)).frames(range(4))
+        except UserError:
+            refused += 1
+            continue
+        hit = [p.start <= at < p.start + p.size for p in whole.pictures]
+        assert frames.shape == expected.shape
+        for i in range(4):
+            assert np.array_equal(frames[i], expected[i]) or (kind == "JPEG" and hit[i])
+    assert refused > 30
+
+
+def test_a_picture_of_another_kind_or_a_huge_one_is_refused() -> None:
+    bmp = io.BytesIO()
+    Image.fromarray(gel(1)).save(bmp, "BMP")
+    for data in (b"", b"text", bmp.getvalue(), encoded(gel(1))[:-200], encoded(gel(1), "PNG")[:-1]):
+        with pytest.raises(UserError, match="frame 3 is broken, or no JPEG or PNG"):
+            decode(data, "frame 3")
+    with pytest.raises(UserError, match="make it smaller"):
+        decode(encoded(np.zeros((8000, 8000, 3), np.uint8)), "frame 3")
