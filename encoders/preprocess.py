@@ -141,8 +141,12 @@ def check_pictures(name: str, pictures: object, ndim: tuple[int, ...]) -> None:
 
 
 PREPROCESSORS: dict[str, TactilePreprocessor] = {
-    sensor: TactilePreprocessor(sensor, version=1, size=(120, 160), scale=16.0)
-    for sensor in ("gelsight_mini", "gelsight_mini_markers")
+    sensor: TactilePreprocessor(sensor, version=1, size=size, scale=16.0)
+    for size, sensors in (
+        ((120, 160), ("gelsight_mini", "gelsight_mini_markers", "gelsight", "gelsight_markers")),
+        ((160, 120), ("digit",)),  # upright
+    )
+    for sensor in sensors
 }
 
 

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from safetensors.torch import load_file, save_file
 
 from touchgoal.control.errors import UserError
-from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
+from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.infonce import info_nce, loss_floor, symmetric_info_nce
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
@@ -57,7 +57,10 @@ def make_encoder(pretrained_together: bool = False) -> TouchEncoder:
 
 
 def test_preprocessor_is_named_after_the_sensor() -> None:
-    assert set(PREPROCESSORS) == {GELSIGHT_MINI.name, GELSIGHT_MINI_MARKERS.name}
+    assert set(PREPROCESSORS) == {sensor.name for sensor in SENSORS.values()}
+    for sensor in SENSORS.values():
+        height, width = sensor.image_shape
+        assert PREPROCESSORS[sensor.name].size == (height // 2, width // 2)
     assert MINI.id == "gelsight_mini/v1"
 
 

@@ -1,6 +1,6 @@
 """The touch encoder: a ViT over touch, and heads that meet it in the space of the frozen towers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -54,11 +54,12 @@ class TouchEncoderConfig:
         Raises:
             UserError: Unknown sensor.
         """
+        preprocess = preprocessor_for(sensor)
         return cls(
-            vit=vit,
+            vit=replace(vit, image_size=preprocess.size),
             embedding_dim=towers.image_dim if towers.pretrained_together else embedding_dim,
             sensor=sensor,
-            preprocessor=preprocessor_for(sensor).id,
+            preprocessor=preprocess.id,
             towers=towers.name,
             image_dim=towers.image_dim,
             text_dim=towers.text_dim,

@@ -1,6 +1,6 @@
 """A touch backbone: a ViT over touch alone, as self-supervision leaves it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -35,8 +35,9 @@ class TouchBackboneConfig:
 
     @classmethod
     def for_sensor(cls, vit: ViTConfig, sensor: str, stride: int = 1) -> "TouchBackboneConfig":
-        """The configuration for a sensor; UserError for an unknown one."""
-        return cls(vit, sensor, preprocessor_for(sensor).id, stride)
+        """The configuration for a sensor and its pictures' size; UserError for an unknown one."""
+        preprocess = preprocessor_for(sensor)
+        return cls(replace(vit, image_size=preprocess.size), sensor, preprocess.id, stride)
 
     @property
     def embedding_dim(self) -> int:

@@ -18,7 +18,6 @@ without `bgs/` it is the usual picture itself.
 """
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -153,6 +152,5 @@ def _read(path: Path) -> UInt8[np.ndarray, "h w 3"]:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
 
 
-_natural: Callable[[Path], list[str | int]] = lambda path: [
-    int(part) if part.isdigit() else part for part in re.split(r"(\d+)", str(path))
-]
+def _natural(path: Path) -> list[str | int]:
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", str(path))]
