@@ -1,4 +1,4 @@
-"""Train a touch encoder on recorded episodes: align it with frozen towers, or by masking alone; or on surfaces."""
+"""Train a touch encoder: on recorded episodes, aligned with frozen towers or without labels; or on surfaces."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -8,6 +8,7 @@ from pydantic import Field
 
 from touchgoal.control.option_types import Count, CountOrNone, Seed, checked_dataclass
 from touchgoal.encoders.config import ALIGN_PRESETS, AlignConfig, MaeConfig
+from touchgoal.encoders.ssl.config import DINO_PRESETS, DinoConfig
 from touchgoal.launch.support.training_options import TrainingOptions
 
 
@@ -58,6 +59,37 @@ class Mae(TrainingOptions):
 
 
 @checked_dataclass
+class Distill(TrainingOptions):
+    """Options of the objectives that see several frames at once."""
+
+    out: Path | None = None
+    """Folder of the run; the encoder goes to its `encoder/`."""
+    sensor: str | None = None
+    """Fingertip sensor, for episodes that do not name theirs."""
+    frames: Count = 20
+    """Moments drawn from each episode, both fingertips of each."""
+    stride: Count = 2
+    """Ticks between the frames of a moment: 2 are 0.1 s at 20 Hz, where Sparsh has 0.08 s (5 frames
+    of a sensor at 60 Hz)."""
+
+
+@checked_dataclass
+class Dino(Distill):
+    """Learn touch without labels from two frames, by self-distillation (DINO)."""
+
+    dino: DinoConfig = DINO_PRESETS["default"]
+    """How the encoder is trained."""
+
+
+@checked_dataclass
+class DinoPaper(Dino):
+    """DINO with the training of the Sparsh paper: ViT-B, 150 epochs; meant for large GPUs."""
+
+    dino: DinoConfig = DINO_PRESETS["paper"]
+    """How the encoder is trained."""
+
+
+@checked_dataclass
 class Surfaces:
     """Fit an ImageNet network to touch, on simulated presses of random surfaces: no episodes needed."""
 
@@ -77,6 +109,8 @@ Config = (
     Annotated[Align, tyro.conf.subcommand("align")]
     | Annotated[AlignPaper, tyro.conf.subcommand("align-paper")]
     | Annotated[Mae, tyro.conf.subcommand("mae")]
+    | Annotated[Dino, tyro.conf.subcommand("dino")]
+    | Annotated[DinoPaper, tyro.conf.subcommand("dino-paper")]
     | Annotated[Surfaces, tyro.conf.subcommand("surfaces")]
 )
 

@@ -9,11 +9,11 @@ import torch
 
 from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.backbones.vit import random_masking
+from touchgoal.encoders.backbones.vit import patchify, random_masking
 from touchgoal.encoders.config import MaeConfig, TrainerOptions
 from touchgoal.encoders.probes.ridge import ridge_r2
 from touchgoal.encoders.ssl.frames import TouchFrames
-from touchgoal.encoders.ssl.mae import MaskedAutoencoder, patchify, train_mae
+from touchgoal.encoders.ssl.mae import MaskedAutoencoder, train_mae
 from touchgoal.encoders.training import trainer
 
 SENSOR = "gelsight_mini_markers"

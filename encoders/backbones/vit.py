@@ -212,7 +212,12 @@ class ViT(nn.Module):
         Returns:
             One token for each kept patch in the order of `ids_keep`; the class token, if any, first.
         """
-        tokens = self.embed_patches(images)
+        return self.encode(self.embed_patches(images), ids_keep)[:, self.config.registers :]
+
+    def encode(
+        self, tokens: Float[Tensor, "b n d"], ids_keep: Int[Tensor, "b k"] | None = None
+    ) -> Float[Tensor, "b m d"]:
+        """All normalised output tokens of embedded patches: registers, class token, kept patches."""
         if ids_keep is not None:
             tokens = tokens.gather(1, ids_keep[:, :, None].expand(-1, -1, tokens.shape[2]))
         if self.class_token is not None:
@@ -221,7 +226,7 @@ class ViT(nn.Module):
             tokens = torch.cat([self.registers.expand(len(tokens), -1, -1), tokens], 1)
         for block in self.blocks:
             tokens = block(tokens)
-        return self.norm(tokens[:, self.config.registers :])
+        return self.norm(tokens)
 
     def features(
         self, images: Float[Tensor, "b c *t h w"], ids_keep: Int[Tensor, "b k"] | None = None
@@ -235,6 +240,14 @@ def patch_grid(config: ViTConfig) -> tuple[int, int]:
     """Rows and columns of patches in an image of the configured size."""
     rows, columns = (-(-side // config.patch_size) for side in config.image_size)
     return rows, columns
+
+
+def patchify(images: Float[Tensor, "b c h w"], vit: ViTConfig) -> Float[Tensor, "b n p"]:
+    """The pixels of every patch, row by row, padded with zeros as the backbone does."""
+    size = vit.patch_size
+    h, w = images.shape[2:]
+    padded = F.pad(images, (0, -w % size, 0, -h % size))
+    return F.unfold(padded, size, stride=size).transpose(1, 2)
 
 
 def _grid(config: ViTConfig) -> tuple[int, ...]:

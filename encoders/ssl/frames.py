@@ -10,6 +10,7 @@ from torch import Tensor
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import TACTILE, TRUTH_PAD_WRENCH
 from touchgoal.control.progress import track
+from touchgoal.encoders.backbones.frame_history import past_rows
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.episodes.store import EpisodeSet
 
@@ -19,31 +20,43 @@ class TouchFrames:
     """n touches.
 
     Attributes:
-        touch: Preprocessed frames; half precision, for they fill the memory.
+        touch: Preprocessed frames; half precision, for they fill the memory. Of an objective that sees
+            several at once a moment's frames, the newest first.
         wrench: What the simulator says acts on each pad (N, Nm, pad frame), for probes only;
             None if the episodes do not say.
         sensor: Name of the fingertip sensor.
+        stride: Ticks from one of a moment's frames to the one before.
     """
 
-    touch: Float16[Tensor, "n 3 h w"]
+    touch: Float16[Tensor, "n *t 3 h w"]
     wrench: Float[Tensor, "n 6"] | None
     sensor: str
+    stride: int = 1
 
     def __len__(self) -> int:
         """Number of touches."""
         return len(self.touch)
 
 
-def sample_frames(episodes: EpisodeSet, sensor: str, per_episode: int, seed: int) -> TouchFrames:
+def sample_frames(
+    episodes: EpisodeSet,
+    sensor: str,
+    per_episode: int,
+    seed: int,
+    offsets: tuple[int, ...] | None = None,
+) -> TouchFrames:
     """Draws ticks at random from every episode, and takes both fingertips of each.
 
-    The background is a fingertip's first frame: episodes start untouched.
+    The background is a fingertip's first frame: episodes start untouched. For frames before an
+    episode's first, that one stands, as it does when a policy acts: nothing has touched or moved yet.
 
     Args:
         episodes: A set with touch.
         sensor: Name of the fingertip sensor.
         per_episode: Ticks drawn from each episode; all of a shorter one.
         seed: Of the draw; an episode's draw does not depend on the other episodes.
+        offsets: How many ticks before a drawn one each frame lies that is seen with it, the drawn one's
+            0 first; None for single frames.
 
     Raises:
         UserError: No touch in the set, or another sensor's.
@@ -56,15 +69,23 @@ def sample_frames(episodes: EpisodeSet, sensor: str, per_episode: int, seed: int
     for i in track(range(len(episodes)), "touches", "episode"):
         check_sensor(episodes, i, sensor)
         rng = np.random.default_rng([seed, i])
-        ticks = np.sort(rng.permutation(episodes.lengths[i])[:per_episode]).tolist()
-        frames = episodes.read(i, [*TACTILE, *truth], ticks).frames
+        ticks = np.sort(rng.permutation(episodes.lengths[i])[:per_episode])
+        seen, where = np.unique(past_rows(ticks, offsets or (0,)), return_inverse=True)
+        frames = episodes.read(i, TACTILE, seen.tolist()).frames
         first = episodes.read(i, TACTILE, [0]).frames
+        known = episodes.read(i, truth, ticks.tolist()).frames
         for side, key in enumerate(TACTILE):
-            rows = preprocess(frames[key], first[key][0])
-            touch.append(torch.from_numpy(rows).half())
+            rows = torch.from_numpy(preprocess(frames[key], first[key][0])).half()
+            touch.append(rows[torch.from_numpy(where.reshape(len(ticks), -1))])
             for name in truth:
-                wrench.append(torch.from_numpy(frames[name][:, 6 * side : 6 * side + 6]))
-    return TouchFrames(torch.cat(touch), torch.cat(wrench) if truth else None, sensor)
+                wrench.append(torch.from_numpy(known[name][:, 6 * side : 6 * side + 6]))
+    moments = torch.cat(touch)
+    return TouchFrames(
+        moments if offsets else moments[:, 0],
+        torch.cat(wrench) if truth else None,
+        sensor,
+        offsets[1] if offsets and len(offsets) > 1 else 1,
+    )
 
 
 def check_sensor(episodes: EpisodeSet, i: int, sensor: str) -> None:

@@ -16,17 +16,17 @@ from touchgoal.encoders.backbones.vit import (
     Block,
     ViTConfig,
     patch_grid,
+    patchify,
     random_masking,
     sinusoidal_positions,
 )
 from touchgoal.encoders.config import MaeConfig, TrainerOptions
-from touchgoal.encoders.probes.ridge import ridge_r2
 from touchgoal.encoders.ssl.frames import TouchFrames
+from touchgoal.encoders.ssl.validation import forces_line, read_forces
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
 
 _ENCODER = "encoder"
-_PROBE_SAMPLES = 2048
 
 
 class MaskedAutoencoder(nn.Module):
@@ -93,14 +93,6 @@ class MaskedAutoencoder(nn.Module):
                 f"mask_ratio {self.config.mask_ratio} masks none of {seen} patches, and without "
                 "bottleneck there is nothing to learn: raise it"
             )
-
-
-def patchify(images: Float[Tensor, "b c h w"], vit: ViTConfig) -> Float[Tensor, "b n p"]:
-    """The pixels of every patch, row by row, padded with zeros as the backbone does."""
-    size = vit.patch_size
-    h, w = images.shape[2:]
-    padded = nn.functional.pad(images, (0, -w % size, 0, -h % size))
-    return nn.functional.unfold(padded, size, stride=size).transpose(1, 2)
 
 
 def train_mae(
@@ -170,10 +162,8 @@ def validate(model: MaskedAutoencoder, train: TouchFrames, val: TouchFrames) -> 
     """Losses on other touches, and how well forces can be read from the embedding.
 
     Returns:
-        `validation_loss`; `validation_loss_of_blank`, the loss of drawing an untouched gel;
-        `force_x_r2`, `force_y_r2` (shear along the image's columns and rows), `force_z_r2`: the
-        share of the variance that a linear reading fitted on 2,048 touches of `train` explains, if
-        the episodes know the force.
+        `validation_loss`; `validation_loss_of_blank`, the loss of drawing an untouched gel; and what
+        `read_forces` finds.
     """
     vit, device = model.backbone.config.vit, model.backbone.device
     generator = torch.Generator().manual_seed(0)
@@ -183,19 +173,10 @@ def validate(model: MaskedAutoencoder, train: TouchFrames, val: TouchFrames) -> 
         ids_keep = random_masking(vit, len(touch), model.config.mask_ratio, generator).to(device)
         total += model.loss(touch, ids_keep).item() * len(touch)
         blank += patchify(touch, vit).square().mean().item() * len(touch)
-    metrics = {
+    return {
         "validation_loss": total / len(val),
         "validation_loss_of_blank": blank / len(val),
-    }
-    if train.wrench is None or val.wrench is None:
-        return metrics
-    rows = torch.linspace(0, len(train) - 1, min(_PROBE_SAMPLES, len(train))).long()
-    inputs = _embed(model.backbone, train.touch[rows])
-    r2 = ridge_r2(
-        inputs, train.wrench[rows, :3], _embed(model.backbone, val.touch), val.wrench[:, :3]
-    )
-    return metrics | {
-        f"force_{axis}_r2": value.item() for axis, value in zip("xyz", r2, strict=True)
+        **read_forces(lambda touches: _embed(model.backbone, touches), train, val),
     }
 
 
@@ -205,13 +186,7 @@ def _embed(backbone: TouchBackbone, touch: Tensor) -> Tensor:
 
 
 def _progress(metrics: dict[str, float]) -> str:
-    line = (
-        f"loss {metrics['loss']:.4f} in training, {metrics['validation_loss']:.4f} in validation "
-        f"({metrics['validation_loss_of_blank']:.4f} for drawing an untouched gel)"
-    )
-    forces = [
-        f"{axis} {metrics[f'force_{axis}_r2']:.2f}" for axis in "xyz" if "force_x_r2" in metrics
-    ]
     return (
-        f"{line}; R2 of the force read from the embedding: {', '.join(forces)}" if forces else line
+        f"loss {metrics['loss']:.4f} in training, {metrics['validation_loss']:.4f} in validation "
+        f"({metrics['validation_loss_of_blank']:.4f} for drawing an untouched gel){forces_line(metrics)}"
     )

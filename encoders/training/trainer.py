@@ -44,6 +44,7 @@ class OptimizerConfig:
             that fill no batch are left out of their epoch.
         lr: Highest learning rate.
         weight_decay: Of weight matrices and convolutions; biases, norms, tokens have none.
+        final_weight_decay: The same at the end, reached by a cosine; None: it stays.
         betas: Of Adam.
         decoupled_weight_decay: AdamW (Loshchilov and Hutter 2019); otherwise Adam with weight decay
             as an L2 term in the gradient.
@@ -63,6 +64,7 @@ class OptimizerConfig:
     max_warmup_steps: float = math.inf
     final_lr: float = 0.0
     max_grad_norm: float | None = None
+    final_weight_decay: float | None = None
 
     def __post_init__(self) -> None:
         """Raises UserError for settings that cannot train."""
@@ -84,9 +86,20 @@ class OptimizerConfig:
         cosine = (1 + math.cos(math.pi * (step - warmup) / max(steps - warmup, 1))) / 2
         return self.lr * (self.final_lr + (1 - self.final_lr) * cosine)
 
+    def decay(self, step: int, steps: int) -> float:
+        """The weight decay of a step (from 0) of so many."""
+        if self.final_weight_decay is None:
+            return self.weight_decay
+        share = (1 - math.cos(math.pi * step / steps)) / 2
+        return self.weight_decay + share * (self.final_weight_decay - self.weight_decay)
+
+    def steps(self, n_samples: int) -> int:
+        """Updates of a whole training on so many samples an epoch."""
+        return self.epochs * (n_samples // min(self.batch_size, n_samples))
+
 
 def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
-    """Weights of linear layers and convolutions decay; biases, norms and learned tokens do not."""
+    """First weights of linear layers and convolutions, which decay; then biases, norms and learned tokens."""
     decayed, others = [], []
     for name, parameter in module.named_parameters():
         if not parameter.requires_grad:
@@ -217,15 +230,17 @@ def _train_epoch(
     generator, batches = epoch_batches(training.n_samples, size, seed, epoch)
     if rank:
         generator.manual_seed(generator.initial_seed() + rank * 2**32)
-    steps = config.epochs * len(batches)
+    steps = config.steps(training.n_samples)
     model.train()
     losses: list[dict[str, Tensor]] = []
     name = f"epoch {epoch + 1}/{config.epochs}"
     for i, rows in enumerate(
         tqdm(batches, desc=name, leave=False, disable=None if not rank else True)
     ):
+        step = epoch * len(batches) + i
         for group in optimizer.param_groups:
-            group["lr"] = config.learning_rate(epoch * len(batches) + i, steps)
+            group["lr"] = config.learning_rate(step, steps)
+        optimizer.param_groups[0]["weight_decay"] = config.decay(step, steps)
         batch = send_to_device(training.batch(rows[rank::world], generator), accelerator.device)
         terms = model(**batch)
         optimizer.zero_grad()

@@ -8,8 +8,11 @@ from touchgoal.control.provenance import provenance
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.alignment.align import align
+from touchgoal.encoders.backbones.frame_history import frame_offsets
+from touchgoal.encoders.backbones.sparsh import SPARSH_BASE
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.pretrained import save
+from touchgoal.encoders.ssl.dino import train_dino
 from touchgoal.encoders.ssl.frames import check_sensor, sample_frames
 from touchgoal.encoders.ssl.mae import train_mae
 from touchgoal.encoders.ssl.surface_whitening import WhiteningConfig, train
@@ -24,13 +27,13 @@ from touchgoal.launch.support.training_run import (
     open_training,
     recipe,
 )
-from touchgoal.launch.train_encoder import Align, Mae, Surfaces
+from touchgoal.launch.train_encoder import Align, Dino, Mae, Surfaces
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder
 from touchgoal.rewards.fit_normalizer import fit_normalizer
 from touchgoal.rewards.normalizer import NORMALIZER, scene_of
 
 
-def run_command(config: Align | Mae | Surfaces) -> None:
+def run_command(config: Align | Mae | Dino | Surfaces) -> None:
     """Train one kind of encoder."""
     if isinstance(config, Surfaces):
         _fit_to_surfaces(config)
@@ -40,6 +43,8 @@ def run_command(config: Align | Mae | Surfaces) -> None:
     sensor = _sensor_of(config.sensor, *sets)
     if isinstance(config, Mae):
         _train_mae(config, sensor, *sets)
+    elif isinstance(config, Dino):
+        _distill(config, sensor, *sets)
     else:
         _align(config, sensor, *sets)
 
@@ -75,6 +80,18 @@ def _train_mae(config: Mae, sensor: str, data: EpisodeSet, validation: EpisodeSe
         for episodes in (data, validation)
     )
     train_mae(train, val, config.mae, out, config.trainer, recipe(data, validation))
+    print(f"encoder: {out / 'encoder'}")
+
+
+def _distill(config: Dino, sensor: str, data: EpisodeSet, validation: EpisodeSet) -> None:
+    """Draw moments of several frames, train, save the teacher."""
+    out = open_training(config, "train-encoder")
+    offsets = frame_offsets(SPARSH_BASE["dino"], config.stride)
+    train, val = (
+        sample_frames(episodes, sensor, config.frames, config.seed, offsets)
+        for episodes in (data, validation)
+    )
+    train_dino(train, val, config.dino, out, config.trainer, recipe(data, validation))
     print(f"encoder: {out / 'encoder'}")
 
 

@@ -1,0 +1,181 @@
+"""Self-distillation without labels (DINO: Caron et al. 2021; Sparsh, Higuera et al. 2024) for touch.
+
+Views are blocks of patches of the same touch, as in Sparsh's code, so that none is scaled: how large a
+contact is must stay what it is. From each view the student is to guess what classes the teacher gives
+the other, larger ones; classes have no meaning beforehand.
+"""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
+from touchgoal.encoders.backbones.vit import patch_grid
+from touchgoal.encoders.config import TrainerOptions
+from touchgoal.encoders.ssl.config import DinoConfig
+from touchgoal.encoders.ssl.frames import TouchFrames
+from touchgoal.encoders.ssl.masks import draw_blocks
+from touchgoal.encoders.ssl.self_distillation import (
+    SelfDistillation,
+    frozen_copy,
+    train_self_distilled,
+)
+from touchgoal.encoders.training.trainer import gather_batch
+
+_GLOBAL_VIEWS = 2
+_SINKHORN_ROUNDS = 3
+
+
+class DinoHead(nn.Module):
+    """Three layers to a unit vector, then its cosine with every prototype."""
+
+    def __init__(self, width: int, config: DinoConfig) -> None:
+        """Randomly initialised."""
+        super().__init__()
+        hidden = config.head_width
+        layers: list[nn.Module] = []
+        for size in (width, hidden):
+            layers += [nn.Linear(size, hidden)]
+            layers += [nn.BatchNorm1d(hidden)] if config.batch_norm else []
+            layers += [nn.GELU()]
+        self.mlp = nn.Sequential(*layers, nn.Linear(hidden, config.head_bottleneck))
+        bottleneck, prototypes = config.head_bottleneck, config.prototypes
+        self.prototypes = nn.Linear(bottleneck, prototypes, bias=False)
+
+    def forward(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n p"]:
+        """Scores, -1 to 1."""
+        unit = F.normalize(self.mlp(x).float(), dim=1)
+        return unit @ F.normalize(self.prototypes.weight.float(), dim=1).T
+
+
+class Dino(SelfDistillation):
+    """A student with its head, and the average of both."""
+
+    center: Float[Tensor, " p"]
+
+    def __init__(self, config: DinoConfig, backbone: TouchBackbone, steps: int) -> None:
+        """Randomly initialised; see `SelfDistillation`."""
+        super().__init__(config, backbone, steps)
+        self.config = config
+        self.head = DinoHead(backbone.config.vit.width, config)
+        self.teacher_head = frozen_copy(self.head)
+        self.register_buffer("center", torch.zeros(config.prototypes))
+
+    def averaged(self) -> list[tuple[nn.Module, nn.Module]]:
+        """See `SelfDistillation`."""
+        return [*super().averaged(), (self.teacher_head, self.head)]
+
+    def draw(self, count: int, generator: torch.Generator) -> dict[str, Any]:
+        """Blocks of the picture's own shape: `global_ids` (count, 2, k), `local_ids` (count, v, j)."""
+        grid, config = patch_grid(self.backbone.config.vit), self.config
+        views = {"global_ids": (config.global_scale, _GLOBAL_VIEWS)}
+        views["local_ids"] = (config.local_scale, config.local_views)
+        drawn = {}
+        for name, ((low, high), blocks) in views.items():
+            side = math.sqrt(low + (high - low) * torch.rand((), generator=generator).item())
+            size = max(round(grid[0] * side), 1), max(round(grid[1] * side), 1)
+            drawn[name] = draw_blocks(grid, size, count, blocks, generator)
+        return drawn
+
+    def forward(
+        self, touch: Tensor, global_ids: Int[Tensor, "b 2 k"], local_ids: Int[Tensor, "b v j"]
+    ) -> dict[str, Float[Tensor, ""]]:
+        """The loss, and how many nats the teacher's classes tell of the touch: 0 if all get the same."""
+        images = self.stacked(touch)
+        with torch.no_grad():
+            scores = self._scores(self.teacher, self.teacher_head, images, [global_ids])
+            targets = self._targets(scores)
+        views = [global_ids, local_ids]
+        student = self._scores(self.backbone, self.head, images, views)
+        loss = cross_entropy_of_views(targets, student / self.config.student_temperature)
+        if self.training:
+            self._move_center(scores)
+        return {"loss": loss, "teacher_information": information(targets)}
+
+    def _scores(
+        self, backbone: TouchBackbone, head: DinoHead, images: Tensor, views: list[Tensor]
+    ) -> Float[Tensor, "v b p"]:
+        """Of every view of every touch; patches are embedded once."""
+        vit = backbone.vit
+        patches = vit.embed_patches(images)
+        outputs = []
+        for ids in views:
+            count = ids.shape[1]
+            tokens = vit.encode(patches.repeat(count, 1, 1), ids.transpose(0, 1).flatten(0, 1))
+            registers = vit.config.registers
+            read = (
+                tokens[:, 0] if self.config.reads == "register" else tokens[:, registers:].mean(1)
+            )
+            outputs.append(read.unflatten(0, (count, len(ids))))
+        read = torch.cat(outputs)
+        return head(read.flatten(0, 1)).unflatten(0, read.shape[:2])
+
+    def _targets(self, scores: Float[Tensor, "2 b p"]) -> Float[Tensor, "2 b p"]:
+        """The teacher's distributions over prototypes."""
+        config = self.config
+        warm = min(self.done / config.teacher_warmup, 1.0) if config.teacher_warmup else 1.0
+        first = config.first_teacher_temperature
+        temperature = first + warm * (config.teacher_temperature - first)
+        if config.targets == "centering":
+            return ((scores - self.center) / temperature).softmax(2)
+        return torch.stack([sinkhorn(view / temperature) for view in scores])
+
+    @torch.no_grad()
+    def _move_center(self, scores: Float[Tensor, "2 b p"]) -> None:
+        mean = gather_batch(scores.flatten(0, 1)).mean(0)
+        self.center.lerp_(mean, 1 - self.config.center_momentum)
+
+
+def cross_entropy_of_views(
+    targets: Float[Tensor, "g b p"], logits: Float[Tensor, "v b p"]
+) -> Float[Tensor, ""]:
+    """Mean over all pairs of a teacher's and another student's view (Caron et al. 2021, equation 3).
+
+    Args:
+        targets: The teacher's distributions for the first g views.
+        logits: The student's for all views.
+    """
+    pairs = -torch.einsum("gbp,vbp->gv", targets, logits.log_softmax(2)) / targets.shape[1]
+    same = torch.eye(*pairs.shape, dtype=torch.bool, device=pairs.device)
+    return pairs[~same].mean()
+
+
+def information(targets: Float[Tensor, "v b p"]) -> Float[Tensor, ""]:
+    """Mutual information of touch and class within a batch, nats; at most the logarithm of its size."""
+    common, own = torch.special.entr(targets.mean(1)).sum(1), torch.special.entr(targets).sum(2)
+    return common.mean() - own.mean()
+
+
+def sinkhorn(logits: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
+    """Distributions over prototypes that use all prototypes alike (Caron et al. 2020).
+
+    Rows and columns are scaled in turn, over the touches of all processes.
+    """
+    every = gather_batch(logits)
+    Q = (every - every.max()).exp()
+    for _ in range(_SINKHORN_ROUNDS):
+        Q = Q / Q.sum(0) / Q.shape[1]
+        Q = Q / Q.sum(1, keepdim=True) / len(Q)
+    own = torch.distributed.get_rank() * len(logits) if len(every) > len(logits) else 0
+    return Q[own : own + len(logits)] * len(Q)
+
+
+def train_dino(
+    train: TouchFrames,
+    val: TouchFrames,
+    config: DinoConfig,
+    out_dir: Path,
+    options: TrainerOptions,
+    recipe: dict[str, Any],
+) -> TouchBackbone:
+    """Trains a backbone by DINO; see `train_self_distilled`."""
+
+    def build(backbone: TouchBackbone, steps: int) -> Dino:
+        return Dino(config, backbone, steps)
+
+    return train_self_distilled("dino", build, train, val, config, out_dir, options, recipe)

@@ -1,0 +1,103 @@
+"""Which patches a network sees and which it is asked for: blocks of a grid, drawn for a whole batch.
+
+A block's size is drawn once a batch, so that its patches make a rectangular tensor; its place is drawn
+for every picture. Indices count row by row, as `ViT.forward` wants them; those of one block are sorted.
+"""
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from touchgoal.control.errors import UserError
+
+_TRIES = 100
+
+
+def draw_size(
+    grid: tuple[int, int],
+    scale: tuple[float, float],
+    aspect: tuple[float, float],
+    generator: torch.Generator,
+) -> tuple[int, int]:
+    """Rows and columns of a block.
+
+    Args:
+        grid: Rows and columns of patches.
+        scale: Least and greatest share of the patches.
+        aspect: Least and greatest height over width.
+        generator: Of the draw.
+    """
+    share, ratio = (
+        low + (high - low) * torch.rand((), generator=generator).item()
+        for low, high in (scale, aspect)
+    )
+    area = share * grid[0] * grid[1]
+    height, width = round((area * ratio) ** 0.5), round((area / ratio) ** 0.5)
+    return min(max(height, 1), grid[0]), min(max(width, 1), grid[1])
+
+
+def draw_blocks(
+    grid: tuple[int, int],
+    size: tuple[int, int],
+    count: int,
+    blocks: int,
+    generator: torch.Generator,
+) -> Int[Tensor, "{count} {blocks} k"]:
+    """Patches of so many blocks of a size in each of `count` pictures, anywhere; they may overlap."""
+    starts = [
+        torch.randint(0, whole - part + 1, (count, blocks, 1, 1), generator=generator)
+        for whole, part in zip(grid, size, strict=True)
+    ]
+    rows = starts[0] + torch.arange(size[0])[:, None]
+    columns = starts[1] + torch.arange(size[1])
+    return (rows * grid[1] + columns).flatten(2)
+
+
+def cover(ids: Int[Tensor, "b m k"], patches: int) -> Bool[Tensor, "b {patches}"]:
+    """Which patches of each picture are in at least one of its blocks."""
+    return torch.zeros(len(ids), patches, dtype=torch.bool).scatter(1, ids.flatten(1), True)
+
+
+def cut(
+    allowed: Bool[Tensor, "b n"], generator: torch.Generator, at_most: int | None = None
+) -> Int[Tensor, "b k"]:
+    """As many of the allowed patches as the picture with the fewest has; which ones is drawn.
+
+    Args:
+        allowed: Patches of each picture.
+        generator: Of the draw.
+        at_most: No more than so many.
+    """
+    fewest = int(allowed.sum(1).min())
+    kept = fewest if at_most is None else min(fewest, at_most)
+    chance = torch.rand(allowed.shape, generator=generator).masked_fill(~allowed, -1.0)
+    return chance.topk(kept, 1).indices.sort(1).values
+
+
+def draw_targets(
+    grid: tuple[int, int],
+    size: tuple[int, int],
+    count: int,
+    blocks: int,
+    within: Bool[Tensor, "b n"],
+    least: int,
+    generator: torch.Generator,
+) -> tuple[Int[Tensor, "b m k"], Bool[Tensor, "b n"]]:
+    """Blocks to ask for, and what of `within` is left to see: at least so many patches.
+
+    A picture with less left has its blocks drawn again.
+
+    Raises:
+        UserError: That cannot be had on a grid so small.
+    """
+    ids = draw_blocks(grid, size, count, blocks, generator)
+    for _ in range(_TRIES):
+        left = within & ~cover(ids, within.shape[1])
+        poor = left.sum(1) < least
+        if not poor.any():
+            return ids, left
+        ids[poor] = draw_blocks(grid, size, int(poor.sum()), blocks, generator)
+    raise UserError(
+        f"{blocks} blocks of {size[0]} x {size[1]} patches leave hardly ever {least} of the "
+        f"{grid[0]} x {grid[1]} to see: choose fewer or smaller blocks, or smaller patches"
+    )

@@ -1,0 +1,206 @@
+"""What is measured of a self-supervised backbone after every epoch, for its losses say little.
+
+Whether it has collapsed, what a linear decoder reconstructs from its tokens, and what forces a ridge
+regression reads from its embedding. Nothing here changes the training.
+"""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from touchgoal.encoders.backbones.frame_history import stack_frames
+from touchgoal.encoders.backbones.touch_backbone import BATCH, TouchBackbone
+from touchgoal.encoders.backbones.vit import ViTConfig, patch_grid, patchify
+from touchgoal.encoders.probes.ridge import ridge_r2
+from touchgoal.encoders.ssl.frames import TouchFrames
+from touchgoal.encoders.training.trainer import is_first_process
+
+_PROBE_SAMPLES, _TOKEN_SAMPLES = 2048, 128
+_STRENGTH = 1e-3  # of the decoder's ridge
+_LEAST_SPREAD, _LEAST_RANK = 0.01, 1.5  # share of the untrained spread; dimensions
+_LEAST_INFORMATION = 0.01  # nats
+_PICTURES, _SHOWN = 4, 6
+_CONTRAST = 32.0  # grey levels that 1.0 is drawn as
+
+
+@runtime_checkable  # beartype checks arguments in tests
+class Distilled(Protocol):
+    """What of an objective is measured; see `SelfDistillation`."""
+
+    teacher: TouchBackbone
+
+    def draw(self, count: int, generator: torch.Generator) -> dict: ...  # noqa: D102
+    def __call__(self, touch: Tensor, **drawn: Tensor) -> dict[str, Tensor]: ...  # noqa: D102
+
+
+class Validation:
+    """Measures a training's teacher on touches of other episodes."""
+
+    def __init__(
+        self, model: Distilled, train: TouchFrames, val: TouchFrames, out_dir: Path, epochs: int
+    ) -> None:
+        """Measures the untrained backbone, which collapse is judged by."""
+        self._model, self._train, self._val = model, train, val
+        self._out_dir, self._epochs = out_dir, epochs
+        self._untrained = token_statistics(self._tokens(val))["token_spread"]
+
+    def metrics(self) -> dict[str, float]:
+        """The loss, `token_statistics`, the reconstruction and the forces, where they are known.
+
+        `reconstruction`: share of a picture's change, as mean square, that a linear decoder fitted to
+        the training's tokens gets right of each patch from its own token.
+        """
+        tokens, pixels = self._tokens(self._val), self._pixels(self._val)
+        error = (self._decode(tokens) - pixels).square().mean() / pixels.square().mean()
+        return {
+            "validation_loss": self._loss(),
+            **token_statistics(tokens),
+            "token_spread_untrained": self._untrained,
+            "reconstruction": 1 - error.item(),
+            **read_forces(self._embed, self._train, self._val),
+        }
+
+    def has_collapsed(self, metrics: dict[str, float]) -> bool:
+        """Whether all touches have come to look the same to the teacher, differ along one line, or are all
+        given the same class, if it gives any."""
+        spread = metrics["token_spread"] / max(self._untrained, 1e-12)
+        information = metrics.get("teacher_information", 1.0)
+        enough = spread >= _LEAST_SPREAD and information >= _LEAST_INFORMATION
+        return not enough or metrics["effective_rank"] < _LEAST_RANK
+
+    def line(self, metrics: dict[str, float]) -> str:
+        """The line printed of an epoch."""
+        text = (
+            f"loss {metrics['loss']:.4f} in training, {metrics['validation_loss']:.4f} in validation; "
+            f"spread of tokens {metrics['token_spread']:.3f} ({self._untrained:.3f} untrained) in "
+            f"{metrics['effective_rank']:.1f} dimensions; {metrics['reconstruction']:.2f} of the "
+            f"picture reconstructed{forces_line(metrics)}"
+        )
+        warning = "  WARNING: the embeddings have collapsed, all touches look the same"
+        return text + warning if self.has_collapsed(metrics) else text
+
+    def draw(self, epoch: int) -> None:
+        """A few times a training: `reconstruction_EPOCH.png`, touches above what is read from tokens."""
+        due = {math.ceil(self._epochs * (k + 1) / _PICTURES) for k in range(_PICTURES)}
+        if epoch not in due or not is_first_process():
+            return
+        vit = self._model.teacher.config.vit
+        pixels = self._pixels(self._val)
+        shown = pixels.square().mean((1, 2)).argsort(descending=True, stable=True)[:_SHOWN]
+        read = self._decode(self._tokens(self._val)[shown])
+        rows = [np.hstack([_picture(p, vit) for p in part]) for part in (pixels[shown], read)]
+        picture = cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR)
+        cv2.imwrite(str(self._out_dir / f"reconstruction_{epoch:04d}.png"), picture)
+
+    @torch.no_grad()
+    def _loss(self) -> float:
+        generator, total = torch.Generator().manual_seed(0), 0.0
+        device = self._model.teacher.device
+        for touch in self._val.touch.split(BATCH):
+            drawn = self._model.draw(len(touch), generator)
+            moved = {name: _to(value, device) for name, value in drawn.items()}
+            total += self._model(touch=touch.to(device), **moved)["loss"].item() * len(touch)
+        return total / len(self._val)
+
+    def _embed(self, touch: Tensor) -> Tensor:
+        return self._of_batches(touch, self._model.teacher.embed_touch)
+
+    def _tokens(self, data: TouchFrames) -> Float[Tensor, "n p d"]:
+        return self._of_batches(_sample(data), self._model.teacher.vit)
+
+    @torch.no_grad()
+    def _of_batches(self, touch: Tensor, network: Callable[[Tensor], Tensor]) -> Tensor:
+        teacher = self._model.teacher
+        batches = touch.split(BATCH)
+        stacked = (stack_frames(b.to(teacher.device).float(), teacher.config.vit) for b in batches)
+        return torch.cat([network(images).float().cpu() for images in stacked])
+
+    def _pixels(self, data: TouchFrames) -> Float[Tensor, "n p c"]:
+        """Of the newest frame's patches."""
+        return patchify(_sample(data)[:, 0].float(), self._model.teacher.config.vit)
+
+    def _decode(self, tokens: Float[Tensor, "m p d"]) -> Float[Tensor, "m q c"]:
+        """What tokens say of the newest frame's patches, each of its own: a ridge regression."""
+        known, pixels = self._tokens(self._train), self._pixels(self._train)
+        count = pixels.shape[1]  # of a clip the tokens of the newest tubelet come first
+        X, Y = known[:, :count].flatten(0, 1), pixels.flatten(0, 1)
+        mean, offset = X.mean(0), Y.mean(0)
+        X = X - mean
+        ridge = _STRENGTH * len(X) * X.var() * torch.eye(X.shape[1])
+        weights = torch.linalg.solve(X.T @ X + ridge, X.T @ (Y - offset))
+        return (tokens[:, :count] - mean) @ weights + offset
+
+
+def token_statistics(tokens: Float[Tensor, "n p d"]) -> dict[str, float]:
+    """How touches differ in their tokens.
+
+    The mean over touches is taken from each place first: tokens of one touch always differ, for they
+    carry the codes of their places, and would hide a collapse.
+
+    Returns:
+        `token_spread`, the mean square of what is left beside the tokens' own: 0 if all touches look
+        the same; `effective_rank`, the exponential of the entropy of its covariance's spectrum (Roy
+        and Vetterli 2007): in how many dimensions touches differ.
+    """
+    apart = (tokens - tokens.mean(0)).double()
+    spread = apart.square().mean() / tokens.double().square().mean()
+    rows = apart.flatten(0, 1)
+    spectrum = torch.linalg.eigvalsh(rows.T @ rows).clamp(min=0)
+    shares = spectrum / spectrum.sum().clamp(min=1e-300)
+    return {
+        "token_spread": spread.item(),
+        "effective_rank": torch.special.entr(shares).sum().exp().item(),
+    }
+
+
+def read_forces(
+    embed: Callable[[Tensor], Tensor], train: TouchFrames, val: TouchFrames
+) -> dict[str, float]:
+    """How well forces can be read from an embedding.
+
+    Returns:
+        `force_x_r2`, `force_y_r2` (shear along the image's columns and rows), `force_z_r2`: the
+        share of the variance that a linear reading fitted on 2,048 touches of `train` explains;
+        nothing if the episodes do not know the force.
+    """
+    if train.wrench is None or val.wrench is None:
+        return {}
+    rows = torch.linspace(0, len(train) - 1, min(_PROBE_SAMPLES, len(train))).long()
+    inputs = embed(train.touch[rows])
+    r2 = ridge_r2(inputs, train.wrench[rows, :3], embed(val.touch), val.wrench[:, :3])
+    return {f"force_{axis}_r2": value.item() for axis, value in zip("xyz", r2, strict=True)}
+
+
+def forces_line(metrics: dict[str, float]) -> str:
+    """What `read_forces` found, for an epoch's line; "" if nothing."""
+    if "force_x_r2" not in metrics:
+        return ""
+    forces = [f"{axis} {metrics[f'force_{axis}_r2']:.2f}" for axis in "xyz"]
+    return f"; R2 of the force read from the embedding: {', '.join(forces)}"
+
+
+def _sample(data: TouchFrames) -> Tensor:
+    """Evenly drawn touches."""
+    rows = torch.linspace(0, len(data) - 1, min(_TOKEN_SAMPLES, len(data))).long()
+    return data.touch[rows]
+
+
+def _to(value: Tensor | list[Tensor], device: torch.device) -> Tensor | list[Tensor]:
+    return [v.to(device) for v in value] if isinstance(value, list) else value.to(device)
+
+
+def _picture(patches: Float[Tensor, "p c"], vit: ViTConfig) -> np.ndarray:
+    """The inverse of `patchify`, as RGB about grey."""
+    rows, columns = patch_grid(vit)
+    size = vit.patch_size
+    image = patches.view(rows, columns, 3, size, size).permute(0, 3, 1, 4, 2)
+    grey = 128 + _CONTRAST * image.reshape(rows * size, columns * size, 3)
+    height, width = vit.image_size
+    return grey.clamp(0, 255).byte().numpy()[:height, :width]

@@ -1,0 +1,291 @@
+"""What DINO, I-JEPA and V-JEPA share, and DINO: averages, schedules, masks, collapse, resumption."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from toy_touches import SENSOR, moving_blobs
+
+from touchgoal.control import features as ft
+from touchgoal.control.errors import UserError
+from touchgoal.encoders import pretrained
+from touchgoal.encoders.backbones.frame_history import stack_frames
+from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
+from touchgoal.encoders.config import TrainerOptions
+from touchgoal.encoders.ssl.config import DINO_PRESETS, DinoConfig
+from touchgoal.encoders.ssl.dino import (
+    Dino,
+    cross_entropy_of_views,
+    information,
+    sinkhorn,
+    train_dino,
+)
+from touchgoal.encoders.ssl.frames import sample_frames
+from touchgoal.encoders.ssl.masks import cover, cut, draw_blocks, draw_size, draw_targets
+from touchgoal.encoders.ssl.self_distillation import (
+    SelfDistillation,
+    backbone_for,
+    train_self_distilled,
+    vit_for,
+)
+from touchgoal.encoders.ssl.validation import token_statistics
+from touchgoal.encoders.training import trainer
+from touchgoal.encoders.training.trainer import OptimizerConfig, parameter_groups
+from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+
+TOY = DinoConfig(
+    vit="tiny",
+    epochs=3,
+    batch_size=12,
+    prototypes=32,
+    head_width=16,
+    head_bottleneck=8,
+    local_views=3,
+    momentum=0.9,
+)
+
+
+def rng(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def toy_dino(config: DinoConfig = TOY) -> Dino:
+    torch.manual_seed(0)
+    return Dino(config, backbone_for("dino", "tiny", moving_blobs(1)), steps=10)
+
+
+def test_the_loss_of_views_is_that_of_the_paper() -> None:
+    """By equation 3: of every other pair of views, with a teacher centred and sharpened."""
+    model = toy_dino(replace(TOY, batch_norm=False)).train()
+    touch, drawn = moving_blobs(4).touch, model.draw(4, rng())
+    model.center.normal_(generator=rng(1))
+    center, images = model.center.clone(), stack_frames(touch.float(), model.backbone.config.vit)
+    views = [*drawn["global_ids"].unbind(1), *drawn["local_ids"].unbind(1)]
+    assert len(views) == 2 + 3
+    losses, said = [], []
+    for i in range(2):
+        teacher = model.teacher_head(model.teacher.embed_touch(images, views[i]))
+        said.append(teacher)
+        P = F.softmax((teacher - center) / 0.04, dim=1)
+        for j, view in enumerate(views):
+            if i != j:
+                student = model.head(model.backbone.embed_touch(images, view)) / 0.1
+                losses.append(-(P * student.log_softmax(1)).sum(1).mean())
+    terms = model(touch=touch, **drawn)
+    torch.testing.assert_close(terms["loss"], torch.stack(losses).mean())
+    torch.testing.assert_close(model.center, 0.9 * center + 0.1 * torch.cat(said).mean(0))
+    model.eval()(touch=touch, **drawn)
+    torch.testing.assert_close(model.center, 0.9 * center + 0.1 * torch.cat(said).mean(0))
+
+
+def test_a_view_is_not_compared_with_itself() -> None:
+    targets = torch.eye(3)[None, :1].expand(2, 1, 3)
+    logits = torch.tensor([[[9.0, 0, 0]], [[0.0, 0, 0]], [[0.0, 0, 0]]])
+    sure = math.log(1 + 2 * math.exp(-9))
+    expected = (sure + 3 * math.log(3)) / 4  # pairs (0, 1), (0, 2), (1, 0), (1, 2)
+    assert cross_entropy_of_views(targets, logits).item() == pytest.approx(expected, abs=1e-6)
+
+
+def test_sinkhorn_spreads_touches_over_prototypes() -> None:
+    logits = torch.randn(64, 8, generator=rng()) + torch.arange(8) / 4
+    Q = sinkhorn(logits)
+    torch.testing.assert_close(Q.sum(1), torch.ones(64))
+    assert (Q.sum(0) - 8).abs().max() < 0.2 < 5 < (logits.softmax(1).sum(0) - 8).abs().max()
+    order = Q[:, :, None] / Q[:, None]  # scaling rows and columns leaves cross ratios alone
+    given = logits[:, :, None] - logits[:, None]
+    torch.testing.assert_close(
+        order.log() - order[:1].log(), given - given[:1], rtol=1e-3, atol=1e-3
+    )
+
+
+@pytest.mark.parametrize("reads", ["mean", "register"])
+def test_the_teacher_learns_by_averaging_alone(reads: str) -> None:
+    """As torch's own AveragedModel with a decay, momentum rising linearly."""
+    model = toy_dino(replace(TOY, reads=reads, momentum=0.9, final_momentum=1.0))
+    oracle = AveragedModel(model.backbone, multi_avg_fn=get_ema_multi_avg_fn(0.9))
+    oracle.update_parameters(model.backbone)  # the first is a copy
+    optimizer = torch.optim.SGD([p for p in model.parameters() if p.requires_grad], lr=0.5)
+    for step in range(3):
+        model(touch=moving_blobs(4).touch, **model.draw(4, rng(step)))["loss"].backward()
+        assert all(p.grad is None for p in model.teacher.parameters())
+        assert all(p.grad is None for p in model.teacher_head.parameters())
+        assert all(p.grad is not None for p in model.backbone.parameters())
+        optimizer.step()
+        oracle.multi_avg_fn = get_ema_multi_avg_fn(0.9 + 0.1 * step / 10)
+        oracle.update_parameters(model.backbone)
+        model.update_teacher()
+    for ours, theirs in zip(model.teacher.parameters(), oracle.module.parameters(), strict=True):
+        torch.testing.assert_close(ours, theirs)
+    assert not torch.equal(model.teacher.vit.norm.bias, model.backbone.vit.norm.bias)
+
+
+def test_weight_decay_goes_along_a_cosine_for_matrices_alone() -> None:
+    config = OptimizerConfig(5, 4, 1e-3, 0.04, final_weight_decay=0.4)
+    assert config.steps(10) == 10
+    assert config.decay(0, 10) == pytest.approx(0.04)
+    assert config.decay(5, 10) == pytest.approx(0.22)
+    assert config.decay(10, 10) == pytest.approx(0.4)
+    first, second = parameter_groups(toy_dino(), 0.04)
+    assert min(p.ndim for p in first["params"]) == 2 and second["weight_decay"] == 0
+
+
+def test_blocks_are_rectangles_of_one_size() -> None:
+    grid = (8, 10)
+    for seed in range(20):
+        size = draw_size(grid, (0.15, 0.2), (0.75, 1.5), rng(seed))
+        assert 10 <= size[0] * size[1] <= 20 and 0.5 < size[0] / size[1] < 2
+        ids = draw_blocks(grid, size, 5, 4, rng(seed))
+        assert ids.shape == (5, 4, size[0] * size[1])
+        for block in ids.flatten(0, 1):
+            rows, columns = block // 10, block % 10
+            assert len(rows.unique()) == size[0] == rows.max() - rows.min() + 1
+            assert len(columns.unique()) == size[1] == columns.max() - columns.min() + 1
+    starts = draw_blocks((3, 3), (2, 2), 400, 1, rng())[:, 0, 0].unique()
+    assert starts.tolist() == [0, 1, 3, 4]
+
+
+def test_what_is_seen_is_not_asked_for() -> None:
+    within = cover(draw_blocks((8, 10), (8, 9), 50, 1, rng()), 80)
+    ids, left = draw_targets((8, 10), (4, 4), 50, 4, within, 10, rng(1))
+    assert left.sum(1).min() >= 10
+    assert not left.gather(1, ids.flatten(1)).any() and (within | ~left).all()
+    seen = cut(left, rng(2))
+    assert seen.shape == (50, left.sum(1).min())
+    assert left.gather(1, seen).all() and (seen.diff(dim=1) > 0).all()
+    assert cut(left, rng(2), at_most=3).shape == (50, 3)
+    with pytest.raises(
+        UserError, match="1 blocks of 3 x 4 patches leave hardly ever 1 of the 3 x 4"
+    ):
+        draw_targets((3, 4), (3, 4), 2, 1, torch.ones(2, 12, dtype=torch.bool), 1, rng())
+
+
+def test_codes_of_places_do_not_hide_a_collapse() -> None:
+    places = torch.randn(1, 12, 16, generator=rng())
+    touches = torch.randn(64, 1, 16, generator=rng(1))
+    assert token_statistics(places.expand(64, -1, -1))["token_spread"] < 1e-12
+    line = places + touches[:, :, :1] * torch.randn(16, generator=rng(2))
+    assert token_statistics(line)["effective_rank"] == pytest.approx(1, abs=1e-3)
+    full = token_statistics(places + touches.expand(-1, 12, -1))
+    assert full["effective_rank"] > 12 and 0.3 < full["token_spread"] < 0.7
+
+
+class Flattening(SelfDistillation):
+    """An objective that a constant answers best."""
+
+    def draw(self, count: int, generator: torch.Generator) -> dict:
+        return {}
+
+    def forward(self, touch: torch.Tensor) -> dict:
+        return {"loss": (self.backbone.vit(self.stacked(touch)) - 1).square().mean()}
+
+
+def test_a_collapsed_training_saves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    data, config = (
+        moving_blobs(24),
+        replace(TOY, epochs=4, lr=0.5, momentum=0.0, final_momentum=0.0),
+    )
+    with pytest.raises(UserError, match=r"collapsed: all touches look the same.*raise --dino.mom"):
+        train_self_distilled(
+            "dino",
+            lambda backbone, steps: Flattening(config, backbone, steps),
+            data,
+            data,
+            config,
+            tmp_path,
+            TrainerOptions(),
+            {},
+        )
+    assert not (tmp_path / "encoder").exists()
+    assert "WARNING: the embeddings have collapsed" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("targets", ["centering", "sinkhorn"])
+def test_a_killed_training_ends_with_the_same_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, targets: str
+) -> None:
+    data, config = moving_blobs(24), replace(TOY, targets=targets)
+    whole = train_dino(data, data, config, tmp_path / "whole", TrainerOptions(), {})
+    with monkeypatch.context() as patch:
+        train_epoch = trainer._train_epoch
+
+        def dies(*args):
+            if args[-1] == 2:
+                raise KeyboardInterrupt
+            return train_epoch(*args)
+
+        patch.setattr(trainer, "_train_epoch", dies)
+        with pytest.raises(KeyboardInterrupt):
+            train_dino(data, data, config, tmp_path / "killed", TrainerOptions(), {})
+    resumed = train_dino(data, data, config, tmp_path / "killed", TrainerOptions(resume=True), {})
+    for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
+        assert torch.equal(a, b)
+    lines = [(tmp_path / run / "metrics.jsonl").read_text() for run in ("whole", "killed")]
+    assert lines[0] == lines[1]
+
+
+def test_the_student_learns_what_the_teacher_says_of_each_touch() -> None:
+    model = toy_dino().train()
+    optimizer = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], lr=2e-3)
+    train, other = moving_blobs(64).touch, moving_blobs(32, seed=1).touch
+    for step in range(30):
+        drawn = model.draw(32, rng(step))
+        optimizer.zero_grad()
+        model(touch=train[torch.randperm(64, generator=rng(step))[:32]], **drawn)["loss"].backward()
+        optimizer.step()
+        model.update_teacher()
+    with torch.no_grad():
+        images, views = model.stacked(other), list(model.draw(32, rng()).values())
+        targets = model._targets(
+            model._scores(model.teacher, model.teacher_head, images, views[:1])
+        )
+        logits = model._scores(model.backbone, model.head, images, views) / 0.1
+    own, others = (cross_entropy_of_views(targets, x) for x in (logits, logits.roll(1, dims=1)))
+    assert own < others - 0.5 and information(targets) > 0.5
+
+
+def test_a_saved_encoder_sees_the_past(tmp_path: Path) -> None:
+    train, val = moving_blobs(48, 0), moving_blobs(24, 1)
+    encoder = train_dino(train, val, TOY, tmp_path, TrainerOptions(), {})
+    metrics = pretrained.ENCODER_FORMAT.provenance(tmp_path / "encoder")["metrics"]
+    assert metrics["reconstruction"] > 0.3 and metrics["force_z_r2"] > 0.3
+    assert len(list(tmp_path.glob("reconstruction_*.png"))) == 3
+    loaded = pretrained.load_encoder(tmp_path / "encoder")
+    assert loaded.offsets == (0, 2) and loaded.config == encoder.config
+    frames = np.full((4, 240, 320, 3), 100, np.uint8)
+    frames[1, 60:120, 80:160] = 160
+    rows = loaded.embed(frames)
+    assert not np.allclose(rows[3], rows[0])  # untouched now, but not two ticks ago
+    assert np.allclose(rows[2], rows[0])
+
+
+def test_moments_hold_the_true_past(tmp_path: Path) -> None:
+    writer = EpisodeWriter(tmp_path)
+    pictures = (
+        np.zeros((6, 240, 320, 3), np.uint8)
+        + 16 * np.arange(6, dtype=np.uint8)[:, None, None, None]
+    )
+    columns = {key: pictures for key in ft.TACTILE} | {ft.ACTION: np.zeros((6, 8), np.float32)}
+    writer.append(Episode(columns, "feel"))
+    moments = sample_frames(EpisodeSet(tmp_path), SENSOR, 6, 0, (0, 2, 4))
+    assert moments.touch.shape == (12, 3, 3, 120, 160) and moments.stride == 2
+    ticks = moments.touch[:6, :, 0, 60, 80].round().tolist()  # a grey level of 16 is 1.0
+    assert ticks == [[t, max(t - 2, 0), max(t - 4, 0)] for t in range(6)]
+    single = sample_frames(EpisodeSet(tmp_path), SENSOR, 6, 0)
+    assert torch.equal(single.touch, moments.touch[:, 0]) and single.stride == 1
+
+
+def test_the_paper_preset_is_table_2() -> None:
+    paper = DINO_PRESETS["paper"]
+    assert (paper.lr, paper.batch_size, paper.epochs, paper.momentum) == (1e-4, 150, 150, 0.998)
+    assert (paper.weight_decay, paper.final_weight_decay) == (0.04, 0.4)
+    assert paper.warmup * paper.epochs == 30
+    config = TouchBackboneConfig.for_sensor(vit_for("dino", "base", (120, 160)), SENSOR, 2)
+    with torch.device("meta"):
+        backbone = TouchBackbone(config)
+    assert sum(p.numel() for p in backbone.parameters()) == 86_255_616
