@@ -8,52 +8,12 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from published_files import UNTOUCHED, encoded, gel, near, write, write_slides
 
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.importers.plain_pickle import StoredBytes
 from touchgoal.episodes.importers.pretraining_clips import read_recordings
 from touchgoal.episodes.importers.touch_clip import TouchClip, decode, read_pictures
-
-UNTOUCHED = {"red": (150, 120, 90), "blue": (80, 110, 160)}
-
-
-def gel(seed: int, shape: tuple[int, int] = (320, 240), light: str = "red") -> np.ndarray:
-    """A smooth picture with a bump somewhere."""
-    rng = np.random.default_rng(seed)
-    y, x = np.mgrid[: shape[0], : shape[1]]
-    place = rng.uniform((0.2, 0.2), (0.8, 0.8)) * shape
-    bump = 70 * np.exp(-((y - place[0]) ** 2 + (x - place[1]) ** 2) / 15**2)
-    return (np.array(UNTOUCHED[light]) + bump[:, :, None] * (1, -0.5, 0.3)).astype(np.uint8)
-
-
-def encoded(picture: np.ndarray, kind: str = "JPEG") -> bytes:
-    """By PIL, which takes RGB."""
-    file = io.BytesIO()
-    Image.fromarray(picture).save(file, kind, **({"quality": 95} if kind == "JPEG" else {}))
-    return file.getvalue()
-
-
-def write(path: Path, pictures: list[bytes]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(pickle.dumps(pictures))
-
-
-def write_slides(folder: Path, objects: tuple[str, ...] = ("004_sugar_box", "bread")) -> None:
-    """Sliding touch as YCB-Slide and Touch-Slide come from Sparsh's page: five recordings an object."""
-    for k, name in enumerate(objects):
-        light = ("red", "blue")[k % 2]
-        for i in range(5):
-            frames = [encoded(gel(100 * k + 10 * i + t, light=light)) for t in range(8 + i)]
-            write(folder / name / f"dataset_{i}.pkl", frames)
-    (folder / "bgs").mkdir()
-    for k, light in ((0, "blue"), (10, "red")):
-        plain = np.full((320, 240, 3), UNTOUCHED[light], np.uint8)
-        (folder / "bgs" / f"bg_{k}.jpg").write_bytes(encoded(plain))
-
-
-def near(picture: np.ndarray, true: np.ndarray) -> bool:
-    """As near as JPEG keeps it."""
-    return bool(np.abs(picture.astype(int) - true).mean() < 2)
 
 
 def test_slides_are_upright_digits_with_their_own_untouched_gel(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import os
 import pickle
 import re
 import struct
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -275,8 +276,8 @@ class _Machine:
         elif type(target) is np.ndarray:
             _, shape, dtype, fortran, stored = state
             made = self._array(stored, dtype, shape, bool(fortran))
-            # in place, for the memo knows this one
-            target.__setstate__((1, made.shape, made.dtype, bool(fortran), made.tobytes("A")))
+            known: Any = target  # in place, for the memo knows this one
+            known.__setstate__((1, made.shape, made.dtype, bool(fortran), made.tobytes("A")))
         else:
             raise TypeError("state")
 
@@ -290,6 +291,12 @@ class _Machine:
         if self._copied > self._size:
             raise UserError(f"{self._path} unpacks to more than it holds: nothing of it was kept")
         data = bytearray(stored.read())
+        if kind.kind == "U":
+            letters = np.frombuffer(data, kind.byteorder + "u4")
+            if (
+                (letters > sys.maxunicode) | (letters >> 11 == 0x1B)
+            ).any():  # 1B: halves of letters
+                raise ValueError("text")
         return np.ndarray(shape, kind, data, order="F" if fortran else "C")
 
     def _take(self, count: int) -> bytes:

@@ -29,9 +29,8 @@ from touchgoal.control.progress import track
 from touchgoal.episodes.importers.touch_clip import (
     TouchClip,
     check_kind,
-    decode,
+    read_picture_file,
     read_pictures,
-    turned,
 )
 
 _TRAINED = 0.725  # of GelSight recordings, the longest: Sparsh's train.py
@@ -61,7 +60,7 @@ class Recording:
         usual = self.clip.usual()
         if not self.backgrounds:
             return usual
-        found = [turned(_read(path), self.clip.sensor) for path in self.backgrounds]
+        found = [read_picture_file(path, self.clip.sensor) for path in self.backgrounds]
         fitting = [picture for picture in found if picture.shape == usual.shape]
         if not fitting:
             raise UserError(
@@ -143,13 +142,6 @@ def _checked(folder: Path, recordings: list[Recording]) -> list[Recording]:
             f"{folder} holds one recording: two at least, to learn from and to judge by"
         )
     return recordings
-
-
-def _read(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    try:
-        return decode(path.read_bytes(), str(path))
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from error
 
 
 def _natural(path: Path) -> list[str | int]:

@@ -126,6 +126,18 @@ def stored_pictures(value: object, name: str) -> list[StoredBytes]:
     return value
 
 
+def read_picture_file(path: Path, sensor: str) -> Picture:
+    """A picture in a file of its own, as the sensor's model has it.
+
+    Raises:
+        UserError: there is none, or it is broken.
+    """
+    try:
+        return turned(decode(path.read_bytes(), str(path)), sensor)
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+
+
 def check_kind(sensor: str | None, kinds: tuple[str, ...], folder: Path) -> str:
     """The sensor of a layout's pictures: the one named, if it can be, else the first that can.
 
