@@ -292,7 +292,7 @@ class _Machine:
             raise UserError(f"{self._path} unpacks to more than it holds: nothing of it was kept")
         data = bytearray(stored.read())
         if kind.kind == "U":
-            letters = np.frombuffer(data, kind.byteorder + "u4")
+            letters = np.frombuffer(data, kind.byteorder + "u4").astype(np.uint32)
             if (
                 (letters > sys.maxunicode) | (letters >> 11 == 0x1B)
             ).any():  # 1B: halves of letters
