@@ -183,8 +183,9 @@ class RealTouchOptions(BenchmarkOptions):
     """Folder of labelled videos (labels.csv and videos/, as PhysiCLeAR's), or of grasps with forces
     (grasps.csv and TRIAL.avi, TRIAL.csv, as EstimateModulus')."""
     encoders: tuple[str, ...] = ("gelsight_mini", "random:gelsight_mini", "pixels", "efficientnet")
-    """Touch encoders by name or folder; `random:NAME` for the same network untrained, `pixels`,
-    `efficientnet` (ImageNet), or a vision model of Hugging Face by its id or folder."""
+    """Touch encoders by name or folder, or published Sparsh ones by file or id (facebook/sparsh-dino-base);
+    `random:NAME` for the same network untrained, `pixels`, `efficientnet` (ImageNet), or a vision model of
+    Hugging Face by its id or folder."""
     every: Annotated[Count, RARE] = 1
     """Take every so many videos."""
     seed: Seed = 0
@@ -218,8 +219,9 @@ class TacbenchOptions(BenchmarkOptions):
         "random:gelsight_mini_markers",
         "end-to-end:gelsight_mini_markers",
     )
-    """Touch encoders with a ViT, frozen, by name or folder; `random:NAME` for the same network untrained,
-    `end-to-end:NAME` for the same one trained with the probe, from random weights."""
+    """Touch encoders with a ViT, frozen, by name or folder, or published Sparsh ones by file or id
+    (facebook/sparsh-dino-base); `random:NAME` for the same network untrained, `end-to-end:NAME` for the same one
+    trained with the probe, from random weights."""
     shares: Annotated[tuple[Share, ...], Field(min_length=1)] = (1.0, 0.33, 0.1, 0.01)
     """Shares of the training labels."""
     rig: RigConfig = RigConfig()
@@ -277,7 +279,8 @@ class TouchProbesOptions(BenchmarkOptions):
     """What do frozen features tell of force, place, shape and slip, on one sensor and across sensors?"""
 
     encoder: str = "gelsight_mini_surfaces"
-    """Encoder whose network is probed, by name or folder (of `train-encoder surfaces`)."""
+    """Encoder whose network is probed: one of `train-encoder surfaces`, or one with a ViT, by name or folder; or a
+    published Sparsh one by file or id."""
     sensors: tuple[str, ...] = ("gelsight_mini_measured", "digit_measured", "gelsight")
     """Sensors that are simulated, by name or folder of a sensor file."""
     presses: Annotated[int, Field(ge=24)] = 600

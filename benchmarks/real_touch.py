@@ -10,7 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from touchgoal.benchmarks.config import RealTouchOptions
 from touchgoal.benchmarks.real_force import force_table, judge_grasps
@@ -44,46 +44,62 @@ _SMALL = 80, 60  # px at which the largest change is looked for
 
 @dataclass(frozen=True, eq=False)
 class VideoTouch:
-    """What is kept of a video.
+    """What is known of a video.
 
     Attributes:
         video: its labels.
-        frames: those of the largest change.
+        chosen: rows of the frames of the largest change.
+        rest: row of an untouched one.
         background: the sensor untouched.
-        rest: one untouched frame.
         untouched, peak: contact strength of the first three frames, and the largest, counts.
         threshold: counts, from the first frames' noise.
     """
 
     video: LabelledVideo
-    frames: UInt8[np.ndarray, "k h w 3"]
+    chosen: Int[np.ndarray, " k"]
+    rest: int
     background: UInt8[np.ndarray, "h w 3"]
-    rest: UInt8[np.ndarray, "h w 3"]
     untouched: float
     peak: float
     threshold: float
 
 
+@dataclass(frozen=True, eq=False)
+class VideoEmbedding:
+    """One encoder's view of a video.
+
+    Attributes:
+        touch: mean over the chosen frames.
+        rest, brighter: of an untouched frame alone, and of the same in more light.
+    """
+
+    touch: Float[np.ndarray, " d"]
+    rest: Float[np.ndarray, " d"]
+    brighter: Float[np.ndarray, " d"]
+
+
 def run(config: RealTouchOptions) -> dict[str, Any]:
-    """Read the videos once, then embed and judge them by every encoder."""
+    """Read every video once and embed it by every encoder, then judge them."""
+    embedders = {name: find_embedder(name, config.seed) for name in config.encoders}
     if (config.data / "grasps.csv").is_file():
-        embedders = {name: find_embedder(name, config.seed) for name in config.encoders}
         grasps = judge_grasps(read_force_grasps(config.data)[:: config.every], embedders)
         return {"table": force_table(grasps), **grasps}
     videos = read_labelled_videos(config.data)[:: config.every]
-    touches = [read_touch(video) for video in track(videos, "reading", "video")]
-    if sum(touch.video.ranks is not None for touch in touches) < 10:
+    if sum(video.ranks is not None for video in videos) < 10:
         raise UserError(f"{config.data} has fewer than 10 ranked videos: nothing to judge by")
-    rows = []
-    for name in config.encoders:
-        embed = find_embedder(name, config.seed)
-        rows.append({"encoder": name, **judge(touches, embed, name)})
+    touches: list[VideoTouch] = []
+    embedded: dict[str, list[VideoEmbedding]] = {name: [] for name in embedders}
+    for video in track(videos, "embedding", "video"):
+        frames = video.frames()
+        touches.append(read_touch(video, frames))
+        for name, embed in embedders.items():
+            embedded[name].append(embed_touch(touches[-1], frames, embed))
+    rows = [{"encoder": name, **judge(touches, seen)} for name, seen in embedded.items()]
     return {"table": "\n".join([_table(rows), "", _contact_line(touches)]), "rows": rows}
 
 
-def read_touch(video: LabelledVideo) -> VideoTouch:
+def read_touch(video: LabelledVideo, frames: UInt8[np.ndarray, "n h w 3"]) -> VideoTouch:
     """The frames of one video that count."""
-    frames = video.frames()
     background = touch_background(frames)
     small = _shrunk(frames)
     change = np.abs(small - _shrunk(background[None])).mean((1, 2, 3))
@@ -92,16 +108,24 @@ def read_touch(video: LabelledVideo) -> VideoTouch:
     first = contact_strength(frames[:FRAMES], background)
     threshold = threshold_for(frames[:FRAMES], background)
     peak, untouched = float(max(strength.max(), first.max())), float(first[:3].max())
-    rest = frames[int(first[:3].argmin())]
-    return VideoTouch(video, frames[chosen], background, rest, untouched, peak, threshold)
+    rest = int(first[:3].argmin())
+    return VideoTouch(video, chosen, rest, background, untouched, peak, threshold)
 
 
-def judge(touches: list[VideoTouch], embed: Embedder, name: str) -> dict[str, Any]:
+def embed_touch(
+    touch: VideoTouch, frames: UInt8[np.ndarray, "n h w 3"], embed: Embedder
+) -> VideoEmbedding:
+    """One encoder's view; the frames before the chosen ones are there to look back to."""
+    chosen = embed(frames, touch.background, touch.chosen).mean(0)
+    rest = frames[touch.rest][None]
+    lit = np.rint(np.clip(rest * BRIGHTER, 0, 255)).astype(np.uint8)
+    alone = (embed(picture, touch.background)[0] for picture in (rest, lit))
+    return VideoEmbedding(chosen, *alone)
+
+
+def judge(touches: list[VideoTouch], embedded: list[VideoEmbedding]) -> dict[str, Any]:
     """One encoder's figures, with 95 % intervals over things."""
-    embedded = [
-        embed(touch.frames, touch.background).mean(0) for touch in track(touches, name, "video")
-    ]
-    every = np.stack(embedded).astype(np.float64)
+    every = np.stack([seen.touch for seen in embedded]).astype(np.float64)
     ranked = np.array([touch.video.ranks is not None for touch in touches])
     things = np.array([touch.video.object for touch in touches])[ranked]
     split = np.array([touch.video.split for touch in touches])[ranked]
@@ -113,7 +137,7 @@ def judge(touches: list[VideoTouch], embed: Embedder, name: str) -> dict[str, An
         "things": len(set(things)),
         "nearest": float(same.mean()),
         "nearest_interval": interval(same, things),
-        "light": light_shift(touches, every, embed),
+        "light": light_shift(touches, embedded),
     }
     cross = cross_validated(embeddings, ranks, things)
     result["cross_validated"] = _figures(cross.right, things)
@@ -128,20 +152,16 @@ def judge(touches: list[VideoTouch], embed: Embedder, name: str) -> dict[str, An
     return result
 
 
-def light_shift(
-    touches: list[VideoTouch], embeddings: Float[np.ndarray, "n d"], embed: Embedder
-) -> dict[str, float]:
+def light_shift(touches: list[VideoTouch], embedded: list[VideoEmbedding]) -> dict[str, float]:
     """How far 10 % more light moves an untouched frame, beside how far touches do.
 
     The lightest touch is the twentieth part's: a few clips are touched from their first frame on.
     """
     moved, touched = [], []
-    for touch, embedding in zip(touches, embeddings, strict=True):
-        lit = np.rint(np.clip(touch.rest * BRIGHTER, 0, 255)).astype(np.uint8)
-        rest, brighter = embed(np.stack([touch.rest, lit]), touch.background)
-        moved.append(np.linalg.norm(brighter - rest))
+    for touch, seen in zip(touches, embedded, strict=True):
+        moved.append(np.linalg.norm(seen.brighter - seen.rest))
         if touch.peak > touch.threshold and touch.video.ranks is not None:
-            touched.append(np.linalg.norm(embedding - rest))
+            touched.append(np.linalg.norm(seen.touch - seen.rest))
     light, lightest, usual = np.median(moved), np.quantile(touched, 0.05), np.median(touched)
     return {"light": float(light), "lightest": float(lightest), "usual": float(usual)}
 
@@ -197,7 +217,7 @@ def _validation(val: dict[str, Any] | None) -> str:
 
 
 def _contact_line(touches: list[VideoTouch]) -> str:
-    judged = [touch for touch in touches if len(touch.frames) == FRAMES]
+    judged = [touch for touch in touches if len(touch.chosen) == FRAMES]
     false = [t.video.path.stem for t in judged if t.untouched > t.threshold]
     missed = [t.video.path.stem for t in judged if t.peak <= t.threshold]
     return (

@@ -2,16 +2,19 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Int, UInt8
 
 from touchgoal.control.errors import UserError, install_extra
-from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
+from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
+from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder, TouchBackbone
+from touchgoal.encoders.backbones.vit import ViT
 from touchgoal.encoders.pretrained import load_encoder
+from touchgoal.encoders.published import is_published
 from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_pixels
 
@@ -19,9 +22,26 @@ CONTRAST = 4
 """By which a change of colour is drawn, about grey, for networks that know pictures alone."""
 
 Frames = UInt8[np.ndarray, "n h w 3"]
-Embeddings = Float32[np.ndarray, "n d"]
-Embedder = Callable[[Frames, UInt8[np.ndarray, "h w 3"]], Embeddings]
-"""Frames of one sensor, and the same sensor untouched, to embeddings."""
+Embeddings = Float32[np.ndarray, "_ d"]
+Untouched = UInt8[np.ndarray, "h w 3"]
+
+
+@runtime_checkable  # beartype checks arguments in tests
+class Embedder(Protocol):
+    """Frames of one sensor to embeddings."""
+
+    def __call__(
+        self, frames: Frames, background: Untouched, rows: Int[np.ndarray, " k"] | None = None
+    ) -> Embeddings:
+        """Embeddings of some rows, or of all.
+
+        Args:
+            frames: One after the other, as they were recorded: an encoder may look back.
+            background: The same sensor untouched.
+            rows: Which to embed; all when None.
+        """
+        ...
+
 
 _PIXELS = 20, 15  # width and height
 
@@ -30,8 +50,8 @@ def find_embedder(name: str, seed: int) -> Embedder:
     """An encoder by its name.
 
     Args:
-        name: a shipped touch encoder or the folder of one; `random:` and such a name for the same
-            network untrained; `pixels` for 20 x 15 pixels of change; `efficientnet` for the ImageNet
+        name: a shipped touch encoder or the folder of one, or a published Sparsh encoder (a file or an
+            id of Hugging Face); `random:` and such a name for the same network untrained; `pixels` for 20 x 15 pixels of change; `efficientnet` for the ImageNet
             network of the offline towers; otherwise a vision model of Hugging Face, by id or folder.
         seed: of untrained weights.
 
@@ -39,14 +59,15 @@ def find_embedder(name: str, seed: int) -> Embedder:
         UserError: none of these.
     """
     if name == "pixels":
-        return _embed_pixels
+        return _one_by_one(_embed_pixels)
     if name == "efficientnet":
         network = load_efficientnet_lite0()
         return _of_pictures(lambda batch: network.features(imagenet_pixels(batch)))
     if name.startswith("random:"):
         return untrained(name.removeprefix("random:"), seed).embed_frames
     # Names on Hugging Face are OWNER/MODEL; ours are plain, and a folder says what it holds.
-    if (Path(name) / "config.json").is_file() or ("/" in name and not Path(name).exists()):
+    foreign = (Path(name) / "config.json").is_file() or ("/" in name and not Path(name).exists())
+    if foreign and not is_published(name):
         return _hugging_face(name)
     return load_encoder(name).eval().embed_frames
 
@@ -60,13 +81,35 @@ def untrained(name: str, seed: int) -> BaseTouchEncoder:
     return fresh.eval()
 
 
-def difference_pictures(frames: Frames, background: UInt8[np.ndarray, "h w 3"]) -> Frames:
+def vit_of(encoder: BaseTouchEncoder) -> ViT:
+    """The ViT of a touch encoder, whose tokens probes read; UserError if it has none."""
+    if isinstance(encoder, TouchEncoder):
+        return encoder.backbone
+    if isinstance(encoder, TouchBackbone):
+        return encoder.vit
+    raise UserError(
+        f"a {type(encoder).__name__} has no tokens to probe: give an encoder with a ViT"
+    )
+
+
+def difference_pictures(frames: Frames, background: Untouched) -> Frames:
     """The change against the untouched sensor as a picture about grey."""
     change = frames.astype(np.float32) - background
     return np.clip(128 + CONTRAST * change, 0, 255).astype(np.uint8)
 
 
-def _embed_pixels(frames: Frames, background: UInt8[np.ndarray, "h w 3"]) -> Embeddings:
+def _one_by_one(embed_all: Callable[[Frames, Untouched], Embeddings]) -> Embedder:
+    """Of what sees single frames."""
+
+    def embed(
+        frames: Frames, background: Untouched, rows: Int[np.ndarray, " k"] | None = None
+    ) -> Embeddings:
+        return embed_all(frames if rows is None else frames[rows], background)
+
+    return embed
+
+
+def _embed_pixels(frames: Frames, background: Untouched) -> Embeddings:
     change = np.abs(frames.astype(np.float32) - background)
     small = [cv2.resize(c, _PIXELS, interpolation=cv2.INTER_AREA) for c in change]
     return np.stack(small).reshape(len(frames), -1)
@@ -74,10 +117,10 @@ def _embed_pixels(frames: Frames, background: UInt8[np.ndarray, "h w 3"]) -> Emb
 
 def _of_pictures(network: Callable[[Frames], torch.Tensor]) -> Embedder:
     @torch.no_grad()
-    def embed(frames: Frames, background: UInt8[np.ndarray, "h w 3"]) -> Embeddings:
+    def embed(frames: Frames, background: Untouched) -> Embeddings:
         return network(difference_pictures(frames, background)).float().numpy()
 
-    return embed
+    return _one_by_one(embed)
 
 
 def _hugging_face(name: str) -> Embedder:

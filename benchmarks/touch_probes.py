@@ -1,7 +1,7 @@
 """What frozen features tell beside what is touched: force, place, shape, slip; on one sensor and on others.
 
 Ten indenters are pressed with known forces into simulated units of each sensor. A ridge reads frozen
-features: the shipped encoder's network, pooled over the picture and over its parts. Its input is either
+features: of the shipped encoder's network, or of the tokens of a ViT, pooled over the picture and over its parts. Its input is either
 the sensor's own change of colour, or the shape that all sensors share: slopes and depth of the gel, read
 from the picture by the unit's sensor file and drawn at one scale. Units of training are not tested on.
 """
@@ -11,15 +11,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float, Float32
 
 from touchgoal.benchmarks.config import TouchProbesOptions
+from touchgoal.benchmarks.touch_features import Change, PressFeatures, press_features
 from touchgoal.control.progress import track
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.sensor_models import find_sensor
-from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
-from touchgoal.encoders.pretrained import find_encoder, load_pooled
+from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.probes.ridge import ridge_scores
 from touchgoal.sim_envs.tactile.indenters import FIELD, INDENTERS, IndenterPose, indent
 from touchgoal.sim_envs.tactile.optics import render_untouched
@@ -32,7 +31,6 @@ SLIDES = 0.4e-3, 1.5e-3
 _SHEAR = 0.15e-3
 _PLACES = 2.5e-3  # m from the middle
 _UNITS, _TEST_UNITS = 6, 2
-_SIDE = 120  # px of the field
 _SLOPE, _DEPTH = 2.5, 4e3  # of the network's input (1.0 is a firm contact) per slope, and per m
 _RIDGE = 0.01
 _CELL = 4  # px of the depth's cells
@@ -65,8 +63,8 @@ class Presses:
 
 def run(config: TouchProbesOptions) -> dict[str, Any]:
     """Press, embed, probe within and across sensors."""
-    encoder = load_pooled(find_encoder(config.encoder)).eval()
-    sets = {name: _presses(name, encoder, config) for name in config.sensors}
+    features = press_features(load_encoder(config.encoder).eval())
+    sets = {name: _presses(name, features, config) for name in config.sensors}
     rows = [
         {"from": source, "to": target, "input": kind, **_probe(sets[source], sets[target], kind)}
         for kind in ("own", "shared")
@@ -76,7 +74,7 @@ def run(config: TouchProbesOptions) -> dict[str, Any]:
     return {"table": _table(rows, config), "rows": rows}
 
 
-def _presses(name: str, encoder: PooledEncoder, config: TouchProbesOptions) -> Presses:
+def _presses(name: str, features: PressFeatures, config: TouchProbesOptions) -> Presses:
     sensor, rng = find_sensor(name), np.random.default_rng([config.seed, len(name)])
     units = [sample_instance(sensor, rng) for _ in range(_UNITS)]
     depths = [DepthEstimator(unit.calibration, _CELL) for unit in units]
@@ -94,39 +92,33 @@ def _presses(name: str, encoder: PooledEncoder, config: TouchProbesOptions) -> P
             indent(names[shape], pose, force * load, unit, rng)
             for pose, load in ((before, rng.uniform(0.85, 1.1)), (IndenterPose(x, y, turn), 1.0))
         ]
-        own = [_field((frame.astype(np.float32) - rest) / 16, unit) for frame in frames]
-        shared = [_shape(frame, rest, unit, depths[u]) for frame in frames]
-        pictures = [own[1], shared[1], own[1] - own[0], shared[1] - shared[0]]
-        features = _features(np.stack(pictures), encoder)
-        rows.append([*features, shape, force, (x, y), slid, u >= _UNITS - _TEST_UNITS])
+        changes = [(frame.astype(np.float32) - rest) / 16 for frame in frames]
+        own = [_field(change, unit, features.shape) for change in changes]
+        reliefs = [_shape(frame, rest, unit, depths[u]) for frame in frames]
+        shared = [_field(relief, unit, features.shape) for relief in reliefs]
+        (now, moved), (felt, felt_moved) = features(*own), features(*shared)
+        seen = [now, felt, moved, felt_moved]
+        rows.append([*seen, shape, force, (x, y), slid, u >= _UNITS - _TEST_UNITS])
     return Presses(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def _field(
-    change: Float32[np.ndarray, "h w c"], unit: SensorInstance
-) -> Float32[np.ndarray, "side side c"]:
-    """The middle of a sensor's picture, at the scale that all share."""
-    h, w, _ = change.shape
-    scale = FIELD / _SIDE / unit.pixel_pitch  # px of the picture per px of the field
-    shift = [(w - 1) / 2 - scale * (_SIDE - 1) / 2, (h - 1) / 2 - scale * (_SIDE - 1) / 2]
+def _field(change: Change, unit: SensorInstance, shape: tuple[int, int]) -> Change:
+    """The middle of a sensor's picture, at the scale that all share: FIELD from top to bottom."""
+    (h, w, _), (rows, columns) = change.shape, shape
+    scale = FIELD / rows / unit.pixel_pitch  # px of the picture per px of the field
+    shift = [(w - 1) / 2 - scale * (columns - 1) / 2, (h - 1) / 2 - scale * (rows - 1) / 2]
     to_picture = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(change, to_picture, (_SIDE, _SIDE), flags=flags)
+    return cv2.warpAffine(change, to_picture, (columns, rows), flags=flags)
 
 
 def _shape(
     frame: np.ndarray, rest: np.ndarray, unit: SensorInstance, estimator: DepthEstimator
-) -> Float32[np.ndarray, "side side 3"]:
+) -> Change:
     """Slopes along x and y, and depth."""
     depth = estimator.estimate(frame, rest.astype(np.float32))
     gy, gx = np.gradient(depth, np.float32(unit.pixel_pitch))
-    return _field(np.stack([_SLOPE * gx, _SLOPE * gy, _DEPTH * depth], -1).astype("f4"), unit)
-
-
-@torch.no_grad()
-def _features(pictures: np.ndarray, encoder: PooledEncoder) -> Float32[np.ndarray, "n d"]:
-    touch = torch.from_numpy(np.ascontiguousarray(pictures.transpose(0, 3, 1, 2)))
-    return encoder.pool_parts(touch).numpy()
+    return np.stack([_SLOPE * gx, _SLOPE * gy, _DEPTH * depth], -1).astype(np.float32)
 
 
 def _probe(known: Presses, asked: Presses, kind: str) -> dict[str, float]:

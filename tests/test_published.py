@@ -11,6 +11,11 @@ from safetensors.torch import save_file
 from sparsh_files import plain_forward, published
 
 import touchgoal
+from touchgoal.benchmarks.config import TouchProbesOptions
+from touchgoal.benchmarks.real_touch_encoders import find_embedder
+from touchgoal.benchmarks.tacbench.data import RigFrames
+from touchgoal.benchmarks.tacbench.probes import frozen_tokens
+from touchgoal.benchmarks.touch_probes import run as run_touch_probes
 from touchgoal.control.errors import UserError
 from touchgoal.encoders.pretrained import find_encoder, load_encoder, save
 from touchgoal.encoders.published import load_published
@@ -131,3 +136,45 @@ def test_a_wrong_file_is_refused_in_one_line(tmp_path: Path) -> None:
         load_encoder(tmp_path / "lost.ckpt")
     with pytest.raises(UserError, match="there is no touch encoder"):
         load_encoder("facebook/dino")
+
+
+def test_real_touch_takes_them(tmp_path: Path) -> None:
+    weights, frames = published(), video()
+    save_file(weights, tmp_path / "mae_vittiny.safetensors")
+    for name in (tmp_path, tmp_path / "mae_vittiny.safetensors"):
+        (seen,) = find_embedder(str(name), 0)(frames, frames[0], np.array([7]))
+        np.testing.assert_allclose(seen, expected(weights, frames, 7, "mae"), atol=2e-5)
+    random = find_embedder(f"random:{tmp_path}", 0)(frames, frames[0], np.array([7]))
+    assert np.abs(random[0] - seen).max() > 0.1
+
+
+@pytest.mark.parametrize("method", ["mae", "vjepa"])
+def test_tacbench_probes_their_tokens_of_the_true_past(tmp_path: Path, method: str) -> None:
+    """Two strokes one after the other; the second one's first frame has no past in the first one."""
+    weights, frames = published(**METHODS[method][0]), video(12)
+    save_file(weights, tmp_path / "vittiny.safetensors")
+    encoder = load_encoder(tmp_path / "vittiny.safetensors")
+    stroke = np.repeat([0, 1], [3, 9])
+    parts = [encoder.preprocess(frames[:3], frames[0]), encoder.preprocess(frames[3:], frames[3])]
+    rig = RigFrames(
+        touch=torch.from_numpy(np.concatenate(parts)).half(),
+        before=torch.zeros(12, dtype=torch.long),
+        force=torch.ones(12, 3),
+        slip=torch.zeros(12, dtype=torch.bool),
+        stroke=stroke,
+        indenter=np.array(["sphere"] * 12),
+    )
+    tokens = frozen_tokens(encoder, rig)(torch.tensor([4, 11])).mean(1).numpy()
+    for row, i in ((0, 1), (1, 8)):
+        wanted = expected(weights, frames[3:], i, method)
+        np.testing.assert_allclose(tokens[row], wanted, atol=3e-3)
+
+
+def test_touch_probes_take_them(tmp_path: Path) -> None:
+    save_file(published(), tmp_path / "mae_vittiny.safetensors")
+    options = TouchProbesOptions(
+        encoder=str(tmp_path), sensors=("gelsight_mini_measured",), presses=24
+    )
+    rows = run_touch_probes(options)["rows"]
+    assert [row["input"] for row in rows] == ["own", "shared"]
+    assert all(0 < row["place_error_mm"] < 3 for row in rows)

@@ -9,7 +9,7 @@ import pytest
 
 from touchgoal.benchmarks.config import RealTouchOptions
 from touchgoal.benchmarks.real_cost import EmbeddedGrasp, cost_table, judge_cost
-from touchgoal.benchmarks.real_touch import run
+from touchgoal.benchmarks.real_touch import embed_touch, read_touch, run
 from touchgoal.benchmarks.real_touch_encoders import find_embedder
 from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.picture_force import calibrate_force, shrunk, statistics
@@ -63,6 +63,21 @@ def test_the_benchmark_judges_encoders(clips: Path) -> None:
     assert (
         "contact in 18 clips: 0 alarms within the first three frames; 0 missed" in result["table"]
     )
+
+
+def test_the_past_of_a_chosen_frame_is_that_of_its_video(clips: Path) -> None:
+    video = read_labelled_videos(clips)[0]
+    frames, asked = video.frames(), []
+
+    def embed(frames: np.ndarray, background: np.ndarray, rows: np.ndarray | None = None):
+        asked.append((len(frames), rows))
+        return np.zeros((len(frames) if rows is None else len(rows), 1), np.float32)
+
+    touch = read_touch(video, frames)
+    embed_touch(touch, frames, embed)
+    (whole, rows), *alone = asked
+    assert whole == 9 and rows.tolist()[1:] == [5, 6, 7, 8]  # pressed from the sixth on
+    assert alone == [(1, None)] * 2  # an untouched frame and a brighter one have no common past
 
 
 def test_the_benchmark_takes_a_hugging_face_model(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ bootstrap over test strokes, of the mean over seeds.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, TextIO
@@ -132,9 +133,9 @@ def _recorder(what: str, config: TacbenchOptions) -> tuple[Callable[..., Episode
 def _encoder(name: str, config: TacbenchOptions) -> BaseTouchEncoder:
     """An encoder that fits the rig's sensor; UserError for another."""
     encoder = find_encoder_of(name, config.seed)
-    PairTokens(encoder)
+    PairTokens(encoder)  # refuses one without tokens
     sensor = find_sensor(config.rig.sensor).name
-    if encoder.preprocess.sensor != sensor:
+    if encoder.preprocess.sensor not in (None, sensor):
         raise UserError(
             f"the encoder {name} is for {encoder.preprocess.sensor}, the rig has {sensor}: choose "
             "--rig.sensor or --encoders"
@@ -145,7 +146,8 @@ def _encoder(name: str, config: TacbenchOptions) -> BaseTouchEncoder:
 def _subject(name: str, encoder: BaseTouchEncoder, frames: RigFrames) -> Subject:
     """An encoder with what its probes read; only a frozen one's tokens are known beforehand."""
     if name.startswith(END_TO_END):
-        return Subject(name, encoder, frames, frames.pairs, True)
+        offsets = PairTokens(encoder).offsets
+        return Subject(name, encoder, frames, partial(frames.seen, offsets=offsets), True)
     return Subject(name, encoder, frames, frozen_tokens(encoder, frames), False)
 
 

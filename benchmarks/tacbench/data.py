@@ -14,7 +14,8 @@ from touchgoal.control.features import (
     TRUTH_SLIP,
 )
 from touchgoal.control.progress import track
-from touchgoal.encoders.preprocess import TactilePreprocessor
+from touchgoal.encoders.backbones.frame_history import past_rows
+from touchgoal.encoders.preprocess import Preprocessor
 from touchgoal.episodes.store import EpisodeSet
 
 STRIDE = 5
@@ -47,9 +48,11 @@ class RigFrames:
     indenter: np.ndarray
     pose: Float[Tensor, "n 3"] | None = None
 
-    def pairs(self, rows: Rows) -> Float[Tensor, "k 2 3 h w"]:
-        """The frames and those before them."""
-        return torch.stack([self.touch[rows], self.touch[self.before[rows]]], 1).float()
+    def seen(self, rows: Rows, offsets: tuple[int, ...]) -> Float[Tensor, "k t 3 h w"]:
+        """Frames, and those so many frames before each; of a stroke's first frames its first."""
+        newest = rows.numpy()
+        first = np.searchsorted(self.stroke, self.stroke[newest])
+        return self.touch[torch.from_numpy(past_rows(newest, offsets, first))].float()
 
     @property
     def pressed(self) -> Bool[np.ndarray, " n"]:
@@ -72,7 +75,7 @@ class Split:
     tests: dict[str, Rows]
 
 
-def read_strokes(strokes: EpisodeSet, count: int, preprocess: TactilePreprocessor) -> RigFrames:
+def read_strokes(strokes: EpisodeSet, count: int, preprocess: Preprocessor) -> RigFrames:
     """All frames of the first so many strokes; a stroke's background is its first frame."""
     keys = [TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP]
     keys += [TRUTH_OBJECT_POSE] if TRUTH_OBJECT_POSE in strokes.features else []

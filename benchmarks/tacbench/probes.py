@@ -11,14 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from touchgoal.benchmarks.real_touch_encoders import untrained
-from touchgoal.benchmarks.tacbench.data import RigFrames, Rows
+from touchgoal.benchmarks.real_touch_encoders import untrained, vit_of
+from touchgoal.benchmarks.tacbench.data import STRIDE, RigFrames, Rows
 from touchgoal.benchmarks.tacbench.tasks import Outputs, Task
-from touchgoal.control.errors import UserError
 from touchgoal.control.progress import track
-from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
-from touchgoal.encoders.backbones.touch_backbone import BATCH, BaseTouchEncoder, TouchBackbone
-from touchgoal.encoders.backbones.vit import ViT
+from touchgoal.encoders.backbones.touch_backbone import BATCH, BaseTouchEncoder
 from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.probes.attentive import AttentiveProbe
@@ -50,31 +47,30 @@ class ProbeTraining:
 
 
 class PairTokens(nn.Module):
-    """An encoder's tokens of a frame and of the one before it, side by side at every place."""
+    """An encoder's tokens of a frame and of the one before it, side by side at every place.
+
+    An encoder that looks back by itself gives the tokens of what it sees.
+
+    Attributes:
+        offsets: how many frames before the newest each lies that is seen.
+        looks_back: whether the encoder does by itself.
+        features: width of a token.
+    """
 
     def __init__(self, encoder: BaseTouchEncoder) -> None:
         """Of an encoder with a ViT; UserError for any other."""
         super().__init__()
-        self.vit = _vit(encoder)
-        stacked = self.vit.config.channels == 6
-        self.features = self.vit.config.width * (1 if stacked else 2)
+        self.vit = vit_of(encoder)
+        self.looks_back, self._stack = len(encoder.offsets) > 1, encoder.stack
+        self.offsets = encoder.offsets if self.looks_back else (0, STRIDE)
+        self.features = self.vit.config.width * (1 if self.looks_back else 2)
 
-    def forward(self, pairs: Float[Tensor, "b 2 3 h w"]) -> Float[Tensor, "b t f"]:
-        """The tokens; from a ViT of two stacked frames those of both."""
-        if self.vit.config.channels == 6:
-            return self.vit(pairs.flatten(1, 2))
-        tokens = self.vit(pairs.flatten(0, 1)).unflatten(0, (len(pairs), 2))
+    def forward(self, seen: Float[Tensor, "b n 3 h w"]) -> Float[Tensor, "b t f"]:
+        """The tokens of frames at `offsets`."""
+        if self.looks_back:
+            return self.vit(self._stack(seen))
+        tokens = self.vit(seen.flatten(0, 1)).unflatten(0, (len(seen), 2))
         return tokens.transpose(1, 2).flatten(2)
-
-
-def _vit(encoder: BaseTouchEncoder) -> ViT:
-    if isinstance(encoder, TouchEncoder):
-        return encoder.backbone
-    if isinstance(encoder, TouchBackbone):
-        return encoder.vit
-    raise UserError(
-        f"a {type(encoder).__name__} has no tokens to probe: give an encoder with a ViT"
-    )
 
 
 def find_encoder_of(name: str, seed: int) -> BaseTouchEncoder:
@@ -90,8 +86,9 @@ def frozen_tokens(encoder: BaseTouchEncoder, frames: RigFrames) -> Callable[[Row
     """A frozen encoder's tokens of every pair, by row; each frame is embedded once."""
     tokens = PairTokens(encoder).eval()
     every = torch.arange(len(frames.before))
-    if tokens.vit.config.channels == 6:
-        known = torch.cat([tokens(frames.pairs(rows)).half() for rows in _batches(every)])
+    if tokens.looks_back:
+        seen = (frames.seen(rows, tokens.offsets) for rows in _batches(every))
+        known = torch.cat([tokens(batch).half() for batch in seen])
         return lambda rows: known[rows].float()
     alone = torch.cat([tokens.vit(frames.touch[rows].float()).half() for rows in _batches(every)])
     return lambda rows: torch.cat([alone[rows], alone[frames.before[rows]]], 2).float()
