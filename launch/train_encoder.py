@@ -9,7 +9,7 @@ from pydantic import Field
 from touchgoal.control.option_types import Count, CountOrNone, Seed, checked_dataclass
 from touchgoal.encoders.config import ALIGN_PRESETS, AlignConfig, MaeConfig
 from touchgoal.encoders.ssl.config import DINO_PRESETS, DinoConfig
-from touchgoal.launch.support.training_options import TrainingOptions
+from touchgoal.launch.support.training_options import TrainingOptions, UnlabelledOptions
 
 
 @checked_dataclass
@@ -45,7 +45,7 @@ class AlignPaper(Align):
 
 
 @checked_dataclass
-class Mae(TrainingOptions):
+class Mae(UnlabelledOptions):
     """Learn touch without labels, by masked autoencoding (MAE)."""
 
     out: Path | None = None
@@ -59,7 +59,7 @@ class Mae(TrainingOptions):
 
 
 @checked_dataclass
-class Distill(TrainingOptions):
+class Distill(UnlabelledOptions):
     """Options of the objectives that see several frames at once."""
 
     out: Path | None = None

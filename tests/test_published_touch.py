@@ -11,9 +11,13 @@ from PIL import Image
 from published_files import UNTOUCHED, encoded, gel, near, write, write_slides
 
 from touchgoal.control.errors import UserError
+from touchgoal.encoders.preprocess import preprocessor_for
+from touchgoal.encoders.pretrained import ENCODER_FORMAT, load_encoder
+from touchgoal.encoders.ssl.published_frames import sample_recordings
 from touchgoal.episodes.importers.plain_pickle import StoredBytes
 from touchgoal.episodes.importers.pretraining_clips import read_recordings
 from touchgoal.episodes.importers.touch_clip import TouchClip, decode, read_pictures
+from touchgoal.launch.__main__ import main
 
 
 def test_slides_are_upright_digits_with_their_own_untouched_gel(tmp_path: Path) -> None:
@@ -66,6 +70,44 @@ def test_object_folder_is_a_mini(tmp_path: Path) -> None:
     assert [r.held_out for r in recordings] == [False, False, True]
     assert near(recordings[2].clip.frames([0])[0], gel(3, (240, 320)))
     assert read_recordings(tmp_path, "gelsight_mini_markers")
+
+
+def test_touches_are_drawn_with_those_before_them(tmp_path: Path) -> None:
+    write_slides(tmp_path, ("mug",))
+    recordings = read_recordings(tmp_path)[1:3]
+    preprocess = preprocessor_for("digit")
+    drawn = sample_recordings(recordings, 100, 0, (0, 5))
+    assert drawn.touch.shape == (9 + 10, 2, 3, 160, 120) and drawn.stride == 5
+    clip, background = recordings[1].clip, recordings[1].background()
+    for row, past in ((0, 0), (4, 0), (9, 4)):
+        expected = preprocess(clip.frames([row, past]), background)
+        assert np.allclose(drawn.touch[9 + row], expected, atol=2e-3)
+    alone = sample_recordings(recordings, 3, 0)
+    assert alone.touch.shape == (6, 3, 160, 120)
+    assert np.array_equal(alone.touch[:3], sample_recordings(recordings[:1], 3, 0).touch)
+
+
+def test_an_encoder_learns_from_a_published_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, out = tmp_path / "slides", tmp_path / "run"
+    write_slides(data)
+    toy = "--frames 4 --mae.vit tiny --mae.epochs 1 --mae.batch-size 8".split()
+    main(["train-encoder", "mae", "--data", str(data), "--out", str(out), *toy])
+    encoder = load_encoder(str(out / "encoder"))
+    assert encoder.embed(np.stack([gel(1), gel(2)])).shape[0] == 2  # upright, as a DIGIT's
+    kept = ENCODER_FORMAT.provenance(out / "encoder")
+    assert (kept["recordings"], kept["validation_recordings"]) == (8, 2)
+    assert kept["data"]["train"] == str(data)
+    for words, told in (
+        (["--data", str(data), "--sensor", "gelsight_mini"], "with digit, not gelsight_mini"),
+        (["--data", str(tmp_path / "none")], "is no folder"),
+        (["--data", str(tmp_path)], "none of the published layouts"),
+        (["--data", str(data), "--validation", str(data)], "leave --validation out"),
+    ):
+        with pytest.raises(SystemExit) as refused:
+            main(["train-encoder", "mae", *words, "--out", str(tmp_path / "other"), *toy])
+        assert told in f"{refused.value.code}{capsys.readouterr().err}"
 
 
 def test_what_is_no_such_folder_is_one_line(tmp_path: Path) -> None:

@@ -10,10 +10,8 @@ from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.alignment.align import align
 from touchgoal.encoders.backbones.frame_history import frame_offsets
 from touchgoal.encoders.backbones.sparsh import SPARSH_BASE
-from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.pretrained import save
 from touchgoal.encoders.ssl.dino import train_dino
-from touchgoal.encoders.ssl.frames import check_sensor, sample_frames
 from touchgoal.encoders.ssl.mae import train_mae
 from touchgoal.encoders.ssl.surface_whitening import WhiteningConfig, train
 from touchgoal.encoders.towers.towers import load_towers
@@ -27,6 +25,7 @@ from touchgoal.launch.support.training_run import (
     open_training,
     recipe,
 )
+from touchgoal.launch.support.unlabelled_touch import UnlabelledTouch, open_touch, sensor_of
 from touchgoal.launch.train_encoder import Align, Dino, Mae, Surfaces
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder
 from touchgoal.rewards.fit_normalizer import fit_normalizer
@@ -39,14 +38,15 @@ def run_command(config: Align | Mae | Dino | Surfaces) -> None:
         _fit_to_surfaces(config)
         return
     check_training(config.trainer, config.out)
-    sets = open_sets(config.data, config.validation)
-    sensor = _sensor_of(config.sensor, *sets)
+    if isinstance(config, Align):
+        sets = open_sets(config.data, config.validation)
+        _align(config, sensor_of(config.sensor, *sets), *sets)
+        return
+    touch = open_touch(config.data, config.validation, config.sensor)
     if isinstance(config, Mae):
-        _train_mae(config, sensor, *sets)
-    elif isinstance(config, Dino):
-        _distill(config, sensor, *sets)
+        _train_mae(config, touch)
     else:
-        _align(config, sensor, *sets)
+        _distill(config, touch)
 
 
 def _fit_to_surfaces(config: Surfaces) -> None:
@@ -61,37 +61,23 @@ def _fit_to_surfaces(config: Surfaces) -> None:
     print(f"encoder: {out / 'encoder'}")
 
 
-def _sensor_of(named: str | None, *sets: EpisodeSet) -> str:
-    """The sensor of all episodes; UserError if it is unknown, or not the one that was named."""
-    sensor = named or str(sets[0].meta(0).get("sensor", ""))
-    if not sensor:
-        raise UserError(f"{sets[0].root} does not name its fingertip sensor: name it with --sensor")
-    preprocessor_for(sensor)
-    for episodes in sets:
-        for i in range(len(episodes)):
-            check_sensor(episodes, i, sensor)
-    return sensor
-
-
-def _train_mae(config: Mae, sensor: str, data: EpisodeSet, validation: EpisodeSet) -> None:
+def _train_mae(config: Mae, touch: UnlabelledTouch) -> None:
     out = open_training(config, "train-encoder")
     train, val = (
-        sample_frames(episodes, sensor, config.frames, config.seed)
-        for episodes in (data, validation)
+        draw(config.frames, config.seed, None) for draw in (touch.train, touch.validation)
     )
-    train_mae(train, val, config.mae, out, config.trainer, recipe(data, validation))
+    train_mae(train, val, config.mae, out, config.trainer, touch.recipe)
     print(f"encoder: {out / 'encoder'}")
 
 
-def _distill(config: Dino, sensor: str, data: EpisodeSet, validation: EpisodeSet) -> None:
+def _distill(config: Dino, touch: UnlabelledTouch) -> None:
     """Draw moments of several frames, train, save the teacher."""
     out = open_training(config, "train-encoder")
     offsets = frame_offsets(SPARSH_BASE["dino"], config.stride)
     train, val = (
-        sample_frames(episodes, sensor, config.frames, config.seed, offsets)
-        for episodes in (data, validation)
+        draw(config.frames, config.seed, offsets) for draw in (touch.train, touch.validation)
     )
-    train_dino(train, val, config.dino, out, config.trainer, recipe(data, validation))
+    train_dino(train, val, config.dino, out, config.trainer, touch.recipe)
     print(f"encoder: {out / 'encoder'}")
 
 

@@ -19,10 +19,37 @@ class DataOptions:
 
 
 @checked_dataclass
-class TrainingOptions(TrainerOptions, DataOptions):
-    """Options of every training command; in its help those of the last base come first."""
+class UnlabelledData:
+    """What is learned from without labels, and where what was learned is left."""
+
+    data: Path
+    """Set of episodes to learn from, or a published folder: YCB-Slide, Touch-Slide, Touch-and-Go or
+    ObjectFolder, as pickles."""
+    validation: Path | None = None
+    """Set of other episodes, or another published folder, on which what was learned is measured.
+    Default: the recordings that a published --data holds out."""
+    out: Path | None = None
+    """Folder of the run."""
+
+
+@checked_dataclass
+class TrainedOptions(TrainerOptions):
+    """Options of the trainer, with those of what it trains."""
+
+    out: Path | None = None
+    """Folder of the run."""
 
     @property
     def trainer(self) -> TrainerOptions:
         """The trainer's part."""
         return TrainerOptions(self.seed, self.device, self.precision, self.resume)
+
+
+@checked_dataclass
+class TrainingOptions(TrainedOptions, DataOptions):
+    """Options of every training command; in its help those of the last base come first."""
+
+
+@checked_dataclass
+class UnlabelledOptions(TrainedOptions, UnlabelledData):
+    """Options of every training without labels."""

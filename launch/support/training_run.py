@@ -11,7 +11,7 @@ from touchgoal.encoders.training.checkpoint import check_run_folder
 from touchgoal.encoders.training.trainer import check_device
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.support.run_folder import open_run
-from touchgoal.launch.support.training_options import TrainingOptions
+from touchgoal.launch.support.training_options import TrainedOptions
 
 
 def check_training(options: TrainerOptions, out: Path | None, first: str = "") -> None:
@@ -34,7 +34,7 @@ def check_training(options: TrainerOptions, out: Path | None, first: str = "") -
         check_run_folder(out / first, options.resume)
 
 
-def open_training(config: TrainingOptions, command: str) -> Path:
+def open_training(config: TrainedOptions, command: str) -> Path:
     """Opens the run's folder; of several processes the first one writes the record."""
     if int(os.environ.get("RANK", 0)) and config.out is not None:
         return config.out
