@@ -8,7 +8,14 @@ from pydantic import Field
 
 from touchgoal.control.option_types import Count, CountOrNone, Seed, checked_dataclass
 from touchgoal.encoders.config import ALIGN_PRESETS, AlignConfig, MaeConfig
-from touchgoal.encoders.ssl.config import DINO_PRESETS, DinoConfig
+from touchgoal.encoders.ssl.config import (
+    DINO_PRESETS,
+    IJEPA_PRESETS,
+    VJEPA_PRESETS,
+    DinoConfig,
+    IJepaConfig,
+    VJepaConfig,
+)
 from touchgoal.launch.support.training_options import TrainingOptions, UnlabelledOptions
 
 
@@ -90,6 +97,43 @@ class DinoPaper(Dino):
 
 
 @checked_dataclass
+class IJepa(Distill):
+    """Learn touch without labels from two frames, by predicting hidden blocks (I-JEPA)."""
+
+    ijepa: IJepaConfig = IJEPA_PRESETS["default"]
+    """How the encoder is trained."""
+
+
+@checked_dataclass
+class IJepaPaper(IJepa):
+    """I-JEPA with the training of the Sparsh paper: ViT-B, 150 epochs; meant for large GPUs."""
+
+    ijepa: IJepaConfig = IJEPA_PRESETS["paper"]
+    """How the encoder is trained."""
+
+
+@checked_dataclass
+class VJepa(Distill):
+    """Learn touch without labels from clips of four frames, by predicting hidden tubes (V-JEPA)."""
+
+    frames: Count = 10
+    """Moments drawn from each episode, both fingertips of each."""
+    stride: Count = 1
+    """Ticks between the frames of a clip: 1 is 0.05 s at 20 Hz, where Sparsh has 0.03 s (2 frames of
+    a sensor at 60 Hz)."""
+    vjepa: VJepaConfig = VJEPA_PRESETS["default"]
+    """How the encoder is trained."""
+
+
+@checked_dataclass
+class VJepaPaper(VJepa):
+    """V-JEPA with the training of the Sparsh paper: ViT-B, 150 epochs; meant for large GPUs."""
+
+    vjepa: VJepaConfig = VJEPA_PRESETS["paper"]
+    """How the encoder is trained."""
+
+
+@checked_dataclass
 class Surfaces:
     """Fit an ImageNet network to touch, on simulated presses of random surfaces: no episodes needed."""
 
@@ -111,6 +155,10 @@ Config = (
     | Annotated[Mae, tyro.conf.subcommand("mae")]
     | Annotated[Dino, tyro.conf.subcommand("dino")]
     | Annotated[DinoPaper, tyro.conf.subcommand("dino-paper")]
+    | Annotated[IJepa, tyro.conf.subcommand("ijepa")]
+    | Annotated[IJepaPaper, tyro.conf.subcommand("ijepa-paper")]
+    | Annotated[VJepa, tyro.conf.subcommand("vjepa")]
+    | Annotated[VJepaPaper, tyro.conf.subcommand("vjepa-paper")]
     | Annotated[Surfaces, tyro.conf.subcommand("surfaces")]
 )
 

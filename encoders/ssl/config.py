@@ -105,3 +105,88 @@ DINO_PRESETS: dict[str, DinoConfig] = {
         batch_norm=False,
     ),
 }
+
+
+@checked_dataclass
+class PredictorConfig(SelfDistillationConfig):
+    """What I-JEPA and V-JEPA share: the network that says what the teacher sees elsewhere."""
+
+    predictor_width: Annotated[int, Field(ge=12, multiple_of=12)] = 96
+    """Size of the predictor's tokens."""
+    predictor_depth: Annotated[Count, RARE] = 3
+    """Number of its blocks."""
+    predictor_heads: Annotated[Count, RARE] = 4
+    """Attention heads of each; they divide its width."""
+    shortest: Annotated[Positive, RARE] = 0.75
+    """Least height over width of a block that is asked for."""
+    tallest: Annotated[Positive, RARE] = 1.5
+    """Greatest height over width of a block that is asked for."""
+
+    def __post_init__(self) -> None:
+        """Raises OptionError for a predictor that cannot be built, or no range."""
+        if self.predictor_width % self.predictor_heads:
+            raise ValueError(
+                f"predictor_width {self.predictor_width} must be a multiple of predictor_heads "
+                f"{self.predictor_heads}"
+            )
+        if self.shortest > self.tallest:
+            raise ValueError("shortest must not be above tallest")
+
+
+@checked_dataclass
+class IJepaConfig(PredictorConfig):
+    """How to train a touch backbone by predicting what lies in blocks that it does not see (I-JEPA)."""
+
+    context_scale: Scales = (0.85, 1.0)
+    """Size of the block that the backbone sees, but for the target blocks."""
+    target_scale: Scales = (0.15, 0.2)
+    """Size of each target block."""
+    target_blocks: Count = 4
+    """Target blocks of each picture."""
+
+
+@checked_dataclass
+class VJepaConfig(PredictorConfig):
+    """How to train a touch backbone by predicting hidden tubes of a clip (V-JEPA)."""
+
+    small_scale: Annotated[Scale, RARE] = 0.15
+    """Size of each of the many blocks that together are hidden in the first of two masks."""
+    small_blocks: Count = 8
+    """How many of them."""
+    large_scale: Annotated[Scale, RARE] = 0.7
+    """Size of each of the few large blocks that together are hidden in the second mask."""
+    large_blocks: Count = 2
+    """How many of them."""
+
+
+# The predictors' sizes are those of the released code.
+IJEPA_PRESETS: dict[str, IJepaConfig] = {
+    "default": IJepaConfig(),
+    "paper": IJepaConfig(
+        vit="base",
+        epochs=150,
+        batch_size=150,
+        lr=6.25e-4,
+        final_lr=1.6e-3,
+        warmup=0.2,
+        momentum=0.996,
+        predictor_width=192,
+        predictor_depth=6,
+        predictor_heads=12,
+    ),
+}
+VJEPA_PRESETS: dict[str, VJepaConfig] = {
+    "default": VJepaConfig(),
+    "paper": VJepaConfig(
+        vit="base",
+        epochs=150,
+        batch_size=150,
+        lr=6.25e-4,
+        final_lr=1.6e-3,
+        warmup=0.2,
+        momentum=0.996,
+        predictor_width=384,
+        predictor_depth=12,
+        predictor_heads=12,
+    ),
+}

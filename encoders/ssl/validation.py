@@ -7,7 +7,7 @@ regression reads from its embedding. Nothing here changes the training.
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -37,7 +37,7 @@ class Distilled(Protocol):
     teacher: TouchBackbone
 
     def draw(self, count: int, generator: torch.Generator) -> dict: ...  # noqa: D102
-    def __call__(self, touch: Tensor, **drawn: Tensor) -> dict[str, Tensor]: ...  # noqa: D102
+    def __call__(self, touch: Tensor, **drawn: Any) -> dict[str, Tensor]: ...  # noqa: D102
 
 
 class Validation:

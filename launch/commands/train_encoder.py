@@ -12,8 +12,10 @@ from touchgoal.encoders.backbones.frame_history import frame_offsets
 from touchgoal.encoders.backbones.sparsh import SPARSH_BASE
 from touchgoal.encoders.pretrained import save
 from touchgoal.encoders.ssl.dino import train_dino
+from touchgoal.encoders.ssl.ijepa import train_ijepa
 from touchgoal.encoders.ssl.mae import train_mae
 from touchgoal.encoders.ssl.surface_whitening import WhiteningConfig, train
+from touchgoal.encoders.ssl.vjepa import train_vjepa
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.training.trainer import is_first_process
 from touchgoal.episodes.store import EpisodeSet
@@ -26,13 +28,13 @@ from touchgoal.launch.support.training_run import (
     recipe,
 )
 from touchgoal.launch.support.unlabelled_touch import UnlabelledTouch, open_touch, sensor_of
-from touchgoal.launch.train_encoder import Align, Dino, Mae, Surfaces
+from touchgoal.launch.train_encoder import Align, Dino, IJepa, Mae, Surfaces, VJepa
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder
 from touchgoal.rewards.fit_normalizer import fit_normalizer
 from touchgoal.rewards.normalizer import NORMALIZER, scene_of
 
 
-def run_command(config: Align | Mae | Dino | Surfaces) -> None:
+def run_command(config: Align | Mae | Dino | IJepa | VJepa | Surfaces) -> None:
     """Train one kind of encoder."""
     if isinstance(config, Surfaces):
         _fit_to_surfaces(config)
@@ -70,14 +72,23 @@ def _train_mae(config: Mae, touch: UnlabelledTouch) -> None:
     print(f"encoder: {out / 'encoder'}")
 
 
-def _distill(config: Dino, touch: UnlabelledTouch) -> None:
+def _distill(config: Dino | IJepa | VJepa, touch: UnlabelledTouch) -> None:
     """Draw moments of several frames, train, save the teacher."""
     out = open_training(config, "train-encoder")
-    offsets = frame_offsets(SPARSH_BASE["dino"], config.stride)
+    method = (
+        "dino" if isinstance(config, Dino) else "ijepa" if isinstance(config, IJepa) else "vjepa"
+    )
+    offsets = frame_offsets(SPARSH_BASE[method], config.stride)
     train, val = (
         draw(config.frames, config.seed, offsets) for draw in (touch.train, touch.validation)
     )
-    train_dino(train, val, config.dino, out, config.trainer, touch.recipe)
+    run = out, config.trainer, touch.recipe
+    if isinstance(config, Dino):
+        train_dino(train, val, config.dino, *run)
+    elif isinstance(config, IJepa):
+        train_ijepa(train, val, config.ijepa, *run)
+    else:
+        train_vjepa(train, val, config.vjepa, *run)
     print(f"encoder: {out / 'encoder'}")
 
 

@@ -1,0 +1,64 @@
+"""I-JEPA (Assran et al. 2023; Sparsh, Higuera et al. 2024) for touch: predict blocks, not their pixels."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
+from touchgoal.encoders.backbones.vit import patch_grid
+from touchgoal.encoders.config import TrainerOptions
+from touchgoal.encoders.ssl.config import IJepaConfig
+from touchgoal.encoders.ssl.frames import TouchFrames
+from touchgoal.encoders.ssl.masks import cover, cut, draw_blocks, draw_size, draw_targets
+from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, take
+from touchgoal.encoders.ssl.self_distillation import train_self_distilled
+
+_SQUARE = 1.0, 1.0
+
+
+class IJepa(JointEmbeddingPrediction):
+    """The backbone sees one large block without the target blocks, each of which is then predicted."""
+
+    config: IJepaConfig
+
+    def draw(self, count: int, generator: torch.Generator) -> dict[str, Any]:
+        """`seen_ids` (count, k), which all touches have as many of as the one with the fewest; and
+        `wanted_ids` (count, blocks, j)."""
+        config, grid = self.config, patch_grid(self.backbone.config.vit)
+        size = draw_size(grid, config.context_scale, _SQUARE, generator)
+        context = cover(draw_blocks(grid, size, count, 1, generator), grid[0] * grid[1])
+        aspect = config.shortest, config.tallest
+        size = draw_size(grid, config.target_scale, aspect, generator)
+        wanted, left = draw_targets(
+            grid, size, count, config.target_blocks, context, self.least_seen, generator
+        )
+        return {"seen_ids": cut(left, generator), "wanted_ids": wanted}
+
+    def forward(
+        self, touch: Tensor, seen_ids: Int[Tensor, "b k"], wanted_ids: Int[Tensor, "b m j"]
+    ) -> dict[str, Float[Tensor, ""]]:
+        """The loss: smooth L1 distance of predicted and actual tokens, as in the released code."""
+        images = self.stacked(touch)
+        actual = take(self.targets(images), wanted_ids)
+        predicted = self.predict(self.backbone.vit.embed_patches(images), seen_ids, wanted_ids)
+        return {"loss": F.smooth_l1_loss(predicted, actual)}
+
+
+def train_ijepa(
+    train: TouchFrames,
+    val: TouchFrames,
+    config: IJepaConfig,
+    out_dir: Path,
+    options: TrainerOptions,
+    recipe: dict[str, Any],
+) -> TouchBackbone:
+    """Trains a backbone by I-JEPA; see `train_self_distilled`."""
+
+    def build(backbone: TouchBackbone, steps: int) -> IJepa:
+        return IJepa(config, backbone, steps)
+
+    return train_self_distilled("ijepa", build, train, val, config, out_dir, options, recipe)

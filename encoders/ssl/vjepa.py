@@ -1,0 +1,83 @@
+"""V-JEPA (Bardes et al. 2024; Sparsh, Higuera et al. 2024) for touch: predict hidden tubes of a clip."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
+from touchgoal.encoders.backbones.vit import patch_grid
+from touchgoal.encoders.config import TrainerOptions
+from touchgoal.encoders.ssl.config import VJepaConfig
+from touchgoal.encoders.ssl.frames import TouchFrames
+from touchgoal.encoders.ssl.masks import cover, cut, draw_size, draw_targets
+from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, take
+from touchgoal.encoders.ssl.self_distillation import train_self_distilled
+
+
+class VJepa(JointEmbeddingPrediction):
+    """The backbone sees what two masks leave of a clip; what they hide is predicted.
+
+    A mask is the same in all frames: what is hidden cannot be copied from a moment before.
+    """
+
+    config: VJepaConfig
+
+    def draw(self, count: int, generator: torch.Generator) -> dict[str, Any]:
+        """For each mask `seen_ids` (count, k) and `wanted_ids` (count, 1, j), time by time; all touches
+        have as many of each as the one with the fewest."""
+        config, vit = self.config, self.backbone.config.vit
+        grid, times = patch_grid(vit), vit.frames // vit.tubelet
+        everything = torch.ones(count, grid[0] * grid[1], dtype=torch.bool)
+        drawn: dict[str, list[Tensor]] = {"seen_ids": [], "wanted_ids": []}
+        for scale, blocks in (
+            (config.small_scale, config.small_blocks),
+            (config.large_scale, config.large_blocks),
+        ):
+            aspect = config.shortest, config.tallest
+            size = draw_size(grid, (scale, scale), aspect, generator)
+            hidden, left = draw_targets(grid, size, count, blocks, everything, 1, generator)
+            wanted = cut(cover(hidden, everything.shape[1]), generator)
+            seen = cut(left, generator)
+            drawn["seen_ids"].append(tubes(seen, times, everything.shape[1]))
+            drawn["wanted_ids"].append(tubes(wanted, times, everything.shape[1])[:, None])
+        return drawn
+
+    def forward(
+        self,
+        touch: Tensor,
+        seen_ids: list[Int[Tensor, "b _"]],
+        wanted_ids: list[Int[Tensor, "b 1 _"]],
+    ) -> dict[str, Float[Tensor, ""]]:
+        """The loss: L1 distance of predicted and actual tokens, the mean over both masks."""
+        images = self.stacked(touch)
+        targets, patches = self.targets(images), self.backbone.vit.embed_patches(images)
+        losses = [
+            F.l1_loss(self.predict(patches, seen, wanted), take(targets, wanted))
+            for seen, wanted in zip(seen_ids, wanted_ids, strict=True)
+        ]
+        return {"loss": torch.stack(losses).mean()}
+
+
+def tubes(ids: Int[Tensor, "b k"], times: int, patches: int) -> Int[Tensor, "b j"]:
+    """The same patches of all times of a clip, of so many patches each."""
+    return torch.cat([ids + time * patches for time in range(times)], 1)
+
+
+def train_vjepa(
+    train: TouchFrames,
+    val: TouchFrames,
+    config: VJepaConfig,
+    out_dir: Path,
+    options: TrainerOptions,
+    recipe: dict[str, Any],
+) -> TouchBackbone:
+    """Trains a backbone by V-JEPA; see `train_self_distilled`."""
+
+    def build(backbone: TouchBackbone, steps: int) -> VJepa:
+        return VJepa(config, backbone, steps)
+
+    return train_self_distilled("vjepa", build, train, val, config, out_dir, options, recipe)

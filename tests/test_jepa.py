@@ -1,0 +1,240 @@
+"""I-JEPA and V-JEPA: what is seen and asked for, the loss by hand, learning, resumption."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from toy_touches import SENSOR, moving_blobs
+
+from touchgoal.encoders import pretrained
+from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
+from touchgoal.encoders.backbones.vit import ViT
+from touchgoal.encoders.config import TrainerOptions
+from touchgoal.encoders.ssl.config import (
+    IJEPA_PRESETS,
+    VJEPA_PRESETS,
+    IJepaConfig,
+    PredictorConfig,
+    VJepaConfig,
+)
+from touchgoal.encoders.ssl.frames import TouchFrames
+from touchgoal.encoders.ssl.ijepa import IJepa, train_ijepa
+from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, Predictor, take
+from touchgoal.encoders.ssl.self_distillation import Method, backbone_for, vit_for
+from touchgoal.encoders.ssl.vjepa import VJepa, train_vjepa
+from touchgoal.encoders.training import trainer
+
+SMALL: dict[str, Any] = {"epochs": 3, "batch_size": 12, "momentum": 0.9}
+PREDICTOR: dict[str, Any] = {"predictor_width": 24, "predictor_depth": 1, "predictor_heads": 2}
+ITOY = IJepaConfig(vit="tiny", **SMALL, **PREDICTOR)
+VTOY = VJepaConfig(vit="tiny", small_blocks=3, **SMALL, **PREDICTOR)
+CASES: dict[Any, Any] = {
+    "ijepa": (IJepa, train_ijepa, ITOY, moving_blobs(24)),
+    "vjepa": (VJepa, train_vjepa, VTOY, moving_blobs(24, frames=4)),
+}
+
+
+def rng(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def build(method: Method, vit: str = "tiny") -> JointEmbeddingPrediction:
+    kind, _, config, data = CASES[method]
+    torch.manual_seed(0)
+    return kind(config, backbone_for(method, vit, data), 10)
+
+
+def test_ijepa_sees_one_block_without_its_targets() -> None:
+    model = build("ijepa", "compact")
+    for seed in range(20):
+        drawn = model.draw(16, rng(seed))
+        seen, wanted = drawn["seen_ids"], drawn["wanted_ids"]
+        assert wanted.shape[:2] == (16, 4) and 8 <= wanted.shape[2] <= 20
+        assert seen.shape[1] >= 10
+        for own, blocks in zip(seen, wanted, strict=True):
+            assert len(own.unique()) == len(own) and not torch.isin(own, blocks).any()
+            for block in blocks:
+                rows, columns = (block // 10).unique(), (block % 10).unique()
+                assert len(rows) * len(columns) == len(block)
+                assert 0.5 <= len(rows) / len(columns) <= 2
+
+
+def test_vjepa_hides_tubes() -> None:
+    model = build("vjepa", "compact")
+    for seed in range(20):
+        drawn = model.draw(16, rng(seed))
+        few, many = (len(ids[0, 0]) for ids in drawn["wanted_ids"])
+        assert few >= 2 * 8 and many >= 2 * 0.5 * 80
+        for seen, wanted in zip(drawn["seen_ids"], drawn["wanted_ids"], strict=True):
+            for ids in (seen, wanted[:, 0]):
+                first, second = ids.chunk(2, 1)
+                assert torch.equal(first + 80, second) and first.max() < 80
+            both = torch.cat([seen, wanted[:, 0]], 1).sort(1).values
+            assert (both.diff(dim=1) > 0).all()
+
+
+def test_the_loss_of_ijepa_is_the_smooth_distance_of_normed_tokens() -> None:
+    model = build("ijepa")
+    touch, drawn = CASES["ijepa"][3].touch[:3], model.draw(3, rng())
+    total, count = 0.0, 0
+    with torch.no_grad():
+        for b in range(3):
+            image = torch.cat([touch[b, 0], touch[b, 1]])[None].float()
+            tokens = model.teacher.vit(image)[0]
+            spread = (tokens.var(1, correction=0, keepdim=True) + 1e-5).sqrt()
+            normed = (tokens - tokens.mean(1, keepdim=True)) / spread
+            seen_ids = drawn["seen_ids"][b : b + 1]
+            seen = model.backbone.vit(image, seen_ids)
+            for block in drawn["wanted_ids"][b]:
+                error = (model.predictor(seen, seen_ids, block[None])[0] - normed[block]).abs()
+                total += torch.where(error < 1, error**2 / 2, error - 0.5).sum().item()
+                count += error.numel()
+    assert model(touch=touch, **drawn)["loss"].item() == pytest.approx(total / count, rel=1e-4)
+
+
+def test_the_loss_of_vjepa_is_the_distance_of_normed_tokens() -> None:
+    model = build("vjepa")
+    touch, drawn = CASES["vjepa"][3].touch[:2], model.draw(2, rng())
+    clip = touch.float().transpose(1, 2)  # channels before frames, the newest first
+    losses = []
+    with torch.no_grad():
+        tokens = model.teacher.vit(clip)
+        spread = (tokens.var(2, correction=0, keepdim=True) + 1e-5).sqrt()
+        normed = (tokens - tokens.mean(2, keepdim=True)) / spread
+        for seen_ids, wanted in zip(drawn["seen_ids"], drawn["wanted_ids"], strict=True):
+            seen = model.backbone.vit(clip, seen_ids)
+            predicted = model.predictor(seen, seen_ids, wanted[:, 0])
+            rows = [normed[b, wanted[b, 0]] for b in range(2)]
+            losses.append((predicted - torch.stack(rows)).abs().mean())
+    torch.testing.assert_close(model(touch=touch, **drawn)["loss"], sum(losses) / 2)
+
+
+@pytest.mark.parametrize("method", CASES)
+def test_what_is_hidden_reaches_the_targets_alone(method: Method) -> None:
+    model = build(method)
+    touch, drawn = CASES[method][3].touch[:2].clone(), model.draw(2, rng())
+    model(touch=touch, **drawn)["loss"].backward()
+    assert all(p.grad is None for p in model.teacher.parameters())
+    assert all(p.grad is not None for p in model.backbone.parameters())
+    seen_ids, wanted = (x[0] if isinstance(x, list) else x for x in drawn.values())
+    with torch.no_grad():
+        before = model.predict(
+            model.backbone.vit.embed_patches(model.stacked(touch)), seen_ids, wanted
+        )
+        for b in range(2):
+            for patch in set(range(12)) - set((seen_ids[b] % 12).tolist()):
+                y, x = 40 * (patch // 4), 40 * (patch % 4)
+                touch[b, ..., y : y + 40, x : x + 40] += 3
+        images = model.stacked(touch)
+        assert not torch.allclose(model.targets(images)[0, wanted[0, 0]], before[0, 0])
+        after = model.predict(model.backbone.vit.embed_patches(images), seen_ids, wanted)
+    torch.testing.assert_close(after, before)
+
+
+def test_the_predictor_is_told_where() -> None:
+    model = build("vjepa")
+    assert len(model.predictor.places) == 24 and len(model.predictor.places.unique(dim=0)) == 24
+    seen, ids = torch.randn(1, 3, 48, generator=rng()), torch.tensor([[0, 1, 13]])
+    here, there = (model.predictor(seen, ids, torch.tensor([[k]])) for k in (2, 14))
+    assert not torch.allclose(here, there, atol=1e-3)
+    moved = model.predictor(seen, torch.tensor([[4, 1, 13]]), torch.tensor([[2]]))
+    assert not torch.allclose(here, moved, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", ["ijepa", pytest.param("vjepa", marks=pytest.mark.slow)])
+def test_what_is_predicted_depends_on_what_is_seen(method: Method) -> None:
+    """Another touch's predictions are worse: the predictor has learned more than the mean of each place."""
+    kind, _, config, _ = CASES[method]
+    torch.manual_seed(0)
+    vit = replace(vit_for(method, "tiny", (24, 32)), patch_size=8)
+    backbone = TouchBackbone(TouchBackboneConfig(vit, SENSOR, ""))
+    model = kind(replace(config, momentum=0.99), backbone, 300).train()
+    optimizer = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], lr=3e-3)
+    frames = 4 if method == "vjepa" else 2
+    train, other = shrunk(moving_blobs(128, 0, frames)), shrunk(moving_blobs(32, 1, frames))
+    for step in range(300):
+        rows = torch.randint(0, 128, (16,), generator=rng(step))
+        optimizer.zero_grad()
+        model(touch=train[rows], **model.draw(16, rng(step)))["loss"].backward()
+        optimizer.step()
+        model.update_teacher()
+    drawn = {name: x[0] if isinstance(x, list) else x for name, x in model.draw(1, rng()).items()}
+    seen, wanted = (ids.expand(32, *ids.shape[1:]) for ids in drawn.values())
+    with torch.no_grad():
+        images = model.stacked(other)
+        targets = take(model.targets(images), wanted)
+        predicted = model.predict(model.backbone.vit.embed_patches(images), seen, wanted)
+    own, others = ((x - targets).square().mean() for x in (predicted, predicted.roll(1, dims=0)))
+    assert own < 0.8 * others
+
+
+def shrunk(touches: TouchFrames) -> torch.Tensor:
+    """A fifth as high and wide."""
+    touch = touches.touch.float()
+    return F.avg_pool2d(touch.flatten(0, 2)[:, None], 5).view(*touch.shape[:3], 24, 32)
+
+
+@pytest.mark.parametrize("method", CASES)
+def test_a_killed_training_ends_with_the_same_weights(
+    method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, train, config, data = CASES[method]
+    whole = train(data, data, config, tmp_path / "whole", TrainerOptions(), {})
+    with monkeypatch.context() as patch:
+        train_epoch: Callable = trainer._train_epoch
+
+        def dies(*args):
+            if args[-1] == 2:
+                raise KeyboardInterrupt
+            return train_epoch(*args)
+
+        patch.setattr(trainer, "_train_epoch", dies)
+        with pytest.raises(KeyboardInterrupt):
+            train(data, data, config, tmp_path / "killed", TrainerOptions(), {})
+    train(data, data, config, tmp_path / "killed", TrainerOptions(resume=True), {})
+    resumed = pretrained.load_encoder(tmp_path / "killed/encoder")
+    for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
+        assert torch.equal(a, b)
+    lines = [(tmp_path / run / "metrics.jsonl").read_text() for run in ("whole", "killed")]
+    assert lines[0] == lines[1]
+    assert resumed.offsets == ((0, 2) if method == "ijepa" else (0, 2, 4, 6))
+    frames = np.full((8, 240, 320, 3), 100, np.uint8)
+    frames[1, 60:120, 80:160] = 160
+    rows = resumed.embed(frames)
+    past = [1, 3] if method == "ijepa" else [1, 3, 5, 7]
+    assert [not np.allclose(row, rows[0]) for row in rows] == [i in past for i in range(8)]
+
+
+def test_paper_presets_are_table_2() -> None:
+    for paper in (IJEPA_PRESETS["paper"], VJEPA_PRESETS["paper"]):
+        assert (paper.lr, paper.batch_size, paper.epochs) == (6.25e-4, 150, 150)
+        assert (paper.weight_decay, paper.final_weight_decay) == (0.04, 0.4)
+        assert (paper.momentum, paper.final_momentum) == (0.996, 1.0)
+        assert paper.warmup * paper.epochs == 30
+
+
+@pytest.mark.parametrize(
+    "method, image_size, backbone_size, paper, predictor_size",
+    [
+        ("ijepa", (224, 224), 86_386_944, IJEPA_PRESETS["paper"], 2_967_936 - 2 * 6 * 192),
+        ("vjepa", (224, 224), 86_537_472, VJEPA_PRESETS["paper"], 21_894_912 - 2 * 12 * 384),
+    ],
+)
+def test_sizes_are_the_published_ones(
+    method: Method,
+    image_size: tuple[int, int],
+    backbone_size: int,
+    paper: PredictorConfig,
+    predictor_size: int,
+) -> None:
+    """The released predictors have LayerScale besides, two factors a block and channel."""
+    vit = vit_for(method, "base", image_size)
+    with torch.device("meta"):
+        backbone = ViT(vit)
+    assert sum(p.numel() for p in backbone.parameters()) == backbone_size
+    assert sum(p.numel() for p in Predictor(vit, paper).parameters()) == predictor_size
