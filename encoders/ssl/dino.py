@@ -50,7 +50,8 @@ class DinoHead(nn.Module):
     def forward(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n p"]:
         """Scores, -1 to 1."""
         unit = F.normalize(self.mlp(x).float(), dim=1)
-        return unit @ F.normalize(self.prototypes.weight.float(), dim=1).T
+        with torch.autocast(x.device.type, enabled=False):  # temperatures blow rounding up
+            return unit @ F.normalize(self.prototypes.weight, dim=1).T
 
 
 class Dino(SelfDistillation):
@@ -92,7 +93,8 @@ class Dino(SelfDistillation):
             targets = self._targets(scores)
         views = [global_ids, local_ids]
         student = self._scores(self.backbone, self.head, images, views)
-        loss = cross_entropy_of_views(targets, student / self.config.student_temperature)
+        with torch.autocast(images.device.type, enabled=False):
+            loss = cross_entropy_of_views(targets, student / self.config.student_temperature)
         if self.training:
             self._move_center(scores)
         return {"loss": loss, "teacher_information": information(targets)}

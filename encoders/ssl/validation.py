@@ -24,7 +24,7 @@ from touchgoal.encoders.training.trainer import is_first_process
 
 _PROBE_SAMPLES, _TOKEN_SAMPLES = 2048, 128
 _STRENGTH = 1e-3  # of the decoder's ridge
-_LEAST_SPREAD, _LEAST_RANK = 0.01, 1.5  # share of the untrained spread; dimensions
+_LEAST_SPREAD, _LEAST_RANK = 0.01, 0.05  # shares of the untrained spread, and rank above 1
 _LEAST_INFORMATION = 0.01  # nats
 _PICTURES, _SHOWN = 4, 6
 _CONTRAST = 32.0  # grey levels that 1.0 is drawn as
@@ -49,7 +49,7 @@ class Validation:
         """Measures the untrained backbone, which collapse is judged by."""
         self._model, self._train, self._val = model, train, val
         self._out_dir, self._epochs = out_dir, epochs
-        self._untrained = token_statistics(self._tokens(val))["token_spread"]
+        self._untrained = token_statistics(self._tokens(val))
 
     def metrics(self) -> dict[str, float]:
         """The loss, `token_statistics`, the reconstruction and the forces, where they are known.
@@ -62,7 +62,7 @@ class Validation:
         return {
             "validation_loss": self._loss(),
             **token_statistics(tokens),
-            "token_spread_untrained": self._untrained,
+            **{f"{name}_untrained": value for name, value in self._untrained.items()},
             "reconstruction": 1 - error.item(),
             **read_forces(self._embed, self._train, self._val),
         }
@@ -70,18 +70,18 @@ class Validation:
     def has_collapsed(self, metrics: dict[str, float]) -> bool:
         """Whether all touches have come to look the same to the teacher, differ along one line, or are all
         given the same class, if it gives any."""
-        spread = metrics["token_spread"] / max(self._untrained, 1e-12)
-        information = metrics.get("teacher_information", 1.0)
-        enough = spread >= _LEAST_SPREAD and information >= _LEAST_INFORMATION
-        return not enough or metrics["effective_rank"] < _LEAST_RANK
+        spread = metrics["token_spread"] / max(self._untrained["token_spread"], 1e-12)
+        rank = (metrics["effective_rank"] - 1) / max(self._untrained["effective_rank"] - 1, 1e-12)
+        told = metrics.get("teacher_information", 1.0)
+        return not (spread >= _LEAST_SPREAD and rank >= _LEAST_RANK and told >= _LEAST_INFORMATION)
 
     def line(self, metrics: dict[str, float]) -> str:
         """The line printed of an epoch."""
         text = (
             f"loss {metrics['loss']:.4f} in training, {metrics['validation_loss']:.4f} in validation; "
-            f"spread of tokens {metrics['token_spread']:.3f} ({self._untrained:.3f} untrained) in "
-            f"{metrics['effective_rank']:.1f} dimensions; {metrics['reconstruction']:.2f} of the "
-            f"picture reconstructed{forces_line(metrics)}"
+            f"spread of tokens {metrics['token_spread']:.3f} ({self._untrained['token_spread']:.3f} "
+            f"untrained) in {metrics['effective_rank']:.1f} dimensions; "
+            f"{metrics['reconstruction']:.2f} of the picture reconstructed{forces_line(metrics)}"
         )
         warning = "  WARNING: the embeddings have collapsed, all touches look the same"
         return text + warning if self.has_collapsed(metrics) else text
