@@ -73,13 +73,13 @@ def test_a_regular_policy_is_followed_without_ripple() -> None:
 @pytest.mark.parametrize("robot", [FR3, UR5E], ids=lambda r: r.arm.name)
 @pytest.mark.parametrize("hz", [20, 125])
 def test_what_is_sent_stays_in_the_box_and_inside_every_limit(robot: RobotLimits, hz: int) -> None:
-    """A wild policy, a third of whose commands come late by up to a tick: 0.1 mm at most."""
+    """A wild policy, a third of whose commands come late by up to a tick."""
     layer, rng = ActionFilter(robot, hz), np.random.default_rng(1)
     commands = wild_commands(layer, 4 * hz, rng)
     late = late_by(4 * hz, 1000 // hz, rng)
     q = np.array(list(send(robot, hz, commands, late.tolist())))
     check_within(robot.interface, q)
-    assert outside_box(layer, q[::5]) < 1e-4
+    assert outside_box(layer, q[::5]) < 0
 
 
 def test_with_commands_lost_the_fingers_stay_in_their_box() -> None:

@@ -136,12 +136,22 @@ _ROUNDING = 1e-12  # rad/s; a smaller change is no clamp
 
 
 class ActionFilter:
-    """The limits of one robot at one control rate (Hz)."""
+    """The limits of one robot at one control rate (Hz).
+
+    Attributes:
+        limits: of the robot.
+        joints: what a policy may use of its joints.
+        dt: s, of a control tick.
+        watchdogs: how old things may be.
+        fingertips: where the corners of the fingertips may be commanded, base frame.
+    """
 
     def __init__(self, limits: RobotLimits, hz: float, watchdogs: Watchdogs | None = None) -> None:
         self.limits, self.joints, self.dt = limits, limits.policy, 1 / hz
         self.watchdogs = watchdogs or Watchdogs()
         edges = np.array(((0.0, 0.0, 0.0), *limits.tool.finger_corners))
+        self._flange = limits.flange.shrunk(limits.reserve)
+        self.fingertips = limits.fingertips.shrunk(limits.reserve)
         self._points = Kinematics(limits.arm, 0.0).points_on_links(edges)
         unit = self.joints.acceleration * self.dt
         self._braking_ticks = int(np.ceil(self.joints.velocity / unit).max()) + 1
@@ -158,7 +168,7 @@ class ActionFilter:
         if not self.inside_workspace(q[None])[0]:
             raise UserError(
                 "the flange or the fingers are outside the workspace box: move the arm into it by "
-                "hand, or widen the box in the robot's limits"
+                "hand, or widen the box in the cell file's [safety]"
             )
         return SafetyState(np.array(q), np.zeros(q.size))
 
@@ -191,10 +201,10 @@ class ActionFilter:
         return float(np.clip(target, *self.limits.tool.stroke))
 
     def inside_workspace(self, q: Float[np.ndarray, "k n"]) -> Bool[np.ndarray, " k"]:
-        """Whether flange and finger edges lie in their boxes, for each of k postures."""
+        """Whether flange and finger edges lie in their boxes, less the reserve, for each of k postures."""
         points = self.monitored_points(q)
-        flange = self.limits.flange.contains(points[:, 0])
-        return flange & self.limits.fingertips.contains(points[:, 1:]).all(axis=1)
+        flange = self._flange.contains(points[:, 0])
+        return flange & self.fingertips.contains(points[:, 1:]).all(axis=1)
 
     def monitored_points(self, q: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k p 3"]:
         """Flange and the fingertips' corners in the base frame (m), for each of k postures."""

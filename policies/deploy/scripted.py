@@ -150,7 +150,7 @@ def pick_and_place(
     limits = safety.joints.scaled(_SPEED_SHARE, _SPEED_SHARE)
     x, y, z, yaw = place.grasp
     below = max(corner[2] for corner in robot.tool.finger_corners) - robot.tool.tcp_offset
-    floor = float(robot.fingertips.lower[2]) + below  # the lowest that the TCP may be
+    floor = float(safety.fingertips.lower[2]) + below  # the lowest that the TCP may be
     z = max(z, floor + _OFF_THE_FLOOR[0])
     pick, put = np.array([x, y, z]), np.array([*place.goal, z])
     deepest = np.array([*place.goal, max(z - _PROBE_DEPTH, floor + _OFF_THE_FLOOR[1])])
