@@ -1,6 +1,8 @@
 """The `touchgoal` command: `touchgoal COMMAND --help`."""
 
 import importlib
+import os
+import select
 import signal
 import sys
 from collections.abc import Iterator
@@ -50,9 +52,14 @@ def main(argv: list[str] | None = None) -> None:
     """Run one command.
 
     A user's mistake is one line on stderr and exit code 1 (2 if tyro finds it); Ctrl-C exits with
-    130 and SIGTERM with 143, after a line that says what was kept.
+    130 and SIGTERM with 143, after a line that says what was kept. Where nobody reads what is
+    printed any more (`touchgoal list | head -1`) it ends with 141, as other programs do.
     """
-    arguments = sys.argv[1:] if argv is None else argv
+    with _until_nobody_reads():
+        _main(sys.argv[1:] if argv is None else argv)
+
+
+def _main(arguments: list[str]) -> None:
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(usage())
     elif arguments[0] in ("-V", "--version", "version"):
@@ -102,6 +109,23 @@ def _unknown(name: str) -> str:
     meant = [command for command in COMMANDS if close and command.startswith(close[0])]
     guess = f"; did you mean {' or '.join(meant)}?" if meant else ""
     return f"touchgoal: there is no command {name!r}{guess}\n\n{usage()}"
+
+
+@contextmanager
+def _until_nobody_reads() -> Iterator[None]:
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        stdout = select.poll()
+        stdout.register(sys.stdout.fileno(), 0)
+        if not any(event & select.POLLERR for _, event in stdout.poll(0)):
+            raise  # another pipe's
+        # What is still to be written would fail again at the interpreter's end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(128 + signal.SIGPIPE)
 
 
 @contextmanager

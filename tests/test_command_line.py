@@ -161,6 +161,20 @@ def test_an_interrupted_command_says_what_was_kept(
     assert capsys.readouterr().err == "\ntouchgoal list: stopped; kept 1 of 2\n"
 
 
+@pytest.mark.parametrize("buffered", [True, False])
+def test_a_reader_who_has_read_enough_is_no_mistake(buffered: bool) -> None:
+    """`touchgoal run-policy --help | head -1`: no traceback, and the exit code of a closed pipe."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, *["-u"] * (not buffered), "-m", "touchgoal.launch"]
+    env = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
+    with os.fdopen(writer, "wb") as stdout:
+        done = subprocess.run(
+            [*command, "run-policy", "--help"], stdout=stdout, stderr=subprocess.PIPE, env=env
+        )
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
+
+
 def test_sigterm_is_taken_in_the_main_thread_alone() -> None:
     before = signal.getsignal(signal.SIGTERM)
     errors: list[BaseException] = []
