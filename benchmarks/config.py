@@ -253,6 +253,15 @@ class TacbenchOptions(BenchmarkOptions):
 
 
 @checked_dataclass
+class TaskCeilingsOptions(BenchmarkOptions):
+    """How hard do demonstrations press, and which force and touch ceilings follow?"""
+
+    data: Path = field(kw_only=True)
+    """Folder of episodes, of the expert or of a person who leads the arm; with fingertips' pictures for
+    the ceiling of touch."""
+
+
+@checked_dataclass
 class TactileRealismOptions(BenchmarkOptions):
     """How close do simulated presses come to real ones that the fit has not seen?"""
 

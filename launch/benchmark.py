@@ -26,6 +26,7 @@ BENCHMARKS: dict[str, type[options.BenchmarkOptions]] = {
     "tacbench": options.TacbenchOptions,
     "tactile-realism": options.TactileRealismOptions,
     "tactile-speed": options.TactileSpeedOptions,
+    "task-ceilings": options.TaskCeilingsOptions,
     "touch-probes": options.TouchProbesOptions,
 }
 IN_FOLDERS = {"tacbench": "tacbench.benchmark"}
@@ -46,6 +47,7 @@ Config = (
     | Annotated[options.TacbenchOptions, tyro.conf.subcommand("tacbench")]
     | Annotated[options.TactileRealismOptions, tyro.conf.subcommand("tactile-realism")]
     | Annotated[options.TactileSpeedOptions, tyro.conf.subcommand("tactile-speed")]
+    | Annotated[options.TaskCeilingsOptions, tyro.conf.subcommand("task-ceilings")]
     | Annotated[options.TouchProbesOptions, tyro.conf.subcommand("touch-probes")]
 )
 

@@ -167,7 +167,8 @@ class SafetySection:
     torque: Annotated[float, Field(gt=0, le=100)] | None = None
     """Torque from outside in a joint that stops the arm, Nm; not given: the task's own."""
     indentation: Annotated[float, Field(gt=0, le=0.005)] | None = None
-    """Depth that a gel is pressed in at which the arm stops and the hand opens, m."""
+    """Depth that a gel is pressed in at which the arm stops and the hand opens, m; not given: the task's
+    own, as deep as the sensor file can read."""
     observation_age: Seconds = 0.1
     """Age of a picture at which the arm holds, s; five times that stops it."""
     state_age: Seconds = 0.05

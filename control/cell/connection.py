@@ -32,6 +32,7 @@ from touchgoal.control.sensors.fingertip_source import fingertip_video, fingerti
 from touchgoal.control.sensors.load_cell import SerialLoadCell
 from touchgoal.control.sensors.tactile_camera import TactileCamera
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
+from touchgoal.control.tactile.indentation import deepest_readable
 from touchgoal.control.tactile.sensor_models import find_sensor
 
 # Hz, and s without a picture, on the wall: what a machine however loaded still manages.
@@ -174,7 +175,11 @@ def cell_limits(cell: CellConfig) -> RobotLimits:
     if cell.tool is not None and cell.arm != "sim":
         robot = replace(robot, tool=_tool(robot.tool, cell.tool))
     forces = TASK_FORCES[cell.task.name]
-    given = {"force": forces.force_ceiling, "torque": forces.torque_ceiling} | {
+    given = {"force": forces.force_ceiling, "torque": forces.torque_ceiling}
+    if cell.fingertips is not None:
+        sensor = find_sensor(cell.fingertips.sensor)
+        given["indentation"] = deepest_readable(sensor, forces.indentation_ceiling)
+    given |= {
         name: value
         for name in ("tip_speed", "velocity_share", "force", "torque", "indentation")
         if (value := getattr(own, name)) is not None

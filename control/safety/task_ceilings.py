@@ -13,26 +13,33 @@ class TaskForces:
     """What the demonstrations of a task reach.
 
     Attributes:
-        reached: N on the hand, at most.
-        episodes: successful ones of the scripted experts that say so (seeds from 30000; the bead led
-            astray at 4 mm/s).
+        force: N on the hand, at most.
+        indentation: m that a gel is pressed in, at most, as `control.tactile.indentation` reads it.
+        episodes: successful ones of the scripted experts that say so, by `touchgoal benchmark
+            task-ceilings` (seeds from 30000; the bead led astray at 4 mm/s).
     """
 
-    reached: float
+    force: float
+    indentation: float
     episodes: int
 
     @property
     def force_ceiling(self) -> float:
         """N on the hand above which a run of this task is stopped."""
-        return min(_MARGIN * self.reached, _MOST)
+        return min(_MARGIN * self.force, _MOST)
 
     @property
     def torque_ceiling(self) -> float:
         """Nm in a joint, likewise: what that force makes of it, so that neither stops the other's task."""
         return _LEVER * self.force_ceiling
 
+    @property
+    def indentation_ceiling(self) -> float:
+        """m into a gel, likewise; `deepest_readable` says what a sensor can tell of it."""
+        return _MARGIN * self.indentation
+
 
 TASK_FORCES: dict[Literal["pick-place", "bead-maze"], TaskForces] = {
-    "pick-place": TaskForces(reached=23.8, episodes=116),
-    "bead-maze": TaskForces(reached=17.9, episodes=29),
+    "pick-place": TaskForces(force=23.8, indentation=1.2e-3, episodes=116),
+    "bead-maze": TaskForces(force=17.9, indentation=1.0e-3, episodes=29),
 }

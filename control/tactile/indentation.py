@@ -1,5 +1,7 @@
 """How deep a gel is pressed in, fast enough for every tick of a control loop."""
 
+from functools import cache
+
 import numpy as np
 from jaxtyping import UInt8
 
@@ -38,21 +40,29 @@ class IndentationMeter:
         return float(self._depth.estimate(frame, self._detector.background.image).max())
 
 
-def require_readable(sensor: SensorModel, ceiling: float) -> None:
-    """UserError unless the sensor file can read a ball pressed in by a ceiling (m).
+def deepest_readable(sensor: SensorModel, wanted: float) -> float:
+    """The wanted depth (m), or the next one below it, in steps of 0.1 mm, that the sensor file can read.
 
     A ball is drawn by the sensor file's own model and read back: with the walls that its presses never
     showed, a deep one reads too shallow, and a ceiling above that would never be met.
     """
-    if _read_ball(sensor, ceiling) >= _READABLE * ceiling:
-        return
-    steps = np.arange(1, 21) * 1e-4
-    deepest = max((d for d in steps if _read_ball(sensor, d) >= _READABLE * d), default=0.0)
-    raise UserError(
-        f"safety.indentation is {1e3 * ceiling:g} mm, deeper than the {sensor.name}'s sensor file can read "
-        f"({1e3 * deepest:.1f} mm): lower it, or calibrate with deeper presses"
-    )
+    depth = wanted
+    while depth > 0 and _read_ball(sensor, depth) < _READABLE * depth:
+        depth = round(np.ceil(depth / 1e-4 - 1.001)) * 1e-4
+    return depth
 
+
+def require_readable(sensor: SensorModel, ceiling: float) -> None:
+    """UserError unless the sensor file can read a ball pressed in by a ceiling (m)."""
+    deepest = deepest_readable(sensor, ceiling)
+    if deepest < ceiling:
+        raise UserError(
+            f"safety.indentation is {1e3 * ceiling:g} mm, deeper than the {sensor.name}'s sensor file "
+            f"can read ({1e3 * deepest:.1f} mm): lower it, or calibrate with deeper presses"
+        )
+
+
+@cache
 
 def _read_ball(sensor: SensorModel, depth: float) -> float:
     """What is read (m) of a ball pressed into the middle of the gel by `depth` (m)."""

@@ -121,20 +121,22 @@ def _limits(cell: CellConfig, safety: ActionFilter) -> str:
         require_readable(find_sensor(cell.sensor), safety.limits.indentation)
     limits, dogs = safety.limits, safety.watchdogs
     return (
-        f"joints up to {safety.joints.velocity.max():.2f} rad/s; stops above {1e3 * limits.indentation:g} mm "
-        f"into a gel; holds when pictures are older than {1e3 * dogs.observation.hold:.0f} ms or the "
-        f"arm's state than {1e3 * dogs.state.hold:.0f}"
+        f"joints up to {safety.joints.velocity.max():.2f} rad/s; holds when pictures are older than "
+        f"{1e3 * dogs.observation.hold:.0f} ms or the arm's state than {1e3 * dogs.state.hold:.0f}"
     )
 
 
 def _ceilings(cell: CellConfig, safety: ActionFilter) -> str:
     """Where the arm is stopped by force, and where that comes from."""
     task = TASK_FORCES[cell.task.name]
-    own = [name for name in ("force", "torque") if getattr(cell.safety, name) is not None]
-    source = f"{' and '.join(own)} as the cell file says; " if own else ""
+    ceilings = ("force", "torque", "indentation")
+    own = [name for name in ceilings if getattr(cell.safety, name) is not None]
+    source = f"{', '.join(own)} as the cell file says; " if own else ""
+    limits = safety.limits
     return (
-        f"stops above {safety.limits.force:.3g} N or {safety.limits.torque:.3g} Nm; {source}"
-        f"{task.episodes} demonstrations of {cell.task.name} reach {task.reached:g} N"
+        f"stops above {limits.force:.3g} N, {limits.torque:.3g} Nm or {1e3 * limits.indentation:.3g} mm into a "
+        f"gel; {source}{task.episodes} demonstrations of {cell.task.name} reach {task.force:g} N and "
+        f"{1e3 * task.indentation:.2g} mm"
     )
 
 
