@@ -32,9 +32,19 @@ class DeployedTwin:
     """
 
     def __init__(
-        self, task: TaskName, seed: int, thing: str, lock_step: bool, folder: Path, number: int
+        self,
+        task: TaskName,
+        seed: int,
+        thing: str,
+        lock_step: bool,
+        folder: Path,
+        number: int,
+        exact: bool = False,
     ) -> None:
-        """Start one with an object or a wire; twins of different numbers run side by side."""
+        """Start one with an object or a wire; twins of different numbers run side by side.
+
+        An exact one estimates forces as they are, no arm does.
+        """
         pid = os.getpid()
         host = f"127.{100 + number % 100}.{pid // 250 % 250}.{1 + pid % 250}"
         kind = "--env.wires" if task == "bead-maze" else "--env.objects"
@@ -42,7 +52,9 @@ class DeployedTwin:
         command += ["--seed", str(seed), "--host", host, "--port", "0", "--out", str(folder)]
         self._log = (folder / "twin.log").open("w")
         self._process = subprocess.Popen(
-            [*command, *["--lock-step"] * lock_step], stdout=self._log, stderr=self._log
+            [*command, *["--lock-step"] * lock_step, *["--no-wrench-error"] * exact],
+            stdout=self._log,
+            stderr=self._log,
         )
         self.cell_file = folder / "cell.json"
         end = time.monotonic() + _START_TIMEOUT

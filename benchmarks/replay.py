@@ -78,7 +78,7 @@ def replay_both(seed: int, number: int = 0) -> Iterator[dict[str, Any]]:
     env = _environment()
     with (
         tempfile.TemporaryDirectory() as name,
-        DeployedTwin("pick-place", seed, _OBJECT, True, Path(name), number) as twin,
+        DeployedTwin("pick-place", seed, _OBJECT, True, Path(name), number, exact=True) as twin,
     ):
         cell = replace(read_cell_file(twin.cell_file), cameras={}, fingertips=None)
         for motion, actions_of in (("wave", _wave), ("press", _press)):

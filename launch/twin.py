@@ -36,6 +36,8 @@ class Config:
     """An FR3 with the Franka Hand, or a UR5e whose gripper talks as a Robotiq does."""
     lock_step: bool = False
     """Wait for the client that drives the arm, so that runs repeat (for tests)."""
+    wrench_error: bool = True
+    """The arm's estimate of force has noise, bias and drift, as a real arm's."""
     host: str = "127.0.0.1"
     """Loopback address; twins at different ones run side by side."""
     port: Annotated[int, Field(ge=0, le=65534)] = 8080

@@ -12,8 +12,8 @@ _WANDER_TIME = 1.0  # s
 Wrench = Float[np.ndarray, "6"]
 
 
-class EstimatedWrench:
-    """Noise, bias, drift and lag on the true wrench, drawn for one episode.
+class WrenchError:
+    """Noise, bias and drift of the estimate, drawn for one episode.
 
     The sizes are guesses: no data sheet and no recording of an arm was at hand to check them by.
     """
@@ -22,16 +22,31 @@ class EstimatedWrench:
         self._rng = rng
         self._bias = rng.uniform(-_BIAS, _BIAS)
         self._wandering = rng.normal(0, _WANDER)
-        self._filtered = np.zeros(6)
 
-    def update(self, true: Wrench, seconds: float) -> None:
-        """The true wrench (N, N m) so long after the last one."""
-        self._filtered += (1 - np.exp(-seconds / _LAG)) * (true - self._filtered)
+    def update(self, seconds: float) -> None:
+        """So long after the last time."""
         keep = np.exp(-seconds / _WANDER_TIME)
         self._wandering = keep * self._wandering + np.sqrt(1 - keep**2) * self._rng.normal(
             0, _WANDER
         )
 
     def read(self) -> Wrench:
+        """By how much the next reading is wrong (N, N m)."""
+        return self._bias + self._wandering + self._rng.normal(0, _NOISE)
+
+
+class EstimatedWrench:
+    """The true wrench with the estimate's error and lag, for one episode."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._error = WrenchError(rng)
+        self._filtered = np.zeros(6)
+
+    def update(self, true: Wrench, seconds: float) -> None:
+        """The true wrench (N, N m) so long after the last one."""
+        self._filtered += (1 - np.exp(-seconds / _LAG)) * (true - self._filtered)
+        self._error.update(seconds)
+
+    def read(self) -> Wrench:
         """The estimate (N, N m)."""
-        return self._filtered + self._bias + self._wandering + self._rng.normal(0, _NOISE)
+        return self._filtered + self._error.read()

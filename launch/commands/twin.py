@@ -21,6 +21,7 @@ def run_command(config: Config) -> None:
             port=config.port,
             lock_step=config.lock_step,
             folder=out,
+            wrench_error=config.wrench_error,
         )
     )
 

@@ -11,6 +11,7 @@ from numba import njit
 from touchgoal.control.errors import UserError
 from touchgoal.control.safety.braking import braked_velocity
 from touchgoal.sim_envs.base import FrankaTactileEnv
+from touchgoal.sim_envs.estimated_wrench import WrenchError
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE, SERVO_DAMPING
 from touchgoal.sim_envs.twin.serial_arm import SerialArm
@@ -26,6 +27,7 @@ _YIELD_TIME = 0.02  # s, likewise: how fast an arm that was hit gives way; our c
 # than it has, and chatter between both ends of it for good.
 _REFLEX_DECELERATION = 40.0
 
+_ERROR_STREAM = 1  # of random numbers, beside the seed
 _NO_FORCE = np.zeros(3)
 
 Joints = Float[np.ndarray, " n"]
@@ -66,11 +68,13 @@ class SimulatedCell:
         q, dq: measured joint positions (rad) and velocities (rad/s).
         q_d, dq_d: their set-points.
         tau_ext: torque (N m) on each joint from outside, filtered.
+        wrench_error: N, N m, by which the arm's estimate of the wrench on the hand is wrong.
         gripper_command: the gripper's orders.
     """
 
-    def __init__(self, env: FrankaTactileEnv, seed: int) -> None:
-        self.env = env
+    def __init__(self, env: FrankaTactileEnv, seed: int, wrench_error: bool = False) -> None:
+        """With the error of a real arm's estimate of force, or without."""
+        self.env, self._errs = env, wrench_error
         self.reset(seed)
 
     def reset(self, seed: int, options: dict[str, Any] | None = None) -> None:
@@ -91,6 +95,10 @@ class SimulatedCell:
         self.time, self._steps = 0.0, 0
         self.q_d, self.dq_d, self.tau_ext = env.command.copy(), np.zeros(n), np.zeros(n)
         self.q, self.dq = env.joints()
+        # Nothing else of an episode depends on it.
+        error_rng = np.random.default_rng([seed, _ERROR_STREAM])
+        self._error = WrenchError(error_rng) if self._errs else None
+        self.wrench_error = self._error.read() if self._error else np.zeros(6)
         self.gripper_command = GripperCommand(
             env.width_target(), env.robot.tool.speed, env.grasp_force
         )
@@ -178,6 +186,9 @@ class SimulatedCell:
         self._steps += 1
         self.time = self._steps * DT
         self._update_measurements(pushed)
+        if self._error:
+            self._error.update(DT)
+            self.wrench_error = self._error.read()
         if self._steps % tick == 0:
             env.update_contacts()
             self.progress, self.success = env.end_tick(self._grasp_begun)

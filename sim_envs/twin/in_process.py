@@ -76,7 +76,7 @@ class SimulatedArm:
         return ArmReading(
             q=cell.q.copy(),
             velocity=cell.dq.copy(),
-            wrench=cell.env.external_wrench().copy(),
+            wrench=cell.env.external_wrench() + cell.wrench_error,
             torque=cell.tau_ext.copy(),
             fault=self._refused_because,
             stamp=cell.time,
@@ -214,7 +214,7 @@ class SimulatedLoadCell:
 def simulate_cell(config: CellConfig, hz: float) -> CellConnection:
     """The connection of a cell file with `arm = "sim"`: its sensors, task and limits, in simulation."""
     env = make_env(env_config_of(config))
-    cell = SimulatedCell(env, config.task.seed)
+    cell = SimulatedCell(env, config.task.seed, wrench_error=True)
     env.update_contacts()
     arm = SimulatedArm(cell, hz)
     cameras: dict[str, Camera] = {

@@ -53,6 +53,7 @@ class TwinConfig:
         port: of the pictures; the next one is the control port. 0: any that are free.
         lock_step: wait for the client that drives the arm, so that runs repeat.
         folder: where serial devices appear.
+        wrench_error: the arm's estimate of force is as wrong as a real arm's.
     """
 
     task: TaskConfig
@@ -62,6 +63,7 @@ class TwinConfig:
     port: int
     lock_step: bool
     folder: Path
+    wrench_error: bool = True
 
 
 @runtime_checkable
@@ -95,8 +97,8 @@ class Twin:
     """
 
     def __init__(self, config: TwinConfig) -> None:
-        self.cell = SimulatedCell(make_env(replace(config.task, arm=config.arm)), config.seed)
-        env = self.cell.env
+        env = make_env(replace(config.task, arm=config.arm))
+        self.cell = SimulatedCell(env, config.seed, config.wrench_error)
         if env.config.tactile:
             # A client would lose the arm while code is loaded at the first touch.
             warm_up(env.bodies, env.sensor)

@@ -359,9 +359,10 @@ class FrankaArm:
         self._torque = zero
 
     def _estimate_wrench(self) -> limits.Contact:
-        """Estimate the wrench from outside and judge it; joint torques say what it is."""
+        """Estimate the wrench from outside and judge it; joint torques say what it is, roughly."""
         self._pose, jacobian = end_effector(self.cell, self._ee, self.cell.q)
-        self._wrench = limits.wrench_behind(self.cell.tau_ext, jacobian)
+        known = limits.wrench_behind(self.cell.tau_ext, jacobian)
+        self._wrench = known + self.cell.wrench_error
         return self._thresholds.judge(self.cell.tau_ext, self._wrench, self._setpoint.ddq)
 
     def _send_state(self, contact: limits.Contact) -> None:

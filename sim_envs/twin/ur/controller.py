@@ -309,7 +309,8 @@ class UrController:
     def _estimate_wrench(self) -> None:
         """The wrench on the TCP that joint torques say is there, base frame, less the sensor's zero."""
         _, _, J = self.cell.kinematics(self.cell.q, np.zeros(3))
-        self._felt = np.linalg.solve(J @ J.T + 1e-8 * np.eye(6), J @ self.cell.tau_ext)
+        known = np.linalg.solve(J @ J.T + 1e-8 * np.eye(6), J @ self.cell.tau_ext)
+        self._felt = known + self.cell.wrench_error
         self._wrench = self._felt - self._zero
 
     def _data(self, client: Client) -> bytes:
