@@ -63,7 +63,6 @@ def require_readable(sensor: SensorModel, ceiling: float) -> None:
 
 
 @cache
-
 def _read_ball(sensor: SensorModel, depth: float) -> float:
     """What is read (m) of a ball pressed into the middle of the gel by `depth` (m)."""
     calibration = load(sensor.sensor_file)
