@@ -20,6 +20,7 @@ from touchgoal.control.option_types import (
 from touchgoal.sim_envs.config import BeadMazeConfig, RigConfig, TaskName
 
 CORES = os.cpu_count() or 1
+SparshShape = Literal["mae-tiny", "mae-small", "mae-base", "dino-base", "ijepa-base", "vjepa-base"]
 Share = Annotated[float, Field(gt=0, le=1)]
 
 
@@ -80,6 +81,40 @@ class DeployOptions(BenchmarkOptions):
     """Random seed of the first episode; each further one adds one."""
     workers: Count = CORES
     """Deployments side by side, in process and in lock-step."""
+
+
+@checked_dataclass
+class EncoderSpeedOptions(BenchmarkOptions):
+    """How fast do encoders embed on one core (Sparsh, Table 3), and how fast is one trained?"""
+
+    encoders: tuple[str, ...] = ("gelsight_mini", "gelsight_mini_surfaces")
+    """Touch encoders by name or folder, or published Sparsh ones by file or id."""
+    shapes: tuple[SparshShape, ...] = (
+        "mae-tiny",
+        "mae-small",
+        "mae-base",
+        "dino-base",
+        "ijepa-base",
+        "vjepa-base",
+    )
+    """Sparsh's networks with random weights, base as published, tiny and small narrower."""
+    precisions: Annotated[tuple[Literal["fp32", "bf16"], ...], Field(min_length=1)] = (
+        "fp32",
+        "bf16",
+    )
+    """Numbers in which networks compute."""
+    batch_size: Count = 8
+    """Frames in a batch."""
+    repeats: Count = 5
+    """Measurements of each figure; the median is printed."""
+    ticks: Annotated[Count, RARE] = 5
+    """Single frames in each of them."""
+    mae_vit: Annotated[Literal["tiny", "compact", "small"], RARE] = "small"
+    """Size of the MAE whose training step is timed."""
+    mae_batch_size: Annotated[Count, RARE] = 64
+    """Touches in a training step."""
+    mae_steps: Annotated[Count, RARE] = 4
+    """Training steps in each measurement."""
 
 
 @checked_dataclass

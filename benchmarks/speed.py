@@ -50,6 +50,19 @@ def measure(
     return Row(what, float(np.median(rates)), min(rates), max(rates))
 
 
+def in_turn(works: Sequence[Callable[[], object]], repeats: int) -> list[float]:
+    """Median processor seconds of each of some works that are compared: done in turn on the same machine."""
+    times: list[list[float]] = [[] for _ in works]
+    for work in works:
+        work()
+    for _ in range(repeats):
+        for work, spent in zip(works, times, strict=True):
+            start = time.process_time()
+            work()
+            spent.append(time.process_time() - start)
+    return [float(np.median(spent)) for spent in times]
+
+
 def table(what: str, unit: str, rows: Sequence[Row]) -> str:
     """The rates as people read them, one a line."""
     lines = [f"{what:<72}{unit:>11}{'slowest':>10}{'fastest':>10}"]

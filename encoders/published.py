@@ -11,7 +11,8 @@ from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBack
 _FILES = (".safetensors", ".ckpt")  # the former holds the encoder alone
 _PATTERN = "*_vit*"  # e.g. dino_vitbase.safetensors
 _HUB_ID = re.compile(r"[\w.-]+/sparsh[\w.-]*", re.IGNORECASE)  # e.g. facebook/sparsh-dino-base
-_STRIDE, _CLIP_STRIDE = 5, 2  # frames of a sensor at 60 Hz
+STRIDES = {"pair": 5, "clip": 2}
+"""As trained, of two stacked frames and of clips: frames of a sensor at 60 Hz."""
 
 
 def is_published(name: str | Path) -> bool:
@@ -43,7 +44,7 @@ def load_published(
         UserError: None there, not to be fetched, or weights that do not fit, which are listed.
     """
     vit = load_sparsh(_file(name))
-    default = _STRIDE if vit.config.tubelet == 1 else _CLIP_STRIDE
+    default = STRIDES["pair" if vit.config.tubelet == 1 else "clip"]
     config = TouchBackboneConfig(
         vit.config,
         sensor=None,

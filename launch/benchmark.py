@@ -14,6 +14,7 @@ from touchgoal.launch.support.run_folder import open_run, write_json
 BENCHMARKS: dict[str, type[options.BenchmarkOptions]] = {
     "bead-maze": options.BeadMazeOptions,
     "deploy": options.DeployOptions,
+    "encoder-speed": options.EncoderSpeedOptions,
     "env-speed": options.EnvSpeedOptions,
     "faults": options.FaultsOptions,
     "motion": options.MotionOptions,
@@ -35,6 +36,7 @@ RESULTS = Path(__file__).resolve().parents[1] / "benchmarks" / "results"
 Config = (
     Annotated[options.BeadMazeOptions, tyro.conf.subcommand("bead-maze")]
     | Annotated[options.DeployOptions, tyro.conf.subcommand("deploy")]
+    | Annotated[options.EncoderSpeedOptions, tyro.conf.subcommand("encoder-speed")]
     | Annotated[options.EnvSpeedOptions, tyro.conf.subcommand("env-speed")]
     | Annotated[options.FaultsOptions, tyro.conf.subcommand("faults")]
     | Annotated[options.MotionOptions, tyro.conf.subcommand("motion")]

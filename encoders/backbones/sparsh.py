@@ -3,6 +3,8 @@
 Table 3's parameter counts are met exactly by these, with patches of 16 pixels (the text says 14).
 """
 
+from dataclasses import replace
+
 from touchgoal.encoders.backbones.vit import ViTConfig
 
 # Pictures there stand upright; the LayerNorm's epsilon is in no file of weights.
@@ -41,3 +43,10 @@ SPARSH_BASE: dict[str, ViTConfig] = {
     "ijepa": _base(SQUARE, learned_positions=True),
     "vjepa": _base(SQUARE, channels=3, tubelet=2, frames=CLIP_FRAMES, learned_positions=True),
 }
+_SIZES = {"tiny": (192, 3), "small": (384, 6), "base": (768, 12)}  # width, heads
+
+
+def sparsh_vit(method: str, size: str) -> ViTConfig:
+    """A method's encoder of size tiny, small or base: as wide as ViTs of that name."""
+    width, heads = _SIZES[size]
+    return replace(SPARSH_BASE[method], width=width, heads=heads)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
@@ -100,6 +101,15 @@ def sinusoidal_positions(
     return torch.cat([angles.sin(), angles.cos()], -1).flatten(1)
 
 
+@lru_cache(maxsize=8)
+def _known_positions(
+    rows: int, columns: int, width: int, times: int | None = None
+) -> Float[Tensor, "n {width}"]:
+    """The same, not to be changed: computed once, which shows where single frames are embedded."""
+    with torch.inference_mode(False):
+        return sinusoidal_positions(rows, columns, width, times)
+
+
 class Block(nn.Module):
     """Pre-norm self-attention and MLP."""
 
@@ -191,7 +201,7 @@ class ViT(nn.Module):
         """Codes for times (of clips), rows and columns of patches."""
         if self.positions is None:
             *times, rows, columns = grid
-            return sinusoidal_positions(rows, columns, self.config.width, *times)
+            return _known_positions(rows, columns, self.config.width, *times)
         if grid != (expected := _grid(self.config)):
             raise UserError(
                 f"this ViT has learned positions for {expected} patches, not {grid}: give it the "
