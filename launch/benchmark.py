@@ -64,8 +64,11 @@ def main(config: options.BenchmarkOptions) -> None:
     out = open_run(config.out, f"benchmark-{name}", config)
     result = benchmark.run(config)
     print(result.pop("table"))
+    pictures = result.pop("pictures", {})
     if "picture" in result:
-        _draw(result.pop("picture"), out / "picture.png")
+        pictures["picture"] = result.pop("picture")
+    for title, picture in pictures.items():
+        _draw(picture, out / f"{title}.png")
     print(f"hardware: {hardware()}")
     result = {**provenance(), "hardware": hardware(), **result}
     write_json(out / "metrics.json", result)

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.sim_envs.config import Indenter, RigConfig
 from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Shape, Texture
+from touchgoal.sim_envs.tactile.field_on_picture import tractions
 from touchgoal.sim_envs.tactile.press_bench import PressBench
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
@@ -47,6 +48,8 @@ class Stroke:
         frames: the sensor's pictures, RGB, of which the first `REST` are untouched.
         wrench: force (N) and torque (Nm) of the probe on the pad, sensor frame; pressed is -z.
         slip: whether the probe slides over the gel.
+        field: tractions over the picture, kPa; see `field_on_picture.tractions`. Recordings of
+            strokes leave it out: whoever wants it simulates the stroke again.
         indenter: which probe.
         load: that the press went up to, N.
         friction: coefficient of this stroke.
@@ -55,6 +58,7 @@ class Stroke:
     frames: UInt8[np.ndarray, "t h w 3"]
     wrench: Float32[np.ndarray, "t 6"]
     slip: Bool[np.ndarray, " t"]
+    field: Float32[np.ndarray, "t 3 24 24"]
     indenter: Indenter
     load: float
     friction: float
@@ -83,19 +87,30 @@ def simulate(config: RigConfig, index: int) -> Stroke:
     indenter = config.indenters[index % len(config.indenters)]
     friction = FRICTION * (1 + FRICTION_SPREAD * rng.uniform(-1, 1))
     path = _draw_path(config, sensor, friction, rng)
-    bench = PressBench(_probe(indenter, friction), sensor, rig_unit(config), config.shear_relief)
-    frames, wrenches, slips = [], [], []
+    unit = rig_unit(config)
+    bench = PressBench(_probe(indenter, friction), sensor, unit, config.shear_relief)
+    frames, wrenches, slips, fields = [], [], [], []
     for load, shear, place, slip in _loads(path, sensor, friction):
         bench.place(np.array([*place, 0.0]))
         depth = -load / sensor.normal_stiffness
         pull = float(shear[0]), float(shear[1])
         centre = float(place[0]), float(place[1])
-        frames.append(bench.sense(load, rng, pull, centre, depth).image)
+        sensed = bench.sense(load, rng, pull, centre, depth)
+        frames.append(sensed.image)
+        fields.append(tractions(sensed.field, sensor.image_shape, unit.pixel_pitch))
         contact = bench.contact(load, pull, centre, depth)
         wrenches.append(np.concatenate([contact.force, contact.torque]))
         slips.append(slip)
     wrench = np.array(wrenches, np.float32)
-    return Stroke(np.stack(frames), wrench, np.array(slips), indenter, path.load.max(), friction)
+    return Stroke(
+        np.stack(frames),
+        wrench,
+        np.array(slips),
+        np.stack(fields),
+        indenter,
+        path.load.max(),
+        friction,
+    )
 
 
 def rig_unit(config: RigConfig) -> SensorInstance:

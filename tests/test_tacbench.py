@@ -7,15 +7,12 @@ import pytest
 import torch
 
 from touchgoal.benchmarks.config import TacbenchOptions
-from touchgoal.benchmarks.tacbench.benchmark import force_metrics, run, slip_metrics
-from touchgoal.benchmarks.tacbench.data import (
-    STRIDE,
-    RigFrames,
-    read_strokes,
-    split_force,
-    split_slip,
-)
-from touchgoal.benchmarks.tacbench.tasks import CLASSES, PoseTask, f1_score
+from touchgoal.benchmarks.tacbench.benchmark import run
+from touchgoal.benchmarks.tacbench.data import STRIDE, RigFrames, read_strokes
+from touchgoal.benchmarks.tacbench.force import force_metrics
+from touchgoal.benchmarks.tacbench.pose import CLASSES, PoseTask
+from touchgoal.benchmarks.tacbench.slip import f1_score, slip_metrics
+from touchgoal.benchmarks.tacbench.splits import split_force, split_slip
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
@@ -25,8 +22,8 @@ from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.pretrained import save
 from touchgoal.encoders.probes.attentive import AttentivePooler, AttentiveProbe
+from touchgoal.episodes.bench_recording import record_strokes
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.episodes.stroke_recording import record_strokes
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.indenter_rig import REST, rig_unit, shear_force, simulate
 from touchgoal.sim_envs.object_slides import FRAMES, pulled, simulate_slide
@@ -108,7 +105,7 @@ def test_strokes_go_on_where_they_stopped(strokes: Path) -> None:
     assert np.array_equal(read[TACTILE_LEFT], whole.frames)
     assert np.array_equal(read[TRUTH_PAD_WRENCH][:, :6], whole.wrench)
     assert np.array_equal(read[TRUTH_SLIP][:, 0], whole.slip)
-    with pytest.raises(UserError, match="strokes of another rig"):
+    with pytest.raises(UserError, match="of another rig"):
         record_strokes(strokes, RigConfig(seed=4), STROKES, workers=1)
 
 
@@ -233,21 +230,25 @@ def test_the_benchmark_judges_every_encoder(
     name = str(tmp_path / "tiny")
     result = run(
         TacbenchOptions(
-            encoders=(name, f"end-to-end:{name}"), shares=(1.0, 0.1), rig=RIG, strokes=STROKES, slides=10,
-            data=strokes.parent, seeds=1, steps=20, end_to_end_steps=10, batch_size=8, workers=1,
+            encoders=(name, "end-to-end:tiny"), shares=(1.0, 0.1), rig=RIG, strokes=STROKES, slides=10,
+            grasps=10, cloths=10, data=strokes.parent, seeds=1, steps=3, end_to_end_steps=2, workers=1,
         )
     )  # fmt: skip
     force = [row for row in result["rows"] if row["task"] == "force"]
-    others = 2 * 2 + 2 + 2 * 2 + 1  # T2 with two references, T3 with one
-    assert len(force) == 2 * 2 * 2 + 2 and len(result["rows"]) == len(force) + others
+    tests = {"force": 2, "field": 2, "slip": 1, "pose": 1, "grasp": 2, "textile": 1}
+    references = {"field": 2, "slip": 2}
+    for task, count in tests.items():
+        own = [row for row in result["rows"] if row["task"] == task]
+        assert len(own) == count * (2 * 2 + references.get(task, 1))
     for row in force:
         low, high = row["rmse_mn_interval"]
         assert low <= row["rmse_mn"] <= high and row["mae_mn"] <= row["rmse_mn"]
     cone = next(row for row in result["rows"] if "nominal cone" in row["encoder"])
     assert cone["f1"] > 0.5
-    assert "paper, real gelsight_mini" in result["table"] and result["picture"].ndim == 3
+    assert "paper, real gelsight_mini" in result["table"] and "Sparsh (MAE)" in result["table"]
+    assert set(result["pictures"]) == {"by_labels", *tests}
     assert "epoch" not in capsys.readouterr().out
-    assert "epoch 10/10" in (strokes.parent / "training.log").read_text()
+    assert "epoch 3/3" in (strokes.parent / "training.log").read_text()
     wrong = TacbenchOptions(encoders=("gelsight_mini",), rig=RIG, data=strokes.parent)
     with pytest.raises(UserError, match="the rig has gelsight_mini_markers"):
         run(wrong)

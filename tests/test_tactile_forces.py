@@ -181,7 +181,7 @@ class Slider:
 
     def __init__(self, normal: float) -> None:
         spec = mujoco.MjSpec()
-        scene._set_options(spec, scene.SceneConfig())
+        scene.set_options(spec, scene.SceneConfig())
         spec.option.gravity = np.zeros(3)
         hand = spec.worldbody.add_body(name="base").add_body(name="hand")
         hand.add_site(name="tcp")

@@ -1,26 +1,33 @@
-"""Strokes of the indenter rig as the samples of TacBench T1 to T3: pairs of frames, and their labels."""
+"""What the bench recorded as the samples of TacBench: frames of one sensor in time, and their labels."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float16, Float32, Int
+from jaxtyping import Bool, Float, Float16, Float32, Int, UInt8
 from torch import Tensor
 
 from touchgoal.control.features import (
     TACTILE_LEFT,
+    TACTILE_RIGHT,
     TRUTH_OBJECT_POSE,
     TRUTH_PAD_WRENCH,
     TRUTH_SLIP,
+    TRUTH_SUCCESS,
 )
 from touchgoal.control.progress import track
 from touchgoal.encoders.backbones.frame_history import past_rows
 from touchgoal.encoders.preprocess import Preprocessor
+from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.sim_envs.cloths import CLOTHS
+from touchgoal.sim_envs.config import RigConfig
+from touchgoal.sim_envs.indenter_rig import simulate
 
 STRIDE = 5
 """Frames between the two of a pair, as in Sparsh: 83 ms at the rig's 60 Hz."""
-_VALIDATION, _TEST = 3, 4  # of every five strokes of a probe; the other three are trained on
 _PRESSED_IS_POSITIVE = np.array([1, 1, -1], np.float32)
 
 Rows = Int[Tensor, " _"]
@@ -28,16 +35,20 @@ Rows = Int[Tensor, " _"]
 
 @dataclass(frozen=True, eq=False)
 class RigFrames:
-    """n frames of strokes.
+    """n frames of recordings, each of them some frames in a row.
 
     Attributes:
         touch: preprocessed; half precision, for they fill the memory.
-        before: row of the frame `STRIDE` earlier; of a stroke's first frames its first.
-        force: of the probe on the pad, N: shear x and y, and the normal force, positive when pressed.
+        before: row of the other frame of a pair: `STRIDE` earlier, or a recording's first one; of a grasp
+            the moment before.
+        force: on the pad, N: shear x and y, and the normal force, positive when pressed.
         slip: whether the probe slides.
-        stroke: which.
-        indenter: name of the probe or object.
+        stroke: which recording; of a grasp both fingers' are one.
+        indenter: name of the probe, object or cloth.
         pose: of the object on the gel, x and y (mm) and turn (degrees); None if the set does not say.
+        label: of a grasp whether it holds in the end, of a cloth its number; None if the set has none.
+        field: shear along x and y and pressure over the picture, kPa; None if it is not known.
+        moments: of each finger in a row, for grasps; 0 for recordings in time.
     """
 
     touch: Float16[Tensor, "n 3 h w"]
@@ -47,11 +58,20 @@ class RigFrames:
     stroke: Int[np.ndarray, " n"]
     indenter: np.ndarray
     pose: Float[Tensor, "n 3"] | None = None
+    label: Int[Tensor, " n"] | None = None
+    field: Float[Tensor, "n 3 24 24"] | None = None
+    moments: int = 0
 
     def seen(self, rows: Rows, offsets: tuple[int, ...]) -> Float[Tensor, "k t 3 h w"]:
-        """Frames, and those so many frames before each; of a stroke's first frames its first."""
+        """Frames, and those so many frames before each; of a stroke's first frames its first.
+
+        Of a grasp, whose moments are seconds apart, `STRIDE` frames are one moment.
+        """
         newest = rows.numpy()
         first = np.searchsorted(self.stroke, self.stroke[newest])
+        if self.moments:
+            first = newest - newest % self.moments
+            offsets = tuple(round(offset / STRIDE) for offset in offsets)
         return self.touch[torch.from_numpy(past_rows(newest, offsets, first))].float()
 
     @property
@@ -59,99 +79,111 @@ class RigFrames:
         """Where the probe touches."""
         return (self.force[:, 2] > 0).numpy()
 
-
-@dataclass(frozen=True, eq=False)
-class Split:
-    """Rows of frames: of each task other strokes for each use.
-
-    Attributes:
-        train: to learn from.
-        validation: to choose a snapshot and a threshold by.
-        tests: to report, by name.
-    """
-
-    train: Rows
-    validation: Rows
-    tests: dict[str, Rows]
+    @property
+    def later(self) -> Bool[np.ndarray, " n"]:
+        """All but the first of each recording, which is untouched."""
+        return (self.before != torch.arange(len(self.before))).numpy()
 
 
 def read_strokes(strokes: EpisodeSet, count: int, preprocess: Preprocessor) -> RigFrames:
-    """All frames of the first so many strokes; a stroke's background is its first frame."""
+    """All frames of the first so many strokes or slides; a stroke's background is its first frame."""
     keys = [TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP]
     keys += [TRUTH_OBJECT_POSE] if TRUTH_OBJECT_POSE in strokes.features else []
     touch, force, slip, pose = [], [], [], []
     for i in track(range(count), "strokes", "stroke"):
         frames = strokes.read(i, keys).frames
-        pictures = frames[TACTILE_LEFT]
-        touch.append(torch.from_numpy(preprocess(pictures, pictures[0])).half())
+        touch.append(_preprocessed(frames[TACTILE_LEFT], preprocess))
         force.append(torch.from_numpy(frames[TRUTH_PAD_WRENCH][:, :3] * _PRESSED_IS_POSITIVE))
         slip.append(torch.from_numpy(frames[TRUTH_SLIP][:, 0]))
         if TRUTH_OBJECT_POSE in frames:
             pose.append(torch.from_numpy(_planar(frames[TRUTH_OBJECT_POSE])))
-    lengths = np.array([len(f) for f in force])
-    starts = np.repeat(np.cumsum(lengths) - lengths, lengths)
-    before = np.maximum(np.arange(lengths.sum()) - STRIDE, starts)
-    names = [str(strokes.meta(i)["object"]) for i in range(count)]
+    lengths = [len(f) for f in force]
     return RigFrames(
         torch.cat(touch),
-        torch.from_numpy(before),
+        _before(lengths, STRIDE),
         torch.cat(force),
         torch.cat(slip),
-        np.repeat(np.arange(len(lengths)), lengths),
-        np.repeat(names, lengths),
+        np.repeat(np.arange(count), lengths),
+        np.repeat(_names(strokes, count), lengths),
         torch.cat(pose) if pose else None,
     )
+
+
+def read_grasps(grasps: EpisodeSet, count: int, preprocess: Preprocessor) -> RigFrames:
+    """The first so many grasp attempts, finger by finger: before, gripped, lifted."""
+    touch, force, label = [], [], []
+    for i in track(range(count), "grasps", "attempt"):
+        keys = [TACTILE_LEFT, TACTILE_RIGHT, TRUTH_PAD_WRENCH, TRUTH_SUCCESS]
+        frames = grasps.read(i, keys).frames
+        for side, key in enumerate((TACTILE_LEFT, TACTILE_RIGHT)):
+            touch.append(_preprocessed(frames[key], preprocess))
+            wrench = frames[TRUTH_PAD_WRENCH][:, 6 * side : 6 * side + 3]
+            force.append(torch.from_numpy(wrench * _PRESSED_IS_POSITIVE))
+            label += [int(frames[TRUTH_SUCCESS][-1, 0])] * len(wrench)
+    length = len(touch[0])
+    return RigFrames(
+        torch.cat(touch),
+        _before([length] * len(touch), 1),
+        torch.cat(force),
+        torch.zeros(len(label), dtype=torch.bool),
+        np.repeat(np.arange(count), 2 * length),
+        np.repeat(_names(grasps, count), 2 * length),
+        label=torch.tensor(label),
+        moments=length,
+    )
+
+
+def read_cloths(clips: EpisodeSet, count: int, preprocess: Preprocessor) -> RigFrames:
+    """All frames of the first so many presses of cloth."""
+    numbers = {cloth.name: i for i, cloth in enumerate(CLOTHS)}
+    touch = [
+        _preprocessed(clips.read(i, [TACTILE_LEFT]).frames[TACTILE_LEFT], preprocess)
+        for i in track(range(count), "cloths", "press")
+    ]
+    lengths = [len(frames) for frames in touch]
+    names, n = np.repeat(_names(clips, count), lengths), sum(lengths)
+    return RigFrames(
+        torch.cat(touch),
+        _before(lengths, STRIDE),
+        torch.zeros(n, 3),
+        torch.zeros(n, dtype=torch.bool),
+        np.repeat(np.arange(count), lengths),
+        names,
+        label=torch.tensor([numbers[name] for name in names]),
+    )
+
+
+def with_fields(frames: RigFrames, rig: RigConfig, workers: int) -> RigFrames:
+    """Strokes with the true field on the gel: recordings leave it out, the same strokes give it again."""
+    count = int(frames.stroke[-1]) + 1
+    with one_core_workers(workers) as pool:
+        made: Iterable = pool.map(partial(_field, rig), range(count))
+        fields = list(track(made, "force fields", "stroke", total=count))
+    return replace(frames, field=torch.from_numpy(np.concatenate(fields)))
+
+
+def _field(rig: RigConfig, index: int) -> Float32[np.ndarray, "t 3 24 24"]:
+    return simulate(rig, index).field
+
+
+def _preprocessed(
+    pictures: UInt8[np.ndarray, "t h w 3"], preprocess: Preprocessor
+) -> Float16[Tensor, "t 3 H W"]:
+    """The first picture is the background."""
+    return torch.from_numpy(preprocess(pictures, pictures[0])).half()
+
+
+def _before(lengths: list[int], stride: int) -> Rows:
+    """Rows so many frames earlier, or the first of each recording."""
+    starts = np.repeat(np.cumsum(lengths) - lengths, lengths)
+    return torch.from_numpy(np.maximum(np.arange(sum(lengths)) - stride, starts))
+
+
+def _names(episodes: EpisodeSet, count: int) -> list[str]:
+    return [str(episodes.meta(i)["object"]) for i in range(count)]
 
 
 def _planar(pose: Float32[np.ndarray, "t 7"]) -> Float32[np.ndarray, "t 3"]:
     """x and y, mm; turn about z, degrees."""
     turn = 2 * np.degrees(np.arctan2(pose[:, 6], pose[:, 3]))
     return np.column_stack([1e3 * pose[:, :2], turn]).astype(np.float32)
-
-
-def split_force(frames: RigFrames) -> Split:
-    """As in Sparsh's C.2: learned from the sphere and the sharp probe, tested on the flat one.
-
-    Beside it a test on other strokes of the probes learned from.
-    """
-    known = frames.pressed & (frames.indenter != "flat")
-    tests = {
-        "flat probe, unseen": _rows(frames.pressed & (frames.indenter == "flat")),
-        "known probes": _of_use(frames, known, _TEST),
-    }
-    return Split(_training(frames, known), _of_use(frames, known, _VALIDATION), tests)
-
-
-def split_slip(frames: RigFrames) -> Split:
-    """As in Sparsh's C.4: the sphere alone."""
-    ball = frames.pressed & (frames.indenter == "sphere")
-    tests = {"sphere": _of_use(frames, ball, _TEST)}
-    return Split(_training(frames, ball), _of_use(frames, ball, _VALIDATION), tests)
-
-
-def split_pose(frames: RigFrames) -> Split:
-    """Pairs in which the object touches both times; every object in each use."""
-    both = frames.pressed & frames.pressed[frames.before.numpy()]
-    tests = {"known objects": _of_use(frames, both, _TEST)}
-    return Split(_training(frames, both), _of_use(frames, both, _VALIDATION), tests)
-
-
-def _use(frames: RigFrames) -> Int[np.ndarray, " n"]:
-    """0 to 4, evenly over the strokes of each probe."""
-    use = np.empty(len(frames.stroke), np.int64)
-    for name in np.unique(frames.indenter):
-        own = frames.indenter == name
-        use[own] = np.unique(frames.stroke[own], return_inverse=True)[1] % 5
-    return use
-
-
-def _of_use(frames: RigFrames, chosen: Bool[np.ndarray, " n"], use: int) -> Rows:
-    return _rows(chosen & (_use(frames) == use))
-
-
-def _training(frames: RigFrames, chosen: Bool[np.ndarray, " n"]) -> Rows:
-    return _rows(chosen & (_use(frames) < _VALIDATION))
-
-
-def _rows(chosen: Bool[np.ndarray, " n"]) -> Rows:
-    return torch.from_numpy(np.flatnonzero(chosen))

@@ -13,17 +13,22 @@ from torch import Tensor, nn
 
 from touchgoal.benchmarks.real_touch_encoders import untrained, vit_of
 from touchgoal.benchmarks.tacbench.data import STRIDE, RigFrames, Rows
-from touchgoal.benchmarks.tacbench.tasks import Outputs, Task
+from touchgoal.benchmarks.tacbench.task import Outputs, Task
 from touchgoal.control.progress import track
-from touchgoal.encoders.backbones.touch_backbone import BATCH, BaseTouchEncoder
+from touchgoal.encoders.backbones.touch_backbone import (
+    BATCH,
+    BaseTouchEncoder,
+    TouchBackbone,
+    TouchBackboneConfig,
+)
+from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.pretrained import load_encoder
-from touchgoal.encoders.probes.attentive import AttentiveProbe
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
 
 END_TO_END, RANDOM = "end-to-end:", "random:"
-_SNAPSHOTS = 10  # of a training, of which the best on validation frames is kept
-_MAX_VALIDATION = 512  # frames, evenly drawn
+_SNAPSHOTS = 8  # of a training, of which the best on validation frames is kept
+_MAX_VALIDATION = 160  # frames, evenly drawn
 _WEIGHT_DECAY = 0.05
 
 Inputs = Float[Tensor, "b ..."]
@@ -55,6 +60,7 @@ class PairTokens(nn.Module):
         offsets: how many frames before the newest each lies that is seen.
         looks_back: whether the encoder does by itself.
         features: width of a token.
+        grid: rows and columns of the patches.
     """
 
     def __init__(self, encoder: BaseTouchEncoder) -> None:
@@ -64,6 +70,9 @@ class PairTokens(nn.Module):
         self.looks_back, self._stack = len(encoder.offsets) > 1, encoder.stack
         self.offsets = encoder.offsets if self.looks_back else (0, STRIDE)
         self.features = self.vit.config.width * (1 if self.looks_back else 2)
+        patch = self.vit.config.patch_size
+        rows, columns = (-(-side // patch) for side in encoder.preprocess.size)
+        self.grid = rows, columns
 
     def forward(self, seen: Float[Tensor, "b n 3 h w"]) -> Float[Tensor, "b t f"]:
         """The tokens of frames at `offsets`."""
@@ -73,8 +82,19 @@ class PairTokens(nn.Module):
         return tokens.transpose(1, 2).flatten(2)
 
 
-def find_encoder_of(name: str, seed: int) -> BaseTouchEncoder:
-    """An encoder by the name that the benchmark gives it: NAME, random:NAME or end-to-end:NAME."""
+def find_encoder_of(name: str, sensor: str, seed: int) -> BaseTouchEncoder:
+    """An encoder by the name that the benchmark gives it.
+
+    Args:
+        name: NAME, random:NAME or end-to-end:NAME of an encoder or its folder; end-to-end:PRESET of a ViT.
+        sensor: of the rig, for which a preset's network is built.
+        seed: of random weights.
+    """
+    preset = name.removeprefix(END_TO_END)
+    if preset != name and preset in PRESETS:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            return TouchBackbone(TouchBackboneConfig.for_sensor(PRESETS[preset], sensor))
     for prefix in (RANDOM, END_TO_END):
         if name.startswith(prefix):
             return untrained(name.removeprefix(prefix), seed)
@@ -83,7 +103,7 @@ def find_encoder_of(name: str, seed: int) -> BaseTouchEncoder:
 
 @torch.no_grad()
 def frozen_tokens(encoder: BaseTouchEncoder, frames: RigFrames) -> Callable[[Rows], Inputs]:
-    """A frozen encoder's tokens of every pair, by row; each frame is embedded once."""
+    """A frozen encoder's tokens of every pair, by row; each is computed once, for all probes."""
     tokens = PairTokens(encoder).eval()
     every = torch.arange(len(frames.before))
     if tokens.looks_back:
@@ -101,11 +121,11 @@ def _batches(rows: Rows) -> list[Rows]:
 class Reader(nn.Module):
     """A probe, with or without the encoder that it is trained with."""
 
-    def __init__(self, task: Task, features: int, encoder: PairTokens | None) -> None:
-        """Builds a randomly initialised probe of a task."""
+    def __init__(self, task: Task, tokens: PairTokens, trained: bool) -> None:
+        """Builds a randomly initialised probe of a task, for an encoder that is trained with it or not."""
         super().__init__()
-        self.encoder = encoder
-        self.probe = AttentiveProbe(features, task.outputs)
+        self.encoder = tokens if trained else None
+        self.probe = task.probe(tokens.features, tokens.grid)
         self._task = [task]  # in a list: no part of the state
 
     def outputs(self, inputs: Inputs) -> Outputs:
@@ -136,7 +156,7 @@ def train_reader(
         log: for the trainer's lines.
     """
     per_snapshot = max(training.steps // _SNAPSHOTS, 1) * training.batch_size
-    every = max(len(task.split.validation) // _MAX_VALIDATION, 1)
+    every = max(-(-len(task.split.validation) // _MAX_VALIDATION), 1)
     validation = task.split.validation[::every]
     best: dict[str, Tensor] = {}
     least = float("inf")

@@ -1,132 +1,166 @@
 """TacBench as a table, beside the numbers that the paper measured on real sensors."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from touchgoal.benchmarks.config import TacbenchOptions
-from touchgoal.benchmarks.tacbench.tasks import CLASSES
+from touchgoal.benchmarks.tacbench.probes import END_TO_END, RANDOM
+from touchgoal.benchmarks.tacbench.published import BEST_AGAINST_END_TO_END, SHARES, published
 
-_SHARES = (1.0, 1 / 3, 0.1, 0.01)
+Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Published:
-    """A table of Sparsh: of each encoder the measure at every share of the labels."""
+class Layout:
+    """How a task's rows are printed.
 
-    task: str
-    sensor: str
+    Attributes:
+        title: above them.
+        measure: the number that counts, in the row under this key.
+        digits: of it after the point.
+        less_is_better: whether it is an error.
+        others: further numbers of a row, by header.
+    """
+
+    title: str
     measure: str
     digits: int
-    values: dict[str, tuple[float, float, float, float]]
+    less_is_better: bool
+    others: dict[str, Callable[[Row], str]]
 
 
-# Tables 5 to 8. What the paper calls RMSE of the force is computed as a mean absolute error over the
-# axes (its code); its tables of slip and pose are a DIGIT's.
-_FORCE = "MAE, there called RMSE"
-PAPER = (
-    Published("force", "gelsight_mini", _FORCE, 0, {
-        "E2E": (57.21, 59.09, 57.43, 82.42),
-        "Sparsh (MAE)": (22.72, 23.28, 33.56, 78.98),
-        "Sparsh (DINO)": (20.25, 23.79, 32.17, 53.43),
-        "Sparsh (IJEPA)": (27.91, 35.2, 44.93, 91.81),
-        "Sparsh (VJEPA)": (33.26, 34.07, 42.35, 80.36),
-    }),
-    Published("force", "digit", _FORCE, 0, {
-        "E2E": (39.34, 61.42, 98.22, 187.51),
-        "Sparsh (MAE)": (36.61, 45.96, 58.55, 115.39),
-        "Sparsh (DINO)": (36.09, 44.03, 51.89, 97.95),
-        "Sparsh (IJEPA)": (40.27, 60.04, 86.57, 130.37),
-        "Sparsh (VJEPA)": (39.38, 56.34, 76.11, 130.83),
-    }),
-    Published("slip", "digit", "F1", 3, {
-        "E2E": (0.767, 0.238, 0.299, 0.214),
-        "Sparsh (MAE)": (0.783, 0.818, 0.691, 0.269),
-        "Sparsh (DINO)": (0.685, 0.561, 0.548, 0.489),
-        "Sparsh (IJEPA)": (0.776, 0.791, 0.775, 0.726),
-        "Sparsh (VJEPA)": (0.82, 0.828, 0.8, 0.76),
-    }),
-    Published("pose", "digit", "accuracy", 3, {
-        "E2E": (0.812, 0.245, 0.162, 0.162),
-        "Sparsh (MAE)": (0.896, 0.719, 0.417, 0.223),
-        "Sparsh (DINO)": (0.913, 0.834, 0.46, 0.242),
-        "Sparsh (IJEPA)": (0.851, 0.601, 0.323, 0.212),
-        "Sparsh (VJEPA)": (0.856, 0.648, 0.368, 0.228),
-    }),
-)  # fmt: skip
+def _axis(key: str, k: int, digits: int) -> Callable[[Row], str]:
+    return lambda row: f"{row[key][k]:.{digits}f}"
 
 
-def table(rows: list[dict[str, Any]], sensor: str, config: TacbenchOptions) -> str:
+def _number(key: str, digits: int) -> Callable[[Row], str]:
+    return lambda row: f"{row[key]:.{digits}f}" if key in row else ""
+
+
+LAYOUTS: dict[str, Layout] = {
+    "force": Layout(
+        "T1, force on the pad, mN: mean absolute error; root mean square error, by axis and of all",
+        "mae_mn",
+        0,
+        True,
+        {axis: _axis("rmse_mn_by_axis", k, 0) for k, axis in enumerate("xyz")}
+        | {"RMSE": _number("rmse_mn", 0)},
+    ),
+    "field": Layout(
+        "T1A, force field where the pad is touched: share of the shear's variation explained, and of the "
+        "pressure's; root mean square errors, kPa",
+        "shear_explained",
+        3,
+        False,
+        {
+            "pressure": _number("pressure_explained", 3),
+            "shear": _number("shear_rmse_kpa", 2),
+            "press.": _number("pressure_rmse_kpa", 2),
+        },
+    ),
+    "slip": Layout(
+        "T2, whether the sphere slips: F1; mean absolute error of the change of force, mN",
+        "f1",
+        3,
+        False,
+        {"change": _number("change_mae_mn", 0)},
+    ),
+    "pose": Layout(
+        "T3, change of the pose of a bar and a can in 11 classes: accuracy; by axis; within one class",
+        "accuracy",
+        3,
+        False,
+        {name: _axis("accuracy_by_axis", k, 3) for k, name in enumerate(("x", "y", "turn"))}
+        | {"within": _number("within_one_class", 3)},
+    ),
+    "grasp": Layout(
+        "T4, whether a grasp holds: accuracy; mean of both outcomes' accuracies",
+        "accuracy",
+        3,
+        False,
+        {"balanced": _number("balanced_accuracy", 3)},
+    ),
+    "textile": Layout(
+        "T6, which of 20 cloths: accuracy; mean of all cloths' accuracies",
+        "accuracy",
+        3,
+        False,
+        {"balanced": _number("balanced_accuracy", 3)},
+    ),
+}
+
+
+def table(rows: list[Row], sensor: str, config: TacbenchOptions) -> str:
     """As people read it."""
     lines = [
-        f"TacBench, simulated: {sensor}, {config.strokes} strokes of {', '.join(config.rig.indenters)}, "
-        f"{config.seeds} training seed{'s' * (config.seeds > 1)}; [95 % over test strokes]"
+        f"TacBench, simulated: {sensor}, {config.strokes} strokes, {config.slides} slides, "
+        f"{config.grasps} grasps, {config.cloths} presses of cloth, "
+        f"{config.seeds} training seed{'s' * (config.seeds > 1)}; [95 % over test recordings]"
     ]
-    if force := [row for row in rows if row["task"] == "force"]:
-        lines += ["", *_force_lines(force), *_paper("force", sensor.removesuffix("_markers"))]
-    if slip := [row for row in rows if row["task"] == "slip"]:
-        lines += ["", *_slip_lines(slip), *_paper("slip", "digit")]
-    if pose := [row for row in rows if row["task"] == "pose"]:
-        lines += ["", *_pose_lines(pose), *_paper("pose", "digit")]
-    return "\n".join(lines)
+    for task in config.tasks:
+        lines += ["", *_task_lines([row for row in rows if row["task"] == task], task)]
+        lines += _published_lines(task, sensor)
+    return "\n".join([*lines, "", *_summary(rows, config)])
 
 
-def _force_lines(rows: list[dict[str, Any]]) -> list[str]:
+def _task_lines(rows: list[Row], task: str) -> list[str]:
+    layout = LAYOUTS[task]
+    headers = "".join(f"{name:>9}" for name in layout.others)
+    name = layout.measure.removesuffix("_mn").replace("_", " ")
     lines = [
-        "T1, force on the pad, mN: root mean square error by axis and of all, mean absolute error",
-        f"{'encoder':<36}{'tested on':<20}{'labels':>7}{'x':>6}{'y':>6}{'z':>6}{'RMSE':>7}{'':>14}"
-        f"{'MAE':>7}",
+        layout.title,
+        f"{'encoder':<36}{'tested on':<20}{'labels':>7}{name:>16}{'':>16}{headers}",
     ]
     for row in rows:
-        x, y, z = row["rmse_mn_by_axis"]
-        low, high = row["rmse_mn_interval"]
-        least, most = row["mae_mn_interval"]
+        low, high = (f"{end:.{layout.digits}f}" for end in row[f"{layout.measure}_interval"])
+        others = "".join(f"{print_(row):>9}" for print_ in layout.others.values())
         lines.append(
-            f"{row['encoder']:<36}{row['test']:<20}{row['samples']:>7}{x:>6.0f}{y:>6.0f}{z:>6.0f}"
-            f"{row['rmse_mn']:>7.0f}{f'[{low:.0f}, {high:.0f}]':>14}"
-            f"{row['mae_mn']:>7.0f} [{least:.0f}, {most:.0f}]"
+            f"{row['encoder']:<36}{row['test']:<20}{row['samples']:>7}"
+            f"{row[layout.measure]:>16.{layout.digits}f}{f'[{low}, {high}]':>16}{others}"
         )
     return lines
 
 
-def _slip_lines(rows: list[dict[str, Any]]) -> list[str]:
+def _published_lines(task: str, sensor: str) -> list[str]:
+    """The paper's rows of a task, if it has any."""
+    known = published(task, sensor)
+    if known is None:
+        return []
+    shares = "".join(f"{f'{share:.2g}':>9}" for share in SHARES)
+    lines = [f"{f'paper, real {known.sensor}, share of labels ({known.measure})':<66}{shares}"]
+    for encoder, values in known.values.items():
+        numbers = "".join(f"{value:>9.{known.digits}f}" for value in values)
+        lines.append(f"{f'  {encoder}':<66}{numbers}")
+    return lines
+
+
+def _summary(rows: list[Row], config: TacbenchOptions) -> list[str]:
+    """As Table 11: the best frozen encoder, chosen by task and share, against the best trained end to end."""
+    shares = "".join(f"{share:>14.2g}" for share in config.shares)
     lines = [
-        "T2, whether the sphere slips: F1; mean absolute error of the change of force, mN",
-        f"{'encoder':<36}{'labels':>7}{'F1':>7}{'':>15}{'change':>8}",
+        f"{'best frozen encoder against end to end, %; * intervals apart':<66}{shares}   paper"
     ]
-    for row in rows:
-        low, high = row["f1_interval"]
-        change = f"{row['change_mae_mn']:.0f}" if "change_mae_mn" in row else ""
-        lines.append(
-            f"{row['encoder']:<36}{row['samples']:>7}{row['f1']:>7.3f}"
-            f"{f'[{low:.2f}, {high:.2f}]':>15}{change:>8}"
-        )
-    return lines
+    for task in config.tasks:
+        for test in dict.fromkeys(row["test"] for row in rows if row["task"] == task):
+            cells = [_gain(rows, task, test, share) for share in config.shares]
+            if any(cells):
+                paper = BEST_AGAINST_END_TO_END.get(task)
+                said = "" if paper is None else f"{paper:8.0f}"
+                lines.append(f"{f'  {task}, {test}':<66}{''.join(f'{c:>14}' for c in cells)}{said}")
+    return lines if len(lines) > 1 else []
 
 
-def _pose_lines(rows: list[dict[str, Any]]) -> list[str]:
-    lines = [
-        f"T3, change of the pose of a bar and a can in {CLASSES} classes: accuracy; within one class",
-        f"{'encoder':<36}{'labels':>7}{'x':>7}{'y':>7}{'turn':>7}{'all':>7}{'':>15}{'within':>8}",
-    ]
-    for row in rows:
-        low, high = row["accuracy_interval"]
-        x, y, turn = row["accuracy_by_axis"]
-        lines.append(
-            f"{row['encoder']:<36}{row['samples']:>7}{x:>7.3f}{y:>7.3f}{turn:>7.3f}"
-            f"{row['accuracy']:>7.3f}{f'[{low:.2f}, {high:.2f}]':>15}{row['within_one_class']:>8.3f}"
-        )
-    return lines
-
-
-def _paper(task: str, sensor: str) -> list[str]:
-    """The published rows of a task, if it was measured on a sensor."""
-    lines = []
-    for known in PAPER:
-        if (known.task, known.sensor) != (task, sensor):
-            continue
-        shares = "".join(f"{f'{share:.2g}':>8}" for share in _SHARES)
-        lines.append(f"{f'paper, real {sensor}, share of labels ({known.measure})':<66}{shares}")
-        for encoder, values in known.values.items():
-            numbers = "".join(f"{value:>8.{known.digits}f}" for value in values)
-            lines.append(f"{f'  {encoder}':<66}{numbers}")
-    return lines
+def _gain(rows: list[Row], task: str, test: str, share: float) -> str:
+    """By how many percent frozen is better; empty without either kind."""
+    layout = LAYOUTS[task]
+    key, sign = layout.measure, -1 if layout.less_is_better else 1
+    same = [r for r in rows if (r["task"], r["test"], r["share"]) == (task, test, share)]
+    trained = [r for r in same if r["encoder"].startswith(END_TO_END)]
+    frozen = [r for r in same if not r["encoder"].startswith((END_TO_END, RANDOM, "("))]
+    if not trained or not frozen:
+        return ""
+    best, other = (max(kind, key=lambda r: sign * r[key]) for kind in (frozen, trained))
+    gain = 100 * sign * (best[key] - other[key]) / max(abs(other[key]), 1e-9)
+    (low, high), (least, most) = (r[f"{key}_interval"] for r in (best, other))
+    return f"{gain:+.0f}{'*' * (low > most or least > high)}"

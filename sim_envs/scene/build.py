@@ -51,11 +51,11 @@ def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpe
         for i, k in ((0, 2), (2, 4), (3, 5)):
             spec.add_exclude(bodyname1=f"fr3_link{i}", bodyname2=f"fr3_link{k}")
     spec.meshdir = str(robot_model().parent / "meshes")
-    _set_options(spec, config)
+    set_options(spec, config)
     _strip(spec, config)
     _compensate_gravity(spec.body("base"))
     for side in SIDES:
-        _add_fingertip(spec, side, find_sensor(config.sensor))
+        add_fingertip(spec, side, find_sensor(config.sensor))
     _add_actuators(spec, config.arm)
     _add_cameras_and_table(spec, ROBOTS[config.arm].tool)
     for body in bodies:
@@ -63,7 +63,8 @@ def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpe
     return spec
 
 
-def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
+def set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
+    """Solver and drawing, for whatever scene has a fingertip in it."""
     option = spec.option
     option.timestep = config.timestep
     # `discrete` keeps implicit damping when an actuator saturates; with `implicitfast` MuJoCo
@@ -123,7 +124,7 @@ def _compensate_gravity(body: mujoco.MjsBody) -> None:
         _compensate_gravity(child)
 
 
-def _add_fingertip(spec: mujoco.MjSpec, side: str, sensor: SensorModel) -> None:
+def add_fingertip(spec: mujoco.MjSpec, side: str, sensor: SensorModel) -> None:
     """Carriage, adapter, sensor case and gel of one finger.
 
     The gel is one rigid plate on three springs (normal, two shear): the pad's force then is exact,

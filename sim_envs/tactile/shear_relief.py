@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from touchgoal.control.tactile.sensor_models import SensorModel
+from touchgoal.sim_envs.tactile.field_on_picture import over_picture
 from touchgoal.sim_envs.tactile.forces import ForceField
 from touchgoal.sim_envs.tactile.geometry import Grid
 from touchgoal.sim_envs.tactile.markers import layer_compliance
@@ -47,16 +48,7 @@ class ShearRelief:
             field: of the contact.
             overlap: of the object with the undeformed gel, on the image's grid.
         """
-        sinks = self.depth(field)
-        h, w = overlap.shape
-        cells = self._pitch / self._image.pitch  # of the image, for one of the forces
-        # A force cell, displaced with its gel, over a pixel of the surface.
-        middle = np.array(sinks.shape[::-1]) / 2 - 0.5
-        middle -= np.array(field.displacement[:2]) / self._pitch
-        shift = middle - (np.array([w, h]) / 2 - 0.5) / cells
-        to_cells = np.column_stack([np.eye(2) / cells, shift])
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        relief = cv2.warpAffine(sinks.astype(np.float32), to_cells, (w, h), flags=flags)
+        relief = over_picture(self.depth(field), field, self._image)
         free = (overlap <= 0).astype(np.float32)
         return relief * cv2.GaussianBlur(free, (0, 0), _RIM / self._image.pitch)
 

@@ -1,6 +1,7 @@
-"""Strokes of the indenter rig, and slides of held objects, as sets of episodes, made on all cores.
+"""What the simulated bench makes, as sets of episodes, made on all cores.
 
-The rig's one sensor is the left fingertip; of the right one the truth is zeros, and there are no pictures.
+Strokes of the indenter rig, slides of held objects, grasp attempts, presses of cloth. Where there is one
+sensor it is the left fingertip; of the right one the truth is zeros, and there are no pictures.
 """
 
 from collections.abc import Callable
@@ -13,17 +14,21 @@ from jaxtyping import Bool, Float32, UInt8
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import (
     TACTILE_LEFT,
+    TACTILE_RIGHT,
     TRUTH_CONTACT,
     TRUTH_OBJECT_POSE,
     TRUTH_PAD_WRENCH,
     TRUTH_SLIP,
+    TRUTH_SUCCESS,
 )
 from touchgoal.control.progress import track
 from touchgoal.episodes.encoding import EncodedEpisode, encode
 from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.sim_envs.cloths import CLOTHS, press_cloth
 from touchgoal.sim_envs.config import RigConfig
+from touchgoal.sim_envs.grasp_rig import attempt_grasp
 from touchgoal.sim_envs.indenter_rig import FPS, simulate
 from touchgoal.sim_envs.object_slides import HELD, simulate_slide
 
@@ -48,7 +53,20 @@ def record_slides(root: Path, config: RigConfig, count: int, workers: int) -> Ep
     return _record_missing(root, rig, partial(_slide, config, rig), count, workers)
 
 
+def record_grasps(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
+    """The first so many grasp attempts, three frames each; as `record_strokes`."""
+    rig = _description(config, ("grasps",))
+    return _record_missing(root, rig, partial(_grasp, config, rig), count, workers)
+
+
+def record_cloths(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
+    """The first so many presses of cloth; as `record_strokes`."""
+    rig = _description(config, ("cloths",))
+    return _record_missing(root, rig, partial(_cloth, config, rig), count, workers)
+
+
 def _description(config: RigConfig, things: tuple[str, ...]) -> str:
+    """Of all that strokes depend on: another rig's are not to be mixed in."""
     low, high = config.load
     loads = f"{low:g} to {high:g} N{', no relief' * (not config.shear_relief)}"
     return f"{config.sensor}, {'+'.join(things)}, {loads}, seed {config.seed}"
@@ -61,13 +79,13 @@ def _record_missing(
     try:
         if len(writer) and (said := EpisodeSet(root).meta(0).get(_RIG)) != rig:
             raise UserError(
-                f"{root} holds strokes of another rig ({said}), not {rig}: give another folder"
+                f"{root} holds recordings of another rig ({said}), not {rig}: give another folder"
             )
         if len(writer) < count:
             with one_core_workers(workers) as pool:
                 missing = range(len(writer), count)
                 made = pool.map(record, missing)
-                for episode in track(made, "indenter rig", "stroke", total=len(missing)):
+                for episode in track(made, root.name, "recording", total=len(missing)):
                     writer.append(episode)
     finally:
         writer.close()
@@ -103,6 +121,36 @@ def _slide(config: RigConfig, rig: str, index: int) -> EncodedEpisode:
         "stroke": index,
     }
     return encode(Episode(frames, f"slide and turn a {slide.held} on the sensor", meta), FPS)
+
+
+def _grasp(config: RigConfig, rig: str, index: int) -> EncodedEpisode:
+    attempt = attempt_grasp(config, index)
+    pressed = attempt.wrench[:, [2, 8]] < 0
+    frames = {
+        TACTILE_LEFT: attempt.left,
+        TACTILE_RIGHT: attempt.right,
+        TRUTH_PAD_WRENCH: attempt.wrench,
+        TRUTH_CONTACT: pressed,
+        TRUTH_SUCCESS: np.array([[False], [False], [attempt.held]]),
+    }
+    name = attempt.body.kind.name
+    meta = {
+        _RIG: rig,
+        "sensor": config.sensor,
+        "object": name,
+        "grip": attempt.grip,
+        "mass": attempt.body.mass,
+        "success": attempt.held,
+        "stroke": index,
+    }
+    return encode(Episode(frames, f"grasp the {name.replace('_', ' ')} and lift it", meta), FPS)
+
+
+def _cloth(config: RigConfig, rig: str, index: int) -> EncodedEpisode:
+    clip = press_cloth(config, index)
+    name = CLOTHS[clip.cloth].name
+    meta = {_RIG: rig, "sensor": config.sensor, "object": name, "stroke": index}
+    return encode(Episode({TACTILE_LEFT: clip.frames}, f"press on {name}", meta), FPS)
 
 
 def _frames(

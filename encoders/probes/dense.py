@@ -1,0 +1,53 @@
+"""Tokens back to a picture: what a dense quantity, such as a force field, is read by.
+
+After DPT (Ranftl et al. 2021), with one stage: tokens go to their places and are refined by
+convolutions between doublings of the resolution.
+"""
+
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from touchgoal.control.errors import UserError
+
+
+class DenseProbe(nn.Module):
+    """Tokens of a grid of patches to planes of values."""
+
+    def __init__(
+        self, features: int, grid: tuple[int, int], planes: int, side: int, width: int = 48
+    ) -> None:
+        """Builds a randomly initialised probe.
+
+        Args:
+            features: width of the tokens.
+            grid: rows and columns of the patches. Tokens before theirs (a class token) are left out;
+                several times as many (clips) are averaged over time.
+            planes: of the output.
+            side: rows and columns of the output.
+            width: channels in between.
+        """
+        super().__init__()
+        self.grid, self.side = grid, side
+        self.norm = nn.LayerNorm(features)
+        self.narrow = nn.Linear(features, width)
+        self.refine = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in range(2))
+        self.out = nn.Conv2d(width, planes, 3, padding=1)
+
+    def forward(self, tokens: Float[Tensor, "b t f"]) -> Float[Tensor, "b p s s"]:
+        """The planes, unbounded.
+
+        Raises:
+            UserError: Fewer tokens than patches.
+        """
+        patches = self.grid[0] * self.grid[1]
+        times = tokens.shape[1] // patches
+        if not times:
+            raise UserError(f"{tokens.shape[1]} tokens are fewer than the grid's {patches} patches")
+        placed = tokens[:, tokens.shape[1] - times * patches :].unflatten(1, (times, patches))
+        x = self.narrow(self.norm(placed.mean(1))).transpose(1, 2).unflatten(2, self.grid)
+        for i, convolution in enumerate(self.refine):
+            size = (self.side // 2, self.side // 2) if i == 0 else (self.side, self.side)
+            x = F.interpolate(x, size, mode="bilinear", align_corners=False)
+            x = x + F.gelu(convolution(x))
+        return self.out(x)

@@ -1,0 +1,147 @@
+"""TacBench's grasps, cloths and force fields: mechanics, splits and metrics by hand."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from touchgoal.benchmarks.tacbench.data import read_cloths, read_grasps
+from touchgoal.benchmarks.tacbench.field import field_metrics
+from touchgoal.benchmarks.tacbench.labels import grasp_task, label_metrics, textile_task
+from touchgoal.benchmarks.tacbench.published import published
+from touchgoal.benchmarks.tacbench.splits import split_grasp
+from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.encoders.preprocess import preprocessor_for
+from touchgoal.encoders.probes.dense import DenseProbe
+from touchgoal.episodes.bench_recording import record_cloths, record_grasps
+from touchgoal.sim_envs.cloths import CLOTHS, press_cloth
+from touchgoal.sim_envs.config import RigConfig
+from touchgoal.sim_envs.grasp_rig import GraspAttempt, attempt_grasp
+from touchgoal.sim_envs.indenter_rig import REST, rig_unit, simulate
+
+RIG = RigConfig(seed=3)
+GRASPS = 5
+
+
+@pytest.fixture(scope="session")
+def grasps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("grasps")
+    record_grasps(folder, RIG, GRASPS, workers=1)
+    return folder
+
+
+def test_the_field_over_the_picture_adds_up_to_the_force() -> None:
+    stroke, unit = simulate(RIG, 1), rig_unit(RIG)
+    rows, columns = find_sensor(RIG.sensor).image_shape
+    cell = rows * columns * unit.pixel_pitch**2 / 24**2
+    force = 1e3 * cell * stroke.field.sum((2, 3))
+    assert not stroke.field[:REST].any()
+    np.testing.assert_allclose(force, stroke.wrench[:, :3] * [1, 1, -1], atol=0.02, rtol=0.01)
+
+
+def held(attempt: GraspAttempt) -> bool | None:
+    """What friction alone says: grips beyond doubt hold, grips far below the weight do not."""
+    friction, weight = attempt.body.kind.material.friction, 9.81 * attempt.body.mass
+    share = 2 * friction * attempt.grip / weight
+    return True if share > 4 else False if share < 0.6 else None
+
+
+def test_a_grasp_holds_as_friction_says() -> None:
+    sure = 0
+    for index in (2, 4, 5, 7, 8):
+        attempt = attempt_grasp(RIG, index)
+        expected = held(attempt)
+        sure += expected is not None
+        assert expected is None or attempt.held == expected
+        assert not attempt.wrench[0].any()
+        grips = -attempt.wrench[1, [2, 8]]
+        assert grips.sum() == pytest.approx(2 * attempt.grip, rel=0.1)
+        if attempt.held:  # what hangs pulls both pads down: their x is down
+            down = attempt.wrench[2, 0] + attempt.wrench[2, 6]
+            assert down > attempt.wrench[1, 0] + attempt.wrench[1, 6]
+    assert sure >= 2
+
+
+def test_grasps_are_pairs_of_moments_of_each_finger(grasps: Path) -> None:
+    episodes = record_grasps(grasps, RIG, GRASPS, workers=1)
+    frames = read_grasps(episodes, GRASPS, preprocessor_for(RIG.sensor))
+    assert len(frames.stroke) == GRASPS * 2 * 3
+    assert frames.before[:6].tolist() == [0, 0, 1, 3, 3, 4]
+    again = attempt_grasp(RIG, 1)
+    assert frames.label is not None and frames.label[6:12].tolist() == 6 * [int(again.held)]
+    split = split_grasp(frames)
+    assert set(split.tests) == {"gripped", "lifted"}
+    rows = torch.cat([split.train, split.validation, *split.tests.values()])
+    assert sorted(rows.tolist()) == [row for row in range(30) if row % 3]
+    task = grasp_task(frames)
+    right = torch.nn.functional.one_hot(torch.from_numpy(task.truth(rows)), 2).float()
+    assert task.error(40 * right, rows) == pytest.approx(0, abs=1e-6)
+
+
+def test_a_cloths_yarns_are_as_many_as_it_says(tmp_path: Path) -> None:
+    """The strongest wave of corduroy's ten ridges lies along x, within the pieces' spread."""
+    cloth = next(c for c in CLOTHS if c.name == "corduroy")
+    y, x = np.mgrid[:256, :256].astype(np.float32) / 256
+    height = cloth.pattern(10 * x, 10 * y)
+    spectrum = np.abs(np.fft.rfft2(height - height.mean()))
+    assert np.unravel_index(spectrum.argmax(), spectrum.shape) == (0, 10)
+    over, under = (CLOTHS[0].pattern(np.full((256, 256), u, np.float32), 0 * x) for u in (0.5, 1.5))
+    # plain weave: between two wefts a warp is up on every other yarn
+    assert sorted([float(over[0, 0]), float(under[0, 0])]) == pytest.approx([0.5, 1.0])
+    episodes = record_cloths(tmp_path, RIG, 21, workers=1)
+    clip = press_cloth(RIG, 20)
+    assert clip.cloth == 0 and episodes.meta(20)["object"] == "poplin"
+    change = np.abs(clip.frames.astype(int) - clip.frames[0]).mean((1, 2, 3))
+    assert change[-1] > change[1] > change[0] == 0
+    frames = read_cloths(episodes, 21, preprocessor_for(RIG.sensor))
+    task = textile_task(frames)
+    assert task.truth(torch.tensor([0, 8, 160])).tolist() == [0, 1, 0]
+
+
+def test_a_dense_probe_puts_values_where_they_belong() -> None:
+    torch.manual_seed(0)
+    probe = DenseProbe(features=12, grid=(3, 4), planes=1, side=12, width=16)
+    optimizer, generator = torch.optim.Adam(probe.parameters(), lr=1e-2), torch.Generator()
+    generator.manual_seed(0)
+
+    def wrong() -> tuple[torch.Tensor, torch.Tensor]:
+        tokens = torch.randn(16, 12, 12, generator=generator)
+        wanted = tokens[:, :, :1].transpose(1, 2).unflatten(2, (3, 4))
+        wanted = torch.nn.functional.interpolate(wanted, (12, 12), mode="bilinear")
+        return (probe(tokens) - wanted).square().mean(), wanted.square().mean()
+
+    for _ in range(120):
+        optimizer.zero_grad()
+        wrong()[0].backward()
+        optimizer.step()
+    loss, size = wrong()
+    assert loss < 0.3 * size
+    tokens, class_token = torch.randn(2, 12, 12), torch.randn(2, 1, 12)
+    assert torch.equal(probe(torch.cat([class_token, tokens], 1)), probe(tokens))
+
+
+def test_metrics_of_labels_and_fields_by_hand() -> None:
+    truth, said = np.array([0, 0, 0, 1]), np.array([[0, 0, 1, 1], [0, 0, 0, 0]])
+    metrics = label_metrics(said, truth, np.arange(4))
+    assert metrics["accuracy"] == pytest.approx(6 / 8)
+    assert metrics["balanced_accuracy"] == pytest.approx((5 / 6 + 1 / 2) / 2)
+    field = np.zeros((2, 3, 24, 24))
+    field[0, :, 3, 4] = 3.0, 4.0, 10.0
+    field[1, :, 5, 5] = 0.0, 5.0, 20.0
+    half = 0.5 * field
+    metrics = field_metrics(half[None], field, np.arange(2))
+    assert metrics["shear_explained"] == pytest.approx(0.75)
+    assert metrics["shear_rmse_kpa"] == pytest.approx(2.5)
+    assert metrics["pressure_rmse_kpa"] == pytest.approx(np.sqrt((25 + 100) / 2))
+    # what is said where nothing presses does not count, and nothing at all explains nothing
+    half[:, :, 20, 20] = 100.0
+    assert field_metrics(half[None], field, np.arange(2))["shear_explained"] == pytest.approx(0.75)
+    assert field_metrics(0 * half[None], field, np.arange(2))["pressure_explained"] == 0
+
+
+def test_the_papers_numbers_are_found_by_sensor() -> None:
+    assert (known := published("force", "gelsight_mini_markers")) is not None
+    assert known.values["Sparsh (DINO)"][0] == 20.25
+    assert (known := published("grasp", "digit")) is not None and known.sensor == "gelsight"
+    assert published("textile", "digit") is None
