@@ -133,12 +133,23 @@ def _draw_bars(axis: Axes, rows: list[dict[str, Any]], task: str, test: str, sen
         axis.bar(
             places, values, width, yerr=spread, capsize=2, label=encoder, color=colour, hatch=hatch
         )
-    for row in rows:
-        if row["encoder"].startswith("("):
-            axis.axhline(row[measure], color="0.4", linewidth=0.8, linestyle=":")
-            axis.text(
-                len(shares) - 0.5, row[measure], row["encoder"], fontsize=7, ha="right", va="bottom"
-            )
+    references = [row for row in rows if row["encoder"].startswith("(")]
+    for k, row in enumerate(references):
+        axis.axhline(row[measure], color="0.3", linewidth=0.9, linestyle=":")
+        place, side = ((len(shares) - 0.55, "right"), (-0.45, "left"))[k % 2]
+        box = {"facecolor": "w", "alpha": 0.7, "edgecolor": "none", "pad": 0.5}
+        axis.text(
+            place,
+            row[measure],
+            row["encoder"],
+            fontsize=7,
+            ha=side,
+            va="bottom",
+            bbox=box,
+            zorder=5,
+        )
+    if not LAYOUTS[task].less_is_better:  # a share explained may be far below 0
+        axis.set_ylim(max(axis.get_ylim()[0], -0.5), 1.02)
     _draw_published(axis, shares, task, sensor)
     axis.set_xticks(range(len(shares)), [_share_name(share) for share in shares])
     axis.set(xlabel="share of the labels", title=f"{_TITLES[task]}\n{test}")
@@ -158,7 +169,9 @@ def _draw_published(axis: Axes, shares: list[float], task: str, sensor: str) -> 
     for (name, values), marker in zip(lines.items(), ("v", "^"), strict=True):
         at = [i for i, share in enumerate(shares) if _of_paper(share) is not None]
         seen = [values[_of_paper(shares[i])] for i in at]  # pyright: ignore[reportArgumentType]
-        axis.plot(at, seen, marker, color="k", fillstyle="none", markersize=7, label=name)
+        axis.plot(
+            at, seen, marker, color="k", markerfacecolor="w", markersize=8, label=name, zorder=4
+        )
 
 
 def _of_paper(share: float) -> int | None:

@@ -18,6 +18,7 @@ from touchgoal.benchmarks.tacbench.task import Task
 from touchgoal.sim_envs.indenter_rig import FRICTION
 
 _AXES = "xyz"
+_WORST = 0.1  # of the largest normal force: the error at the end of the colours
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ def draw_force(axes: np.ndarray, one: Read) -> None:
     assert isinstance(one.task, ForceTask)
     truth, said = one.frames.force[one.rows].numpy(), one.task.read(one.outputs).numpy()
     error = 1e3 * np.abs(said - truth)
-    worst = np.quantile(error, 0.98)
+    worst = 1e3 * _WORST * truth[:, 2].max()
     for k, axis in enumerate(axes[:3]):
         most = truth[:, 2].max()
         for side in (-1, 1):
@@ -70,7 +71,7 @@ def draw_slip(axes: np.ndarray, one: Read) -> None:
         ratio = np.hypot(force[:, 0], force[:, 1]) / np.maximum(force[:, 2], 1e-9)
         frames = np.arange(own.sum())
         axis.fill_between(frames, truth[own].astype(float), step="mid", alpha=0.25, label="slips")
-        axis.plot(frames, likely[own], color="C3", label="probe: likely")
+        axis.plot(frames, likely[own], color="C3", label="the probe's probability")
         axis.plot(frames, ratio, color="0.4", linewidth=1, label="shear / normal force")
         axis.axhline(FRICTION, color="0.4", linewidth=0.7, linestyle=":", label="nominal cone")
         axis.set(xlabel="frames since touch", ylim=(-0.05, 1.05))
@@ -141,26 +142,31 @@ def draw_field(axes: np.ndarray, one: Read) -> None:
     shear = np.hypot(truth[:, 0], truth[:, 1]).sum((1, 2))
     ends = [np.flatnonzero(stroke == s)[shear[stroke == s].argmax()] for s in np.unique(stroke)]
     chosen = ends[:: max(len(ends) // axes.shape[1], 1)][: axes.shape[1]]
+    size = one.frames.touch.shape[2], one.frames.touch.shape[3]
     for axis, i in zip(axes[0], chosen, strict=False):
-        _draw_arrows(axis, truth[i], truth[i])
+        _draw_arrows(axis, truth[i], truth[i], size)
         axis.set_title(f"true, stroke {stroke[i]}", fontsize=9)
     for axis, i in zip(axes[1], chosen, strict=False):
-        _draw_arrows(axis, said[i], truth[i])
+        _draw_arrows(axis, said[i], truth[i], size)
         axis.set_title(one.encoder, fontsize=9)
     for axis in axes[:, len(chosen) :].flat:
         axis.axis("off")
 
 
-def _draw_arrows(axis: Axes, field: np.ndarray, like: np.ndarray) -> None:
-    """A field on the scale of another."""
-    image = axis.imshow(field[2], cmap="magma", vmin=0, vmax=like[2].max())
-    axis.figure.colorbar(image, ax=axis, shrink=0.8)
-    y, x = np.mgrid[: field.shape[1], : field.shape[2]]
+def _draw_arrows(axis: Axes, field: np.ndarray, like: np.ndarray, picture: tuple[int, int]) -> None:
+    """A field over a picture of so many rows and columns, on the scale of another."""
+    h, w = picture
+    rows, columns = field.shape[1:]
+    image = axis.imshow(
+        field[2], cmap="magma", vmin=0, vmax=like[2].max(), extent=(0.0, w, h, 0.0), aspect="equal"
+    )
+    axis.figure.colorbar(image, ax=axis, shrink=0.8, label="kPa")
+    y, x = (np.mgrid[:rows, :columns] + 0.5) * np.reshape([h / rows, w / columns], (2, 1, 1))
     size = max(float(np.hypot(like[0], like[1]).max()), 1e-6)
     seen = np.hypot(field[0], field[1]) > 0.05 * size
     axis.quiver(
         x[seen], y[seen], field[0][seen], field[1][seen],
-        color="cyan", angles="xy", scale_units="xy", scale=size / 3, width=0.006,
+        color="cyan", angles="xy", scale_units="xy", scale=size / (3 * w / columns), width=0.006,
     )  # fmt: skip
     axis.set(xticks=[], yticks=[])
 
