@@ -279,7 +279,9 @@ class TacbenchOptions(BenchmarkOptions):
     """Presses of 20 cloths in turn simulated, for T6."""
     data: Path | None = None
     """Folder of the recordings: made there if it is new, gone on with if some are missing. Default:
-    runs/tacbench_<sensor>_<seed>."""
+    runs/tacbench_<sensor>_<seed>. Or a folder of published files: TacBench's force estimation (--tasks force
+    slip) or pose estimation (pose), or Feeling of Success (grasp); about as many recordings are read
+    as would be simulated."""
     seeds: Count = 3
     """Training seeds of each row: of labels drawn, initial weights and order."""
     seed: Seed = 0

@@ -36,6 +36,7 @@ from touchgoal.benchmarks.tacbench.probes import (
     read,
     train_reader,
 )
+from touchgoal.benchmarks.tacbench.published_recordings import check_tasks, find_published
 from touchgoal.benchmarks.tacbench.tables import table
 from touchgoal.benchmarks.tacbench.task import Task
 from touchgoal.benchmarks.tacbench.tasks import RECORDED_AS, TASKS, Recording
@@ -67,6 +68,8 @@ _READERS: dict[Recording, Callable[[EpisodeSet, int, Preprocessor], RigFrames]] 
     "grasps": read_grasps,
     "cloths": read_cloths,
 }
+Reading = Callable[[Preprocessor], RigFrames]
+"""Recordings, as an encoder's preprocessor makes them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,24 +106,32 @@ class Bench:
 def run(config: TacbenchOptions) -> dict[str, Any]:
     """Record the bench, train every probe, judge it on test recordings."""
     sensor = find_sensor(config.rig.sensor).name
+    published = find_published(config.data, sensor) if config.data else None
+    if published is not None and config.data is not None:
+        check_tasks(published, config.data, config.tasks)
+        sensor = published.sensor
     encoders = {name: _encoder(name, sensor, config) for name in config.encoders}
     short = Path(config.rig.sensor).name  # of a sensor file's folder, too
-    folder = config.data or Path("runs") / f"tacbench_{short}_{config.rig.seed}"
-    recordings: dict[Recording, EpisodeSet] = {
-        what: _record(what, folder, config) for what in _recordings(config)
-    }
+    folder = Path("runs") / f"tacbench_{short}_{config.rig.seed}"
+    readings: dict[Recording, Reading]
+    if published is None:
+        folder = config.data or folder
+        readings = {what: _record(what, folder, config) for what in _recordings(config)}
+    else:
+        folder.mkdir(parents=True, exist_ok=True)
+        readings = {published.what: partial(published.read, getattr(config, published.what))}
     trainings = len(encoders) * len(config.tasks) * len(config.shares) * config.seeds
     with (
-        kept(lambda: f"recordings are kept in {folder}, trained probes are not"),
+        kept(lambda: f"recordings are kept in {config.data or folder}, trained probes are not"),
         (folder / _LOG).open("a") as log,
         Progress("probes", trainings, "training") as bar,
     ):
         bench = Bench(config, sensor, log, bar, [], [])
-        for what in recordings:
-            _run_recording(bench, what, recordings[what], encoders)
+        for what, reading in readings.items():
+            _run_recording(bench, what, reading, encoders)
     bench.rows.sort(key=lambda row: config.tasks.index(row["task"]))
     return {
-        "table": table(bench.rows, sensor, config),
+        "table": table(bench.rows, sensor, config, config.data if published else None),
         "rows": bench.rows,
         "pictures": pictures(bench.rows, bench.reads, sensor),
     }
@@ -130,8 +141,11 @@ def _recordings(config: TacbenchOptions) -> list[Recording]:
     return list(dict.fromkeys(RECORDED_AS[task] for task in config.tasks))
 
 
-def _record(what: Recording, folder: Path, config: TacbenchOptions) -> EpisodeSet:
-    return _RECORDERS[what](folder / what, config.rig, getattr(config, what), config.workers)
+def _record(what: Recording, folder: Path, config: TacbenchOptions) -> Reading:
+    """Records what is missing of the bench's recordings."""
+    count = getattr(config, what)
+    episodes = _RECORDERS[what](folder / what, config.rig, count, config.workers)
+    return partial(_READERS[what], episodes, count)
 
 
 def _encoder(name: str, sensor: str, config: TacbenchOptions) -> BaseTouchEncoder:
@@ -147,7 +161,7 @@ def _encoder(name: str, sensor: str, config: TacbenchOptions) -> BaseTouchEncode
 
 
 def _run_recording(
-    bench: Bench, what: Recording, episodes: EpisodeSet, encoders: dict[str, BaseTouchEncoder]
+    bench: Bench, what: Recording, reading: Reading, encoders: dict[str, BaseTouchEncoder]
 ) -> None:
     """All tasks on one kind of recordings; frames and tokens are kept no longer than for these."""
     config = bench.config
@@ -156,7 +170,7 @@ def _run_recording(
     for name, encoder in encoders.items():
         key = encoder.preprocess.id
         if key not in seen:
-            frames = _READERS[what](episodes, getattr(config, what), encoder.preprocess)
+            frames = reading(encoder.preprocess)
             if "field" in tasks:
                 frames = with_fields(frames, config.rig, config.workers)
             seen[key] = frames

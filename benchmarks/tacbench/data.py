@@ -49,6 +49,7 @@ class RigFrames:
         label: of a grasp whether it holds in the end, of a cloth its number; None if the set has none.
         field: shear along x and y and pressure over the picture, kPa; None if it is not known.
         moments: of each finger in a row, for grasps; 0 for recordings in time.
+        use: what a recording is for, as published (see `splits`); None to have it chosen.
     """
 
     touch: Float16[Tensor, "n 3 h w"]
@@ -61,6 +62,7 @@ class RigFrames:
     label: Int[Tensor, " n"] | None = None
     field: Float[Tensor, "n 3 24 24"] | None = None
     moments: int = 0
+    use: Int[np.ndarray, " n"] | None = None
 
     def seen(self, rows: Rows, offsets: tuple[int, ...]) -> Float[Tensor, "k t 3 h w"]:
         """Frames, and those so many frames before each; of a stroke's first frames its first.
@@ -100,7 +102,7 @@ def read_strokes(strokes: EpisodeSet, count: int, preprocess: Preprocessor) -> R
     lengths = [len(f) for f in force]
     return RigFrames(
         torch.cat(touch),
-        _before(lengths, STRIDE),
+        rows_before(lengths, STRIDE),
         torch.cat(force),
         torch.cat(slip),
         np.repeat(np.arange(count), lengths),
@@ -123,7 +125,7 @@ def read_grasps(grasps: EpisodeSet, count: int, preprocess: Preprocessor) -> Rig
     length = len(touch[0])
     return RigFrames(
         torch.cat(touch),
-        _before([length] * len(touch), 1),
+        rows_before([length] * len(touch), 1),
         torch.cat(force),
         torch.zeros(len(label), dtype=torch.bool),
         np.repeat(np.arange(count), 2 * length),
@@ -144,7 +146,7 @@ def read_cloths(clips: EpisodeSet, count: int, preprocess: Preprocessor) -> RigF
     names, n = np.repeat(_names(clips, count), lengths), sum(lengths)
     return RigFrames(
         torch.cat(touch),
-        _before(lengths, STRIDE),
+        rows_before(lengths, STRIDE),
         torch.zeros(n, 3),
         torch.zeros(n, dtype=torch.bool),
         np.repeat(np.arange(count), lengths),
@@ -173,7 +175,7 @@ def _preprocessed(
     return torch.from_numpy(preprocess(pictures, pictures[0])).half()
 
 
-def _before(lengths: list[int], stride: int) -> Rows:
+def rows_before(lengths: list[int], stride: int) -> Rows:
     """Rows so many frames earlier, or the first of each recording."""
     starts = np.repeat(np.cumsum(lengths) - lengths, lengths)
     return torch.from_numpy(np.maximum(np.arange(sum(lengths)) - stride, starts))

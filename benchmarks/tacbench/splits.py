@@ -8,7 +8,8 @@ from jaxtyping import Bool, Int
 
 from touchgoal.benchmarks.tacbench.data import RigFrames, Rows
 
-_VALIDATION, _TEST = 3, 4  # of every five recordings of a thing; the other three are trained on
+VALIDATION, TEST = 3, 4
+"""Of every five recordings of a thing; the other three are trained on."""
 _MOST = 800  # frames of a test of forces, evenly: neighbours tell little more
 
 
@@ -35,9 +36,9 @@ def split_force(frames: RigFrames) -> Split:
     known = frames.pressed & (frames.indenter != "flat")
     tests = {
         "flat probe, unseen": _evenly(_rows(frames.pressed & (frames.indenter == "flat"))),
-        "known probes": _evenly(_of_use(frames, known, _TEST)),
+        "known probes": _evenly(_of_use(frames, known, TEST)),
     }
-    return Split(_training(frames, known), _of_use(frames, known, _VALIDATION), tests)
+    return Split(_training(frames, known), _of_use(frames, known, VALIDATION), tests)
 
 
 def split_slip(frames: RigFrames) -> Split:
@@ -68,12 +69,14 @@ def split_textile(frames: RigFrames) -> Split:
 
 
 def _split(frames: RigFrames, chosen: Bool[np.ndarray, " n"], test: str) -> Split:
-    tests = {test: _of_use(frames, chosen, _TEST)}
-    return Split(_training(frames, chosen), _of_use(frames, chosen, _VALIDATION), tests)
+    tests = {test: _of_use(frames, chosen, TEST)}
+    return Split(_training(frames, chosen), _of_use(frames, chosen, VALIDATION), tests)
 
 
 def _use(frames: RigFrames) -> Int[np.ndarray, " n"]:
-    """0 to 4, evenly over the recordings of each thing, and over things with few recordings."""
+    """0 to 4, evenly over the recordings of each thing, and over things with few recordings; or as published."""
+    if frames.use is not None:
+        return frames.use
     use = np.empty(len(frames.stroke), np.int64)
     for k, name in enumerate(np.unique(frames.indenter)):
         own = frames.indenter == name
@@ -90,7 +93,7 @@ def _evenly(rows: Rows) -> Rows:
 
 
 def _training(frames: RigFrames, chosen: Bool[np.ndarray, " n"]) -> Rows:
-    return _rows(chosen & (_use(frames) < _VALIDATION))
+    return _rows(chosen & (_use(frames) < VALIDATION))
 
 
 def _rows(chosen: Bool[np.ndarray, " n"]) -> Rows:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from touchgoal.benchmarks.config import TacbenchOptions
@@ -91,11 +92,18 @@ LAYOUTS: dict[str, Layout] = {
 }
 
 
-def table(rows: list[Row], sensor: str, config: TacbenchOptions) -> str:
-    """As people read it."""
+def table(
+    rows: list[Row], sensor: str, config: TacbenchOptions, published_in: Path | None = None
+) -> str:
+    """As people read it; `published_in` is the folder of real recordings, if they are."""
+    recorded = (
+        f"simulated: {sensor}, {config.strokes} strokes, {config.slides} slides, {config.grasps} "
+        f"grasps, {config.cloths} presses of cloth"
+        if published_in is None
+        else f"published files in {published_in}: {sensor}"
+    )
     lines = [
-        f"TacBench, simulated: {sensor}, {config.strokes} strokes, {config.slides} slides, "
-        f"{config.grasps} grasps, {config.cloths} presses of cloth, "
+        f"TacBench, {recorded}, "
         f"{config.seeds} training seed{'s' * (config.seeds > 1)}; [95 % over test recordings]"
     ]
     for task in config.tasks:

@@ -51,7 +51,7 @@ def read_grasps(folder: Path, sensor: str | None = None) -> Iterator[GraspTrial]
     Raises:
         UserError: no such files, another sensor's, or what they hold is not as published.
     """
-    paths = sorted(p for p in folder.glob("*.pkl") if re.fullmatch(r"\d{3}\.pkl", p.name))
+    paths = _files(folder)
     if not paths:
         raise UserError(
             f"{folder} holds no 000.pkl to 035.pkl: give a folder of Feeling of Success"
@@ -59,6 +59,15 @@ def read_grasps(folder: Path, sensor: str | None = None) -> Iterator[GraspTrial]
     named = check_kind(sensor, ("gelsight", "gelsight_markers"), folder)
     for path in paths:
         yield from _read(path, named)
+
+
+def is_grasp_set(folder: Path) -> bool:
+    """Whether a folder holds files of these names."""
+    return bool(_files(folder))
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.glob("*.pkl") if re.fullmatch(r"\d{3}\.pkl", p.name))
 
 
 def _read(path: Path, sensor: str) -> Iterator[GraspTrial]:
