@@ -275,7 +275,7 @@ class TacbenchOptions(BenchmarkOptions):
     """Slides of held objects simulated, for T3; used as the strokes are, and so are the others."""
     grasps: Annotated[int, Field(ge=10)] = 400
     """Grasp attempts simulated, of the catalogue's 20 objects in turn, for T4."""
-    cloths: Annotated[int, Field(ge=10)] = 300
+    cloths: Annotated[int, Field(ge=10)] = 600
     """Presses of 20 cloths in turn simulated, for T6."""
     data: Path | None = None
     """Folder of the recordings: made there if it is new, gone on with if some are missing. Default:

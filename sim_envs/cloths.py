@@ -19,7 +19,7 @@ from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance
 from touchgoal.sim_envs.tactile.surface_press import SurfacePose, press, untouched
 from touchgoal.sim_envs.tactile.surfaces import TILE, Surface
 
-FRAMES = 8
+FRAMES = 5
 """Of a clip, of which the first is untouched."""
 _UNEVEN = 0.1  # of the relief: fuzz and slubs
 _YARN = 0.06  # by which share the yarn of two pieces of a cloth differs, at most

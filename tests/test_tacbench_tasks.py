@@ -15,7 +15,7 @@ from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.probes.dense import DenseProbe
 from touchgoal.episodes.bench_recording import record_cloths, record_grasps
-from touchgoal.sim_envs.cloths import CLOTHS, press_cloth
+from touchgoal.sim_envs.cloths import CLOTHS, FRAMES, press_cloth
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.grasp_rig import GraspAttempt, attempt_grasp
 from touchgoal.sim_envs.indenter_rig import REST, rig_unit, simulate
@@ -96,7 +96,7 @@ def test_a_cloths_yarns_are_as_many_as_it_says(tmp_path: Path) -> None:
     assert change[-1] > change[1] > change[0] == 0
     frames = read_cloths(episodes, 21, preprocessor_for(RIG.sensor))
     task = textile_task(frames)
-    assert task.truth(torch.tensor([0, 8, 160])).tolist() == [0, 1, 0]
+    assert task.truth(torch.tensor([0, FRAMES, 20 * FRAMES])).tolist() == [0, 1, 0]
 
 
 def test_a_dense_probe_puts_values_where_they_belong() -> None:
