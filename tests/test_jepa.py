@@ -146,7 +146,8 @@ def test_the_predictor_is_told_where() -> None:
     assert not torch.allclose(here, moved, atol=1e-4)
 
 
-@pytest.mark.parametrize("method", ["ijepa", pytest.param("vjepa", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", CASES)
 def test_what_is_predicted_depends_on_what_is_seen(method: Method) -> None:
     """Another touch's predictions are worse: the predictor has learned more than the mean of each place."""
     kind, _, config, _ = CASES[method]
