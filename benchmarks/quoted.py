@@ -123,11 +123,18 @@ QUOTED = {
     ),
     "sent-stream": Quoted("touchgoal benchmark sent-stream"),
     "replay": Quoted("touchgoal benchmark replay"),
-    "bead-maze": Quoted(
-        "touchgoal benchmark bead-maze --held-out 40",
-        "the shipped policy leads a bead along wires it has not seen, by touch and joint state",
-        _maze,
+    "maze": Quoted(
+        "touchgoal run-policy --task bead-maze --env.split test --episodes 100 --seed 4000000 --no-video",
+        "the shipped policy leads a bead along wires it has not seen, by touch",
+        _successes,
     ),
+    "maze-as-deployed": Quoted(
+        "touchgoal run-policy --task bead-maze --env.split test --env.as-deployed --env.start-angle 10 "
+        "--episodes 100 --seed 4000000 --no-video",
+        "the same as deployed, the hand up to 10 degrees beside the wire at the start",
+        _successes,
+    ),
+    "bead-maze": Quoted("touchgoal benchmark bead-maze --held-out 40", headline=_maze),
     "reward-quality": Quoted(
         "touchgoal benchmark reward-quality",
         "the last cost tells a success from a dropped object (area under ROC)",
@@ -150,9 +157,7 @@ QUOTED = {
         ),
     ),
     "policy-latency": Quoted(
-        "touchgoal benchmark policy-latency",
-        "from an observation to the maze policy's plan, one core (a tick has 50 ms)",
-        _plan,
+        "touchgoal benchmark policy-latency", headline=_plan
     ),
     "touch-probes": Quoted("touchgoal benchmark touch-probes"),
     "faults": Quoted("touchgoal benchmark faults"),
