@@ -156,9 +156,7 @@ QUOTED = {
             "env step (50 physics steps), two tactile images, holding", "per second"
         ),
     ),
-    "policy-latency": Quoted(
-        "touchgoal benchmark policy-latency", headline=_plan
-    ),
+    "policy-latency": Quoted("touchgoal benchmark policy-latency", headline=_plan),
     "touch-probes": Quoted("touchgoal benchmark touch-probes"),
     "faults": Quoted("touchgoal benchmark faults"),
 }

@@ -27,8 +27,7 @@ class Config:
     rounds: CountOrNone = 3
     """Rounds of corrections, three at most; the last of pick-place is in the plain environment."""
     epochs: Count | None = None
-    """Passes over the data in each training; default: 16 for pick-place; 10 for the maze, in
-    the last 6."""
+    """Passes over the data in each training; default: 16 for pick-place, 5 for the maze."""
     trials: CountOrNone = 24
     """Validation episodes in which every snapshot of the last training is tried; 0 keeps the last."""
     touch: Annotated[Path | None, RARE] = None
