@@ -55,10 +55,6 @@ class AlignPaper(Align):
 class Mae(UnlabelledOptions):
     """Learn touch without labels, by masked autoencoding (MAE)."""
 
-    out: Path | None = None
-    """Folder of the run; the encoder goes to its `encoder/`."""
-    sensor: str | None = None
-    """Fingertip sensor, for episodes that do not name theirs."""
     frames: Count = 40
     """Moments drawn from each episode, both fingertips of each."""
     mae: MaeConfig = MaeConfig()
@@ -69,10 +65,6 @@ class Mae(UnlabelledOptions):
 class Distill(UnlabelledOptions):
     """Options of the objectives that see several frames at once."""
 
-    out: Path | None = None
-    """Folder of the run; the encoder goes to its `encoder/`."""
-    sensor: str | None = None
-    """Fingertip sensor, for episodes that do not name theirs."""
     frames: Count = 20
     """Moments drawn from each episode, both fingertips of each."""
     stride: Count = 2

@@ -1,6 +1,5 @@
 """I-JEPA and V-JEPA: what is seen and asked for, the loss by hand, learning, resumption."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from killed import killed_in_epoch
 from toy_touches import SENSOR, moving_blobs
 
 from touchgoal.encoders import pretrained
@@ -27,7 +27,6 @@ from touchgoal.encoders.ssl.ijepa import IJepa, train_ijepa
 from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, Predictor, take
 from touchgoal.encoders.ssl.self_distillation import Method, backbone_for, vit_for
 from touchgoal.encoders.ssl.vjepa import VJepa, train_vjepa
-from touchgoal.encoders.training import trainer
 
 SMALL: dict[str, Any] = {"epochs": 3, "batch_size": 12, "momentum": 0.9}
 PREDICTOR: dict[str, Any] = {"predictor_width": 24, "predictor_depth": 1, "predictor_heads": 2}
@@ -181,22 +180,11 @@ def shrunk(touches: TouchFrames) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("method", CASES)
-def test_a_killed_training_ends_with_the_same_weights(
-    method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_training_ends_with_the_same_weights(method: Method, tmp_path: Path) -> None:
     _, train, config, data = CASES[method]
     whole = train(data, data, config, tmp_path / "whole", TrainerOptions(), {})
-    with monkeypatch.context() as patch:
-        train_epoch: Callable = trainer._train_epoch
-
-        def dies(*args):
-            if args[-1] == 2:
-                raise KeyboardInterrupt
-            return train_epoch(*args)
-
-        patch.setattr(trainer, "_train_epoch", dies)
-        with pytest.raises(KeyboardInterrupt):
-            train(data, data, config, tmp_path / "killed", TrainerOptions(), {})
+    with killed_in_epoch(2):
+        train(data, data, config, tmp_path / "killed", TrainerOptions(), {})
     train(data, data, config, tmp_path / "killed", TrainerOptions(resume=True), {})
     resumed = pretrained.load_encoder(tmp_path / "killed/encoder")
     for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):

@@ -3,8 +3,8 @@
 A reference walks in straight lines from target to target, each within the policy's period; what goes
 out is its mean over the last moments. A mean never leaves the range of what it averages, all joints
 are late by the same time, and so the arm keeps near the path that the safety layer has checked, whatever
-comes when: it cuts that path's corners, see `touchgoal benchmark sent-stream`. Where the reference would have to stop or turn faster than the limits allow, it walks
-slower: it never leaves its path.
+comes when: it cuts that path's corners, see `touchgoal benchmark sent-stream`. Where the reference
+would have to stop or turn faster than the limits allow, it walks slower: it never leaves its path.
 """
 
 from dataclasses import dataclass, replace

@@ -33,6 +33,19 @@ class TouchFrames:
     sensor: str
     stride: int = 1
 
+    @classmethod
+    def of_moments(
+        cls,
+        moments: list[Float16[Tensor, "_ t 3 h w"]],
+        wrench: Float[Tensor, "n 6"] | None,
+        sensor: str,
+        offsets: tuple[int, ...] | None,
+    ) -> "TouchFrames":
+        """Of the frames of drawn moments, newest first; see `sample_frames` for `offsets`."""
+        touch = torch.cat(moments)
+        stride = offsets[1] if offsets and len(offsets) > 1 else 1
+        return cls(touch if offsets else touch[:, 0], wrench, sensor, stride)
+
     def __len__(self) -> int:
         """Number of touches."""
         return len(self.touch)
@@ -79,13 +92,7 @@ def sample_frames(
             touch.append(rows[torch.from_numpy(where.reshape(len(ticks), -1))])
             for name in truth:
                 wrench.append(torch.from_numpy(known[name][:, 6 * side : 6 * side + 6]))
-    moments = torch.cat(touch)
-    return TouchFrames(
-        moments if offsets else moments[:, 0],
-        torch.cat(wrench) if truth else None,
-        sensor,
-        offsets[1] if offsets and len(offsets) > 1 else 1,
-    )
+    return TouchFrames.of_moments(touch, torch.cat(wrench) if truth else None, sensor, offsets)
 
 
 def check_sensor(episodes: EpisodeSet, i: int, sensor: str) -> None:

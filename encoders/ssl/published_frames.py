@@ -38,10 +38,4 @@ def sample_recordings(
         seen, where = np.unique(past_rows(drawn, offsets or (0,)), return_inverse=True)
         rows = preprocess(recording.clip.frames(seen), recording.background())
         touch.append(torch.from_numpy(rows).half()[torch.from_numpy(where.reshape(len(drawn), -1))])
-    moments = torch.cat(touch)
-    return TouchFrames(
-        moments if offsets else moments[:, 0],
-        None,
-        sensor,
-        offsets[1] if offsets and len(offsets) > 1 else 1,
-    )
+    return TouchFrames.of_moments(touch, None, sensor, offsets)

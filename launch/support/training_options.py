@@ -53,3 +53,8 @@ class TrainingOptions(TrainedOptions, DataOptions):
 @checked_dataclass
 class UnlabelledOptions(TrainedOptions, UnlabelledData):
     """Options of every training without labels."""
+
+    out: Path | None = None
+    """Folder of the run; the encoder goes to its `encoder/`."""
+    sensor: str | None = None
+    """Fingertip sensor, for episodes that do not name theirs."""
