@@ -12,8 +12,10 @@ from touchgoal.encoders.backbones.frame_history import frame_offsets
 from touchgoal.encoders.backbones.sparsh import SPARSH_BASE
 from touchgoal.encoders.pretrained import save
 from touchgoal.encoders.ssl.dino import train_dino
+from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.ijepa import train_ijepa
 from touchgoal.encoders.ssl.mae import train_mae
+from touchgoal.encoders.ssl.self_distillation import Method
 from touchgoal.encoders.ssl.surface_whitening import WhiteningConfig, train
 from touchgoal.encoders.ssl.vjepa import train_vjepa
 from touchgoal.encoders.towers.towers import load_towers
@@ -75,20 +77,20 @@ def _train_mae(config: Mae, touch: UnlabelledTouch) -> None:
 def _distill(config: Dino | IJepa | VJepa, touch: UnlabelledTouch) -> None:
     """Draw moments of several frames, train, save the teacher."""
     out = open_training(config, "train-encoder")
-    method = (
-        "dino" if isinstance(config, Dino) else "ijepa" if isinstance(config, IJepa) else "vjepa"
-    )
-    offsets = frame_offsets(SPARSH_BASE[method], config.stride)
-    train, val = (
-        draw(config.frames, config.seed, offsets) for draw in (touch.train, touch.validation)
-    )
+
+    def drawn(method: Method) -> tuple[TouchFrames, TouchFrames]:
+        offsets = frame_offsets(SPARSH_BASE[method], config.stride)
+        train = touch.train(config.frames, config.seed, offsets)
+        return train, touch.validation(config.frames, config.seed, offsets)
+
     run = out, config.trainer, touch.recipe
-    if isinstance(config, Dino):
-        train_dino(train, val, config.dino, *run)
-    elif isinstance(config, IJepa):
-        train_ijepa(train, val, config.ijepa, *run)
-    else:
-        train_vjepa(train, val, config.vjepa, *run)
+    match config:
+        case Dino():
+            train_dino(*drawn("dino"), config.dino, *run)
+        case IJepa():
+            train_ijepa(*drawn("ijepa"), config.ijepa, *run)
+        case VJepa():
+            train_vjepa(*drawn("vjepa"), config.vjepa, *run)
     print(f"encoder: {out / 'encoder'}")
 
 
