@@ -126,8 +126,10 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
             self._run_tick(action[:-1], action[-1], seconds=1 / self.config.control_hz)
         progress, success = self.end_tick()
         truncated = self._ticks >= self.config.max_seconds * self.config.control_hz
-        info = self._info(progress, success)
-        return self._observe(), progress - before, success, truncated, info
+        # First, for the truth about the pads is of the moment at which their pictures were taken.
+        observation = self._observe()
+        ended = success or bool(self.failures())
+        return observation, progress - before, ended, truncated, self._info(progress, success)
 
     def render(self) -> UInt8[np.ndarray, "h w 3"]:
         """A picture for people, from the side camera, 480 x 640."""
@@ -220,8 +222,8 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         return self.evaluate()
 
     def failures(self) -> list[str]:
-        """Names of what has failed after the last tick; here nothing can."""
-        return []
+        """Names of what has failed after the last tick: here at most over_force, as deployed."""
+        return ["over_force"] if self._deployed and self._deployed.stopped else []
 
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
         """Joint positions (rad) and velocities (rad/s)."""

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from touchgoal.control import features as ft
 from touchgoal.control.motion.rotations import fingers_across, rotation_matrix
-from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
+from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.config import BeadMazeConfig, BeadMazeReset
 from touchgoal.sim_envs.options import with_options
 from touchgoal.sim_envs.scene import wires
@@ -67,11 +67,6 @@ class BeadMaze(FrankaTactileEnv):
         """With a config, or with those of its fields that differ from the default by name."""
         super().__init__(with_options(config or BeadMazeConfig(), options), render_mode)
 
-    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One control tick; the reward is the tick's gain in progress."""
-        observation, reward, success, truncated, info = super().step(action)
-        return observation, reward, success or bool(self.failure.any()), truncated, info
-
     @property
     def grasping(self) -> bool:
         """Whether the fixture still holds the bead."""
@@ -84,7 +79,8 @@ class BeadMaze(FrankaTactileEnv):
     def failures(self) -> list[str]:
         """Of drop, jam and over_force, what is so after the last tick."""
         names = ft.FEATURES[ft.TRUTH_FAILURE].names
-        return [name for name, true in zip(names, self.failure, strict=True) if true]
+        failed = [name for name, true in zip(names, self.failure, strict=True) if true]
+        return failed or super().failures()
 
     def instruction(self) -> str:
         """The episode's task in words."""

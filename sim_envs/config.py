@@ -135,6 +135,9 @@ class DeploymentConfig:
     """How much each of these delays varies from tick to tick: up to so much is added, s."""
     plan_ticks: TickRange | None = None
     """Control ticks by which a learned policy's plans come late: one of these."""
+    force_ceiling: bool | None = None
+    """An episode ends, failed, once the force on the hand is above the task's ceiling, at which
+    `deploy` stops the arm."""
 
 
 IDEAL_DEPLOYMENT = DeploymentConfig(
@@ -147,6 +150,7 @@ IDEAL_DEPLOYMENT = DeploymentConfig(
     command_delay=(0.0, 0.0),
     jitter=(0.0, 0.0),
     plan_ticks=(0,),
+    force_ceiling=False,
 )
 # Measured on the wire, `shared/research/deployment.md`: a state is 7 to 18 ms old, commands take 20 to
 # 25 ms of which the tracker has its share; fingertips and cameras send 25 to 30 pictures a second; a
@@ -161,6 +165,7 @@ AS_DEPLOYED = DeploymentConfig(
     command_delay=(0.005, 0.02),
     jitter=(0.0, 0.02),
     plan_ticks=(1,),
+    force_ceiling=True,
 )
 
 

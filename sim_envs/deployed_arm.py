@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from touchgoal.control import features as ft
 from touchgoal.control.motion.tracker import Tracker
 from touchgoal.control.safety.action_filter import ActionFilter, Measurements
+from touchgoal.control.safety.task_ceilings import TASK_FORCES
 from touchgoal.sim_envs.config import DeploymentConfig
 from touchgoal.sim_envs.deployed_hand import DeployedHand
 from touchgoal.sim_envs.estimated_wrench import EstimatedWrench
@@ -105,6 +106,7 @@ class DeployedArm:
     Attributes:
         plan_ticks: by which a learned policy's plans come late.
         contacts: of the pads, when the pictures of the last observation were taken.
+        stopped: whether the force on the hand, as the policy saw it, was above the task's ceiling.
     """
 
     def __init__(self, env: Any, between: DeploymentConfig, rng: np.random.Generator) -> None:
@@ -141,6 +143,9 @@ class DeployedArm:
         self._states = {0: self._read_state()}
         self._pictures = {0: (env.take_pictures(), env.pad_contacts())}
         self.contacts = env.pad_contacts()
+        forces = TASK_FORCES.get(env.task) if between.force_ceiling else None
+        self._ceiling = forces.force_ceiling if forces else np.inf
+        self.stopped = False
 
     def run_tick(self, delta: Joints, width: float) -> None:
         """A control tick of physics, with what the policy has just answered."""
@@ -168,7 +173,9 @@ class DeployedArm:
         self._states = _since(self._states, read_at)
         self._pictures = _since(self._pictures, shot_at)
         pictures, self.contacts = self._pictures[shot_at]
-        return {**self._states[read_at], **pictures}
+        state = self._states[read_at]
+        self.stopped |= bool(np.linalg.norm(state[ft.WRENCH][:3]) > self._ceiling)
+        return {**state, **pictures}
 
     def _sense(self, read: bool, shoot: bool) -> None:
         """Measure and take pictures, where this millisecond is the time for it."""

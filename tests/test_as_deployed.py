@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from touchgoal.control import features as ft
+from touchgoal.control.safety.task_ceilings import TASK_FORCES
 from touchgoal.policies.perception.proprioception import network_input, tare
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import BeadMazeConfig, DeploymentConfig, PickPlaceConfig
@@ -197,3 +198,34 @@ def test_a_maze_may_begin_beside_the_wires_direction() -> None:
     assert beside(straight, 0) < 0.1
     angles = [beside(replace(straight, start_angle=15.0), seed) for seed in range(6)]
     assert max(angles) > 2 and max(angles) < 15.1
+
+
+def test_the_truth_of_the_pads_is_as_old_as_their_pictures() -> None:
+    def contact(picture_delay: float) -> np.ndarray:
+        between = DeploymentConfig(plan_ticks=(1,), picture_delay=(picture_delay,) * 2)
+        env = BeadMaze(BeadMazeConfig(cameras=(), tactile=False, deployment=between))
+        env.reset(seed=3)
+        infos = [env.step(np.zeros(8))[-1] for _ in range(12)]
+        return np.stack([info[ft.TRUTH_PAD_WRENCH] for info in infos])
+
+    now, late = contact(0.0), contact(0.1)
+    assert np.abs(now[-1]).max() > 1 and not np.array_equal(now[2:], now[:-2])
+    np.testing.assert_array_equal(late[2:], now[:-2])
+
+
+@pytest.mark.parametrize("as_deployed", [True, False])
+def test_an_episode_ends_at_the_ceiling_of_force(as_deployed: bool) -> None:
+    """Closed fingers, down onto a block."""
+    env = PickPlace(replace(BLIND, as_deployed=as_deployed))
+    observation, _ = env.reset(seed=3, options={"object": "wooden_block"})
+    forces, ended = [0.0], False
+    while not ended and len(forces) < 120:
+        away = 0.2 * (env.object_pose()[:3] - observation[ft.TCP_POSE][:3])[:2]
+        down = -0.005 if np.linalg.norm(away) < 0.003 else 0.0
+        way = np.append(np.clip(away, -0.01, 0.01), down)
+        step = env.kinematics.joint_change(env.command, np.append(way, np.zeros(3)))
+        observation, _, ended, _, _ = env.step(np.append(step, 0.0))
+        forces.append(np.linalg.norm(observation[ft.WRENCH][:3]))
+    ceiling = TASK_FORCES["pick-place"].force_ceiling
+    assert max(forces[:-1]) < ceiling < forces[-1] if as_deployed else max(forces) > ceiling
+    assert ended == as_deployed and env.failures() == ["over_force"] * as_deployed

@@ -32,7 +32,6 @@ from touchgoal.sim_envs.scene.objects import CATALOGUE
 from touchgoal.sim_envs.tasks import make_env
 
 FIRST_SEED = 1_000_000
-_FAILURES = ft.FEATURES[ft.TRUTH_FAILURE].names
 
 
 @dataclass(frozen=True)
@@ -170,7 +169,7 @@ def run_trial(config: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec) -> Tri
             seed=spec.seed,
             success=bool(last[ft.TRUTH_SUCCESS][0]),
             progress=float(progress.max()),
-            failure=_failure(last),
+            failure="" if last[ft.TRUTH_SUCCESS][0] else (env.failures() or ["time"])[0],
             peak_force=float(force.max()),
             mean_force=float(force.mean()),
             peak_pad_force=float(np.abs(pads[:, [2, 8]]).max()),
@@ -180,14 +179,6 @@ def run_trial(config: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec) -> Tri
         )
     finally:
         env.close()
-
-
-def _failure(last: dict[str, np.ndarray]) -> str:
-    if last[ft.TRUTH_SUCCESS][0]:
-        return ""
-    flags = last.get(ft.TRUTH_FAILURE, np.zeros(0))
-    names = [_FAILURES[i] for i in np.flatnonzero(flags)]
-    return names[0] if names else "time"
 
 
 def _task_config(task: str | TaskConfig) -> TaskConfig:
