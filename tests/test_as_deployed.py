@@ -202,7 +202,8 @@ def test_a_maze_may_begin_beside_the_wires_direction() -> None:
 
 def test_the_truth_of_the_pads_is_as_old_as_their_pictures() -> None:
     def contact(picture_delay: float) -> np.ndarray:
-        between = DeploymentConfig(plan_ticks=(1,), picture_delay=(picture_delay,) * 2)
+        delays = picture_delay, picture_delay
+        between = DeploymentConfig(plan_ticks=(1,), picture_delay=delays)
         env = BeadMaze(BeadMazeConfig(cameras=(), tactile=False, deployment=between))
         env.reset(seed=3)
         infos = [env.step(np.zeros(8))[-1] for _ in range(12)]
@@ -225,7 +226,7 @@ def test_an_episode_ends_at_the_ceiling_of_force(as_deployed: bool) -> None:
         way = np.append(np.clip(away, -0.01, 0.01), down)
         step = env.kinematics.joint_change(env.command, np.append(way, np.zeros(3)))
         observation, _, ended, _, _ = env.step(np.append(step, 0.0))
-        forces.append(np.linalg.norm(observation[ft.WRENCH][:3]))
+        forces.append(float(np.linalg.norm(observation[ft.WRENCH][:3])))
     ceiling = TASK_FORCES["pick-place"].force_ceiling
     assert max(forces[:-1]) < ceiling < forces[-1] if as_deployed else max(forces) > ceiling
     assert ended == as_deployed and env.failures() == ["over_force"] * as_deployed
