@@ -29,8 +29,10 @@ def _successes(metrics: Metrics) -> str:
 
 
 def _deployed(metrics: Metrics) -> str:
-    done = [row["success"] for row in metrics["deployments"]]
-    return f"{SuccessRate(sum(done), len(done))} (95 % Wilson)"
+    rows = metrics["deployments"]
+    done = {row["task"]: [r["success"] for r in rows if r["task"] == row["task"]] for row in rows}
+    rates = [f"{task} {SuccessRate(sum(each), len(each))}" for task, each in done.items()]
+    return f"{'; '.join(rates)} (95 % Wilson)"
 
 
 def _maze(metrics: Metrics) -> str:
@@ -114,12 +116,21 @@ QUOTED = {
         "touchgoal run-policy --episodes 100 --policy expert", headline=_successes
     ),
     "deploy-real-time": Quoted(
-        "touchgoal benchmark deploy --tasks pick-place --policies shipped --arms real-time --episodes 20",
-        "the shipped policy through libfranka's protocol, on fresh twins in real time",
+        "touchgoal benchmark deploy --policies shipped --arms real-time --episodes 20 --seed 7000000",
+        "the shipped policies through libfranka's protocol, on fresh twins in real time",
         _deployed,
     ),
     "deploy-lock-step": Quoted(
-        "touchgoal benchmark deploy --tasks pick-place --policies shipped --arms lock-step --episodes 40",
+        "touchgoal benchmark deploy --policies shipped --arms environment in-process lock-step "
+        "--episodes 40 --seed 7000000",
+    ),
+    "deploy-in-a-row": Quoted(
+        "touchgoal benchmark deploy --policies shipped --arms real-time --in-a-row 20"
+    ),
+    "policy-delay": Quoted("touchgoal benchmark policy-delay"),
+    "policy-delay-causes": Quoted("touchgoal benchmark policy-delay --causes"),
+    "policy-delay-causes-maze": Quoted(
+        "touchgoal benchmark policy-delay --task bead-maze --causes"
     ),
     "sent-stream": Quoted("touchgoal benchmark sent-stream"),
     "replay": Quoted("touchgoal benchmark replay"),
