@@ -2,7 +2,7 @@
 
 Expert episodes on seeds that no training saw, and failures to order, measured with the shipped
 encoder. Every definition was fixed before the first result was seen: a curve "drops" at the first
-frame by which half of its net drop has fell; peaks of an episode's curves are counted above one
+frame by which half of its net drop has fallen; peaks of an episode's curves are counted above one
 common noise level, the largest of theirs; goals and sentences are named below.
 """
 

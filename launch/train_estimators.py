@@ -23,9 +23,9 @@ class Config(TrainingOptions):
     encoder: Path | None = None
     """Folder of a frozen touch encoder (train-encoder), which is copied beside the estimator; default:
     the shipped one, which is not copied."""
-    objects: Count = 600
+    objects: Count = 1200
     """Number of objects to look at, of random kind and size."""
-    placements: Count = 20
+    placements: Count = 12
     """Number of places on the table for each object."""
     train: EstimatorTrainConfig = EstimatorTrainConfig()
     """How the networks are trained."""

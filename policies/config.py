@@ -98,6 +98,9 @@ class PoseEstimatorConfig:
     columns (from, to; from, to), px."""
     channels: Count = 32
     """Feature maps of a picture; each of their cells covers 4 x 4 pixels."""
+    dilations: tuple[Count, ...] = (1, 2, 4)
+    """How far each further layer looks around a cell, in cells; together as far as the largest object
+    is wide, or what it is, and so how high, cannot be told."""
     keypoints: Count = 16
     """Places found in each picture, by a spatial softmax."""
     keypoint_features: Count = 32
@@ -110,7 +113,7 @@ class PoseEstimatorConfig:
 class EstimatorTrainConfig:
     """How the state estimator is trained, by AdamW."""
 
-    epochs: Count = 21
+    epochs: Count = 20
     """Passes over the placements, for the pose estimator."""
     batch_size: Count = 64
     """Placements in each step."""

@@ -53,19 +53,31 @@ class PoseEstimator(nn.Module):
         return self.head(torch.cat(parts, 1))
 
 
+class _Surroundings(nn.Module):
+    """Adds to each cell what lies so many cells around it."""
+
+    def __init__(self, width: int, dilation: int) -> None:
+        super().__init__()
+        self.around = nn.Conv2d(width, width, 3, 1, dilation, dilation)
+        self.mix = nn.Conv2d(width, width, 1)
+
+    def forward(self, maps: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        return maps + self.mix(F.relu(self.around(F.relu(maps))))
+
+
 class _SpatialSoftmax(nn.Module):
     """Looks at several places of a picture: where each is, in [-1, 1], and what is there."""
 
     def __init__(self, config: PoseEstimatorConfig) -> None:
         super().__init__()
-        width, self.keypoints = config.channels, config.keypoints
+        width = config.channels
         self.patches = nn.Conv2d(3, width, 8, 4, 2)
-        self.mix = nn.Conv2d(width, width, 3, 1, 1)
+        self.surroundings = nn.Sequential(*(_Surroundings(width, d) for d in config.dilations))
         self.attention = nn.Conv2d(width, config.keypoints, 1)
         self.features = nn.Conv2d(width, config.keypoint_features, 1)
 
     def forward(self, pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b p"]:
-        maps = F.relu(self.mix(F.relu(self.patches(pictures))))
+        maps = F.relu(self.surroundings(self.patches(pictures)))
         share = self.attention(maps).flatten(2).softmax(2)
         h, w = maps.shape[2:]
         y, x = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")

@@ -139,7 +139,6 @@ def load_estimator(directory: Path) -> StateEstimator:
 def _config(fields: dict[str, Any]) -> StateEstimatorConfig:
     pose_estimator = fields.pop("pose_estimator")
     crops = tuple((key, tuple(box)) for key, box in pose_estimator.pop("crops"))
-    size = tuple(pose_estimator.pop("size"))
-    return StateEstimatorConfig(
-        **fields, pose_estimator=PoseEstimatorConfig(size, crops, **pose_estimator)
-    )
+    size, dilations = (tuple(pose_estimator.pop(name)) for name in ("size", "dilations"))
+    seen = PoseEstimatorConfig(size, crops, dilations=dilations, **pose_estimator)
+    return StateEstimatorConfig(**fields, pose_estimator=seen)
