@@ -48,8 +48,7 @@ class Progress:
     def _line(self, seconds: float) -> str:
         done = f"{self._count}" if self._total is None else f"{self._count} of {self._total}"
         rate = f", {seconds / self._count:.2g} s each" if self._count and seconds >= 1 else ""
-        units = self._unit.removesuffix("y") + ("ies" if self._unit.endswith("y") else "s")
-        return f"{self._what}: {done} {units}, {seconds:.0f} s{rate}"
+        return f"{self._what}: {done} {_plural(self._unit)}, {seconds:.0f} s{rate}"
 
     def __enter__(self) -> "Progress":
         """Itself."""
@@ -64,6 +63,12 @@ class Progress:
         """Ends the bar's line."""
         if self._bar is not None:
             self._bar.close()
+
+
+def _plural(unit: str) -> str:
+    if unit.endswith("y"):
+        return unit.removesuffix("y") + "ies"
+    return unit + ("es" if unit.endswith("s") else "s")
 
 
 def track(items: Iterable[Item], what: str, unit: str, total: int | None = None) -> Iterator[Item]:
