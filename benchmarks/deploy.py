@@ -8,8 +8,8 @@ import json
 import sys
 import tempfile
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -22,14 +22,13 @@ from touchgoal.benchmarks.deployed_twin import DeployedTwin
 from touchgoal.benchmarks.deployments_in_a_row import run_in_a_row
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.progress import track
-from touchgoal.episodes.recording import EpisodeSpec
+from touchgoal.episodes.recording import EpisodeSpec, one_core_workers
 from touchgoal.policies.by_name import choose_policy, env_config_for, scripted
 from touchgoal.policies.evaluation.evaluate import run_trial, trial_specs
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskName
 
 EXAMPLES = {"pick-place": "sim.toml", "bead-maze": "sim_maze.toml"}
-_OWN_TIME = ("in-process", "lock-step")  # in processes of their own, however slow the machine
 _CELLS = Path(__file__).parents[1] / "launch" / "cells"
 
 
@@ -44,8 +43,7 @@ def run(config: DeployOptions) -> dict[str, Any]:
         for name in config.policies:
             policy = scripted(task) if name == "scripted" else name
             for arm in config.arms:
-                side_by_side = config.workers if arm in _OWN_TIME else 1
-                with ThreadPoolExecutor(side_by_side) as pool:
+                with _side_by_side(arm, len(scenes), config.workers) as pool:
                     begun = [
                         pool.submit(_deploy, scene, policy, arm, i, config.seconds)
                         for i, scene in enumerate(scenes)
@@ -60,6 +58,13 @@ def run(config: DeployOptions) -> dict[str, Any]:
                 )
                 done += rows
     return {"table": "\n".join(lines), "deployments": [asdict(row) for row in done]}
+
+
+def _side_by_side(arm: str, count: int, workers: int) -> AbstractContextManager[Executor]:
+    """Deployments are processes of their own, and wait for nothing but in real time."""
+    if arm == "environment":
+        return one_core_workers(min(count, workers))
+    return ThreadPoolExecutor(1 if arm == "real-time" else workers)
 
 
 def _scenes(task: TaskName, config: DeployOptions) -> Iterator[Scene]:
