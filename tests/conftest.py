@@ -1,8 +1,10 @@
-"""Shared by all tests: one thread, no network; the twins that several files talk to."""
+"""Shared by all tests: one thread, no network; the twins and the toy episodes that several files use."""
 
 import os
+import shutil
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["HF_HUB_OFFLINE"] = "1"
@@ -11,6 +13,7 @@ os.environ["LP_NUM_THREADS"] = "0"
 import pytest  # noqa: E402
 import torch  # noqa: E402
 from running_twin import RunningTwin  # noqa: E402
+from toy_episodes import record  # noqa: E402
 
 torch.set_num_threads(1)
 # A shell that starts the tests in the background ignores Ctrl-C, for them and all their children.
@@ -40,3 +43,17 @@ def ur5e(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningTwin]:
     twin = RunningTwin(arguments, tmp_path_factory.mktemp("ur5e"), 1)
     yield twin
     twin.close()
+
+
+@pytest.fixture(scope="module")
+def recorded_small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A set of three toy episodes, which stays as it is."""
+    root = tmp_path_factory.mktemp("small") / "episodes"
+    record(root, range(3))
+    return root
+
+
+@pytest.fixture
+def small(recorded_small: Path, tmp_path: Path) -> Path:
+    """The same, to do with as one likes."""
+    return shutil.copytree(recorded_small, tmp_path / "set")

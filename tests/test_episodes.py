@@ -1,15 +1,9 @@
+"""Sets of episodes: what is read is what was written; what does not fit is refused."""
+
 import io
 import json
-import os
 import pickle
-import random
 import shutil
-import signal
-import struct
-import subprocess
-import sys
-import time
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -17,70 +11,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
+from toy_episodes import FPS, PNG_START, assert_holds, flip_byte, make_episode, moving_blob, record
 
 from touchgoal.control import features as ft
 from touchgoal.control.atomic_write import write_file
-from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.errors import UserError
 from touchgoal.episodes import metadata, statistics
-from touchgoal.episodes.encoding import decode_png, encode
-from touchgoal.episodes.media import read_frames, write_video
+from touchgoal.episodes.encoding import encode
+from touchgoal.episodes.media import write_video
 from touchgoal.episodes.repair import repair, validate
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-
-FPS = 20
-PNG_START = b"\x89PNG"
-NUMERIC = (ft.STATE, ft.ACTION, ft.TRUTH_CONTACT, ft.TRUTH_PROGRESS, ft.TRUTH_SUCCESS)
-
-
-def moving_blob(n: int, height: int, width: int, seed: int) -> np.ndarray:
-    y, x = np.mgrid[:height, :width]
-    centre = width * (0.2 + 0.6 * np.arange(n)[:, None, None] / n)
-    blob = np.exp(-((x - centre) ** 2 + (y - height / 2) ** 2) / (0.02 * width * height))
-    red, green, blue = np.random.default_rng(seed).uniform(20, 120, 3)
-    picture = np.stack([red + 100 * blob, green + 60 * blob, blue + 0 * blob], axis=-1)
-    return picture.astype(np.uint8)
-
-
-def make_episode(seed: int, n: int = 7) -> Episode:
-    rng = np.random.default_rng(seed)
-    touch = rng.integers(0, 256, (2, n, 24, 32, 3), dtype=np.uint8)
-    frames = {
-        ft.STATE: rng.standard_normal((n, 15)).astype(np.float32),
-        ft.WRIST: moving_blob(n, 32, 48, seed),
-        ft.TACTILE_LEFT: touch[0],
-        ft.TACTILE_RIGHT: touch[1],
-        ft.ACTION: rng.standard_normal((n, 8)).astype(np.float32),
-        ft.TRUTH_CONTACT: rng.random((n, 2)) < 0.5,
-        ft.TRUTH_PROGRESS: np.linspace(0, 1, n, dtype=np.float32)[:, None],
-        ft.TRUTH_SUCCESS: np.arange(n)[:, None] == n - 1,
-    }
-    meta = {"object": f"cube_{seed % 2}", "descriptions": ["hard", "smooth"][: seed % 3]}
-    return Episode(
-        frames, f"lift the {seed % 2}", {**meta, "seed": seed, "grasp_force": np.float64(2.5)}
-    )
-
-
-def record(root: Path, seeds: range, n: int = 7) -> None:
-    writer = EpisodeWriter(root, FPS)
-    for seed in seeds:
-        writer.append(make_episode(seed, n))
-
-
-def assert_holds(root: Path, seeds: list[int], n: int = 7) -> None:
-    episodes = EpisodeSet(root)
-    assert [episodes.meta(i)["seed"] for i in range(len(episodes))] == seeds
-    for i, seed in enumerate(seeds):
-        assert_same(episodes.read(i), make_episode(seed, n))
-
-
-def assert_same(read: Episode, original: Episode) -> None:
-    assert (read.task, read.meta) == (original.task, original.meta)
-    assert set(read.frames) == set(original.frames)
-    for key in (*NUMERIC, *ft.TACTILE, ft.WRIST):  # so costs are those of the raw frames
-        np.testing.assert_array_equal(read.frames[key], original.frames[key], err_msg=key)
-        assert read.frames[key].dtype == original.frames[key].dtype
 
 
 @pytest.fixture(scope="module")
@@ -88,18 +29,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("set") / "episodes"
     record(root, range(3), n=70)
     return root
-
-
-@pytest.fixture(scope="module")
-def recorded_small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("small") / "episodes"
-    record(root, range(3))
-    return root
-
-
-@pytest.fixture
-def small(recorded_small: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(recorded_small, tmp_path / "set")
 
 
 def test_round_trip(recorded: Path) -> None:
@@ -349,198 +278,3 @@ def test_checksum_tells_sets_apart(recorded_small: Path, small: Path) -> None:
     assert EpisodeSet(small).checksum != checksum
     record(small.with_name("other"), range(1, 4))
     assert EpisodeSet(small.with_name("other")).checksum != checksum, "as many, other frames"
-
-
-def flip_byte(path: Path, position: int) -> None:
-    data = bytearray(path.read_bytes())
-    data[position] ^= 0xFF
-    path.write_bytes(data)
-
-
-def cut_in_half(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
-DAMAGE = {
-    "flipped byte in touch": (
-        metadata.data_path(1),
-        lambda path: flip_byte(path, path.read_bytes().index(PNG_START) + 100),
-    ),
-    "half a data file": (metadata.data_path(1), cut_in_half),
-    "flipped byte in a video": (
-        metadata.video_path(ft.WRIST, 1),
-        lambda path: flip_byte(path, 400),
-    ),
-    "half a video": (metadata.video_path(ft.WRIST, 1), cut_in_half),
-    "no data file": (metadata.data_path(1), Path.unlink),
-    "no video": (metadata.video_path(ft.WRIST, 1), Path.unlink),
-}
-
-
-@pytest.mark.parametrize("case", DAMAGE)
-def test_a_damaged_episode_is_named_and_moved_aside(small: Path, case: str) -> None:
-    name, harm = DAMAGE[case]
-    harm(small / name)
-    with pytest.raises(UserError, match=name) as error:
-        EpisodeSet(small).read(1)
-    assert "\n" not in str(error.value) and "touchgoal repair" in str(error.value)
-    assert any(name in problem for problem in validate(small))
-    assert repair(small)
-    assert validate(small) == []
-    assert_holds(small, [0, 2])
-    assert EpisodeWriter(small, FPS).append(make_episode(4)) == 2
-    assert_holds(small, [0, 2, 4])
-    assert validate(small) == [] and repair(small) == []
-
-
-@pytest.mark.parametrize("name", [metadata.INFO, metadata.EPISODES, metadata.TASKS, metadata.STATS])
-@pytest.mark.parametrize("harm", [cut_in_half, Path.unlink])
-def test_damaged_metadata_is_made_again(small: Path, name: str, harm) -> None:
-    before = {path: path.read_bytes() for path in (small / "meta").rglob("*") if path.is_file()}
-    harm(small / name)
-    assert any(name in problem for problem in validate(small))
-    assert repair(small)
-    assert validate(small) == []
-    assert {path: path.read_bytes() for path in before} == before
-
-
-FILES = (
-    metadata.INFO,
-    metadata.EPISODES,
-    metadata.TASKS,
-    metadata.STATS,
-    metadata.data_path(1),
-    metadata.video_path(ft.WRIST, 1),
-)
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_a_flipped_byte_anywhere_is_noticed(small: Path, name: str) -> None:
-    """Footers and JSON have no checksum: they are compared with what the data files make them."""
-    whole, rng = (small / name).read_bytes(), np.random.default_rng(0)
-    writer = whole.rfind(b"parquet-cpp-arrow version ")  # another release may have written it
-    unnoticed = []
-    for place in rng.integers(0, len(whole), 40):
-        if writer >= 0 and writer <= place < writer + 40:
-            continue
-        data = bytearray(whole)
-        data[place] ^= 1 << int(rng.integers(8))
-        (small / name).write_bytes(bytes(data))
-        try:
-            if not validate(small):
-                unnoticed.append(int(place))
-        except UserError:
-            pass
-    assert unnoticed == []
-
-
-def test_statistics_that_are_none_of_the_frames_are_noticed(small: Path) -> None:
-    stats = json.loads((small / metadata.STATS).read_text())
-    stats[ft.STATE]["mean"] = [999.0] * 15
-    stats[ft.STATE]["std"] = [0.0] * 15
-    (small / metadata.STATS).write_text(json.dumps(stats))
-    assert any(metadata.STATS in problem for problem in validate(small))
-    assert repair(small) and validate(small) == []
-
-
-def test_pictures_and_json_that_are_traps_are_one_line(tmp_path: Path, small: Path) -> None:
-    """A PNG of 50,000 squared in 60 bytes, lengths that cannot be, JSON a hundred thousand deep."""
-    chunk = b"IHDR" + struct.pack(">IIBBBBB", 50_000, 50_000, 8, 2, 0, 0, 0)
-    bomb = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk
-    bomb += struct.pack(">I", zlib.crc32(chunk))
-    (tmp_path / "0.png").write_bytes(bomb)
-    with pytest.raises(UserError, match="pixels|readable"):
-        read_frames(tmp_path)
-    with pytest.raises(UserError, match="no readable PNG"):
-        decode_png(bomb)
-    for rubbish in (b"", b"\x89PNG", bomb[:20]):
-        with pytest.raises(UserError):
-            decode_png(rubbish)
-    (small / metadata.INFO).write_text("[" * 100_000)
-    with pytest.raises(UserError, match="corrupt"):
-        EpisodeSet(small)
-    deep = tmp_path / "cell.json"
-    deep.write_text('{"a":' * 100_000)
-    with pytest.raises(UserError, match="no JSON"):
-        read_cell_file(deep)
-
-
-class Killed(BaseException):
-    """Stands for the process ending here."""
-
-
-def test_killed_at_every_write(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ends an append at each of its writes, with the file half written and fully written."""
-    replace, steps = os.replace, 0
-    for step in range(100):
-        root = shutil.copytree(small, small.with_name(f"killed_{step}"))
-        writer, calls = EpisodeWriter(root, FPS), 0
-
-        def die(source: Path, target: Path, step: int = step) -> None:
-            nonlocal calls
-            if calls == step // 2:
-                if step % 2:
-                    cut_in_half(Path(source))
-                raise Killed
-            calls += 1
-            replace(source, target)
-
-        monkeypatch.setattr(os, "replace", die)
-        try:
-            writer.append(make_episode(3))
-            break
-        except Killed:
-            steps += 1
-        finally:
-            monkeypatch.setattr(os, "replace", replace)
-        writer.close()
-        assert_holds(root, [0, 1, 2])
-        with pytest.raises(UserError, match="interrupted.*repair"):
-            EpisodeWriter(root, FPS)
-        assert repair(root)
-        kept = len(EpisodeSet(root))
-        EpisodeWriter(root, FPS).append(make_episode(kept))
-        assert_holds(root, list(range(kept + 1)))
-        assert validate(root) == []
-    assert steps == 2 * 6, "a video, a data file and four files of metadata"
-
-
-def test_killed_in_the_first_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def die(source: Path, target: Path) -> None:
-        raise Killed
-
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(os, "replace", die)
-        record(tmp_path, range(1))
-    with pytest.raises(UserError, match="interrupted"):
-        EpisodeSet(tmp_path)
-    assert "no whole episode" in repair(tmp_path)[-1]
-    record(tmp_path, range(2))
-    assert validate(tmp_path) == []
-
-
-RECORDER = """
-import runpy, sys
-from touchgoal.episodes.store import EpisodeWriter
-make_episode = runpy.run_path(sys.argv[1])["make_episode"]
-writer = EpisodeWriter(sys.argv[2])
-while True:
-    print(writer.append(make_episode(len(writer))), flush=True)
-"""
-
-
-def test_killed_recorder_loses_no_acknowledged_episode(tmp_path: Path) -> None:
-    rng, acknowledged = random.Random(0), -1
-    for _ in range(3):
-        command = [sys.executable, "-c", RECORDER, __file__, str(tmp_path)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as recorder:
-            assert recorder.stdout is not None
-            for _ in range(rng.randint(1, 5)):
-                acknowledged = int(recorder.stdout.readline())
-            time.sleep(rng.uniform(0, 0.05))
-            recorder.send_signal(signal.SIGKILL)
-            acknowledged = int((recorder.stdout.read().split() or [acknowledged])[-1])
-        repair(tmp_path)
-        assert validate(tmp_path) == []
-        assert len(EpisodeSet(tmp_path)) - 1 in (acknowledged, acknowledged + 1)
-    assert_holds(tmp_path, list(range(len(EpisodeSet(tmp_path)))))

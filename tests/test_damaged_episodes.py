@@ -1,0 +1,216 @@
+"""Sets that were damaged, or whose recorder was killed: nothing sound is lost."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import time
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import toy_episodes
+from toy_episodes import FPS, PNG_START, assert_holds, flip_byte, make_episode, record
+
+from touchgoal.control import features as ft
+from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.errors import UserError
+from touchgoal.episodes import metadata
+from touchgoal.episodes.encoding import decode_png
+from touchgoal.episodes.media import read_frames
+from touchgoal.episodes.repair import repair, validate
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+
+
+def cut_in_half(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+DAMAGE = {
+    "flipped byte in touch": (
+        metadata.data_path(1),
+        lambda path: flip_byte(path, path.read_bytes().index(PNG_START) + 100),
+    ),
+    "half a data file": (metadata.data_path(1), cut_in_half),
+    "flipped byte in a video": (
+        metadata.video_path(ft.WRIST, 1),
+        lambda path: flip_byte(path, 400),
+    ),
+    "half a video": (metadata.video_path(ft.WRIST, 1), cut_in_half),
+    "no data file": (metadata.data_path(1), Path.unlink),
+    "no video": (metadata.video_path(ft.WRIST, 1), Path.unlink),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_a_damaged_episode_is_named_and_moved_aside(small: Path, case: str) -> None:
+    name, harm = DAMAGE[case]
+    harm(small / name)
+    with pytest.raises(UserError, match=name) as error:
+        EpisodeSet(small).read(1)
+    assert "\n" not in str(error.value) and "touchgoal repair" in str(error.value)
+    assert any(name in problem for problem in validate(small))
+    assert repair(small)
+    assert validate(small) == []
+    assert_holds(small, [0, 2])
+    assert EpisodeWriter(small, FPS).append(make_episode(4)) == 2
+    assert_holds(small, [0, 2, 4])
+    assert validate(small) == [] and repair(small) == []
+
+
+@pytest.mark.parametrize("name", [metadata.INFO, metadata.EPISODES, metadata.TASKS, metadata.STATS])
+@pytest.mark.parametrize("harm", [cut_in_half, Path.unlink])
+def test_damaged_metadata_is_made_again(small: Path, name: str, harm) -> None:
+    before = {path: path.read_bytes() for path in (small / "meta").rglob("*") if path.is_file()}
+    harm(small / name)
+    assert any(name in problem for problem in validate(small))
+    assert repair(small)
+    assert validate(small) == []
+    assert {path: path.read_bytes() for path in before} == before
+
+
+FILES = (
+    metadata.INFO,
+    metadata.EPISODES,
+    metadata.TASKS,
+    metadata.STATS,
+    metadata.data_path(1),
+    metadata.video_path(ft.WRIST, 1),
+)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_flipped_byte_anywhere_is_noticed(small: Path, name: str) -> None:
+    """Footers and JSON have no checksum: they are compared with what the data files make them."""
+    whole, rng = (small / name).read_bytes(), np.random.default_rng(0)
+    writer = whole.rfind(b"parquet-cpp-arrow version ")  # another release may have written it
+    unnoticed = []
+    for place in rng.integers(0, len(whole), 40):
+        if writer >= 0 and writer <= place < writer + 40:
+            continue
+        data = bytearray(whole)
+        data[place] ^= 1 << int(rng.integers(8))
+        (small / name).write_bytes(bytes(data))
+        try:
+            if not validate(small):
+                unnoticed.append(int(place))
+        except UserError:
+            pass
+    assert unnoticed == []
+
+
+def test_statistics_that_are_none_of_the_frames_are_noticed(small: Path) -> None:
+    stats = json.loads((small / metadata.STATS).read_text())
+    stats[ft.STATE]["mean"] = [999.0] * 15
+    stats[ft.STATE]["std"] = [0.0] * 15
+    (small / metadata.STATS).write_text(json.dumps(stats))
+    assert any(metadata.STATS in problem for problem in validate(small))
+    assert repair(small) and validate(small) == []
+
+
+def test_pictures_and_json_that_are_traps_are_one_line(tmp_path: Path, small: Path) -> None:
+    """A PNG of 50,000 squared in 60 bytes, lengths that cannot be, JSON a hundred thousand deep."""
+    chunk = b"IHDR" + struct.pack(">IIBBBBB", 50_000, 50_000, 8, 2, 0, 0, 0)
+    bomb = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk
+    bomb += struct.pack(">I", zlib.crc32(chunk))
+    (tmp_path / "0.png").write_bytes(bomb)
+    with pytest.raises(UserError, match="pixels|readable"):
+        read_frames(tmp_path)
+    with pytest.raises(UserError, match="no readable PNG"):
+        decode_png(bomb)
+    for rubbish in (b"", b"\x89PNG", bomb[:20]):
+        with pytest.raises(UserError):
+            decode_png(rubbish)
+    (small / metadata.INFO).write_text("[" * 100_000)
+    with pytest.raises(UserError, match="corrupt"):
+        EpisodeSet(small)
+    deep = tmp_path / "cell.json"
+    deep.write_text('{"a":' * 100_000)
+    with pytest.raises(UserError, match="no JSON"):
+        read_cell_file(deep)
+
+
+class Killed(BaseException):
+    """Stands for the process ending here."""
+
+
+def test_killed_at_every_write(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ends an append at each of its writes, with the file half written and fully written."""
+    replace, steps = os.replace, 0
+    for step in range(100):
+        root = shutil.copytree(small, small.with_name(f"killed_{step}"))
+        writer, calls = EpisodeWriter(root, FPS), 0
+
+        def die(source: Path, target: Path, step: int = step) -> None:
+            nonlocal calls
+            if calls == step // 2:
+                if step % 2:
+                    cut_in_half(Path(source))
+                raise Killed
+            calls += 1
+            replace(source, target)
+
+        monkeypatch.setattr(os, "replace", die)
+        try:
+            writer.append(make_episode(3))
+            break
+        except Killed:
+            steps += 1
+        finally:
+            monkeypatch.setattr(os, "replace", replace)
+        writer.close()
+        assert_holds(root, [0, 1, 2])
+        with pytest.raises(UserError, match="interrupted.*repair"):
+            EpisodeWriter(root, FPS)
+        assert repair(root)
+        kept = len(EpisodeSet(root))
+        EpisodeWriter(root, FPS).append(make_episode(kept))
+        assert_holds(root, list(range(kept + 1)))
+        assert validate(root) == []
+    assert steps == 2 * 6, "a video, a data file and four files of metadata"
+
+
+def test_killed_in_the_first_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def die(source: Path, target: Path) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(os, "replace", die)
+        record(tmp_path, range(1))
+    with pytest.raises(UserError, match="interrupted"):
+        EpisodeSet(tmp_path)
+    assert "no whole episode" in repair(tmp_path)[-1]
+    record(tmp_path, range(2))
+    assert validate(tmp_path) == []
+
+
+RECORDER = """
+import runpy, sys
+from touchgoal.episodes.store import EpisodeWriter
+make_episode = runpy.run_path(sys.argv[1])["make_episode"]
+writer = EpisodeWriter(sys.argv[2])
+while True:
+    print(writer.append(make_episode(len(writer))), flush=True)
+"""
+
+
+def test_killed_recorder_loses_no_acknowledged_episode(tmp_path: Path) -> None:
+    rng, acknowledged = random.Random(0), -1
+    for _ in range(3):
+        command = [sys.executable, "-c", RECORDER, toy_episodes.__file__, str(tmp_path)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as recorder:
+            assert recorder.stdout is not None
+            for _ in range(rng.randint(1, 5)):
+                acknowledged = int(recorder.stdout.readline())
+            time.sleep(rng.uniform(0, 0.05))
+            recorder.send_signal(signal.SIGKILL)
+            acknowledged = int((recorder.stdout.read().split() or [acknowledged])[-1])
+        repair(tmp_path)
+        assert validate(tmp_path) == []
+        assert len(EpisodeSet(tmp_path)) - 1 in (acknowledged, acknowledged + 1)
+    assert_holds(tmp_path, list(range(len(EpisodeSet(tmp_path)))))
