@@ -1,0 +1,217 @@
+"""Episodes and goals through tiny encoders: pictures, touch and words become curves."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
+from torch import Tensor
+
+from touchgoal.benchmarks import reward_quality
+from touchgoal.benchmarks.reward_quality import collect_goals, is_goal
+from touchgoal.control.errors import UserError
+from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT, WRIST
+from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
+from touchgoal.encoders.backbones.vit import PRESETS
+from touchgoal.episodes.recording import EpisodeSpec
+from touchgoal.episodes.schema import Episode, MetaValue
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.rewards.curves import (
+    Contact,
+    first_contact,
+)
+from touchgoal.rewards.embedding_distance import (
+    EpisodeEmbedder,
+    compute_curves,
+    compute_distances,
+)
+from touchgoal.rewards.goals import (
+    EpisodeEnd,
+    FrameNumber,
+    Goal,
+    GoalSpec,
+    LastFrame,
+    Modality,
+    PictureArray,
+    PictureFile,
+    Sentence,
+    assign_goals,
+    parse_goal,
+)
+from touchgoal.sim_envs.config import PickPlaceConfig
+
+ALL: tuple[Modality, ...] = ("image", "tactile", "text")
+
+
+class PaintTowers:
+    """Towers that see coarse colours and hear letters; no weights to load."""
+
+    image_dim = 48
+    text_dim = 8
+    pretrained_together = False
+
+    def __init__(self, name: str = "paint") -> None:
+        self.name = name
+
+    def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
+        n, h, w, _ = images.shape
+        coarse = images.reshape(n, 4, h // 4, 4, w // 4, 3).mean((2, 4)).reshape(n, -1)
+        return torch.from_numpy(coarse.astype(np.float32)) + 1
+
+    def embed_texts(self, texts: list[str]) -> Float[Tensor, "n d"]:
+        letters = [[text.count(c) + 0.5 for c in "aeioursl"] for text in texts]
+        return torch.tensor(letters)
+
+
+def recorded(n: int = 12, contact: int = 7, color: int = 200) -> Episode:
+    """A square that crosses the front picture; a bright blob on both gels from contact on."""
+    rng = np.random.default_rng(0)
+    front = np.full((n, 32, 32, 3), 60, np.uint8)
+    gel = rng.integers(90, 110, (240, 320, 3), dtype=np.uint8)
+    touch = np.repeat(gel[None], n, axis=0)
+    touch[contact:, 80:160, 100:200] = color
+    for t in range(n):
+        front[t, 12:20, 2 * t : 2 * t + 8] = (color, 30, 30)
+    touching = np.arange(n)[:, None] >= [contact, contact + 1]  # the left finger comes first
+    frames = {FRONT: front, TACTILE_LEFT: touch, TACTILE_RIGHT: touch[:, :, ::-1].copy()}
+    meta = {"object": "apple", "descriptions": ["hard and smooth", "round"], "success": True}
+    return Episode({**frames, TRUTH_CONTACT: touching}, "pick the apple", meta)
+
+
+@pytest.fixture(scope="module")
+def embedder() -> EpisodeEmbedder:
+    torch.manual_seed(0)
+    towers = PaintTowers()
+    config = TouchEncoderConfig.for_towers(PRESETS["tiny"], towers, "gelsight_mini", 16)
+    encoder = TouchEncoder(config)
+    return EpisodeEmbedder(towers, encoder)
+
+
+def choose(specs: Sequence[GoalSpec], available: Sequence[Modality] = ALL) -> Goal:
+    return assign_goals(specs, available)
+
+
+def test_curves_are_causal(embedder: EpisodeEmbedder) -> None:
+    """What comes later changes no value, once the 5 frames of the background are over."""
+    whole = recorded(color=160)
+    part = replace(whole, frames={k: v[:9] for k, v in whole.frames.items()})
+    goal = choose([PictureArray(np.full((32, 32, 3), 90, np.uint8)), Sentence("soft")])
+    long, short = (
+        compute_curves(e, embedder.embed_goal(goal, e), None)
+        for e in (embedder.embed_episode(x, 20.0, "x") for x in (whole, part))
+    )
+    for name, cost in short.costs.items():
+        assert long.costs[name][:9] == pytest.approx(cost, abs=1e-6)
+        reward = short.potential_rewards()[name]
+        assert long.potential_rewards()[name][:9] == pytest.approx(reward, abs=1e-6)
+
+
+def test_contact_is_the_simulators_or_detected() -> None:
+    episode = recorded()
+    assert first_contact(episode) == Contact(7, "truth")
+    seen = {k: v for k, v in episode.frames.items() if k != TRUTH_CONTACT}
+    assert first_contact(replace(episode, frames=seen)) == Contact(7, "detected")
+    assert first_contact(replace(episode, frames={FRONT: seen[FRONT]})).label_source == "no touch"
+
+
+def test_episode_is_embedded_once_for_all_goals(embedder: EpisodeEmbedder) -> None:
+    e = embedder.embed_episode(recorded(), 20.0, "mine", descriptions=True)
+    assert e.modalities == ALL and (e.object, e.success) == ("apple", True)
+    goal = choose([LastFrame(), Sentence("hard and smooth")], e.modalities)
+    curves = compute_curves(e, embedder.embed_goal(goal, e), None)
+    assert set(curves.raw) == set(ALL) and not curves.normalised
+    assert curves.raw["image"][-1] == pytest.approx(0, abs=1e-6)
+    assert np.ptp(curves.raw["tactile"][:7]) < 1e-6 < 1e-4 < curves.raw["tactile"][0]
+    assert curves.raw["tactile"][7:] == pytest.approx(np.zeros(5), abs=1e-6)
+    assert e.descriptions is not None and embedder.embed_goal(goal, e).text is not None
+    assert embedder.embed_goal(goal, e).text == pytest.approx(e.descriptions[0], abs=1e-6)
+
+    third = embedder.embed_goal(choose([FrameNumber(3)], e.modalities), e)
+    assert compute_distances(e, third)["image"].argmin() == 3
+    with pytest.raises(UserError, match="frames are 0 to 11"):
+        embedder.embed_goal(choose([FrameNumber(12)], e.modalities), e)
+
+
+def test_goals_from_a_picture_and_from_another_episode(
+    embedder: EpisodeEmbedder, tmp_path: Path
+) -> None:
+    writer = EpisodeWriter(tmp_path / "set")
+    writer.append(recorded(color=160))
+    writer.append(recorded())
+    stored = EpisodeSet(tmp_path / "set").read(1)
+    other = embedder.embed_episode(stored, 20.0, "set#1")
+    mine = embedder.embed_episode(recorded(color=160), 20.0, "mine")
+    spec = parse_goal(f"episode:{tmp_path / 'set'}#1")
+    end = embedder.embed_goal(choose([spec], ALL), mine)
+    assert other.touch is not None and end.touch is not None and end.image is not None
+    assert end.image == pytest.approx(other.pictures()[-1], abs=1e-5)
+    assert end.touch == pytest.approx(other.touch[:, -1], abs=1e-5)
+    with pytest.raises(UserError, match="episodes 0 to 1"):
+        embedder.embed_goal(choose([EpisodeEnd(tmp_path / "set", 2)], ALL), mine)
+
+    Image.fromarray(stored.frames[FRONT][-1]).save(tmp_path / "end.png")
+    picture = embedder.embed_goal(choose([PictureFile(tmp_path / "end.png")], ALL), mine)
+    assert picture.touch is None and picture.image == pytest.approx(other.pictures()[-1], abs=1e-5)
+    (tmp_path / "end.png").write_text("no picture")
+    with pytest.raises(UserError, match=r"end\.png cannot be read"):
+        PictureFile(tmp_path / "end.png").read()
+    with pytest.raises(UserError, match="does not exist"):
+        PictureFile(tmp_path / "none.png").read()
+
+
+def test_video_has_pictures_alone(embedder: EpisodeEmbedder) -> None:
+    frames = recorded().frames[FRONT]
+    episode = embedder.embed_episode(recorded(), 20.0, "mine")
+    for any_embedder in (embedder, EpisodeEmbedder(PaintTowers(), None)):
+        video = any_embedder.embed_video(frames, 30.0, "a.mp4")
+        goal = choose([LastFrame()], video.modalities)
+        curves = compute_curves(video, any_embedder.embed_goal(goal, video), None)
+        assert list(curves.costs) == ["image"] and curves.contact.frame is None
+        of_episode = compute_curves(episode, embedder.embed_goal(goal, episode), None)
+        assert curves.costs["image"] == pytest.approx(of_episode.costs["image"])
+        assert curves.costs["image"][0] > 0.01
+
+
+def test_what_cannot_be_embedded_is_refused(embedder: EpisodeEmbedder) -> None:
+    encoder = TouchEncoder(
+        TouchEncoderConfig.for_towers(PRESETS["tiny"], PaintTowers("oil"), "gelsight_mini", 16)
+    )
+    with pytest.raises(UserError, match="trained with the towers oil, not paint"):
+        EpisodeEmbedder(PaintTowers(), encoder)
+    with pytest.raises(UserError, match="starts in contact"):
+        embedder.embed_episode(recorded(contact=2), 20.0, "mine")
+    touch_alone = {k: v for k, v in recorded().frames.items() if k != FRONT}
+    felt = embedder.embed_episode(replace(recorded(), frames=touch_alone), 20.0, "mine")
+    assert felt.modalities == ("tactile", "text") and len(felt) == 12
+    other_camera = touch_alone | {WRIST: recorded().frames[FRONT]}
+    with pytest.raises(UserError, match=f"choose --camera {WRIST}"):
+        embedder.embed_episode(replace(recorded(), frames=other_camera), 20.0, "mine")
+
+
+def test_only_successes_felt_with_the_encoders_sensor_are_goals() -> None:
+    reached: dict[str, MetaValue] = {"sensor": "gelsight_mini", "success": True}
+    assert is_goal(reached, "gelsight_mini")
+    assert not is_goal(reached | {"success": False}, "gelsight_mini")
+    with pytest.raises(UserError, match="felt with gelsight_mini, the encoder is for digit"):
+        is_goal(reached, "digit")
+
+
+def test_goals_that_failed_are_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The expert fails with the second object, once."""
+
+    def collect(
+        root: Path, config: PickPlaceConfig, specs: list[EpisodeSpec], workers: int
+    ) -> None:
+        for spec in specs:
+            success = not (spec.options["object"] == "cork" and spec.seed == 3_000_001)
+            meta: dict[str, MetaValue] = {"sensor": config.sensor, "success": success}
+            EpisodeWriter(root).append(replace(recorded(), meta=meta))
+
+    monkeypatch.setattr(reward_quality, "collect", collect)
+    ends = collect_goals(["brick", "cork", "candle"], "gelsight_mini", tmp_path, 1)
+    found = [(end.root.name, end.index) for end in ends]
+    assert found == [("goals-0", 0), ("goals-1", 0), ("goals-0", 2)]
