@@ -15,7 +15,7 @@ from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.policies.config import EstimatorTrainConfig
+from touchgoal.policies.config import Box, EstimatorTrainConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.placements import Placements
 from touchgoal.policies.perception.pose_estimator import PoseEstimator
@@ -92,8 +92,10 @@ def train_pose_estimator(
 
     def batch(rows: Tensor, generator: torch.Generator) -> dict[str, Any]:
         pictures = {
-            key: _add_pixel_noise(placements.pictures[key][rows], config.pixel_noise, generator)
-            for key, _ in estimator.config.crops
+            key: _add_pixel_noise(
+                placements.pictures[key][rows], box, config.pixel_noise, generator
+            )
+            for key, box in estimator.config.crops
         }
         return {"pictures": pictures, "tcp": placements.tcp[rows], "start": placements.start[rows]}
 
@@ -127,12 +129,14 @@ class _PoseLoss(nn.Module):
 
 
 def _add_pixel_noise(
-    pictures: UInt8[Tensor, "b h w 3"], counts: int, generator: torch.Generator
+    pictures: UInt8[Tensor, "b h w 3"], box: Box, counts: int, generator: torch.Generator
 ) -> UInt8[Tensor, "b h w 3"]:
-    noise = torch.randint(
-        -counts, counts + 1, pictures.shape, dtype=torch.int16, generator=generator
-    )
-    return (pictures + noise).clamp(0, 255).to(torch.uint8)
+    """Changes, and returns, the pictures; outside the box nobody looks."""
+    top, bottom, left, right = box
+    seen = pictures[:, top:bottom, left:right]
+    noise = torch.randint(-counts, counts + 1, seen.shape, dtype=torch.int16, generator=generator)
+    seen.copy_((seen + noise).clamp(0, 255))
+    return pictures
 
 
 @torch.no_grad()
