@@ -121,7 +121,7 @@ QUOTED = {
     ),
     "deploy-lock-step": Quoted(
         "touchgoal benchmark deploy --tasks pick-place --policies shipped "
-        "--arms environment in-process lock-step --episodes 40 --seed 7000000",
+        "--arms environment lock-step --episodes 40 --seed 7000000",
     ),
     "deploy-real-time-maze": Quoted(
         "touchgoal benchmark deploy --tasks bead-maze --policies shipped --arms real-time --episodes 20 "
@@ -131,7 +131,10 @@ QUOTED = {
     ),
     "deploy-lock-step-maze": Quoted(
         "touchgoal benchmark deploy --tasks bead-maze --policies shipped "
-        "--arms environment in-process lock-step --episodes 40 --seed 7000000",
+        "--arms environment lock-step --episodes 40 --seed 7000000",
+    ),
+    "deploy-in-process": Quoted(
+        "touchgoal benchmark deploy --policies shipped --arms in-process --episodes 20 --seed 7000000"
     ),
     "deploy-in-a-row": Quoted(
         "touchgoal benchmark deploy --policies shipped --arms real-time --in-a-row 20"
