@@ -17,7 +17,9 @@ RECIPE = "recipe.json"
 _DEPLOYED = shlex.split(
     "--env.as-deployed --env.deployment.state-delay 0 0.05 --env.deployment.picture-delay 0 0.08 "
     "--env.deployment.command-delay 0 0.04 --env.deployment.jitter 0 0.03 "
-    "--env.deployment.plan-ticks 0 1 1 2"
+    "--env.deployment.plan-ticks 0 1 1 2 "
+    # Beyond it the expert shows how to give way.
+    "--env.deployment.force-ceiling False"
 )
 _BLIND = [
     "--env.no-tactile",
@@ -67,7 +69,7 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
     )
     learn = shlex.split(
         "--task pick-place --head regression --representation base_twist --position-noise 0 "
-        "--arm-state commanded "
+        "--arm-state commanded --observation-horizon 4 "
         f"--train.lr 1e-3 --train.epochs {config.epochs or 16} --train.snapshot-epochs 16"
     )
     learn += ["--estimator", str(estimator)]
