@@ -43,15 +43,24 @@ class DaggerRoles:
         return self.policy(env), expert
 
 
+# Of `features.TRUTH_START`, as pose estimators err: standard deviations, m, and of twice the yaw.
+_START_ERROR = np.array([0.003, 0.003, 0.0015, 0.03, 0.03, 0.0015, 0.0015])
+
+
 class _TrueState:
-    """A state estimator that asks the simulator."""
+    """A state estimator that asks the simulator, and errs as pose estimators do, an episode long.
+
+    Who acts on the exact truth never gets where its estimates will lead it.
+    """
 
     def __init__(self, env: PickPlace) -> None:
         self._env = env
+        error = env.np_random.spawn(1)[0].normal(0, _START_ERROR)
+        self._start = (env.start + error).astype(np.float32)
 
     def estimate(
         self, observation: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray]
     ) -> dict[str, np.ndarray]:
         """See StateEstimator."""
         contact = np.array([pad.touching for pad in self._env.observed_contacts()], np.float32)
-        return {ft.TRUTH_CONTACT: contact, ft.TRUTH_START: self._env.start}
+        return {ft.TRUTH_CONTACT: contact, ft.TRUTH_START: self._start}
