@@ -20,12 +20,14 @@ class Config:
     """Which policy."""
     out: Path | None = None
     """Folder of the run; the policy goes to its `policy/policy`."""
-    demonstrations: Count = 160
-    """Episodes of the expert."""
-    corrections: Count = 80
-    """Episodes of each round in which the policy acts and the expert answers."""
-    rounds: CountOrNone = 3
-    """Rounds of corrections, three at most; the last of pick-place is in the plain environment."""
+    demonstrations: Count | None = None
+    """Episodes of the expert; default: 240 for pick-place, 160 for the maze."""
+    corrections: Count | None = None
+    """Episodes of each round in which the policy acts and the expert answers; default: 200 for
+    pick-place, 80 for the maze."""
+    rounds: CountOrNone = 5
+    """Rounds of corrections, at most five for pick-place, whose third is in the plain environment, and
+    three for the maze."""
     epochs: Count | None = None
     """Passes over the data in each training; default: 16 for pick-place, 5 for the maze."""
     trials: CountOrNone = 24

@@ -73,7 +73,7 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
         f"--train.lr 1e-3 --train.epochs {config.epochs or 16} --train.snapshot-epochs 16"
     )
     learn += ["--estimator", str(estimator)]
-    many = config.demonstrations
+    many = config.demonstrations or 240
     disturbed = many * 7 // 16  # so that the expert shows how to come back
     return [
         _record(out / "val", max(1, many // 13), 120_000, ["--feedback", *wired], config),
@@ -84,7 +84,7 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
             if disturbed else []
         ),
         # Where nothing is late or estimated it is to act, too.
-        *_corrected(config, out, learn, [wired, wired, _BLIND]),
+        *_corrected(config, out, learn, [wired, wired, _BLIND, wired, wired], 200),
     ]  # fmt: skip
 
 
@@ -101,18 +101,18 @@ def _bead_maze(config: Config, out: Path) -> list[list[str]]:
     learn += ["--head", "regression", "--observation-horizon", "4", "--train.snapshot-epochs", "5"]
     learn += ["--train.epochs", str(config.epochs or 5)]
     wired = [*_MAZE, *_DEPLOYED]
-    many = config.demonstrations
+    many = config.demonstrations or 160
     return [
         _record(out / "val", max(1, many // 13), 20_000, [*_VALIDATION, *_DEPLOYED], config),
         _record(out / "train", many, 0, wired, config),
-        *_corrected(config, out, learn, [wired] * 3),
+        *_corrected(config, out, learn, [wired] * 3, 80),
     ]
 
 
 def _corrected(
-    config: Config, out: Path, options: list[str], envs: list[list[str]]
+    config: Config, out: Path, options: list[str], envs: list[list[str]], episodes: int
 ) -> list[list[str]]:
-    """Rounds of learning and correcting (DAgger), and the last training."""
+    """Rounds of learning and correcting (DAgger), so many episodes each, and the last training."""
     data = ["--data", str(out / "train/episodes"), "--validation", str(out / "val/episodes")]
     learn = ["train-policy", *data, "--workers", str(config.workers)]
     steps = []
@@ -121,7 +121,7 @@ def _corrected(
         steps.append([*learn, *options, "--trials", "0", "--out", str(folder)])
         acts = ["--policy", str(folder / "policy"), *env]
         seed = 31_000 + 1000 * k
-        steps.append(_record(out / "train", config.corrections, seed, acts, config))
+        steps.append(_record(out / "train", config.corrections or episodes, seed, acts, config))
     final = [*learn, *options, "--trials", str(config.trials), "--env.as-deployed"]
     return [*steps, [*final, "--out", str(out / "policy")]]
 
