@@ -87,7 +87,7 @@ class StateEstimator:
     def estimate(
         self, observation: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray]
     ) -> dict[str, Float32[np.ndarray, " n"]]:
-        """Whether each pad touches something (probability), and how the episode began.
+        """Whether each pad touches something (1 or 0), and how the episode began.
 
         Args:
             observation: of a tick.
@@ -98,7 +98,8 @@ class StateEstimator:
             tcp = torch.from_numpy(first[ft.TCP_POSE])[None]
             self._start = first, self.network.pose_estimator(pictures, tcp)[0].numpy()
         touch = torch.from_numpy(self.touch.embed_tick([observation], first))[None]
-        contact = self.network.contact(touch).sigmoid()[0].numpy()
+        # True or false, as in what the policy learned on: of 0.97 it would make something else.
+        contact = (self.network.contact(touch)[0] > 0).numpy().astype(np.float32)
         return {ft.TRUTH_CONTACT: contact, ft.TRUTH_START: self._start[1]}
 
     def _picture(self, key: str, picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[Tensor, "1 h w 3"]:
