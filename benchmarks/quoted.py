@@ -123,27 +123,6 @@ QUOTED = {
         "touchgoal benchmark deploy --tasks pick-place --policies shipped "
         "--arms environment lock-step --episodes 40 --seed 7000000",
     ),
-    "deploy-real-time-maze": Quoted(
-        "touchgoal benchmark deploy --tasks bead-maze --policies shipped --arms real-time --episodes 20 "
-        "--seed 7000000",
-        "the shipped maze policy likewise",
-        _deployed,
-    ),
-    "deploy-lock-step-maze": Quoted(
-        "touchgoal benchmark deploy --tasks bead-maze --policies shipped "
-        "--arms environment lock-step --episodes 40 --seed 7000000",
-    ),
-    "deploy-in-process": Quoted(
-        "touchgoal benchmark deploy --policies shipped --arms in-process --episodes 20 --seed 7000000"
-    ),
-    "deploy-in-a-row": Quoted(
-        "touchgoal benchmark deploy --policies shipped --arms real-time --in-a-row 20"
-    ),
-    "policy-delay": Quoted("touchgoal benchmark policy-delay"),
-    "policy-delay-causes": Quoted("touchgoal benchmark policy-delay --causes"),
-    "policy-delay-causes-maze": Quoted(
-        "touchgoal benchmark policy-delay --task bead-maze --causes"
-    ),
     "sent-stream": Quoted("touchgoal benchmark sent-stream"),
     "replay": Quoted("touchgoal benchmark replay"),
     "maze": Quoted(
