@@ -120,8 +120,7 @@ QUOTED = {
         _deployed,
     ),
     "deploy-lock-step": Quoted(
-        "touchgoal benchmark deploy --tasks pick-place --policies shipped "
-        "--arms environment lock-step --episodes 40 --seed 7000000",
+        "touchgoal benchmark deploy --tasks pick-place --policies shipped --arms lock-step --episodes 40",
     ),
     "sent-stream": Quoted("touchgoal benchmark sent-stream"),
     "replay": Quoted("touchgoal benchmark replay"),

@@ -90,6 +90,14 @@ def test_contact_is_learnt(tmp_path: Path) -> None:
     assert ((network.contact(touch) > 0) == contact).float().mean() > 0.9
 
 
+def test_contact_is_true_or_false() -> None:
+    """As in what a policy learns on, however sure the network is."""
+    estimator, seen = toy_estimator(), toy_observations(1)[0]
+    seen |= {ft.FRONT: np.zeros((16, 16, 3), np.uint8)}
+    contact = estimator.estimate(seen, seen)[ft.TRUTH_CONTACT]
+    assert contact.dtype == np.float32 and set(contact.tolist()) <= {0.0, 1.0}
+
+
 def test_a_place_is_learnt(tmp_path: Path) -> None:
     """A bright spot on grey, where it is to be found again."""
     torch.manual_seed(0)
