@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from test_rewards import PaintTowers, recorded
+from test_episode_embedder import PaintTowers, recorded
 
 import touchgoal
 from touchgoal.control.errors import UserError
