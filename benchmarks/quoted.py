@@ -114,7 +114,8 @@ QUOTED = {
         "touchgoal run-policy --episodes 100 --policy expert", headline=_successes
     ),
     "deploy-real-time": Quoted(
-        "touchgoal benchmark deploy --tasks pick-place --policies shipped --arms real-time --episodes 20",
+        "touchgoal benchmark deploy --tasks pick-place --policies shipped --arms real-time --episodes 20 "
+        "--seed 7000000",
         "the shipped policy through libfranka's protocol, on fresh twins in real time",
         _deployed,
     ),
