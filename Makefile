@@ -79,7 +79,7 @@ weights-markers: $(READY)
 
 # How a shipped policy is made anew, by one command each that says what it did (recipe.json beside the
 # weights). With new pads: make the touch encoder or the state estimator first, and name its run with
-# --touch. (What ships of the maze had other rounds, see docs/training.md.)
+# --touch. (What ships had other rounds, see docs/training.md.)
 pick-place-policy: $(READY)
 	$(BIN)/touchgoal make-policy --out runs/pick_place
 	rm -rf policies/weights/pick_place && cp -r runs/pick_place/policy/policy policies/weights/pick_place

@@ -98,7 +98,7 @@ class StateEstimator:
             tcp = torch.from_numpy(first[ft.TCP_POSE])[None]
             self._start = first, self.network.pose_estimator(pictures, tcp)[0].numpy()
         touch = torch.from_numpy(self.touch.embed_tick([observation], first))[None]
-        # True or false, as in what the policy learned on: of 0.97 it would make something else.
+        # True or false, as in what the policy learned on: acting on a probability it stands still at times.
         contact = (self.network.contact(touch)[0] > 0).numpy().astype(np.float32)
         return {ft.TRUTH_CONTACT: contact, ft.TRUTH_START: self._start[1]}
 

@@ -16,6 +16,10 @@ from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.tasks import make_expert
 
+# Standard deviations of what is added to `features.TRUTH_START`: m, and of twice the yaw's cosine and sine.
+# A little more than the shipped pose estimator errs (its errors: `estimator.json`).
+_START_ERROR = np.array([0.003, 0.003, 0.0015, 0.03, 0.03, 0.0015, 0.0015])
+
 
 @dataclass(frozen=True)
 class DaggerRoles:
@@ -25,8 +29,8 @@ class DaggerRoles:
 
     Attributes:
         policy: makes the policy that acts while the expert says what it should have done (DAgger,
-            Ross et al. 2011); one with a state estimator acts on the simulator's truth instead.
-            None: the expert itself acts.
+            Ross et al. 2011); one with a state estimator acts on nearly the simulator's truth
+            instead. None: the expert itself acts.
     """
 
     policy: Callable[[Any], Actor] | None = None
@@ -39,15 +43,13 @@ class DaggerRoles:
         if isinstance(self.policy, SavedPolicy) and isinstance(env, PickPlace):
             policy = checkpoint.load(self.policy.directory)
             if policy.config.estimated:
-                return PolicyActor(Planner(policy, None, _TrueState(env)), env.plan_ticks), expert
+                return PolicyActor(
+                    Planner(policy, None, _NearlyTrueState(env)), env.plan_ticks
+                ), expert
         return self.policy(env), expert
 
 
-# Of `features.TRUTH_START`, as pose estimators err: standard deviations, m, and of twice the yaw.
-_START_ERROR = np.array([0.003, 0.003, 0.0015, 0.03, 0.03, 0.0015, 0.0015])
-
-
-class _TrueState:
+class _NearlyTrueState:
     """A state estimator that asks the simulator, and errs as pose estimators do, an episode long.
 
     Who acts on the exact truth never gets where its estimates will lead it.

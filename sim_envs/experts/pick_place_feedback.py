@@ -72,7 +72,7 @@ class FeedbackExpert:
         turn = float(np.clip(_RETURN * turn, -_TURN, _TURN)) / hz
         # A policy may have led the arm to where nothing is in reach: the nearest place will do.
         solution = env.kinematics.solve_ik_near(
-            here + (pace + change) / hz, _upright(R, yaw + turn, _RETURN / hz), env.command
+            here + (pace + change) / hz, _righted(R, yaw, turn, _RETURN / hz), env.command
         )
         delta = solution.q - env.command
         if (
@@ -104,13 +104,15 @@ class FeedbackExpert:
         return _funnel(off, beside - _OVER, _LOWER)
 
 
-def _upright(R: Float[np.ndarray, "3 3"], yaw: float, share: float) -> Float[np.ndarray, "3 3"]:
-    """The hand turned to `yaw`, with its tilt less that share of it.
+def _righted(
+    R: Float[np.ndarray, "3 3"], yaw: float, turn: float, share: float
+) -> Float[np.ndarray, "3 3"]:
+    """The hand, at `yaw`, turned on by `turn` (rad), and its tilt less that share of it.
 
     Not all of it at once: a policy whose plans come two ticks late, taught so, swings to and fro.
     """
-    tilt = rotation_vector(fingers_down(float(np.arctan2(R[1, 0], R[0, 0]))).T @ R)
-    return fingers_down(yaw) @ rotation_matrix((1 - share) * tilt)
+    tilt = rotation_vector(fingers_down(yaw).T @ R)
+    return fingers_down(yaw + turn) @ rotation_matrix((1 - share) * tilt)
 
 
 def _funnel(off: np.ndarray, beside: float, lower: float = _RETURN) -> np.ndarray:
