@@ -1,14 +1,15 @@
 """How often a deployed policy succeeds, by task, policy and arm, and what ends it where it does not.
 
 Each deployment is a `touchgoal deploy --execute` of its own; on the wire each has a fresh twin and the
-cell file that it writes. The same seeds, objects and wires in every row of a task.
+cell file that it writes. The same seeds, objects and wires in every row of a task. Each is kept as it ends, in
+deployments.jsonl of the run's folder: the same command with the same `--out` does only those that are missing.
 """
 
 import json
 import sys
 import tempfile
 from collections.abc import Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from touchgoal.benchmarks.config import DeployOptions
 from touchgoal.benchmarks.deployed_episode import Deployment, Scene, deploy, limited
 from touchgoal.benchmarks.deployed_twin import DeployedTwin
 from touchgoal.benchmarks.deployments_in_a_row import run_in_a_row
+from touchgoal.benchmarks.kept_deployments import KeptDeployments
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.progress import track
 from touchgoal.episodes.recording import EpisodeSpec, one_core_workers
@@ -37,7 +39,7 @@ def run(config: DeployOptions) -> dict[str, Any]:
     if config.in_a_row:
         return run_in_a_row(config)
     head = f"{'task, policy, arm':<34}{'success [95 % Wilson]':<23}{'peak N':>12}{'late ms':>9}{'pace':>6}  clamped"
-    lines, done = [head], []
+    lines, done, kept = [head], [], KeptDeployments(config.out)
     for task in config.tasks:
         scenes = list(_scenes(task, config))
         for name in config.policies:
@@ -47,11 +49,13 @@ def run(config: DeployOptions) -> dict[str, Any]:
                     begun = [
                         pool.submit(_deploy, scene, policy, arm, i, config.seconds)
                         for i, scene in enumerate(scenes)
+                        if kept.find(scene, policy, arm) is None
                     ]
-                    rows = [
-                        deployment.result()
-                        for deployment in track(begun, f"{task}, {policy}, {arm}", "deployment")
-                    ]
+                    for deployment in track(
+                        as_completed(begun), f"{task}, {policy}, {arm}", "deployment", len(begun)
+                    ):
+                        kept.add(deployment.result())
+                rows = [row for scene in scenes if (row := kept.find(scene, policy, arm))]
                 lines += _lines(rows)
                 print(
                     "\n".join(lines[-1 - sum(not row.success for row in rows) :]), file=sys.stderr

@@ -1,6 +1,7 @@
 """Print one table of measured figures and keep its numbers."""
 
 import importlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -62,7 +63,7 @@ def main(config: options.BenchmarkOptions) -> None:
     module = IN_FOLDERS.get(name, name.replace("-", "_"))
     benchmark = importlib.import_module(f"touchgoal.benchmarks.{module}")
     out = open_run(config.out, f"benchmark-{name}", config)
-    result = benchmark.run(config)
+    result = benchmark.run(replace(config, out=out))
     print(result.pop("table"))
     pictures = result.pop("pictures", {})
     if "picture" in result:
