@@ -16,6 +16,9 @@ from touchgoal.encoders.published import is_published, load_published
 from touchgoal.encoders.towers.towers import same_towers
 from touchgoal.encoders.training.weights import WeightsFormat
 
+AnyTouchEncoder = TouchEncoder | TouchBackbone | PooledEncoder
+"""Aligned with images and texts; learned without labels; a whitened ImageNet network."""
+
 _WEIGHTS = Path(__file__).parent / "weights"
 DEFAULT_ENCODER = _WEIGHTS / "gelsight_mini_offline"
 ENCODER_FORMAT = WeightsFormat(
@@ -24,7 +27,7 @@ ENCODER_FORMAT = WeightsFormat(
 
 
 def save(
-    encoder: TouchEncoder | TouchBackbone | PooledEncoder,
+    encoder: AnyTouchEncoder,
     directory: Path,
     provenance: dict[str, Any],
     half: bool = True,
@@ -130,7 +133,7 @@ def find_encoder(name_or_path: str | Path) -> Path:
     )
 
 
-def load_encoder(name_or_path: str | Path) -> TouchEncoder | TouchBackbone | PooledEncoder:
+def load_encoder(name_or_path: str | Path, sensor: str | None = None) -> AnyTouchEncoder:
     """A touch encoder of any kind, on the CPU, ready for `embed`; see `find_encoder`.
 
         encoder = load_encoder("gelsight_mini")
@@ -138,6 +141,10 @@ def load_encoder(name_or_path: str | Path) -> TouchEncoder | TouchBackbone | Poo
 
     Published Sparsh encoders, too: a file in their layout, a folder with one, or an id of Hugging Face such as
     "facebook/sparsh-dino-base"; see `published.load_published` for their options.
+
+    Args:
+        name_or_path: Which one.
+        sensor: Name of the sensor it is meant for, if that matters here.
 
     Raises:
         UserError: no such encoder, or as `load_aligned` or `load_published`.
@@ -147,8 +154,9 @@ def load_encoder(name_or_path: str | Path) -> TouchEncoder | TouchBackbone | Poo
     directory = find_encoder(name_or_path)
     config = ENCODER_FORMAT.read_json(directory).get("config", {})
     if "features" in config:
-        return load_pooled(directory)
-    return load_aligned(directory) if "towers" in config else load_touch_backbone(directory)
+        return load_pooled(directory, sensor)
+    load = load_aligned if "towers" in config else load_touch_backbone
+    return load(directory, sensor)
 
 
 def _check_sensor(

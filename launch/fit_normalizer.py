@@ -25,8 +25,8 @@ class Config:
     camera: str = "front"
     """Camera of the episodes whose pictures are measured: front or wrist."""
     encoder: str | None = None
-    """Touch encoder: a name (touchgoal list encoders) or folder. Default: the one that ships for the
-    episodes' sensor."""
+    """Touch encoder of any kind: a name (touchgoal list encoders), a folder, or a published Sparsh one.
+    Default: the one that ships for the episodes' sensor. Sentences need one that is aligned with texts."""
     towers: str | None = None
     """Image and text networks: offline, or a CLIP (Hugging Face id or folder). Without --encoder,
     pictures alone are measured with them."""
@@ -42,12 +42,13 @@ def main(config: Config) -> None:
     from touchgoal.launch.support.run_folder import open_run
     from touchgoal.rewards.fit_normalizer import fit_normalizer
     from touchgoal.rewards.normalizer import NORMALIZER
-    from touchgoal.rewards.setup import load_encoders
+    from touchgoal.rewards.setup import embedder_for, load_touch
     from touchgoal.rewards.sources import open_successes
 
     with_touch = config.towers is None or config.encoder is not None
     sources = open_successes(config.sources, config.camera, with_touch, config.assume_success)
-    embedder, _ = load_encoders(sources[0], config.encoder, config.towers)
+    touch, _ = load_touch(sources[0], config.encoder)
+    embedder = embedder_for(sources[0], touch, config.towers)
     out = open_run(config.out, "fit-normalizer", config)
     total = sum(len(source.names) for source in sources)
     trajectories = (one for source in sources for one in source.embed(embedder, descriptions=True))

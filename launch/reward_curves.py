@@ -32,8 +32,8 @@ class Config:
     camera: str = "front"
     """Camera of the episodes whose pictures are measured: front or wrist."""
     encoder: str | None = None
-    """Touch encoder: a name (touchgoal list encoders) or folder. Default: the one that ships for the
-    episodes' sensor."""
+    """Touch encoder of any kind: a name (touchgoal list encoders), a folder, or a published Sparsh one.
+    Default: the one that ships for the episodes' sensor. Sentences need one that is aligned with texts."""
     towers: str | None = None
     """Image and text networks: offline, or a CLIP (Hugging Face id or folder), which also takes
     sentences as goals of plain videos. Without --encoder, pictures alone are measured with them."""

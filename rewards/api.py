@@ -10,11 +10,12 @@ from touchgoal.control.features import CONTROL_HZ, FRONT, TACTILE, TACTILE_LEFT,
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
 from touchgoal.encoders.preprocess import check_pictures
-from touchgoal.encoders.towers.towers import Towers, load_towers
+from touchgoal.encoders.pretrained import AnyTouchEncoder
+from touchgoal.encoders.towers.towers import OfflineTowers, Towers, load_towers
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import Curves
-from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
+from touchgoal.rewards.embedding_distance import EpisodeEmbedder, check_words, compute_curves
 from touchgoal.rewards.goals import (
     FrameNumber,
     GoalSpec,
@@ -39,7 +40,7 @@ def reward_curve(
     images: np.ndarray | None = None,
     tactile: Mapping[str, np.ndarray] | None = None,
     goal: GoalLike | list[GoalLike] | tuple[GoalLike, ...] = "last",
-    encoder: str | Path | TouchEncoder | None = None,
+    encoder: str | Path | AnyTouchEncoder | None = None,
     *,
     towers: str | Towers | None = None,
     normalizer: str | Path | DistanceNormalizer | None = None,
@@ -64,8 +65,9 @@ def reward_curve(
             of the goal state (touch with the same fingertips as here, untouched as here);
             a sentence on how the object feels (touch; or pictures, with the towers of a CLIP and
             without tactile); or any form of `reward-curves --goal`, such as "episode:data/set#3".
-        encoder: touch encoder: a name ("gelsight_mini"), a folder, or one already loaded. Default:
-            the one that ships for the GelSight Mini.
+        encoder: touch encoder of any kind: a name ("gelsight_mini"), a folder, or one already loaded; a
+            sentence as goal needs one that is aligned with texts. Default: the one that ships for the
+            GelSight Mini.
         towers: "offline", a CLIP's Hugging Face id or folder, or loaded ones. Default: those that
             the encoder was trained with, "offline" without tactile.
         normalizer: what normalises distances and lets them be fused: a file that `touchgoal fit-normalizer`
@@ -84,10 +86,13 @@ def reward_curve(
     specs = [spec for one in goals for spec in _as_specs(one, episode)]
     sides = [key for key in TACTILE if key in episode.frames]
     image: tuple[Modality, ...] = ("image",) if camera in episode.frames else ()
-    modalities: tuple[Modality, ...] = (*image, "tactile", "text") if sides else image
     touch_encoder = _touch_encoder(encoder) if sides else None
+    check_words(specs, touch_encoder)
+    aligned = isinstance(touch_encoder, TouchEncoder)
+    touch: tuple[Modality, ...] = ("tactile", *(("text",) if aligned else ())) if sides else ()
+    modalities: tuple[Modality, ...] = (*image, *touch)
     if towers is None:
-        towers = touch_encoder.config.towers if touch_encoder else "offline"
+        towers = touch_encoder.config.towers if aligned else OfflineTowers.name
     if isinstance(towers, str):
         towers = load_towers(towers)
     assigned = assign_goals(specs, modalities, towers.pretrained_together)
@@ -152,8 +157,7 @@ def _array_specs(goal: Mapping[str, np.ndarray], episode: Episode) -> list[GoalS
     return specs
 
 
-def _touch_encoder(encoder: str | Path | TouchEncoder | None) -> TouchEncoder:
-    if isinstance(encoder, TouchEncoder):
+def _touch_encoder(encoder: str | Path | AnyTouchEncoder | None) -> AnyTouchEncoder:
+    if isinstance(encoder, AnyTouchEncoder):
         return encoder
-    found = pretrained.DEFAULT_ENCODER if encoder is None else pretrained.find_encoder(encoder)
-    return pretrained.load_aligned(found)
+    return pretrained.load_encoder(pretrained.DEFAULT_ENCODER if encoder is None else encoder)

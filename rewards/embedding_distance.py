@@ -5,13 +5,14 @@ All distances are cosine distances, 1 - cos, in [0, 2]:
 - image: frozen tower's embedding of the camera picture against that of the goal picture, or, with
   towers that were trained together (a CLIP), against that of a sentence;
 - tactile: touch embedding of each fingertip against the goal's same fingertip, mean over sides;
-- text: touch embedding of each fingertip against the projected goal sentence, mean over sides.
+- text: touch embedding of each fingertip against the projected goal sentence, mean over sides; of
+  encoders alone that were aligned with texts.
 
 Raw distances of different modalities are not comparable; `rewards/normalizer.py` makes them so.
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +22,8 @@ from jaxtyping import Float, Float32, UInt8
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import FRONT, TACTILE, TRUTH_CONTACT
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
+from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
+from touchgoal.encoders.pretrained import AnyTouchEncoder
 from touchgoal.encoders.towers.towers import Towers
 from touchgoal.episodes.schema import Episode, is_camera
 from touchgoal.episodes.touches import touch_background
@@ -29,6 +32,7 @@ from touchgoal.rewards.goals import (
     EpisodeEnd,
     FrameNumber,
     Goal,
+    GoalSpec,
     LastFrame,
     Modality,
     PictureArray,
@@ -57,6 +61,7 @@ class EmbeddedEpisode:
             none or they were not asked for.
         object: catalogue id of the object, "" if unknown.
         success: whether the episode reached its goal, None if unknown.
+        words: whether its touch embeddings can be compared with sentences.
     """
 
     source: str
@@ -69,6 +74,7 @@ class EmbeddedEpisode:
     descriptions: Float32[np.ndarray, "m k"] | None = None
     object: str = ""
     success: bool | None = None
+    words: bool = True
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -78,7 +84,8 @@ class EmbeddedEpisode:
     def modalities(self) -> tuple[Modality, ...]:
         """The modalities this trajectory can be measured in."""
         image: tuple[Modality, ...] = () if self.image is None else ("image",)
-        return image if self.touch is None else (*image, "tactile", "text")
+        touch: tuple[Modality, ...] = () if self.touch is None else ("tactile",)
+        return (*image, *touch, "text") if touch and self.words else (*image, *touch)
 
     def pictures(self) -> Float32[np.ndarray, "n d"]:
         """The picture embeddings of a trajectory that has the modality image."""
@@ -114,13 +121,15 @@ class EpisodeEmbedder:
     free of contact.
     """
 
-    def __init__(self, towers: Towers, encoder: TouchEncoder | None, camera: str = FRONT) -> None:
+    def __init__(
+        self, towers: Towers, encoder: AnyTouchEncoder | None, camera: str = FRONT
+    ) -> None:
         """Keep the encoders and note what they are.
 
         Args:
             towers: frozen image and text towers.
-            encoder: touch encoder trained with these towers (put into evaluation mode), or None
-                to measure pictures alone.
+            encoder: touch encoder (put into evaluation mode), which knows sentences if it was aligned with
+                these towers; or None to measure pictures alone.
             camera: vocabulary key of the camera whose pictures are measured.
 
         Raises:
@@ -128,21 +137,30 @@ class EpisodeEmbedder:
         """
         self._towers = towers
         self._encoder = encoder
+        self._aligned = encoder if isinstance(encoder, TouchEncoder) else None
         self._camera = camera
         # A CLIP's name ends in "#" and a hash of its weights; the folder before it may differ.
         self._pictures_with = EmbeddingSource(towers.name.rpartition("#")[2], camera)
         self._made_with = self._pictures_with
         if encoder is not None:
-            encoder.check_towers(towers)
+            if self._aligned is not None:
+                self._aligned.check_towers(towers)
             encoder.eval()
             self._made_with = replace(
-                self._pictures_with, encoder=_weights_hash(encoder), sensor=encoder.config.sensor
+                self._pictures_with,
+                encoder=_weights_hash(encoder),
+                sensor=encoder.config.sensor or "",
             )
 
     @property
     def made_with(self) -> EmbeddingSource:
         """What makes the embeddings of episodes with touch."""
         return self._made_with
+
+    @property
+    def knows_words(self) -> bool:
+        """Whether touch can be compared with sentences."""
+        return self._aligned is not None
 
     def embed_episode(
         self, episode: Episode, fps: float, source: str, descriptions: bool = False
@@ -172,6 +190,7 @@ class EpisodeEmbedder:
             descriptions=self._embed_descriptions(episode, source) if descriptions else None,
             object=str(episode.meta.get("object", "")),
             success=None if success is None else bool(success),
+            words=self.knows_words,
         )
 
     def embed_video(
@@ -205,14 +224,21 @@ class EpisodeEmbedder:
     def embed_touch(
         self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
     ) -> Float32[np.ndarray, "n k"]:
-        """Unit embeddings of one fingertip's pictures, given the same fingertip untouched."""
+        """Embeddings of one fingertip's pictures, given the same fingertip untouched.
+
+        Unit vectors, but for those of a `PooledEncoder`: they are the shorter the less is felt, and so all
+        the farther from a firm touch.
+        """
         assert self._encoder is not None  # without it no trajectory has sides
-        return self._encoder.embed_frames(frames, background)
+        embedded = self._encoder.embed_frames(frames, background)
+        if isinstance(self._encoder, TouchBackbone):
+            embedded /= np.linalg.norm(embedded, axis=1, keepdims=True)
+        return embedded
 
     def embed_sentences(self, sentences: Sequence[str]) -> Float32[np.ndarray, "m k"]:
         """Unit embeddings of sentences on how touch feels, to be compared with `embed_touch`."""
-        assert self._encoder is not None  # without it no modality takes a sentence
-        return self._encoder.embed_text_goal(list(sentences), self._towers)
+        assert self._aligned is not None  # without it no modality takes a sentence
+        return self._aligned.embed_text_goal(list(sentences), self._towers)
 
     def _goal_picture(
         self,
@@ -267,7 +293,17 @@ class EpisodeEmbedder:
         sentences = episode.meta.get("descriptions", [])
         if not isinstance(sentences, list):
             raise UserError(f"{source}: meta descriptions must be a list of sentences")
-        return self.embed_sentences(sentences) if sentences and self._encoder else None
+        return self.embed_sentences(sentences) if sentences and self._aligned else None
+
+
+def check_words(specs: Iterable[GoalSpec], encoder: AnyTouchEncoder | None) -> None:
+    """Raises UserError if a goal is a sentence, and touch is felt by an encoder that knows none."""
+    sentences = [spec for spec in specs if isinstance(spec, Sentence)]
+    if sentences and encoder is not None and not isinstance(encoder, TouchEncoder):
+        raise UserError(
+            f"goal '{sentences[0]}': this touch encoder was not aligned with texts: leave the goal out, or "
+            "take an encoder of train-encoder align"
+        )
 
 
 def missing_camera(source: str, camera: str, cameras: Sequence[str]) -> str:
@@ -330,7 +366,7 @@ def _unit(embeddings: torch.Tensor) -> Float32[np.ndarray, "n d"]:
     return torch.nn.functional.normalize(embeddings.float(), dim=1).cpu().numpy()
 
 
-def _weights_hash(encoder: TouchEncoder) -> str:
+def _weights_hash(encoder: AnyTouchEncoder) -> str:
     """Short hash of weights and preprocessor, the same wherever the encoder was loaded from.
 
     Saving rounds the weights, so a normalizer is fitted with an encoder loaded from disk.

@@ -9,7 +9,7 @@ import torch
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import CONTROL_HZ, FRONT, TACTILE
 from touchgoal.control.sensors.latest_value import LatestValue
-from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
+from touchgoal.encoders.pretrained import AnyTouchEncoder
 from touchgoal.encoders.towers.towers import Towers
 from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import Contact
@@ -17,6 +17,7 @@ from touchgoal.rewards.embedding_distance import (
     EmbeddedEpisode,
     EmbeddedGoal,
     EpisodeEmbedder,
+    check_words,
     compute_curves,
 )
 from touchgoal.rewards.goals import GoalSpec, assign_goals
@@ -39,7 +40,7 @@ class CostMeter:
     def __init__(
         self,
         towers: Towers,
-        encoder: TouchEncoder,
+        encoder: AnyTouchEncoder,
         normalizer: DistanceNormalizer | None,
         goals: Sequence[GoalSpec],
     ) -> None:
@@ -47,12 +48,13 @@ class CostMeter:
 
         Args:
             towers: frozen image and text towers.
-            encoder: touch encoder trained with them.
+            encoder: touch encoder, aligned with them if a goal is a sentence.
             normalizer: fitted with these encoders on episodes of this scene; None for the raw
                 cosine distance, of goals that speak for one modality alone.
             goals: each modality takes the first that speaks for it; what none speaks for is left
                 out. Frames of the episode itself are not known yet and cannot be goals.
         """
+        check_words(goals, encoder)
         self._normalizer, self._goals = normalizer, goals
         self._embedder = EpisodeEmbedder(towers, encoder)
         self._goal: EmbeddedGoal | None = None
@@ -92,6 +94,7 @@ class CostMeter:
             image=self._embedder.embed_pictures(observation[FRONT][None]),
             sides=sides,
             touch=np.stack(touch) if touch else None,
+            words=self._embedder.knows_words,
         )
 
 

@@ -7,9 +7,11 @@ from pathlib import Path
 from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
+from touchgoal.encoders.pretrained import AnyTouchEncoder, load_encoder
+from touchgoal.encoders.published import is_published
 from touchgoal.encoders.towers.towers import OfflineTowers, load_towers
 from touchgoal.rewards.curves import Curves
-from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
+from touchgoal.rewards.embedding_distance import EpisodeEmbedder, check_words, compute_curves
 from touchgoal.rewards.goals import Goal, parse_goal
 from touchgoal.rewards.normalizer import NORMALIZER, REMEDY, DistanceNormalizer
 from touchgoal.rewards.sources import EpisodeSource, VideoSource
@@ -54,7 +56,8 @@ def prepare(
     Args:
         source: what to measure.
         goals: in the forms of rewards/goals.py.
-        encoder, towers: see `load_encoders`.
+        encoder: see `load_touch`.
+        towers: see `embedder_for`.
         normalizer: a file of `fit-normalizer`, "none", or None for the one beside the encoder where it
             applies.
 
@@ -62,9 +65,12 @@ def prepare(
         UserError: whatever would stop the measurement.
     """
     picture_words = towers not in (None, OfflineTowers.name)
-    goal = source.check_goals([parse_goal(text) for text in goals], picture_words)
+    specs = [parse_goal(text) for text in goals]
+    goal = source.check_goals(specs, picture_words)
     given = DistanceNormalizer.load(Path(normalizer)) if normalizer not in (None, "none") else None
-    embedder, folder = load_encoders(source, encoder, towers)
+    touch, folder = load_touch(source, encoder)
+    check_words(specs, touch)
+    embedder = embedder_for(source, touch, towers)
     made_with = source.made_with(embedder)
     if given is not None:
         reason = given.mismatch(made_with, goal.as_dict(), goal.own)
@@ -92,25 +98,37 @@ def prepare(
 _FIT = "touchgoal fit-normalizer, on successful episodes of your own"
 
 
-def load_encoders(
-    source: Source, encoder: str | None, towers: str | None
-) -> tuple[EpisodeEmbedder, Path | None]:
-    """The encoders for a source, and the folder of the touch encoder (None without touch).
+def load_touch(source: Source, encoder: str | None) -> tuple[AnyTouchEncoder | None, Path | None]:
+    """The touch encoder for a source and its folder; None without touch, and no folder of published weights.
 
     Args:
         source: what to embed.
-        encoder: name or folder of a touch encoder; None for the one that ships for the sensor.
-        towers: "offline" or a CLIP; None for those of the touch encoder, "offline" without touch.
+        encoder: name or folder of a touch encoder of any kind; None for the one that ships for the sensor.
 
     Raises:
-        UserError: nothing ships for the sensor, or the encoder is for other towers.
+        UserError: nothing ships for the sensor, or the encoder is for another one.
     """
+    if encoder is not None and source.sides and is_published(encoder):
+        return load_encoder(encoder), None
     folder = _encoder_folder(source, encoder)
-    touch: TouchEncoder | None = None
-    if folder is not None:
-        touch = pretrained.load_aligned(folder, sensor=source.sensor)
-    towers = towers or (touch.config.towers if touch else OfflineTowers.name)
-    return EpisodeEmbedder(load_towers(towers), touch, source.camera), folder
+    return (None if folder is None else load_encoder(folder, source.sensor)), folder
+
+
+def embedder_for(
+    source: Source, touch: AnyTouchEncoder | None, towers: str | None
+) -> EpisodeEmbedder:
+    """The encoders for a source.
+
+    Args:
+        source: what to embed.
+        touch: its touch encoder.
+        towers: "offline" or a CLIP; None for those that the touch encoder was aligned with, else "offline".
+
+    Raises:
+        UserError: the encoder was aligned with other towers.
+    """
+    own = touch.config.towers if isinstance(touch, TouchEncoder) else OfflineTowers.name
+    return EpisodeEmbedder(load_towers(towers or own), touch, source.camera)
 
 
 def _encoder_folder(source: Source, encoder: str | None) -> Path | None:

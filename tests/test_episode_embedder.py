@@ -16,6 +16,8 @@ from touchgoal.benchmarks.reward_quality import collect_goals, is_goal
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT, WRIST
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
+from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
+from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.episodes.recording import EpisodeSpec
 from touchgoal.episodes.schema import Episode, MetaValue
@@ -26,6 +28,7 @@ from touchgoal.rewards.curves import (
 )
 from touchgoal.rewards.embedding_distance import (
     EpisodeEmbedder,
+    check_words,
     compute_curves,
     compute_distances,
 )
@@ -190,6 +193,25 @@ def test_what_cannot_be_embedded_is_refused(embedder: EpisodeEmbedder) -> None:
     other_camera = touch_alone | {WRIST: recorded().frames[FRONT]}
     with pytest.raises(UserError, match=f"choose --camera {WRIST}"):
         embedder.embed_episode(replace(recorded(), frames=other_camera), 20.0, "mine")
+
+
+def test_encoders_without_words_measure_touch() -> None:
+    """Learned without labels, or an ImageNet network: 0 at the goal, as far untouched as can be."""
+    torch.manual_seed(0)
+    goal = choose([LastFrame()], ("image", "tactile"))
+    for encoder in (
+        TouchBackbone(TouchBackboneConfig.for_sensor(PRESETS["tiny"], "gelsight_mini")),
+        PooledEncoder(PooledEncoderConfig.for_sensor("gelsight_mini")),
+    ):
+        embedder = EpisodeEmbedder(PaintTowers(), encoder)
+        e = embedder.embed_episode(recorded(), 20.0, "mine", descriptions=True)
+        assert e.modalities == ("image", "tactile") and e.descriptions is None
+        cost = compute_curves(e, embedder.embed_goal(goal, e), None).raw["tactile"]
+        assert cost[7:] == pytest.approx(np.zeros(5), abs=1e-3)
+        assert cost[0] > 0.02 and np.ptp(cost[:7]) < 1e-6
+        assert e.made_with.sensor == "gelsight_mini" and e.made_with.encoder
+        with pytest.raises(UserError, match="was not aligned with texts"):
+            check_words([Sentence("hard")], encoder)
 
 
 def test_only_successes_felt_with_the_encoders_sensor_are_goals() -> None:

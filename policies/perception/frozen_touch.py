@@ -10,10 +10,7 @@ from jaxtyping import Float32
 
 from touchgoal.control import features as ft
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
 from touchgoal.encoders.backbones.frame_history import RecentFrames
-from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
-from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.ssl.frames import check_sensor
 from touchgoal.episodes.store import EpisodeSet
 
@@ -30,7 +27,7 @@ class TouchEmbedder:
         reach: how many ticks back an embedding sees; 0 of an encoder of single frames.
     """
 
-    def __init__(self, encoder: TouchEncoder | TouchBackbone | PooledEncoder, name: str) -> None:
+    def __init__(self, encoder: pretrained.AnyTouchEncoder, name: str) -> None:
         self.encoder, self.name = encoder, name
         self.dim = len(ft.TACTILE) * encoder.config.embedding_dim
         self.sensor = encoder.config.sensor

@@ -1,9 +1,10 @@
-"""Clients that are not ours against the twin, each in a process and an interpreter of its own.
+"""Clients that are not ours against the twin, and our driver against controllers that are not ours.
 
-    python tests/interop/run.py [NAME ...]      NAME: pylibfranka, franky, ur_rtde; none: all
+    python tests/interop/run.py [NAME ...]      NAME: pylibfranka, franky, ur_rtde, franka-sim, franky-sim;
+                                                none: all
 
-The clients run in the virtual environment `.venv-interop` (`make interop` makes it). It prints what each
-one found, and fails if that is wrong.
+What is not ours runs in the virtual environment `.venv-interop` (`make interop` makes it), each in a process
+of its own. It prints what each one found, and fails if that is wrong.
 """
 
 import json
@@ -18,6 +19,7 @@ import numpy as np
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
+from emulators import COMMANDS, drive  # noqa: E402
 from running_twin import RunningTwin  # noqa: E402
 
 PYTHON = HERE.parents[1] / ".venv-interop" / "bin" / "python"
@@ -94,7 +96,11 @@ def run(name: str, number: int) -> bool:
         print(f"{name}: it failed: {done.stderr.strip().splitlines()[-1:]}", flush=True)
         return False
     said = json.loads(done.stdout.splitlines()[-1])
-    found = check(said)
+    return report(name, check(said), str(said))
+
+
+def report(name: str, found: dict[str, bool], said: str) -> bool:
+    """Print what was found; whether all is as it should be."""
     print(
         f"{name}: " + ", ".join(f"{what} {'ok' if ok else 'WRONG'}" for what, ok in found.items())
     )
@@ -103,7 +109,18 @@ def run(name: str, number: int) -> bool:
     return all(found.values())
 
 
+def run_emulator(name: str, number: int) -> bool:
+    """Our driver on one of them; whether all is as it should be."""
+    found, figures = drive(name, str(PYTHON), str(HERE), number)
+    print(f"{name}: {figures}")
+    return report(name, found, figures)
+
+
 if __name__ == "__main__":
-    names = sys.argv[1:] or list(CLIENTS)
-    results = [run(name, 20 + list(CLIENTS).index(name)) for name in names]
+    everything = [*CLIENTS, *COMMANDS]
+    names = sys.argv[1:] or everything
+    results = [
+        (run if name in CLIENTS else run_emulator)(name, 20 + everything.index(name))
+        for name in names
+    ]
     sys.exit(0 if all(results) else 1)
