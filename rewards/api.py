@@ -11,7 +11,7 @@ from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
 from touchgoal.encoders.preprocess import check_pictures
 from touchgoal.encoders.pretrained import AnyTouchEncoder
-from touchgoal.encoders.towers.towers import OfflineTowers, Towers, load_towers
+from touchgoal.encoders.towers.towers import Towers, load_towers
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import Curves
@@ -28,6 +28,7 @@ from touchgoal.rewards.goals import (
     parse_goal,
 )
 from touchgoal.rewards.normalizer import DistanceNormalizer
+from touchgoal.rewards.setup import own_towers
 
 GoalLike = str | int | np.ndarray | Mapping[str, np.ndarray]
 """A goal as a script has it; see `reward_curve`."""
@@ -91,8 +92,7 @@ def reward_curve(
     aligned = isinstance(touch_encoder, TouchEncoder)
     touch: tuple[Modality, ...] = ("tactile", *(("text",) if aligned else ())) if sides else ()
     modalities: tuple[Modality, ...] = (*image, *touch)
-    if towers is None:
-        towers = touch_encoder.config.towers if aligned else OfflineTowers.name
+    towers = own_towers(touch_encoder) if towers is None else towers
     if isinstance(towers, str):
         towers = load_towers(towers)
     assigned = assign_goals(specs, modalities, towers.pretrained_together)

@@ -127,8 +127,12 @@ def embedder_for(
     Raises:
         UserError: the encoder was aligned with other towers.
     """
-    own = touch.config.towers if isinstance(touch, TouchEncoder) else OfflineTowers.name
-    return EpisodeEmbedder(load_towers(towers or own), touch, source.camera)
+    return EpisodeEmbedder(load_towers(towers or own_towers(touch)), touch, source.camera)
+
+
+def own_towers(touch: AnyTouchEncoder | None) -> str:
+    """Those that a touch encoder was aligned with; the offline ones of any other, and without touch."""
+    return touch.config.towers if isinstance(touch, TouchEncoder) else OfflineTowers.name
 
 
 def _encoder_folder(source: Source, encoder: str | None) -> Path | None:

@@ -13,6 +13,7 @@ from PIL import Image
 from test_episode_embedder import PaintTowers, recorded
 
 import touchgoal
+from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT
 from touchgoal.control.interfaces import DriverError
@@ -22,6 +23,7 @@ from touchgoal.episodes.media import write_video
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.__main__ import main
+from touchgoal.launch.commands.deploy import EXAMPLES, _load_cost
 from touchgoal.rewards.api import reward_curve
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
 from touchgoal.rewards.goals import PictureFile, Sentence, assign_goals
@@ -274,3 +276,17 @@ def test_cost_during_a_run_is_that_of_its_recording(encoder: TouchEncoder, tmp_p
     during = [meter.measure(tick, ticks[: min(i + 1, 5)]) for i, tick in enumerate(ticks)]
     np.testing.assert_allclose(during[4:], expected[4:], atol=1e-5)
     assert np.abs(during[0] - expected[0]) > 1e-4  # one frame is another background
+
+
+def test_a_cell_chooses_the_encoder_of_its_rewards(tmp_path: Path) -> None:
+    text = (EXAMPLES / "sim.toml").read_text()
+    cell = tmp_path / "cell.toml"
+    words = 'rewards = ["text:a hard ball"]\nencoder = "gelsight_mini_surfaces"'
+    cell.write_text(text.replace("[task]", f"[task]\n{words}"))
+    with pytest.raises(UserError, match="was not aligned with texts"):
+        _load_cost(read_cell_file(cell))
+    cell.write_text(
+        text.replace("[task]", f"[task]\n{words}".replace("gelsight_mini_surfaces", "x"))
+    )
+    with pytest.raises(UserError, match="there is no touch encoder 'x'"):
+        _load_cost(read_cell_file(cell))

@@ -140,9 +140,12 @@ class TaskSection:
     rewards: tuple[str, ...] = ()
     """Goals whose distance is shown and recorded during the run, as those of reward-curves:
     episode:FOLDER#K, image:PATH, text:SENTENCE."""
+    encoder: str = ""
+    """Touch encoder that measures that distance, by name or folder; sentences need one that is aligned with
+    texts. Not given: the one that ships for the fingertips."""
     normalizer: str = ""
     """What normalises that distance: a normalizer.json that fit-normalizer made of successes in this cell. Not
-    given: that of the simulated scene on a simulated arm or a twin, the raw distance elsewhere."""
+    given: the encoder's own on a simulated arm or a twin, the raw distance elsewhere."""
 
 
 @dataclass(frozen=True, config=STRICT)

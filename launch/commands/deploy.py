@@ -20,6 +20,7 @@ from touchgoal.control.interfaces import DriverError
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.encoders import pretrained
+from touchgoal.encoders.published import is_published
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.launch.deploy import Config
 from touchgoal.launch.support.run_folder import open_run, write_json
@@ -28,9 +29,11 @@ from touchgoal.policies.deploy.actors import CellPolicy, load_cell_policy, make_
 from touchgoal.policies.deploy.control_loop import SLOW_ARM, Request, slow_arm
 from touchgoal.policies.deploy.preflight import check_client, preflight
 from touchgoal.policies.deploy.session import Result, Session
+from touchgoal.rewards.embedding_distance import check_words
 from touchgoal.rewards.goals import parse_goal
 from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
 from touchgoal.rewards.online import CostMeter, OnlineCost
+from touchgoal.rewards.setup import own_towers
 from touchgoal.sim_envs.config import EnvConfig
 from touchgoal.sim_envs.twin.control_port import ask_twin, put_scene_back
 from touchgoal.sim_envs.twin.in_process import simulate_cell
@@ -165,17 +168,19 @@ def _deploy(
 
 
 def _load_cost(cell: CellConfig) -> OnlineCost | None:
-    """What measures the distance to the cell's goals, on the shipped encoder."""
+    """What measures the distance to the cell's goals."""
     if not cell.task.rewards:
         return None
     goals = [parse_goal(text) for text in cell.task.rewards]
-    directory = pretrained.shipped_encoder_for(cell.sensor)
-    encoder = pretrained.load_aligned(directory, sensor=cell.sensor)
+    chosen = cell.task.encoder or pretrained.shipped_encoder_for(cell.sensor)
+    encoder = pretrained.load_encoder(chosen, cell.sensor)
+    check_words(goals, encoder)
     simulated = cell.arm == "sim" or bool(cell.task.twin)
-    given = cell.task.normalizer
-    path = Path(given) if given else directory / NORMALIZER
-    normalizer = DistanceNormalizer.load(path) if simulated or given else None
-    towers = load_towers(encoder.config.towers)
+    path = Path(cell.task.normalizer)
+    if not cell.task.normalizer and simulated and not is_published(chosen):
+        path = pretrained.find_encoder(chosen) / NORMALIZER
+    normalizer = DistanceNormalizer.load(path) if path.is_file() or cell.task.normalizer else None
+    towers = load_towers(own_towers(encoder))
     return OnlineCost(CostMeter(towers, encoder, normalizer, goals))
 
 
