@@ -89,6 +89,7 @@ pick-place-policy: $(READY)
 maze-policy: $(READY)
 	$(BIN)/touchgoal make-policy --task bead-maze --out runs/maze
 	rm -rf policies/weights/bead_maze && cp -r runs/maze/policy/policy policies/weights/bead_maze
+	rm -r policies/weights/bead_maze/touch  # it ships as an encoder
 
 $(READY): pyproject.toml constraints.txt
 	@echo "setting up $(VENV): about 1 GB from PyPI, 2 to 3 minutes"

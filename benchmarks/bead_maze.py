@@ -27,7 +27,6 @@ from touchgoal.policies.evaluation.evaluate import Trial, run_trials
 from touchgoal.policies.evaluation.open_loop import OpenLoopErrors, Plan, open_loop_errors
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.heads.diffusion import RegressionConfig
-from touchgoal.policies.perception.frozen_touch import load_touch
 from touchgoal.policies.policy import ObservationBatch, Policy
 from touchgoal.policies.training.sequence_dataset import (
     SequenceDataset,
@@ -75,7 +74,8 @@ class ShuffledTouch:
         """For one episode."""
         torch.set_num_threads(1)
         loaded = checkpoint.load(self.policy.directory)
-        touch = load_touch(self.policy.directory / checkpoint.TOUCH)
+        touch = self.policy.touch(loaded.config)
+        assert touch is not None
         planner = ShuffledTouchPlanner(loaded, touch)
         rows = other_wires(self.episodes, env.wire.name)
         chosen = rows[int(env.np_random.integers(len(rows)))]
@@ -219,7 +219,7 @@ def _open_loop(
     for seed, directory in enumerate(directories):
         policy = checkpoint.load(directory)
         config, horizon = policy.config, policy.config.prediction_horizon
-        touch = load_touch(directory / checkpoint.TOUCH) if config.touch_dim else None
+        touch = SavedPolicy(directory).touch(config)
         if touch:
             load_recordings(episodes, range(count), config, touch, workers)  # embeds, all at once
         recorded = [load_recordings(episodes, [i], config, touch) for i in range(count)]

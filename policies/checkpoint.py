@@ -27,7 +27,7 @@ from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig
-from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
+from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
 from touchgoal.policies.perception.state_estimation import StateEstimator, load_estimator
 from touchgoal.policies.policy import Policy, PolicyConfig
 from touchgoal.sim_envs.base import FrankaTactileEnv
@@ -101,7 +101,7 @@ class SavedPolicy:
     def planner(self) -> Planner:
         """What makes its plans in one episode."""
         policy = load(self.directory)
-        return Planner(policy, self._touch(policy.config), self._estimator(policy.config))
+        return Planner(policy, self.touch(policy.config), self._estimator(policy.config))
 
     def check_task(self, task: EnvConfig) -> "SavedPolicy":
         """Itself; UserError if the policy cannot act in the task: before anything is simulated."""
@@ -121,7 +121,7 @@ class SavedPolicy:
                 f"the policy in {self.directory} was trained for {config.task}, not for {name}: add "
                 f"--task {config.task}, or choose another policy"
             )
-        touch, estimator = self._touch(config), self._estimator(config)
+        touch, estimator = self.touch(config), self._estimator(config)
         sensor = find_sensor(task.sensor).name
         trained = {config.sensor, touch and touch.sensor, estimator and estimator.touch.sensor}
         for other in trained - {"", None, sensor}:
@@ -139,8 +139,9 @@ class SavedPolicy:
         config = load(self.directory).config
         return _observed(task, config, self._estimator(config))
 
-    def _touch(self, config: PolicyConfig) -> TouchEmbedder | None:
-        return load_touch(self.directory / TOUCH) if config.touch_dim else None
+    def touch(self, config: PolicyConfig) -> TouchEmbedder | None:
+        """What it feels with; None if it does not feel."""
+        return load_touch_of(self.directory / TOUCH, config.touch) if config.touch_dim else None
 
     def _estimator(self, config: PolicyConfig) -> StateEstimator | None:
         return load_estimator(self.directory / ESTIMATOR) if config.estimated else None

@@ -1,7 +1,9 @@
 """Acting by plans: in order, on time, with a planner that is slow or fails."""
 
+import shutil
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,9 +19,12 @@ from toy_policies import (
 
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
+from touchgoal.encoders.pretrained import find_encoder
+from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import Planner, PolicyActor
+from touchgoal.policies.checkpoint import SHIPPED_POLICIES
 from touchgoal.policies.deploy.realtime import RealTimeActor
-from touchgoal.policies.perception.frozen_touch import TouchEmbedder
+from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
 from touchgoal.policies.policy import ObservationBatch, Policy
 
 
@@ -131,3 +136,13 @@ def test_a_planner_that_fails_later_is_not_waited_for() -> None:
         for _ in range(2):  # a plan from the first is needed in the second
             actor.act({})
     actor.close()
+
+
+def test_a_policy_feels_with_the_encoder_of_its_training(tmp_path: Path) -> None:
+    """The one in its folder, else the one that ships under that name, and no other."""
+    name = checkpoint.load(SHIPPED_POLICIES["bead-maze"]).config.touch
+    assert load_touch_of(tmp_path / "none", name).name == name
+    shutil.copytree(find_encoder("gelsight_mini_offline"), tmp_path / "touch")
+    assert load_touch_of(tmp_path / "touch", name).name != name
+    with pytest.raises(UserError, match="none like it ships"):
+        load_touch_of(tmp_path / "none", "gelsight_mini/v1/0123456789ab")

@@ -180,7 +180,7 @@ def test_learning_the_bead_maze(
         "--large-repeats", 0)  # fmt: skip
     assert "denoising" in capsys.readouterr().out
     run("train-policy-paper", *both, *one, "--head", "tiny", "--sampler.num-inference-steps", 2, "--trials", 0,
-        "--encoder", "mae/encoder", "--train.epochs", 1, "--out", "paper")  # fmt: skip
+        "--encoder", "gelsight_mini_markers_mae", "--train.epochs", 1, "--out", "paper")  # fmt: skip
     paper = checkpoint.load(Path("paper/policy")).config
     assert paper.representation == "delta" and paper.touch_input == "embedding"
     assert Path("paper/policy/touch/encoder.json").is_file()

@@ -9,7 +9,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.launch.__main__ import read_options
 from touchgoal.launch.make_policy import Config
 from touchgoal.launch.support.run_folder import open_run, write_json
-from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES, TOUCH
+from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES
 
 RECIPE = "recipe.json"
 
@@ -25,6 +25,7 @@ _BLIND = [
     "--env.no-tactile",
     "--env.cameras",
 ]  # the policy learns on the truth of what it estimates
+_MAZE_TOUCH = "gelsight_mini_markers_mae"
 _MAZE = shlex.split("--task bead-maze --env.n-wires 260 --env.start-angle 10")
 _VALIDATION = shlex.split(
     "--task bead-maze --env.split validation --env.n-wires 16 --env.start-angle 10"
@@ -93,11 +94,11 @@ def _bead_maze(config: Config, out: Path) -> list[list[str]]:
 
     It sees four ticks: with two it led the bead less often on validation wires.
     """
-    encoder = config.touch / "encoder" if config.touch else SHIPPED_POLICIES["bead-maze"] / TOUCH
+    encoder = str(config.touch / "encoder") if config.touch else _MAZE_TOUCH
     learn = shlex.split(
         "--representation body_twist --arm-state commanded --train.lr 1e-3 --env.start-angle 10"
     )
-    learn += ["--encoder", str(encoder), "--task", "bead-maze"]
+    learn += ["--encoder", encoder, "--task", "bead-maze"]
     learn += ["--head", "regression", "--observation-horizon", "4", "--train.snapshot-epochs", "5"]
     learn += ["--train.epochs", str(config.epochs or 5)]
     wired = [*_MAZE, *_DEPLOYED]

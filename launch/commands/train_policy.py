@@ -6,6 +6,7 @@ from pathlib import Path
 from touchgoal.control import features as ft
 from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.encoders.pretrained import find_encoder
 from touchgoal.encoders.training.trainer import is_first_process
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.support.run_folder import write_json
@@ -48,7 +49,7 @@ def run_command(config: Config) -> None:
     parts = {
         name: folder
         for name, folder in (
-            (checkpoint.TOUCH, config.encoder),
+            (checkpoint.TOUCH, config.encoder and find_encoder(config.encoder)),
             (checkpoint.ESTIMATOR, config.estimator),
         )
         if folder

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float32
 
 from touchgoal.control import features as ft
+from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.frame_history import RecentFrames
 from touchgoal.encoders.ssl.frames import check_sensor
@@ -70,9 +71,29 @@ def load_touch(name_or_path: str | Path) -> TouchEmbedder:
     """
     directory = pretrained.find_encoder(name_or_path)
     encoder = pretrained.load_encoder(directory)
-    digest = hashlib.sha256(
-        pretrained.ENCODER_FORMAT.weights_path(directory).read_bytes()
-    ).hexdigest()[:12]
     offsets = encoder.offsets
     seen = f"/frames{'-'.join(map(str, offsets))}" if len(offsets) > 1 else ""
-    return TouchEmbedder(encoder, f"{encoder.config.preprocessor}/{digest}{seen}")
+    return TouchEmbedder(encoder, f"{encoder.config.preprocessor}/{_digest(directory)}{seen}")
+
+
+def load_touch_of(directory: Path, name: str) -> TouchEmbedder:
+    """The embedder with which a policy was trained: in its folder, or else the one that ships by that name.
+
+    Args:
+        directory: `touch/` of the policy's folder, there or not.
+        name: `PolicyConfig.touch`.
+
+    Raises:
+        UserError: there is none.
+    """
+    if directory.is_dir():
+        return load_touch(directory)
+    for shipped in map(pretrained.find_encoder, pretrained.encoder_names()):
+        if _digest(shipped) in name:
+            return load_touch(shipped)
+    raise UserError(f"no touch encoder {name} in {directory}, and none like it ships: train again")
+
+
+def _digest(directory: Path) -> str:
+    weights = pretrained.ENCODER_FORMAT.weights_path(directory).read_bytes()
+    return hashlib.sha256(weights).hexdigest()[:12]
