@@ -257,8 +257,9 @@ class TacbenchOptions(BenchmarkOptions):
     """T1, the force on the pad; T1A, the field of forces over it; T2, whether it slips; T3, how the pose of a held
     object changes; T4, whether a grasp will hold; T6, which cloth it is."""
     encoders: Annotated[tuple[str, ...], Field(min_length=1)] = (
+        "gelsight_mini_markers_mae",
         "gelsight_mini_markers",
-        "random:gelsight_mini_markers",
+        "random:gelsight_mini_markers_mae",
         "end-to-end:compact",
     )
     """Touch encoders with a ViT, frozen, by name or folder, or published Sparsh ones by file or id

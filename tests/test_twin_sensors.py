@@ -18,6 +18,7 @@ from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.twin import control_port
 from touchgoal.sim_envs.twin.cell import SimulatedCell
 from touchgoal.sim_envs.twin.in_process import SimulatedArm
+from touchgoal.sim_envs.twin.mjpeg import Stream
 from touchgoal.sim_envs.twin.pace import Pace
 
 pytestmark = pytest.mark.realtime
@@ -170,3 +171,11 @@ def test_pace_is_of_whole_seconds_in_which_a_client_drives(monkeypatch: pytest.M
     assert numbers["seconds"] == 2
     assert numbers["pace_median"] == pytest.approx(0.5) == numbers["pace_slowest"]
     assert numbers["processor_pictures"] == pytest.approx(0.2)
+
+
+def test_streams_that_have_sent_as_many_pictures_are_told_apart() -> None:
+    """As when the clients of two cameras come at once: the process that takes pictures ended by it."""
+    streams = [Stream(clients=1) for _ in range(2)]
+    for stream in streams:
+        stream.publish(np.zeros((4, 4, 3), np.uint8))
+    assert streams[1] in streams and streams[1] not in streams[:1]

@@ -17,7 +17,7 @@ _POLL_INTERVAL = 0.2  # s between looks at whether the stream is to end
 Picture = UInt8[np.ndarray, "h w 3"]
 
 
-@dataclass
+@dataclass(eq=False)
 class Stream:
     """One source of pictures.
 
