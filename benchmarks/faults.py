@@ -80,7 +80,7 @@ CASES = (
     FaultCase("policy: not a number", policy="nan"),
     FaultCase("policy hangs", policy="hangs"),
     FaultCase("joint limit ahead", policy="outwards"),
-    FaultCase("force ceiling met", "nudge 0 22 0 3"),
+    FaultCase("force ceiling met", "nudge 0 29 0 3"),
     FaultCase("contact reflex", "error cartesian_reflex"),
     FaultCase("user stop", "stop-button on"),
     FaultCase("deploy killed (-9)", kills=True),

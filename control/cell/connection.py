@@ -37,6 +37,7 @@ from touchgoal.control.tactile.sensor_models import find_sensor
 
 # Hz, and s without a picture, on the wall: what a machine however loaded still manages.
 _LOCK_STEP_RATE, _LOCK_STEP_TIMEOUT = 0.1, 10.0
+_TWIN_RATE = 25.0  # pictures of a twin in a second of its time, at least
 _STOP_FACTOR = 5  # times the age at which the arm holds
 _CLOCK_TIMEOUT = 1.0  # s on the wall for which an arm's clock may stand
 _POLL_INTERVAL = 0.002  # s between looks at it
@@ -259,4 +260,10 @@ def _timed(config: VideoConfig, cell: CellConfig) -> VideoConfig:
     """Pictures of a lock-step twin come when they come."""
     if not cell.lock_step:
         return config
-    return replace(config, rate=_LOCK_STEP_RATE, timeout=_LOCK_STEP_TIMEOUT, frozen_after=np.inf)
+    return replace(
+        config,
+        rate=_LOCK_STEP_RATE,
+        timeout=_LOCK_STEP_TIMEOUT,
+        frozen_after=0.0,
+        frozen_pictures=round(config.frozen_after * _TWIN_RATE),
+    )

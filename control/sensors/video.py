@@ -47,6 +47,8 @@ class VideoConfig:
         frozen_after: s of pixel-for-pixel the same picture, or part of it, after which it counts as
             old. Sensor noise makes real pictures differ; rendered ones may rightly stand still: then
             infinity.
+        frozen_pictures: how many in a row must be the same besides: of a lock-step twin, whose time is not
+            the one on the wall.
         gel: whether it is a fingertip's, whose pictures are smooth but for its dots: broken ones show.
         dots: diameter of its printed dots as a share of the picture's diagonal; 0: it has none.
         device: finds the camera's device whenever it is opened, when `source` is a serial number.
@@ -59,6 +61,7 @@ class VideoConfig:
     white_balance: int | None = None
     timeout: float = 1.0
     frozen_after: float = 0.5
+    frozen_pictures: int = 0
     gel: bool = False
     dots: float = 0.0
     device: Callable[[], str] | None = None
@@ -90,6 +93,7 @@ class VideoCamera:
         self._image: np.ndarray | None = None
         self._next_frame_at = time.monotonic()
         self._frozen_parts, self._decoder = FrozenParts(), JpegDecoder()
+        self._same, self._frozen = 0, False  # pictures in a row of which some part was as before
         self._lost = self._refused = ""
         self._latest = LatestValue(f"camera {config.source}", self._take)
 
@@ -108,7 +112,7 @@ class VideoCamera:
             return f"{self.config.source} {self._lost}"
         if self._refused:
             return f"{self.config.source} {self._refused}"
-        if self._grab_times[-1] - frame.stamp > self.config.frozen_after:
+        if self._frozen:
             return f"{self.config.source} or a part of it shows one picture for {now - frame.stamp:.1f} s"
         if now - frame.stamp > _LATE_PERIODS / self.config.rate:
             return f"{self.config.source} gave its last frame {now - frame.stamp:.2f} s ago"
@@ -142,8 +146,12 @@ class VideoCamera:
             self._grab_times.popleft()
         self._image = image
         same_since = self._frozen_parts.update(image, stamp)
-        frozen = stamp - same_since > self.config.frozen_after
-        return Frame(image, self._count, same_since if frozen else stamp)
+        self._same = self._same + 1 if same_since < stamp else 0
+        self._frozen = (
+            stamp - same_since > self.config.frozen_after
+            and self._same > self.config.frozen_pictures
+        )
+        return Frame(image, self._count, same_since if self._frozen else stamp)
 
     def _checked(self, image: np.ndarray) -> np.ndarray | None:
         """RGB of what was grabbed, a JPEG or BGR; None if it is not to be believed."""
