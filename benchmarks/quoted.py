@@ -119,9 +119,29 @@ QUOTED = {
         "the shipped policy through libfranka's protocol, on fresh twins in real time",
         _deployed,
     ),
-    "deploy-lock-step": Quoted(
-        "touchgoal benchmark deploy --tasks pick-place --policies shipped --arms lock-step --episodes 40",
+    "deploy-pick-place": Quoted(
+        "touchgoal benchmark deploy --tasks pick-place --policies shipped --arms environment in-process "
+        "lock-step --episodes 40 --seed 7000000",
+        headline=_deployed,
     ),
+    "deploy-bead-maze": Quoted(
+        "touchgoal benchmark deploy --tasks bead-maze --policies shipped --arms environment in-process "
+        "lock-step --episodes 40 --seed 7000000",
+        headline=_deployed,
+    ),
+    "deploy-maze-real-time": Quoted(
+        "touchgoal benchmark deploy --tasks bead-maze --policies shipped --arms real-time --episodes 20 "
+        "--seed 7000000",
+        headline=_deployed,
+    ),
+    "deploy-scripted": Quoted(
+        "touchgoal benchmark deploy --policies scripted --arms lock-step --episodes 20 --seed 7000000",
+        headline=_deployed,
+    ),
+    "deploy-in-a-row": Quoted("touchgoal benchmark deploy --policies shipped --in-a-row 20"),
+    "policy-delay": Quoted("touchgoal benchmark policy-delay"),
+    "policy-delay-causes": Quoted("touchgoal benchmark policy-delay --causes"),
+    "maze-delay-causes": Quoted("touchgoal benchmark policy-delay --task bead-maze --causes"),
     "sent-stream": Quoted("touchgoal benchmark sent-stream"),
     "replay": Quoted("touchgoal benchmark replay"),
     "maze": Quoted(
