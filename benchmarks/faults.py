@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import resource
 import signal
+import sys
 import tempfile
 import threading
 import time
@@ -123,7 +124,7 @@ def run(config: FaultsOptions) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         for i, case in enumerate(cases):
             rows.append(_run(case, Path(folder) / str(i), config.lock_step, i))
-            print(_line(rows[-1]), flush=True)
+            print(_line(rows[-1]), file=sys.stderr, flush=True)
     return {"table": _table(rows), "rows": [vars(row) for row in rows]}
 
 

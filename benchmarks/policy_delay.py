@@ -4,6 +4,7 @@ The arm is as deployed otherwise: `--env.as-deployed` with other delays. With `c
 is put in by itself, and left out by itself. The same seeds in every row.
 """
 
+import sys
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from typing import Any
@@ -40,7 +41,7 @@ def run(config: PolicyDelayOptions) -> dict[str, Any]:
         trials = _trials(config, as_deployed, between)
         peak = max(trial.peak_force for trial in trials)
         lines.append(f"{what:<40}{Evaluation(trials)!s:<24}{peak:>7.0f}")
-        print(lines[-1], flush=True)
+        print(lines[-1], file=sys.stderr, flush=True)
         rows.append({"what": what, "trials": [asdict(trial) for trial in trials]})
     return {"table": "\n".join(lines), "rows": rows}
 

@@ -134,14 +134,8 @@ QUOTED = {
         "--seed 7000000",
         headline=_deployed,
     ),
-    "deploy-scripted": Quoted(
-        "touchgoal benchmark deploy --policies scripted --arms lock-step --episodes 20 --seed 7000000",
-        headline=_deployed,
-    ),
     "deploy-in-a-row": Quoted("touchgoal benchmark deploy --policies shipped --in-a-row 20"),
     "policy-delay": Quoted("touchgoal benchmark policy-delay"),
-    "policy-delay-causes": Quoted("touchgoal benchmark policy-delay --causes"),
-    "maze-delay-causes": Quoted("touchgoal benchmark policy-delay --task bead-maze --causes"),
     "sent-stream": Quoted("touchgoal benchmark sent-stream"),
     "replay": Quoted("touchgoal benchmark replay"),
     "maze": Quoted(
