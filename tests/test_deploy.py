@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -86,10 +86,9 @@ def test_the_shipped_policy_leads_a_bead_on_the_twin(tmp_path: Path) -> None:
     pytest.importorskip("franky", reason=FRANKY.install)
     cell = ["--lock-step", "--task", "bead-maze", "--env.wires", "helix-3"]
     small = ["--env.cameras", "front", "--env.camera-size", "128", "128"]
-    twin = RunningTwin([*cell, *small], tmp_path, 3)
-    _, complaint = deploying(twin, tmp_path).communicate(timeout=_PATIENCE)
-    worst = twin.ask("truth")["worst"]
-    twin.close()
+    with closing(RunningTwin([*cell, *small], tmp_path, 3)) as twin:
+        _, complaint = deploying(twin, tmp_path).communicate(timeout=_PATIENCE)
+        worst = twin.ask("truth")["worst"]
     assert complaint == "" and worst["excess"] == 0 and worst["speed"] < 1
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["success"]
     assert touch_comes_nearer(tmp_path)

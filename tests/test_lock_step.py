@@ -2,6 +2,7 @@
 
 import json
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -58,19 +59,18 @@ def swing(cell: CellConfig, pause: float) -> list[np.ndarray]:
 def test_a_lock_step_twin_gives_the_same_run_to_the_last_bit(tmp_path: Path) -> None:
     """Its time stands but while the deployment waits; afterwards it goes on by itself."""
     pytest.importorskip("franky", reason=FRANKY.install)
-    twin = RunningTwin(["--lock-step", *_SMALL, "--seed", "3"], tmp_path, 4)
-    first = swing(twin.cell, 0.0)
-    states = [seen for seen in first if seen.ndim == 1]
-    assert states[-1][0] - states[0][0] > 0.05 and states[-1][-1] < 0.07
-    assert states[-1][-2] == pytest.approx(_TICKS / ft.CONTROL_HZ)
-    again = swing(twin.cell, 0.1)
-    assert len(first) == len(again)
-    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
-    left_at = twin.ask("truth")["time"]
-    time.sleep(0.1)
-    assert twin.ask("truth")["time"] > left_at
-    assert _ages_of_a_frozen_camera(twin) == pytest.approx([0.0, 1.0], abs=0.1)
-    twin.close()
+    with closing(RunningTwin(["--lock-step", *_SMALL, "--seed", "3"], tmp_path, 4)) as twin:
+        first = swing(twin.cell, 0.0)
+        states = [seen for seen in first if seen.ndim == 1]
+        assert states[-1][0] - states[0][0] > 0.05 and states[-1][-1] < 0.07
+        assert states[-1][-2] == pytest.approx(_TICKS / ft.CONTROL_HZ)
+        again = swing(twin.cell, 0.1)
+        assert len(first) == len(again)
+        assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+        left_at = twin.ask("truth")["time"]
+        time.sleep(0.1)
+        assert twin.ask("truth")["time"] > left_at
+        assert _ages_of_a_frozen_camera(twin) == pytest.approx([0.0, 1.0], abs=0.1)
 
 
 def _ages_of_a_frozen_camera(twin: RunningTwin) -> list[float]:
