@@ -35,12 +35,12 @@ _PARTS = {
 def run(config: PolicyDelayOptions) -> dict[str, Any]:
     """Success by delay, jitter and picture rate, or by cause; `table` and the trials behind it."""
     cases = _causes() if config.causes else _delays(config)
-    lines = [f"{'':<40}{'success [95 % Wilson]':<24}{'peak N':>7}"]
+    lines = [f"{'':<46}{'success [95 % Wilson]':<24}{'peak N':>7}"]
     rows = []
     for what, as_deployed, between in cases:
         trials = _trials(config, as_deployed, between)
         peak = max(trial.peak_force for trial in trials)
-        lines.append(f"{what:<40}{Evaluation(trials)!s:<24}{peak:>7.0f}")
+        lines.append(f"{what:<46}{Evaluation(trials)!s:<24}{peak:>7.0f}")
         print(lines[-1], file=sys.stderr, flush=True)
         rows.append({"what": what, "trials": [asdict(trial) for trial in trials]})
     return {"table": "\n".join(lines), "rows": rows}

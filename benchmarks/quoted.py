@@ -136,6 +136,7 @@ QUOTED = {
     ),
     "deploy-in-a-row": Quoted("touchgoal benchmark deploy --policies shipped --in-a-row 20"),
     "policy-delay": Quoted("touchgoal benchmark policy-delay"),
+    "policy-delay-causes": Quoted("touchgoal benchmark policy-delay --causes"),
     "sent-stream": Quoted("touchgoal benchmark sent-stream"),
     "replay": Quoted("touchgoal benchmark replay"),
     "maze": Quoted(
