@@ -24,12 +24,12 @@ class KeptDeployments:
         self._code = {key: said[key] for key in ("touchgoal", "commit", "dirty")}
         self._file = None if folder is None else folder / "deployments.jsonl"
         self._found: dict[_Key, Deployment] = {}
-        if self._file is None or said["dirty"] or not self._file.exists():
+        if self._file is None or not self._file.exists():
             return
         whole = [line for line in self._file.read_text().splitlines(True) if line.endswith("\n")]
         self._file.write_text("".join(whole))  # without what was being written when it was stopped
         for kept in map(json.loads, whole):
-            if kept.pop("code") == self._code:
+            if kept.pop("code") == self._code and not said["dirty"]:
                 self._remember(Deployment(**kept))
 
     def find(self, scene: Scene, policy: str, arm: str) -> Deployment | None:

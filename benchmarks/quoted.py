@@ -122,12 +122,10 @@ QUOTED = {
     "deploy-pick-place": Quoted(
         "touchgoal benchmark deploy --tasks pick-place --policies shipped --arms environment in-process "
         "lock-step --episodes 40 --seed 7000000",
-        headline=_deployed,
     ),
     "deploy-bead-maze": Quoted(
         "touchgoal benchmark deploy --tasks bead-maze --policies shipped --arms environment in-process "
         "lock-step --episodes 40 --seed 7000000",
-        headline=_deployed,
     ),
     "deploy-maze-real-time": Quoted(
         "touchgoal benchmark deploy --tasks bead-maze --policies shipped --arms real-time --episodes 20 "

@@ -17,7 +17,6 @@ from touchgoal.rewards.embedding_distance import (
     EmbeddedEpisode,
     EmbeddedGoal,
     EpisodeEmbedder,
-    check_words,
     compute_curves,
 )
 from touchgoal.rewards.goals import GoalSpec, assign_goals
@@ -54,7 +53,6 @@ class CostMeter:
             goals: each modality takes the first that speaks for it; what none speaks for is left
                 out. Frames of the episode itself are not known yet and cannot be goals.
         """
-        check_words(goals, encoder)
         self._normalizer, self._goals = normalizer, goals
         self._embedder = EpisodeEmbedder(towers, encoder)
         self._goal: EmbeddedGoal | None = None

@@ -81,7 +81,7 @@ def _swing(arm: ArmProcess, hand: FrankaHand, tolerance: float) -> tuple[dict[st
     arrived = _distance(arm.read(), q)
     arm.stop()
     _wait(arm, _REST)
-    # Their last joint trembles: its velocity says 0.08 rad/s, to and fro within 0.1 mrad.
+    # Their last joint trembles: its velocity says 0.08 rad/s where the arm stands.
     stopped = arm.read().q
     _wait(arm, _REST / 4)
     found = {
