@@ -341,7 +341,7 @@ class TouchProbesOptions(BenchmarkOptions):
     encoder: str = "gelsight_mini_surfaces"
     """Encoder whose network is probed: one of `train-encoder surfaces`, or one with a ViT, by name or folder; or a
     published Sparsh one by file or id."""
-    sensors: tuple[str, ...] = ("gelsight_mini_measured", "digit_measured", "gelsight")
+    sensors: tuple[str, ...] = ("gelsight_mini", "digit", "gelsight")
     """Sensors that are simulated, by name or folder of a sensor file."""
     presses: Annotated[int, Field(ge=24)] = 600
     """Presses simulated on each."""

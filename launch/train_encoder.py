@@ -129,7 +129,7 @@ class VJepaPaper(VJepa):
 class Surfaces:
     """Fit an ImageNet network to touch, on simulated presses of random surfaces: no episodes needed."""
 
-    sensor: str = "gelsight_mini_measured"
+    sensor: str = "gelsight_mini"
     """Sensor that is simulated: a name, or the folder of a sensor file."""
     surfaces: Annotated[int, Field(ge=16)] = 5000
     """Random surfaces."""

@@ -179,7 +179,7 @@ def test_check_sensor_says_what_is_off(
     for i, frame in enumerate([*balls, *[balls[0]] * 90]):
         lit = np.rint(frame * (1 + 0.2 * min(i / 60, 1))).clip(0, 255)
         cv2.imwrite(str(pictures / f"{i:03d}.png"), lit.astype(np.uint8)[..., ::-1])
-    main(["check-sensor", str(pictures), "--sensor", "gelsight_mini_measured", "--ball-mm", "6",
+    main(["check-sensor", str(pictures), "--sensor", "gelsight_mini", "--ball-mm", "6",
           "--weight-g", "2000", "--out", str(tmp_path / "out")])  # fmt: skip
     said = capsys.readouterr().out
     assert "lock the exposure" in said and "record-presses" in said

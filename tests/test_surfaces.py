@@ -150,7 +150,7 @@ def test_an_indenter_presses_with_the_force_asked_for() -> None:
 
 
 def test_touch_probes_print_a_row_for_every_pair() -> None:
-    sensors = ("gelsight_mini_measured", "digit_measured")
+    sensors = ("gelsight_mini", "digit")
     result = run_probes(TouchProbesOptions(sensors=sensors, presses=36))
     assert len(result["rows"]) == 8 and len(result["table"].splitlines()) == 11
     own = result["rows"][0]

@@ -63,7 +63,7 @@ BEST_AGAINST_END_TO_END = {"force": 59.74, "slip": 242.70, "pose": 235.89, "gras
 
 def published(task: str, sensor: str) -> Published | None:
     """The table of a task: of this sensor, if there is one, else the only one there is."""
-    kind = sensor.removesuffix("_markers").removesuffix("_measured")
+    kind = sensor.removesuffix("_markers")
     own = [t for t in PAPER if t.task == task and t.sensor == kind]
     others = [t for t in PAPER if t.task == task]
     return own[0] if own else others[0] if len(others) == 1 else None

@@ -66,8 +66,9 @@ class SensorModel:
 
 _FILES = Path(__file__).parent / "sensor_files"
 
-# Image: the SDK's 320x240 crop; 0.059 mm/px is Tactile-MNIST's 18.88 x 14.16 mm and Taxim's Mini
-# (the datasheet says 18.6 x 14.3; other sources up to 22.9 x 17.1: calibrate your own).
+# Image: the SDK's 320x240 crop. Sensor file and 0.0634 mm/px: one unit fitted to 46 presses of two balls
+# of known radius (GelSLAM), so depths in millimetres hold on it. Other sources range from 0.058 (the
+# datasheet's 18.6 x 14.3 mm) to 0.071 (22.9 x 17.1): calibrate your own.
 # Gel 25.4 x 20.9 x 4.0 mm: FEATS STEP file. Case 32.5 x 28.5 x 28.3 mm: GelSight STEP file.
 # Shear modulus: FEATS' Neo-Hooke fit, 2 C10 = 0.145 MPa.
 # Foundation modulus: a bonded, nearly incompressible 4 mm layer of E = 0.44 MPa (the same fit) is
@@ -77,7 +78,7 @@ _FILES = Path(__file__).parent / "sensor_files"
 GELSIGHT_MINI = SensorModel(
     name="gelsight_mini",
     image_shape=(240, 320),
-    pixel_pitch=0.059e-3,
+    pixel_pitch=0.0634e-3,
     pitch_range=(0.058e-3, 0.071e-3),
     gel_size=(25.4e-3, 20.9e-3),
     gel_thickness=4.0e-3,
@@ -90,19 +91,12 @@ GELSIGHT_MINI = SensorModel(
     sensor_file=_FILES / "gelsight_mini",
 )
 
-# The same model, one unit of it fitted to 46 presses of two balls of known radius (GelSLAM): depths in
-# millimetres hold on it. `GELSIGHT_MINI` stays what encoders and policies are trained on.
-GELSIGHT_MINI_MEASURED = replace(
-    GELSIGHT_MINI,
-    pixel_pitch=0.0634e-3,
-    sensor_file=_FILES / "gelsight_mini_measured",
-)
-
-# 63 dots found in three real pictures: pitch 31.4-32.5 px, diameter 14-18 px of 320.
+# 63 dots found in three real pictures: pitch 31.4-32.5 px, diameter 14-18 px of 320, round figures
+# in millimetres at the scale above.
 GELSIGHT_MINI_MARKERS = replace(
     GELSIGHT_MINI,
     name="gelsight_mini_markers",
-    markers=MarkerGrid(rows=7, columns=9, pitch=1.88e-3, diameter=0.94e-3),
+    markers=MarkerGrid(rows=7, columns=9, pitch=2.0e-3, diameter=1.0e-3),
 )
 
 # The bench sensor of the Taxim paper: 0.0295 mm/px at 640x480, here at half of that. Its gel's
@@ -112,6 +106,7 @@ GELSIGHT_MINI_MARKERS = replace(
 GELSIGHT = replace(
     GELSIGHT_MINI,
     name="gelsight",
+    pixel_pitch=0.059e-3,
     pitch_range=(0.051e-3, 0.063e-3),
     gel_size=(25.0e-3, 25.0e-3),
     sensor_file=_FILES / "gelsight",
@@ -122,14 +117,15 @@ GELSIGHT_MARKERS = replace(
     markers=MarkerGrid(rows=9, columns=11, pitch=1.4e-3, diameter=0.7e-3),
 )
 
-# Image: QVGA at 60 Hz, upright as digit-interface returns it. Scale 0.0511 mm/px: FOTS; sources
-# range from 0.0405 (gs_sdk, at VGA) to 0.0667 (a 16 x 19 mm sensing field). Case 32.3 x 27 x 34 mm:
+# Image: QVGA at 60 Hz, upright as digit-interface returns it. Sensor file: one unit fitted to 20 presses
+# of one ball (FOTS); ball (3 mm) and scale are assumed, neither is stated and pictures do not tell. Sources
+# range from 0.0405 (gs_sdk, at VGA) over 0.0511 (FOTS) to 0.0667 (a 16 x 19 mm sensing field). Case 32.3 x 27 x 34 mm:
 # its STL. Gel 20 x 30 mm: TACTO, which also bends it by 5 mm (R 100 mm); flat here.
 # Thickness and moduli are not published: a third thinner than the Mini's, of the same silicone.
 DIGIT = SensorModel(
     name="digit",
     image_shape=(320, 240),
-    pixel_pitch=0.0511e-3,
+    pixel_pitch=0.047e-3,
     pitch_range=(0.0405e-3, 0.0667e-3),
     gel_size=(20.0e-3, 30.0e-3),
     gel_thickness=2.7e-3,
@@ -142,18 +138,10 @@ DIGIT = SensorModel(
     sensor_file=_FILES / "digit",
 )
 
-# The same model, one unit of it fitted to 20 presses of one ball (FOTS). Ball (3 mm) and scale are
-# assumed: neither is stated, and pictures do not tell.
-DIGIT_MEASURED = replace(
-    DIGIT,
-    pixel_pitch=0.047e-3,
-    sensor_file=_FILES / "digit_measured",
-)
-
 SENSORS = {
     sensor.name: sensor
     for sensor in (GELSIGHT_MINI, GELSIGHT_MINI_MARKERS, GELSIGHT, GELSIGHT_MARKERS, DIGIT)
-} | {"gelsight_mini_measured": GELSIGHT_MINI_MEASURED, "digit_measured": DIGIT_MEASURED}
+}
 
 
 def find_sensor(name: str) -> SensorModel:
