@@ -35,6 +35,9 @@ class Config:
     touch: Annotated[Path | None, RARE] = None
     """Run folder of a new touch encoder (the maze), or of a state estimator (pick-place), in place of the
     shipped one: after the pads have changed."""
+    learn_touch: bool = False
+    """The maze: first learn a touch encoder from the demonstrations, without labels; after the pads have
+    changed. Otherwise it feels with the shipped one."""
     resume: bool = False
     """Go on with an interrupted run in `out`."""
     workers: Count = os.cpu_count() or 1

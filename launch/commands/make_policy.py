@@ -35,6 +35,8 @@ _VALIDATION = shlex.split(
 def run_command(config: Config) -> None:
     """Record, train, correct, train again, choose."""
     steps = _pick_place if config.task == "pick-place" else _bead_maze
+    if config.learn_touch and (config.touch or config.task == "pick-place"):
+        raise UserError("--learn-touch goes with --task bead-maze and without --touch")
     if config.resume and config.out is None:
         raise UserError("to go on with a run, name its folder with --out")
     out = open_run(config.out, "make-policy", config, adds=config.resume)
@@ -94,7 +96,8 @@ def _bead_maze(config: Config, out: Path) -> list[list[str]]:
 
     It sees four ticks: with two it led the bead less often on validation wires.
     """
-    encoder = str(config.touch / "encoder") if config.touch else _MAZE_TOUCH
+    touch = out / "touch" if config.learn_touch else config.touch
+    encoder = str(touch / "encoder") if touch else _MAZE_TOUCH
     learn = shlex.split(
         "--representation body_twist --arm-state commanded --train.lr 1e-3 --env.start-angle 10"
     )
@@ -103,9 +106,12 @@ def _bead_maze(config: Config, out: Path) -> list[list[str]]:
     learn += ["--train.epochs", str(config.epochs or 5)]
     wired = [*_MAZE, *_DEPLOYED]
     many = config.demonstrations or 160
+    feel = ["train-encoder", "mae", *_data(out), "--frames", "45", "--mae.bottleneck"]
+    feel += ["--mae.epochs", "12", "--out", str(out / "touch")]
     return [
         _record(out / "val", max(1, many // 13), 20_000, [*_VALIDATION, *_DEPLOYED], config),
         _record(out / "train", many, 0, wired, config),
+        *([feel] if config.learn_touch else []),
         *_corrected(config, out, learn, [wired] * 3, 80),
     ]
 
@@ -114,8 +120,7 @@ def _corrected(
     config: Config, out: Path, options: list[str], envs: list[list[str]], episodes: int
 ) -> list[list[str]]:
     """Rounds of learning and correcting (DAgger), so many episodes each, and the last training."""
-    data = ["--data", str(out / "train/episodes"), "--validation", str(out / "val/episodes")]
-    learn = ["train-policy", *data, "--workers", str(config.workers)]
+    learn = ["train-policy", *_data(out), "--workers", str(config.workers)]
     steps = []
     for k, env in enumerate(envs[: config.rounds]):
         folder = out / f"round-{k + 1}"
@@ -125,6 +130,10 @@ def _corrected(
         steps.append(_record(out / "train", config.corrections or episodes, seed, acts, config))
     final = [*learn, *options, "--trials", str(config.trials), "--env.as-deployed"]
     return [*steps, [*final, "--out", str(out / "policy")]]
+
+
+def _data(out: Path) -> list[str]:
+    return ["--data", str(out / "train/episodes"), "--validation", str(out / "val/episodes")]
 
 
 def _record(
