@@ -15,7 +15,12 @@ import pytest
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError, TactileSensor
 from touchgoal.control.sensors.fingertip_source import fingertip_video, fingertip_view
-from touchgoal.control.sensors.pictures import FrozenParts, JpegDecoder, is_broken_gel
+from touchgoal.control.sensors.pictures import (
+    FrozenParts,
+    JpegDecoder,
+    gel_picture,
+    is_broken_gel,
+)
 from touchgoal.control.sensors.tactile_camera import (
     DIGIT_CROP,
     GELSIGHT_MINI_CROP,
@@ -186,14 +191,18 @@ def test_broken_jpegs_of_a_gel_are_refused_and_presses_of_a_real_one_are_not() -
     for k in range(100):
         data = cv2.imencode(".jpg", noisy(k), [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
         image = decoder.decode(damaged(data, 20, rng))
-        if image is not None and not is_broken_gel(image[..., ::-1], noisy(1000)):
+        if image is not None and not is_broken(image[..., ::-1], noisy(1000)):
             seen = cv2.blur(np.abs(image[..., ::-1].astype(np.float32) - GEL), (8, 8))
             passed += seen.max() > 20
     assert passed <= 5  # in 100 with visible damage; without the checks it is half
-    assert all(not is_broken_gel(noisy(k, 3.0), noisy(1000)) for k in range(20))
+    assert all(not is_broken(noisy(k, 3.0), noisy(1000)) for k in range(20))
     real = sorted(Path("/work/shared/data/mini_presses").glob("ball*.png"))
     pictures = [p for path in real if (p := cv2.imread(str(path))) is not None]
-    assert not any(is_broken_gel(p, pictures[0]) for p in pictures)
+    assert not any(is_broken(p, pictures[0]) for p in pictures)
+
+
+def is_broken(image: np.ndarray, before: np.ndarray, dots: float = 0.0) -> bool:
+    return is_broken_gel(gel_picture(image, dots), gel_picture(before, dots))
 
 
 def damaged(data: bytes, count: int, rng: np.random.Generator) -> bytes:
@@ -239,13 +248,13 @@ def test_broken_jpegs_of_a_gel_with_dots_are_refused_and_moving_dots_are_not() -
             whole = [decoder.decode(data) for data in sent]
             for before, image in itertools.pairwise(whole):
                 assert before is not None and image is not None
-                assert not is_broken_gel(image, before, dots)
+                assert not is_broken(image, before, dots)
         passed = 0
         for k in range(100):
             before, good = (decoder.decode(jpegs[95][(k + i) % len(clip)]) for i in (0, 1))
             image = decoder.decode(damaged(jpegs[95][(k + 1) % len(clip)], 20, rng))
             assert before is not None and good is not None
-            if image is not None and not is_broken_gel(image, before, dots):
+            if image is not None and not is_broken(image, before, dots):
                 passed += cv2.blur(np.abs(image.astype(np.float32) - good), (8, 8)).max() > 20
         assert passed <= 5  # in 100 with visible damage
 

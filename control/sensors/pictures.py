@@ -1,9 +1,12 @@
 """Whether a picture is what the camera saw: decoded without errors, whole, and new in all its parts."""
 
+from dataclasses import dataclass
+
 import av
 import cv2
 import numpy as np
 from av.error import FFmpegError
+from av.video.reformatter import VideoReformatter
 from jaxtyping import Bool, Float, Int16, UInt8
 
 Picture = UInt8[np.ndarray, "h w 3"]
@@ -32,6 +35,7 @@ class JpegDecoder:
         self._codec = av.CodecContext.create("mjpeg", "r")
         self._codec.options = {"err_detect": _STRICT}
         self._codec.thread_count = 1
+        self._reformatter = VideoReformatter()  # a new one starts and ends a thread per core
 
     def decode(self, data: bytes) -> Picture | None:
         """RGB picture; None if anything about it is broken, such as a cut end."""
@@ -41,22 +45,44 @@ class JpegDecoder:
             return None
         if not frames or frames[0].is_corrupt:
             return None
-        return frames[0].to_ndarray(format="rgb24")
+        return self._reformatter.reformat(frames[0], format="rgb24", threads=1).to_ndarray()
 
 
-def jumps_at_blocks(image: Picture, before: Picture, dots: float = 0.0) -> float:
+@dataclass(frozen=True)
+class GelPicture:
+    """A gel's picture.
+
+    Attributes:
+        image: RGB.
+        spots: where printed dots may be, and their rims; None: there are none.
+    """
+
+    image: Picture
+    spots: Bool[np.ndarray, "h w"] | None
+
+
+def gel_picture(image: Picture, dots: float = 0.0) -> GelPicture:
+    """A picture to be judged, or to judge the next one by.
+
+    Args:
+        image: RGB.
+        dots: diameter of printed dots as a share of the picture's diagonal; 0: there are none.
+    """
+    return GelPicture(image, _dark_spots(image, dots) if dots > 0 else None)
+
+
+def jumps_at_blocks(now: GelPicture, before: GelPicture) -> float:
     """By how many counts the change since `before` jumps more between JPEG's blocks than inside them.
 
     A decoder cannot see every wrong byte. It shows as blocks of another brightness, which a smooth
     gel never has: its real changes do not know where blocks end. Dots that move do look like such
     blocks: the change is looked at where neither picture has one.
-
-    Args:
-        image, before: RGB.
-        dots: diameter of printed dots as a share of the picture's diagonal; 0: there are none.
     """
-    change = cv2.transform(cv2.subtract(image, before, dtype=cv2.CV_16S), _ALL_CHANNELS)
-    clear = _clear_of_dots(image, before, dots) if dots > 0 else None
+    difference = cv2.subtract(now.image, before.image, dtype=cv2.CV_16S)
+    change = cv2.transform(difference, _ALL_CHANNELS)
+    clear = None
+    if now.spots is not None and before.spots is not None:
+        clear = ~(now.spots | before.spots)
     worst = 0.0
     for turned in (False, True):
         grey = np.ascontiguousarray(change.T) if turned else change
@@ -69,12 +95,9 @@ def jumps_at_blocks(image: Picture, before: Picture, dots: float = 0.0) -> float
     return worst / (3 * _BLOCK)
 
 
-def is_broken_gel(image: Picture, before: Picture, dots: float = 0.0) -> bool:
-    """Whether a gel's picture came through a broken JPEG, judged by the last good one.
-
-    Arguments: see `jumps_at_blocks`.
-    """
-    return jumps_at_blocks(image, before, dots) > _SMOOTH
+def is_broken_gel(now: GelPicture, before: GelPicture) -> bool:
+    """Whether a gel's picture came through a broken JPEG, judged by the last good one."""
+    return jumps_at_blocks(now, before) > _SMOOTH
 
 
 class FrozenParts:
@@ -112,23 +135,21 @@ def _differs(image: Picture, before: Picture) -> Bool[np.ndarray, " bands"]:
     return np.array([band.any() for band in np.array_split(rows, _BANDS)])
 
 
-def _clear_of_dots(image: Picture, before: Picture, dots: float) -> Bool[np.ndarray, "h w"]:
-    """Where neither picture has a spot that is darker than around it and no larger than a dot."""
+def _dark_spots(image: Picture, dots: float) -> Bool[np.ndarray, "h w"]:
+    """Spots that are darker than around them and no larger than a dot, and their rims."""
     height, width = image.shape[:2]
     diameter = dots * float(np.hypot(height, width))
     scale = min(1.0, _DOT / diameter)
     size = round(width * scale), round(height * scale)
-    small = [
-        cv2.cvtColor(cv2.resize(x, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
-        for x in (image, before)
-    ]
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     widest = int(_WIDER * diameter * scale) | 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (widest, widest))
-    darker = _DARKER * float(np.median(small[1]))
-    spots = np.maximum(*(cv2.morphologyEx(grey, cv2.MORPH_BLACKHAT, disc) for grey in small))
+    spots = cv2.morphologyEx(grey, cv2.MORPH_BLACKHAT, disc) > _DARKER * float(np.median(grey))
     rim = 2 * round(_RIM * diameter * scale) + 1
-    spotted = cv2.dilate((spots > darker).astype(np.uint8), np.ones((rim, rim), np.uint8))
-    return cv2.resize(spotted, (width, height), interpolation=cv2.INTER_NEAREST) == 0
+    spotted = cv2.dilate(spots.astype(np.uint8), np.ones((rim, rim), np.uint8))
+    whole = cv2.resize(spotted, (width, height), interpolation=cv2.INTER_NEAREST)
+    return whole.view(np.bool_)
 
 
 def _steps(

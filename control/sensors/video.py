@@ -18,7 +18,13 @@ import numpy as np
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import Frame
 from touchgoal.control.sensors.latest_value import LatestValue
-from touchgoal.control.sensors.pictures import FrozenParts, JpegDecoder, is_broken_gel
+from touchgoal.control.sensors.pictures import (
+    FrozenParts,
+    GelPicture,
+    JpegDecoder,
+    gel_picture,
+    is_broken_gel,
+)
 
 # A lost stream is told in `problem`; what the libraries print about it would tear a live view apart.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
@@ -91,6 +97,7 @@ class VideoCamera:
         self._capture = _open(config, _OPEN_TIMEOUT)
         self._count, self._grab_times = 0, deque[float]()
         self._image: np.ndarray | None = None
+        self._gel: GelPicture | None = None
         self._next_frame_at = time.monotonic()
         self._frozen_parts, self._decoder = FrozenParts(), JpegDecoder()
         self._same, self._frozen = 0, False  # pictures in a row of which some part was as before
@@ -166,15 +173,20 @@ class VideoCamera:
             was, now = (f"{x.shape[1]}x{x.shape[0]}" for x in (before, decoded))
             self._refused = f"sends {now} pixels instead of {was}: another camera, or set anew?"
             return None
-        elif before is not None and self._is_broken_gel(decoded, before):
+        elif self.config.gel and self._is_broken_gel(decoded):
             self._refused = "sends broken pictures: check its cable"
             return None
         else:
             self._refused = ""
         return decoded
 
-    def _is_broken_gel(self, image: np.ndarray, before: np.ndarray) -> bool:
-        return self.config.gel and is_broken_gel(image, before, self.config.dots)
+    def _is_broken_gel(self, image: np.ndarray) -> bool:
+        """As against the last good one, whose place it takes if it is whole."""
+        now, before = gel_picture(image, self.config.dots), self._gel
+        if before is not None and is_broken_gel(now, before):
+            return True
+        self._gel = now
+        return False
 
     def _wait_for_turn(self) -> None:
         self._next_frame_at = max(
