@@ -46,6 +46,10 @@ class Pictures:
         if env.config.tactile:
             names = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.TACTILE]
             self.rates |= dict.fromkeys(names, round(env.sensor.frame_rate))
+        self._due = [
+            tuple(name for name, rate in self.rates.items() if _is_due(step, rate))
+            for step in range(1000)
+        ]
         self._progress = Progress(dict.fromkeys(self.rates, 0), 0.0)
         self._unanswered = 0
         self._pipe, theirs = Pipe()
@@ -71,8 +75,7 @@ class Pictures:
 
     def send(self) -> None:
         """Have the pictures taken that are due."""
-        steps = self._cell.steps
-        due = tuple(name for name, rate in self.rates.items() if _is_due(steps, rate))
+        due = self._due[self._cell.steps % 1000]
         if due:
             env = self._cell.env
             env.update_contacts()  # watched or not: watching must not change the physics
@@ -153,4 +156,4 @@ def _ended() -> UserError:
 
 def _is_due(steps: int, rate: int) -> bool:
     """Whether something at `rate` Hz is due in this millisecond."""
-    return steps * rate // 1000 > (steps - 1) * rate // 1000
+    return steps * rate % 1000 < rate
