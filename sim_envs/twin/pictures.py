@@ -20,7 +20,7 @@ from touchgoal.sim_envs.twin.picture_process import (
     Scene,
 )
 
-CAMERA_RATE = 30  # Hz, a webcam's
+CAMERA_RATE = 25  # Hz, as fingertips: more than a policy looks
 _START_TIMEOUT, _ANSWER_TIMEOUT, _END_TIMEOUT = 120.0, 60.0, 5.0  # s, on a machine however loaded
 _MOST_BEHIND = 2  # moments that wait to be taken, in real time; then some are left out
 _PROGRAM = "from touchgoal.sim_envs.twin.picture_process import main; main()"
@@ -42,10 +42,11 @@ class Pictures:
         self.held = False
         self.taken = self.left_out = 0
         env = cell.env
-        self.rates = dict.fromkeys(env.config.cameras, CAMERA_RATE)
-        if env.config.tactile:
+        self.rates: dict[str, int] = {}
+        if env.config.tactile:  # first: what is drawn later is later on its way
             names = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.TACTILE]
             self.rates |= dict.fromkeys(names, round(env.sensor.frame_rate))
+        self.rates |= dict.fromkeys(env.config.cameras, CAMERA_RATE)
         self._due = [
             tuple(name for name, rate in self.rates.items() if _is_due(step, rate))
             for step in range(1000)
