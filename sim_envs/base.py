@@ -235,7 +235,9 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
 
     def width(self) -> float:
         """Of the gripper, m."""
-        return float(self.data.qpos[self._fingers].sum())
+        left, right = self._fingers
+        positions = self.data.qpos
+        return float(positions[left] + positions[right])
 
     def width_target(self) -> float:
         """Where the gripper has been sent, m."""
@@ -284,8 +286,8 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
         self.model = model = self.scene(self.config).compile()
         self.data = mujoco.MjData(model)
         joints = [model.joint(name) for name in arm_joints(self.config.arm)]
-        self.arm_positions = [joint.qposadr[0] for joint in joints]
-        self.arm_dofs = [joint.dofadr[0] for joint in joints]
+        self.arm_positions = np.array([joint.qposadr[0] for joint in joints])
+        self.arm_dofs = np.array([joint.dofadr[0] for joint in joints])
         self._fingers = [model.joint(f"finger_joint{i}").qposadr[0] for i in (1, 2)]
         self._gripper = model.actuator("gripper").id
         self._finger_stiffness = float(model.actuator_gainprm[self._gripper, 0])

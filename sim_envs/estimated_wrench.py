@@ -1,5 +1,7 @@
 """The force on the hand as a real arm estimates it from its joint torques."""
 
+from functools import cache
+
 import numpy as np
 from jaxtyping import Float
 
@@ -25,14 +27,13 @@ class WrenchError:
 
     def update(self, seconds: float) -> None:
         """So long after the last time."""
-        keep = np.exp(-seconds / _WANDER_TIME)
-        self._wandering = keep * self._wandering + np.sqrt(1 - keep**2) * self._rng.normal(
-            0, _WANDER
-        )
+        keep, new = _wandering(seconds)
+        noise = _WANDER * self._rng.standard_normal(6)
+        self._wandering = keep * self._wandering + new * noise
 
     def read(self) -> Wrench:
         """By how much the next reading is wrong (N, N m)."""
-        return self._bias + self._wandering + self._rng.normal(0, _NOISE)
+        return self._bias + self._wandering + _NOISE * self._rng.standard_normal(6)
 
 
 class EstimatedWrench:
@@ -50,3 +51,10 @@ class EstimatedWrench:
     def read(self) -> Wrench:
         """The estimate (N, N m)."""
         return self._filtered + self._error.read()
+
+
+@cache
+def _wandering(seconds: float) -> tuple[float, float]:
+    """How much of what drifts is kept after a while, and how much is new."""
+    keep = float(np.exp(-seconds / _WANDER_TIME))
+    return keep, float(np.sqrt(1 - keep**2))

@@ -14,10 +14,17 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from touchgoal.control.tactile.background import cosines
+from touchgoal.control.tactile.depth_steps import (
+    add_against_slopes,
+    best_slopes,
+    conjugate_gradients,
+    normal_equations,
+    shading,
+    slopes,
+)
 from touchgoal.control.tactile.sensor_calibration import (
     SensorCalibration,
     illumination,
-    monomials,
     shadows,
 )
 
@@ -116,6 +123,9 @@ class _Level:
         # As products, cosine transforms of these sizes are faster than cv2.dct.
         self._down, self._across = cosines(h, h), cosines(w, w)
         down, across = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in (h, w))
+        self._half = np.float32(0.5 / self._pitch)
+        lengths = np.linspace(0, p.max_slope, _LENGTHS + 2)[1:-1]
+        self._lengths = lengths.astype(np.float32)
         self._laplace = ((down[:, None] + across) / self._pitch**2).astype(np.float32)
 
     def refine(
@@ -146,7 +156,8 @@ class _Level:
 
     def _linearise(self, seen: Colours, surface: Map, search: bool) -> _Linear:
         p = self._calibration
-        gx, gy = self._slopes(surface)
+        gx, gy = np.empty_like(surface), np.empty_like(surface)
+        slopes(surface, self._half, gx, gy)
         dark = shadows(p, surface, self._pitch)
         # What shadows and depth leave for the slopes to explain.
         left = seen - self._per_depth * np.minimum(surface, np.float32(p.max_depth))
@@ -165,113 +176,40 @@ class _Level:
 
     def _shading(self, gx: Map, gy: Map) -> tuple[Colours, Colours, Colours]:
         """What slopes add to the picture, and the derivatives of that by gx and gy."""
-        p = self._calibration
-        square = gx * gx + gy * gy
-        steep = square > (1 + square) * np.float32(p.max_slope**2)
-        # n = -g / length; beyond `max_slope` only the direction of g counts.
-        squared = np.where(steep, square / np.float32(p.max_slope**2), 1 + square)
-        bend = np.where(steep, 1 / np.maximum(square, 1e-6), 1 / squared)
-        inverse = -1 / np.sqrt(squared)
-        terms = self._coefficients @ _terms(gx * inverse, gy * inverse).reshape(10, -1)
-        terms = terms.reshape(3, 3, len(self._places), *self._shape)
-        value, by_nx, by_ny = self._gain * np.einsum("dcphw,phw->dchw", terms, self._places)
-        # dn/dg = -(1 - bend g g^T) / length
-        bend *= inverse
-        xx, xy, yy = inverse - bend * gx * gx, -bend * gx * gy, inverse - bend * gy * gy
-        return value, by_nx * xx + by_ny * xy, by_nx * xy + by_ny * yy
+        steepest = np.float32(self._calibration.max_slope)
+        return shading(gx, gy, self._gain, self._places, self._coefficients, steepest)
 
     def _search(self, left: Colours, error: Colours, gx: Map, gy: Map) -> tuple[Map, Map] | None:
         """Slopes, where some others in their direction fit the colours much better; else None."""
-        before = np.einsum("chw,chw->hw", error, error)
-        square = gx * gx + gy * gy
-        bad = (before > (_OUTLIER * self._noise) ** 2) & (square > _TILTED**2)
-        i, j = np.nonzero(bad)
-        if not len(i):
-            return None
-        lengths = np.linspace(0, self._calibration.max_slope, _LENGTHS + 2)[1:-1].astype(np.float32)
-        slope = np.sqrt(square[i, j])
-        x, y = (-lengths[:, None] * g[i, j] / slope for g in (gx, gy))
-        values = self._coefficients[: 3 * len(self._places)] @ _terms(x, y).reshape(10, -1)
-        values = values.reshape(3, len(self._places), *x.shape)
-        values = np.einsum("cpkn,pn->ckn", values, self._places[:, i, j])
-        errors = left[:, i, j][:, None] - self._gain[:, i, j][:, None] * values
-        after = np.einsum("ckn,ckn->kn", errors, errors)
-        n = lengths[after.argmin(0)]
-        factor = np.where(
-            after.min(0) < _BETTER * before[i, j], n / np.sqrt(1 - n * n) / slope, np.float32(1)
+        outlier = np.float32((_OUTLIER * self._noise) ** 2)
+        new_x, new_y, found = best_slopes(
+            *(left, error, gx, gy, self._gain, self._places, self._coefficients, self._lengths),
+            *(outlier, np.float32(_TILTED**2), np.float32(_BETTER)),
         )
-        scale = np.ones_like(gx)
-        scale[i, j] = factor
-        return gx * scale, gy * scale
+        return (new_x, new_y) if found else None
 
     def _solve(self, linear: _Linear, surface: Map, inner: int) -> Map:
         """The step that Gauss and Newton would take: preconditioned conjugate gradients."""
-        jx, jy, jh = linear.by_gx, linear.by_gy, linear.by_depth
-        wx, wy, wh = jx * linear.weight, jy * linear.weight, jh * linear.weight
-        a, b, c = _dot(wx, jx), _dot(wx, jy), _dot(wy, jy)
-        d, e, f = _dot(wx, jh), _dot(wy, jh), _dot(wh, jh)
-        usual = (a.mean() + c.mean()) / 2
-        a += np.float32(_DAMPING) * usual
-        c += np.float32(_DAMPING) * usual
+        curvature, slope = normal_equations(
+            linear.error, linear.by_gx, linear.by_gy, linear.by_depth, linear.weight
+        )
+        usual = (curvature[0].mean() + curvature[2].mean()) / 2
+        curvature[0] += np.float32(_DAMPING) * usual
+        curvature[2] += np.float32(_DAMPING) * usual
         tenth = surface.size // 10
         lowest = np.partition(surface, tenth, axis=None)[tenth]
         rest = self._rest / (1 + ((surface - lowest) / np.float32(_FLAT)) ** 2)
-        f += rest
-        residual = self._against_slopes(_dot(wx, linear.error), _dot(wy, linear.error))
-        residual += _dot(wh, linear.error) - rest * surface
-        smooth = 1 / (usual * self._laplace + f.mean())
-        step = np.zeros_like(surface)
-        direction, size = step, np.float32(1)
-        for _ in range(inner):
-            z = self._down.T @ (self._down @ residual @ self._across.T * smooth) @ self._across
-            before, size = size, np.vdot(residual, z)
-            if size == 0:  # nothing left to explain: a frame equal to its background
-                break
-            direction = z + size / before * direction
-            gx, gy = self._slopes(direction)
-            curved = self._against_slopes(
-                a * gx + b * gy + d * direction, b * gx + c * gy + e * direction
-            )
-            curved += d * gx + e * gy + f * direction
-            length = size / np.vdot(direction, curved)
-            step += length * direction
-            residual -= length * curved
-        return step
-
-    def _slopes(self, surface: Map) -> tuple[Map, Map]:
-        """Central differences, the edge replicated, as in `sensor_calibration.shape_features`."""
-        p = cv2.copyMakeBorder(surface, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
-        half = np.float32(0.5 / self._pitch)
-        return (p[1:-1, 2:] - p[1:-1, :-2]) * half, (p[2:, 1:-1] - p[:-2, 1:-1]) * half
-
-    def _against_slopes(self, x: Map, y: Map) -> Map:
-        """The transpose of `_slopes`."""
-        out = np.zeros_like(x)
-        out[:, 1:] += x[:, :-1]
-        out[:, :-1] -= x[:, 1:]
-        out[:, -1] += x[:, -1]
-        out[:, 0] -= x[:, 0]
-        out[1:] += y[:-1]
-        out[:-1] -= y[1:]
-        out[-1] += y[-1]
-        out[0] -= y[0]
-        out *= np.float32(0.5 / self._pitch)
-        return out
-
-
-def _dot(a: Colours, b: Colours) -> Map:
-    return np.einsum("chw,chw->hw", a, b)
-
-
-def _terms(
-    x: Float32[np.ndarray, "a b"], y: Float32[np.ndarray, "a b"]
-) -> Float32[np.ndarray, "10 a b"]:
-    """1 and the monomials: what they and their derivatives are made of."""
-    return np.concatenate([np.ones((1, *x.shape), np.float32), monomials(x, y)])
+        curvature[5] += rest
+        residual = slope[2] - rest * surface
+        add_against_slopes(slope[0], slope[1], self._half, residual)
+        smooth = 1 / (usual * self._laplace + curvature[5].mean())
+        return conjugate_gradients(
+            curvature, residual, smooth, self._down, self._across, self._half, inner
+        )
 
 
 def _coefficients(response: Float32[np.ndarray, "3 10 waves"]) -> Float32[np.ndarray, "rows 10"]:
-    """What `_terms` of the normal (x, y) are multiplied by.
+    """What 1 and `monomials` of the normal (x, y) are multiplied by.
 
     Rows: the colour, its derivative by x, by y; each for R, G, B; each for 1, u, v.
     """

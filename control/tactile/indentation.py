@@ -32,6 +32,7 @@ class IndentationMeter:
     def __init__(self, sensor: SensorModel, untouched: UInt8[np.ndarray, "h w 3"]) -> None:
         self._detector = ContactDetector(Background(untouched[None]))
         self._depth = DepthEstimator(load(sensor.sensor_file), _CELL)
+        self._depth.estimate(untouched)  # compiled code is loaded now, not in a control loop
 
     def measure(self, frame: UInt8[np.ndarray, "h w 3"]) -> float:
         """The deepest point in the next frame, m; 0 while nothing touches."""

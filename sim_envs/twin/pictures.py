@@ -20,7 +20,7 @@ from touchgoal.sim_envs.twin.picture_process import (
     Scene,
 )
 
-CAMERA_RATE = 30  # Hz, a webcam's
+CAMERA_RATE = 25  # Hz, as fingertips: more than a policy looks
 _START_TIMEOUT, _ANSWER_TIMEOUT, _END_TIMEOUT = 120.0, 60.0, 5.0  # s, on a machine however loaded
 _MOST_BEHIND = 2  # moments that wait to be taken, in real time; then some are left out
 _PROGRAM = "from touchgoal.sim_envs.twin.picture_process import main; main()"
@@ -42,10 +42,15 @@ class Pictures:
         self.held = False
         self.taken = self.left_out = 0
         env = cell.env
-        self.rates = dict.fromkeys(env.config.cameras, CAMERA_RATE)
-        if env.config.tactile:
+        self.rates: dict[str, int] = {}
+        if env.config.tactile:  # first: what is drawn later is later on its way
             names = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.TACTILE]
             self.rates |= dict.fromkeys(names, round(env.sensor.frame_rate))
+        self.rates |= dict.fromkeys(env.config.cameras, CAMERA_RATE)
+        self._due = [
+            tuple(name for name, rate in self.rates.items() if _is_due(step, rate))
+            for step in range(1000)
+        ]
         self._progress = Progress(dict.fromkeys(self.rates, 0), 0.0)
         self._unanswered = 0
         self._pipe, theirs = Pipe()
@@ -71,8 +76,7 @@ class Pictures:
 
     def send(self) -> None:
         """Have the pictures taken that are due."""
-        steps = self._cell.steps
-        due = tuple(name for name, rate in self.rates.items() if _is_due(steps, rate))
+        due = self._due[self._cell.steps % 1000]
         if due:
             env = self._cell.env
             env.update_contacts()  # watched or not: watching must not change the physics
@@ -153,4 +157,4 @@ def _ended() -> UserError:
 
 def _is_due(steps: int, rate: int) -> bool:
     """Whether something at `rate` Hz is due in this millisecond."""
-    return steps * rate // 1000 > (steps - 1) * rate // 1000
+    return steps * rate % 1000 < rate

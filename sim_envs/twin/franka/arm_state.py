@@ -1,7 +1,10 @@
 """The arm's state as the wire has it, written in place every millisecond."""
 
+from typing import no_type_check
+
 import numpy as np
 from jaxtyping import Float
+from numba import njit
 
 from touchgoal.sim_envs.twin.cell import SimulatedCell
 from touchgoal.sim_envs.twin.franka import limits, messages
@@ -84,7 +87,18 @@ def end_effector(
     cell: SimulatedCell, ee: Pose, q: limits.Joints
 ) -> tuple[Pose, Float[np.ndarray, "6 7"]]:
     """Pose and Jacobian of the end effector, which a client may have moved off the TCP."""
-    T = np.eye(4)
-    T[:3, 3], R, jacobian = cell.kinematics(q, ee[:3, 3])
-    T[:3, :3] = R @ ee[:3, :3]
-    return T, jacobian
+    position, R, jacobian = cell.kinematics(q, ee[:3, 3])
+    return _pose(position, R, ee), jacobian
+
+
+@njit(cache=True)
+@no_type_check
+def _pose(position, R, ee):
+    """At a position, turned by R and then as `ee` is."""
+    T = np.zeros((4, 4))
+    for i in range(3):
+        for j in range(3):
+            T[i, j] = R[i, 0] * ee[0, j] + R[i, 1] * ee[1, j] + R[i, 2] * ee[2, j]
+        T[i, 3] = position[i]
+    T[3, 3] = 1.0
+    return T

@@ -351,6 +351,7 @@ class FrankaArm:
         contact = self._estimate_wrench()
         self._state.write_tcp(self.cell, self._ee, self._pose, self._wrench, contact)
         limits.joint_fault(self._setpoint, self._setpoint, cartesian=False)
+        limits.arm_fault(self.cell.q, self.cell.dq)
 
     def _reset_setpoint(self) -> None:
         """What the next set-point is compared with, and the torque the next one."""

@@ -24,6 +24,15 @@ _DAMPING = 1e-8  # m^2: makes the wrench at a singular pose finite
 _NEVER_ZERO = 1e-6  # N: what a measured estimate differs from 0 by, with nothing touching
 
 
+_TAPER = FR3.hardware.taper
+assert _TAPER is not None  # the FR3's speeds shrink near the ends of its ranges
+_HARDWARE = (
+    *(FR3.hardware.lower, FR3.hardware.upper, FR3.hardware.velocity),
+    *(FR3.hardware.acceleration, FR3.hardware.jerk),
+    *(_TAPER.gain, _TAPER.lower, _TAPER.upper, _TAPER.offset),
+)
+
+
 @dataclass(frozen=True)
 class Setpoint:
     """A joint set-point with its derivatives: rad, rad/s, rad/s^2."""
@@ -46,12 +55,7 @@ def joint_fault(before: Setpoint, now: Setpoint, cartesian: bool) -> str | None:
     pass through the twin's own inverse kinematics.
     """
     name = "cartesian_motion_generator_joint" if cartesian else "joint_motion_generator"
-    hardware = FR3.hardware
-    lowest, highest = hardware.speed_range(now.q)
-    broken = _broken_limit(
-        *(now.q, now.dq, now.ddq, before.ddq, hardware.lower, hardware.upper, lowest, highest),
-        *(hardware.acceleration, hardware.jerk),
-    )
+    broken = _broken_limit(now.q, now.dq, now.ddq, before.ddq, *_HARDWARE)
     if broken < 0 or (cartesian and broken > _SPEED):
         return None
     return f"{name}_{_LIMITS[broken]}"
@@ -68,14 +72,19 @@ _SPEED = 1  # place of the last of them that holds for set-points in Cartesian s
 
 @njit(cache=True)
 @no_type_check
-def _broken_limit(q, dq, ddq, ddq_before, lower, upper, lowest, highest, acceleration, jerk):
-    """The first of `_LIMITS` that any joint breaks; -1: none."""
+def _broken_limit(
+    q, dq, ddq, ddq_before, lower, upper, velocity, acceleration, jerk, gain, below, above, offset
+):
+    """The first of `_LIMITS` that any joint breaks; -1: none. Speeds as `JointLimits.speed_range`."""
     worst = len(_LIMITS)
     for i in range(len(q)):
+        up = np.sqrt(max(gain[i] * (above[i] - q[i]), 0.0)) - offset[i]
+        down = np.sqrt(max(gain[i] * (q[i] - below[i]), 0.0)) - offset[i]
+        highest, lowest = min(max(up, 0.0), velocity[i]), -min(max(down, 0.0), velocity[i])
         outward = dq[i] if q[i] > upper[i] else -dq[i] if q[i] < lower[i] else 0.0
         if not np.isfinite(q[i]) or outward > 1e-3:
             worst = 0
-        elif dq[i] > _SLACK * highest[i] + 1e-3 or dq[i] < _SLACK * lowest[i] - 1e-3:
+        elif dq[i] > _SLACK * highest + 1e-3 or dq[i] < _SLACK * lowest - 1e-3:
             worst = min(worst, 1)
         elif abs(ddq[i]) > _SLACK * acceleration[i]:
             worst = min(worst, 2)
@@ -104,11 +113,24 @@ def torque_fault(before: Joints, now: Joints) -> str | None:
 def arm_fault(q: Joints, dq: Joints) -> str | None:
     """Whether the arm itself is where or as fast as it must not be, whoever drives it."""
     hardware = FR3.hardware
-    if (q < hardware.lower - 0.01).any() or (q > hardware.upper + 0.01).any():
-        return "joint_position_limits_violation"
-    if (np.abs(dq) > 1.1 * hardware.velocity).any():
-        return "joint_velocity_violation"
-    return None
+    place = _worst_of_arm(q, dq, hardware.lower, hardware.upper, hardware.velocity)
+    return _ARM_FAULTS[place]
+
+
+_ARM_FAULTS = None, "joint_velocity_violation", "joint_position_limits_violation"
+
+
+@njit(cache=True)
+@no_type_check
+def _worst_of_arm(q, dq, lower, upper, velocity):
+    """Which of `_ARM_FAULTS`."""
+    worst = 0
+    for i in range(len(q)):
+        if q[i] < lower[i] - 0.01 or q[i] > upper[i] + 0.01:
+            worst = 2
+        elif abs(dq[i]) > 1.1 * velocity[i]:
+            worst = max(worst, 1)
+    return worst
 
 
 def estimate_sent(wrench: Wrench, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
@@ -159,18 +181,28 @@ class Thresholds:
 
     def judge(self, torque: Joints, wrench: Wrench, ddq: Joints) -> Contact:
         """What a torque (N m) and wrench (N, N m) from outside mean at this acceleration."""
-        steady = np.abs(ddq).max() < _STEADY
+        steady = max(ddq.max(), -ddq.min()) < _STEADY
         lower = self.lower_torque_nominal if steady else self.lower_torque_acceleration
         upper = self.upper_torque_nominal if steady else self.upper_torque_acceleration
         low = self.lower_force_nominal if steady else self.lower_force_acceleration
         high = self.upper_force_nominal if steady else self.upper_force_acceleration
-        torque, wrench = np.abs(torque), np.abs(wrench)
-        return Contact(
-            (torque > lower).astype(float),
-            (torque > upper).astype(float),
-            (wrench > low).astype(float),
-            (wrench > high).astype(float),
-        )
+        touched, hit = _above(torque, lower, upper)
+        pressed, pushed = _above(wrench, low, high)
+        return Contact(touched, hit, pressed, pushed)
+
+
+@njit(cache=True)
+@no_type_check
+def _above(values, lower, upper):
+    """1 where a value is beyond a threshold, either way, and 0 where it is not."""
+    n = len(values)
+    beyond_lower, beyond_upper = np.zeros(n), np.zeros(n)
+    for i in range(n):
+        if abs(values[i]) > lower[i]:
+            beyond_lower[i] = 1.0
+        if abs(values[i]) > upper[i]:
+            beyond_upper[i] = 1.0
+    return beyond_lower, beyond_upper
 
 
 def pseudo_inverse(jacobian: Float[np.ndarray, "6 7"]) -> Float[np.ndarray, "6 7"]:

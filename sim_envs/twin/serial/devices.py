@@ -92,7 +92,6 @@ class LoadCell:
 
     def receive(self) -> None:
         """Nothing is said to a load cell."""
-        self.port.read()
 
     def hold(self) -> None:
         """No line is due while time stands."""
@@ -102,6 +101,7 @@ class LoadCell:
         self._milliseconds += 1
         if self._milliseconds * _LOAD_RATE % 1000 >= _LOAD_RATE:
             return
+        self.port.read()  # whatever was said
         counts = ZERO + self.cell.env.table_load() / NEWTONS_PER_COUNT
         counts += self._rng.normal(0.0, _LOAD_NOISE)
         line = f"{self._milliseconds},{round(counts)}".encode()
