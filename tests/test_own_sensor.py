@@ -22,7 +22,6 @@ from touchgoal.control.tactile.sensor_calibration import load, shade
 from touchgoal.control.tactile.sensor_models import (
     GELSIGHT_MINI,
     GELSIGHT_MINI_MARKERS,
-    GELSIGHT_MINI_MEASURED,
 )
 from touchgoal.launch.__main__ import main
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
@@ -42,7 +41,7 @@ def centres(unit: SensorInstance) -> list[tuple[float, float]]:
 def pressing(unit: SensorInstance, at: tuple[float, float]) -> Iterator[np.ndarray]:
     """Frames of a ball that comes, stands for a fifth of a second, and goes."""
     x, y = (pixels * unit.pixel_pitch for pixels in at)
-    for depth in (0.1, 0.25, *[0.4] * 6, 0.2):
+    for depth in (0.15, 0.4, *[0.6] * 6, 0.3):
         pose = SurfacePose((x, y), 0.0, (0.0, 0.0), (0.0, 0.0), depth * 1e-3)
         yield press(BALL, pose, unit, RNG)
     for _ in range(4):
@@ -148,7 +147,7 @@ def test_what_is_shown_live_can_be_read_live(session: list[np.ndarray]) -> None:
 @pytest.fixture(scope="module")
 def balls() -> list[np.ndarray]:
     """The measured Mini, untouched and under a ball of 4 mm, with noise of one count."""
-    calibration, rng = load(GELSIGHT_MINI_MEASURED.sensor_file), np.random.default_rng(0)
+    calibration, rng = load(GELSIGHT_MINI.sensor_file), np.random.default_rng(0)
     flat = np.zeros((240, 320), np.float32)
     pressed = [
         press_surface(calibration, np.array([x, 120.0, 22.0]), 4e-3) for x in (100.0, 160.0, 220.0)
@@ -159,7 +158,7 @@ def balls() -> list[np.ndarray]:
 
 
 def test_a_sensor_check_reads_noise_ball_and_contact(balls: list[np.ndarray]) -> None:
-    check = check_sensor(balls, GELSIGHT_MINI_MEASURED, ball_radius=4e-3)
+    check = check_sensor(balls, GELSIGHT_MINI, ball_radius=4e-3)
     assert (check.frames, check.touching, len(check.presses)) == (18, 3, 3)
     assert check.noise == pytest.approx(1.05, abs=0.1)  # rounding adds a twelfth
     assert check.untouched < check.threshold < check.touched / 2
@@ -204,6 +203,6 @@ def test_a_sensor_check_counts_markers() -> None:
 
 def test_a_darker_picture_has_a_depth(balls: list[np.ndarray]) -> None:
     """It once had none: a surface that lies below rest all over threw shadows of negative length."""
-    estimator = DepthEstimator(load(GELSIGHT_MINI_MEASURED.sensor_file), 8)
+    estimator = DepthEstimator(load(GELSIGHT_MINI.sensor_file), 8)
     depth = estimator.estimate(np.rint(0.75 * balls[0]).astype(np.uint8), balls[0].astype("f4"))
     assert np.isfinite(depth).all()

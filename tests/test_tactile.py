@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from touchgoal.control.tactile.sensor_calibration import shade
-from touchgoal.control.tactile.sensor_models import DIGIT, SensorModel
+from touchgoal.control.tactile.sensor_calibration import load, shade
+from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT, SensorModel
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI as MINI
 from touchgoal.sim_envs.config import NO_RANDOMIZATION, PickPlaceConfig, SensorRandomization
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
@@ -219,8 +219,9 @@ def test_turned_lights_turn_the_response() -> None:
         assert np.abs(np.abs(now / was) - 1).max() < 5 * randomization.gain
 
 
+@pytest.mark.parametrize("sensor", [GELSIGHT, DIGIT], ids=lambda s: s.name)
 @pytest.mark.parametrize("largest_turn", [0.0, 80.0])
-def test_shadows_fall_opposite_the_bright_sides(largest_turn: float) -> None:
+def test_shadows_fall_opposite_the_bright_sides(sensor: SensorModel, largest_turn: float) -> None:
     """Of each light alone, on a bump: the colours brighten towards it, the shadow lies behind."""
     lights = replace(NO_RANDOMIZATION, azimuth=largest_turn)
     y, x = np.mgrid[:120, :160].astype(np.float32) - np.array([60, 80], np.float32)[:, None, None]
@@ -230,7 +231,7 @@ def test_shadows_fall_opposite_the_bright_sides(largest_turn: float) -> None:
         return complex((change * x).sum(), (change * y).sum())
 
     for seed in range(4):
-        instance = sample_instance(MINI, np.random.default_rng(seed), lights)
+        instance = sample_instance(sensor, np.random.default_rng(seed), lights)
         calibration = instance.calibration
         own_shadow = np.diag(np.diag(calibration.shadow))
         slopes = np.zeros_like(calibration.response)
@@ -250,7 +251,9 @@ def test_untouched_sensor_shows_only_noise() -> None:
     env.reset(seed=0)
     frames = [env.step(np.append(np.zeros(7), 0.08))[0] for _ in range(3)]
     images = np.stack([f["observation.images.tactile_left"] for f in frames]).astype(float)
-    assert 0.3 < (images[1] - images[0]).std() / np.sqrt(2) < 1.5  # counts
+    seen = (images[1] - images[0]).std() / np.sqrt(2)
+    noise = load(MINI.sensor_file).noise  # of which the darkest colours lose some, cut off at 0
+    assert 0.7 * noise < seen < 1.1 * noise
     assert not env.tactile_frames()[0].mask.any()
     env.close()
 

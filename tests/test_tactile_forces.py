@@ -97,7 +97,7 @@ def test_field_integrates_to_the_wrench(height: np.ndarray, contact: PadContact)
     [
         ball(0.0127, 0.0103),
         ball(0.03, 0.0),
-        block(12.5e-3, 1, 10.2e-3, 1),
+        block(X.max() - 1e-5, 1, Y.max() - 1e-5, 1),
         EVERYWHERE,
         np.full_like(EVERYWHERE, NO_SURFACE),
     ],

@@ -255,7 +255,9 @@ def test_painting_markers_over_gives_the_plain_gel(gel: SensorInstance) -> None:
     painted = without_markers(dotted(plain, gel), gel.markers, gel.marker_radius)
     changed = (painted != plain).any(2)
     error = np.abs(painted.astype(float) - plain)[changed]
-    assert changed.mean() > 0.15 and error.mean() < 1.5 and np.quantile(error, 0.99) < 6
+    noise = gel.calibration.noise  # of the plain picture
+    assert changed.mean() > 0.15
+    assert error.mean() < noise and np.quantile(error, 0.99) < 4 * noise
 
 
 # Depth and force.
@@ -286,7 +288,8 @@ def test_depth_comes_back(sensor: SensorModel, name: str) -> None:
 def test_an_untouched_gel_is_flat() -> None:
     background = Background(untouched(MINI, 8)).image
     depth = DepthEstimator(MINI.calibration).estimate(untouched(MINI, 1, seed=1)[0], background)
-    assert np.abs(depth).max() < 10e-6
+    off = np.abs(depth)
+    assert np.quantile(off, 0.99) < 10e-6 and off.max() < 30e-6
 
 
 @pytest.mark.parametrize("frame", ["background", "black", "white", "snow"])
