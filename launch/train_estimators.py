@@ -23,6 +23,9 @@ class Config(TrainingOptions):
     encoder: Path | None = None
     """Folder of a frozen touch encoder (train-encoder), which is copied beside the estimator; default:
     the shipped one, which is not copied."""
+    pose: Annotated[Path | None, RARE] = None
+    """Folder of a state estimator that goes on finding things in pictures: only contact is learned. After
+    the pads have changed, and the cameras have not."""
     objects: Count = 1200
     """Number of objects to look at, of random kind and size."""
     placements: Count = 12

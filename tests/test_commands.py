@@ -9,6 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import load_file
 
 from touchgoal.encoders import pretrained
 from touchgoal.episodes.media import read_frames
@@ -203,6 +205,14 @@ def test_learning_to_pick_and_place(
     other = shutil.copytree(episodes, tmp_path / "other")
     run("train-estimators", "--data", episodes, "--validation", other, *one, "--objects", 2,
         "--placements", 2, "--train.epochs", 1, "--train.contact-epochs", 1, "--out", "est")  # fmt: skip
+    run("train-estimators", "--data", episodes, "--validation", other, *one, "--objects", 8,
+        "--train.contact-epochs", 2, "--pose", "est/estimator", "--out", "est-2")  # fmt: skip
+    first, second = (
+        load_file(Path(name, "estimator/estimator.safetensors")) for name in ("est", "est-2")
+    )
+    same = {name for name in first if torch.equal(first[name], second[name])}
+    assert same >= {name for name in first if name.startswith("pose_")}
+    assert "contact_head.weight" not in same
     run("collect-demos", "--feedback", "--episodes", 1, *one, *blind)
     run(
         "collect-demos",

@@ -23,6 +23,7 @@ from touchgoal.policies.perception.placements import render_placements
 from touchgoal.policies.perception.state_estimation import (
     StateEstimatorConfig,
     StateEstimatorNetwork,
+    load_network,
     save_estimator,
 )
 from touchgoal.policies.perception.training import (
@@ -49,9 +50,9 @@ def run_command(config: Config) -> None:
         raise UserError(f"an estimator reads single frames, {encoder} looks back: give another")
     out = open_training(config, "train-estimators")
     torch.manual_seed(config.seed)
-    network = StateEstimatorNetwork(
-        StateEstimatorConfig(touch.name, touch.dim, config.pose_estimator)
-    )
+    kept = load_network(config.pose) if config.pose else None
+    seen = kept.config.pose_estimator if kept else config.pose_estimator
+    network = StateEstimatorNetwork(StateEstimatorConfig(touch.name, touch.dim, seen))
     provenance = recipe(*sets)
     rows, validation = (
         embed_touch_and_contact(episodes, touch, config.workers) for episodes in sets
@@ -59,17 +60,19 @@ def run_command(config: Config) -> None:
     contact_out, pose_out = out / _CONTACT, out / _POSE
     train_contact_estimator(network, *rows, config.train, contact_out, config.trainer, provenance)
     errors: dict = {"contact": contact_error_rate(network, *validation)}
-    cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key, _ in config.pose_estimator.crops)
-    size = config.pose_estimator.size
-    env = replace(config.env, tactile=False, cameras=cameras, camera_size=size)
-    train_pose_estimator(
-        network.pose_estimator,
-        render_placements(env, config.objects, config.placements, _SEED, config.workers),
-        config.train,
-        pose_out,
-        replace(config.trainer, resume=config.resume and has_checkpoint(pose_out)),
-        provenance,
-    )
+    cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key, _ in seen.crops)
+    env = replace(config.env, tactile=False, cameras=cameras, camera_size=seen.size)
+    if kept:
+        network.pose_estimator = kept.pose_estimator
+    else:
+        train_pose_estimator(
+            network.pose_estimator,
+            render_placements(env, config.objects, config.placements, _SEED, config.workers),
+            config.train,
+            pose_out,
+            replace(config.trainer, resume=config.resume and has_checkpoint(pose_out)),
+            provenance,
+        )
     if not is_first_process():
         return
     others = render_placements(

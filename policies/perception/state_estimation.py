@@ -131,10 +131,15 @@ def load_estimator(directory: Path) -> StateEstimator:
     Raises:
         UserError: nothing there, damaged, or another touch encoder than the training's.
     """
+    network, own = load_network(directory), directory / "touch"
+    return StateEstimator(network, load_touch(own if own.is_dir() else pretrained.DEFAULT_ENCODER))
+
+
+def load_network(directory: Path) -> StateEstimatorNetwork:
+    """The networks alone; UserError: nothing there, or damaged."""
     network = StateEstimatorNetwork(ESTIMATOR_FORMAT.read_config(directory, _config))
     ESTIMATOR_FORMAT.load_weights(network, directory)
-    own = directory / "touch"
-    return StateEstimator(network, load_touch(own if own.is_dir() else pretrained.DEFAULT_ENCODER))
+    return network
 
 
 def _config(fields: dict[str, Any]) -> StateEstimatorConfig:
