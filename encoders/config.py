@@ -133,8 +133,10 @@ ALIGN_PRESETS: dict[str, AlignConfig] = {
 class MaeConfig:
     """How to train a touch backbone by masked autoencoding."""
 
-    vit: Literal["tiny", "compact", "small"] = "compact"
-    """Size of the backbone, a ViT."""
+    vit: Literal["tiny", "compact", "small", "base"] = "compact"
+    """Size of the backbone, a ViT; base is the paper's."""
+    stacked: bool = False
+    """See an earlier frame, too, as further channels of the picture, as Sparsh does."""
     mask_ratio: MaskRatio = 0.5
     """Share of the patches that the backbone does not see."""
     bottleneck: bool = True
@@ -145,12 +147,52 @@ class MaeConfig:
     """Size of the decoder's tokens."""
     decoder_depth: Annotated[Count, RARE] = 2
     """Number of the decoder's blocks."""
+    decoder_heads: Annotated[Count, RARE] = 4
+    """Attention heads of each; they divide its width."""
     epochs: Count = 30
     """Passes over the touches."""
     batch_size: Count = 128
     """Touches in each step; all of them if there are fewer."""
     lr: Positive = 1e-3
-    """Highest learning rate of AdamW; reached from 0 in a tenth of the training, left by a cosine
-    to 0."""
+    """Highest learning rate of AdamW; reached from 0 in `warmup`, left by a cosine to 0."""
+    warmup: Annotated[Fraction, RARE] = 0.1
+    """Share of the steps in which the learning rate rises from 0."""
+    second_moment: Annotated[Fraction, RARE] = 0.999
+    """Share of itself that AdamW's mean of squared gradients keeps in each step: beta 2."""
     weight_decay: NotNegative = 0.05
-    """Weight decay of weight matrices and convolutions."""
+    """Weight decay of weight matrices and convolutions at the start."""
+    final_weight_decay: Annotated[NotNegative | None, RARE] = None
+    """Weight decay at the end, reached by a cosine; default: as at the start."""
+
+    def __post_init__(self) -> None:
+        """Raises OptionError for a network that is not."""
+        if self.vit == "base" and not self.stacked:
+            raise ValueError("base is Sparsh's, which sees two frames: it goes with stacked")
+        if self.decoder_width % self.decoder_heads:
+            raise ValueError(
+                f"decoder_width {self.decoder_width} must be a multiple of decoder_heads "
+                f"{self.decoder_heads}"
+            )
+
+
+# Sparsh's Table 2 (Higuera et al. 2024); what it leaves open is as in the released code, but for the
+# decoder's positions, which are learned there.
+MAE_PRESETS: dict[str, MaeConfig] = {
+    "default": MaeConfig(),
+    "paper": MaeConfig(
+        vit="base",
+        stacked=True,
+        mask_ratio=0.75,
+        bottleneck=False,
+        decoder_width=512,
+        decoder_depth=8,
+        decoder_heads=16,
+        epochs=150,
+        batch_size=100,
+        lr=1e-4,
+        warmup=0.2,
+        second_moment=0.95,
+        weight_decay=0.04,
+        final_weight_decay=0.4,
+    ),
+}

@@ -7,7 +7,7 @@ import tyro
 from pydantic import Field
 
 from touchgoal.control.option_types import Count, CountOrNone, Seed, checked_dataclass
-from touchgoal.encoders.config import ALIGN_PRESETS, AlignConfig, MaeConfig
+from touchgoal.encoders.config import ALIGN_PRESETS, MAE_PRESETS, AlignConfig, MaeConfig
 from touchgoal.encoders.ssl.config import (
     DINO_PRESETS,
     IJEPA_PRESETS,
@@ -57,7 +57,17 @@ class Mae(UnlabelledOptions):
 
     frames: Count = 40
     """Moments drawn from each episode, both fingertips of each."""
-    mae: MaeConfig = MaeConfig()
+    stride: Count = 2
+    """Ticks between the two frames of a moment, with `stacked`."""
+    mae: MaeConfig = MAE_PRESETS["default"]
+    """How the encoder is trained."""
+
+
+@checked_dataclass
+class MaePaper(Mae):
+    """MAE with the training of the Sparsh paper: ViT-B, two frames, 150 epochs; meant for large GPUs."""
+
+    mae: MaeConfig = MAE_PRESETS["paper"]
     """How the encoder is trained."""
 
 
@@ -145,6 +155,7 @@ Config = (
     Annotated[Align, tyro.conf.subcommand("align")]
     | Annotated[AlignPaper, tyro.conf.subcommand("align-paper")]
     | Annotated[Mae, tyro.conf.subcommand("mae")]
+    | Annotated[MaePaper, tyro.conf.subcommand("mae-paper")]
     | Annotated[Dino, tyro.conf.subcommand("dino")]
     | Annotated[DinoPaper, tyro.conf.subcommand("dino-paper")]
     | Annotated[IJepa, tyro.conf.subcommand("ijepa")]

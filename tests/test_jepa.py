@@ -25,7 +25,7 @@ from touchgoal.encoders.ssl.config import (
 from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.ijepa import IJepa, train_ijepa
 from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, Predictor, take
-from touchgoal.encoders.ssl.self_distillation import Method, backbone_for, vit_for
+from touchgoal.encoders.ssl.untrained import Method, backbone_for, vit_for
 from touchgoal.encoders.ssl.vjepa import VJepa, train_vjepa
 
 SMALL: dict[str, Any] = {"epochs": 3, "batch_size": 12, "momentum": 0.9}
@@ -45,7 +45,7 @@ def rng(seed: int = 0) -> torch.Generator:
 def build(method: Method, vit: str = "tiny") -> JointEmbeddingPrediction:
     kind, _, config, data = CASES[method]
     torch.manual_seed(0)
-    return kind(config, backbone_for(method, vit, data), 10)
+    return kind(config, backbone_for(method, vit, data.sensor, data.stride), 10)
 
 
 def test_ijepa_sees_one_block_without_its_targets() -> None:

@@ -30,10 +30,9 @@ from touchgoal.encoders.ssl.frames import sample_frames
 from touchgoal.encoders.ssl.masks import cover, cut, draw_blocks, draw_size, draw_targets
 from touchgoal.encoders.ssl.self_distillation import (
     SelfDistillation,
-    backbone_for,
     train_self_distilled,
-    vit_for,
 )
+from touchgoal.encoders.ssl.untrained import backbone_for, vit_for
 from touchgoal.encoders.ssl.validation import token_statistics
 from touchgoal.encoders.training.trainer import OptimizerConfig, parameter_groups
 from touchgoal.episodes.schema import Episode
@@ -57,7 +56,7 @@ def rng(seed: int = 0) -> torch.Generator:
 
 def toy_dino(config: DinoConfig = TOY) -> Dino:
     torch.manual_seed(0)
-    return Dino(config, backbone_for("dino", "tiny", moving_blobs(1)), steps=10)
+    return Dino(config, backbone_for("dino", "tiny", SENSOR, 2), steps=10)
 
 
 def test_the_loss_of_views_is_that_of_the_paper() -> None:

@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float16, Int
 from torch import Tensor, nn
 
 from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
+from touchgoal.encoders.backbones.frame_history import stack_frames
 from touchgoal.encoders.backbones.touch_backbone import BATCH, TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS as VIT_PRESETS
 from touchgoal.encoders.backbones.vit import (
@@ -22,6 +23,7 @@ from touchgoal.encoders.backbones.vit import (
 )
 from touchgoal.encoders.config import MaeConfig, TrainerOptions
 from touchgoal.encoders.ssl.frames import TouchFrames
+from touchgoal.encoders.ssl.untrained import backbone_for
 from touchgoal.encoders.ssl.validation import forces_line, read_forces
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
@@ -32,30 +34,44 @@ _ENCODER = "encoder"
 class MaskedAutoencoder(nn.Module):
     """A backbone, and a decoder that reconstructs what the backbone did not see."""
 
-    def __init__(self, config: MaeConfig, sensor: str) -> None:
-        """Builds both, randomly initialised; UserError for an unknown sensor or nothing masked."""
+    def __init__(self, config: MaeConfig, sensor: str, stride: int = 1) -> None:
+        """Builds both, randomly initialised; UserError for an unknown sensor or nothing masked.
+
+        Args:
+            config: Of the training.
+            sensor: Name of the fingertip sensor.
+            stride: Ticks between the frames of a touch, if it has several.
+        """
         super().__init__()
         self.config = config
-        vit = VIT_PRESETS[config.vit]
-        self.backbone = TouchBackbone(TouchBackboneConfig.for_sensor(vit, sensor))
-        width = config.decoder_width
+        if config.stacked:
+            self.backbone = backbone_for("mae", config.vit, sensor, stride)
+        else:
+            preset = VIT_PRESETS[config.vit]
+            self.backbone = TouchBackbone(TouchBackboneConfig.for_sensor(preset, sensor))
+        vit, width = self.backbone.config.vit, config.decoder_width
         self.decoder_embed = nn.Linear(vit.width, width)
         self.mask_token = None if config.bottleneck else nn.Parameter(torch.zeros(width))
         self.decoder_blocks = nn.ModuleList(
-            Block(width, 4, 4.0) for _ in range(config.decoder_depth)
+            Block(width, config.decoder_heads, 4.0) for _ in range(config.decoder_depth)
         )
         self.decoder_norm = nn.LayerNorm(width)
         self.decoder_pred = nn.Linear(width, vit.channels * vit.patch_size**2)
         self._check_mask(vit)
 
     def forward(
-        self, touch: Float[Tensor, "b 3 h w"], ids_keep: Int[Tensor, "b k"]
+        self, touch: Float16[Tensor, "b *t 3 h w"], ids_keep: Int[Tensor, "b k"]
     ) -> dict[str, Float[Tensor, ""]]:
         """The loss, for the trainer."""
-        return {"loss": self.loss(touch.float(), ids_keep)}
+        return {"loss": self.loss(self.images(touch), ids_keep)}
+
+    def images(self, touch: Float16[Tensor, "b *t 3 h w"]) -> Float[Tensor, "b c h w"]:
+        """Touches as the backbone takes them; of two frames the newer one's channels come first."""
+        touch = touch.float()
+        return stack_frames(touch, self.backbone.config.vit) if self.config.stacked else touch
 
     def loss(
-        self, touch: Float[Tensor, "b 3 h w"], ids_keep: Int[Tensor, "b k"]
+        self, touch: Float[Tensor, "b c h w"], ids_keep: Int[Tensor, "b k"]
     ) -> Float[Tensor, ""]:
         """Mean squared error of the reconstructed patches, in the preprocessor's units.
 
@@ -69,7 +85,7 @@ class MaskedAutoencoder(nn.Module):
         return (error.mean(2) * masked).sum() / masked.sum()
 
     def reconstruct(
-        self, touch: Float[Tensor, "b 3 h w"], ids_keep: Int[Tensor, "b k"]
+        self, touch: Float[Tensor, "b c h w"], ids_keep: Int[Tensor, "b k"]
     ) -> Float[Tensor, "b n p"]:
         """All patches of touches, of which the backbone sees those in `ids_keep`."""
         tokens = self.decoder_embed(self.backbone.vit(touch, ids_keep))
@@ -124,7 +140,7 @@ def train_mae(
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
-        model = MaskedAutoencoder(config, train.sensor)
+        model = MaskedAutoencoder(config, train.sensor, train.stride)
 
     def batch(rows: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
         ids_keep = random_masking(
@@ -137,11 +153,19 @@ def train_mae(
         n_samples=len(train),
         batch=batch,
         optimizer=OptimizerConfig(
-            config.epochs, config.batch_size, config.lr, config.weight_decay, max_grad_norm=1.0
+            config.epochs,
+            config.batch_size,
+            config.lr,
+            config.weight_decay,
+            betas=(0.9, config.second_moment),
+            warmup=config.warmup,
+            max_grad_norm=1.0,
+            final_weight_decay=config.final_weight_decay,
         ),
         identity={
             "mae": asdict(config),
             "sensor": train.sensor,
+            "stride": train.stride,
             "data": checksum(train.touch, val.touch),
         },
         evaluate=lambda: validate(model, train, val),
@@ -169,20 +193,21 @@ def validate(model: MaskedAutoencoder, train: TouchFrames, val: TouchFrames) -> 
     generator = torch.Generator().manual_seed(0)
     total, blank = 0.0, 0.0
     for batch in val.touch.split(BATCH):
-        touch = batch.to(device).float()
+        touch = model.images(batch.to(device))
         ids_keep = random_masking(vit, len(touch), model.config.mask_ratio, generator).to(device)
         total += model.loss(touch, ids_keep).item() * len(touch)
         blank += patchify(touch, vit).square().mean().item() * len(touch)
     return {
         "validation_loss": total / len(val),
         "validation_loss_of_blank": blank / len(val),
-        **read_forces(lambda touches: _embed(model.backbone, touches), train, val),
+        **read_forces(lambda touches: _embed(model, touches), train, val),
     }
 
 
-def _embed(backbone: TouchBackbone, touch: Tensor) -> Tensor:
-    rows = [backbone.embed_touch(batch.to(backbone.device).float()) for batch in touch.split(BATCH)]
-    return torch.cat(rows).cpu()
+def _embed(model: MaskedAutoencoder, touch: Tensor) -> Tensor:
+    device = model.backbone.device
+    batches = (model.images(batch.to(device)) for batch in touch.split(BATCH))
+    return torch.cat([model.backbone.embed_touch(batch) for batch in batches]).cpu()
 
 
 def _progress(metrics: dict[str, float]) -> str:

@@ -5,9 +5,9 @@ The teacher is what is kept, measured and saved: it is steadier than its student
 
 import copy
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -16,54 +16,17 @@ from torch import Tensor, nn
 from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.frame_history import stack_frames
-from touchgoal.encoders.backbones.sparsh import SPARSH_BASE
-from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
-from touchgoal.encoders.backbones.vit import ViTConfig
+from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.config import TrainerOptions
-from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.ssl.config import SelfDistillationConfig
 from touchgoal.encoders.ssl.frames import TouchFrames
+from touchgoal.encoders.ssl.untrained import Method, backbone_for
 from touchgoal.encoders.ssl.validation import Validation
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
 
 _ENCODER = "encoder"
 _MAX_GRAD_NORM = 10.0
-Method = Literal["dino", "ijepa", "vjepa"]
-
-# As MAE's of these names, with widths that have thirds, too, for clips.
-_SIZES = {
-    "tiny": ViTConfig(patch_size=40, width=48, depth=2, heads=2, mlp_ratio=2.0),
-    "compact": ViTConfig(width=144, depth=4, heads=4),
-    "small": ViTConfig(),
-}
-
-
-def vit_for(method: Method, size: str, image_size: tuple[int, int]) -> ViTConfig:
-    """The network of a method: Sparsh's own, or a smaller one with its input and its registers.
-
-    Args:
-        method: Decides on the input: two frames on top of each other, or a clip.
-        size: See `SelfDistillationConfig.vit`.
-        image_size: Height and width in pixels that the preprocessor makes.
-    """
-    published = replace(SPARSH_BASE[method], image_size=image_size)
-    if size == "base":
-        return published
-    return replace(
-        _SIZES[size],
-        image_size=image_size,
-        channels=published.channels,
-        registers=published.registers,
-        tubelet=published.tubelet,
-        frames=published.frames,
-    )
-
-
-def backbone_for(method: Method, size: str, data: TouchFrames) -> TouchBackbone:
-    """A randomly initialised backbone that sees frames as these touches have them."""
-    vit = vit_for(method, size, preprocessor_for(data.sensor).size)
-    return TouchBackbone(TouchBackboneConfig.for_sensor(vit, data.sensor, data.stride))
 
 
 def frozen_copy(module: nn.Module) -> Any:
@@ -173,7 +136,8 @@ def train_self_distilled(
     )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
-        model = build(backbone_for(method, config.vit, train), optimizer.steps(len(train)))
+        backbone = backbone_for(method, config.vit, train.sensor, train.stride)
+        model = build(backbone, optimizer.steps(len(train)))
     validation = Validation(model, train, val, out_dir, config.epochs)
 
     def batch(rows: Tensor, generator: torch.Generator) -> dict[str, Any]:

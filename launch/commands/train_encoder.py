@@ -15,8 +15,8 @@ from touchgoal.encoders.ssl.dino import train_dino
 from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.ijepa import train_ijepa
 from touchgoal.encoders.ssl.mae import train_mae
-from touchgoal.encoders.ssl.self_distillation import Method
 from touchgoal.encoders.ssl.surface_whitening import WhiteningConfig, train
+from touchgoal.encoders.ssl.untrained import Method
 from touchgoal.encoders.ssl.vjepa import train_vjepa
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.training.trainer import is_first_process
@@ -67,8 +67,9 @@ def _fit_to_surfaces(config: Surfaces) -> None:
 
 def _train_mae(config: Mae, touch: UnlabelledTouch) -> None:
     out = open_training(config, "train-encoder")
+    offsets = frame_offsets(SPARSH_BASE["mae"], config.stride) if config.mae.stacked else None
     train, val = (
-        draw(config.frames, config.seed, None) for draw in (touch.train, touch.validation)
+        draw(config.frames, config.seed, offsets) for draw in (touch.train, touch.validation)
     )
     train_mae(train, val, config.mae, out, config.trainer, touch.recipe)
     print(f"encoder: {out / 'encoder'}")
