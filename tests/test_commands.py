@@ -254,7 +254,7 @@ def test_a_shipped_policy_is_made_by_one_command(
         *["collect-demos"] * 2, "train-policy", "collect-demos", "train-policy",
     ]  # fmt: skip
     capsys.readouterr()
-    run(*make.split(), "--resume")  # nothing is left to do
+    run(*make.replace("--workers 1", "--workers 2").split(), "--resume")  # nothing is left to do
     assert "5 steps" in capsys.readouterr().out and "collect-demos" not in capsys.readouterr().out
 
 
