@@ -61,8 +61,8 @@ def sliding(count: int, seed: int) -> TouchFrames:
 
 
 def test_two_frames_on_top_of_each_other_tell_motion(tmp_path: Path) -> None:
-    train, val = sliding(512, 0), sliding(64, 1)
-    config = replace(TOY, stacked=True, epochs=12, mask_ratio=0.25)
+    train, val = sliding(256, 0), sliding(64, 1)
+    config = replace(TOY, stacked=True, epochs=8, mask_ratio=0.25)
     backbone = train_mae(train, val, config, tmp_path, TrainerOptions(), {"data": "toy"})
     metrics = pretrained.ENCODER_FORMAT.provenance(tmp_path / "encoder")["metrics"]
     assert metrics["force_x_r2"] > 0.5
