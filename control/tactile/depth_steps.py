@@ -18,7 +18,7 @@ def shading(gx, gy, gain, places, coefficients, max_slope):
         gx, gy: slopes of the surface along columns and rows, maps.
         gain: of the light, colours.
         places: 1, or 1, u and v, of each cell (waves, rows, columns).
-        coefficients: of `depth.coefficients`.
+        coefficients: as `depth` orders those of the sensor file.
         max_slope: beyond it only the direction counts.
 
     Returns:
