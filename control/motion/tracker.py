@@ -8,9 +8,11 @@ would have to stop or turn faster than the limits allow, it walks slower: it nev
 """
 
 from dataclasses import dataclass, replace
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
+from numba import njit
 
 from touchgoal.control.motion.arm_models import JointLimits
 
@@ -33,7 +35,7 @@ class TrackerState:
     """
 
     q: Joints
-    targets: tuple[Joints, ...]
+    targets: Float[np.ndarray, "k n"]
     step: Joints
     window: Float[np.ndarray, "m n"]
 
@@ -60,11 +62,14 @@ class Tracker:
         self.lag = (self._weights.size - 1) / 2 * dt
         self._reach = limits.acceleration * self._m * dt**2  # rad a tick that may be gained or lost
         self._fastest = np.minimum(limits.velocity * dt, self._reach)
+        self.step(
+            self.start(speed)
+        )  # so that nothing is compiled, or read from the disk, in a loop
 
     def start(self, q: Joints) -> TrackerState:
         """At rest in `q` (rad)."""
         window = np.tile(q, (max(self._weights.size, self._m + 1), 1))
-        return TrackerState(q, (), np.zeros(q.size), window)
+        return TrackerState(q, np.empty((0, q.size)), np.zeros(q.size), window)
 
     def set_target(self, state: TrackerState, target: Joints) -> TrackerState:
         """A new target (rad) from the policy, clamped to the limits; not a number: it is left out.
@@ -74,30 +79,51 @@ class Tracker:
         if not np.isfinite(target).all():
             return state
         target = np.clip(target, self.limits.lower, self.limits.upper)
-        reference = state.window[-1]
-        if np.array_equal(state.targets[-1] if state.targets else reference, target):
+        reference, waiting = state.window[-1], len(state.targets)
+        if np.array_equal(state.targets[-1] if waiting else reference, target):
             return state
-        if state.targets and len(state.targets) < _MOST:
-            return replace(state, targets=(*state.targets, target))
-        return replace(state, targets=(target,), step=(target - reference) / self._ticks)
+        if 0 < waiting < _MOST:
+            return replace(state, targets=np.vstack([state.targets, target]))
+        return replace(state, targets=target[None], step=(target - reference) / self._ticks)
 
     def step(self, state: TrackerState) -> TrackerState:
         """One tick of the interface; `q` of the result is the command."""
-        reference, targets, step = state.window[-1], state.targets, state.step
-        if targets:
-            pace = min(float(len(targets)), self._highest_pace(state))
-            if (np.abs(targets[0] - reference) <= pace * np.abs(step) + _ROUNDING).all():
-                reference, targets = targets[0], targets[1:]
-                step = (targets[0] - reference) / self._ticks if targets else np.zeros(step.size)
-            else:
-                reference = reference + pace * step
-        window = np.vstack([state.window[1:], reference])
-        q = self._weights @ window[-self._weights.size :]
-        return TrackerState(q, targets, step, window)
+        return TrackerState(
+            *_step(
+                state.targets,
+                state.step,
+                state.window,
+                self._weights,
+                self._m,
+                self._reach,
+                self._fastest,
+                self._ticks,
+            )
+        )
 
-    def _highest_pace(self, state: TrackerState) -> float:
-        """How many times its step the reference may go, so that its mean keeps to the limits."""
-        before = state.window[-self._m] - state.window[-self._m - 1]
-        most = np.minimum(np.abs(before + np.sign(state.step) * self._reach), self._fastest)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            return float(np.nanmin(most / np.abs(state.step)))
+
+@njit(cache=True)
+@no_type_check
+def _step(targets, step, window, weights, m, reach, fastest, ticks):
+    """The command, and what waits, the reference's step and its window after this tick."""
+    reference = window[-1].copy()
+    if len(targets):
+        # How many times its step the reference may go, so that its mean keeps to the limits.
+        pace = float(len(targets))
+        for i in range(step.size):
+            if step[i] != 0:
+                before = window[-m, i] - window[-m - 1, i]
+                most = min(abs(before + np.sign(step[i]) * reach[i]), fastest[i])
+                pace = min(pace, most / abs(step[i]))
+        if (np.abs(targets[0] - reference) <= pace * np.abs(step) + _ROUNDING).all():
+            reference, targets = targets[0].copy(), targets[1:]
+            step = (targets[0] - reference) / ticks if len(targets) else np.zeros(step.size)
+        else:
+            reference += pace * step
+    moved = np.empty_like(window)
+    moved[:-1] = window[1:]
+    moved[-1] = reference
+    q = np.zeros(step.size)
+    for k in range(weights.size):
+        q += weights[k] * moved[k - weights.size]
+    return q, targets, step, moved

@@ -1,10 +1,12 @@
 """What the solver's contacts say about the fingertips: wrenches, slip, external force."""
 
 from dataclasses import dataclass
+from typing import NamedTuple, no_type_check
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from numba import njit
 
 from touchgoal.sim_envs.scene.build import SIDES
 
@@ -47,7 +49,9 @@ class ContactReader:
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
-        self._pads = {model.geom(f"{side}_pad").id: i for i, side in enumerate(SIDES)}
+        self._pad_of = np.full(model.ngeom, -1)  # by geom: 0 left, 1 right, -1 none
+        for i, side in enumerate(SIDES):
+            self._pad_of[model.geom(f"{side}_pad").id] = i
         self._sensors = [model.site(f"{side}_sensor").id for side in SIDES]
         self._tcp = model.site("tcp").id
         base = model.body("base").id
@@ -62,35 +66,28 @@ class ContactReader:
         The wrench is the force (N) and torque (Nm) of everything outside on the robot, at the TCP,
         in the base frame.
         """
-        force, torque = np.zeros((2, 3)), np.zeros((2, 3))
-        slip: list[float] = [0.0, 0.0]
-        geoms: list[set[int]] = [set(), set()]
-        external = np.zeros(6)
-        for i in range(data.ncon):
-            contact = data.contact[i]
-            first, second = (int(g) for g in contact.geom)
-            if contact.efc_address < 0 or not (self._is_robot[first] or self._is_robot[second]):
-                continue
-            f, t = self._wrench(data, i, contact)
-            if self._is_robot[first] != self._is_robot[second]:
-                sign = 1.0 if self._is_robot[second] else -1.0
-                arm = contact.pos - data.site_xpos[self._tcp]
-                external += sign * np.concatenate([f, _cross(arm, f) + t])
-            for own, other, sign in ((first, second, -1.0), (second, first, 1.0)):
-                side = self._pads.get(own)
-                if side is None:
-                    continue
-                site = self._sensors[side]
-                R = data.site_xmat[site].reshape(3, 3)
-                arm = contact.pos - data.site_xpos[site]
-                force[side] += sign * R.T @ f
-                torque[side] += sign * R.T @ (_cross(arm, f) + t)
-                slip[side] = max(slip[side], self._sliding_speed(data, contact))
-                geoms[side].add(other)
-        left, right = (
-            PadContact(force[s], torque[s], slip[s], frozenset(geoms[s])) for s in range(2)
+        contacts, model = data.contact, self._model
+        pads = self._pad_of[contacts.geom]
+        wrenches, slip = _read_contacts(
+            Contacts(
+                contacts.geom, contacts.frame, contacts.pos, contacts.efc_address, contacts.dim
+            ),
+            data.efc_force,
+            self._is_robot,
+            pads,
+            data.site_xpos[[*self._sensors, self._tcp]],
+            Moving(model.geom_bodyid, model.body_rootid, data.cvel, data.subtree_com),
         )
-        return (left, right), external
+        solved = contacts.efc_address >= 0
+        left, right = (
+            PadContact(
+                *(data.site_xmat[site].reshape(3, 3).T @ wrench.reshape(2, 3, 1))[..., 0],
+                float(slip[side]),
+                frozenset(contacts.geom[:, ::-1][(pads == side) & solved[:, None]].tolist()),
+            )
+            for side, (site, wrench) in enumerate(zip(self._sensors, wrenches[:2], strict=True))
+        )
+        return (left, right), wrenches[2]
 
     def joint_torque(self, data: mujoco.MjData) -> Float[np.ndarray, " nv"]:
         """Generalised force of all contacts, J^T f; what the hand does to itself cancels out."""
@@ -121,20 +118,73 @@ class ContactReader:
         frame = contact.frame.reshape(3, 3)
         return frame.T @ wrench[:3], frame.T @ wrench[3:]
 
-    def _sliding_speed(self, data: mujoco.MjData, contact: mujoco.MjContact) -> float:
-        """Tangential speed of one surface over the other at a contact point, m/s."""
-        velocities = []
-        for geom in contact.geom:
-            twist = np.zeros(6)
-            body = self._model.geom_bodyid[geom]
-            mujoco.mj_objectVelocity(self._model, data, mujoco.mjtObj.mjOBJ_XBODY, body, twist, 0)
-            velocities.append(twist[3:] + _cross(twist[:3], contact.pos - data.xpos[body]))
-        relative = velocities[1] - velocities[0]
-        normal = contact.frame[:3]
-        return float(np.linalg.norm(relative - normal * (normal @ relative)))
+
+class Contacts(NamedTuple):
+    """MuJoCo's contacts as arrays: a row each."""
+
+    geoms: Int[np.ndarray, "k 2"]
+    frames: Float[np.ndarray, "k 9"]
+    points: Float[np.ndarray, "k 3"]
+    addresses: Int[np.ndarray, " k"]
+    sizes: Int[np.ndarray, " k"]
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """np.cross of two 3-vectors, without its 30 us of checks."""
-    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+class Moving(NamedTuple):
+    """What tells how fast a point of a geom moves: bodies, and their velocities about their tree's centre."""
+
+    bodies: Int[np.ndarray, " geoms"]
+    roots: Int[np.ndarray, " bodies"]
+    velocities: Float[np.ndarray, "bodies 6"]
+    centres: Float[np.ndarray, "bodies 3"]
+
+
+@njit(cache=True)
+@no_type_check
+def _read_contacts(contacts, forces, is_robot, pads, origins, moving):
+    """What acts on the left pad, the right pad and the robot, and how fast things slip over the pads.
+
+    Returns:
+        forces (N) and torques (N m) about the three origins, in the world frame (3, 6), and m/s (2).
+    """
+    wrenches, slip = np.zeros((3, 6)), np.zeros(2)
+    for i in range(contacts.addresses.size):
+        first, second = contacts.geoms[i]
+        address, point = contacts.addresses[i], contacts.points[i]
+        if address < 0 or not (is_robot[first] or is_robot[second]):
+            continue
+        # With elliptic cones the solver's rows are the first geom's wrench on the second, in the contact's frame.
+        force, torque = np.zeros(3), np.zeros(3)
+        for k in range(contacts.sizes[i]):
+            axis = contacts.frames[i, 3 * (k % 3) : 3 * (k % 3) + 3]
+            part = force if k < 3 else torque
+            part += forces[address + k] * axis
+        if is_robot[first] != is_robot[second]:
+            sign = 1.0 if is_robot[second] else -1.0
+            _add_wrench(wrenches[2], sign, force, torque, point - origins[2])
+        for k in range(2):
+            side = pads[i, k]
+            if side < 0:
+                continue
+            _add_wrench(wrenches[side], 2.0 * k - 1.0, force, torque, point - origins[side])
+            normal = contacts.frames[i, :3]
+            relative = _velocity(moving, second, point) - _velocity(moving, first, point)
+            relative -= normal * (normal * relative).sum()
+            slip[side] = max(slip[side], np.sqrt((relative**2).sum()))
+    return wrenches, slip
+
+
+@njit(inline="always")
+@no_type_check
+def _add_wrench(total, sign, force, torque, arm):
+    """Add a force at the end of an arm, and a torque."""
+    total[:3] += sign * force
+    total[3:] += sign * (np.cross(arm, force) + torque)
+
+
+@njit(inline="always")
+@no_type_check
+def _velocity(moving, geom, point):
+    """Of a point (m, world frame) fixed to a geom, m/s."""
+    body = moving.bodies[geom]
+    twist = moving.velocities[body]
+    return twist[3:] + np.cross(twist[:3], point - moving.centres[moving.roots[body]])
