@@ -68,7 +68,7 @@ class Progress:
 def _plural(unit: str) -> str:
     if unit.endswith("y"):
         return unit.removesuffix("y") + "ies"
-    return unit + ("es" if unit.endswith("s") else "s")
+    return unit + ("es" if unit.endswith(("s", "sh", "ch")) else "s")
 
 
 def track(items: Iterable[Item], what: str, unit: str, total: int | None = None) -> Iterator[Item]:

@@ -57,7 +57,7 @@ def train(sensor: SensorModel, name: str, config: WhiteningConfig) -> PooledEnco
     total, square = np.zeros(FEATURES), np.zeros((FEATURES, FEATURES))
     within = np.zeros((FEATURES, FEATURES))
     count = config.surfaces * config.presses
-    for rows in track(_pooled(encoder, sensor, config), "surfaces", "set", _batches(config)):
+    for rows in track(_pooled(encoder, sensor, config), "surfaces", "batch", _batches(config)):
         total += rows.sum((0, 1))
         flat = rows.reshape(-1, FEATURES)
         square += flat.T @ flat
