@@ -96,7 +96,7 @@ QUOTED = {
         _nearest,
     ),
     "real-force": Quoted(
-        "touchgoal benchmark real-touch --data franka_wedge_grasps",
+        "touchgoal benchmark real-touch --data franka_wedge_grasps --encoders gelsight_mini_surfaces pixels",
         "force of real grasps from pictures, of things not calibrated on",
         _real_force,
     ),

@@ -19,6 +19,7 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.progress import track
 from touchgoal.control.tactile.contact import contact_strength, threshold_for
 from touchgoal.encoders.probes.property_probe import (
+    adapted_nearest_is_same,
     cross_validated,
     interval,
     most_of_three,
@@ -132,11 +133,14 @@ def judge(touches: list[VideoTouch], embedded: list[VideoEmbedding]) -> dict[str
     ranks = np.array([touch.video.ranks for touch in touches if touch.video.ranks is not None])
     embeddings = every[ranked]
     same = nearest_is_same(embeddings, things)
+    adapted = adapted_nearest_is_same(embeddings, things)
     result: dict[str, Any] = {
         "videos": len(things),
         "things": len(set(things)),
         "nearest": float(same.mean()),
         "nearest_interval": interval(same, things),
+        "adapted": float(adapted.mean()),
+        "adapted_interval": interval(adapted, things),
         "light": light_shift(touches, embedded),
     }
     cross = cross_validated(embeddings, ranks, things)
@@ -186,17 +190,19 @@ def _table(rows: list[dict[str, Any]]) -> str:
     first = rows[0]
     lines = [
         f"{first['videos']} videos of {first['things']} things; in brackets 95 % over things.",
-        "nearest: the nearest other video is of the same thing. Properties by a ridge: all three",
-        "right of things never seen, by ten folds, and on the published validation things (there",
-        "hardness, roughness, bumpiness / all three / PC / PSS). light: shift of an untouched frame",
-        "by 10 % more light, as a share of the lightest touch's (of the usual touch's).",
-        f"{'encoder':<24}{'nearest':<20}{'all 3, folds':<20}{'validation things':<52}light",
+        "nearest: the nearest other video is of the same thing; adapted: centred and whitened by the",
+        "videos of other things, in ten folds. Properties by a ridge: all three right of things never",
+        "seen, by ten folds, and on the published validation things (there hardness, roughness,",
+        "bumpiness / all three / PC / PSS). light: shift of an untouched frame by 10 % more light, as a",
+        "share of the lightest touch's (of the usual touch's).",
+        f"{'encoder':<24}{'nearest':<20}{'adapted':<20}{'all 3, folds':<20}{'validation things':<52}light",
     ]
     for row in rows:
         fold, light = row["cross_validated"], row["light"]
         val = row.get("val")
         lines.append(
             f"{row['encoder'][-23:]:<24}{_with(row['nearest'], row['nearest_interval']):<20}"
+            f"{_with(row['adapted'], row['adapted_interval']):<20}"
             f"{_with(fold['all'], fold['all_interval']):<20}{_validation(val):<52}"
             f"{light['light'] / max(light['lightest'], 1e-12):.2f} "
             f"({light['light'] / max(light['usual'], 1e-12):.2f})"

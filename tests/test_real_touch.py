@@ -14,6 +14,7 @@ from touchgoal.benchmarks.real_touch_encoders import find_embedder
 from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.picture_force import calibrate_force, shrunk, statistics
 from touchgoal.encoders.probes import property_probe
+from touchgoal.encoders.probes.property_probe import adapted_nearest_is_same, nearest_is_same
 from touchgoal.episodes.importers.force_grasps import read_force_grasps
 from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
 from touchgoal.episodes.media import write_video
@@ -187,3 +188,17 @@ def test_things_grasped_once_have_forces_and_no_cost(tmp_path: Path) -> None:
     (tmp_path / "grasps.csv").write_text("\n".join(table))
     result = run(RealTouchOptions(data=tmp_path, encoders=("pixels",)))
     assert result["cost"] == {} and result["things"] == 3
+
+
+def test_videos_of_other_things_tell_what_differs_without_meaning() -> None:
+    """Thirty things by 38 numbers, beside two that are larger and differ from video to video."""
+    rng = np.random.default_rng(0)
+    things = np.repeat(np.arange(30), 4)
+    kind = rng.normal(size=(30, 38))[things]
+    embeddings = np.hstack([kind, rng.normal(5, 10, (120, 2))])
+    plain, adapted = (
+        judge(embeddings, things).mean() for judge in (nearest_is_same, adapted_nearest_is_same)
+    )
+    assert plain < 0.6 and adapted > 0.9
+    shuffled = rng.permutation(things)  # nothing to learn: no better than chance
+    assert adapted_nearest_is_same(embeddings, shuffled).mean() < 0.15

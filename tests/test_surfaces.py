@@ -14,9 +14,9 @@ from touchgoal.encoders.preprocess import steady_preprocessor_for
 from touchgoal.encoders.pretrained import load_encoder, save
 from touchgoal.encoders.ssl.surface_whitening import (
     WhiteningConfig,
-    inverse_square_root,
     train,
 )
+from touchgoal.encoders.whitening import inverse_square_root
 from touchgoal.sim_envs.tactile.indenters import FOUNDATION_MODULUS, IndenterPose, indent
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 from touchgoal.sim_envs.tactile.surface_press import (

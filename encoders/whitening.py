@@ -1,0 +1,27 @@
+"""Distances that ignore what differs within a class (Hatch et al. 2006, within-class covariance normalisation)."""
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+_LEAST = 1e-12  # variance: samples that do not differ at all
+
+
+def inverse_square_root(
+    covariance: Float[np.ndarray, "d d"], shrinkage: float
+) -> Float[np.ndarray, "d d"]:
+    """V of a covariance C, shrunk towards a sphere, such that V.T C V is the identity."""
+    size = len(covariance)
+    sphere = max(np.trace(covariance) / size, _LEAST) * np.eye(size)
+    values, vectors = np.linalg.eigh((1 - shrinkage) * covariance + shrinkage * sphere)
+    return vectors / np.sqrt(values)
+
+
+def within_classes(
+    samples: Float[np.ndarray, "n d"], classes: Shaped[np.ndarray, " n"]
+) -> Float[np.ndarray, "d d"]:
+    """Covariance about the mean of each class."""
+    apart = samples.astype(np.float64)
+    names = np.unique(classes)
+    for name in names:
+        apart[classes == name] -= apart[classes == name].mean(0)
+    return apart.T @ apart / max(len(samples) - len(names), 1)
