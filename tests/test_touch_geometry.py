@@ -8,7 +8,7 @@ import pytest
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.background import Background
-from touchgoal.control.tactile.contact import ContactDetector
+from touchgoal.control.tactile.contact import ContactDetector, contact_strength
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.force import estimate_force
 from touchgoal.control.tactile.markers import MarkerTracker, find_markers, without_markers
@@ -258,6 +258,20 @@ def test_painting_markers_over_gives_the_plain_gel(gel: SensorInstance) -> None:
     noise = gel.calibration.noise  # of the plain picture
     assert changed.mean() > 0.15
     assert error.mean() < noise and np.quantile(error, 0.99) < 4 * noise
+
+
+@pytest.mark.parametrize(
+    "seed", [6, 56, 70]
+)  # 70: a unit whose dots are a fifth larger in the picture
+def test_dots_of_another_unit_are_painted_out_whole(seed: int) -> None:
+    """Their size and the picture's scale differ; rims left over look like a touch, and `deploy` refuses."""
+    assert DOTTED.markers is not None
+    unit = sample_instance(DOTTED, np.random.default_rng(seed))
+    plain = untouched(unit, 1)[0]
+    image = dotted(plain, unit)
+    dots = find_markers(image, DOTTED.markers, DOTTED.pixel_pitch)
+    painted = without_markers(image, dots.positions, dots.largest_radius(DOTTED.markers))
+    assert contact_strength(painted[None], plain)[0] < 7.0  # counts; refused are 12
 
 
 # Depth and force.

@@ -14,7 +14,7 @@ from touchgoal.control.tactile.background import Background, Drift, local_change
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.force import estimate_force
-from touchgoal.control.tactile.markers import MarkerTracker, without_markers
+from touchgoal.control.tactile.markers import Markers, MarkerTracker, without_markers
 from touchgoal.control.tactile.sensor_calibration import load, shade
 from touchgoal.control.tactile.sensor_models import SensorModel
 
@@ -131,8 +131,7 @@ def check_sensor(
     drift = followed.drift()
     followed.reference = reference.astype(np.float32)
     firm = _firmest(touches)
-    rest = tracker.rest.positions if tracker is not None else None
-    read = _Reader(sensor, ball_radius, rest)
+    read = _Reader(sensor, ball_radius, tracker.rest if tracker is not None else None)
     return SensorCheck(
         frames=len(untouched) + len(touches),
         touching=len(touches),
@@ -157,10 +156,11 @@ class _Reader:
         self,
         sensor: SensorModel,
         ball_radius: float | None,
-        rest: Float32[np.ndarray, "rows columns 2"] | None,
+        rest: Markers | None,
     ) -> None:
-        self._sensor, self._ball_radius, self._rest = sensor, ball_radius, rest
-        self._dot = sensor.markers.diameter / sensor.pixel_pitch / 2 if sensor.markers else 0.0
+        self._sensor, self._ball_radius = sensor, ball_radius
+        self._rest = rest.positions if rest is not None else None
+        self._dot = rest.largest_radius(sensor.markers) if rest and sensor.markers else 0.0
         self._calibration = load(sensor.sensor_file)
         self._depth = DepthEstimator(self._calibration)
 

@@ -14,6 +14,7 @@ _FAINTEST = 0.5  # of the usual darkness: a fainter spot is no dot
 _LEAST_FOUND = 0.7  # of the grid, or it is no marker gel
 _NOISE = 0.02  # darkness of a spot that may be noise
 _RIM = 2.0  # px around a dot's nominal radius that may still be dark
+_LARGER = 1.1  # times a dot's nominal radius: how large those of another gel may be
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,11 @@ class Markers:
 
     positions: Float32[np.ndarray, "rows columns 2"]
     found: Bool[np.ndarray, "rows columns"]
+
+    def largest_radius(self, grid: MarkerGrid) -> float:
+        """Radius (px) within which such dots end, on an untouched gel: by how far apart they lie in the picture."""
+        spacing = np.median(np.linalg.norm(np.diff(self.positions, axis=1), axis=-1))
+        return float(_LARGER * spacing * grid.diameter / grid.pitch / 2)
 
 
 class MarkerTracker:

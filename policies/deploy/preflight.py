@@ -188,8 +188,8 @@ def _fingertip(camera: TactileSensor) -> tuple[Picture, Picture]:
     """What it shows and its sensor file's background, both without dots."""
     frame, model = camera.read().image, camera.model
     if model.markers is not None:  # every unit's dots lie elsewhere
-        dots = find_markers(frame, model.markers, model.pixel_pitch).positions
-        frame = without_markers(frame, dots, model.markers.diameter / model.pixel_pitch / 2)
+        dots = find_markers(frame, model.markers, model.pixel_pitch)
+        frame = without_markers(frame, dots.positions, dots.largest_radius(model.markers))
     return frame, load(model.sensor_file).background
 
 
