@@ -139,7 +139,7 @@ QUOTED = {
     ),
     "policy-delay": Quoted("touchgoal benchmark policy-delay"),
     "policy-delay-causes": Quoted("touchgoal benchmark policy-delay --causes"),
-    "maze-delay": Quoted("touchgoal benchmark policy-delay --task bead-maze"),
+    "maze-delay": Quoted("touchgoal benchmark policy-delay --task bead-maze --jitter 50"),
     "maze-delay-causes": Quoted("touchgoal benchmark policy-delay --task bead-maze --causes"),
     "sent-stream": Quoted("touchgoal benchmark sent-stream"),
     "replay": Quoted("touchgoal benchmark replay"),
