@@ -133,10 +133,6 @@ QUOTED = {
         headline=_deployed,
     ),
     "deploy-in-a-row": Quoted("touchgoal benchmark deploy --policies shipped --in-a-row 20"),
-    "deploy-expert": Quoted(
-        "touchgoal benchmark deploy --tasks pick-place --policies scripted --arms environment lock-step "
-        "--episodes 20 --seed 7000000",
-    ),
     "policy-delay": Quoted("touchgoal benchmark policy-delay"),
     "policy-delay-causes": Quoted("touchgoal benchmark policy-delay --causes"),
     "maze-delay": Quoted("touchgoal benchmark policy-delay --task bead-maze --jitter 50"),
