@@ -22,7 +22,8 @@ def test_wrenches_and_slip_are_mujocos() -> None:
     for pad, side in zip(env.pad_contacts(), SIDES, strict=True):
         site, geom = data.site(f"{side}_sensor"), model.geom(f"{side}_pad").id
         wrench, fastest, others = np.zeros(6), 0.0, set()
-        for i, contact in enumerate(data.contact):
+        for i in range(data.ncon):
+            contact = data.contact[i]
             if geom not in contact.geom or contact.efc_address < 0:
                 continue
             towards = 1.0 if contact.geom[1] == geom else -1.0

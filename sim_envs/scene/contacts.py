@@ -79,15 +79,15 @@ class ContactReader:
             Moving(model.geom_bodyid, model.body_rootid, data.cvel, data.subtree_com),
         )
         solved = contacts.efc_address >= 0
-        left, right = (
-            PadContact(
-                *(data.site_xmat[site].reshape(3, 3).T @ wrench.reshape(2, 3, 1))[..., 0],
-                float(slip[side]),
-                frozenset(contacts.geom[:, ::-1][(pads == side) & solved[:, None]].tolist()),
-            )
-            for side, (site, wrench) in enumerate(zip(self._sensors, wrenches[:2], strict=True))
-        )
-        return (left, right), wrenches[2]
+
+        def pad(side: int) -> PadContact:
+            force, torque = wrenches[side].reshape(2, 3) @ data.site_xmat[
+                self._sensors[side]
+            ].reshape(3, 3)
+            touching = contacts.geom[:, ::-1][(pads == side) & solved[:, None]]
+            return PadContact(force, torque, float(slip[side]), frozenset(touching.tolist()))
+
+        return (pad(0), pad(1)), wrenches[2]
 
     def joint_torque(self, data: mujoco.MjData) -> Float[np.ndarray, " nv"]:
         """Generalised force of all contacts, J^T f; what the hand does to itself cancels out."""
