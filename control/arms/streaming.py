@@ -61,13 +61,17 @@ class ArmClient(ABC):
         self.period = NEVER if config.lock_step else self._stream_period
         self._state: TrackerState | None = None
         self._twin_time: float | None = None
-        self._tracker = Tracker(
-            self._connect(recover), config.robot.policy.velocity, 1 / config.hz, self._stream_period
-        )
+        # A tracker's first step is compiled, or read from the disk: before a controller waits for it.
+        self._make_tracker(config.robot.interface)
+        self._tracker = self._make_tracker(self._connect(recover))
         self._clock, self._stamp = -1.0, time.monotonic()
         self._reading = self._measure()
         self._refusal = self._reading.fault
         self._ticked, self._streamed, self._streams = time.monotonic(), 0.0, False
+
+    def _make_tracker(self, limits: JointLimits) -> Tracker:
+        config = self.config
+        return Tracker(limits, config.robot.policy.velocity, 1 / config.hz, self._stream_period)
 
     @abstractmethod
     def _connect(self, recover: bool) -> JointLimits:
