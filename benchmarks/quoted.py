@@ -132,6 +132,10 @@ QUOTED = {
         "--seed 7000000",
         headline=_deployed,
     ),
+    "deploy-expert": Quoted(
+        "touchgoal benchmark deploy --tasks pick-place --policies scripted --arms environment lock-step "
+        "--episodes 20 --seed 7000000",
+    ),
     "deploy-in-a-row": Quoted("touchgoal benchmark deploy --policies shipped --in-a-row 20"),
     "policy-delay": Quoted("touchgoal benchmark policy-delay"),
     "policy-delay-causes": Quoted("touchgoal benchmark policy-delay --causes"),
