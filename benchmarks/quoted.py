@@ -177,5 +177,6 @@ QUOTED = {
     ),
     "policy-latency": Quoted("touchgoal benchmark policy-latency", headline=_plan),
     "touch-probes": Quoted("touchgoal benchmark touch-probes"),
+    "tacbench": Quoted("touchgoal benchmark tacbench"),
     "faults": Quoted("touchgoal benchmark faults"),
 }
