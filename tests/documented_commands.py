@@ -24,6 +24,7 @@ TOY = {
     "collect-demos --episodes 240": "--episodes 2 --workers 2 --env.objects glass_ball --env.control-hz 10",
     "collect-demos --episodes 80": "--episodes 2 --workers 2 --env.objects glass_ball --env.control-hz 10",
     "collect-demos": "--episodes 4 --workers 2 --env.objects glass_ball --env.cameras front --env.control-hz 10",
+    "collect-touches": "--episodes 2 --workers 2",
     "reward-curves data/episodes": "--index 0",
     "train-encoder align": "--align.vit tiny --align.epochs 1 --align.batch-size 8 --normalizer-episodes 2",
     "train-encoder mae": "--frames 8 --mae.vit tiny --mae.epochs 1 --mae.batch-size 8",
