@@ -8,7 +8,6 @@ trained on them.
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
@@ -29,18 +28,16 @@ from touchgoal.encoders.probes.property_probe import (
 )
 from touchgoal.episodes.importers.force_grasps import read_force_grasps
 from touchgoal.episodes.importers.labelled_videos import (
+    FIRMEST,
     PROPERTIES,
     LabelledVideo,
+    firmest_frames,
     read_labelled_videos,
 )
 from touchgoal.episodes.touches import touch_background
 
-FRAMES = 5
-"""Of a video that are embedded: those of the largest change."""
 BRIGHTER = 1.1
 """Light of the drift test."""
-
-_SMALL = 80, 60  # px at which the largest change is looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,12 +99,10 @@ def run(config: RealTouchOptions) -> dict[str, Any]:
 def read_touch(video: LabelledVideo, frames: UInt8[np.ndarray, "n h w 3"]) -> VideoTouch:
     """The frames of one video that count."""
     background = touch_background(frames)
-    small = _shrunk(frames)
-    change = np.abs(small - _shrunk(background[None])).mean((1, 2, 3))
-    chosen = np.sort(np.argsort(-change, kind="stable")[:FRAMES])
+    chosen = firmest_frames(frames, background)
     strength = contact_strength(frames[chosen], background)
-    first = contact_strength(frames[:FRAMES], background)
-    threshold = threshold_for(frames[:FRAMES], background)
+    first = contact_strength(frames[:FIRMEST], background)
+    threshold = threshold_for(frames[:FIRMEST], background)
     peak, untouched = float(max(strength.max(), first.max())), float(first[:3].max())
     rest = int(first[:3].argmin())
     return VideoTouch(video, chosen, rest, background, untouched, peak, threshold)
@@ -181,11 +176,6 @@ def _figures(right: np.ndarray, things: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _shrunk(frames: np.ndarray) -> Float[np.ndarray, "n h w 3"]:
-    small = [cv2.resize(frame, _SMALL, interpolation=cv2.INTER_AREA) for frame in frames]
-    return np.stack(small).astype(np.float32)
-
-
 def _table(rows: list[dict[str, Any]]) -> str:
     first = rows[0]
     lines = [
@@ -223,7 +213,7 @@ def _validation(val: dict[str, Any] | None) -> str:
 
 
 def _contact_line(touches: list[VideoTouch]) -> str:
-    judged = [touch for touch in touches if len(touch.chosen) == FRAMES]
+    judged = [touch for touch in touches if len(touch.chosen) == FIRMEST]
     false = [t.video.path.stem for t in judged if t.untouched > t.threshold]
     missed = [t.video.path.stem for t in judged if t.peak <= t.threshold]
     return (

@@ -41,6 +41,7 @@ NOT_RUN = {
     "record-presses": "needs a sensor and a person: test_own_sensor.py",
     "check-sensor": "needs a sensor and a person: test_own_sensor.py",
     "calibrate": "needs presses of a real sensor: test_calibration.py",
+    "train-encoder adapt": "needs videos: test_real_touch.py",
     "teleop": "needs a terminal and a person: test_teleop.py",
     "benchmark": "test_commands.py runs each at toy size",
     "make-policy": "test_commands.py",

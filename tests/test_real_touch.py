@@ -13,11 +13,15 @@ from touchgoal.benchmarks.real_touch import embed_touch, read_touch, run
 from touchgoal.benchmarks.real_touch_encoders import find_embedder
 from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.picture_force import calibrate_force, shrunk, statistics
+from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
+from touchgoal.encoders.pretrained import find_encoder, load_encoder, load_pooled
 from touchgoal.encoders.probes import property_probe
 from touchgoal.encoders.probes.property_probe import adapted_nearest_is_same, nearest_is_same
+from touchgoal.encoders.ssl.own_videos import adapt
 from touchgoal.episodes.importers.force_grasps import read_force_grasps
 from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
 from touchgoal.episodes.media import write_video
+from touchgoal.launch.__main__ import main
 
 Y, X = np.mgrid[:60, :80].astype(np.float32)
 
@@ -64,6 +68,33 @@ def test_the_benchmark_judges_encoders(clips: Path) -> None:
     assert (
         "contact in 18 clips: 0 alarms within the first three frames; 0 missed" in result["table"]
     )
+
+
+def test_an_encoder_is_adapted_to_videos(clips: Path, tmp_path: Path) -> None:
+    """What differs between videos of one thing counts less then; other things stay apart."""
+    main(["train-encoder", "adapt", "--data", str(clips), "--share", "0.9", "--out", str(tmp_path)])
+    videos = [v for v in read_labelled_videos(clips) if v.object in ("thing0", "thing1")]
+    names = np.array([v.object for v in videos])
+
+    def apart(encoder: BaseTouchEncoder) -> float:
+        """Squared distances within things, as a share of those between them."""
+        seen = np.stack([encoder.embed(v.frames())[5:].mean(0) for v in videos])
+        means = np.stack([seen[names == name].mean(0) for name in ("thing0", "thing1")])
+        within = np.square(seen - means[(names == "thing1").astype(int)]).sum(1).mean()
+        return float(within / np.square(means[0] - means[1]).sum())
+
+    assert apart(load_encoder(tmp_path / "encoder")) < 0.7 * apart(
+        load_encoder("gelsight_mini_surfaces")
+    )
+
+
+def test_adapting_says_what_it_needs(clips: Path, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="was not fitted by"):
+        main(["train-encoder", "adapt", "--data", str(clips), "--encoder", "gelsight_mini",
+              "--out", str(tmp_path / "a")])  # fmt: skip
+    one = [video for video in read_labelled_videos(clips) if video.path.stem.endswith("_0")]
+    with pytest.raises(UserError, match="no thing has two videos"):
+        adapt(load_pooled(find_encoder("gelsight_mini_surfaces"), None), one, 0.1)
 
 
 def test_the_past_of_a_chosen_frame_is_that_of_its_video(clips: Path) -> None:

@@ -10,6 +10,7 @@ its length, 0 to 1, whether anything is: it comes from the strongest spot of the
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
@@ -81,6 +82,20 @@ class PooledEncoder(BaseTouchEncoder):
     def device(self) -> torch.device:
         """Where the weights are."""
         return self.mean.device
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "d d"]:
+        """Of the pooled features where nothing that matters differs: what the whitening takes out."""
+        whitening = self.whitening.double().numpy()
+        return np.linalg.inv(whitening @ whitening.T)
+
+    def fit(
+        self, mean: Float[np.ndarray, " d"], whitening: Float[np.ndarray, "d d"]
+    ) -> "PooledEncoder":
+        """Take another mean of the pooled features and another whitening; returns itself."""
+        self.mean.copy_(torch.from_numpy(mean))
+        self.whitening.copy_(torch.from_numpy(whitening))
+        return self
 
     def embed_touch(
         self, touch: Float[Tensor, "n 3 h w"], ids_keep: Int[Tensor, "n k"] | None = None
