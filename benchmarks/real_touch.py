@@ -25,7 +25,10 @@ from touchgoal.encoders.probes.property_probe import (
     nearest_is_same,
     pair_accuracy,
     read_properties,
+    sentences_right,
 )
+from touchgoal.encoders.text_head import EmbedTexts
+from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.importers.force_grasps import read_force_grasps
 from touchgoal.episodes.importers.labelled_videos import (
     FIRMEST,
@@ -92,7 +95,10 @@ def run(config: RealTouchOptions) -> dict[str, Any]:
         touches.append(read_touch(video, frames))
         for name, embed in embedders.items():
             embedded[name].append(embed_touch(touches[-1], frames, embed))
-    rows = [{"encoder": name, **judge(touches, seen)} for name, seen in embedded.items()]
+    embed_texts = load_towers("offline").embed_texts
+    rows = [
+        {"encoder": name, **judge(touches, seen, embed_texts)} for name, seen in embedded.items()
+    ]
     return {"table": "\n".join([_table(rows), "", _contact_line(touches)]), "rows": rows}
 
 
@@ -119,7 +125,9 @@ def embed_touch(
     return VideoEmbedding(chosen, *alone)
 
 
-def judge(touches: list[VideoTouch], embedded: list[VideoEmbedding]) -> dict[str, Any]:
+def judge(
+    touches: list[VideoTouch], embedded: list[VideoEmbedding], embed_texts: EmbedTexts
+) -> dict[str, Any]:
     """One encoder's figures, with 95 % intervals over things."""
     every = np.stack([seen.touch for seen in embedded]).astype(np.float64)
     ranked = np.array([touch.video.ranks is not None for touch in touches])
@@ -129,6 +137,7 @@ def judge(touches: list[VideoTouch], embedded: list[VideoEmbedding]) -> dict[str
     embeddings = every[ranked]
     same = nearest_is_same(embeddings, things)
     adapted = adapted_nearest_is_same(embeddings, things)
+    sentences, frequent = sentences_right(embeddings, ranks, things, embed_texts)
     result: dict[str, Any] = {
         "videos": len(things),
         "things": len(set(things)),
@@ -136,6 +145,12 @@ def judge(touches: list[VideoTouch], embedded: list[VideoEmbedding]) -> dict[str
         "nearest_interval": interval(same, things),
         "adapted": float(adapted.mean()),
         "adapted_interval": interval(adapted, things),
+        "sentences": dict(zip(PROPERTIES, sentences.mean(0).tolist(), strict=True)),
+        "sentences_intervals": {
+            name: interval(column, things)
+            for name, column in zip(PROPERTIES, sentences.T, strict=True)
+        },
+        "most_frequent": dict(zip(PROPERTIES, frequent.mean(0).tolist(), strict=True)),
         "light": light_shift(touches, embedded),
     }
     cross = cross_validated(embeddings, ranks, things)
@@ -178,6 +193,7 @@ def _figures(right: np.ndarray, things: np.ndarray) -> dict[str, Any]:
 
 def _table(rows: list[dict[str, Any]]) -> str:
     first = rows[0]
+    frequent = " ".join(f"{first['most_frequent'][name]:.2f}" for name in PROPERTIES)
     lines = [
         f"{first['videos']} videos of {first['things']} things; in brackets 95 % over things.",
         "nearest: the nearest other video is of the same thing; adapted: centred and whitened by the",
@@ -196,6 +212,17 @@ def _table(rows: list[dict[str, Any]]) -> str:
             f"{_with(fold['all'], fold['all_interval']):<20}{_validation(val):<52}"
             f"{light['light'] / max(light['lightest'], 1e-12):.2f} "
             f"({light['light'] / max(light['usual'], 1e-12):.2f})"
+        )
+    lines += [
+        "",
+        'sentences: of "a soft object", "a slightly hard object", "a hard object" and so on the nearest is true,',
+        f"of things never seen, adapted as above; the most frequent answer of the others: {frequent}",
+        f"{'encoder':<24}" + "".join(f"{name:<20}" for name in PROPERTIES),
+    ]
+    for row in rows:
+        cells = (_with(row["sentences"][n], row["sentences_intervals"][n]) for n in PROPERTIES)
+        lines.append(
+            f"{row['encoder'][-23:]:<24}" + "".join(f"{cell:<20}" for cell in cells).rstrip()
         )
     return "\n".join(lines)
 

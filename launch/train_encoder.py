@@ -164,9 +164,11 @@ class Adapt:
 
     data: Path
     """Folder with videos/ and labels.csv, as PhysiCLeAR has them; those of split train and unlabelled
-    are taken, and of the labels what thing each video is of."""
+    are taken. From ranks of hardness, roughness and bumpiness the encoder also learns sentences."""
     encoder: str = "gelsight_mini_surfaces"
     """Encoder to adapt: a name, or the folder of one."""
+    towers: str = "offline"
+    """Frozen towers whose sentences it learns: offline, or a CLIP as Hugging Face id or local directory."""
     share: Annotated[Fraction, RARE] = 0.1
     """Share of the videos in what counts as no difference; the rest is what simulation says. Chosen on
     PhysiCLeAR's training things, where 0.02 to 0.9 do alike."""

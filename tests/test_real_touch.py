@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from touchgoal.benchmarks.config import RealTouchOptions
 from touchgoal.benchmarks.real_cost import EmbeddedGrasp, cost_table, judge_cost
@@ -16,8 +17,14 @@ from touchgoal.control.tactile.picture_force import calibrate_force, shrunk, sta
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.pretrained import find_encoder, load_encoder, load_pooled
 from touchgoal.encoders.probes import property_probe
-from touchgoal.encoders.probes.property_probe import adapted_nearest_is_same, nearest_is_same
+from touchgoal.encoders.probes.property_probe import (
+    adapted_nearest_is_same,
+    nearest_is_same,
+    sentences_right,
+)
 from touchgoal.encoders.ssl.own_videos import adapt
+from touchgoal.encoders.text_head import RANK_WORDS, fit_text_head, rank_sentences
+from touchgoal.encoders.towers.towers import OfflineTowers
 from touchgoal.episodes.importers.force_grasps import read_force_grasps
 from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
 from touchgoal.episodes.media import write_video
@@ -73,6 +80,10 @@ def test_the_benchmark_judges_encoders(clips: Path) -> None:
 def test_an_encoder_is_adapted_to_videos(clips: Path, tmp_path: Path) -> None:
     """What differs between videos of one thing counts less then; other things stay apart."""
     main(["train-encoder", "adapt", "--data", str(clips), "--share", "0.9", "--out", str(tmp_path)])
+    adapted = load_encoder(tmp_path / "encoder")
+    goals = adapted.embed_text_goal(["a soft object", "a hard object"], OfflineTowers())
+    soft, hard = (adapted.embed(press(thing))[5:].mean(0) for thing in (0, 2))
+    assert (goals @ np.stack([soft, hard], 1)).argmax(1).tolist() == [0, 1]
     videos = [v for v in read_labelled_videos(clips) if v.object in ("thing0", "thing1")]
     names = np.array([v.object for v in videos])
 
@@ -83,9 +94,21 @@ def test_an_encoder_is_adapted_to_videos(clips: Path, tmp_path: Path) -> None:
         within = np.square(seen - means[(names == "thing1").astype(int)]).sum(1).mean()
         return float(within / np.square(means[0] - means[1]).sum())
 
-    assert apart(load_encoder(tmp_path / "encoder")) < 0.7 * apart(
-        load_encoder("gelsight_mini_surfaces")
-    )
+    assert apart(adapted) < 0.7 * apart(load_encoder("gelsight_mini_surfaces"))
+
+
+def test_sentences_are_judged_on_things_never_seen() -> None:
+    """Where touch says the ranks, sentences find them; where it does not, they do no better than guesses."""
+    rng = np.random.default_rng(0)
+    ranks = rng.integers(0, 3, (120, 3))
+    things = np.array([f"thing{i // 2}" for i in range(120)])
+    ranks[1::2] = ranks[::2]
+    told = np.eye(3)[ranks].reshape(120, 9) @ rng.normal(size=(9, 30))
+    noise = rng.normal(size=(120, 30))
+    embed_texts = OfflineTowers().embed_texts
+    right, frequent = sentences_right(told + 0.3 * noise, ranks, things, embed_texts)
+    assert right.mean() > 0.9 and 0.15 < frequent.mean() < 0.5
+    assert sentences_right(noise, ranks, things, embed_texts)[0].mean() < 0.5
 
 
 def test_adapting_says_what_it_needs(clips: Path, tmp_path: Path) -> None:
@@ -94,7 +117,26 @@ def test_adapting_says_what_it_needs(clips: Path, tmp_path: Path) -> None:
               "--out", str(tmp_path / "a")])  # fmt: skip
     one = [video for video in read_labelled_videos(clips) if video.path.stem.endswith("_0")]
     with pytest.raises(UserError, match="no thing has two videos"):
-        adapt(load_pooled(find_encoder("gelsight_mini_surfaces"), None), one, 0.1)
+        adapt(load_pooled(find_encoder("gelsight_mini_surfaces")), one, 0.1, OfflineTowers())
+
+
+def test_sentences_lie_where_what_they_tell_of_is_felt() -> None:
+    """Six kinds of touch about orthogonal directions; a triple of ranks that was never felt is named."""
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(3, 3, 40))
+    ranks = np.array([[i, j, k] for i in range(3) for j in range(3) for k in range(3)])
+    felt = directions[0, ranks[:, 0]] + directions[1, ranks[:, 1]] + directions[2, ranks[:, 2]]
+    unseen = (ranks == (0, 2, 1)).all(1)
+    towers = OfflineTowers()
+    centred = torch.from_numpy(felt - felt.mean(0)).float()
+    head = fit_text_head(centred[~unseen], torch.from_numpy(ranks[~unseen]), towers.embed_texts)
+    for k in range(3):
+        near = centred[unseen] @ head(towers.embed_texts(rank_sentences(k))).T
+        assert near.argmax() == ranks[unseen][0, k]
+    whole = towers.embed_texts(
+        [f"a {w[r]} object" for w, r in zip(RANK_WORDS, (0, 2, 1), strict=True)]
+    )
+    assert (head(whole).sum(0) @ centred.T).argmax() == np.flatnonzero(unseen)[0]
 
 
 def test_the_past_of_a_chosen_frame_is_that_of_its_video(clips: Path) -> None:

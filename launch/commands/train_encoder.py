@@ -85,10 +85,11 @@ def _adapt(config: Adapt) -> None:
         )
     splits = "train", "unlabelled"
     videos = [v for v in read_labelled_videos(config.data) if v.split in splits]
+    towers = load_towers(config.towers)
     out = open_run(config.out, "train-encoder", config)
-    adapt(encoder, videos, config.share)
+    adapted = adapt(encoder, videos, config.share, towers)
     source = {"data": str(config.data), "videos": len(videos), "share": config.share}
-    save(encoder, out / "encoder", {"adapted_from": config.encoder, **source, **provenance()})
+    save(adapted, out / "encoder", {"adapted_from": config.encoder, **source, **provenance()})
     print(
         f"{len(videos)} videos of {len({v.object for v in videos})} things; encoder: {out / 'encoder'}"
     )
