@@ -78,6 +78,11 @@ def prepare(
         return Setup(source, goal, embedder, given, f"normalizer: {normalizer}")
     if normalizer == "none":
         return Setup(source, goal, embedder, None, "normalizer: none, raw cosine distances")
+    if touch is not None and folder is None:
+        note = (
+            f"raw cosine distances, for published weights bring no normalizer; to normalise: {_FIT}"
+        )
+        return Setup(source, goal, embedder, None, note)
     path = (folder or pretrained.DEFAULT_ENCODER) / NORMALIZER
     if not path.is_file() and (older := path.with_name("scale.json")).is_file():
         raise UserError(f"{older} is called {NORMALIZER} now: mv {older} {path}")
