@@ -137,7 +137,8 @@ def judge(
     embeddings = every[ranked]
     same = nearest_is_same(embeddings, things)
     adapted = adapted_nearest_is_same(embeddings, things)
-    sentences, frequent = sentences_right(embeddings, ranks, things, embed_texts)
+    sentences = sentences_right(embeddings, ranks, things, embed_texts)
+    frequent = [np.bincount(column).max() / len(column) for column in ranks.T]
     result: dict[str, Any] = {
         "videos": len(things),
         "things": len(set(things)),
@@ -150,7 +151,7 @@ def judge(
             name: interval(column, things)
             for name, column in zip(PROPERTIES, sentences.T, strict=True)
         },
-        "most_frequent": dict(zip(PROPERTIES, frequent.mean(0).tolist(), strict=True)),
+        "most_frequent": dict(zip(PROPERTIES, map(float, frequent), strict=True)),
         "light": light_shift(touches, embedded),
     }
     cross = cross_validated(embeddings, ranks, things)
@@ -216,7 +217,7 @@ def _table(rows: list[dict[str, Any]]) -> str:
     lines += [
         "",
         'sentences: of "a soft object", "a slightly hard object", "a hard object" and so on the nearest is true,',
-        f"of things never seen, adapted as above; the most frequent answer of the others: {frequent}",
+        f"of things never seen, adapted as above; the most frequent answer alone: {frequent}",
         f"{'encoder':<24}" + "".join(f"{name:<20}" for name in PROPERTIES),
     ]
     for row in rows:

@@ -106,9 +106,8 @@ def test_sentences_are_judged_on_things_never_seen() -> None:
     told = np.eye(3)[ranks].reshape(120, 9) @ rng.normal(size=(9, 30))
     noise = rng.normal(size=(120, 30))
     embed_texts = OfflineTowers().embed_texts
-    right, frequent = sentences_right(told + 0.3 * noise, ranks, things, embed_texts)
-    assert right.mean() > 0.9 and 0.15 < frequent.mean() < 0.5
-    assert sentences_right(noise, ranks, things, embed_texts)[0].mean() < 0.5
+    assert sentences_right(told + 0.3 * noise, ranks, things, embed_texts).mean() > 0.9
+    assert sentences_right(noise, ranks, things, embed_texts).mean() < 0.5
 
 
 def test_adapting_says_what_it_needs(clips: Path, tmp_path: Path) -> None:

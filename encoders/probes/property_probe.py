@@ -66,12 +66,12 @@ def sentences_right(
     ranks: Int[np.ndarray, "n properties"],
     things: Things,
     embed_texts: EmbedTexts,
-) -> tuple[Bool[np.ndarray, "n properties"], Bool[np.ndarray, "n properties"]]:
-    """Whether the nearest of the three sentences on a property is true, and whether the most frequent rank is.
+) -> Bool[np.ndarray, "n properties"]:
+    """Whether the nearest of the three sentences on a property is true.
 
     Sentences are brought to touch by other things, by which embeddings are adapted, too.
     """
-    right, frequent = np.zeros(ranks.shape, bool), np.zeros(ranks.shape, bool)
+    right = np.zeros(ranks.shape, bool)
     for test, adapted in _adapted(embeddings, things):
         touches = torch.from_numpy(adapted)
         touches = touches / touches.norm(dim=1, keepdim=True).clamp_min(1e-12)
@@ -79,8 +79,7 @@ def sentences_right(
         for k in range(ranks.shape[1]):
             goals = head(embed_texts(rank_sentences(k))).double()
             right[test, k] = (touches[test] @ goals.T).argmax(1).numpy() == ranks[test, k]
-            frequent[test, k] = ranks[test, k] == np.bincount(ranks[~test, k]).argmax()
-    return right, frequent
+    return right
 
 
 def read_properties(
