@@ -95,6 +95,9 @@ QUOTED = {
         "the nearest other video of a real touch is of the same thing (chance 0.015)",
         _nearest,
     ),
+    "real-touch-adapted": Quoted(
+        "touchgoal benchmark real-touch --data physiclear --encoders runs/adapted/encoder"
+    ),
     "real-force": Quoted(
         "touchgoal benchmark real-touch --data franka_wedge_grasps --encoders gelsight_mini_surfaces pixels",
         "force of real grasps from pictures, of things not calibrated on",
