@@ -8,7 +8,6 @@ trained on them.
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
@@ -26,21 +25,22 @@ from touchgoal.encoders.probes.property_probe import (
     nearest_is_same,
     pair_accuracy,
     read_properties,
+    sentences_right,
 )
+from touchgoal.encoders.text_head import EmbedTexts
+from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.importers.force_grasps import read_force_grasps
 from touchgoal.episodes.importers.labelled_videos import (
+    FIRMEST,
     PROPERTIES,
     LabelledVideo,
+    firmest_frames,
     read_labelled_videos,
 )
 from touchgoal.episodes.touches import touch_background
 
-FRAMES = 5
-"""Of a video that are embedded: those of the largest change."""
 BRIGHTER = 1.1
 """Light of the drift test."""
-
-_SMALL = 80, 60  # px at which the largest change is looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,19 +95,20 @@ def run(config: RealTouchOptions) -> dict[str, Any]:
         touches.append(read_touch(video, frames))
         for name, embed in embedders.items():
             embedded[name].append(embed_touch(touches[-1], frames, embed))
-    rows = [{"encoder": name, **judge(touches, seen)} for name, seen in embedded.items()]
+    embed_texts = load_towers("offline").embed_texts
+    rows = [
+        {"encoder": name, **judge(touches, seen, embed_texts)} for name, seen in embedded.items()
+    ]
     return {"table": "\n".join([_table(rows), "", _contact_line(touches)]), "rows": rows}
 
 
 def read_touch(video: LabelledVideo, frames: UInt8[np.ndarray, "n h w 3"]) -> VideoTouch:
     """The frames of one video that count."""
     background = touch_background(frames)
-    small = _shrunk(frames)
-    change = np.abs(small - _shrunk(background[None])).mean((1, 2, 3))
-    chosen = np.sort(np.argsort(-change, kind="stable")[:FRAMES])
+    chosen = firmest_frames(frames, background)
     strength = contact_strength(frames[chosen], background)
-    first = contact_strength(frames[:FRAMES], background)
-    threshold = threshold_for(frames[:FRAMES], background)
+    first = contact_strength(frames[:FIRMEST], background)
+    threshold = threshold_for(frames[:FIRMEST], background)
     peak, untouched = float(max(strength.max(), first.max())), float(first[:3].max())
     rest = int(first[:3].argmin())
     return VideoTouch(video, chosen, rest, background, untouched, peak, threshold)
@@ -124,7 +125,9 @@ def embed_touch(
     return VideoEmbedding(chosen, *alone)
 
 
-def judge(touches: list[VideoTouch], embedded: list[VideoEmbedding]) -> dict[str, Any]:
+def judge(
+    touches: list[VideoTouch], embedded: list[VideoEmbedding], embed_texts: EmbedTexts
+) -> dict[str, Any]:
     """One encoder's figures, with 95 % intervals over things."""
     every = np.stack([seen.touch for seen in embedded]).astype(np.float64)
     ranked = np.array([touch.video.ranks is not None for touch in touches])
@@ -134,6 +137,8 @@ def judge(touches: list[VideoTouch], embedded: list[VideoEmbedding]) -> dict[str
     embeddings = every[ranked]
     same = nearest_is_same(embeddings, things)
     adapted = adapted_nearest_is_same(embeddings, things)
+    sentences = sentences_right(embeddings, ranks, things, embed_texts)
+    frequent = [np.bincount(column).max() / len(column) for column in ranks.T]
     result: dict[str, Any] = {
         "videos": len(things),
         "things": len(set(things)),
@@ -141,6 +146,12 @@ def judge(touches: list[VideoTouch], embedded: list[VideoEmbedding]) -> dict[str
         "nearest_interval": interval(same, things),
         "adapted": float(adapted.mean()),
         "adapted_interval": interval(adapted, things),
+        "sentences": dict(zip(PROPERTIES, sentences.mean(0).tolist(), strict=True)),
+        "sentences_intervals": {
+            name: interval(column, things)
+            for name, column in zip(PROPERTIES, sentences.T, strict=True)
+        },
+        "most_frequent": dict(zip(PROPERTIES, map(float, frequent), strict=True)),
         "light": light_shift(touches, embedded),
     }
     cross = cross_validated(embeddings, ranks, things)
@@ -181,13 +192,9 @@ def _figures(right: np.ndarray, things: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _shrunk(frames: np.ndarray) -> Float[np.ndarray, "n h w 3"]:
-    small = [cv2.resize(frame, _SMALL, interpolation=cv2.INTER_AREA) for frame in frames]
-    return np.stack(small).astype(np.float32)
-
-
 def _table(rows: list[dict[str, Any]]) -> str:
     first = rows[0]
+    frequent = " ".join(f"{first['most_frequent'][name]:.2f}" for name in PROPERTIES)
     lines = [
         f"{first['videos']} videos of {first['things']} things; in brackets 95 % over things.",
         "nearest: the nearest other video is of the same thing; adapted: centred and whitened by the",
@@ -207,6 +214,17 @@ def _table(rows: list[dict[str, Any]]) -> str:
             f"{light['light'] / max(light['lightest'], 1e-12):.2f} "
             f"({light['light'] / max(light['usual'], 1e-12):.2f})"
         )
+    lines += [
+        "",
+        'sentences: of "a soft object", "a slightly hard object", "a hard object" and so on the nearest is true,',
+        f"of things never seen, adapted as above; the most frequent answer alone: {frequent}",
+        f"{'encoder':<24}" + "".join(f"{name:<20}" for name in PROPERTIES),
+    ]
+    for row in rows:
+        cells = (_with(row["sentences"][n], row["sentences_intervals"][n]) for n in PROPERTIES)
+        lines.append(
+            f"{row['encoder'][-23:]:<24}" + "".join(f"{cell:<20}" for cell in cells).rstrip()
+        )
     return "\n".join(lines)
 
 
@@ -223,7 +241,7 @@ def _validation(val: dict[str, Any] | None) -> str:
 
 
 def _contact_line(touches: list[VideoTouch]) -> str:
-    judged = [touch for touch in touches if len(touch.chosen) == FRAMES]
+    judged = [touch for touch in touches if len(touch.chosen) == FIRMEST]
     false = [t.video.path.stem for t in judged if t.untouched > t.threshold]
     missed = [t.video.path.stem for t in judged if t.peak <= t.threshold]
     return (

@@ -30,7 +30,12 @@ from touchgoal.sim_envs.cloths import CLOTHS, press_cloth
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.grasp_rig import attempt_grasp
 from touchgoal.sim_envs.indenter_rig import FPS, simulate
-from touchgoal.sim_envs.object_slides import HELD, simulate_slide
+from touchgoal.sim_envs.object_slides import (
+    HELD,
+    Slide,
+    simulate_catalogue_slide,
+    simulate_slide,
+)
 
 _RIG = "rig"  # meta: what tells one rig's recordings from another's
 
@@ -51,6 +56,13 @@ def record_slides(root: Path, config: RigConfig, count: int, workers: int) -> Ep
     """The first so many slides of held objects; as `record_strokes`."""
     rig = _description(config, HELD)
     return _record_missing(root, rig, partial(_slide, config, rig), count, workers)
+
+
+def record_catalogue_slides(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
+    """The first so many slides of pick-and-place's objects, each on a unit of its own; as `record_strokes`."""
+    rig = _description(config, ("objects",))
+    record = partial(_slide, config, rig, simulate=simulate_catalogue_slide)
+    return _record_missing(root, rig, record, count, workers)
 
 
 def record_grasps(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
@@ -107,8 +119,13 @@ def _stroke(config: RigConfig, rig: str, index: int) -> EncodedEpisode:
     return encode(Episode(frames, task, meta), FPS)
 
 
-def _slide(config: RigConfig, rig: str, index: int) -> EncodedEpisode:
-    slide = simulate_slide(config, index)
+def _slide(
+    config: RigConfig,
+    rig: str,
+    index: int,
+    simulate: Callable[[RigConfig, int], Slide] = simulate_slide,
+) -> EncodedEpisode:
+    slide = simulate(config, index)
     half, zero = slide.pose[:, 2] / 2, np.zeros(len(slide.pose), np.float32)
     turned = np.column_stack([np.cos(half), zero, zero, np.sin(half)])
     frames = _frames(slide.frames, slide.wrench, slide.slip)

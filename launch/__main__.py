@@ -19,6 +19,7 @@ COMMANDS = {
     "doctor": "what this machine can do, and how to mend what is missing",
     "list": "objects, sensors, tasks, policies, encoders and benchmarks by name",
     "collect-demos": "record an expert's episodes of a task, or failures on purpose",
+    "collect-touches": "record objects slid over a simulated sensor, to learn from without labels",
     "teleop": "lead the bead along a wire with keys, and record it",
     "train-encoder": "train a touch encoder",
     "train-estimators": "train networks that estimate contact from touch and poses from camera pictures",

@@ -1,4 +1,4 @@
-"""Train a touch encoder: on recorded episodes, aligned with frozen towers or without labels; or on surfaces."""
+"""Train a touch encoder: on recorded episodes, aligned or without labels; on simulated surfaces; on videos."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -6,7 +6,14 @@ from typing import Annotated, Any
 import tyro
 from pydantic import Field
 
-from touchgoal.control.option_types import Count, CountOrNone, Seed, checked_dataclass
+from touchgoal.control.option_types import (
+    RARE,
+    Count,
+    CountOrNone,
+    Fraction,
+    Seed,
+    checked_dataclass,
+)
 from touchgoal.encoders.config import ALIGN_PRESETS, MAE_PRESETS, AlignConfig, MaeConfig
 from touchgoal.encoders.ssl.config import (
     DINO_PRESETS,
@@ -151,6 +158,24 @@ class Surfaces:
     """Folder of the run; the encoder goes to its `encoder/`."""
 
 
+@checked_dataclass
+class Adapt:
+    """Adapt an encoder that `surfaces` fitted to videos of things of your own, several of each."""
+
+    data: Path
+    """Folder with videos/ and labels.csv, as PhysiCLeAR has them; those of split train and unlabelled
+    are taken. From ranks of hardness, roughness and bumpiness the encoder also learns sentences."""
+    encoder: str = "gelsight_mini_surfaces"
+    """Encoder to adapt: a name, or the folder of one."""
+    towers: str = "offline"
+    """Frozen towers whose sentences it learns: offline, or a CLIP as Hugging Face id or local directory."""
+    share: Annotated[Fraction, RARE] = 0.1
+    """Share of the videos in what counts as no difference; the rest is what simulation says. Chosen on
+    PhysiCLeAR's training things, where 0.02 to 0.9 do alike."""
+    out: Path | None = None
+    """Folder of the run; the encoder goes to its `encoder/`."""
+
+
 Config = (
     Annotated[Align, tyro.conf.subcommand("align")]
     | Annotated[AlignPaper, tyro.conf.subcommand("align-paper")]
@@ -163,6 +188,7 @@ Config = (
     | Annotated[VJepa, tyro.conf.subcommand("vjepa")]
     | Annotated[VJepaPaper, tyro.conf.subcommand("vjepa-paper")]
     | Annotated[Surfaces, tyro.conf.subcommand("surfaces")]
+    | Annotated[Adapt, tyro.conf.subcommand("adapt")]
 )
 
 

@@ -8,7 +8,6 @@ import numpy as np
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import CONTROL_HZ, FRONT, TACTILE, TACTILE_LEFT, TACTILE_RIGHT
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
 from touchgoal.encoders.preprocess import check_pictures
 from touchgoal.encoders.pretrained import AnyTouchEncoder
 from touchgoal.encoders.towers.towers import Towers, load_towers
@@ -89,7 +88,7 @@ def reward_curve(
     image: tuple[Modality, ...] = ("image",) if camera in episode.frames else ()
     touch_encoder = _touch_encoder(encoder) if sides else None
     check_words(specs, touch_encoder)
-    aligned = isinstance(touch_encoder, TouchEncoder)
+    aligned = touch_encoder is not None and touch_encoder.towers is not None
     touch: tuple[Modality, ...] = ("tactile", *(("text",) if aligned else ())) if sides else ()
     modalities: tuple[Modality, ...] = (*image, *touch)
     towers = own_towers(touch_encoder) if towers is None else towers

@@ -21,7 +21,6 @@ from jaxtyping import Float, Float32, UInt8
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import FRONT, TACTILE, TRUTH_CONTACT
-from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.pretrained import AnyTouchEncoder
 from touchgoal.encoders.towers.towers import Towers
@@ -137,7 +136,7 @@ class EpisodeEmbedder:
         """
         self._towers = towers
         self._encoder = encoder
-        self._aligned = encoder if isinstance(encoder, TouchEncoder) else None
+        self._aligned = encoder if encoder is not None and encoder.towers else None
         self._camera = camera
         # A CLIP's name ends in "#" and a hash of its weights; the folder before it may differ.
         self._pictures_with = EmbeddingSource(towers.name.rpartition("#")[2], camera)
@@ -299,7 +298,7 @@ class EpisodeEmbedder:
 def check_words(specs: Iterable[GoalSpec], encoder: AnyTouchEncoder | None) -> None:
     """Raises UserError if a goal is a sentence, and touch is felt by an encoder that knows none."""
     sentences = [spec for spec in specs if isinstance(spec, Sentence)]
-    if sentences and encoder is not None and not isinstance(encoder, TouchEncoder):
+    if sentences and encoder is not None and encoder.towers is None:
         raise UserError(
             f"goal '{sentences[0]}': this touch encoder was not aligned with texts: leave the goal out, or "
             "take an encoder of train-encoder align"

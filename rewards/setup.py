@@ -6,7 +6,6 @@ from pathlib import Path
 
 from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
 from touchgoal.encoders.pretrained import AnyTouchEncoder, load_encoder
 from touchgoal.encoders.published import is_published
 from touchgoal.encoders.towers.towers import OfflineTowers, load_towers
@@ -79,6 +78,11 @@ def prepare(
         return Setup(source, goal, embedder, given, f"normalizer: {normalizer}")
     if normalizer == "none":
         return Setup(source, goal, embedder, None, "normalizer: none, raw cosine distances")
+    if touch is not None and folder is None:
+        note = (
+            f"raw cosine distances, for published weights bring no normalizer; to normalise: {_FIT}"
+        )
+        return Setup(source, goal, embedder, None, note)
     path = (folder or pretrained.DEFAULT_ENCODER) / NORMALIZER
     if not path.is_file() and (older := path.with_name("scale.json")).is_file():
         raise UserError(f"{older} is called {NORMALIZER} now: mv {older} {path}")
@@ -132,7 +136,7 @@ def embedder_for(
 
 def own_towers(touch: AnyTouchEncoder | None) -> str:
     """Those that a touch encoder was aligned with; the offline ones of any other, and without touch."""
-    return touch.config.towers if isinstance(touch, TouchEncoder) else OfflineTowers.name
+    return (touch and touch.towers) or OfflineTowers.name
 
 
 def _encoder_folder(source: Source, encoder: str | None) -> Path | None:

@@ -1,9 +1,11 @@
-"""Objects held against one fingertip sensor and slid and turned under it, for TacBench T3 (pose).
+"""Objects held against one fingertip sensor and slid and turned under it.
 
 As in Sparsh's appendix C.5, the load holds and the object is moved by hand: every fraction of a second
 with another velocity. Changes of the pose over five frames are drawn log-uniformly, so that small and
-large ones are as common. Two things: the face of a bar, and a can on its side. The gel's stick and slip
-are those of the indenter rig; torsion is left out.
+large ones are as common. The gel's stick and slip are those of the indenter rig; torsion is left out.
+
+For TacBench T3 (pose) two things are slid: the face of a bar, and a can on its side. To learn from
+without labels, as Sparsh does from Touch-Slide, the objects of pick-and-place are, any side of them.
 """
 
 import math
@@ -13,11 +15,20 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.indenter_rig import FRICTION, REST, rig_unit
-from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Texture
+from touchgoal.sim_envs.scene.objects import (
+    CATALOGUE,
+    HARD,
+    Body,
+    Material,
+    ObjectKind,
+    Texture,
+    sample_body,
+)
 from touchgoal.sim_envs.tactile.press_bench import PressBench
+from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
 HeldObject = Literal["bar", "can"]
 HELD: tuple[HeldObject, ...] = ("bar", "can")
@@ -26,6 +37,7 @@ FRAMES = 60
 _SEGMENT = 6, 13  # frames of one velocity, least and one more than most
 _WINDOW = 5  # frames over which changes are drawn
 _SHIFTS, _TURNS = (0.03e-3, 8e-3), (math.radians(0.02), math.radians(4))  # least and most change
+_MASS = 0.1  # kg: slides have no dynamics
 _FIELD, _TURN = 3.5e-3, math.radians(30)  # m and rad from the middle, at most
 
 
@@ -38,7 +50,7 @@ class Slide:
         wrench: force (N) and torque (Nm) of the object on the pad, sensor frame.
         slip: whether it slides over the gel.
         pose: of the object in the sensor frame: x and y (m), and its turn about z (rad).
-        held: which object.
+        held: name of the object.
         load: with which it is held, N.
     """
 
@@ -46,26 +58,49 @@ class Slide:
     wrench: Float32[np.ndarray, "t 6"]
     slip: Bool[np.ndarray, " t"]
     pose: Float32[np.ndarray, "t 3"]
-    held: HeldObject
+    held: str
     load: float
 
 
 def simulate_slide(config: RigConfig, index: int) -> Slide:
-    """One slide; the same config and index always give the same one."""
-    sensor, rng = find_sensor(config.sensor), np.random.default_rng([config.seed, index, 2])
-    held = HELD[index % len(HELD)]
+    """One slide of the bar or the can; the same config and index always give the same one."""
+    rng = np.random.default_rng([config.seed, index, 2])
     load = float(rng.uniform(*config.load))
+    body, flat = _body(HELD[index % len(HELD)])
+    sensor = find_sensor(config.sensor)
+    return _slide(body, flat, load, sensor, rig_unit(config), config.shear_relief, rng)
+
+
+def simulate_catalogue_slide(config: RigConfig, index: int) -> Slide:
+    """One slide of an object of pick-and-place, any side of it, on a unit of its own of the sensor."""
+    sensor, rng = find_sensor(config.sensor), np.random.default_rng([config.seed, index, 5])
+    kinds = list(CATALOGUE.values())
+    body = sample_body(kinds[index % len(kinds)], rng, _MASS)
+    load = float(rng.uniform(*config.load))
+    unit = sample_instance(sensor, rng)
+    return _slide(body, _random_side(rng), load, sensor, unit, config.shear_relief, rng)
+
+
+def _slide(
+    body: Body,
+    side: Float[np.ndarray, "3 3"],
+    load: float,
+    sensor: SensorModel,
+    unit: SensorInstance,
+    relief: bool,
+    rng: np.random.Generator,
+) -> Slide:
+    """A body slid over a unit with a load (N); `side` is its rotation when it is not turned."""
     pose = _draw_poses(rng)
     pull, slip = pulled(pose[:, :2], sensor.shear_stiffness, FRICTION * load)
-    body, flat = _body(held)
-    bench = PressBench(body, sensor, rig_unit(config), config.shear_relief)
+    bench = PressBench(body, sensor, unit, relief)
     frames, wrenches = [], []
     for i in range(REST + FRAMES):
         k = max(i - REST, 0)
         normal = load if i >= REST else 0.0
         shear = (float(pull[k, 0]), float(pull[k, 1])) if normal else (0.0, 0.0)
         centre = float(pose[k, 0]), float(pose[k, 1])
-        bench.place(np.array([*centre, 0.0]), _turned(pose[k, 2]) @ flat)
+        bench.place(np.array([*centre, 0.0]), _turned(pose[k, 2]) @ side)
         depth = -normal / sensor.normal_stiffness
         frames.append(bench.sense(normal, rng, shear, centre, depth).image)
         contact = bench.contact(normal, shear, centre, depth)
@@ -73,7 +108,7 @@ def simulate_slide(config: RigConfig, index: int) -> Slide:
     wrench = np.array(wrenches, np.float32)
     whole = np.vstack([np.repeat(pose[:1], REST, 0), pose]).astype(np.float32)
     slides = np.concatenate([np.zeros(REST, bool), slip])
-    return Slide(np.stack(frames), wrench, slides, whole, held, load)
+    return Slide(np.stack(frames), wrench, slides, whole, body.kind.name, load)
 
 
 def pulled(
@@ -116,9 +151,20 @@ def _body(held: HeldObject) -> tuple[Body, Float[np.ndarray, "3 3"]]:
     """The object, and how it lies on the gel when it is not turned."""
     material = Material(Texture.SMOOTH, 0.0, 1e-3, HARD, FRICTION, (0.6, 0.6, 0.6, 1.0))
     if held == "bar":
-        return Body(ObjectKind(held, "box", material, ()), (4e-3, 1.5e-3, 4e-3), 0.1), np.eye(3)
+        return Body(ObjectKind(held, "box", material, ()), (4e-3, 1.5e-3, 4e-3), _MASS), np.eye(3)
     lying = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # its axis along the sensor's x
-    return Body(ObjectKind(held, "cylinder", material, ()), (8e-3, 3.5e-3), 0.1), lying
+    return Body(ObjectKind(held, "cylinder", material, ()), (8e-3, 3.5e-3), _MASS), lying
+
+
+def _random_side(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+    """A rotation: half of them lay an axis of the object along the sensor's, the others are any."""
+    if rng.random() < 0.5:
+        rotation = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)
+    else:
+        rotation, triangle = np.linalg.qr(rng.normal(size=(3, 3)))
+        rotation *= np.sign(np.diag(triangle))  # so that all are alike
+    rotation[:, 0] *= np.linalg.det(rotation)  # no mirror
+    return rotation
 
 
 def _turned(angle: float) -> Float[np.ndarray, "3 3"]:

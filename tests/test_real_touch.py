@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from touchgoal.benchmarks.config import RealTouchOptions
 from touchgoal.benchmarks.real_cost import EmbeddedGrasp, cost_table, judge_cost
@@ -13,11 +14,21 @@ from touchgoal.benchmarks.real_touch import embed_touch, read_touch, run
 from touchgoal.benchmarks.real_touch_encoders import find_embedder
 from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.picture_force import calibrate_force, shrunk, statistics
+from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
+from touchgoal.encoders.pretrained import find_encoder, load_encoder, load_pooled
 from touchgoal.encoders.probes import property_probe
-from touchgoal.encoders.probes.property_probe import adapted_nearest_is_same, nearest_is_same
+from touchgoal.encoders.probes.property_probe import (
+    adapted_nearest_is_same,
+    nearest_is_same,
+    sentences_right,
+)
+from touchgoal.encoders.ssl.own_videos import adapt
+from touchgoal.encoders.text_head import RANK_WORDS, fit_text_head, rank_sentences
+from touchgoal.encoders.towers.towers import OfflineTowers
 from touchgoal.episodes.importers.force_grasps import read_force_grasps
 from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
 from touchgoal.episodes.media import write_video
+from touchgoal.launch.__main__ import main
 
 Y, X = np.mgrid[:60, :80].astype(np.float32)
 
@@ -64,6 +75,67 @@ def test_the_benchmark_judges_encoders(clips: Path) -> None:
     assert (
         "contact in 18 clips: 0 alarms within the first three frames; 0 missed" in result["table"]
     )
+
+
+def test_an_encoder_is_adapted_to_videos(clips: Path, tmp_path: Path) -> None:
+    """What differs between videos of one thing counts less then; other things stay apart."""
+    main(["train-encoder", "adapt", "--data", str(clips), "--share", "0.9", "--out", str(tmp_path)])
+    adapted = load_encoder(tmp_path / "encoder")
+    goals = adapted.embed_text_goal(["a soft object", "a hard object"], OfflineTowers())
+    soft, hard = (adapted.embed(press(thing))[5:].mean(0) for thing in (0, 2))
+    assert (goals @ np.stack([soft, hard], 1)).argmax(1).tolist() == [0, 1]
+    videos = [v for v in read_labelled_videos(clips) if v.object in ("thing0", "thing1")]
+    names = np.array([v.object for v in videos])
+
+    def apart(encoder: BaseTouchEncoder) -> float:
+        """Squared distances within things, as a share of those between them."""
+        seen = np.stack([encoder.embed(v.frames())[5:].mean(0) for v in videos])
+        means = np.stack([seen[names == name].mean(0) for name in ("thing0", "thing1")])
+        within = np.square(seen - means[(names == "thing1").astype(int)]).sum(1).mean()
+        return float(within / np.square(means[0] - means[1]).sum())
+
+    assert apart(adapted) < 0.7 * apart(load_encoder("gelsight_mini_surfaces"))
+
+
+def test_sentences_are_judged_on_things_never_seen() -> None:
+    """Where touch says the ranks, sentences find them; where it does not, they do no better than guesses."""
+    rng = np.random.default_rng(0)
+    ranks = rng.integers(0, 3, (120, 3))
+    things = np.array([f"thing{i // 2}" for i in range(120)])
+    ranks[1::2] = ranks[::2]
+    told = np.eye(3)[ranks].reshape(120, 9) @ rng.normal(size=(9, 30))
+    noise = rng.normal(size=(120, 30))
+    embed_texts = OfflineTowers().embed_texts
+    assert sentences_right(told + 0.3 * noise, ranks, things, embed_texts).mean() > 0.9
+    assert sentences_right(noise, ranks, things, embed_texts).mean() < 0.5
+
+
+def test_adapting_says_what_it_needs(clips: Path, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="was not fitted by"):
+        main(["train-encoder", "adapt", "--data", str(clips), "--encoder", "gelsight_mini",
+              "--out", str(tmp_path / "a")])  # fmt: skip
+    one = [video for video in read_labelled_videos(clips) if video.path.stem.endswith("_0")]
+    with pytest.raises(UserError, match="no thing has two videos"):
+        adapt(load_pooled(find_encoder("gelsight_mini_surfaces")), one, 0.1, OfflineTowers())
+
+
+def test_sentences_lie_where_what_they_tell_of_is_felt() -> None:
+    """Six kinds of touch about orthogonal directions; a triple of ranks that was never felt is named."""
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(3, 3, 40))
+    ranks = np.array([[i, j, k] for i in range(3) for j in range(3) for k in range(3)])
+    felt = directions[0, ranks[:, 0]] + directions[1, ranks[:, 1]] + directions[2, ranks[:, 2]]
+    unseen = (ranks == (0, 2, 1)).all(1)
+    towers = OfflineTowers()
+    centred = torch.from_numpy(felt - felt.mean(0)).float()
+    head = fit_text_head(centred[~unseen], torch.from_numpy(ranks[~unseen]), towers.embed_texts)
+    for k in range(3):
+        near = centred[unseen] @ head(towers.embed_texts(rank_sentences(k))).T
+        assert near.argmax() == ranks[unseen][0, k]
+    whole = towers.embed_texts(
+        [f"a {w[r]} object" for w, r in zip(RANK_WORDS, (0, 2, 1), strict=True)]
+    )
+    assert (head(whole).sum(0) @ centred.T).argmax() == np.flatnonzero(unseen)[0]
 
 
 def test_the_past_of_a_chosen_frame_is_that_of_its_video(clips: Path) -> None:

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from safetensors.torch import save_file
+from sparsh_files import published
 from test_episode_embedder import PaintTowers, recorded
 
 import touchgoal
@@ -29,6 +31,7 @@ from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
 from touchgoal.rewards.goals import PictureFile, Sentence, assign_goals
 from touchgoal.rewards.normalizer import DistanceNormalizer
 from touchgoal.rewards.online import CostMeter, OnlineCost
+from touchgoal.rewards.setup import prepare
 from touchgoal.rewards.sources import open_source
 
 EPISODE = recorded()
@@ -185,6 +188,15 @@ def test_told_before_any_encoder_is_loaded(
 def test_a_run_folder_stands_for_its_episodes(run_folder: Path) -> None:
     source = open_source(run_folder, "front")
     assert source.path == run_folder / "episodes" and len(source.names) == 3
+
+
+def test_published_weights_bring_no_normalizer(run_folder: Path, tmp_path: Path) -> None:
+    """The note is about them, not about the file of an encoder that is not used."""
+    weights = tmp_path / "mae_vittiny.safetensors"
+    save_file(published(), weights)
+    source = open_source(run_folder / "episodes", "front")
+    setup = prepare(source, ("last",), str(weights), None, None)
+    assert "for published weights bring no normalizer" in setup.note
 
 
 def test_foreign_data_are_drawn_raw_until_a_normalizer_is_fitted(

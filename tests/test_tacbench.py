@@ -22,11 +22,17 @@ from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.pretrained import save
 from touchgoal.encoders.probes.attentive import AttentivePooler, AttentiveProbe
+from touchgoal.encoders.ssl.frames import sample_frames
 from touchgoal.episodes.bench_recording import record_strokes
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.indenter_rig import REST, rig_unit, shear_force, simulate
-from touchgoal.sim_envs.object_slides import FRAMES, pulled, simulate_slide
+from touchgoal.sim_envs.object_slides import (
+    FRAMES,
+    pulled,
+    simulate_catalogue_slide,
+    simulate_slide,
+)
 from touchgoal.sim_envs.scene.objects import CATALOGUE, Body
 from touchgoal.sim_envs.tactile.press_bench import PressBench
 
@@ -150,6 +156,23 @@ def test_a_slide_pulls_at_the_gel_up_to_the_cone() -> None:
     assert np.allclose(np.diff(slide.pose[: REST + 1], axis=0), 0)
     field = np.abs(slide.pose).max(0)
     assert (field < [3.6e-3, 3.6e-3, np.radians(31)]).all()
+
+
+def test_objects_to_learn_from_are_slid_on_units_of_their_own() -> None:
+    """Drawn the same each time; the bench's own slides are on one unit."""
+    first, again, other = (simulate_catalogue_slide(RIG, k) for k in (0, 0, 1))
+    np.testing.assert_array_equal(first.frames, again.frames)
+    rest = [slide.frames[:REST].astype(float).mean(0) for slide in (first, other)]
+    assert np.abs(rest[0] - rest[1]).mean() > 5  # counts: another light
+    assert np.abs(first.frames[REST].astype(float) - rest[0]).max() > 15
+    assert len({first.held, other.held}) == 2 and 0 < first.slip.mean() < 1
+
+
+def test_one_fingertip_is_enough_to_learn_from(strokes: Path) -> None:
+    episodes = EpisodeSet(strokes)
+    touches = sample_frames(episodes, RIG.sensor, 4, 0, (0, 5))
+    assert len(touches) == 4 * len(episodes) and touches.touch.shape[1] == 2
+    assert touches.wrench is not None and touches.wrench[:, 2].min() < 0
 
 
 def test_an_object_is_seen_where_it_lies() -> None:

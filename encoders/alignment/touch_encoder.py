@@ -8,11 +8,10 @@ import torch.nn.functional as F
 from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor, nn
 
-from touchgoal.control.errors import UserError
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.encoders.preprocess import preprocessor_for
-from touchgoal.encoders.towers.towers import Towers, same_towers
+from touchgoal.encoders.towers.towers import Towers
 
 
 @dataclass(frozen=True)
@@ -86,6 +85,11 @@ class TouchEncoder(BaseTouchEncoder):
         self.image_head = None if together else nn.Linear(config.image_dim, d, bias=False)
         self.text_head = None if together else nn.Linear(config.text_dim, d, bias=False)
 
+    @property
+    def towers(self) -> str:
+        """See BaseTouchEncoder."""
+        return self.config.towers
+
     def embed_touch(
         self, touch: Float[Tensor, "n 3 h w"], ids_keep: Int[Tensor, "n k"] | None = None
     ) -> Float[Tensor, "n d"]:
@@ -105,16 +109,6 @@ class TouchEncoder(BaseTouchEncoder):
         return F.normalize(embeddings, dim=1)
 
     @torch.no_grad()
-    def embed_text_goal(self, texts: list[str], towers: Towers) -> Float32[np.ndarray, "n d"]:
-        """Sentences in the shared space, to be compared with `embed_frames`.
-
-        Raises:
-            UserError: The encoder was trained with other towers.
-        """
-        self.check_towers(towers)
-        return self.project_text(towers.embed_texts(texts).to(self.device)).cpu().numpy()
-
-    @torch.no_grad()
     def embed_image_goal(
         self, images: UInt8[np.ndarray, "n h w 3"], towers: Towers
     ) -> Float32[np.ndarray, "n d"]:
@@ -125,11 +119,3 @@ class TouchEncoder(BaseTouchEncoder):
         """
         self.check_towers(towers)
         return self.project_image(towers.embed_images(images).to(self.device)).cpu().numpy()
-
-    def check_towers(self, towers: Towers) -> None:
-        """Raises UserError unless these are the towers the encoder was trained with."""
-        if not same_towers(self.config.towers, towers.name):
-            raise UserError(
-                f"this touch encoder was trained with the towers {self.config.towers}, not "
-                f"{towers.name}: load those towers, or train an encoder with these"
-            )

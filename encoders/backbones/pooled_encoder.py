@@ -10,6 +10,7 @@ its length, 0 to 1, whether anything is: it comes from the strongest spot of the
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.preprocess import steady_preprocessor_for
+from touchgoal.encoders.text_head import TextHead
 from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_normalised
 
@@ -40,11 +42,15 @@ class PooledEncoderConfig:
         features: width of an embedding; also tells this kind of encoder from the others.
         sensor: name of the fingertip sensor.
         preprocessor: `TactilePreprocessor.id` in use at training.
+        towers: `Towers.name` of the towers whose sentences it knows; None if it knows no words.
+        text_dim: width of their text embeddings.
     """
 
     features: int
     sensor: str
     preprocessor: str
+    towers: str | None = None
+    text_dim: int = 0
 
     @classmethod
     def for_sensor(cls, sensor: str) -> "PooledEncoderConfig":
@@ -68,6 +74,8 @@ class PooledEncoder(BaseTouchEncoder):
 
     mean: Float[Tensor, " d"]
     whitening: Float[Tensor, "d d"]
+    text_mean: Float[Tensor, " t"]
+    text_matrix: Float[Tensor, "t d"]
 
     def __init__(self, config: PooledEncoderConfig) -> None:
         preprocess = steady_preprocessor_for(config.sensor)
@@ -75,6 +83,9 @@ class PooledEncoder(BaseTouchEncoder):
         self.config, self._scale = config, preprocess.scale
         self.register_buffer("mean", torch.zeros(config.features))
         self.register_buffer("whitening", torch.eye(config.features))
+        if config.towers is not None:
+            self.register_buffer("text_mean", torch.zeros(config.text_dim))
+            self.register_buffer("text_matrix", torch.zeros(config.text_dim, config.features))
         self._network = [load_efficientnet_lite0()]  # in a list: no part of the state
 
     @property
@@ -82,12 +93,39 @@ class PooledEncoder(BaseTouchEncoder):
         """Where the weights are."""
         return self.mean.device
 
+    @property
+    def towers(self) -> str | None:
+        """See BaseTouchEncoder."""
+        return self.config.towers
+
+    def project_text(self, embeddings: Float[Tensor, "n t"]) -> Float[Tensor, "n d"]:
+        """See BaseTouchEncoder."""
+        return TextHead(self.text_mean, self.text_matrix)(embeddings)
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "d d"]:
+        """Of the pooled features where nothing that matters differs: what the whitening takes out."""
+        whitening = self.whitening.double().numpy()
+        return np.linalg.inv(whitening @ whitening.T)
+
+    def fit(
+        self, mean: Float[np.ndarray, " d"], whitening: Float[np.ndarray, "d d"]
+    ) -> "PooledEncoder":
+        """Take another mean of the pooled features and another whitening; returns itself."""
+        self.mean.copy_(torch.from_numpy(mean))
+        self.whitening.copy_(torch.from_numpy(whitening))
+        return self
+
     def embed_touch(
         self, touch: Float[Tensor, "n 3 h w"], ids_keep: Int[Tensor, "n k"] | None = None
     ) -> Float[Tensor, "n d"]:
         """See BaseTouchEncoder; all patches are seen."""
-        direction = F.normalize((self.pool(touch) - self.mean) @ self.whitening, dim=1)
+        direction = F.normalize(self.whiten(self.pool(touch)), dim=1)
         return self._length(touch)[:, None] * direction
+
+    def whiten(self, pooled: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
+        """Pooled features, centred and whitened."""
+        return (pooled - self.mean) @ self.whitening
 
     def _length(self, touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, " n"]:
         square = (self._scale * F.avg_pool2d(touch, 2)).square().sum(1)

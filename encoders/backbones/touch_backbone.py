@@ -12,6 +12,7 @@ from touchgoal.encoders.backbones.frame_history import frame_offsets, past_rows,
 from touchgoal.encoders.backbones.sparsh_input import SparshPreprocessor
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.encoders.preprocess import Preprocessor, check_pictures, preprocessor_for
+from touchgoal.encoders.towers.towers import Towers, same_towers
 
 BATCH = 64  # frames at once
 
@@ -73,6 +74,33 @@ class BaseTouchEncoder(nn.Module):
     ) -> Float[Tensor, "n d"]:
         """Embeds what `stack` made, of which only the patches in `ids_keep` are seen if given."""
         raise NotImplementedError
+
+    @property
+    def towers(self) -> str | None:
+        """`Towers.name` of the frozen towers whose sentences it knows; None if it knows no words."""
+        return None
+
+    def project_text(self, embeddings: Float[Tensor, "n t"]) -> Float[Tensor, "n d"]:
+        """Brings the text tower's embeddings to touch, as unit vectors."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def embed_text_goal(self, texts: list[str], towers: Towers) -> Float32[np.ndarray, "n d"]:
+        """Sentences among touches, to be compared with `embed_frames`.
+
+        Raises:
+            UserError: The encoder was trained with other towers.
+        """
+        self.check_towers(towers)
+        return self.project_text(towers.embed_texts(texts).to(self.device)).cpu().numpy()
+
+    def check_towers(self, towers: Towers) -> None:
+        """Raises UserError unless these are the towers the encoder was trained with."""
+        if self.towers is None or not same_towers(self.towers, towers.name):
+            raise UserError(
+                f"this touch encoder was trained with the towers {self.towers}, not "
+                f"{towers.name}: load those towers, or train an encoder with these"
+            )
 
     def stack(self, frames: Float[Tensor, "n t 3 h w"]) -> Float[Tensor, "n c *t h w"]:
         """The network's input: preprocessed frames at `offsets`, put together."""

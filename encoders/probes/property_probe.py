@@ -7,9 +7,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int, Shaped
 
 from touchgoal.encoders.probes.ridge import ridge_scores
+from touchgoal.encoders.text_head import EmbedTexts, fit_text_head, rank_sentences
 from touchgoal.encoders.whitening import inverse_square_root, within_classes
 
 STRENGTHS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
@@ -54,10 +56,29 @@ def adapted_nearest_is_same(
 ) -> Bool[np.ndarray, " n"]:
     """As `nearest_is_same`, centred and whitened by videos of other things: what a user's own data add."""
     right = np.zeros(len(things), bool)
-    for test in _folds(things):
-        known = embeddings[~test]
-        whitening = inverse_square_root(within_classes(known, things[~test]), _SHRINKAGE)
-        right[test] = nearest_is_same((embeddings - known.mean(0)) @ whitening, things)[test]
+    for test, adapted in _adapted(embeddings, things):
+        right[test] = nearest_is_same(adapted, things)[test]
+    return right
+
+
+def sentences_right(
+    embeddings: Float[np.ndarray, "n d"],
+    ranks: Int[np.ndarray, "n properties"],
+    things: Things,
+    embed_texts: EmbedTexts,
+) -> Bool[np.ndarray, "n properties"]:
+    """Whether the nearest of the three sentences on a property is true.
+
+    Sentences are brought to touch by other things, by which embeddings are adapted, too.
+    """
+    right = np.zeros(ranks.shape, bool)
+    for test, adapted in _adapted(embeddings, things):
+        touches = torch.from_numpy(adapted)
+        touches = touches / touches.norm(dim=1, keepdim=True).clamp_min(1e-12)
+        head = fit_text_head(touches[~test], torch.from_numpy(ranks[~test]), embed_texts)
+        for k in range(ranks.shape[1]):
+            goals = head(embed_texts(rank_sentences(k))).double()
+            right[test, k] = (touches[test] @ goals.T).argmax(1).numpy() == ranks[test, k]
     return right
 
 
@@ -132,6 +153,16 @@ def interval(
     ]
     low, high = np.quantile(drawn, [0.025, 0.975])
     return float(low), float(high)
+
+
+def _adapted(
+    embeddings: Float[np.ndarray, "n d"], things: Things
+) -> Iterator[tuple[Bool[np.ndarray, " n"], Float[np.ndarray, "n d"]]]:
+    """Which videos are a fold's, and all of them centred and whitened by the others."""
+    for test in _folds(things):
+        known = embeddings[~test]
+        whitening = inverse_square_root(within_classes(known, things[~test]), _SHRINKAGE)
+        yield test, (embeddings - known.mean(0)) @ whitening
 
 
 def _folds(things: Things) -> Iterator[Bool[np.ndarray, " n"]]:

@@ -58,7 +58,7 @@ def sample_frames(
     seed: int,
     offsets: tuple[int, ...] | None = None,
 ) -> TouchFrames:
-    """Draws ticks at random from every episode, and takes both fingertips of each.
+    """Draws ticks at random from every episode, and takes every fingertip of each.
 
     The background is a fingertip's first frame: episodes start untouched. For frames before an
     episode's first, that one stands, as it does when a policy acts: nothing has touched or moved yet.
@@ -74,8 +74,10 @@ def sample_frames(
     Raises:
         UserError: No touch in the set, or another sensor's.
     """
-    if missing := set(TACTILE) - set(episodes.features):
-        raise UserError(f"{episodes.root} has no {', '.join(sorted(missing))}: record touch")
+    sides = {side: key for side, key in enumerate(TACTILE) if key in episodes.features}
+    if not sides:
+        raise UserError(f"{episodes.root} has no {' and no '.join(TACTILE)}: record touch")
+    keys = list(sides.values())
     preprocess = preprocessor_for(sensor)
     truth = [TRUTH_PAD_WRENCH] if TRUTH_PAD_WRENCH in episodes.features else []
     touch, wrench = [], []
@@ -84,10 +86,10 @@ def sample_frames(
         rng = np.random.default_rng([seed, i])
         ticks = np.sort(rng.permutation(episodes.lengths[i])[:per_episode])
         seen, where = np.unique(past_rows(ticks, offsets or (0,)), return_inverse=True)
-        frames = episodes.read(i, TACTILE, seen.tolist()).frames
-        first = episodes.read(i, TACTILE, [0]).frames
+        frames = episodes.read(i, keys, seen.tolist()).frames
+        first = episodes.read(i, keys, [0]).frames
         known = episodes.read(i, truth, ticks.tolist()).frames
-        for side, key in enumerate(TACTILE):
+        for side, key in sides.items():
             rows = torch.from_numpy(preprocess(frames[key], first[key][0])).half()
             touch.append(rows[torch.from_numpy(where.reshape(len(ticks), -1))])
             for name in truth:

@@ -68,9 +68,7 @@ def train(sensor: SensorModel, name: str, config: WhiteningConfig) -> PooledEnco
     spread = np.sqrt(np.diag(square) / count - mean**2) + 1e-4
     covariance = within / (config.surfaces * (config.presses - 1)) / np.outer(spread, spread)
     whitening = inverse_square_root(covariance, _SHRINKAGE) / spread[:, None]
-    encoder.mean.copy_(torch.from_numpy(mean))
-    encoder.whitening.copy_(torch.from_numpy(whitening))
-    return encoder
+    return encoder.fit(mean, whitening)
 
 
 def _batches(config: WhiteningConfig) -> int:

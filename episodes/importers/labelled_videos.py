@@ -8,13 +8,18 @@ import csv
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, Int, UInt8
 
 from touchgoal.control.errors import UserError
 from touchgoal.episodes.media import read_frames
 
 PROPERTIES = ("hardness", "roughness", "bumpiness")
+FIRMEST = 5
+"""Frames of a video that count, those of the largest change, as published for PhysiCLeAR."""
+
+_SMALL = 80, 60  # px at which the change is looked for
 _COLUMNS = ("file", "object", "name", "split", *PROPERTIES)
 
 
@@ -58,6 +63,19 @@ def read_labelled_videos(folder: Path) -> list[LabelledVideo]:
     if absent := [video.path for video in videos if not video.path.is_file()]:
         raise UserError(f"{table} names {absent[0].name}, which is not in {folder / 'videos'}")
     return videos
+
+
+def firmest_frames(
+    frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
+) -> Int[np.ndarray, " k"]:
+    """Rows of the frames that differ most from the untouched sensor, in the order of time."""
+    change = np.abs(_shrunk(frames) - _shrunk(background[None])).mean((1, 2, 3))
+    return np.sort(np.argsort(-change, kind="stable")[:FIRMEST])
+
+
+def _shrunk(frames: UInt8[np.ndarray, "n h w 3"]) -> Float[np.ndarray, "n 60 80 3"]:
+    small = [cv2.resize(frame, _SMALL, interpolation=cv2.INTER_AREA) for frame in frames]
+    return np.stack(small).astype(np.float32)
 
 
 def _video(folder: Path, row: dict[str, str]) -> LabelledVideo:

@@ -9,17 +9,20 @@ from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.alignment.align import align
 from touchgoal.encoders.backbones.frame_history import frame_offsets
+from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.backbones.sparsh import SPARSH_BASE
-from touchgoal.encoders.pretrained import save
+from touchgoal.encoders.pretrained import load_encoder, save
 from touchgoal.encoders.ssl.dino import train_dino
 from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.ijepa import train_ijepa
 from touchgoal.encoders.ssl.mae import train_mae
+from touchgoal.encoders.ssl.own_videos import adapt
 from touchgoal.encoders.ssl.surface_whitening import WhiteningConfig, train
 from touchgoal.encoders.ssl.untrained import Method
 from touchgoal.encoders.ssl.vjepa import train_vjepa
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.training.trainer import is_first_process
+from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import collect_touches
 from touchgoal.launch.support.run_folder import open_run
@@ -30,14 +33,17 @@ from touchgoal.launch.support.training_run import (
     recipe,
 )
 from touchgoal.launch.support.unlabelled_touch import UnlabelledTouch, open_touch, sensor_of
-from touchgoal.launch.train_encoder import Align, Dino, IJepa, Mae, Surfaces, VJepa
+from touchgoal.launch.train_encoder import Adapt, Align, Dino, IJepa, Mae, Surfaces, VJepa
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder
 from touchgoal.rewards.fit_normalizer import fit_normalizer
 from touchgoal.rewards.normalizer import NORMALIZER, scene_of
 
 
-def run_command(config: Align | Mae | Dino | IJepa | VJepa | Surfaces) -> None:
+def run_command(config: Align | Mae | Dino | IJepa | VJepa | Surfaces | Adapt) -> None:
     """Train one kind of encoder."""
+    if isinstance(config, Adapt):
+        _adapt(config)
+        return
     if isinstance(config, Surfaces):
         _fit_to_surfaces(config)
         return
@@ -68,6 +74,25 @@ def _fit_to_surfaces(config: Surfaces) -> None:
     }
     save(encoder, out / "encoder", {**source, **asdict(whitening), **provenance()})
     print(f"encoder: {out / 'encoder'}")
+
+
+def _adapt(config: Adapt) -> None:
+    """Blend what real videos of the same things show into a fitted encoder."""
+    encoder = load_encoder(config.encoder)
+    if not isinstance(encoder, PooledEncoder):
+        raise UserError(
+            f"{config.encoder} was not fitted by `train-encoder surfaces`: adapt one that was"
+        )
+    splits = "train", "unlabelled"
+    videos = [v for v in read_labelled_videos(config.data) if v.split in splits]
+    towers = load_towers(config.towers)
+    out = open_run(config.out, "train-encoder", config)
+    adapted = adapt(encoder, videos, config.share, towers)
+    source = {"data": str(config.data), "videos": len(videos), "share": config.share}
+    save(adapted, out / "encoder", {"adapted_from": config.encoder, **source, **provenance()})
+    print(
+        f"{len(videos)} videos of {len({v.object for v in videos})} things; encoder: {out / 'encoder'}"
+    )
 
 
 def _train_mae(config: Mae, touch: UnlabelledTouch) -> None:
