@@ -20,6 +20,7 @@ from touchgoal.benchmarks.mae_step import measure_mae_step, step_line
 from touchgoal.benchmarks.plain_torch import PlainViT
 from touchgoal.benchmarks.real_touch_encoders import vit_of
 from touchgoal.benchmarks.speed import in_turn, one_core
+from touchgoal.control.progress import track
 from touchgoal.encoders.backbones.frame_history import RecentFrames
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.backbones.sparsh import sparsh_vit
@@ -67,16 +68,20 @@ def run(config: EncoderSpeedOptions) -> dict[str, Any]:
     """Time everything on one core, by processor time, which busy neighbours distort least."""
     encoders = {name: load_encoder(name).eval() for name in config.encoders}
     encoders |= {f"Sparsh {name}, random": _random(name) for name in config.shapes}
+    measured = [
+        (name, precision)
+        for name, encoder in encoders.items()
+        for precision in config.precisions
+        if precision == "fp32" or not isinstance(encoder, PooledEncoder)
+    ]
     threads, cv_threads = torch.get_num_threads(), cv2.getNumThreads()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     try:
         with one_core():
             rows = [
-                _measure(name, encoder, precision, config)
-                for name, encoder in encoders.items()
-                for precision in config.precisions
-                if precision == "fp32" or not isinstance(encoder, PooledEncoder)
+                _measure(name, encoders[name], precision, config)
+                for name, precision in track(measured, "timing", "encoder")
             ]
             step = measure_mae_step(config)
     finally:
