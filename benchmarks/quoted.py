@@ -190,5 +190,6 @@ QUOTED = {
     "encoder-speed": Quoted("touchgoal benchmark encoder-speed"),
     "policy-latency": Quoted("touchgoal benchmark policy-latency", headline=_plan),
     "touch-probes": Quoted("touchgoal benchmark touch-probes"),
+    "tacbench": Quoted("touchgoal benchmark tacbench"),
     "faults": Quoted("touchgoal benchmark faults"),
 }
