@@ -187,6 +187,7 @@ QUOTED = {
             "env step (50 physics steps), two tactile images, holding", "per second"
         ),
     ),
+    "encoder-speed": Quoted("touchgoal benchmark encoder-speed"),
     "policy-latency": Quoted("touchgoal benchmark policy-latency", headline=_plan),
     "touch-probes": Quoted("touchgoal benchmark touch-probes"),
     "tacbench": Quoted("touchgoal benchmark tacbench"),
