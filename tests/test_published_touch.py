@@ -97,8 +97,7 @@ def test_an_encoder_learns_from_a_published_folder(
     encoder = load_encoder(str(out / "encoder"))
     assert encoder.embed(np.stack([gel(1), gel(2)])).shape[0] == 2  # upright, as a DIGIT's
     kept = ENCODER_FORMAT.provenance(out / "encoder")
-    assert (kept["recordings"], kept["validation_recordings"]) == (8, 2)
-    assert kept["data"]["train"] == str(data)
+    assert kept["data"]["train"] == [{"path": str(data), "recordings": 8, "held_out": 2}]
     for words, told in (
         (["--data", str(data), "--sensor", "gelsight_mini"], "with digit, not gelsight_mini"),
         (["--data", str(tmp_path / "none")], "is no folder"),

@@ -46,6 +46,14 @@ class TouchFrames:
         stride = offsets[1] if offsets and len(offsets) > 1 else 1
         return cls(touch if offsets else touch[:, 0], wrench, sensor, stride)
 
+    @classmethod
+    def joined(cls, parts: list["TouchFrames"]) -> "TouchFrames":
+        """All touches of one sensor and stride; forces are known only if they are of every part."""
+        wrenches = [part.wrench for part in parts if part.wrench is not None]
+        wrench = torch.cat(wrenches) if len(wrenches) == len(parts) else None
+        first = parts[0]
+        return cls(torch.cat([part.touch for part in parts]), wrench, first.sensor, first.stride)
+
     def __len__(self) -> int:
         """Number of touches."""
         return len(self.touch)

@@ -20,6 +20,7 @@ FIRMEST = 5
 """Frames of a video that count, those of the largest change, as published for PhysiCLeAR."""
 
 _SMALL = 80, 60  # px at which the change is looked for
+_TABLE = "labels.csv"
 _COLUMNS = ("file", "object", "name", "split", *PROPERTIES)
 
 
@@ -46,14 +47,19 @@ class LabelledVideo:
         return read_frames(self.path)[0]
 
 
+def has_labels(folder: Path) -> bool:
+    """Whether a folder has the table of such videos."""
+    return (folder / _TABLE).is_file()
+
+
 def read_labelled_videos(folder: Path) -> list[LabelledVideo]:
     """The videos of a folder, in the order of `labels.csv`.
 
     Raises:
         UserError: no such table, a column or a video is missing, or a rank is none.
     """
-    table = folder / "labels.csv"
-    if not table.is_file():
+    table = folder / _TABLE
+    if not has_labels(folder):
         raise UserError(f"no labels.csv in {folder}: give a folder of PhysiCLeAR videos with it")
     with table.open(newline="") as file:
         reader = csv.DictReader(file)
@@ -83,9 +89,7 @@ def _video(folder: Path, row: dict[str, str]) -> LabelledVideo:
     ranks = None
     if all(values):
         if not set(values) <= {"0", "1", "2"}:
-            raise UserError(
-                f"{folder / 'labels.csv'}: {row['file']} has a rank that is not 0, 1 or 2"
-            )
+            raise UserError(f"{folder / _TABLE}: {row['file']} has a rank that is not 0, 1 or 2")
         ranks = int(values[0]), int(values[1]), int(values[2])
     path = folder / "videos" / row["file"]
     return LabelledVideo(path, row["object"], row["name"], row["split"], ranks)

@@ -55,6 +55,15 @@ class Recording:
     held_out: bool
     backgrounds: tuple[Path, ...] = ()
 
+    @property
+    def sensor(self) -> str:
+        """What recorded it."""
+        return self.clip.sensor
+
+    def open(self) -> tuple[TouchClip, UInt8[np.ndarray, "h w 3"]]:
+        """Its pictures, decoded when asked for, and the untouched sensor."""
+        return self.clip, self.background()
+
     def background(self) -> UInt8[np.ndarray, "h w 3"]:
         """The sensor untouched, as well as the files know; UserError if `bgs/` is of another size."""
         usual = self.clip.usual()
@@ -93,14 +102,8 @@ def read_recordings(folder: Path, sensor: str | None = None) -> list[Recording]:
     raise UserError(
         f"{folder} is no set of episodes (meta/info.json), and has none of the published layouts: "
         "OBJECT/dataset_0.pkl (YCB-Slide, Touch-Slide), 20220410_031604.pkl (Touch-and-Go), "
-        "001.pkl (ObjectFolder)"
+        "001.pkl (ObjectFolder), videos with labels.csv (PhysiCLeAR)"
     )
-
-
-def is_published(folder: Path) -> bool:
-    """Whether a folder holds pickles, alone or in folders, and no episodes."""
-    pickled = any(folder.glob("*.pkl")) or any(folder.glob("*/*.pkl"))
-    return pickled and not (folder / "meta").exists()
 
 
 def _slides(folder: Path, paths: list[Path], sensor: str) -> list[Recording]:

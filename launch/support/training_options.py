@@ -1,6 +1,9 @@
 """Options of every training command."""
 
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
 
 from touchgoal.control.option_types import checked_dataclass
 from touchgoal.encoders.config import TrainerOptions
@@ -22,12 +25,13 @@ class DataOptions:
 class UnlabelledData:
     """What is learned from without labels, and where what was learned is left."""
 
-    data: Path
-    """Set of episodes to learn from, or a published folder: YCB-Slide, Touch-Slide, Touch-and-Go or
-    ObjectFolder, as pickles."""
-    validation: Path | None = None
-    """Set of other episodes, or another published folder, on which what was learned is measured.
-    Default: the recordings that a published --data holds out."""
+    data: Annotated[tuple[Path, ...], Field(min_length=1)]
+    """What to learn from, one folder or several of one sensor: sets of episodes; published recordings as
+    pickles (YCB-Slide, Touch-Slide, Touch-and-Go, ObjectFolder); videos with labels.csv, as PhysiCLeAR has
+    them. Recordings that a folder holds out are not learned from."""
+    validation: tuple[Path, ...] = ()
+    """Other such folders, on which what was learned is measured, besides what --data holds out. Sets of
+    episodes hold nothing out, and need one."""
     out: Path | None = None
     """Folder of the run."""
 

@@ -1,6 +1,6 @@
-"""What trainings without labels learn from: episodes, or published recordings."""
+"""What trainings without labels learn from: episodes, published recordings, videos, or several of these."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,10 +9,11 @@ from touchgoal.control.errors import UserError
 from touchgoal.control.provenance import provenance
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.ssl.frames import TouchFrames, check_sensor, sample_frames
-from touchgoal.encoders.ssl.published_frames import sample_recordings
-from touchgoal.episodes.importers.pretraining_clips import is_published, read_recordings
+from touchgoal.encoders.ssl.published_frames import Recorded, sample_recordings
+from touchgoal.episodes.importers.labelled_videos import has_labels
+from touchgoal.episodes.importers.pretraining_clips import read_recordings
+from touchgoal.episodes.importers.video_recordings import read_video_recordings
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.launch.support.training_run import open_sets, recipe
 
 Offsets = tuple[int, ...] | None
 Draw = Callable[[int, int, Offsets], TouchFrames]
@@ -34,28 +35,54 @@ class UnlabelledTouch:
     recipe: dict[str, Any]
 
 
-def open_touch(data: Path, validation: Path | None, sensor: str | None) -> UnlabelledTouch:
-    """Opens what was named, and checks its sensor.
+@dataclass(frozen=True)
+class _Source:
+    """One folder: all of it, and what it asks not to learn from, if it does."""
+
+    folder: Path
+    sensor: str
+    whole: Draw
+    learned: Draw
+    held_out: Draw | None
+    facts: dict[str, Any]
+
+
+def open_touch(
+    data: Sequence[Path], validation: Sequence[Path], sensor: str | None
+) -> UnlabelledTouch:
+    """Opens what was named, all of one sensor.
+
+    What a folder of `data` holds out is judged by, besides `validation`.
 
     Raises:
         UserError: no such folder, an unknown or another sensor, or nothing to judge by.
     """
-    if is_published(data) or (validation is None and not (data / "meta").exists()):
-        return _published(data, validation, sensor)
-    if validation is None:
-        raise UserError(
-            f"{data} is no published folder that holds recordings out: name other episodes with "
-            "--validation"
-        )
-    sets = open_sets(data, validation)
-    named = sensor_of(sensor, *sets)
-    train, val = (
-        lambda count, seed, offsets, episodes=episodes: sample_frames(
-            episodes, named, count, seed, offsets
-        )
-        for episodes in sets
+    learned_from = {folder.resolve() for folder in data}
+    for folder in validation:
+        if folder.resolve() in learned_from:
+            raise UserError(
+                f"--data and --validation are both {folder}: judge by episodes that are not learned "
+                "from; where a folder holds recordings out, leave --validation out"
+            )
+    first = _open(data[0], sensor)
+    learned = [first, *(_open(folder, first.sensor) for folder in data[1:])]
+    judged = [_open(folder, first.sensor) for folder in validation]
+    if not judged:
+        for source in learned:
+            if source.held_out is None:
+                raise UserError(
+                    f"{source.folder} holds no recordings out: name other episodes with --validation"
+                )
+    held_out = [source.held_out for source in learned if source.held_out is not None]
+    facts = {
+        "train": [source.facts for source in learned],
+        "validation": [source.facts for source in judged],
+    }
+    return UnlabelledTouch(
+        _joined([source.learned for source in learned]),
+        _joined([*held_out, *(source.whole for source in judged)]),
+        {**provenance(), "data": facts},
     )
-    return UnlabelledTouch(train, val, recipe(*sets))
 
 
 def sensor_of(named: str | None, *sets: EpisodeSet) -> str:
@@ -70,19 +97,36 @@ def sensor_of(named: str | None, *sets: EpisodeSet) -> str:
     return sensor
 
 
-def _published(data: Path, validation: Path | None, sensor: str | None) -> UnlabelledTouch:
-    found = read_recordings(data, sensor)
-    if validation is None:
-        learned = [recording for recording in found if not recording.held_out]
-        judged = [recording for recording in found if recording.held_out]
-    elif validation.resolve() == data.resolve():
-        raise UserError(f"--data and --validation are both {data}: leave --validation out")
-    else:
-        learned, judged = found, read_recordings(validation, found[0].clip.sensor)
-    train, val = (
-        lambda count, seed, offsets, chosen=chosen: sample_recordings(chosen, count, seed, offsets)
-        for chosen in (learned, judged)
+def _open(folder: Path, sensor: str | None) -> _Source:
+    if (folder / "meta").exists():
+        return _episodes(folder, sensor)
+    found = read_video_recordings(folder) if has_labels(folder) else read_recordings(folder, sensor)
+    recorded = found[0].sensor
+    if sensor not in (None, recorded):
+        raise UserError(f"{folder} was recorded with {recorded}, not {sensor}")
+    kept = [recording for recording in found if not recording.held_out]
+    others = [recording for recording in found if recording.held_out]
+    facts = {"path": str(folder), "recordings": len(kept), "held_out": len(others)}
+    draws = _drawn(found), _drawn(kept), _drawn(others) if others else None
+    return _Source(folder, recorded, *draws, facts)
+
+
+def _episodes(folder: Path, sensor: str | None) -> _Source:
+    episodes = EpisodeSet(folder)
+    named = sensor_of(sensor, episodes)
+
+    def draw(count: int, seed: int, offsets: Offsets) -> TouchFrames:
+        return sample_frames(episodes, named, count, seed, offsets)
+
+    facts = {"path": str(folder), "episodes": len(episodes), "checksum": episodes.checksum}
+    return _Source(folder, named, draw, draw, None, facts)
+
+
+def _drawn(recordings: Sequence[Recorded]) -> Draw:
+    return lambda count, seed, offsets: sample_recordings(recordings, count, seed, offsets)
+
+
+def _joined(draws: list[Draw]) -> Draw:
+    return lambda count, seed, offsets: TouchFrames.joined(
+        [draw(count, seed, offsets) for draw in draws]
     )
-    paths = {"train": str(data), "validation": str(validation or data)}
-    facts = {"recordings": len(learned), "validation_recordings": len(judged), "data": paths}
-    return UnlabelledTouch(train, val, {**provenance(), **facts})

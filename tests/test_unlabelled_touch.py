@@ -1,0 +1,81 @@
+"""What trainings without labels learn from: several folders of several kinds, none of it held out."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from published_files import encoded, gel, write, write_slides
+
+from touchgoal.control.errors import UserError
+from touchgoal.episodes.media import write_video
+from touchgoal.launch.support.unlabelled_touch import open_touch
+
+SPLITS = "train", "unlabelled", "val", "test"
+
+
+def press(brightness: int) -> np.ndarray:
+    """Nine pictures of a Mini: untouched five times, then with a square as bright as that."""
+    pictures = np.full((9, 60, 80, 3), 100, np.uint8)
+    pictures[5:, 20:40, 30:50] = brightness
+    return pictures
+
+
+def write_videos(folder: Path, splits: tuple[str, ...] = SPLITS) -> Path:
+    """One video of each split: the held-out ones are darker than untouched, the others brighter."""
+    (folder / "videos").mkdir(parents=True)
+    with (folder / "labels.csv").open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow("file object name split hardness roughness bumpiness".split())
+        for split in splits:
+            write_video(
+                folder / "videos" / f"{split}.mp4",
+                press(20 if split in ("val", "test") else 180),
+                10,
+            )
+            rows.writerow([f"{split}.mp4", split, split, split, "", "", ""])
+    return folder
+
+
+def pressed_up(touch: torch.Tensor) -> np.ndarray:
+    """Which touches are brighter than the untouched sensor and which darker: +1, 0, -1."""
+    mean = touch.float().mean(dim=(1, 2, 3)).numpy()
+    return np.where(np.abs(mean) < 0.005, 0, np.sign(mean))
+
+
+def test_held_out_videos_are_judged_by_and_not_learned_from(tmp_path: Path) -> None:
+    touch = open_touch([write_videos(tmp_path / "videos")], (), None)
+    train, judged = (draw(9, 0, None) for draw in (touch.train, touch.validation))
+    assert train.sensor == "gelsight_mini" and len(train) == len(judged) == 18
+    assert set(pressed_up(train.touch)) == {0, 1} and set(pressed_up(judged.touch)) == {0, -1}
+    moments = touch.train(9, 0, (0, 2))
+    assert moments.touch.shape[:2] == (18, 2) and moments.stride == 2
+    facts = {"path": str(tmp_path / "videos"), "recordings": 2, "held_out": 2}
+    assert touch.recipe["data"] == {"train": [facts], "validation": []}
+
+
+def test_several_folders_are_learned_from_together(tmp_path: Path) -> None:
+    videos = write_videos(tmp_path / "videos")
+    for i in (1, 2, 3):  # ObjectFolder's layout: the last is held out
+        write(tmp_path / "pickles" / f"{i:03d}.pkl", [encoded(gel(i, (240, 320)))])
+    touch = open_touch([videos, tmp_path / "pickles"], (), "gelsight_mini")
+    assert len(touch.train(9, 0, None)) == 18 + 2
+    assert len(touch.validation(9, 0, None)) == 18 + 1
+    elsewhere = write_videos(tmp_path / "others", ("train", "val"))
+    assert len(open_touch([videos], [elsewhere], None).validation(9, 0, None)) == 18 + 18
+
+
+def test_what_cannot_be_learned_from_together_is_one_line(tmp_path: Path) -> None:
+    videos = write_videos(tmp_path / "videos")
+    write_slides(tmp_path / "slides", ("mug",))
+    with pytest.raises(UserError, match="slides was recorded with digit, not gelsight_mini"):
+        open_touch([videos, tmp_path / "slides"], (), None)
+    with pytest.raises(UserError, match="was recorded with gelsight_mini, not digit"):
+        open_touch([videos], (), "digit")
+    with pytest.raises(UserError, match="videos holds no recordings out: .* --validation"):
+        open_touch([write_videos(tmp_path / "a" / "videos", ("train",))], (), None)
+    with pytest.raises(UserError, match="has no video to learn from: .* train or unlabelled"):
+        open_touch([write_videos(tmp_path / "held", ("val",))], (), None)
+    with pytest.raises(UserError, match="leave --validation out"):
+        open_touch([videos], [tmp_path / "slides" / ".." / "videos"], None)
