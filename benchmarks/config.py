@@ -300,7 +300,7 @@ class TacbenchOptions(BenchmarkOptions):
     end_to_end_lr: Annotated[Positive, RARE] = 5e-4
     """Highest learning rate of an encoder with its probe."""
     workers: Count = CORES
-    """Processes that simulate."""
+    """Processes that simulate and train."""
 
 
 @checked_dataclass

@@ -1,5 +1,6 @@
 """The indenter rig and TacBench on it: mechanics against closed forms, metrics by hand, toy runs."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -251,12 +252,11 @@ def test_the_benchmark_judges_every_encoder(
     config = TouchBackboneConfig.for_sensor(PRESETS["tiny"], "gelsight_mini_markers")
     save(TouchBackbone(config), tmp_path / "tiny", {})
     name = str(tmp_path / "tiny")
-    result = run(
-        TacbenchOptions(
-            encoders=(name, "end-to-end:tiny"), shares=(1.0, 0.1), rig=RIG, strokes=STROKES, slides=10,
-            grasps=10, cloths=10, data=strokes.parent, seeds=1, steps=3, end_to_end_steps=2, workers=1,
-        )
+    options = TacbenchOptions(
+        encoders=(name, "end-to-end:tiny"), shares=(1.0, 0.1), rig=RIG, strokes=STROKES, slides=10,
+        grasps=10, cloths=10, data=strokes.parent, seeds=1, steps=3, end_to_end_steps=2, workers=1,
     )  # fmt: skip
+    result = run(options)
     force = [row for row in result["rows"] if row["task"] == "force"]
     tests = {"force": 2, "field": 2, "slip": 1, "pose": 1, "grasp": 2, "textile": 1}
     references = {"field": 2, "slip": 2}
@@ -272,6 +272,10 @@ def test_the_benchmark_judges_every_encoder(
     assert set(result["pictures"]) == {"by_labels", *tests}
     assert "epoch" not in capsys.readouterr().out
     assert "epoch 3/3" in (strokes.parent / "training.log").read_text()
+    shared_out = run(replace(options, tasks=("slip",), workers=2))["rows"]
+    for row in [*result["rows"], *shared_out]:
+        row.pop("seconds", None)
+    assert shared_out == [row for row in result["rows"] if row["task"] == "slip"]
     wrong = TacbenchOptions(encoders=("gelsight_mini",), rig=RIG, data=strokes.parent)
     with pytest.raises(UserError, match="the rig has gelsight_mini_markers"):
         run(wrong)

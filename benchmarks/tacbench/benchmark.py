@@ -6,19 +6,18 @@ and thresholds are chosen on validation recordings; test recordings are for the 
 bootstrap over test recordings, of the mean over seeds.
 """
 
-import time
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import torch
 
 from touchgoal.benchmarks.config import TacbenchOptions
 from touchgoal.benchmarks.tacbench.data import (
     RigFrames,
-    Rows,
     read_cloths,
     read_grasps,
     read_strokes,
@@ -27,19 +26,15 @@ from touchgoal.benchmarks.tacbench.data import (
 from touchgoal.benchmarks.tacbench.figures import Read, pictures
 from touchgoal.benchmarks.tacbench.probes import (
     END_TO_END,
-    Inputs,
     PairTokens,
-    ProbeTraining,
-    Reader,
     find_encoder_of,
     frozen_tokens,
-    read,
-    train_reader,
 )
 from touchgoal.benchmarks.tacbench.published_recordings import check_tasks, find_published
 from touchgoal.benchmarks.tacbench.tables import table
 from touchgoal.benchmarks.tacbench.task import Task
 from touchgoal.benchmarks.tacbench.tasks import RECORDED_AS, TASKS, Recording
+from touchgoal.benchmarks.tacbench.trainings import Answers, Job, Subject, work
 from touchgoal.control.errors import UserError
 from touchgoal.control.interruption import kept
 from touchgoal.control.progress import Progress
@@ -52,9 +47,9 @@ from touchgoal.episodes.bench_recording import (
     record_slides,
     record_strokes,
 )
+from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.store import EpisodeSet
 
-_LEAST_SAMPLES = 8
 _LOG = "training.log"
 _RECORDERS: dict[Recording, Callable[..., EpisodeSet]] = {
     "strokes": record_strokes,
@@ -72,32 +67,13 @@ Reading = Callable[[Preprocessor], RigFrames]
 """Recordings, as an encoder's preprocessor makes them."""
 
 
-@dataclass(frozen=True, eq=False)
-class Subject:
-    """One encoder of the table.
-
-    Attributes:
-        name: as the user gave it.
-        encoder: the frozen one; of one trained end to end only its kind counts.
-        frames: of the bench, as its preprocessor makes them.
-        inputs_of: rows of the frames to what a reader reads.
-        trained: whether it is trained with each probe.
-    """
-
-    name: str
-    encoder: BaseTouchEncoder
-    frames: RigFrames
-    inputs_of: Callable[[Rows], Inputs]
-    trained: bool
-
-
 @dataclass(frozen=True)
 class Bench:
     """What all trainings share."""
 
     config: TacbenchOptions
     sensor: str
-    log: TextIO
+    folder: Path
     bar: Progress
     rows: list[dict[str, Any]]
     reads: list[Read]
@@ -123,10 +99,9 @@ def run(config: TacbenchOptions) -> dict[str, Any]:
     trainings = len(encoders) * len(config.tasks) * len(config.shares) * config.seeds
     with (
         kept(lambda: f"recordings are kept in {config.data or folder}, trained probes are not"),
-        (folder / _LOG).open("a") as log,
         Progress("probes", trainings, "training") as bar,
     ):
-        bench = Bench(config, sensor, log, bar, [], [])
+        bench = Bench(config, sensor, folder, bar, [], [])
         for what, reading in readings.items():
             _run_recording(bench, what, reading, encoders)
     bench.rows.sort(key=lambda row: config.tasks.index(row["task"]))
@@ -164,87 +139,66 @@ def _run_recording(
     bench: Bench, what: Recording, reading: Reading, encoders: dict[str, BaseTouchEncoder]
 ) -> None:
     """All tasks on one kind of recordings; frames and tokens are kept no longer than for these."""
-    config = bench.config
-    tasks = [name for name in config.tasks if RECORDED_AS[name] == what]
-    seen: dict[str, RigFrames] = {}
-    for name, encoder in encoders.items():
+    tasks = [name for name in bench.config.tasks if RECORDED_AS[name] == what]
+    with (
+        tempfile.TemporaryDirectory(dir=bench.folder) as files,
+        one_core_workers(bench.config.workers) as workers,
+    ):
+        shared = _share(bench, tasks, reading, encoders, Path(files))
+        jobs = [
+            (Job(subject, task, share, bench.config, bench.folder / _LOG), frames)
+            for subject, frames in shared
+            for task in tasks
+            for share in bench.config.shares
+        ]
+        for (job, frames), answers in zip(
+            jobs, workers.map(work, [job for job, _ in jobs]), strict=True
+        ):
+            _judge(bench, job, frames, answers)
+            bench.bar.update(bench.config.seeds)
+    frames = shared[0][1]
+    for name in tasks:
+        bench.rows.extend(_references(name, TASKS[name](frames)))
+
+
+def _share(
+    bench: Bench,
+    tasks: list[str],
+    reading: Reading,
+    encoders: dict[str, BaseTouchEncoder],
+    files: Path,
+) -> list[tuple[Subject, RigFrames]]:
+    """Leaves what each encoder's probes read in files for the workers."""
+    seen: dict[str, tuple[Path, RigFrames]] = {}
+    shared = []
+    for i, (name, encoder) in enumerate(encoders.items()):
         key = encoder.preprocess.id
         if key not in seen:
             frames = reading(encoder.preprocess)
             if "field" in tasks:
-                frames = with_fields(frames, config.rig, config.workers)
-            seen[key] = frames
-        subject = _subject(name, encoder, seen[key])
-        for task_name in tasks:
-            task = TASKS[task_name](subject.frames)
-            for share in config.shares:
-                _train_and_judge(bench, subject, task_name, task, share)
-    frames = next(iter(seen.values()))
-    for task_name in tasks:
-        bench.rows.extend(_references(task_name, TASKS[task_name](frames)))
+                frames = with_fields(frames, bench.config.rig, bench.config.workers)
+            seen[key] = files / f"frames_{i}.pt", frames
+            torch.save(frames, seen[key][0])
+        path, frames = seen[key]
+        tokens = None
+        if not name.startswith(END_TO_END):
+            tokens = files / f"tokens_{i}.pt"
+            torch.save(frozen_tokens(encoder, frames), tokens)
+        shared.append((Subject(name, bench.sensor, path, tokens), frames))
+    return shared
 
 
-def _subject(name: str, encoder: BaseTouchEncoder, frames: RigFrames) -> Subject:
-    """An encoder with what its probes read; only a frozen one's tokens are known beforehand."""
-    if name.startswith(END_TO_END):
-        offsets = PairTokens(encoder).offsets
-        return Subject(name, encoder, frames, partial(frames.seen, offsets=offsets), True)
-    return Subject(name, encoder, frames, frozen_tokens(encoder, frames), False)
-
-
-def _train_and_judge(
-    bench: Bench, subject: Subject, task_name: str, task: Task, share: float
-) -> None:
+def _judge(bench: Bench, job: Job, frames: RigFrames, answers: Answers) -> None:
     """The rows of one encoder, task and share, one for each set of test frames."""
-    config, began = bench.config, time.monotonic()
-    count = max(round(share * len(task.split.train)), _LEAST_SAMPLES)
-    tests = task.split.tests
-    said: dict[str, list[torch.Tensor]] = {test: [] for test in tests}
-    validation: list[torch.Tensor] = []
-    for seed in range(config.seed, config.seed + config.seeds):
-        reader = _reader(subject, task, bench.sensor, seed)
-        train = _thinned(task.split.train, count, seed)
-        training = _training(config, subject.trained, seed)
-        train_reader(reader, task, subject.inputs_of, train, training, bench.log)
-        validation.append(read(reader, subject.inputs_of, task.split.validation))
-        for test, rows in tests.items():
-            said[test].append(read(reader, subject.inputs_of, rows))
-        bench.bar.update()
-    facts = {"task": task_name, "encoder": subject.name, "share": share, "samples": count}
-    facts["seconds"] = round((time.monotonic() - began) / config.seeds, 1)
-    for test, rows in tests.items():
+    task, name = TASKS[job.task](frames), job.subject.name
+    validation = [torch.from_numpy(outputs) for outputs in answers.validation]
+    facts = {"task": job.task, "encoder": name, "share": job.share, "samples": answers.samples}
+    facts["seconds"] = round(answers.seconds, 1)
+    for test, rows in task.split.tests.items():
+        said = [torch.from_numpy(outputs) for outputs in answers.said[test]]
         about = facts | {"test": test, "test_samples": len(rows)}
-        bench.rows.append(about | task.judge(said[test], validation, rows))
-        bench.reads.append(
-            Read(task_name, task, subject.frames, subject.name, share, test, rows, said[test][0])
-        )
-
-
-def _training(config: TacbenchOptions, trained: bool, seed: int) -> ProbeTraining:
-    if trained:
-        steps, size, lr = (
-            config.end_to_end_steps,
-            config.end_to_end_batch_size,
-            config.end_to_end_lr,
-        )
-    else:
-        steps, size, lr = config.steps, config.batch_size, config.lr
-    return ProbeTraining(steps, size, lr, seed)
-
-
-def _reader(subject: Subject, task: Task, sensor: str, seed: int) -> Reader:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        encoder = subject.encoder
-        if subject.trained:
-            encoder = find_encoder_of(subject.name, sensor, seed)
-        return Reader(task, PairTokens(encoder), subject.trained)
-
-
-def _thinned(rows: Rows, count: int, seed: int) -> Rows:
-    """So many rows, drawn at random; of one seed fewer rows are part of more."""
-    order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
-    return rows[order[:count]]
+        bench.rows.append(about | task.judge(said, validation, rows))
+        bench.reads.append(Read(job.task, task, frames, name, job.share, test, rows, said[0]))
 
 
 def _references(name: str, task: Task) -> list[dict[str, Any]]:

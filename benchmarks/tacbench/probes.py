@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TextIO
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float16
 from torch import Tensor, nn
 
 from touchgoal.benchmarks.real_touch_encoders import untrained, vit_of
@@ -102,16 +102,23 @@ def find_encoder_of(name: str, sensor: str, seed: int) -> BaseTouchEncoder:
 
 
 @torch.no_grad()
-def frozen_tokens(encoder: BaseTouchEncoder, frames: RigFrames) -> Callable[[Rows], Inputs]:
-    """A frozen encoder's tokens of every pair, by row; each is computed once, for all probes."""
+def frozen_tokens(encoder: BaseTouchEncoder, frames: RigFrames) -> Float16[Tensor, "n t f"]:
+    """A frozen encoder's tokens of every frame, each computed once, for all probes."""
     tokens = PairTokens(encoder).eval()
-    every = torch.arange(len(frames.before))
+    every = _batches(torch.arange(len(frames.before)))
     if tokens.looks_back:
-        seen = (frames.seen(rows, tokens.offsets) for rows in _batches(every))
-        known = torch.cat([tokens(batch).half() for batch in seen])
-        return lambda rows: known[rows].float()
-    alone = torch.cat([tokens.vit(frames.touch[rows].float()).half() for rows in _batches(every)])
-    return lambda rows: torch.cat([alone[rows], alone[frames.before[rows]]], 2).float()
+        seen = (frames.seen(rows, tokens.offsets) for rows in every)
+        return torch.cat([tokens(batch).half() for batch in seen])
+    return torch.cat([tokens.vit(frames.touch[rows].float()).half() for rows in every])
+
+
+def inputs_of_tokens(
+    pairs: PairTokens, tokens: Float16[Tensor, "n t f"], frames: RigFrames
+) -> Callable[[Rows], Inputs]:
+    """What a probe reads of a frozen encoder, by row: see `PairTokens`."""
+    if pairs.looks_back:
+        return lambda rows: tokens[rows].float()
+    return lambda rows: torch.cat([tokens[rows], tokens[frames.before[rows]]], 2).float()
 
 
 def _batches(rows: Rows) -> list[Rows]:
@@ -143,6 +150,7 @@ def train_reader(
     inputs_of: Callable[[Rows], Inputs],
     train: Rows,
     training: ProbeTraining,
+    scratch: Path,
     log: TextIO,
 ) -> None:
     """Trains a reader on some frames, and leaves the snapshot that does best on validation frames.
@@ -153,6 +161,7 @@ def train_reader(
         inputs_of: rows to what the reader reads.
         train: rows to learn from.
         training: for how long.
+        scratch: folder for snapshots while it trains.
         log: for the trainer's lines.
     """
     per_snapshot = max(training.steps // _SNAPSHOTS, 1) * training.batch_size
@@ -181,11 +190,8 @@ def train_reader(
         max_grad_norm=1.0,
     )
     work = Training(reader, per_snapshot, batch, optimizer, identity={}, evaluate=evaluate)
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(log):
-        try:
-            fit(work, Path(folder) / "probe", TrainerOptions(seed=training.seed), {})
-        except KeyboardInterrupt as stopped:
-            raise type(stopped) from None  # its note names a folder that goes with it
+    with tempfile.TemporaryDirectory(dir=scratch) as folder, contextlib.redirect_stdout(log):
+        fit(work, Path(folder) / "probe", TrainerOptions(seed=training.seed), {})
     reader.load_state_dict(best)
 
 

@@ -68,6 +68,12 @@ def split_textile(frames: RigFrames) -> Split:
     return _split(frames, frames.later, "other pieces")
 
 
+def thinned(rows: Rows, count: int, seed: int) -> Rows:
+    """So many rows, drawn at random; of one seed fewer rows are part of more."""
+    order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
+    return rows[order[:count]]
+
+
 def _split(frames: RigFrames, chosen: Bool[np.ndarray, " n"], test: str) -> Split:
     tests = {test: _of_use(frames, chosen, TEST)}
     return Split(_training(frames, chosen), _of_use(frames, chosen, VALIDATION), tests)
