@@ -2,7 +2,8 @@
 
 As in Sparsh's appendix C.5, the load holds and the object is moved by hand: every fraction of a second
 with another velocity. Changes of the pose over five frames are drawn log-uniformly, so that small and
-large ones are as common. The gel's stick and slip are those of the indenter rig; torsion is left out.
+large ones are as common. The gel's stick and slip are those of the indenter rig, with torsion: a patch is
+turned in the gel as a ring of its mean radius is drawn along it.
 
 For TacBench T3 (pose) two things are slid: the face of a bar, and a can on its side. To learn from
 without labels, as Sparsh does from Touch-Slide, the objects of pick-and-place are, any side of them.
@@ -27,6 +28,7 @@ from touchgoal.sim_envs.scene.objects import (
     Texture,
     sample_body,
 )
+from touchgoal.sim_envs.tactile.forces import ForceField
 from touchgoal.sim_envs.tactile.press_bench import PressBench
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
@@ -92,18 +94,26 @@ def _slide(
 ) -> Slide:
     """A body slid over a unit with a load (N); `side` is its rotation when it is not turned."""
     pose = _draw_poses(rng)
-    pull, slip = pulled(pose[:, :2], sensor.shear_stiffness, FRICTION * load)
     bench = PressBench(body, sensor, unit, relief)
+    depth = -load / sensor.normal_stiffness
+
+    def place(at: Float[np.ndarray, "3"]) -> tuple[float, float]:
+        bench.place(np.array([at[0], at[1], 0.0]), _turned(at[2]) @ side)
+        return float(at[0]), float(at[1])
+
+    centre = place(pose[0])
+    touched = bench.sense(load, np.random.default_rng(0), centre=centre, depth=depth).field
+    radius = mean_radius(touched) if touched is not None else 0.0
+    pull, slip = pulled(pose * [1, 1, radius], sensor.shear_stiffness, FRICTION * load)
+    pull[:, 2] *= radius
     frames, wrenches = [], []
-    for i in range(REST + FRAMES):
-        k = max(i - REST, 0)
-        normal = load if i >= REST else 0.0
-        shear = (float(pull[k, 0]), float(pull[k, 1])) if normal else (0.0, 0.0)
-        centre = float(pose[k, 0]), float(pose[k, 1])
-        bench.place(np.array([*centre, 0.0]), _turned(pose[k, 2]) @ side)
-        depth = -normal / sensor.normal_stiffness
-        frames.append(bench.sense(normal, rng, shear, centre, depth).image)
-        contact = bench.contact(normal, shear, centre, depth)
+    for _ in range(REST):
+        frames.append(bench.sense(0.0, rng, centre=centre).image)
+        wrenches.append(np.zeros(6))
+    for at, (fx, fy, torsion) in zip(pose, pull, strict=True):
+        acting = (float(fx), float(fy)), place(at), depth, float(torsion)
+        frames.append(bench.sense(load, rng, *acting).image)
+        contact = bench.contact(load, *acting)
         wrenches.append(np.concatenate([contact.force, contact.torque]))
     wrench = np.array(wrenches, np.float32)
     whole = np.vstack([np.repeat(pose[:1], REST, 0), pose]).astype(np.float32)
@@ -112,11 +122,17 @@ def _slide(
 
 
 def pulled(
-    places: Float[np.ndarray, "t 2"], stiffness: float, limit: float
-) -> tuple[Float[np.ndarray, "t 2"], Bool[np.ndarray, " t"]]:
-    """Shear force (N, 2) on a gel of so many N/m under an object at these places (m), and its slip.
+    places: Float[np.ndarray, "t d"], stiffness: float, limit: float
+) -> tuple[Float[np.ndarray, "t d"], Bool[np.ndarray, " t"]]:
+    """Forces (N) on a gel of so many N/m under an object at these places (m), and whether it slips.
 
     The gel's point of rest is drawn along as soon as it would pull with more than `limit` N.
+
+    Args:
+        places: x, y and, if it turns, the way along a ring of the patch's mean radius, whose force is
+            torsion over that radius.
+        stiffness: of the gel, N/m.
+        limit: that friction bears, N.
     """
     rest = places[0].astype(float)
     force, slip = np.zeros(places.shape), np.zeros(len(places), bool)
@@ -127,6 +143,14 @@ def pulled(
             force[i] *= limit / size
             rest, slip[i] = place - force[i] / stiffness, True
     return force, slip
+
+
+def mean_radius(field: ForceField) -> float:
+    """Mean distance of the load from its middle, m."""
+    y, x = np.indices(field.normal.shape)
+    normal, load = field.normal, field.normal.sum()
+    away = np.hypot(x - (normal * x).sum() / load, y - (normal * y).sum() / load)
+    return float((normal * away).sum() / load * field.pitch)
 
 
 def _draw_poses(rng: np.random.Generator) -> Float[np.ndarray, "t 3"]:

@@ -16,6 +16,7 @@ from touchgoal.benchmarks.tacbench.slip import f1_score, slip_metrics
 from touchgoal.benchmarks.tacbench.splits import split_force, split_slip
 from touchgoal.control.errors import UserError
 from touchgoal.control.features import TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP
+from touchgoal.control.tactile.markers import MarkerTracker
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS as MINI
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
@@ -30,6 +31,7 @@ from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.indenter_rig import REST, rig_unit, shear_force, simulate
 from touchgoal.sim_envs.object_slides import (
     FRAMES,
+    mean_radius,
     pulled,
     simulate_catalogue_slide,
     simulate_slide,
@@ -121,6 +123,18 @@ def test_the_pooler_is_the_published_one() -> None:
     assert sum(p.numel() for p in pooler.parameters()) == 7_088_640
 
 
+def test_the_pooler_is_attention_as_torch_has_it() -> None:
+    torch.manual_seed(0)
+    pooler, tokens = AttentivePooler(features=6, width=8, heads=2), torch.randn(3, 5, 6)
+    torch.nn.init.normal_(pooler.kv.bias)
+    k, v = pooler.kv(pooler.norm1(tokens)).view(3, 5, 2, 2, 4).permute(2, 0, 3, 1, 4)
+    q = pooler.q(pooler.query).view(1, 1, 2, 4).transpose(1, 2).expand(3, -1, -1, -1)
+    seen = torch.nn.functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(1)
+    pooled = pooler.query[0] + pooler.proj(seen)
+    wanted = pooled + pooler.mlp_out(torch.nn.functional.gelu(pooler.mlp_in(pooler.norm2(pooled))))
+    torch.testing.assert_close(pooler(tokens), wanted)
+
+
 def test_a_probe_finds_the_one_token_that_matters() -> None:
     """No linear reading of the mean can: the token's place is random, its marker says which."""
     torch.manual_seed(0)
@@ -157,6 +171,30 @@ def test_a_slide_pulls_at_the_gel_up_to_the_cone() -> None:
     assert np.allclose(np.diff(slide.pose[: REST + 1], axis=0), 0)
     field = np.abs(slide.pose).max(0)
     assert (field < [3.6e-3, 3.6e-3, np.radians(31)]).all()
+
+
+def test_torsion_turns_the_dots_the_way_the_object_turns() -> None:
+    """An upright can: a disc, whose mean radius is two thirds of its own."""
+    unit, radius, load = rig_unit(RIG), 4e-3, 4.0
+    smooth = replace(CATALOGUE["glass_ball"], shape="cylinder")
+    bench = PressBench(Body(smooth, (radius, 4e-3), 0.1), MINI, unit)
+    bench.place(np.zeros(3))
+    depth, rng = -load / MINI.normal_stiffness, np.random.default_rng(0)
+    field = bench.sense(load, rng, depth=depth).field
+    assert field is not None
+    assert mean_radius(field) == pytest.approx(2 / 3 * radius, rel=0.05)
+    assert MINI.markers is not None
+    for torsion in (8e-3, -8e-3):
+        rest = bench.sense(0.0, rng).image
+        tracker = MarkerTracker(rest, MINI.markers, MINI.pixel_pitch)
+        tracker.update(bench.sense(load, rng, depth=depth).image)
+        before = tracker.displacement
+        tracker.update(bench.sense(load, rng, depth=depth, torsion=torsion).image)
+        moved, at = tracker.displacement - before, tracker.rest.positions
+        away = at - (np.array(rest.shape[1::-1]) - 1) / 2
+        under = np.linalg.norm(away, axis=-1) * MINI.pixel_pitch < 0.8 * radius
+        turns = (away[..., 0] * moved[..., 1] - away[..., 1] * moved[..., 0])[under]
+        assert np.sign(turns.mean()) == np.sign(torsion) and np.abs(turns).mean() > 5
 
 
 def test_objects_to_learn_from_are_slid_on_units_of_their_own() -> None:

@@ -4,6 +4,8 @@ One block of cross-attention, then two linear layers. With tokens of width 768, 
 of 768 the block has 7,088,640 parameters, as published.
 """
 
+import math
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -41,12 +43,17 @@ class AttentivePooler(nn.Module):
 
     def forward(self, tokens: Float[Tensor, "b t f"]) -> Float[Tensor, "b d"]:
         """What the query finds in the tokens."""
-        b, t, _ = tokens.shape
-        query = self.query.expand(b, -1, -1)
-        k, v = self.kv(self.norm1(tokens)).view(b, t, 2, self.heads, -1).permute(2, 0, 3, 1, 4)
-        q = self.q(query).view(b, 1, self.heads, -1).transpose(1, 2)
-        seen = F.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(b, 1, -1)
-        pooled = query + self.proj(seen)
+        # There is one query for all tokens: its product with a key is one with the token itself, and values are
+        # made of the tokens' weighted sum. The keys' bias is the same for all tokens, so it drops out of the softmax.
+        tokens = self.norm1(tokens)
+        key, value = self.kv.weight.view(2, self.heads, -1, tokens.shape[2])
+        q = self.q(self.query).view(self.heads, -1)
+        asked = torch.einsum("hd,hdf->fh", q, key) / math.sqrt(q.shape[1])
+        weights = (tokens @ asked).softmax(1)
+        seen = torch.einsum("bhf,hdf->bhd", weights.transpose(1, 2) @ tokens, value)
+        pooled = (
+            self.query + self.proj(seen.flatten(1) + self.kv.bias[self.proj.in_features :])[:, None]
+        )
         pooled = pooled + self.mlp_out(F.gelu(self.mlp_in(self.norm2(pooled))))
         return pooled[:, 0]
 

@@ -48,6 +48,7 @@ class PressBench:
         shear: tuple[float, float] = (0.0, 0.0),
         centre: tuple[float, float] = (0.0, 0.0),
         depth: float = 0.0,
+        torsion: float = 0.0,
     ) -> TactileFrame:
         """The sensor's reading.
 
@@ -57,8 +58,9 @@ class PressBench:
             shear: force along the sensor's x and y, N.
             centre: where the forces act, m in the sensor's frame, and
             depth: how far below the gel's rest plane, m.
+            torsion: torque about the sensor's z at `centre`, Nm.
         """
-        return self._pad.sense(self._data, self.contact(force, shear, centre, depth), rng)
+        return self._pad.sense(self._data, self.contact(force, shear, centre, depth, torsion), rng)
 
     def contact(
         self,
@@ -66,10 +68,12 @@ class PressBench:
         shear: tuple[float, float],
         centre: tuple[float, float],
         depth: float,
+        torsion: float = 0.0,
     ) -> PadContact:
         """The pad's contact with the body; see `sense`."""
         (x, y), (sx, sy) = centre, shear
-        torque = np.array([-y * force + depth * sy, x * force - depth * sx, x * sy - y * sx])
+        turning = x * sy - y * sx + torsion
+        torque = np.array([-y * force + depth * sy, x * force - depth * sx, turning])
         return PadContact(np.array([sx, sy, -force]), torque, 0.0, self._geoms)
 
 
