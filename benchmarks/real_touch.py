@@ -193,7 +193,7 @@ def _figures(right: np.ndarray, things: np.ndarray) -> dict[str, Any]:
 
 
 def _table(rows: list[dict[str, Any]]) -> str:
-    first = rows[0]
+    first, names = rows[0], max(len(row["encoder"]) for row in rows) + 2
     frequent = " ".join(f"{first['most_frequent'][name]:.2f}" for name in PROPERTIES)
     lines = [
         f"{first['videos']} videos of {first['things']} things; in brackets 95 % over things.",
@@ -202,13 +202,13 @@ def _table(rows: list[dict[str, Any]]) -> str:
         "seen, by ten folds, and on the published validation things (there hardness, roughness,",
         "bumpiness / all three / PC / PSS). light: shift of an untouched frame by 10 % more light, as a",
         "share of the lightest touch's (of the usual touch's).",
-        f"{'encoder':<24}{'nearest':<20}{'adapted':<20}{'all 3, folds':<20}{'validation things':<52}light",
+        f"{'encoder':<{names}}{'nearest':<20}{'adapted':<20}{'all 3, folds':<20}{'validation things':<52}light",
     ]
     for row in rows:
         fold, light = row["cross_validated"], row["light"]
         val = row.get("val")
         lines.append(
-            f"{row['encoder'][-23:]:<24}{_with(row['nearest'], row['nearest_interval']):<20}"
+            f"{row['encoder']:<{names}}{_with(row['nearest'], row['nearest_interval']):<20}"
             f"{_with(row['adapted'], row['adapted_interval']):<20}"
             f"{_with(fold['all'], fold['all_interval']):<20}{_validation(val):<52}"
             f"{light['light'] / max(light['lightest'], 1e-12):.2f} "
@@ -218,12 +218,12 @@ def _table(rows: list[dict[str, Any]]) -> str:
         "",
         'sentences: of "a soft object", "a slightly hard object", "a hard object" and so on the nearest is true,',
         f"of things never seen, adapted as above; the most frequent answer alone: {frequent}",
-        f"{'encoder':<24}" + "".join(f"{name:<20}" for name in PROPERTIES),
+        f"{'encoder':<{names}}" + "".join(f"{name:<20}" for name in PROPERTIES),
     ]
     for row in rows:
         cells = (_with(row["sentences"][n], row["sentences_intervals"][n]) for n in PROPERTIES)
         lines.append(
-            f"{row['encoder'][-23:]:<24}" + "".join(f"{cell:<20}" for cell in cells).rstrip()
+            f"{row['encoder']:<{names}}" + "".join(f"{cell:<20}" for cell in cells).rstrip()
         )
     return "\n".join(lines)
 
