@@ -345,5 +345,8 @@ class TouchProbesOptions(BenchmarkOptions):
     """Sensors that are simulated, by name or folder of a sensor file."""
     presses: Annotated[int, Field(ge=24)] = 600
     """Presses simulated on each."""
+    real_balls: tuple[Path, ...] = ()
+    """Folders of real presses of a ball, with background.png, to be read as well: one for the first of --sensors, one
+    for the second and so on."""
     seed: Seed = 0
     """Random seed of units and presses."""

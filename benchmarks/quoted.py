@@ -202,7 +202,9 @@ QUOTED = {
     ),
     "encoder-speed": Quoted("touchgoal benchmark encoder-speed"),
     "policy-latency": Quoted("touchgoal benchmark policy-latency", headline=_plan),
-    "touch-probes": Quoted("touchgoal benchmark touch-probes"),
+    "touch-probes": Quoted(
+        "touchgoal benchmark touch-probes --real-balls mini_presses digit_presses"
+    ),
     "tacbench": Quoted("touchgoal benchmark tacbench"),
     "tacbench-slides": Quoted(
         "touchgoal benchmark tacbench --encoders runs/slides-mae/encoder runs/slides-dino/encoder "
