@@ -107,10 +107,6 @@ QUOTED = {
         "(chance 0.04)",
         _all_right,
     ),
-    "real-touch-seeds": Quoted(
-        "touchgoal benchmark real-touch --data physiclear --encoders gelsight_mini_surfaces runs/surfaces-1/encoder "
-        "runs/surfaces-2/encoder",
-    ),
     "real-touch-without-labels": Quoted(
         "touchgoal benchmark real-touch --data physiclear --encoders "
         + " ".join(
