@@ -200,8 +200,8 @@ def _table(rows: list[dict[str, Any]]) -> str:
         "nearest: the nearest other video is of the same thing; adapted: centred and whitened by the",
         "videos of other things, in ten folds. Properties by a ridge: all three right of things never",
         "seen, by ten folds, and on the published validation things (there hardness, roughness,",
-        "bumpiness / all three / PC / PSS). light: shift of an untouched frame by 10 % more light, as a",
-        "share of the lightest touch's (of the usual touch's).",
+        "bumpiness / all three / PC / PSS); its strength is the best on these very things. light: shift of an",
+        "untouched frame by 10 % more light, as a share of the lightest touch's (of the usual touch's).",
         f"{'encoder':<{names}}{'nearest':<20}{'adapted':<20}{'all 3, folds':<20}{'validation things':<52}light",
     ]
     for row in rows:
