@@ -107,15 +107,6 @@ QUOTED = {
         "(chance 0.04)",
         _all_right,
     ),
-    "real-touch-without-labels": Quoted(
-        "touchgoal benchmark real-touch --data physiclear --encoders "
-        + " ".join(
-            f"runs/{method}-{data}/encoder"
-            for method in ("mae", "dino", "ijepa", "vjepa")
-            for data in ("simulated", "real", "both")
-        )
-        + " random:runs/mae-simulated/encoder random:runs/vjepa-simulated/encoder",
-    ),
     "real-force": Quoted(
         "touchgoal benchmark real-touch --data franka_wedge_grasps --encoders gelsight_mini_surfaces pixels",
         "force of real grasps from pictures, of things not calibrated on",
@@ -198,17 +189,7 @@ QUOTED = {
     ),
     "encoder-speed": Quoted("touchgoal benchmark encoder-speed"),
     "policy-latency": Quoted("touchgoal benchmark policy-latency", headline=_plan),
-    "touch-probes": Quoted(
-        "touchgoal benchmark touch-probes --real-balls mini_presses digit_presses"
-    ),
+    "touch-probes": Quoted("touchgoal benchmark touch-probes"),
     "tacbench": Quoted("touchgoal benchmark tacbench"),
-    "tacbench-slides": Quoted(
-        "touchgoal benchmark tacbench --encoders runs/slides-mae/encoder runs/slides-dino/encoder "
-        "runs/slides-ijepa/encoder runs/slides-vjepa/encoder random:runs/slides-mae/encoder"
-    ),
-    "tacbench-pose": Quoted(
-        "touchgoal benchmark tacbench --tasks pose --slides 300 --steps 2000 --encoders gelsight_mini_markers_mae "
-        "runs/slides-mae/encoder runs/slides-dino/encoder"
-    ),
     "faults": Quoted("touchgoal benchmark faults"),
 }
