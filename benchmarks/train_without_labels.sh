@@ -22,7 +22,7 @@ slides slides-plain-validation --sensor gelsight_mini --episodes 24 --seed 1
 mae="--mae.stacked --mae.no-bottleneck --mae.mask-ratio 0.75 --mae.epochs 8"
 dino="--dino.local-views 4 --dino.epochs 4"
 ijepa="--ijepa.epochs 6"
-vjepa="--vjepa.epochs 8"
+vjepa="--vjepa.epochs 5"
 
 markers="--data runs/slides/episodes --validation runs/slides-validation/episodes"
 train slides-mae mae $markers --stride 5 --frames 20 $mae
