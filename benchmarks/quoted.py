@@ -189,7 +189,9 @@ QUOTED = {
     ),
     "encoder-speed": Quoted("touchgoal benchmark encoder-speed"),
     "policy-latency": Quoted("touchgoal benchmark policy-latency", headline=_plan),
-    "touch-probes": Quoted("touchgoal benchmark touch-probes"),
+    "touch-probes": Quoted(
+        "touchgoal benchmark touch-probes --real-balls mini_presses digit_presses"
+    ),
     "tacbench": Quoted("touchgoal benchmark tacbench"),
     "faults": Quoted("touchgoal benchmark faults"),
 }

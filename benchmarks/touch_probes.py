@@ -3,8 +3,9 @@
 Ten indenters are pressed with known forces into simulated units of each sensor. A ridge reads frozen
 features: of the shipped encoder's network, or of the tokens of a ViT, pooled over the picture and over its parts. Its input is either
 the sensor's own change of colour, or the shape that all sensors share: slopes and depth of the gel, read
-from the picture by the unit's sensor file and drawn at one scale. Units of training are not tested on.
-Real presses of a ball, where there are some, are read by the same probes.
+from the picture by the unit's sensor file and drawn at one scale. Centred: each sensor's features less their mean over
+presses that nobody needs to have labelled. Units of training are not tested on. Real presses of a ball, where there
+are some, are read by the same probes.
 """
 
 from dataclasses import dataclass
@@ -40,6 +41,11 @@ _RIDGE = 0.01
 _CELL = 4  # px of the depth's cells
 _BLUR = 0.3e-3  # m, before the deepest place is looked for
 _BALLS = [i for i, name in enumerate(INDENTERS) if name.endswith("ball")]
+_INPUTS = {
+    "colours": ("own", False),
+    "shape": ("shared", False),
+    "shape, centred": ("shared", True),
+}  # which features, and whether each sensor's are centred
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +96,7 @@ def run(config: TouchProbesOptions) -> dict[str, Any]:
             "input": kind,
             **_probe(sets[source], sets[target], kind, balls.get(target)),
         }
-        for kind in ("own", "shared")
+        for kind in _INPUTS
         for source in sets
         for target in sets
     ]
@@ -177,13 +183,15 @@ def _shape(
 
 
 def _probe(known: Presses, asked: Presses, kind: str, balls: RealBalls | None) -> dict[str, float]:
+    name, centred = _INPUTS[kind]
     train, test = ~known.test, asked.test
-    inputs, others = getattr(known, kind)[train], getattr(asked, kind)[test]
     shapes = np.eye(len(INDENTERS))[known.shape[train]]
     targets = np.column_stack([known.force[train], 1e3 * known.place[train], 10 * shapes])
+    inputs, others = _features(known, name, centred)[train], _features(asked, name, centred)[test]
     read = ridge_scores(inputs, targets, others, _RIDGE)
     moved, other_moved = (
-        getattr(s, f"{kind}_moved")[m] for s, m in ((known, train), (asked, test))
+        _features(presses, f"{name}_moved", centred)[rows]
+        for presses, rows in ((known, train), (asked, test))
     )
     slid = (
         ridge_scores(moved, known.slid[train, None].astype(float), other_moved, _RIDGE)[:, 0] > 0.5
@@ -192,7 +200,8 @@ def _probe(known: Presses, asked: Presses, kind: str, balls: RealBalls | None) -
     off = np.linalg.norm(read[:, 1:3] - 1e3 * asked.place[test], axis=1)
     real = {}
     if balls is not None:
-        said = ridge_scores(inputs, targets, getattr(balls, kind), _RIDGE)[:, 3:].argmax(1)
+        seen = getattr(balls, name) - (_middle(asked, name) if centred else 0)
+        said = ridge_scores(inputs, targets, seen, _RIDGE)[:, 3:].argmax(1)
         others = read[~np.isin(asked.shape[test], _BALLS), 3:].argmax(1)
         real["real_balls"] = float(np.isin(said, _BALLS).mean())
         real["others_called_balls"] = float(np.isin(others, _BALLS).mean())
@@ -205,15 +214,25 @@ def _probe(known: Presses, asked: Presses, kind: str, balls: RealBalls | None) -
     }
 
 
+def _features(presses: Presses, name: str, centred: bool) -> Float32[np.ndarray, "n d"]:
+    features = getattr(presses, name)
+    return features - _middle(presses, name) if centred else features
+
+
+def _middle(presses: Presses, name: str) -> Float32[np.ndarray, " d"]:
+    """The mean of a sensor's features, of units that are not tested on."""
+    return getattr(presses, name)[~presses.test].mean(0)
+
+
 def _table(rows: list[dict[str, Any]], config: TouchProbesOptions) -> str:
     tested = config.presses // _UNITS * _TEST_UNITS
     lines = [
         f"{config.presses} presses of {len(INDENTERS)} indenters on each sensor, tested on {tested} of other units;",
         f"force of {FORCES[0]:g} to {FORCES[1]:g} N, median error; place, median error; slip against sticking",
-        f"{'probe from':<24}{'read on':<24}{'input':<9}{'force':>8}{'place':>10}{'shape':>7}{'slip F1':>9}",
+        f"{'probe from':<24}{'read on':<24}{'input':<15}{'force':>8}{'place':>10}{'shape':>7}{'slip F1':>9}",
     ]
     lines += [
-        f"{row['from']:<24}{row['to']:<24}{'shape' if row['input'] == 'shared' else 'colours':<9}"
+        f"{row['from']:<24}{row['to']:<24}{row['input']:<15}"
         f"{row['force_error']:>6.1f} N{row['place_error_mm']:>7.2f} mm{row['shape']:>7.2f}"
         f"{row['slip_f1']:>9.2f}"
         for row in rows
@@ -223,10 +242,10 @@ def _table(rows: list[dict[str, Any]], config: TouchProbesOptions) -> str:
         lines += [
             "",
             "share called a ball: of real presses of a ball, and of simulated ones of the other indenters",
-            f"{'probe from':<24}{'read on':<24}{'input':<9}{'real balls':>11}{'others':>9}",
+            f"{'probe from':<24}{'read on':<24}{'input':<15}{'real balls':>11}{'others':>9}",
         ]
     lines += [
-        f"{row['from']:<24}{row['to']:<24}{'shape' if row['input'] == 'shared' else 'colours':<9}"
+        f"{row['from']:<24}{row['to']:<24}{row['input']:<15}"
         f"{row['real_balls']:>11.2f}{row['others_called_balls']:>9.2f}"
         for row in real
     ]

@@ -174,5 +174,5 @@ def test_touch_probes_take_them(tmp_path: Path) -> None:
     save_file(published(), tmp_path / "mae_vittiny.safetensors")
     options = TouchProbesOptions(encoder=str(tmp_path), sensors=("gelsight_mini",), presses=24)
     rows = run_touch_probes(options)["rows"]
-    assert [row["input"] for row in rows] == ["own", "shared"]
+    assert [row["input"] for row in rows] == ["colours", "shape", "shape, centred"]
     assert all(0 < row["place_error_mm"] < 3 for row in rows)

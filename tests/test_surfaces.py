@@ -161,7 +161,7 @@ def test_touch_probes_print_a_row_for_every_pair(tmp_path: Path) -> None:
     for name, picture in {"background": render_untouched(unit, rng), **pictures}.items():
         cv2.imwrite(str(tmp_path / f"{name}.png"), picture[..., ::-1])
     result = run_probes(TouchProbesOptions(sensors=sensors, presses=36, real_balls=(tmp_path,)))
-    assert len(result["rows"]) == 8 and len(result["table"].splitlines()) == 11 + 3 + 4
+    assert len(result["rows"]) == 12 and len(result["table"].splitlines()) == 15 + 3 + 6
     read = [row for row in result["rows"] if "real_balls" in row]
     assert {row["to"] for row in read} == {"gelsight_mini"}
     assert read[0]["real_balls"] > read[0]["others_called_balls"]
