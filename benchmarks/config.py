@@ -215,8 +215,9 @@ class RealTouchOptions(BenchmarkOptions):
     """What do encoders know of real touches: which thing, how hard, rough and bumpy?"""
 
     data: Path = field(kw_only=True)
-    """Folder of labelled videos (labels.csv and videos/, as PhysiCLeAR's), or of grasps with forces
-    (grasps.csv and TRIAL.avi, TRIAL.csv, as EstimateModulus')."""
+    """Folder of labelled videos (labels.csv and videos/, as PhysiCLeAR's), of grasps with forces (grasps.csv and
+    TRIAL.avi, TRIAL.csv, as EstimateModulus'), or of pictures of a gel with dots and where another tracker saw
+    them (SERIES_NUMBER.png and .json, as gelsight-material-classifier's), which need no encoder."""
     encoders: tuple[str, ...] = ("gelsight_mini", "random:gelsight_mini", "pixels", "efficientnet")
     """Touch encoders by name or folder, or published Sparsh ones by file or id (facebook/sparsh-dino-base);
     `random:NAME` for the same network untrained, `pixels`, `efficientnet` (ImageNet), or a vision model of

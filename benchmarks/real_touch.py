@@ -13,6 +13,7 @@ from jaxtyping import Float, Int, UInt8
 
 from touchgoal.benchmarks.config import RealTouchOptions
 from touchgoal.benchmarks.real_force import force_table, judge_grasps
+from touchgoal.benchmarks.real_markers import judge_markers, marker_table
 from touchgoal.benchmarks.real_touch_encoders import Embedder, find_embedder
 from touchgoal.control.errors import UserError
 from touchgoal.control.progress import track
@@ -37,6 +38,7 @@ from touchgoal.episodes.importers.labelled_videos import (
     firmest_frames,
     read_labelled_videos,
 )
+from touchgoal.episodes.importers.marker_pictures import has_markers, read_marker_pictures
 from touchgoal.episodes.touches import touch_background
 
 BRIGHTER = 1.1
@@ -81,6 +83,9 @@ class VideoEmbedding:
 
 def run(config: RealTouchOptions) -> dict[str, Any]:
     """Read every video once and embed it by every encoder, then judge them."""
+    if has_markers(config.data):
+        markers = judge_markers(read_marker_pictures(config.data)[:: config.every], config.seed)
+        return {"table": marker_table(markers), **markers}
     embedders = {name: find_embedder(name, config.seed) for name in config.encoders}
     if (config.data / "grasps.csv").is_file():
         grasps = judge_grasps(read_force_grasps(config.data)[:: config.every], embedders)

@@ -1,6 +1,7 @@
 """Readers of published touch data, and the benchmark that judges encoders by them."""
 
 import csv
+import json
 from pathlib import Path
 
 import cv2
@@ -274,3 +275,35 @@ def test_videos_of_other_things_tell_what_differs_without_meaning() -> None:
     assert plain < 0.6 and adapted > 0.9
     shuffled = rng.permutation(things)  # nothing to learn: no better than chance
     assert adapted_nearest_is_same(embeddings, shuffled).mean() < 0.15
+
+
+def dotted_picture(shift: float) -> np.ndarray:
+    """6 x 4 dots, 40 px apart and moved to the right; a dot of each row further."""
+    picture = np.full((200, 280), 160, np.uint8)
+    for row in range(4):
+        for column in range(6):
+            centre = (40 * column + 40 + shift * (2 if column == 2 else 1), 40 * row + 40)
+            cv2.circle(picture, [round(16 * c) for c in centre], 16 * 9, 20, -1, cv2.LINE_AA, 4)
+    return cv2.cvtColor(cv2.GaussianBlur(picture, (0, 0), 1.0), cv2.COLOR_GRAY2BGR)
+
+
+def test_markers_are_compared_with_another_trackers(tmp_path: Path) -> None:
+    y, x = np.mgrid[40:200:40, 40:280:40].astype(float)
+    for i, shift in enumerate((0.0, 4.0, -3.0, 5.5)):
+        cv2.imwrite(str(tmp_path / f"gel_{i}.png"), dotted_picture(shift))
+        told = x + shift + 0.5  # where its first pixel lies is its own affair
+        told[:, 2] += shift
+        if i == 3:
+            told[0, 0] += 5  # here the other one is wrong
+        tables = [x, y, told, y + 0.5, np.arange(24).reshape(4, 6)]
+        (tmp_path / f"gel_{i}.json").write_text(json.dumps([t.tolist() for t in tables]))
+    result = run(RealTouchOptions(data=tmp_path))
+    for row in result["orders"].values():
+        assert row["dots"] == 3 * 24 and row["exchanged"] == row["lost"] == 0
+        assert row["near"] == pytest.approx(71 / 72) and row["most_px"] == pytest.approx(5, abs=0.2)
+    (tmp_path / "gel_2.json").write_text("[1, 2]")
+    with pytest.raises(UserError, match=r"gel_2.json does not hold 5 tables"):
+        run(RealTouchOptions(data=tmp_path))
+    (tmp_path / "gel_2.png").unlink()
+    with pytest.raises(UserError, match=r"gel_2.png is missing"):
+        run(RealTouchOptions(data=tmp_path))
