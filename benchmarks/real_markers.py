@@ -33,7 +33,7 @@ def judge_markers(pictures: Sequence[MarkerPicture], seed: int) -> dict[str, Any
     rows = {}
     for order in ("in order", "shuffled"):
         followed = []
-        for first, *others in track(list(series.values()), order, "series"):
+        for first, *others in track(list(series.values()), order, "recording"):
             rest = (
                 others if order == "in order" else [others[i] for i in rng.permutation(len(others))]
             )
