@@ -112,6 +112,7 @@ QUOTED = {
         "force of real grasps from pictures, of things not calibrated on",
         _real_force,
     ),
+    "real-markers": Quoted("touchgoal benchmark real-touch --data mini_markers"),
     "pick-place": Quoted(
         "touchgoal run-policy --episodes 100 --no-video",
         "the shipped policy picks and places, of 100 scenes it has not seen",
