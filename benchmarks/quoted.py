@@ -194,5 +194,10 @@ QUOTED = {
         "touchgoal benchmark touch-probes --real-balls mini_presses digit_presses"
     ),
     "tacbench": Quoted("touchgoal benchmark tacbench"),
+    "tacbench-slides": Quoted(
+        "touchgoal benchmark tacbench --tasks force slip pose grasp textile --shares 1 0.1 0.01 --encoders "
+        "gelsight_mini_markers_mae runs/slides-mae/encoder runs/slides-dino/encoder runs/slides-ijepa/encoder "
+        "runs/slides-vjepa/encoder random:runs/slides-dino/encoder"
+    ),
     "faults": Quoted("touchgoal benchmark faults"),
 }
