@@ -107,6 +107,25 @@ QUOTED = {
         "(chance 0.04)",
         _all_right,
     ),
+    "real-touch-without-labels": Quoted(
+        "touchgoal benchmark real-touch --data physiclear --encoders "
+        + " ".join(
+            f"runs/{name}/encoder"
+            for name in (
+                "mae-simulated",
+                "mae-real",
+                "mae-both",
+                "dino-simulated",
+                "dino-real",
+                "dino-both",
+                "ijepa-simulated",
+                "ijepa-real",
+                "vjepa-simulated",
+                "vjepa-real",
+            )
+        )
+        + " random:runs/dino-simulated/encoder random:runs/vjepa-simulated/encoder",
+    ),
     "real-force": Quoted(
         "touchgoal benchmark real-touch --data franka_wedge_grasps --encoders gelsight_mini_surfaces pixels",
         "force of real grasps from pictures, of things not calibrated on",
