@@ -107,6 +107,10 @@ QUOTED = {
         "(chance 0.04)",
         _all_right,
     ),
+    "real-touch-seeds": Quoted(
+        "touchgoal benchmark real-touch --data physiclear --encoders runs/surfaces-1/encoder "
+        "runs/surfaces-2/encoder"
+    ),
     "real-touch-without-labels": Quoted(
         "touchgoal benchmark real-touch --data physiclear --encoders "
         + " ".join(
