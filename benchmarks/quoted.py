@@ -222,5 +222,9 @@ QUOTED = {
         "gelsight_mini_markers_mae runs/slides-mae/encoder runs/slides-dino/encoder runs/slides-ijepa/encoder "
         "runs/slides-vjepa/encoder random:runs/slides-dino/encoder"
     ),
+    "tacbench-pose": Quoted(
+        "touchgoal benchmark tacbench --tasks pose --slides 300 --steps 2000 --shares 1 --encoders "
+        "gelsight_mini_markers_mae runs/slides-dino/encoder"
+    ),
     "faults": Quoted("touchgoal benchmark faults"),
 }
