@@ -84,7 +84,7 @@ class VideoEmbedding:
 def run(config: RealTouchOptions) -> dict[str, Any]:
     """Read every video once and embed it by every encoder, then judge them."""
     if has_markers(config.data):
-        markers = judge_markers(read_marker_pictures(config.data)[:: config.every], config.seed)
+        markers = judge_markers(read_marker_pictures(config.data)[:: config.every])
         return {"table": marker_table(markers), **markers}
     embedders = {name: find_embedder(name, config.seed) for name in config.encoders}
     if (config.data / "grasps.csv").is_file():

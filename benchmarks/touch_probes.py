@@ -41,11 +41,12 @@ _RIDGE = 0.01
 _CELL = 4  # px of the depth's cells
 _BLUR = 0.3e-3  # m, before the deepest place is looked for
 _BALLS = [i for i, name in enumerate(INDENTERS) if name.endswith("ball")]
+# Which features, and whether each sensor's are centred.
 _INPUTS = {
     "colours": ("own", False),
     "shape": ("shared", False),
     "shape, centred": ("shared", True),
-}  # which features, and whether each sensor's are centred
+}
 
 
 @dataclass(frozen=True, eq=False)

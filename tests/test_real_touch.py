@@ -298,9 +298,11 @@ def test_markers_are_compared_with_another_trackers(tmp_path: Path) -> None:
         tables = [x, y, told, y + 0.5, np.arange(24).reshape(4, 6)]
         (tmp_path / f"gel_{i}.json").write_text(json.dumps([t.tolist() for t in tables]))
     result = run(RealTouchOptions(data=tmp_path))
-    for row in result["orders"].values():
-        assert row["dots"] == 3 * 24 and row["exchanged"] == row["lost"] == 0
-        assert row["near"] == pytest.approx(71 / 72) and row["most_px"] == pytest.approx(5, abs=0.2)
+    assert result["dots"] == 3 * 24 and result["exchanged"] == result["lost"] == 0
+    assert result["near"] == pytest.approx(71 / 72) and result["most_px"] == pytest.approx(
+        5, abs=0.2
+    )
+    assert result["moved_px"] == pytest.approx(11) and result["apart_px"] == pytest.approx(40)
     (tmp_path / "gel_2.json").write_text("[1, 2]")
     with pytest.raises(UserError, match=r"gel_2.json does not hold 5 tables"):
         run(RealTouchOptions(data=tmp_path))
