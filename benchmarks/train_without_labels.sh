@@ -10,7 +10,7 @@ videos=${1:?usage: benchmarks/train_without_labels.sh FOLDER_OF_PHYSICLEAR}
 train() { # name, options of train-encoder
     [ -d "runs/$1/encoder" ] && return
     local resume=()
-    [ -d "runs/$1" ] && resume=(--resume)
+    [ -f "runs/$1/checkpoint.pt" ] && resume=(--resume)
     touchgoal train-encoder "${@:2}" --out "runs/$1" "${resume[@]}"
 }
 
