@@ -9,13 +9,15 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from touchgoal.benchmarks.config import BeadMazeOptions
+from touchgoal.encoders.pretrained import ENCODER_FORMAT
+from touchgoal.encoders.ssl.untrained import Method
 from touchgoal.episodes.recording import Actor, EpisodeSpec, collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
@@ -27,7 +29,7 @@ from touchgoal.policies.evaluation.evaluate import Trial, run_trials
 from touchgoal.policies.evaluation.open_loop import OpenLoopErrors, Plan, open_loop_errors
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.heads.diffusion import RegressionConfig
-from touchgoal.policies.policy import ObservationBatch, Policy
+from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
 from touchgoal.policies.training.sequence_dataset import (
     SequenceDataset,
     cached_embeddings,
@@ -117,7 +119,7 @@ def _group_by_recipe(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
     arms: dict[str, list[Path]] = {}
     for directory in policies:
         config = checkpoint.load(directory).config
-        inputs = ["frozen touch"] * (config.touch_dim > 0)
+        inputs = [f"frozen touch ({_objective(directory, config)})"] if config.touch_dim else []
         inputs += ["end-to-end touch"] * (config.end_to_end is not None)
         episodes = checkpoint.POLICY_FORMAT.provenance(directory)["episodes"]
         name = f"{' and '.join(inputs) or 'state only'}, {episodes} demos"
@@ -127,6 +129,13 @@ def _group_by_recipe(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
             name += ", regression"
         arms.setdefault(name, []).append(directory)
     return arms
+
+
+def _objective(policy: Path, config: PolicyConfig) -> str:
+    """What its touch encoder was trained by, such as `dino`."""
+    folder = SavedPolicy(policy).touch_folder(config)
+    known = ENCODER_FORMAT.provenance(folder)
+    return next((name for name in ("align", *get_args(Method)) if name in known), folder.name)
 
 
 # ---- closed loop
@@ -155,7 +164,7 @@ def _closed_loop(
         env = makers[0].env_config(maze)
         run_arm(name, env, makers, jobs)
         run_arm(f"{name}, {HELD_OUT}", env, makers, other)
-        if checkpoint.load(directories[0]).config.touch_dim:
+        if config.shuffled and checkpoint.load(directories[0]).config.touch_dim:
             shuffled = [ShuffledTouch(maker, recorded) for maker in makers]
             run_arm(f"{name}, shuffled", blind, shuffled, jobs)
     first = config.policies[0]

@@ -10,6 +10,7 @@ from pydantic import Field
 from touchgoal.control import features as ft
 from touchgoal.control.option_types import (
     RARE,
+    Corners,
     Count,
     CountOrNone,
     NotNegative,
@@ -49,6 +50,8 @@ class BeadMazeOptions(BenchmarkOptions):
     """Number of test wires on which open-loop errors are measured."""
     plan_ticks: tuple[CountOrNone, ...] = (1, 2)
     """Control ticks by which plans come late, tried besides 0 on the first policy."""
+    shuffled: bool = True
+    """Try every policy with frozen touch also with what was felt on another wire."""
     env: BeadMazeConfig = BeadMazeConfig(split="test")
     """Options of the maze, e.g. a disturbance; demonstrations are recorded with the same."""
     workers: Count = CORES
@@ -222,6 +225,9 @@ class RealTouchOptions(BenchmarkOptions):
     """Touch encoders by name or folder, or published Sparsh ones by file or id (facebook/sparsh-dino-base);
     `random:NAME` for the same network untrained, `pixels`, `efficientnet` (ImageNet), or a vision model of
     Hugging Face by its id or folder."""
+    corners: Corners | None = None
+    """Of grasps, corners of the gel in the pictures, x and y in px (top left, top right, bottom left, bottom
+    right), where the camera sees it at an angle; not given: whole pictures."""
     every: Annotated[Count, RARE] = 1
     """Take every so many videos."""
     seed: Seed = 0

@@ -88,7 +88,9 @@ def run(config: RealTouchOptions) -> dict[str, Any]:
         return {"table": marker_table(markers), **markers}
     embedders = {name: find_embedder(name, config.seed) for name in config.encoders}
     if (config.data / "grasps.csv").is_file():
-        grasps = judge_grasps(read_force_grasps(config.data)[:: config.every], embedders)
+        grasps = judge_grasps(
+            read_force_grasps(config.data, config.corners)[:: config.every], embedders
+        )
         return {"table": force_table(grasps), **grasps}
     videos = read_labelled_videos(config.data)[:: config.every]
     if sum(video.ranks is not None for video in videos) < 10:

@@ -18,6 +18,12 @@ CountOrNone = Annotated[int, Field(ge=0)]
 Seed = Annotated[int, Field(ge=0)]
 Port = Annotated[int, Field(ge=0, le=65535)]
 
+Point = tuple[float, float]
+"""x and y in a picture, px; the middle of its first pixel is 0, 0."""
+Corners = tuple[Point, Point, Point, Point]
+"""Of a gel in its camera's picture: top left, top right, bottom left, bottom right; the order in which GelSight
+Wedges' config.csv has them."""
+
 STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 """Of pydantic dataclasses that are read from a file: nothing is converted, every key is known."""
 

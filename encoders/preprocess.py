@@ -143,7 +143,16 @@ def check_pictures(name: str, pictures: object, ndim: tuple[int, ...]) -> None:
 PREPROCESSORS: dict[str, TactilePreprocessor] = {
     sensor: TactilePreprocessor(sensor, version=1, size=size, scale=16.0)
     for size, sensors in (
-        ((120, 160), ("gelsight_mini", "gelsight_mini_markers", "gelsight", "gelsight_markers")),
+        (
+            (120, 160),
+            (
+                "gelsight_mini",
+                "gelsight_mini_markers",
+                "gelsight",
+                "gelsight_markers",
+                "gelsight_wedge",
+            ),
+        ),
         ((160, 120), ("digit",)),  # upright
     )
     for sensor in sensors

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from touchgoal.control.option_types import Positive, checked_dataclass
+from touchgoal.control.option_types import Corners, Positive, checked_dataclass
 
 
 @checked_dataclass
@@ -21,6 +21,9 @@ class Config:
     """USB serial number, device, or stream's address of the sensor; or a recording of it."""
     sensor: str = "gelsight_mini"
     """Model of the sensor (`touchgoal list sensors`), or the folder that calibrate made of it."""
+    corners: Corners | None = None
+    """Corners of the gel in the camera's picture, x and y in px: top left, top right, bottom left, bottom
+    right; of a camera that sees its gel at an angle (gelsight_wedge)."""
     ball_mm: Positive | None = None
     """Radius of the ball that presses, mm: what the depth shows is compared with it."""
     weight_g: Positive | None = None

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import tyro
 from pydantic import Field
 
-from touchgoal.control.option_types import Count, Port, Positive, checked_dataclass
+from touchgoal.control.option_types import Corners, Count, Port, Positive, checked_dataclass
 
 
 @checked_dataclass
@@ -30,6 +30,9 @@ class Config:
     """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); a device needs it."""
     white_balance: Annotated[int, Field(ge=1000, le=15_000)] | None = None
     """White balance to lock, K; not given: as it is set."""
+    corners: Corners | None = None
+    """Corners of the gel in the camera's picture, x and y in px: top left, top right, bottom left, bottom
+    right; of a camera that sees its gel at an angle (gelsight_wedge)."""
     presses_per_part: Count = 2
     """Presses wanted in each of the 12 parts of the picture."""
     port: Port = 8095

@@ -173,7 +173,7 @@ def test_learning_the_bead_maze(
     run("benchmark", "bead-maze", "--policies", "policy/policy", "--wires", 1, "--held-out", 0,
         "--demonstrations", 2, "--plan-ticks", "--env.max-seconds", 3, *one)  # fmt: skip
     printed = capsys.readouterr().out
-    assert "frozen touch, 1 demos, shuffled" in printed and "zero motion" in printed
+    assert "frozen touch (mae), 1 demos, shuffled" in printed and "zero motion" in printed
     run("benchmark", "task-ceilings", "--data", "demos/episodes")
     assert "safety.indentation" in capsys.readouterr().out
     run("benchmark", "policy-delay", "--policy", "expert", "--episodes", 1, "--delay", 0, "--jitter", 0, "--rates",

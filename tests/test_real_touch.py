@@ -180,6 +180,9 @@ def test_forces_come_with_their_frames(tmp_path: Path) -> None:
     (grasp,) = read_force_grasps(tmp_path)
     assert grasp.object == "ball" and grasp.force[3] == 1.5
     assert grasp.frames().shape == (9, 60, 80, 3)
+    corners = ((8, 6), (70, 10), (10, 55), (68, 50))
+    (grasp,) = read_force_grasps(tmp_path, corners)
+    assert grasp.frames().shape == (9, 240, 320, 3)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from pydantic.dataclasses import dataclass
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.motion.tool import ROBOTIQ_2F85
-from touchgoal.control.option_types import STRICT, Seed
+from touchgoal.control.option_types import STRICT, Corners, Seed
 from touchgoal.control.sensors.load_cell import LoadCellConfig
 from touchgoal.control.tactile.sensor_models import find_sensor
 
@@ -87,6 +87,9 @@ class FingertipsSection:
     """Width and height to ask the sensors' cameras for, pixels; not given: their default."""
     border: Annotated[float, Field(ge=0, lt=0.5)] | None = None
     """Share cut off at each side of a camera's picture; not given: the model's."""
+    corners: tuple[Corners, Corners] | None = None
+    """Of the left and of the right gel in its camera's picture, px (top left, top right, bottom left, bottom
+    right), where the camera sees it at an angle (gelsight_wedge), in place of a border."""
     exposure: Exposure | None = None
     """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); not given: as it is set."""
     white_balance: Kelvin | None = None

@@ -244,16 +244,16 @@ def _tactile_camera(whole: CellConfig, cell: FingertipsSection, side: int) -> Ta
     """Of the left (0) or right (1) finger, at a device, a USB serial number or a stream."""
     source = (cell.left, cell.right)[side]
     model = find_sensor(cell.sensor_files[side] if cell.sensor_files else cell.sensor)
+    corners = cell.corners[side] if cell.corners else None
     config = replace(
-        fingertip_video(source, model),
+        fingertip_video(source, model, corners),
         size=cell.size,
         rate=cell.rate or model.frame_rate,
         exposure=cell.exposure,
         white_balance=cell.white_balance,
     )
-    return TactileCamera(
-        VideoCamera(_timed(config, whole)), model, fingertip_view(model, source, cell.border)
-    )
+    view = fingertip_view(model, source, cell.border, corners)
+    return TactileCamera(VideoCamera(_timed(config, whole)), model, view)
 
 
 def _timed(config: VideoConfig, cell: CellConfig) -> VideoConfig:

@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError
+from touchgoal.control.option_types import Corners
 from touchgoal.control.picture_file import read_picture
 from touchgoal.control.sensors.tactile_camera import (
     DIGIT_CROP,
@@ -23,7 +24,7 @@ from touchgoal.control.sensors.tactile_camera import (
 )
 from touchgoal.control.sensors.usb_cameras import find_sensor_camera
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
-from touchgoal.control.tactile.sensor_models import DIGIT, SensorModel
+from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT_WEDGE, SensorModel
 
 _PICTURES = (".png", ".jpg", ".jpeg")
 _UNTOUCHED = "background.png"  # of a folder of presses: what the sensor shows before them
@@ -38,7 +39,7 @@ def is_recorded(source: str) -> bool:
     return not source.startswith("/dev/") and Path(source).exists()
 
 
-def fingertip_video(source: str, model: SensorModel) -> VideoConfig:
+def fingertip_video(source: str, model: SensorModel, corners: Corners | None = None) -> VideoConfig:
     """How to open a live source: a USB serial number, a device (/dev/video2) or a stream's address.
 
     A serial number is looked up again whenever it is opened: after a replug it is another device.
@@ -47,13 +48,25 @@ def fingertip_video(source: str, model: SensorModel) -> VideoConfig:
         source,
         rate=model.frame_rate,
         gel=True,
-        dots=_dots(model, fingertip_view(model, source)),
+        dots=_dots(model, fingertip_view(model, source, corners=corners)),
         device=None if "/" in source else partial(_device_of, model, source),
     )
 
 
-def fingertip_view(model: SensorModel, source: str, border: float | None = None) -> Crop:
-    """How the sensor's picture lies in its camera's: a stream is cut and turned already."""
+def fingertip_view(
+    model: SensorModel, source: str, border: float | None = None, corners: Corners | None = None
+) -> Crop:
+    """How the sensor's picture lies in its camera's: without corners, a stream is cut and turned already.
+
+    Raises:
+        UserError: of a sensor that its camera sees at an angle, the corners are missing.
+    """
+    if corners is not None:
+        return Crop(corners=corners)
+    if model.name == GELSIGHT_WEDGE.name and "://" not in source:
+        raise UserError(
+            f"the camera of a {model.name} sees its gel at an angle: give the corners of the gel in its picture"
+        )
     if "://" in source:
         view = NO_CROP
     else:
@@ -61,30 +74,36 @@ def fingertip_view(model: SensorModel, source: str, border: float | None = None)
     return view if border is None else replace(view, border=border)
 
 
-def recorded_frames(source: Path, model: SensorModel) -> Generator[Frame, None, None]:
-    """Every frame of a video, or of a folder's pictures by name (background.png first), cut already.
+def recorded_frames(
+    source: Path, model: SensorModel, corners: Corners | None = None
+) -> Generator[Frame, None, None]:
+    """Every frame of a video, or of a folder's pictures by name (background.png first).
+
+    Without corners of the gel they are taken to be cut already.
 
     Raises:
         UserError: no pictures in it, or of other proportions than the sensor's.
     """
-    empty = True
+    empty, view = True, Crop(corners=corners)
     for frame in _folder(source) if source.is_dir() else _video(source):
         empty = False
-        yield crop_to_sensor(frame, model, NO_CROP)
+        yield crop_to_sensor(frame, model, view)
     if empty:
         raise UserError(
             f"{source} holds no pictures: give a video, or a folder of PNG or JPEG files"
         )
 
 
-def live_frames(config: VideoConfig, model: SensorModel) -> Generator[Frame, None, None]:
+def live_frames(
+    config: VideoConfig, model: SensorModel, corners: Corners | None = None
+) -> Generator[Frame, None, None]:
     """Frames of a live sensor as they come, without end; close the iterator to release it.
 
     Raises:
         UserError: it cannot be opened.
         DriverError: for 5 s nothing came.
     """
-    view = fingertip_view(model, config.source)
+    view = fingertip_view(model, config.source, corners=corners)
     camera = TactileCamera(VideoCamera(config), model, view)
     try:
         last, heard = -1, time.monotonic()

@@ -8,6 +8,8 @@ from jaxtyping import UInt8
 
 from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import Camera, Frame
+from touchgoal.control.option_types import Corners
+from touchgoal.control.sensors.gel_corners import rectify
 from touchgoal.control.tactile.sensor_models import SensorModel
 
 
@@ -18,10 +20,13 @@ class Crop:
     Attributes:
         border: share cut off at each of the four sides; 0 of a stream that is cut already.
         quarter_turns: counter-clockwise, before cutting; a DIGIT's camera lies on its side.
+        corners: of the gel, in place of a border, of a camera that sees it at an angle (a GelSight Wedge's);
+            after the turns.
     """
 
     border: float = 0.0
     quarter_turns: int = 0
+    corners: Corners | None = None
 
 
 # Of a whole GelSight Mini picture its SDK cuts a seventh off each side, the case's edge, and scales
@@ -71,8 +76,14 @@ class TactileCamera:
 def crop_to_sensor(
     image: UInt8[np.ndarray, "h w 3"], model: SensorModel, crop: Crop
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The sensor's picture in its camera's, at the model's shape."""
+    """The sensor's picture in its camera's, at the model's shape.
+
+    Raises:
+        UserError: the picture's proportions are not the sensor's, or the corners are none of a gel in it.
+    """
     image = np.rot90(image, crop.quarter_turns)
+    if crop.corners is not None:
+        return rectify(np.ascontiguousarray(image), model.image_shape, crop.corners)
     height, width = image.shape[:2]
     top, left = int(crop.border * height), int(crop.border * width)
     image = image[top : height - top, left : width - left]

@@ -138,9 +138,32 @@ DIGIT = SensorModel(
     sensor_file=_FILES / "digit",
 )
 
+# A finger whose camera sees the gel at an angle (Wang et al. 2021, arXiv 2106.08851); its picture is that between
+# the gel's corners, which differ from unit to unit. Scale: with it the dimples of golf balls in EstimateModulus'
+# pictures are 3.9 mm apart, of 3.6 to 4.4 mm on 300 to 400 of them. 30 pictures a second there, too.
+# Gel: as large as the picture. Its thickness and moduli and the case are not published in what was at hand: the Mini's.
+# Sensor file: a drawing of its lamps (`led_ring.py`), fitted to nothing, for no pictures of rigid balls may ship.
+GELSIGHT_WEDGE = replace(
+    GELSIGHT_MINI,
+    name="gelsight_wedge",
+    pixel_pitch=0.1e-3,
+    pitch_range=(0.09e-3, 0.11e-3),
+    gel_size=(32.0e-3, 24.0e-3),
+    case_size=(36.0e-3, 28.0e-3, 28.3e-3),
+    frame_rate=30.0,
+    sensor_file=_FILES / "gelsight_wedge",
+)
+
 SENSORS = {
     sensor.name: sensor
-    for sensor in (GELSIGHT_MINI, GELSIGHT_MINI_MARKERS, GELSIGHT, GELSIGHT_MARKERS, DIGIT)
+    for sensor in (
+        GELSIGHT_MINI,
+        GELSIGHT_MINI_MARKERS,
+        GELSIGHT,
+        GELSIGHT_MARKERS,
+        DIGIT,
+        GELSIGHT_WEDGE,
+    )
 }
 
 

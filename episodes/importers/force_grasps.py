@@ -12,6 +12,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from touchgoal.control.errors import UserError
+from touchgoal.control.option_types import Corners
+from touchgoal.control.sensors.gel_corners import rectify
+from touchgoal.control.tactile.sensor_models import GELSIGHT_WEDGE
 from touchgoal.episodes.media import read_frames
 
 _COLUMNS = ("force_newtons", "gripper_width_m")
@@ -27,6 +30,7 @@ class ForceGrasp:
         video: its file.
         force: of the grasp, N, one a frame, as its load cell says: spikes and drift included.
         width: of the gripper, m, one a frame.
+        corners: of the gel in the pictures, px, if they are to be rectified.
     """
 
     trial: str
@@ -34,14 +38,18 @@ class ForceGrasp:
     video: Path
     force: Float[np.ndarray, " n"]
     width: Float[np.ndarray, " n"]
+    corners: Corners | None = None
 
     def frames(self) -> UInt8[np.ndarray, "m h w 3"]:
-        """RGB frames, raw; as many as `force` has."""
-        return read_frames(self.video)[0][: len(self.force)]
+        """RGB frames, as many as `force` has: raw, or the gel as a GelSight Wedge shows it."""
+        frames = read_frames(self.video)[0][: len(self.force)]
+        if self.corners is None:
+            return frames
+        return np.stack([rectify(f, GELSIGHT_WEDGE.image_shape, self.corners) for f in frames])
 
 
-def read_force_grasps(folder: Path) -> list[ForceGrasp]:
-    """The grasps of a folder.
+def read_force_grasps(folder: Path, corners: Corners | None = None) -> list[ForceGrasp]:
+    """The grasps of a folder; with corners of the gel in its pictures, they are rectified.
 
     Raises:
         UserError: a table, a column or a video is missing.
@@ -57,7 +65,7 @@ def read_force_grasps(folder: Path) -> list[ForceGrasp]:
                 if not path.is_file():
                     raise UserError(f"{path} is missing, which {index} names")
             force, width = _read_table(table)
-            grasps.append(ForceGrasp(row["trial"], row["object"], video, force, width))
+            grasps.append(ForceGrasp(row["trial"], row["object"], video, force, width, corners))
     return grasps
 
 

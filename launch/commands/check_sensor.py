@@ -27,7 +27,7 @@ def run_command(config: Config) -> None:
     sensor = find_sensor(config.sensor)
     out = open_run(config.out, "check-sensor", config)
     if is_recorded(config.source):
-        frames = recorded_frames(Path(config.source), sensor)
+        frames = recorded_frames(Path(config.source), sensor, config.corners)
     else:
         print(f"leave the gel untouched for a second, then press; {config.seconds:g} s", flush=True)
         frames = _watched(config, sensor)
@@ -42,9 +42,10 @@ def run_command(config: Config) -> None:
 
 def _watched(config: Config, sensor: SensorModel) -> Iterator[np.ndarray]:
     """A live sensor's frames until the time is over, or Ctrl-C."""
-    video = replace(fingertip_video(config.source, sensor), exposure=config.exposure)
+    video = fingertip_video(config.source, sensor, config.corners)
+    video = replace(video, exposure=config.exposure)
     end = time.monotonic() + config.seconds
-    with closing(live_frames(video, sensor)) as frames:
+    with closing(live_frames(video, sensor, config.corners)) as frames:
         try:
             for frame in frames:
                 yield frame

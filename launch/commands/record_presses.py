@@ -34,7 +34,7 @@ def run_command(config: Config) -> None:
     recorder = PressRecorder(model.image_shape, config.presses_per_part)
     if is_recorded(config.source):
         out = open_run(config.out, "record-presses", config, adds=config.resume)
-        _record(recorded_frames(Path(config.source), model), recorder, None)
+        _record(recorded_frames(Path(config.source), model, config.corners), recorder, None)
     else:
         frames = _live(config, model)
         out = open_run(config.out, "record-presses", config, adds=config.resume)
@@ -63,9 +63,9 @@ def _live(config: Config, model: SensorModel) -> Generator[np.ndarray, None, Non
             "give --exposure (v4l2-ctl --list-ctrls shows its range): an exposure that the camera sets "
             "itself changes the light with every press"
         )
-    video = fingertip_video(config.source, model)
+    video = fingertip_video(config.source, model, config.corners)
     locked = replace(video, exposure=config.exposure, white_balance=config.white_balance)
-    return live_frames(locked, model)
+    return live_frames(locked, model, config.corners)
 
 
 def _record(

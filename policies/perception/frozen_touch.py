@@ -76,8 +76,8 @@ def load_touch(name_or_path: str | Path) -> TouchEmbedder:
     return TouchEmbedder(encoder, f"{encoder.config.preprocessor}/{_digest(directory)}{seen}")
 
 
-def load_touch_of(directory: Path, name: str) -> TouchEmbedder:
-    """The embedder with which a policy was trained: in its folder, or else the one that ships by that name.
+def find_touch_of(directory: Path, name: str) -> Path:
+    """The folder of the encoder with which a policy was trained: its own, or else the one that ships by that name.
 
     Args:
         directory: `touch/` of the policy's folder, there or not.
@@ -87,11 +87,16 @@ def load_touch_of(directory: Path, name: str) -> TouchEmbedder:
         UserError: there is none.
     """
     if directory.is_dir():
-        return load_touch(directory)
+        return directory
     for shipped in map(pretrained.find_encoder, pretrained.encoder_names()):
         if _digest(shipped) in name:
-            return load_touch(shipped)
+            return shipped
     raise UserError(f"no touch encoder {name} in {directory}, and none like it ships: train again")
+
+
+def load_touch_of(directory: Path, name: str) -> TouchEmbedder:
+    """The embedder with which a policy was trained, see `find_touch_of`."""
+    return load_touch(find_touch_of(directory, name))
 
 
 def _digest(directory: Path) -> str:
