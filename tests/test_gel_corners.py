@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.cell.connection import _tactile_camera
 from touchgoal.control.errors import UserError
 from touchgoal.control.sensors.fingertip_source import fingertip_view, recorded_frames
 from touchgoal.control.sensors.gel_corners import rectify
@@ -92,3 +94,23 @@ def test_a_wedges_camera_needs_its_corners() -> None:
         fingertip_view(GELSIGHT_WEDGE, "/dev/video2")
     assert fingertip_view(GELSIGHT_WEDGE, "http://pi/raw", corners=corners).corners == corners
     assert fingertip_view(GELSIGHT_WEDGE, "http://127.0.0.1/left") == NO_CROP  # a twin's
+
+
+def test_a_cell_file_has_the_corners_of_either_gel(tmp_path: Path) -> None:
+    picture, corners = seen_at_an_angle(1.0)
+    cv2.imwrite(str(tmp_path / "0.png"), picture)
+    a, b, c, d = ((639 - x, y) for x, y in corners)
+    mirrored = b, a, d, c
+    path = tmp_path / "cell.toml"
+    path.write_text(
+        'arm = "sim"\ngripper = { kind = "franka_hand" }\n[fingertips]\nsensor = "gelsight_wedge"\n'
+        f'left = "{tmp_path}/%d.png"\nright = "{tmp_path}/%d.png"\n'
+        f"corners = {[[list(point) for point in gel] for gel in (corners, mirrored)]}\n"
+        '[task]\nname = "pick-place"\npolicy = "expert"\n'
+    )
+    cell = read_cell_file(path)
+    assert cell.fingertips is not None and cell.fingertips.corners == (corners, mirrored)
+    for side, gel in enumerate((corners, mirrored)):
+        camera = _tactile_camera(cell, cell.fingertips, side)
+        np.testing.assert_array_equal(camera.read().image, rectify(picture, SHAPE, gel))
+        camera.close()
