@@ -29,6 +29,7 @@ from touchgoal.policies.evaluation.evaluate import Trial, run_trials
 from touchgoal.policies.evaluation.open_loop import OpenLoopErrors, Plan, open_loop_errors
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.heads.diffusion import RegressionConfig
+from touchgoal.policies.perception.frozen_touch import shipped_touch
 from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
 from touchgoal.policies.training.sequence_dataset import (
     SequenceDataset,
@@ -119,7 +120,7 @@ def _group_by_recipe(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
     arms: dict[str, list[Path]] = {}
     for directory in policies:
         config = checkpoint.load(directory).config
-        inputs = [f"frozen touch ({_objective(directory, config)})"] if config.touch_dim else []
+        inputs = [f"frozen touch ({_encoder_name(directory, config)})"] if config.touch_dim else []
         inputs += ["end-to-end touch"] * (config.end_to_end is not None)
         episodes = checkpoint.POLICY_FORMAT.provenance(directory)["episodes"]
         name = f"{' and '.join(inputs) or 'state only'}, {episodes} demos"
@@ -131,11 +132,13 @@ def _group_by_recipe(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
     return arms
 
 
-def _objective(policy: Path, config: PolicyConfig) -> str:
-    """What its touch encoder was trained by, such as `dino`."""
+def _encoder_name(policy: Path, config: PolicyConfig) -> str:
+    """Of its touch encoder: its name if it ships, else what it was trained by, such as `dino`."""
+    if shipped := shipped_touch(config.touch):
+        return shipped
     folder = SavedPolicy(policy).touch_folder(config)
     known = ENCODER_FORMAT.provenance(folder)
-    return next((name for name in ("align", *get_args(Method)) if name in known), folder.name)
+    return next((n for n in ("align", *get_args(Method), "untrained") if n in known), folder.name)
 
 
 # ---- closed loop

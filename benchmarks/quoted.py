@@ -131,6 +131,10 @@ QUOTED = {
         "force of real grasps from pictures, of things not calibrated on",
         _real_force,
     ),
+    "real-force-rectified": Quoted(
+        "touchgoal benchmark real-touch --data franka_wedge_grasps --encoders gelsight_mini_surfaces pixels "
+        "--corners 44 66 458 110 56 440 460 382",
+    ),
     "real-markers": Quoted("touchgoal benchmark real-touch --data mini_markers"),
     "pick-place": Quoted(
         "touchgoal run-policy --episodes 100 --no-video",
@@ -186,6 +190,12 @@ QUOTED = {
         _successes,
     ),
     "bead-maze": Quoted("touchgoal benchmark bead-maze --held-out 40", headline=_maze),
+    "bead-maze-encoders": Quoted(
+        "touchgoal benchmark bead-maze --policies runs/maze-half-untrained/policy runs/maze-half-mae/policy "
+        "runs/maze-half-dino/policy runs/maze-half-ijepa/policy runs/maze-half-vjepa/policy "
+        "runs/maze-half-aligned/policy runs/maze-half-shipped/policy runs/maze-half-wrench/policy "
+        "runs/maze-half-end-to-end/policy --held-out 0 --plan-ticks --no-shuffled",
+    ),
     "reward-quality": Quoted(
         "touchgoal benchmark reward-quality",
         "the last cost tells a success from a dropped object (area under ROC)",

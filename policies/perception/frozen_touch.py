@@ -88,10 +88,15 @@ def find_touch_of(directory: Path, name: str) -> Path:
     """
     if directory.is_dir():
         return directory
-    for shipped in map(pretrained.find_encoder, pretrained.encoder_names()):
-        if _digest(shipped) in name:
-            return shipped
+    if shipped := shipped_touch(name):
+        return pretrained.find_encoder(shipped)
     raise UserError(f"no touch encoder {name} in {directory}, and none like it ships: train again")
+
+
+def shipped_touch(name: str) -> str | None:
+    """Which of the encoders that ship made embeddings of a name (`TouchEmbedder.name`), if one did."""
+    names = pretrained.encoder_names()
+    return next((n for n in names if _digest(pretrained.find_encoder(n)) in name), None)
 
 
 def load_touch_of(directory: Path, name: str) -> TouchEmbedder:
