@@ -27,11 +27,7 @@ from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.heads.unet import UNetConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig
-from touchgoal.policies.perception.frozen_touch import (
-    TouchEmbedder,
-    find_touch_of,
-    load_touch_of,
-)
+from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
 from touchgoal.policies.perception.state_estimation import StateEstimator, load_estimator
 from touchgoal.policies.policy import Policy, PolicyConfig
 from touchgoal.sim_envs.base import FrankaTactileEnv
@@ -146,10 +142,6 @@ class SavedPolicy:
     def touch(self, config: PolicyConfig) -> TouchEmbedder | None:
         """What it feels with; None if it does not feel."""
         return load_touch_of(self.directory / TOUCH, config.touch) if config.touch_dim else None
-
-    def touch_folder(self, config: PolicyConfig) -> Path:
-        """Where its touch encoder lies; UserError if it is not there or the policy does not feel."""
-        return find_touch_of(self.directory / TOUCH, config.touch)
 
     def _estimator(self, config: PolicyConfig) -> StateEstimator | None:
         return load_estimator(self.directory / ESTIMATOR) if config.estimated else None

@@ -139,15 +139,16 @@ DIGIT = SensorModel(
 )
 
 # A finger whose camera sees the gel at an angle (Wang et al. 2021, arXiv 2106.08851); its picture is that between
-# the gel's corners, which differ from unit to unit. Scale: with it the dimples of golf balls in EstimateModulus'
-# pictures are 3.9 mm apart, of 3.6 to 4.4 mm on 300 to 400 of them. 30 pictures a second there, too.
-# Gel: as large as the picture. Its thickness and moduli and the case are not published in what was at hand: the Mini's.
+# the gel's corners, which differ from unit to unit. Scale: a round number; taken for 33 x 24 mm, EstimateModulus' pictures
+# show the dimples of golf balls 3.9 mm apart, where 400 to 300 of them spread evenly over a ball lie 4.1 to 4.7 mm
+# apart: it may be a tenth larger. 30 pictures a second there, too. Gel: as large as the picture; its case is drawn around it.
+# Thickness and moduli are not published in what was at hand: the Mini's.
 # Sensor file: a drawing of its lamps (`led_ring.py`), fitted to nothing, for no pictures of rigid balls may ship.
 GELSIGHT_WEDGE = replace(
     GELSIGHT_MINI,
     name="gelsight_wedge",
     pixel_pitch=0.1e-3,
-    pitch_range=(0.09e-3, 0.11e-3),
+    pitch_range=(0.09e-3, 0.12e-3),
     gel_size=(32.0e-3, 24.0e-3),
     case_size=(36.0e-3, 28.0e-3, 28.3e-3),
     frame_rate=30.0,

@@ -76,8 +76,8 @@ def load_touch(name_or_path: str | Path) -> TouchEmbedder:
     return TouchEmbedder(encoder, f"{encoder.config.preprocessor}/{_digest(directory)}{seen}")
 
 
-def find_touch_of(directory: Path, name: str) -> Path:
-    """The folder of the encoder with which a policy was trained: its own, or else the one that ships by that name.
+def load_touch_of(directory: Path, name: str) -> TouchEmbedder:
+    """The embedder with which a policy was trained: in its folder, or else the one that ships by that name.
 
     Args:
         directory: `touch/` of the policy's folder, there or not.
@@ -87,9 +87,9 @@ def find_touch_of(directory: Path, name: str) -> Path:
         UserError: there is none.
     """
     if directory.is_dir():
-        return directory
+        return load_touch(directory)
     if shipped := shipped_touch(name):
-        return pretrained.find_encoder(shipped)
+        return load_touch(shipped)
     raise UserError(f"no touch encoder {name} in {directory}, and none like it ships: train again")
 
 
@@ -97,11 +97,6 @@ def shipped_touch(name: str) -> str | None:
     """Which of the encoders that ship made embeddings of a name (`TouchEmbedder.name`), if one did."""
     names = pretrained.encoder_names()
     return next((n for n in names if _digest(pretrained.find_encoder(n)) in name), None)
-
-
-def load_touch_of(directory: Path, name: str) -> TouchEmbedder:
-    """The embedder with which a policy was trained, see `find_touch_of`."""
-    return load_touch(find_touch_of(directory, name))
 
 
 def _digest(directory: Path) -> str:
