@@ -51,3 +51,11 @@ policy maze-half-aligned --share 0.5 --encoder gelsight_mini_markers_offline --t
 policy maze-half-shipped --share 0.5 --encoder gelsight_mini_markers_mae --touch-input embedding
 policy maze-half-wrench --share 0.5 --encoder gelsight_mini_markers_mae
 policy maze-half-end-to-end --share 0.5 --end-to-end
+
+# Of all the demonstrations, three training seeds, for the record bead-maze-seeds: the embedding of the least validation
+# loss above, the wrench read out of it, and touch learned with the policy.
+for seed in 0 1 2; do
+    policy "maze-all-shipped-$seed" --seed "$seed" --encoder gelsight_mini_markers_mae --touch-input embedding
+    policy "maze-all-wrench-$seed" --seed "$seed" --encoder gelsight_mini_markers_mae
+    policy "maze-all-end-to-end-$seed" --seed "$seed" --end-to-end
+done
