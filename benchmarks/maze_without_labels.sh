@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# The policies that the record bead-maze-encoders judges: the maze by each encoder's frozen embedding (Sparsh's task T5), by
-# the wrench read out of it, and by touch that is learned with the policy; of half of 130 demonstrations.
-# Some two hours of one core, estimated. Stopped, the same line goes on.
+# The policies that the records bead-maze-encoders and bead-maze-seeds judge: the maze by each encoder's frozen embedding (Sparsh's task T5), by
+# the wrench read out of it, and by touch that is learned with the policy; of half of 130 demonstrations. Three
+# of them of all 130, with three seeds. Some three hours of one core, estimated. Stopped, the same line goes on.
 set -eu
 
 demos() { # name, options
@@ -52,7 +52,7 @@ policy maze-half-shipped --share 0.5 --encoder gelsight_mini_markers_mae --touch
 policy maze-half-wrench --share 0.5 --encoder gelsight_mini_markers_mae
 policy maze-half-end-to-end --share 0.5 --end-to-end
 
-# Of all the demonstrations, three training seeds, for the record bead-maze-seeds: the embedding of the least validation
+# Of all the demonstrations, three training seeds: the embedding of the least validation
 # loss above, the wrench read out of it, and touch learned with the policy.
 for seed in 0 1 2; do
     policy "maze-all-shipped-$seed" --seed "$seed" --encoder gelsight_mini_markers_mae --touch-input embedding

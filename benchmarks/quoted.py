@@ -126,6 +126,10 @@ QUOTED = {
         )
         + " random:runs/dino-simulated/encoder random:runs/vjepa-simulated/encoder",
     ),
+    "real-touch-without-labels-both": Quoted(
+        "touchgoal benchmark real-touch --data physiclear --encoders runs/ijepa-both/encoder runs/vjepa-both/encoder "
+        "random:runs/vjepa-both/encoder",
+    ),
     "real-force": Quoted(
         "touchgoal benchmark real-touch --data franka_wedge_grasps --encoders gelsight_mini_surfaces pixels",
         "force of real grasps from pictures, of things not calibrated on",
@@ -196,6 +200,15 @@ QUOTED = {
         "runs/maze-half-aligned/policy runs/maze-half-shipped/policy runs/maze-half-wrench/policy "
         "runs/maze-half-end-to-end/policy --held-out 0 --plan-ticks --no-shuffled",
     ),
+    "bead-maze-seeds": Quoted(
+        "touchgoal benchmark bead-maze --policies "
+        + " ".join(
+            f"runs/maze-all-{name}-{seed}/policy"
+            for name in ("shipped", "wrench", "end-to-end")
+            for seed in range(3)
+        )
+        + " --held-out 0 --plan-ticks --no-shuffled",
+    ),
     "reward-quality": Quoted(
         "touchgoal benchmark reward-quality",
         "the last cost tells a success from a dropped object (area under ROC)",
@@ -231,6 +244,10 @@ QUOTED = {
     "tacbench-pose": Quoted(
         "touchgoal benchmark tacbench --tasks pose --slides 300 --steps 2000 --shares 1 --encoders "
         "gelsight_mini_markers_mae runs/slides-dino/encoder"
+    ),
+    "tacbench-end-to-end": Quoted(
+        "touchgoal benchmark tacbench --tasks force slip pose --shares 0.1 0.01 --encoders "
+        "gelsight_mini_markers_mae end-to-end:compact --end-to-end-steps 400"
     ),
     "faults": Quoted("touchgoal benchmark faults"),
 }
