@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# The policies that the records bead-maze-encoders and bead-maze-seeds judge: the maze by each encoder's frozen embedding (Sparsh's task T5), by
-# the wrench read out of it, and by touch that is learned with the policy; of half of 130 demonstrations. Three
-# of them of all 130, with three seeds. Some three hours of one core, estimated. Stopped, the same line goes on.
+# The policies that the records bead-maze-encoders and bead-maze-seeds judge: the maze by each encoder's
+# frozen embedding (Sparsh's task T5), by the wrench read out of it, and by touch that is learned with the policy;
+# of half of 130 demonstrations, and three of them of all, with three seeds. Some three hours of one core, estimated. Stopped, the same line goes on.
 set -eu
 
 demos() { # name, options
