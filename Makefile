@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
-CODE := control sim_envs episodes encoders rewards policies benchmarks launch tests
+CODE := runtime control sim_envs episodes encoders rewards policies benchmarks launch tests
 
 # Without compiled files each of the tests' many processes would compile everything anew.
 unexport PYTHONDONTWRITEBYTECODE

@@ -16,12 +16,13 @@ import torch
 from jaxtyping import Float
 
 from touchgoal.benchmarks.config import BeadMazeOptions
+from touchgoal.control.features import Observation
 from touchgoal.encoders.pretrained import ENCODER_FORMAT
 from touchgoal.encoders.ssl.untrained import Method
 from touchgoal.episodes.recording import Actor, EpisodeSpec, collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
-from touchgoal.policies.acting import Observation, Planner, PolicyActor
+from touchgoal.policies.acting import Planner, PolicyActor
 from touchgoal.policies.by_name import follower
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.evaluation import open_loop
@@ -36,12 +37,11 @@ from touchgoal.policies.training.sequence_dataset import (
     cached_embeddings,
     load_recordings,
 )
+from touchgoal.runtime import seeds
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.scene.wires import HELD_OUT, Wire, choose
-
-FIRST_SEED = 4_000_000
 
 
 class ShuffledTouchPlanner(Planner):
@@ -148,8 +148,10 @@ def _closed_loop(
 ) -> dict[str, list[Trial]]:
     maze = config.env
     blind = replace(maze, tactile=False)
-    jobs = _specs(choose(maze.split, config.wires, maze.families), FIRST_SEED)
-    other = _specs(choose(maze.split, config.held_out, (HELD_OUT,)), FIRST_SEED + 10_000)
+    jobs = _specs(choose(maze.split, config.wires, maze.families), seeds.POLICY_TEST.start)
+    other = _specs(
+        choose(maze.split, config.held_out, (HELD_OUT,)), seeds.POLICY_TEST.start + 10_000
+    )
     results: dict[str, list[Trial]] = {}
 
     def run_arm(name: str, env: BeadMazeConfig, makers: list[Callable], trials: list) -> None:
@@ -217,7 +219,7 @@ def _record(config: BeadMazeOptions, root: Path) -> EpisodeSet:
     """Expert demonstrations, on test wires and undisturbed unless other options are chosen."""
     maze = config.env
     wires = choose(maze.split, config.demonstrations, maze.families)
-    collect(root, maze, _specs(wires, FIRST_SEED), config.workers)
+    collect(root, maze, _specs(wires, seeds.POLICY_TEST.start), config.workers)
     return EpisodeSet(root)
 
 

@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from touchgoal.control import features as ft
-from touchgoal.control.option_types import (
+from touchgoal.runtime import seeds
+from touchgoal.runtime.option_types import (
     RARE,
     Corners,
     Count,
@@ -80,7 +81,7 @@ class DeployOptions(BenchmarkOptions):
     """In place of all that: so many deployments on one twin of each task, in turn."""
     seconds: Positive = 40.0
     """After which a deployment ends."""
-    seed: Seed = 6_000_000
+    seed: Seed = seeds.DEPLOY_TEST.start
     """Random seed of the first episode; each further one adds one."""
     workers: Count = CORES
     """Deployments side by side, in process and in lock-step."""
@@ -160,7 +161,7 @@ class ReplayOptions(BenchmarkOptions):
 
     episodes: Count = 3
     """Waves in free air, and presses onto the table."""
-    seed: Seed = 8_000_000
+    seed: Seed = seeds.REPLAY.start
     """Random seed of the first."""
 
 
@@ -193,7 +194,7 @@ class PolicyDelayOptions(BenchmarkOptions):
     """Pictures a second, Hz."""
     episodes: Count = 20
     """Number of episodes of each row."""
-    seed: Seed = 4_000_000
+    seed: Seed = seeds.POLICY_TEST.start
     """Random seed of the first episode; each further one adds one."""
     workers: Count = CORES
     """Processes that simulate."""

@@ -23,15 +23,15 @@ from touchgoal.benchmarks.deployed_twin import DeployedTwin
 from touchgoal.benchmarks.deployments_in_a_row import run_in_a_row
 from touchgoal.benchmarks.kept_deployments import KeptDeployments
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
-from touchgoal.control.progress import track
 from touchgoal.episodes.recording import EpisodeSpec, one_core_workers
 from touchgoal.policies.by_name import choose_policy, env_config_for, scripted
 from touchgoal.policies.evaluation.evaluate import run_trial, trial_specs
 from touchgoal.policies.evaluation.success_rate import SuccessRate
+from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskName
 
 EXAMPLES = {"pick-place": "sim.toml", "bead-maze": "sim_maze.toml"}
-_CELLS = Path(__file__).parents[1] / "launch" / "cells"
+_CELLS = Path(__file__).parents[1] / "control" / "cell" / "examples"
 
 
 def run(config: DeployOptions) -> dict[str, Any]:

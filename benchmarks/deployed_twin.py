@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import TaskName
 
 _START_TIMEOUT, _END_TIMEOUT = 300.0, 60.0  # s, on a machine however loaded

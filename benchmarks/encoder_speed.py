@@ -20,7 +20,6 @@ from touchgoal.benchmarks.mae_step import measure_mae_step, step_line
 from touchgoal.benchmarks.plain_torch import PlainViT
 from touchgoal.benchmarks.real_touch_encoders import vit_of
 from touchgoal.benchmarks.speed import in_turn, one_core
-from touchgoal.control.progress import track
 from touchgoal.encoders.backbones.frame_history import RecentFrames
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.backbones.sparsh import sparsh_vit
@@ -32,6 +31,7 @@ from touchgoal.encoders.backbones.touch_backbone import (
 )
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.published import STRIDES
+from touchgoal.runtime.progress import track
 
 _DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
 _FRAME = 240, 320  # of a sensor, px

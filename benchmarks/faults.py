@@ -25,20 +25,20 @@ import numpy as np
 
 from touchgoal.benchmarks.config import FaultsOptions
 from touchgoal.control import features as ft
-from touchgoal.control.atomic_write import write_file
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import cell_watchdogs, connect_cell
-from touchgoal.control.errors import UserError
+from touchgoal.control.deployment.control_loop import PLAN_ENDED, ControlLoop, DeployedActor
+from touchgoal.control.deployment.session import Session
+from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.episodes.repair import validate
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.policies.acting import Observation
-from touchgoal.policies.deploy.actors import LearnedActor, make_actor
-from touchgoal.policies.deploy.control_loop import PLAN_ENDED, ControlLoop, DeployedActor
-from touchgoal.policies.deploy.session import Session
+from touchgoal.policies.deployed import LearnedActor, make_actor
 from touchgoal.policies.policy import PolicyConfig
+from touchgoal.runtime.atomic_write import write_file
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.twin.control_port import ask_twin
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig

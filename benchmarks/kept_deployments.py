@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from touchgoal.benchmarks.deployed_episode import Deployment, Scene
-from touchgoal.control.provenance import provenance
+from touchgoal.runtime.provenance import provenance
 
 _Key = tuple[str, str, str, int, str]
 

@@ -10,11 +10,11 @@ from jaxtyping import Float
 
 from touchgoal.benchmarks.config import MotionOptions
 from touchgoal.benchmarks.speed import one_core
-from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.trajectories import joint_move
 from touchgoal.control.safety.limits import FR3, UR5E, RobotLimits
+from touchgoal.runtime.errors import UserError
 
 Joints = Float[np.ndarray, " n"]
 

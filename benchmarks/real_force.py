@@ -6,12 +6,12 @@ import numpy as np
 
 from touchgoal.benchmarks.real_cost import EmbeddedGrasp, cost_table, judge_cost
 from touchgoal.benchmarks.real_touch_encoders import Embedder
-from touchgoal.control.progress import track
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.control.tactile.picture_force import calibrate_force, shrunk, statistics
 from touchgoal.encoders.probes.property_probe import interval
 from touchgoal.episodes.importers.force_grasps import ForceGrasp
+from touchgoal.runtime.progress import track
 
 RANGE = 25.0
 """N, up to which forces are judged."""

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.progress import track
 from touchgoal.control.tactile.markers import MarkerTracker
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS, MarkerGrid
 from touchgoal.episodes.importers.marker_pictures import MarkerPicture
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
 
 NEAR = 1.0
 """px within which both trackers agree."""

@@ -15,8 +15,6 @@ from touchgoal.benchmarks.config import RealTouchOptions
 from touchgoal.benchmarks.real_force import force_table, judge_grasps
 from touchgoal.benchmarks.real_markers import judge_markers, marker_table
 from touchgoal.benchmarks.real_touch_encoders import Embedder, find_embedder
-from touchgoal.control.errors import UserError
-from touchgoal.control.progress import track
 from touchgoal.control.tactile.contact import contact_strength, threshold_for
 from touchgoal.encoders.probes.property_probe import (
     adapted_nearest_is_same,
@@ -40,6 +38,8 @@ from touchgoal.episodes.importers.labelled_videos import (
 )
 from touchgoal.episodes.importers.marker_pictures import has_markers, read_marker_pictures
 from touchgoal.episodes.touches import touch_background
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
 
 BRIGHTER = 1.1
 """Light of the drift test."""

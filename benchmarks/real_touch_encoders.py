@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Int, UInt8
 
-from touchgoal.control.errors import UserError, install_extra
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder, TouchBackbone
 from touchgoal.encoders.backbones.vit import ViT
@@ -17,6 +16,7 @@ from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.published import is_published
 from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_pixels
+from touchgoal.runtime.errors import UserError, install_extra
 
 CONTRAST = 4
 """By which a change of colour is drawn, about grey, for networks that know pictures alone."""

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from touchgoal.benchmarks.quoted import QUOTED
-from touchgoal.control.errors import UserError
-from touchgoal.control.provenance import hardware
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.provenance import hardware
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "benchmarks" / "results"

@@ -16,8 +16,6 @@ import numpy as np
 from scipy import stats
 
 from touchgoal.benchmarks.config import RewardQualityOptions
-from touchgoal.control.errors import UserError
-from touchgoal.control.progress import track
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.recording import EpisodeSpec, collect
@@ -30,6 +28,9 @@ from touchgoal.rewards.goals import EpisodeEnd, Goal, LastFrame, Sentence
 from touchgoal.rewards.metrics import CurveMetrics, measure_curve
 from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
 from touchgoal.rewards.report.summary import metrics_table
+from touchgoal.runtime import seeds
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import OUTCOMES
 from touchgoal.sim_envs.scene.objects import CATALOGUE
@@ -57,8 +58,6 @@ SENTENCES = {
     "clay_lump": "a lump of smooth soft clay",
     "rag_bundle": "a soft heap of woven cloth",
 }
-FIRST_SEED = 3_000_000
-_GOALS, _TESTS = FIRST_SEED, FIRST_SEED + 100_000
 _GOAL_ATTEMPTS = 3  # the expert places 98 of 100
 
 
@@ -124,7 +123,7 @@ def record_and_measure(
     tests = []
     for k, outcome in enumerate(OUTCOMES):
         env = PickPlaceConfig(distractors=int(outcome == "wrong_object"), sensor=sensor)
-        first = _TESTS + 1000 * k
+        first = seeds.REWARD_TEST.start + 1000 * k
         jobs = [EpisodeSpec(first + i, outcome, {"object": n}) for i, n in enumerate(names)]
         collect(folder / outcome, env, jobs, config.workers)
         episodes = EpisodeSet(folder / outcome)
@@ -157,7 +156,7 @@ def collect_goals(
         if not missing:
             break
         root = folder / f"goals-{attempt}"
-        first = _GOALS + 1000 * attempt
+        first = seeds.REWARD_GOALS.start + 1000 * attempt
         jobs = [EpisodeSpec(first + i, "success", {"object": names[i]}) for i in missing]
         collect(root, PickPlaceConfig(distractors=0, sensor=sensor), jobs, workers)
         episodes = EpisodeSet(root)

@@ -9,9 +9,9 @@ from jaxtyping import Float, Int
 from touchgoal.benchmarks.config import SentStreamOptions
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.tracker import Tracker
-from touchgoal.control.progress import track
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3, UR5E, RobotLimits
+from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.deployed_arm import all_well
 
 Joints = Float[np.ndarray, " n"]

@@ -20,8 +20,8 @@ from touchgoal.control.calibration.picture_errors import mean_errors, picture_er
 from touchgoal.control.calibration.pictures import side_by_side
 from touchgoal.control.calibration.press_fit import REGION
 from touchgoal.control.calibration.press_set import PressSet, split, write_presses
-from touchgoal.control.errors import install_extra
-from touchgoal.control.progress import track
+from touchgoal.runtime.errors import install_extra
+from touchgoal.runtime.progress import track
 
 N_TEST_PRESSES = {"gelsight": 12, "gelsight_mini": 6}
 MAIN_METHOD = "ours, circles corrected"

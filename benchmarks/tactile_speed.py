@@ -13,8 +13,8 @@ from numba import njit
 from touchgoal.benchmarks.config import TactileSpeedOptions
 from touchgoal.benchmarks.speed import Row, measure, one_core, table
 from touchgoal.benchmarks.taxim_peer import has_jax, has_taxim
-from touchgoal.control.errors import install_extra
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS, SensorModel
+from touchgoal.runtime.errors import install_extra
 from touchgoal.sim_envs.config import NO_RANDOMIZATION
 from touchgoal.sim_envs.scene.objects import CATALOGUE, HARD, Body, Material, ObjectKind, Texture
 from touchgoal.sim_envs.tactile.press_bench import PressBench

@@ -8,8 +8,6 @@ from jaxtyping import Float
 
 from touchgoal.benchmarks.config import TaskCeilingsOptions
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
-from touchgoal.control.progress import track
 from touchgoal.control.safety.task_ceilings import TaskForces
 from touchgoal.control.tactile.indentation import IndentationMeter
 from touchgoal.control.tactile.sensor_models import find_sensor
@@ -17,6 +15,8 @@ from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.training.training_data import succeeded
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
 
 
 def peak_force(episode: Episode) -> float:

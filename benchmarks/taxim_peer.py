@@ -14,7 +14,7 @@ from jaxtyping import Float32, UInt8
 
 from touchgoal.control.calibration.ball import Circle
 from touchgoal.control.calibration.press_set import PressSet
-from touchgoal.control.errors import UserError, install_extra
+from touchgoal.runtime.errors import UserError, install_extra
 
 PIXEL_PITCH = 0.059e-3
 """m per pixel of the presses here: half of the wheel's 640x480 at 0.0295 mm (its params.json)."""

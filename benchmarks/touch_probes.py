@@ -18,13 +18,13 @@ from jaxtyping import Float, Float32
 
 from touchgoal.benchmarks.config import TouchProbesOptions
 from touchgoal.benchmarks.touch_features import Change, PressFeatures, press_features
-from touchgoal.control.progress import track
 from touchgoal.control.sensors.fingertip_source import recorded_frames
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.probes.ridge import ridge_scores
+from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.tactile.indenters import FIELD, INDENTERS, IndenterPose, indent
 from touchgoal.sim_envs.tactile.optics import render_untouched
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance

@@ -7,6 +7,11 @@ is the robot's first link. Keys follow LeRobot's naming.
 
 from dataclasses import dataclass
 
+import numpy as np
+
+Observation = dict[str, np.ndarray]
+"""One tick's observation: key -> array."""
+
 STATE = "observation.state"
 COMMAND = "observation.command"
 TCP_POSE = "observation.tcp_pose"

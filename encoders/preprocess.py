@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 _BRIGHTNESS_CELL = 4  # px
 _ASPECT_TOLERANCE = 0.02  # a GelSight Mini's own 3280 x 2464 differs from 4:3 by 0.2 %

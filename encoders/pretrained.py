@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 
-from touchgoal.control.errors import UserError
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
@@ -15,6 +14,7 @@ from touchgoal.encoders.preprocess import preprocessor_for, steady_preprocessor_
 from touchgoal.encoders.published import is_published, load_published
 from touchgoal.encoders.towers.towers import same_towers
 from touchgoal.encoders.training.weights import WeightsFormat
+from touchgoal.runtime.errors import UserError
 
 AnyTouchEncoder = TouchEncoder | TouchBackbone | PooledEncoder
 """Aligned with images and texts; learned without labels; a whitened ImageNet network."""

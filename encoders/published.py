@@ -3,10 +3,10 @@
 import re
 from pathlib import Path
 
-from touchgoal.control.errors import UserError, install_extra
 from touchgoal.encoders.backbones.sparsh_input import SPARSH, SPARSH_PLAIN
 from touchgoal.encoders.backbones.sparsh_weights import load_sparsh
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
+from touchgoal.runtime.errors import UserError, install_extra
 
 _FILES = (".safetensors", ".ckpt")  # the former holds the encoder alone
 _PATTERN = "*_vit*"  # e.g. dino_vitbase.safetensors

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import (
     TACTILE_LEFT,
     TACTILE_RIGHT,
@@ -21,11 +20,12 @@ from touchgoal.control.features import (
     TRUTH_SLIP,
     TRUTH_SUCCESS,
 )
-from touchgoal.control.progress import track
 from touchgoal.episodes.encoding import EncodedEpisode, encode
 from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.cloths import CLOTHS, press_cloth
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.grasp_rig import attempt_grasp

@@ -21,7 +21,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Int, Shaped, UInt8
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import FEATURES
 from touchgoal.episodes import statistics
 from touchgoal.episodes.media import encode_video
@@ -33,6 +32,7 @@ from touchgoal.episodes.schema import (
     is_camera,
     is_image,
 )
+from touchgoal.runtime.errors import UserError
 
 # Frames a row group: reading one window of touch reads a few groups, not the whole episode.
 FRAMES_PER_ROW_GROUP = 32

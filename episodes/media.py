@@ -12,8 +12,8 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 from jaxtyping import UInt8
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.picture_file import read_picture
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.picture_file import read_picture
 
 # Every second frame is a key frame, so that one frame is found by decoding at most two.
 KEY_FRAME_INTERVAL = 2

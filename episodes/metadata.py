@@ -15,13 +15,13 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from touchgoal.control.atomic_write import write_file
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import FEATURES
 from touchgoal.episodes.bytes_on_disk import json_bytes, parquet_bytes
 from touchgoal.episodes.encoding import Description, index_columns
 from touchgoal.episodes.schema import INDEX_DTYPES
 from touchgoal.episodes.statistics import Stats, array_statistics, merge
+from touchgoal.runtime.atomic_write import write_file
+from touchgoal.runtime.errors import UserError
 
 VERSION = "v3.0"
 CHUNK = 1000

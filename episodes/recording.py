@@ -17,12 +17,13 @@ import numpy as np
 from jaxtyping import UInt8
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
-from touchgoal.control.progress import track
+from touchgoal.control.features import Observation
 from touchgoal.episodes.encoding import EncodedEpisode, encode
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeWriter
-from touchgoal.sim_envs.base import FrankaTactileEnv, Observation
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
+from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.config import Outcome, TaskConfig
 from touchgoal.sim_envs.scene.filming import SceneRecorder
 from touchgoal.sim_envs.tasks import make_env, make_expert

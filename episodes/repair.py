@@ -13,9 +13,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from touchgoal.control.atomic_write import write_file
-from touchgoal.control.errors import UserError
-from touchgoal.control.progress import track
 from touchgoal.episodes import metadata
 from touchgoal.episodes.encoding import (
     Description,
@@ -23,8 +20,11 @@ from touchgoal.episodes.encoding import (
     read_description,
     write_table,
 )
-from touchgoal.episodes.folder_lock import FolderLock
 from touchgoal.episodes.metadata import SetMetadata
+from touchgoal.runtime.atomic_write import write_file
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.folder_lock import FolderLock
+from touchgoal.runtime.progress import track
 
 REPAIRED = "repaired"
 _FOLDERS = ("data", "videos", "meta")

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import (
     ACTION,
     FEATURES,
@@ -16,6 +15,7 @@ from touchgoal.control.features import (
     Feature,
     features_of,
 )
+from touchgoal.runtime.errors import UserError
 
 MetaValue = str | int | float | bool | list[str]
 

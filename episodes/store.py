@@ -19,8 +19,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import UInt8
 
-from touchgoal.control.atomic_write import write_file
-from touchgoal.control.errors import UserError
 from touchgoal.episodes import metadata
 from touchgoal.episodes.encoding import (
     EncodedEpisode,
@@ -28,11 +26,13 @@ from touchgoal.episodes.encoding import (
     encode,
     read_columns,
 )
-from touchgoal.episodes.folder_lock import FolderLock
 from touchgoal.episodes.media import decode_video
 from touchgoal.episodes.metadata import Row, SetMetadata
 from touchgoal.episodes.repair import contradictions_in_meta, unlisted_files
 from touchgoal.episodes.schema import INDEX_DTYPES, Episode, MetaValue, is_camera
+from touchgoal.runtime.atomic_write import write_file
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.folder_lock import FolderLock
 
 
 class EpisodeWriter:

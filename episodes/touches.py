@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import TACTILE, TRUTH_CONTACT, WRIST
-from touchgoal.control.progress import track
 from touchgoal.control.tactile.contact import detect_contact, threshold_for
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
 
 _BACKGROUND_FRAMES = 5
 _VIEW_FRAMES_BEFORE_CONTACT = 5

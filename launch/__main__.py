@@ -11,8 +11,8 @@ from difflib import get_close_matches
 from typing import Any
 
 from touchgoal import __version__
-from touchgoal.control.errors import UserError
-from touchgoal.control.interruption import Terminated, terminable
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.interruption import Terminated, terminable
 
 COMMANDS = {
     "demo": "pick an object up in simulation, and draw how near it comes to its goal",
@@ -89,7 +89,7 @@ def _run(name: str, *options: str) -> None:
 def read_options(name: str, options: list[str]) -> tuple[Any, Any]:
     """A command's module and its Config. What can be checked before any work is checked here."""
     from touchgoal.launch.support.command_line import parse
-    from touchgoal.launch.support.run_folder import check_writable
+    from touchgoal.runtime.run_folder import check_writable
 
     module = importlib.import_module(f"touchgoal.launch.{name.replace('-', '_')}")
     config = parse(

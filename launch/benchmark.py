@@ -8,9 +8,9 @@ from typing import Annotated, Any
 import tyro
 
 from touchgoal.benchmarks import config as options
-from touchgoal.control.errors import UserError
-from touchgoal.control.provenance import hardware, provenance
-from touchgoal.launch.support.run_folder import open_run, write_json
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.provenance import hardware, provenance
+from touchgoal.runtime.run_folder import open_run, write_json
 
 BENCHMARKS: dict[str, type[options.BenchmarkOptions]] = {
     "bead-maze": options.BeadMazeOptions,

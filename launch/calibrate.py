@@ -13,8 +13,8 @@ from typing import Annotated
 import tyro
 from pydantic import Field
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.option_types import Positive, Seed, checked_dataclass
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import Positive, Seed, checked_dataclass
 
 
 @checked_dataclass
@@ -56,11 +56,11 @@ def main(config: Config) -> None:
     from touchgoal.control.calibration.held_out_depth import depth_errors, median_by_ball
     from touchgoal.control.calibration.pictures import light_compass
     from touchgoal.control.calibration.press_set import read_presses, split
-    from touchgoal.control.progress import Progress
-    from touchgoal.control.provenance import provenance
     from touchgoal.control.tactile.sensor_calibration import save
     from touchgoal.control.tactile.sensor_models import SENSORS
-    from touchgoal.launch.support.run_folder import open_run, write_json
+    from touchgoal.runtime.progress import Progress
+    from touchgoal.runtime.provenance import provenance
+    from touchgoal.runtime.run_folder import open_run, write_json
 
     if config.sensor not in SENSORS:
         raise UserError(f"unknown sensor {config.sensor!r}; choose from: {', '.join(SENSORS)}")

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from touchgoal.control.option_types import Corners, Positive, checked_dataclass
+from touchgoal.runtime.option_types import Corners, Positive, checked_dataclass
 
 
 @checked_dataclass

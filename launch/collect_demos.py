@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from touchgoal.control.option_types import Count, Seed, checked_dataclass
+from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 from touchgoal.sim_envs.config import (
     BeadMazeConfig,
     Outcome,

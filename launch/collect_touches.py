@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from touchgoal.control.option_types import Count, Seed, checked_dataclass
+from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 
 
 @checked_dataclass
@@ -27,10 +27,10 @@ class Config:
 
 def main(config: Any) -> None:
     """Record what is missing."""
-    from touchgoal.control.interruption import kept
     from touchgoal.control.tactile.sensor_models import find_sensor
     from touchgoal.episodes.bench_recording import record_catalogue_slides
-    from touchgoal.launch.support.run_folder import open_run
+    from touchgoal.runtime.interruption import kept
+    from touchgoal.runtime.run_folder import open_run
     from touchgoal.sim_envs.config import RigConfig
 
     find_sensor(config.sensor)  # a wrong one is refused before anything is written

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from touchgoal.control.option_types import checked_dataclass
+from touchgoal.runtime.option_types import checked_dataclass
 
 
 @checked_dataclass

@@ -7,9 +7,10 @@ goal is drawn along the episode: in the camera's image, in touch, in both, and t
 from dataclasses import asdict
 from pathlib import Path
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import FRONT, IMAGE_PREFIX
-from touchgoal.control.option_types import Seed, checked_dataclass
+from touchgoal.runtime import seeds
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import Seed, checked_dataclass
 from touchgoal.sim_envs.config import PickPlaceConfig
 
 
@@ -21,7 +22,7 @@ class Config:
     """Folder of the run; default: runs/<date>_demo."""
     words: str = "a hard smooth round object"
     """Sentence that says how the object feels: the goal in words."""
-    seed: Seed = 2_000_000
+    seed: Seed = seeds.DEMO.start
     """Random seed of the episode."""
     env: PickPlaceConfig = PickPlaceConfig(objects=("glass_ball",))
     """Options of the task; --env.objects names what to pick up."""
@@ -41,11 +42,11 @@ def main(config: Config) -> None:
     from touchgoal.episodes.recording import EpisodeSpec, record_with_film
     from touchgoal.episodes.store import EpisodeWriter
     from touchgoal.launch.reward_curves import report_all
-    from touchgoal.launch.support.run_folder import open_run
     from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
     from touchgoal.rewards.goals import assign_goals, parse_goal
     from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
     from touchgoal.rewards.report.report import write_report
+    from touchgoal.runtime.run_folder import open_run
     from touchgoal.sim_envs.pick_place import PickPlace
 
     sensor = find_sensor(config.env.sensor).name

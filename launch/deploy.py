@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from touchgoal.control.option_types import Seed, checked_dataclass
+from touchgoal.runtime.option_types import Seed, checked_dataclass
 
 
 @checked_dataclass

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Run the task of a cell file on its arm: launch/deploy.sh launch/cells/fr3_two_minis.toml [--execute]
+# Run the task of a cell file on its arm: launch/deploy.sh control/cell/examples/fr3_two_minis.toml [--execute]
 set -eu
 root=$(cd "$(dirname "$0")/.." && pwd)
 if [ -x "$root/.venv/bin/touchgoal" ]; then

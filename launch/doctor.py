@@ -7,9 +7,9 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from touchgoal.control.checks import CheckResult, require_all_ok
-from touchgoal.control.errors import UserError, install_extra
-from touchgoal.control.option_types import checked_dataclass
+from touchgoal.runtime.checks import CheckResult, require_all_ok
+from touchgoal.runtime.errors import UserError, install_extra
+from touchgoal.runtime.option_types import checked_dataclass
 
 _GL_PROBE = "import touchgoal, mujoco; c = mujoco.GLContext(64, 64); c.make_current(); c.free()"
 _PACKAGES = ("mujoco", "torch", "opencv-contrib-python-headless", "casadi", "pyarrow", "av")

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from touchgoal.control.option_types import checked_dataclass
+from touchgoal.runtime.option_types import checked_dataclass
 
 
 @checked_dataclass
@@ -38,12 +38,12 @@ class Config:
 
 def main(config: Config) -> None:
     """Check, embed, fit."""
-    from touchgoal.control.progress import track
-    from touchgoal.launch.support.run_folder import open_run
     from touchgoal.rewards.fit_normalizer import fit_normalizer
     from touchgoal.rewards.normalizer import NORMALIZER
     from touchgoal.rewards.setup import embedder_for, load_touch
     from touchgoal.rewards.sources import open_successes
+    from touchgoal.runtime.progress import track
+    from touchgoal.runtime.run_folder import open_run
 
     with_touch = config.towers is None or config.encoder is not None
     sources = open_successes(config.sources, config.camera, with_touch, config.assume_success)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 import touchgoal
-from touchgoal.control.option_types import checked_dataclass
+from touchgoal.runtime.option_types import checked_dataclass
 
 _WEIGHTS = Path(touchgoal.__file__).parent / "encoders" / "weights"
 Kind = Literal["objects", "sensors", "tasks", "policies", "encoders", "benchmarks"]

@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import Annotated, Any
 
-from touchgoal.control.option_types import RARE, Count, CountOrNone, checked_dataclass
+from touchgoal.runtime.option_types import RARE, Count, CountOrNone, checked_dataclass
 from touchgoal.sim_envs.config import TaskName
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import tyro
 from pydantic import Field
 
-from touchgoal.control.option_types import Corners, Count, Port, Positive, checked_dataclass
+from touchgoal.runtime.option_types import Corners, Count, Port, Positive, checked_dataclass
 
 
 @checked_dataclass

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import tyro
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.option_types import checked_dataclass
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import checked_dataclass
 
 
 @checked_dataclass

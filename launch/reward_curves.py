@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from pydantic import Field
 
-from touchgoal.control.option_types import checked_dataclass
+from touchgoal.runtime.option_types import checked_dataclass
 
 if TYPE_CHECKING:
     from touchgoal.rewards.curves import Curves
@@ -48,11 +48,11 @@ class Config:
 
 def main(config: Config) -> None:
     """Check, embed, measure, and write a plot, a CSV and a JSON for each trajectory."""
-    from touchgoal.control.progress import track
-    from touchgoal.launch.support.run_folder import open_run
     from touchgoal.rewards.report.report import write_report
     from touchgoal.rewards.setup import prepare
     from touchgoal.rewards.sources import VideoSource, open_source
+    from touchgoal.runtime.progress import track
+    from touchgoal.runtime.run_folder import open_run
 
     with_touch = config.towers is None or config.encoder is not None
     source = open_source(config.source, config.camera, config.index, with_touch)
@@ -81,8 +81,8 @@ def main(config: Config) -> None:
 
 def report_all(curves: list["Curves"], out: Path) -> None:
     """Print the table of all curves and write it to metrics.json."""
-    from touchgoal.launch.support.run_folder import write_json
     from touchgoal.rewards.report.summary import metrics_table
+    from touchgoal.runtime.run_folder import write_json
 
     write_json(
         out / "metrics.json",

@@ -8,7 +8,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import Any, Literal
 
-from touchgoal.control.option_types import Count, Seed, checked_dataclass
+from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 from touchgoal.sim_envs.config import BeadMazeConfig, TeleoperatorConfig
 
 

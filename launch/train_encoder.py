@@ -6,14 +6,6 @@ from typing import Annotated, Any
 import tyro
 from pydantic import Field
 
-from touchgoal.control.option_types import (
-    RARE,
-    Count,
-    CountOrNone,
-    Fraction,
-    Seed,
-    checked_dataclass,
-)
 from touchgoal.encoders.config import ALIGN_PRESETS, MAE_PRESETS, AlignConfig, MaeConfig
 from touchgoal.encoders.ssl.config import (
     DINO_PRESETS,
@@ -24,6 +16,14 @@ from touchgoal.encoders.ssl.config import (
     VJepaConfig,
 )
 from touchgoal.launch.support.training_options import TrainingOptions, UnlabelledOptions
+from touchgoal.runtime.option_types import (
+    RARE,
+    Count,
+    CountOrNone,
+    Fraction,
+    Seed,
+    checked_dataclass,
+)
 
 
 @checked_dataclass

@@ -4,14 +4,6 @@ import os
 from pathlib import Path
 from typing import Annotated, Any
 
-from touchgoal.control.option_types import (
-    RARE,
-    Count,
-    CountOrNone,
-    Fraction,
-    NotNegative,
-    checked_dataclass,
-)
 from touchgoal.launch.support.training_options import TrainingOptions
 from touchgoal.policies.config import (
     ActionRepresentation,
@@ -20,6 +12,14 @@ from touchgoal.policies.config import (
     SamplerConfig,
     TouchInput,
     TrainConfig,
+)
+from touchgoal.runtime.option_types import (
+    RARE,
+    Count,
+    CountOrNone,
+    Fraction,
+    NotNegative,
+    checked_dataclass,
 )
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 

@@ -8,7 +8,6 @@ diffusion_policy's real-robot tasks). On a CPU this is a matter of days.
 
 from typing import Annotated
 
-from touchgoal.control.option_types import RARE, Count, NotNegative, checked_dataclass
 from touchgoal.launch import train_policy
 from touchgoal.policies.config import (
     ActionRepresentation,
@@ -17,6 +16,7 @@ from touchgoal.policies.config import (
     TouchInput,
     TrainConfig,
 )
+from touchgoal.runtime.option_types import RARE, Count, NotNegative, checked_dataclass
 
 
 @checked_dataclass

@@ -9,7 +9,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from touchgoal.control.option_types import Seed, checked_dataclass
+from touchgoal.runtime import seeds
+from touchgoal.runtime.option_types import Seed, checked_dataclass
 from touchgoal.sim_envs.config import (
     STREAM_SIZE,
     BeadMazeConfig,
@@ -42,7 +43,7 @@ class Config:
     """Loopback address; twins at different ones run side by side."""
     port: Annotated[int, Field(ge=0, le=65534)] = 8080
     """TCP port of the pictures; the next one is the control port. 0: any that are free."""
-    seed: Seed = 1_000_000
+    seed: Seed = seeds.EVALUATION.start
     """Random seed of the scene."""
     out: Path | None = None
     """Folder of the run: cell.json, serial devices."""

@@ -1,6 +1,6 @@
 """Acting by plans: the policy as an actor in an environment or on the arm."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -9,13 +9,12 @@ from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
+from touchgoal.control.features import Observation
 from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.proprioception import tare
 from touchgoal.policies.policy import ObservationBatch, Policy
-
-Observation = Mapping[str, np.ndarray]
+from touchgoal.runtime.errors import UserError
 
 
 @runtime_checkable

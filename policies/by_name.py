@@ -24,10 +24,10 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import Actor
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy, find_policy, suggestion
 from touchgoal.policies.follower import WireFollower
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.config import TaskConfig, TaskName
 from touchgoal.sim_envs.tasks import make_expert, task_name

@@ -19,10 +19,10 @@ import torch
 from jaxtyping import Float32
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
+from touchgoal.control.features import Observation
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.training.weights import WeightsFormat
-from touchgoal.policies.acting import Observation, Planner, PolicyActor
+from touchgoal.policies.acting import Planner, PolicyActor
 from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.heads.unet import UNetConfig
@@ -30,6 +30,7 @@ from touchgoal.policies.perception.end_to_end import EndToEndConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
 from touchgoal.policies.perception.state_estimation import StateEstimator, load_estimator
 from touchgoal.policies.policy import Policy, PolicyConfig
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.config import TASKS, EnvConfig, TaskConfig, TaskName
 from touchgoal.sim_envs.tasks import task_name

@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
-from touchgoal.control.option_types import (
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import (
     RARE,
     Count,
     CountOrNone,

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
 from touchgoal.policies.actions import (
     ACTION_DIM,
     Normalizer,
@@ -25,6 +24,7 @@ from touchgoal.policies.heads.diffusion import (
 )
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, EndToEndEncoder
 from touchgoal.policies.perception.proprioception import input_widths, is_position, network_input
+from touchgoal.runtime.errors import UserError
 
 WRENCH_DIM = ft.FEATURES[ft.TRUTH_PAD_WRENCH].shape[0]
 _CLIP = 5.0  # standard deviations beyond which an input is as surprising as it gets

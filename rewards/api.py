@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import CONTROL_HZ, FRONT, TACTILE, TACTILE_LEFT, TACTILE_RIGHT
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.preprocess import check_pictures
@@ -28,6 +27,7 @@ from touchgoal.rewards.goals import (
 )
 from touchgoal.rewards.normalizer import DistanceNormalizer
 from touchgoal.rewards.setup import own_towers
+from touchgoal.runtime.errors import UserError
 
 GoalLike = str | int | np.ndarray | Mapping[str, np.ndarray]
 """A goal as a script has it; see `reward_curve`."""

@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import FRONT, TACTILE, TRUTH_CONTACT
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.pretrained import AnyTouchEncoder
@@ -42,6 +41,7 @@ from touchgoal.rewards.goals import (
 )
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.rewards.normalizer import DistanceNormalizer, EmbeddingSource
+from touchgoal.runtime.errors import UserError
 
 
 @dataclass(frozen=True)

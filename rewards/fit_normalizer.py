@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.errors import UserError
 from touchgoal.rewards.embedding_distance import (
     EmbeddedEpisode,
     image_distances,
@@ -15,6 +14,7 @@ from touchgoal.rewards.embedding_distance import (
 from touchgoal.rewards.goals import Modality
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.rewards.normalizer import DistanceNormalizer, median_name
+from touchgoal.runtime.errors import UserError
 
 END_FRAMES = 5
 """Frames before the last one that stand for the end of a training episode."""

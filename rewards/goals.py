@@ -32,11 +32,11 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import TRUTH_CONTACT
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.rewards.metrics import START_FRAMES
+from touchgoal.runtime.errors import UserError
 
 Modality = Literal["image", "tactile", "text"]
 MODALITIES: tuple[Modality, ...] = ("image", "tactile", "text")

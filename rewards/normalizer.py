@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.atomic_write import write_file
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import TRUTH_FAILURE, TRUTH_PROGRESS, TRUTH_START
+from touchgoal.runtime.atomic_write import write_file
+from touchgoal.runtime.errors import UserError
 
 NORMALIZER = "normalizer.json"
 """The normalizer in an encoder's folder: of the episodes that the encoder was trained on."""

@@ -1,13 +1,12 @@
 """The cost of a trajectory while it happens: what `reward-curves` would say of the newest tick."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.features import CONTROL_HZ, FRONT, TACTILE
+from touchgoal.control.features import CONTROL_HZ, FRONT, TACTILE, Observation
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.encoders.pretrained import AnyTouchEncoder
 from touchgoal.encoders.towers.towers import Towers
@@ -22,11 +21,10 @@ from touchgoal.rewards.embedding_distance import (
 from touchgoal.rewards.goals import GoalSpec, assign_goals
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.rewards.normalizer import DistanceNormalizer
+from touchgoal.runtime.errors import UserError
 
 _FIRST_COST_TIMEOUT = 30.0  # s for the first cost, which warms everything up
 _IDLE_SLEEP = 0.005  # s between looks for a new tick
-
-Observation = Mapping[str, np.ndarray]
 
 
 class CostMeter:

@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.pretrained import AnyTouchEncoder, load_encoder
 from touchgoal.encoders.published import is_published
@@ -14,6 +13,7 @@ from touchgoal.rewards.embedding_distance import EpisodeEmbedder, check_words, c
 from touchgoal.rewards.goals import Goal, parse_goal
 from touchgoal.rewards.normalizer import NORMALIZER, REMEDY, DistanceNormalizer
 from touchgoal.rewards.sources import EpisodeSource, VideoSource
+from touchgoal.runtime.errors import UserError
 
 Source = EpisodeSource | VideoSource
 

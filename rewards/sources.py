@@ -13,7 +13,6 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import (
     CONTROL_HZ,
     FRONT,
@@ -28,6 +27,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EpisodeEmbedder, missing_camera
 from touchgoal.rewards.goals import Goal, GoalSpec, Modality, assign_goals, check_goal
 from touchgoal.rewards.normalizer import EmbeddingSource, scene_of
+from touchgoal.runtime.errors import UserError
 
 CAMERAS = (FRONT, WRIST)
 

@@ -9,11 +9,12 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
+from touchgoal.control.features import Observation
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.motion.tool import FRANKA_HAND
 from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import IDEAL_DEPLOYMENT, SETPOINT_PERIOD, EnvConfig, SceneConfig
 from touchgoal.sim_envs.deployed_arm import DeployedArm
 from touchgoal.sim_envs.scene.build import ROBOTS, SIDES, arm_joints, build
@@ -28,8 +29,6 @@ GRIPPER_MAX_WIDTH = FRANKA_HAND.stroke[1]  # m, to which experts open
 DISTURBANCE_SECONDS = 0.5  # for which a disturbance keeps its direction
 GRIPPER_SPEED = FRANKA_HAND.speed  # m/s of width
 _FINGER_LAG = 1e-3  # m by which a finger may follow its set-point while it moves freely
-
-Observation = dict[str, np.ndarray]
 
 
 class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from touchgoal.control import features as ft
-from touchgoal.control.option_types import (
+from touchgoal.runtime.option_types import (
     ORDERED,
     RARE,
     Count,

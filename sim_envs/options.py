@@ -5,7 +5,7 @@ from dataclasses import fields, is_dataclass, replace
 from difflib import get_close_matches
 from typing import Any, TypeVar
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 Config = TypeVar("Config")
 

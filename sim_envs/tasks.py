@@ -2,7 +2,7 @@
 
 from typing import Any, Literal, overload
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import BeadMazeConfig, EnvConfig, Outcome, TaskConfig, TaskName

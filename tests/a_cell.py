@@ -7,10 +7,10 @@ import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.connection import CellConnection
+from touchgoal.control.deployment.control_loop import ControlLoop, Ending, RunLog
 from touchgoal.control.interfaces import ArmReading, Frame, GripperReading, LoadReading
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
-from touchgoal.policies.deploy.control_loop import ControlLoop, Ending, RunLog
 
 
 @dataclass

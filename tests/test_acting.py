@@ -18,14 +18,14 @@ from toy_policies import (
 )
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
+from touchgoal.control.deployment.realtime import RealTimeActor
 from touchgoal.encoders.pretrained import find_encoder
 from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import Planner, PolicyActor
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES
-from touchgoal.policies.deploy.realtime import RealTimeActor
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
 from touchgoal.policies.policy import ObservationBatch, Policy
+from touchgoal.runtime.errors import UserError
 
 
 @pytest.mark.parametrize("plan_ticks", [0, 1, 3])

@@ -10,7 +10,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment import align as align_module
 from touchgoal.encoders.alignment.align import AlignedBatch, align, batch_losses
@@ -29,6 +28,7 @@ from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncode
 from touchgoal.encoders.backbones.vit import PRESETS as PRESETS_VIT
 from touchgoal.encoders.config import ALIGN_PRESETS, AlignConfig, Augmentation, TrainerOptions
 from touchgoal.episodes.touches import Touches
+from touchgoal.runtime.errors import UserError
 
 DESCRIPTIONS = {
     "ball": ["a hard round ball", "round and firm", "a smooth sphere"],

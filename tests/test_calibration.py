@@ -14,11 +14,11 @@ from touchgoal.control.calibration.calibrate import fit, median_background
 from touchgoal.control.calibration.held_out_depth import sphere_in
 from touchgoal.control.calibration.light_drift import without_drift
 from touchgoal.control.calibration.press_set import PressSet, read_presses, split, write_presses
-from touchgoal.control.errors import UserError
 from touchgoal.control.tactile import gel, sensor_calibration
 from touchgoal.control.tactile.sensor_calibration import SensorCalibration
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.launch.__main__ import main
+from touchgoal.runtime.errors import UserError
 
 SHAPE, PITCH, BALL, NOISE = (120, 160), 0.118e-3, 3e-3, 1.0
 AZIMUTHS = (25.0, 150.0, -85.0)  # no sensor's

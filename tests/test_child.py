@@ -14,16 +14,16 @@ from touchgoal.control.arms.driver_process import DriverProcess
 from touchgoal.control.arms.franka import FrankaClient
 from touchgoal.control.arms.streaming import ArmClient, ArmConfig
 from touchgoal.control.arms.ur import UrClient
-from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.safety.limits import FR3
+from touchgoal.runtime.errors import UserError
 
 pytestmark = pytest.mark.realtime  # time-outs of children, which must get a core
 
 # A child imports its driver by name, so it stands in a module.
 ODD_DRIVER = """
 import ctypes, os, time
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 class Odd:
     period = 0.01

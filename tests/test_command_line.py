@@ -14,15 +14,15 @@ from typing import Any
 import pytest
 
 from touchgoal import __version__
-from touchgoal.control import progress
-from touchgoal.control.errors import UserError
-from touchgoal.control.interruption import Terminated, kept, terminable
-from touchgoal.control.option_types import checked_dataclass
-from touchgoal.control.progress import track
 from touchgoal.launch.__main__ import COMMANDS, main
 from touchgoal.launch.list import KINDS
 from touchgoal.launch.support.command_line import SHOWN, _all_options, _members, docstrings, parse
-from touchgoal.launch.support.run_folder import check_writable, open_run
+from touchgoal.runtime import progress
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.interruption import Terminated, kept, terminable
+from touchgoal.runtime.option_types import checked_dataclass
+from touchgoal.runtime.progress import track
+from touchgoal.runtime.run_folder import check_writable, open_run
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 
 ENVS = {"pick-place": PickPlaceConfig(), "bead-maze": BeadMazeConfig(split="validation")}

@@ -19,12 +19,12 @@ from toy_episodes import FPS, PNG_START, assert_holds, flip_byte, make_episode, 
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
-from touchgoal.control.errors import UserError
 from touchgoal.episodes import metadata
 from touchgoal.episodes.encoding import decode_png
 from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.repair import repair, validate
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.runtime.errors import UserError
 
 
 def cut_in_half(path: Path) -> None:

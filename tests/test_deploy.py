@@ -22,7 +22,8 @@ from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import cell_limits, cell_watchdogs
-from touchgoal.control.errors import UserError
+from touchgoal.control.deployment.control_loop import ControlLoop, Request, RunLog, TickStatus
+from touchgoal.control.deployment.session import Session
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.control.tactile.indentation import require_readable
@@ -32,9 +33,8 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.__main__ import main
 from touchgoal.launch.commands.deploy import EXAMPLES, NOT_DONE, STOPPED, find_cell_file
 from touchgoal.policies import checkpoint
-from touchgoal.policies.deploy.actors import load_cell_policy
-from touchgoal.policies.deploy.control_loop import ControlLoop, Request, RunLog, TickStatus
-from touchgoal.policies.deploy.session import Session
+from touchgoal.policies.deployed import load_cell_policy
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.twin.in_process import simulate_cell
 
@@ -143,7 +143,7 @@ def test_a_disk_that_fills_up_costs_one_episode_and_is_said_in_a_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Through the command, on a real file system: the table is there, earlier episodes are whole."""
-    monkeypatch.setattr("touchgoal.policies.deploy.preflight._MIN_FREE_BYTES", 0)
+    monkeypatch.setattr("touchgoal.control.deployment.preflight._MIN_FREE_BYTES", 0)
     cell = write_cell_file(tmp_path, SIM.replace("seed = 3", "seed = 3, seconds = 0.4"))
     arguments = ["deploy", cell, "--execute", "--yes", "--out", small_disk / "run"]
     with pytest.raises(SystemExit):
@@ -316,7 +316,7 @@ def test_example_cell_files_are_read(path: Path) -> None:
 
 def test_an_example_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    for name in ("sim", "sim.toml", "launch/cells/sim.toml"):
+    for name in ("sim", "sim.toml", "control/cell/examples/sim.toml"):
         assert find_cell_file(Path(name)) == EXAMPLES / "sim.toml"
     with pytest.raises(
         UserError, match="no cell file mine.toml.*fr3_two_minis, sim, sim_maze, ur5e"

@@ -86,7 +86,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     cv2.imwrite(str(folder / "goal.png"), frames[-1])
     sensor = Path(sensor_models.__file__).parent / "sensor_files" / "gelsight_mini"
     shutil.copytree(sensor, folder / "runs" / "mini" / "sensor_file")
-    shutil.copy(ROOT / "launch" / "cells" / "sim.toml", folder / "my_cell.toml")
+    shutil.copy(ROOT / "control" / "cell" / "examples" / "sim.toml", folder / "my_cell.toml")
     for page in PAGES:
         for code in snippets(page):
             if named := re.match(r"# (\w+\.py)\n", code):

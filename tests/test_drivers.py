@@ -13,7 +13,6 @@ from running_twin import RunningTwin
 
 from touchgoal.control.arms import franka, ur
 from touchgoal.control.arms.streaming import ArmConfig, ArmProcess, shift_wrench
-from touchgoal.control.errors import UserError
 from touchgoal.control.grippers.franka_hand import FrankaHand
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
 from touchgoal.control.interfaces import (
@@ -26,6 +25,7 @@ from touchgoal.control.interfaces import (
 from touchgoal.control.safety.limits import FR3, UR5E
 from touchgoal.control.sensors.load_cell import SerialLoadCell
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
+from touchgoal.runtime.errors import UserError
 
 pytestmark = pytest.mark.realtime
 

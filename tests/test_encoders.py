@@ -12,13 +12,13 @@ import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file, save_file
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.infonce import info_nce, loss_floor, symmetric_info_nce
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS, ViT, ViTConfig, random_masking
 from touchgoal.encoders.preprocess import PREPROCESSORS, check_pictures
+from touchgoal.runtime.errors import UserError
 
 MINI = PREPROCESSORS["gelsight_mini"]
 

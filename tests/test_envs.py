@@ -13,8 +13,8 @@ from gymnasium.utils.env_checker import check_env
 
 import touchgoal
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import EpisodeSpec, record_episode
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig

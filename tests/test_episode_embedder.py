@@ -13,7 +13,6 @@ from torch import Tensor
 
 from touchgoal.benchmarks import reward_quality
 from touchgoal.benchmarks.reward_quality import collect_goals, is_goal
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT, WRIST
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
@@ -45,6 +44,7 @@ from touchgoal.rewards.goals import (
     assign_goals,
     parse_goal,
 )
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import PickPlaceConfig
 
 ALL: tuple[Modality, ...] = ("image", "tactile", "text")

@@ -14,14 +14,14 @@ from PIL import Image
 from toy_episodes import FPS, PNG_START, assert_holds, flip_byte, make_episode, moving_blob, record
 
 from touchgoal.control import features as ft
-from touchgoal.control.atomic_write import write_file
-from touchgoal.control.errors import UserError
 from touchgoal.episodes import metadata, statistics
 from touchgoal.episodes.encoding import encode
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.repair import repair, validate
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.runtime.atomic_write import write_file
+from touchgoal.runtime.errors import UserError
 
 
 @pytest.fixture(scope="module")

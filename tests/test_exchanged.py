@@ -14,17 +14,17 @@ from a_cell import MadeUpArm, MadeUpCamera, MadeUpClock, MadeUpGripper
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.connection import CellConnection
-from touchgoal.control.checks import CheckResult
+from touchgoal.control.deployment.control_loop import ControlLoop
+from touchgoal.control.deployment.exchanged import cameras_exchanged, fingertips_exchanged
+from touchgoal.control.deployment.preflight import preflight
+from touchgoal.control.deployment.scripted import ScriptedActor
+from touchgoal.control.deployment.session import Session
 from touchgoal.control.interfaces import Camera, Frame
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.control.sensors.tactile_camera import NO_CROP, TactileCamera
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, find_sensor
-from touchgoal.policies.deploy.control_loop import ControlLoop
-from touchgoal.policies.deploy.exchanged import cameras_exchanged, fingertips_exchanged
-from touchgoal.policies.deploy.preflight import preflight
-from touchgoal.policies.deploy.scripted import ScriptedActor
-from touchgoal.policies.deploy.session import Session
+from touchgoal.runtime.checks import CheckResult
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.tactile.optics import render_untouched

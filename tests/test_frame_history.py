@@ -9,12 +9,12 @@ import torch
 from toy_policies import TOY, toy_observations
 
 from touchgoal.control import features as ft
+from touchgoal.control.deployment.realtime import RealTimeActor
 from touchgoal.encoders.backbones.touch_backbone import BATCH, TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS, ViTConfig
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.pretrained import load_encoder, save
 from touchgoal.policies.acting import Planner, PolicyActor
-from touchgoal.policies.deploy.realtime import RealTimeActor
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.policy import Policy
 

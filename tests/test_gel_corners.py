@@ -8,11 +8,11 @@ import pytest
 
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.connection import _tactile_camera
-from touchgoal.control.errors import UserError
 from touchgoal.control.sensors.fingertip_source import fingertip_view, recorded_frames
 from touchgoal.control.sensors.gel_corners import rectify
 from touchgoal.control.sensors.tactile_camera import NO_CROP
 from touchgoal.control.tactile.sensor_models import GELSIGHT_WEDGE
+from touchgoal.runtime.errors import UserError
 
 WIDE, HIGH = 32.0, 24.0  # mm of gel
 DOTS = [(4.0, 3.0), (28.0, 3.0), (16.0, 12.0), (4.0, 21.0), (28.0, 21.0), (22.0, 8.0)]  # mm

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from touchgoal.benchmarks.motion import near_tasks
-from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import FR3_ARM
 from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics, Ur5eKinematics
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.scene.build import SceneConfig, build
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ORDER = [
+    "runtime",
     "control",
     "sim_envs",
     "episodes",
@@ -51,7 +52,7 @@ def test_imports_point_left(path: Path) -> None:
     modules = imported_modules(path)
     used = {name.split(".")[1] for name in modules if name.startswith("touchgoal.")} & set(ORDER)
     assert used <= allowed(folder), f"{path.name} imports from {used - allowed(folder)}"
-    if folder == "control":
+    if folder in ("runtime", "control"):
         assert not any(name.split(".")[0] == "torch" for name in modules)
 
 
@@ -87,7 +88,11 @@ def test_every_data_file_is_packaged() -> None:
 
 
 def test_control_needs_no_torch() -> None:
-    files = (p.relative_to(ROOT).with_suffix("") for p in (ROOT / "control").rglob("*.py"))
+    files = (
+        p.relative_to(ROOT).with_suffix("")
+        for folder in ("runtime", "control")
+        for p in (ROOT / folder).rglob("*.py")
+    )
     modules = ["touchgoal." + ".".join(f.parts) for f in files]
     program = f"import sys, {', '.join(modules)}; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -18,10 +18,11 @@ from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import connect_cell
 from touchgoal.control.cell.lock_step import connect_control_port
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.__main__ import main
 from touchgoal.launch.commands.deploy import EXAMPLES
+from touchgoal.runtime import seeds
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.twin.control_port import put_scene_back
 
 _TICKS = 8
@@ -90,7 +91,7 @@ def _ages_of_a_frozen_camera(twin: RunningTwin) -> list[float]:
 @pytest.mark.slow
 def test_the_same_actions_lead_to_the_same_place_in_the_environment_and_over_the_wire() -> None:
     pytest.importorskip("franky", reason=FRANKY.install)
-    wave, press = replay_both(seed=8_000_000)
+    wave, press = replay_both(seed=seeds.REPLAY.start)
     for row in (wave, press):
         assert row["joints"] < 0.01 and row["tool"] < 2e-3  # rad, m
     assert wave["force here"] == 0 and press["force here"] > 5

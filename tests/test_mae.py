@@ -8,13 +8,13 @@ import pytest
 import torch
 from killed import killed_in_epoch
 
-from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.vit import patchify, random_masking
 from touchgoal.encoders.config import MAE_PRESETS, MaeConfig, TrainerOptions
 from touchgoal.encoders.probes.ridge import ridge_r2
 from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.mae import MaskedAutoencoder, train_mae
+from touchgoal.runtime.errors import UserError
 
 SENSOR = "gelsight_mini_markers"
 TOY = MaeConfig(vit="tiny", decoder_width=16, decoder_depth=1, epochs=3, batch_size=16, lr=3e-3)

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.media import read_frames, write_video
+from touchgoal.runtime.errors import UserError
 
 
 def moving_ramp(n: int, height: int, width: int) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from touchgoal.control.option_types import OptionError
+from touchgoal.runtime.option_types import OptionError
 from touchgoal.sim_envs.config import BeadMazeConfig, EnvConfig, PickPlaceConfig
 
 

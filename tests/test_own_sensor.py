@@ -13,7 +13,6 @@ from touchgoal.control.calibration.ball import press_surface
 from touchgoal.control.calibration.press_recorder import PressRecorder
 from touchgoal.control.calibration.press_set import read_presses
 from touchgoal.control.calibration.sensor_check import check_sensor
-from touchgoal.control.errors import UserError
 from touchgoal.control.sensors.fingertip_source import live_frames, recorded_frames
 from touchgoal.control.sensors.live_picture import LivePicture
 from touchgoal.control.sensors.video import VideoConfig
@@ -24,6 +23,7 @@ from touchgoal.control.tactile.sensor_models import (
     GELSIGHT_MINI_MARKERS,
 )
 from touchgoal.launch.__main__ import main
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 from touchgoal.sim_envs.tactile.surface_press import SurfacePose, press, untouched
 from touchgoal.sim_envs.tactile.surfaces import TILE, Surface

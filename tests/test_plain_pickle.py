@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.importers.plain_pickle import StoredBytes, read_plain_pickle
+from touchgoal.runtime.errors import UserError
 
 VALUE = {
     "pictures": [bytes([i]) * (100 * i) for i in range(5)],

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import EpisodeSpec, collect
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
@@ -26,6 +25,7 @@ from touchgoal.policies.training.training_data import (
     common_sensor,
     common_task,
 )
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.tasks import make_env

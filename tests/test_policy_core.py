@@ -22,7 +22,6 @@ from toy_policies import (
 )
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import FR3_ARM
 from touchgoal.control.motion.kinematics import Fr3Kinematics
 from touchgoal.encoders.config import TrainerOptions
@@ -38,6 +37,7 @@ from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
 from touchgoal.policies.training import train as train_module
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
 from touchgoal.policies.training.train import ema_decay, train
+from touchgoal.runtime.errors import UserError
 
 import mujoco  # isort: skip - after touchgoal, which chooses the OpenGL platform
 

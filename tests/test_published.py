@@ -16,10 +16,10 @@ from touchgoal.benchmarks.real_touch_encoders import find_embedder
 from touchgoal.benchmarks.tacbench.data import RigFrames
 from touchgoal.benchmarks.tacbench.probes import frozen_tokens
 from touchgoal.benchmarks.touch_probes import run as run_touch_probes
-from touchgoal.control.errors import UserError
 from touchgoal.encoders.pretrained import find_encoder, load_encoder, save
 from touchgoal.encoders.published import load_published
 from touchgoal.policies.perception.frozen_touch import load_touch
+from touchgoal.runtime.errors import UserError
 
 UPRIGHT, SQUARE = (320, 240), (224, 224)
 # What the weights are, the size of their pictures, and how many frames before the newest each one lies.

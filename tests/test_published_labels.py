@@ -18,11 +18,11 @@ from published_files import (
     write_textile,
 )
 
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.importers.feeling_of_success import read_grasps
 from touchgoal.episodes.importers.tacbench_forces import read_strokes
 from touchgoal.episodes.importers.tacbench_poses import read_bags
 from touchgoal.episodes.importers.textiles import read_textiles
+from touchgoal.runtime.errors import UserError
 
 
 def test_strokes_have_their_pictures_forces_and_slips(tmp_path: Path) -> None:

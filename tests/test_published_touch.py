@@ -10,7 +10,6 @@ import pytest
 from PIL import Image
 from published_files import UNTOUCHED, encoded, gel, near, write, write_slides
 
-from touchgoal.control.errors import UserError
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.pretrained import ENCODER_FORMAT, load_encoder
 from touchgoal.encoders.ssl.published_frames import sample_recordings
@@ -18,6 +17,7 @@ from touchgoal.episodes.importers.plain_pickle import StoredBytes
 from touchgoal.episodes.importers.pretraining_clips import read_recordings
 from touchgoal.episodes.importers.touch_clip import TouchClip, decode, read_pictures
 from touchgoal.launch.__main__ import main
+from touchgoal.runtime.errors import UserError
 
 
 def test_slides_are_upright_digits_with_their_own_untouched_gel(tmp_path: Path) -> None:

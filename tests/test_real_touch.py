@@ -13,7 +13,6 @@ from touchgoal.benchmarks.config import RealTouchOptions
 from touchgoal.benchmarks.real_cost import EmbeddedGrasp, cost_table, judge_cost
 from touchgoal.benchmarks.real_touch import embed_touch, read_touch, run
 from touchgoal.benchmarks.real_touch_encoders import find_embedder
-from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.picture_force import calibrate_force, shrunk, statistics
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.pretrained import find_encoder, load_encoder, load_pooled
@@ -30,6 +29,7 @@ from touchgoal.episodes.importers.force_grasps import read_force_grasps
 from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
 from touchgoal.episodes.media import write_video
 from touchgoal.launch.__main__ import main
+from touchgoal.runtime.errors import UserError
 
 Y, X = np.mgrid[:60, :80].astype(np.float32)
 

@@ -16,7 +16,6 @@ from test_episode_embedder import PaintTowers, recorded
 
 import touchgoal
 from touchgoal.control.cell.cell_file import read_cell_file
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT
 from touchgoal.control.interfaces import DriverError
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
@@ -33,6 +32,7 @@ from touchgoal.rewards.normalizer import DistanceNormalizer
 from touchgoal.rewards.online import CostMeter, OnlineCost
 from touchgoal.rewards.setup import prepare
 from touchgoal.rewards.sources import open_source
+from touchgoal.runtime.errors import UserError
 
 EPISODE = recorded()
 IMAGES = EPISODE.frames[FRONT]

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import TACTILE_LEFT, TACTILE_RIGHT
 from touchgoal.rewards.curves import (
     Contact,
@@ -42,6 +41,7 @@ from touchgoal.rewards.goals import (
 )
 from touchgoal.rewards.normalizer import DistanceNormalizer, EmbeddingSource
 from touchgoal.rewards.report.report import write_report
+from touchgoal.runtime.errors import UserError
 
 N, CONTACT = 40, 20
 ALL: tuple[Modality, ...] = ("image", "tactile", "text")

@@ -13,7 +13,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety import limits as robots
 from touchgoal.control.safety.action_filter import (
@@ -24,6 +23,7 @@ from touchgoal.control.safety.action_filter import (
     SafetyState,
 )
 from touchgoal.control.safety.limits import RobotLimits
+from touchgoal.runtime.errors import UserError
 
 HZ = 20
 TICKS = int(os.environ.get("TOUCHGOAL_SAFETY_TICKS", "400"))

@@ -6,7 +6,6 @@ import pytest
 import torch
 from toy_policies import torch_rng
 
-from touchgoal.control.errors import UserError
 from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.samplers import (
     FLOW_TIME_SCALE,
@@ -16,6 +15,7 @@ from touchgoal.policies.heads.samplers import (
     inference_timesteps,
 )
 from touchgoal.policies.heads.unet import PRESETS, ShortConv1d, UNet
+from touchgoal.runtime.errors import UserError
 
 MEAN, DEVIATION = 0.4, 0.3  # of the Gaussian that the exact denoisers know
 

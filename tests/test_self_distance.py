@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import FR3_ARM
 from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics
 from touchgoal.control.motion.rotations import fingers_down
@@ -14,6 +13,7 @@ from touchgoal.control.motion.self_collision import (
 )
 from touchgoal.control.motion.trajectories import joint_move
 from touchgoal.control.safety import limits as robots
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.scene.build import build
 
 

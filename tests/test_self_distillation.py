@@ -13,7 +13,6 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from toy_touches import SENSOR, moving_blobs
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.frame_history import stack_frames
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
@@ -37,6 +36,7 @@ from touchgoal.encoders.ssl.validation import token_statistics
 from touchgoal.encoders.training.trainer import OptimizerConfig, parameter_groups
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.runtime.errors import UserError
 
 TOY = DinoConfig(
     vit="tiny",

@@ -16,7 +16,6 @@ from toy_policies import (
 )
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
 from touchgoal.encoders.config import TrainerOptions
 from touchgoal.policies.acting import Planner
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
@@ -36,6 +35,7 @@ from touchgoal.policies.perception.training import (
     train_contact_estimator,
     train_pose_estimator,
 )
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.pick_place import WORKSPACE, PickPlace
 

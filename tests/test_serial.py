@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.sensors.load_cell import (
@@ -23,6 +22,7 @@ from touchgoal.control.sensors.load_cell import (
     with_checksum,
 )
 from touchgoal.control.sensors.serial_port import modbus_crc
+from touchgoal.runtime.errors import UserError
 
 
 @pytest.fixture

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from touchgoal.control.errors import UserError
 from touchgoal.encoders.backbones.sparsh import SPARSH_BASE
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig, sinusoidal_positions
+from touchgoal.runtime.errors import UserError
 
 TOY = ViTConfig((32, 48), width=48, depth=2, heads=2, mlp_ratio=2.0)
 

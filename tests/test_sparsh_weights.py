@@ -12,8 +12,8 @@ from safetensors.torch import save_file
 from sparsh_files import DEPTH, plain_forward, published
 from torch import Tensor
 
-from touchgoal.control.errors import UserError
 from touchgoal.encoders.backbones.sparsh_weights import load_sparsh
+from touchgoal.runtime.errors import UserError
 
 
 class Scheduler:

@@ -14,7 +14,6 @@ from touchgoal.benchmarks.tacbench.force import force_metrics
 from touchgoal.benchmarks.tacbench.pose import CLASSES, PoseTask
 from touchgoal.benchmarks.tacbench.slip import f1_score, slip_metrics
 from touchgoal.benchmarks.tacbench.splits import split_force, split_slip
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP
 from touchgoal.control.tactile.markers import MarkerTracker
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
@@ -27,6 +26,7 @@ from touchgoal.encoders.probes.attentive import AttentivePooler, AttentiveProbe
 from touchgoal.encoders.ssl.frames import sample_frames
 from touchgoal.episodes.bench_recording import record_strokes
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.indenter_rig import REST, rig_unit, shear_force, simulate
 from touchgoal.sim_envs.object_slides import (

@@ -17,9 +17,9 @@ from touchgoal.benchmarks.tacbench.published_recordings import (
     read_published_strokes,
 )
 from touchgoal.benchmarks.tacbench.splits import split_force, split_grasp
-from touchgoal.control.errors import UserError
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.episodes.importers.tacbench_poses import read_bags
+from touchgoal.runtime.errors import UserError
 
 DIGIT, GELSIGHT = preprocessor_for("digit"), preprocessor_for("gelsight")
 

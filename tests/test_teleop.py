@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
 from touchgoal.control.sensors.keyboard import Keyboard
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import BeadMazeConfig, TeleoperatorConfig
 from touchgoal.sim_envs.experts.teleoperator import Teleoperator

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector, contact_strength
 from touchgoal.control.tactile.depth import DepthEstimator
@@ -14,6 +13,7 @@ from touchgoal.control.tactile.force import estimate_force
 from touchgoal.control.tactile.markers import MarkerTracker, find_markers, without_markers
 from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT, GELSIGHT_MINI, SensorModel
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS as DOTTED
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import NO_RANDOMIZATION
 from touchgoal.sim_envs.scene.objects import CATALOGUE, Body, ObjectKind
 from touchgoal.sim_envs.tactile.markers import draw

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.episodes.touches import collect_touches
+from touchgoal.runtime.errors import UserError
 
 
 def touch_episode(seed: int, truth: bool) -> Episode:

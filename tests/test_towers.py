@@ -13,7 +13,6 @@ import torch.nn.functional as F
 from PIL import Image
 from safetensors.torch import load_file, save_file
 
-from touchgoal.control.errors import UserError
 from touchgoal.encoders.towers import efficientnet, minilm
 from touchgoal.encoders.towers.towers import (
     ClipTowers,
@@ -24,6 +23,7 @@ from touchgoal.encoders.towers.towers import (
     same_towers,
 )
 from touchgoal.encoders.towers.wheels import wheel_folder
+from touchgoal.runtime.errors import UserError
 
 pytest.importorskip("transformers")
 IMAGENET_MILITARY_UNIFORM = 652

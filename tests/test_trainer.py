@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import nn
 
-from touchgoal.control.errors import UserError
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.encoders.config import MaeConfig, TrainerOptions
 from touchgoal.encoders.ssl.mae import MaskedAutoencoder
@@ -20,6 +19,7 @@ from touchgoal.encoders.training.trainer import (
     fit,
     parameter_groups,
 )
+from touchgoal.runtime.errors import UserError
 
 OPTIMIZER = OptimizerConfig(epochs=2, batch_size=4, lr=1e-2, weight_decay=0.0)
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from touchgoal.benchmarks.motion import ruckig_duration
-from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics, Ur5eKinematics
 from touchgoal.control.motion.rotations import fingers_down
@@ -19,6 +18,7 @@ from touchgoal.control.motion.trajectories import (
 from touchgoal.control.safety import limits as robots
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import RobotLimits
+from touchgoal.runtime.errors import UserError
 
 ROBOTS = [(robots.FR3, Fr3Kinematics()), (robots.UR5E, Ur5eKinematics())]
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from running_twin import client
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.twin.control_port import ask_twin
 from touchgoal.sim_envs.twin.franka import messages as fci

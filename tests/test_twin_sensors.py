@@ -10,8 +10,8 @@ import pytest
 import serial
 from running_twin import RunningTwin
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.sensors.load_cell import parse
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace

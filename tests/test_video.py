@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError, TactileSensor
 from touchgoal.control.sensors.fingertip_source import fingertip_video, fingertip_view
 from touchgoal.control.sensors.pictures import (
@@ -32,6 +31,7 @@ from touchgoal.control.sensors.usb_cameras import find_sensor_camera, list_camer
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
+from touchgoal.runtime.errors import UserError
 
 BITS = 12
 

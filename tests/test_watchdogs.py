@@ -10,12 +10,12 @@ import pytest
 from a_cell import MadeUpCell, MadeUpLoadCell
 
 from touchgoal.control import features as ft
+from touchgoal.control.deployment.held_object import HeldObject
 from touchgoal.control.grippers.franka_hand import FrankaHandClient
 from touchgoal.control.grippers.non_blocking import NonBlockingGripper
 from touchgoal.control.interfaces import DriverError, GripperReading, LoadReading
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.limits import FR3
-from touchgoal.policies.deploy.held_object import HeldObject
 
 NAN = float("nan")
 

@@ -35,9 +35,6 @@ from touchgoal.benchmarks.tacbench.tables import table
 from touchgoal.benchmarks.tacbench.task import Task
 from touchgoal.benchmarks.tacbench.tasks import RECORDED_AS, TASKS, Recording
 from touchgoal.benchmarks.tacbench.trainings import Answers, Job, Subject, work
-from touchgoal.control.errors import UserError
-from touchgoal.control.interruption import kept
-from touchgoal.control.progress import Progress
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.preprocess import Preprocessor
@@ -49,6 +46,9 @@ from touchgoal.episodes.bench_recording import (
 )
 from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.interruption import kept
+from touchgoal.runtime.progress import Progress
 
 _LOG = "training.log"
 _RECORDERS: dict[Recording, Callable[..., EpisodeSet]] = {

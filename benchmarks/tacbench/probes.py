@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from touchgoal.benchmarks.real_touch_encoders import untrained, vit_of
 from touchgoal.benchmarks.tacbench.data import STRIDE, RigFrames, Rows
 from touchgoal.benchmarks.tacbench.task import Outputs, Task
-from touchgoal.control.progress import track
 from touchgoal.encoders.backbones.touch_backbone import (
     BATCH,
     BaseTouchEncoder,
@@ -25,6 +24,7 @@ from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
+from touchgoal.runtime.progress import track
 
 END_TO_END, RANDOM = "end-to-end:", "random:"
 _SNAPSHOTS = 8  # of a training, of which the best on validation frames is kept

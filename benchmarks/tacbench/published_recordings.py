@@ -18,12 +18,12 @@ from torch import Tensor
 from touchgoal.benchmarks.tacbench.data import STRIDE, RigFrames, rows_before
 from touchgoal.benchmarks.tacbench.splits import TEST, VALIDATION
 from touchgoal.benchmarks.tacbench.tasks import RECORDED_AS, Recording
-from touchgoal.control.errors import UserError
-from touchgoal.control.progress import track
 from touchgoal.encoders.preprocess import Preprocessor
 from touchgoal.episodes.importers.feeling_of_success import MOMENTS, is_grasp_set, read_grasps
 from touchgoal.episodes.importers.tacbench_forces import is_force_set, read_strokes
 from touchgoal.episodes.importers.tacbench_poses import is_pose_set, read_bags
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
 
 _LONGEST = 180  # pictures of a recording that are read
 _OF_FIVE = 5

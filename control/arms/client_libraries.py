@@ -5,7 +5,7 @@ import importlib.metadata
 from dataclasses import dataclass
 from typing import Any
 
-from touchgoal.control.errors import UserError, install_extra
+from touchgoal.runtime.errors import UserError, install_extra
 
 
 @dataclass(frozen=True)

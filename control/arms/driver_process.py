@@ -18,8 +18,8 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection, Pipe
 from typing import Any, Protocol, runtime_checkable
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError
+from touchgoal.runtime.errors import UserError
 
 _GRACE = 1.0  # s that the kernel's alarm gives beyond the parent's patience
 _CLOSING = 3.0  # s to bring an arm to rest and disconnect

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control.arms.driver_process import NEVER, DriverProcess
-from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import STOPPED_ON_REQUEST, ArmReading, DriverError, Joints
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.tracker import Tracker, TrackerState
 from touchgoal.control.safety.limits import RobotLimits
+from touchgoal.runtime.errors import UserError
 
 _MAX_CATCH_UP = 4  # periods that a late tick makes up for at once
 _BRAKING = 1.5  # s for coming to rest on closing

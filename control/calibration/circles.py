@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 _BLUR = 2.0  # px
 _SHARE = 0.3  # of the strongest change, at which the disc is taken to end

@@ -8,9 +8,9 @@ from jaxtyping import Int, UInt8
 
 from touchgoal.control.calibration.circles import find_circle
 from touchgoal.control.calibration.press_set import PressSet
-from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.background import Background, local_change
 from touchgoal.control.tactile.contact import ContactDetector
+from touchgoal.runtime.errors import UserError
 
 GRID = 3, 4
 """Rows and columns of the map of presses, of a picture that is wider than high."""

@@ -11,8 +11,8 @@ from jaxtyping import Float, Int, UInt8
 
 from touchgoal.control.calibration.circles import find_circle
 from touchgoal.control.calibration.light_drift import without_drift
-from touchgoal.control.errors import UserError
-from touchgoal.control.picture_file import read_picture
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.picture_file import read_picture
 
 COLUMNS = ("file", "x_px", "y_px", "radius_px", "ball_mm")
 _NEEDED = ("file",)

@@ -21,7 +21,7 @@ from touchgoal.control.calibration.press_fit import (
     WIDEST,
 )
 from touchgoal.control.calibration.press_set import PressSet
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 # Errors (L1) above this share of the background's own mean that the fit explains nothing.
 _USELESS = 0.9

@@ -9,7 +9,6 @@ from jaxtyping import Float32, UInt8
 from touchgoal.control.calibration.ball import Circle
 from touchgoal.control.calibration.circles import find_circle
 from touchgoal.control.calibration.held_out_depth import DepthErrors, sphere_in
-from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.background import Background, Drift, local_change
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.control.tactile.depth import DepthEstimator
@@ -17,6 +16,7 @@ from touchgoal.control.tactile.force import estimate_force
 from touchgoal.control.tactile.markers import Markers, MarkerTracker, without_markers
 from touchgoal.control.tactile.sensor_calibration import load, shade
 from touchgoal.control.tactile.sensor_models import SensorModel
+from touchgoal.runtime.errors import UserError
 
 _PRESSES = 12  # whose depth is read: the firmest frame of as many stretches of contact
 _STRONGEST = 0.1  # share of the picture over which it is asked what the simulator explains

@@ -10,7 +10,7 @@ from typing import Any, get_args, get_type_hints
 from pydantic import TypeAdapter, ValidationError
 
 from touchgoal.control.cell.config import CellConfig, check
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 _CELL = TypeAdapter(CellConfig)
 # Keys of older cell files.

@@ -10,11 +10,12 @@ from typing import Annotated, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.motion.tool import ROBOTIQ_2F85
-from touchgoal.control.option_types import STRICT, Corners, Seed
 from touchgoal.control.sensors.load_cell import LoadCellConfig
 from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.runtime import seeds
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import STRICT, Corners, Seed
 
 Coordinate = Annotated[float, Field(ge=-3, le=3)]  # m, base frame
 Corner = tuple[Coordinate, Coordinate, Coordinate]
@@ -134,7 +135,7 @@ class TaskSection:
     twin: str = ""
     """Control port (token@host:port) of a twin: it puts its scene back before each run, and says where
     things are and whether the task is done."""
-    seed: Seed = 1_000_000
+    seed: Seed = seeds.EVALUATION.start
     """Random seed of the scene of a simulated arm or a twin."""
     objects: tuple[str, ...] = ()
     """pick-place on a simulated arm: names of objects to draw from; none: all."""
@@ -230,7 +231,7 @@ def check(cell: CellConfig) -> None:
     if cell.arm != "sim" and cell.tool is None:
         raise UserError(
             "tool is missing: measure tcp, mass, centre_of_mass and finger_corners of what the arm "
-            "carries; launch/cells/fr3_two_minis.toml and ur5e.toml show those of two GelSight Minis"
+            "carries; control/cell/examples/fr3_two_minis.toml and ur5e.toml show those of two GelSight Minis"
         )
     least, most = _FORCES[gripper.kind]
     if not least <= gripper.force <= most:

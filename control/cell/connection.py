@@ -19,7 +19,6 @@ from touchgoal.control.cell.config import (
     ToolSection,
 )
 from touchgoal.control.cell.lock_step import LockStepClock
-from touchgoal.control.errors import UserError
 from touchgoal.control.grippers.franka_hand import FrankaHand
 from touchgoal.control.grippers.non_blocking import NonBlockingGripper
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
@@ -34,6 +33,7 @@ from touchgoal.control.sensors.tactile_camera import TactileCamera
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.indentation import deepest_readable
 from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.runtime.errors import UserError
 
 # Hz, and s without a picture, on the wall: what a machine however loaded still manages.
 _LOCK_STEP_RATE, _LOCK_STEP_TIMEOUT = 0.1, 10.0

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control.arms.streaming import ArmProcess
-from touchgoal.control.errors import UserError
 from touchgoal.control.grippers.franka_hand import PERIOD, FrankaHand
 from touchgoal.control.interfaces import Camera, DriverError
 from touchgoal.control.sensors.load_cell import SerialLoadCell
+from touchgoal.runtime.errors import UserError
 
 _DT = 1e-3  # s of a step of the twin
 _STREAM_STEPS = 5  # of them between two commands of the arm's stream, `arms.franka.RATE`

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.arms.driver_process import NEVER, DriverProcess
-from touchgoal.control.errors import UserError
 from touchgoal.control.grippers.hand_commands import PERIOD, SPEED, HandCommands, LastCommand
 from touchgoal.control.interfaces import DriverError, GripperReading
+from touchgoal.runtime.errors import UserError
 
 if TYPE_CHECKING:
     import franky

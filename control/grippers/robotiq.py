@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import minimalmodbus
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.grippers import robotiq_registers as registers
 from touchgoal.control.interfaces import DriverError, GripperReading
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.control.sensors.serial_port import open_port
+from touchgoal.runtime.errors import UserError
 
 _PERIOD = 0.02  # s between exchanges; one takes 2 to 10 ms
 _ACTIVATION = 8.0  # s that opening and closing once may take

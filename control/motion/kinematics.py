@@ -11,10 +11,10 @@ import casadi
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import FR3_ARM, UR5E_ARM, ArmModel, Joints
 from touchgoal.control.motion.rotations import Matrix3, Vector3
 from touchgoal.control.motion.tool import FRANKA_HAND, ROBOTIQ_2F85
+from touchgoal.runtime.errors import UserError
 
 # m^2: makes steps finite at a singularity. The squared error is added to it, so that a step from afar
 # goes no farther than the linearisation holds (Sugihara 2011).

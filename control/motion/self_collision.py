@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import FR3_ARM, UR5E_ARM, ArmModel
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.trajectories import Trajectory
+from touchgoal.runtime.errors import UserError
 
 Point = tuple[float, float, float]
 Points = Float[np.ndarray, "*k 3"]

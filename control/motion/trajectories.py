@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import chebyshev
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.motion.arm_models import JointLimits, Joints
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import (
@@ -22,6 +21,7 @@ from touchgoal.control.motion.rotations import (
 )
 from touchgoal.control.motion.s_curve import SCurve, s_curve
 from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.runtime.errors import UserError
 
 _DEGREE = 16  # of a straight line's joints; 0.4 m are then straight within 0.1 mm
 _STRAIGHT = 5e-4  # m off the line that are refused

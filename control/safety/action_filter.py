@@ -11,10 +11,10 @@ from enum import StrEnum
 import numpy as np
 from jaxtyping import Bool, Float
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.braking import braked_velocity, max_stoppable_speed
 from touchgoal.control.safety.limits import RobotLimits
+from touchgoal.runtime.errors import UserError
 
 Joints = Float[np.ndarray, "n"]
 

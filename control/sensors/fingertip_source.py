@@ -10,10 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError
-from touchgoal.control.option_types import Corners
-from touchgoal.control.picture_file import read_picture
 from touchgoal.control.sensors.tactile_camera import (
     DIGIT_CROP,
     GELSIGHT_MINI_CROP,
@@ -25,6 +22,9 @@ from touchgoal.control.sensors.tactile_camera import (
 from touchgoal.control.sensors.usb_cameras import find_sensor_camera
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT_WEDGE, SensorModel
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import Corners
+from touchgoal.runtime.picture_file import read_picture
 
 _PICTURES = (".png", ".jpg", ".jpeg")
 _UNTOUCHED = "background.png"  # of a folder of presses: what the sensor shows before them

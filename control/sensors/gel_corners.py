@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.option_types import Corners
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import Corners
 
 
 def rectify(

@@ -7,7 +7,7 @@ import termios
 import tty
 from typing import TextIO
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 _CTRL_C = "\x03"
 

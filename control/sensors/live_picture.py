@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 _BOUNDARY = b"picture"
 _PATIENCE = 1.0  # s without a new picture after which the last one is sent again

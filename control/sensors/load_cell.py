@@ -17,9 +17,9 @@ import pydantic.dataclasses
 from pydantic import Field
 
 from touchgoal.control.interfaces import LoadReading
-from touchgoal.control.option_types import STRICT
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.control.sensors.serial_port import modbus_crc, open_port
+from touchgoal.runtime.option_types import STRICT
 
 Checksum = Literal["none", "xor", "crc16"]
 

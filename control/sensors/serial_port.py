@@ -4,7 +4,7 @@ import struct
 
 import serial
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 
 def open_port(device: str, baud: int, timeout: float) -> serial.Serial:

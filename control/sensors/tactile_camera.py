@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import Camera, Frame
-from touchgoal.control.option_types import Corners
 from touchgoal.control.sensors.gel_corners import rectify
 from touchgoal.control.tactile.sensor_models import SensorModel
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import Corners
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,13 @@ not change.
 from dataclasses import dataclass
 from pathlib import Path
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.sensor_models import (
     DIGIT,
     GELSIGHT_MINI,
     GELSIGHT_MINI_MARKERS,
     SensorModel,
 )
+from touchgoal.runtime.errors import UserError
 
 _ROOT = Path("/sys/class/video4linux")
 # What the USB product names contain: gsrobotics looks for the first, digit-interface for the second.

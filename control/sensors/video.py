@@ -15,7 +15,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import Frame
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.control.sensors.pictures import (
@@ -25,6 +24,7 @@ from touchgoal.control.sensors.pictures import (
     gel_picture,
     is_broken_gel,
 )
+from touchgoal.runtime.errors import UserError
 
 # A lost stream is told in `problem`; what the libraries print about it would tear a live view apart.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

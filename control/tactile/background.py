@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 # Pictures are averaged over _CELL x _CELL pixels and then blurred. Measured on 320 x 240 frames:
 # pixel noise of 1 count leaves at most 0.45 counts of `local_change`, and a bump of shading that

@@ -5,13 +5,13 @@ from functools import cache
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.gel import deform
 from touchgoal.control.tactile.sensor_calibration import load, shade
 from touchgoal.control.tactile.sensor_models import SensorModel
+from touchgoal.runtime.errors import UserError
 
 # Cells of half a millimetre on a Mini. On simulated grasps at 10 and 30 N the deepest point came out
 # within a tenth for blocks and balls; a pebble's edges, steeper than any calibration press, at 60 %.

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.sensor_models import MarkerGrid
+from touchgoal.runtime.errors import UserError
 
 _FAINTEST = 0.5  # of the usual darkness: a fainter spot is no dot
 _LEAST_FOUND = 0.7  # of the grid, or it is no marker gel

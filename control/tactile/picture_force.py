@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.background import local_change
+from touchgoal.runtime.errors import UserError
 
 STRENGTH = 10.0
 """Of the ridge; from 0.1 to 100 the error on real grasps of other things stays below 2.2 N."""

@@ -28,9 +28,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.picture_file import read_picture
 from touchgoal.control.tactile import gel
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.picture_file import read_picture
 
 N_FEATURES = 10
 FORMAT = 2

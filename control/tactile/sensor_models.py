@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.sensor_calibration import load
+from touchgoal.runtime.errors import UserError
 
 
 @dataclass(frozen=True)

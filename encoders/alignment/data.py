@@ -8,12 +8,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float16, Int
 from torch import Tensor
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.progress import track
 from touchgoal.encoders.config import Augmentation
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.towers.towers import BATCH, Towers
 from touchgoal.episodes.touches import Touches
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
 
 NO_CONTACT = ""
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 SPARSH, SPARSH_PLAIN = "sparsh/v1", "sparsh-plain/v1"
 """With the background subtracted, as Sparsh has it for the DIGIT and the GelSight Mini; without, as for the

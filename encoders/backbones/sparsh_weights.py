@@ -18,9 +18,9 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, _utils
 
-from touchgoal.control.errors import UserError
 from touchgoal.encoders.backbones.sparsh import NORM_EPSILON, SQUARE, UPRIGHT
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
+from touchgoal.runtime.errors import UserError
 
 # Where the averaged ("teacher", "target") encoder lies, which is the one that Sparsh probes: DINO, V-JEPA,
 # I-JEPA, MAE, and a file with the encoder alone.

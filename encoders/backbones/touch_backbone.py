@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor, nn
 
-from touchgoal.control.errors import UserError
 from touchgoal.encoders.backbones.frame_history import frame_offsets, past_rows, stack_frames
 from touchgoal.encoders.backbones.sparsh_input import SparshPreprocessor
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.encoders.preprocess import Preprocessor, check_pictures, preprocessor_for
 from touchgoal.encoders.towers.towers import Towers, same_towers
+from touchgoal.runtime.errors import UserError
 
 BATCH = 64  # frames at once
 

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 
 @dataclass(frozen=True)

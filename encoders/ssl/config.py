@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from touchgoal.control.option_types import (
+from touchgoal.runtime.option_types import (
     ORDERED,
     RARE,
     Count,

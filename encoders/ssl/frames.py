@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float, Float16
 from torch import Tensor
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.features import TACTILE, TRUTH_PAD_WRENCH
-from touchgoal.control.progress import track
 from touchgoal.encoders.backbones.frame_history import past_rows
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
 
 
 @dataclass(frozen=True, eq=False)

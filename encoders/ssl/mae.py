@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float, Float16, Int
 from torch import Tensor, nn
 
-from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.frame_history import stack_frames
 from touchgoal.encoders.backbones.touch_backbone import BATCH, TouchBackbone, TouchBackboneConfig
@@ -27,6 +26,7 @@ from touchgoal.encoders.ssl.untrained import backbone_for
 from touchgoal.encoders.ssl.validation import forces_line, read_forces
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
+from touchgoal.runtime.errors import UserError
 
 _ENCODER = "encoder"
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 _TRIES = 100
 

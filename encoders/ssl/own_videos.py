@@ -13,14 +13,14 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.progress import track
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.text_head import fit_text_head
 from touchgoal.encoders.towers.towers import Towers
 from touchgoal.encoders.whitening import inverse_square_root, within_classes
 from touchgoal.episodes.importers.labelled_videos import LabelledVideo, firmest_frames
 from touchgoal.episodes.touches import touch_background
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
 
 
 def adapt(

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from touchgoal.control.progress import track
 from touchgoal.encoders.backbones.frame_history import past_rows
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.ssl.frames import TouchFrames
+from touchgoal.runtime.progress import track
 
 
 @runtime_checkable  # beartype checks arguments in tests

@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.frame_history import stack_frames
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
@@ -24,6 +23,7 @@ from touchgoal.encoders.ssl.untrained import Method, backbone_for
 from touchgoal.encoders.ssl.validation import Validation
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
+from touchgoal.runtime.errors import UserError
 
 _ENCODER = "encoder"
 _MAX_GRAD_NORM = 10.0

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from jaxtyping import Float32, UInt8
 
-from touchgoal.control.progress import track
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.encoders.backbones.pooled_encoder import (
     FEATURES,
@@ -22,6 +21,7 @@ from touchgoal.encoders.backbones.pooled_encoder import (
     PooledEncoderConfig,
 )
 from touchgoal.encoders.whitening import inverse_square_root
+from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 from touchgoal.sim_envs.tactile.surface_press import press, random_pose, untouched
 from touchgoal.sim_envs.tactile.surfaces import random_surface

@@ -14,9 +14,9 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from touchgoal.control.errors import UserError
 from touchgoal.encoders.towers import efficientnet, minilm
 from touchgoal.encoders.towers.wheels import wheel_folder
+from touchgoal.runtime.errors import UserError
 
 BATCH = 32
 _CPU_PICTURES = 4  # a larger batch of EfficientNet's activations leaves the cache: 30 % slower

@@ -3,7 +3,7 @@
 import importlib.util
 from pathlib import Path
 
-from touchgoal.control.errors import UserError, install_extra
+from touchgoal.runtime.errors import UserError, install_extra
 
 
 def wheel_folder(module: str) -> Path:

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from touchgoal.control.atomic_write import atomic_write
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.atomic_write import atomic_write
+from touchgoal.runtime.errors import UserError
 
 _CHECKPOINT, _METRICS = "checkpoint.pt", "metrics.jsonl"
 

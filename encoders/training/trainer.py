@@ -24,11 +24,11 @@ from torch import Tensor, nn
 from torch.distributed.nn.functional import all_gather
 from tqdm import tqdm
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.interruption import kept
-from touchgoal.control.provenance import command_line
 from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.training import checkpoint
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.interruption import kept
+from touchgoal.runtime.provenance import command_line
 
 Metrics = dict[str, Any]
 """Numbers by name; None where one is undefined."""

@@ -15,8 +15,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from touchgoal.control.atomic_write import atomic_write
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.atomic_write import atomic_write
+from touchgoal.runtime.errors import UserError
 
 FORMAT = 1
 Config = TypeVar("Config")

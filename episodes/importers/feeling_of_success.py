@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.importers.labels import entry, truths
 from touchgoal.episodes.importers.plain_pickle import StoredBytes, read_plain_pickle
 from touchgoal.episodes.importers.touch_clip import TouchClip, check_kind, stored_pictures
+from touchgoal.runtime.errors import UserError
 
 MOMENTS = ("before", "during", "after")
 """Pictures of a grasp: of the open hand, of the closed one, and of the lifted one."""

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.option_types import Corners
 from touchgoal.control.sensors.gel_corners import rectify
 from touchgoal.control.tactile.sensor_models import GELSIGHT_WEDGE
 from touchgoal.episodes.media import read_frames
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import Corners
 
 _COLUMNS = ("force_newtons", "gripper_width_m")
 

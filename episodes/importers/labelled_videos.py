@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.media import read_frames
+from touchgoal.runtime.errors import UserError
 
 PROPERTIES = ("hardness", "roughness", "bumpiness")
 FIRMEST = 5

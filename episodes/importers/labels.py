@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 
 def entry(value: Any, key: str, name: str) -> Any:

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.picture_file import read_picture
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.picture_file import read_picture
 
 _TABLES = 5
 

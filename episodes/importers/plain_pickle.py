@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 _MOST_STEPS = 5_000_000  # a list of pictures takes two each
 _MOST_TEXT = 65_536  # bytes

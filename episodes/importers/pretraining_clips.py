@@ -24,14 +24,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.progress import track
 from touchgoal.episodes.importers.touch_clip import (
     TouchClip,
     check_kind,
     read_picture_file,
     read_pictures,
 )
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
 
 _TRAINED = 0.725  # of GelSight recordings, the longest: Sparsh's train.py
 _SLIDES = ("digit",)

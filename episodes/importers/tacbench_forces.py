@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.importers.labels import entry, numbers, truths, whole_numbers
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
 from touchgoal.episodes.importers.touch_clip import TouchClip, check_kind, read_pictures
+from touchgoal.runtime.errors import UserError
 
 STRIDE = 5
 """Pictures between the two of a pair: 83 ms at a DIGIT's 60 Hz."""

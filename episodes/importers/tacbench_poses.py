@@ -19,7 +19,6 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.importers.labels import entry, numbers
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
 from touchgoal.episodes.importers.touch_clip import (
@@ -28,6 +27,7 @@ from touchgoal.episodes.importers.touch_clip import (
     read_picture_file,
     stored_pictures,
 )
+from touchgoal.runtime.errors import UserError
 
 STRIDE = 5
 """Pictures over which a motion is measured."""

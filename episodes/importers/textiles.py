@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.importers.touch_clip import TouchClip, check_kind, read_pictures
+from touchgoal.runtime.errors import UserError
 
 _CLASSES = 20
 _MOST_BYTES = 65_536

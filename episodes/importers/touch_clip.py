@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.picture_file import decode_picture
 from touchgoal.control.sensors.pictures import JpegDecoder
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.episodes.importers.plain_pickle import StoredBytes, read_plain_pickle
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.picture_file import decode_picture
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _LOOKS = 25  # pictures from all over a clip by which its untouched gel is found

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.importers.labelled_videos import LabelledVideo, read_labelled_videos
 from touchgoal.episodes.touches import touch_background
+from touchgoal.runtime.errors import UserError
 
 _LEARNED = "train", "unlabelled"
 

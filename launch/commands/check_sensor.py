@@ -19,7 +19,7 @@ from touchgoal.control.sensors.fingertip_source import (
 )
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.launch.check_sensor import Config
-from touchgoal.launch.support.run_folder import open_run, write_json
+from touchgoal.runtime.run_folder import open_run, write_json
 
 
 def run_command(config: Config) -> None:

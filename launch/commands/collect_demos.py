@@ -6,15 +6,15 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import EpisodeSpec, Roles, collect, expert_alone
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.collect_demos import Config
-from touchgoal.launch.support.run_folder import open_run, write_json
 from touchgoal.policies.by_name import choose_policy, env_config_for
 from touchgoal.policies.checkpoint import SavedPolicy, load
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.training.dagger import DaggerRoles
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.run_folder import open_run, write_json
 from touchgoal.sim_envs.config import (
     BeadMazeConfig,
     PickPlaceConfig,

@@ -14,8 +14,9 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection, cell_watchdogs, connect_cell
-from touchgoal.control.checks import require_all_ok
-from touchgoal.control.errors import UserError
+from touchgoal.control.deployment.control_loop import SLOW_ARM, Request, slow_arm
+from touchgoal.control.deployment.preflight import check_client, preflight
+from touchgoal.control.deployment.session import Result, Session
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.sensors.latest_value import LatestValue
@@ -23,22 +24,21 @@ from touchgoal.encoders import pretrained
 from touchgoal.encoders.published import is_published
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.launch.deploy import Config
-from touchgoal.launch.support.run_folder import open_run, write_json
 from touchgoal.launch.support.terminal import HELP, Terminal
-from touchgoal.policies.deploy.actors import CellPolicy, load_cell_policy, make_actor
-from touchgoal.policies.deploy.control_loop import SLOW_ARM, Request, slow_arm
-from touchgoal.policies.deploy.preflight import check_client, preflight
-from touchgoal.policies.deploy.session import Result, Session
+from touchgoal.policies.deployed import CellPolicy, load_cell_policy, make_actor
 from touchgoal.rewards.embedding_distance import check_words
 from touchgoal.rewards.goals import parse_goal
 from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
 from touchgoal.rewards.online import CostMeter, OnlineCost
 from touchgoal.rewards.setup import own_towers
+from touchgoal.runtime.checks import require_all_ok
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.run_folder import open_run, write_json
 from touchgoal.sim_envs.config import EnvConfig
 from touchgoal.sim_envs.twin.control_port import ask_twin, put_scene_back
 from touchgoal.sim_envs.twin.in_process import simulate_cell
 
-EXAMPLES = Path(__file__).parents[1] / "cells"
+EXAMPLES = Path(__file__).parents[2] / "control" / "cell" / "examples"
 
 
 NOT_DONE, STOPPED = 3, 4  # exit status
@@ -81,7 +81,7 @@ def find_cell_file(path: Path) -> Path:
         return path
     names = sorted(example.stem for example in EXAMPLES.glob("*.toml"))
     example = EXAMPLES / f"{path.name.removesuffix('.toml')}.toml"
-    if path.parent in (Path("."), Path("launch/cells")) and example.is_file():
+    if path.parent in (Path("."), Path("control/cell/examples")) and example.is_file():
         return example
     raise UserError(
         f"there is no cell file {path}; a twin writes its own (touchgoal twin), and these examples "

@@ -6,11 +6,11 @@ import shlex
 import time
 from pathlib import Path
 
-from touchgoal.control.errors import UserError
 from touchgoal.launch.__main__ import read_options
 from touchgoal.launch.make_policy import Config
-from touchgoal.launch.support.run_folder import open_run, write_json
 from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.run_folder import open_run, write_json
 
 RECIPE = "recipe.json"
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from touchgoal.control.calibration.press_recorder import PressRecorder
 from touchgoal.control.calibration.press_set import MINIMUM, write_presses
-from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.sensors.fingertip_source import (
     fingertip_video,
@@ -21,7 +20,8 @@ from touchgoal.control.sensors.live_picture import LivePicture
 from touchgoal.control.tactile.sensor_models import SENSORS, SensorModel
 from touchgoal.launch import calibrate
 from touchgoal.launch.record_presses import Config
-from touchgoal.launch.support.run_folder import open_run
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.run_folder import open_run
 
 
 def run_command(config: Config) -> None:

@@ -9,10 +9,10 @@ from typing import Any
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.recording import Actor, EpisodeSpec, record_with_film
 from touchgoal.launch.run_policy import Config
-from touchgoal.launch.support.run_folder import open_run, write_json
 from touchgoal.policies.by_name import choose_policy, env_config_for
 from touchgoal.policies.evaluation.evaluate import Evaluation, Trial, run_trials, trial_specs
 from touchgoal.policies.evaluation.table import table, worst_first
+from touchgoal.runtime.run_folder import open_run, write_json
 from touchgoal.sim_envs.config import TaskConfig
 from touchgoal.sim_envs.tasks import make_env
 

@@ -11,8 +11,8 @@ from touchgoal.control.sensors.keyboard import Keyboard
 from touchgoal.episodes.recording import EpisodeSpec, run, to_episode
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
-from touchgoal.launch.support.run_folder import open_run, write_json
 from touchgoal.launch.teleop import Config
+from touchgoal.runtime.run_folder import open_run, write_json
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import TeleoperatorConfig
 from touchgoal.sim_envs.experts.teleoperator import HELP, Teleoperator

@@ -2,9 +2,6 @@
 
 from dataclasses import asdict
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.progress import track
-from touchgoal.control.provenance import provenance
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.alignment.align import align
@@ -25,7 +22,6 @@ from touchgoal.encoders.training.trainer import is_first_process
 from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import collect_touches
-from touchgoal.launch.support.run_folder import open_run
 from touchgoal.launch.support.training_run import (
     check_training,
     open_sets,
@@ -37,6 +33,10 @@ from touchgoal.launch.train_encoder import Adapt, Align, Dino, IJepa, Mae, Surfa
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder
 from touchgoal.rewards.fit_normalizer import fit_normalizer
 from touchgoal.rewards.normalizer import NORMALIZER, scene_of
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
+from touchgoal.runtime.provenance import provenance
+from touchgoal.runtime.run_folder import open_run
 
 
 def run_command(config: Align | Mae | Dino | IJepa | VJepa | Surfaces | Adapt) -> None:

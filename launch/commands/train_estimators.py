@@ -6,11 +6,9 @@ from dataclasses import replace
 import torch
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.training.checkpoint import has_checkpoint
 from touchgoal.encoders.training.trainer import is_first_process
-from touchgoal.launch.support.run_folder import write_json
 from touchgoal.launch.support.training_run import (
     check_training,
     open_sets,
@@ -33,11 +31,11 @@ from touchgoal.policies.perception.training import (
     train_contact_estimator,
     train_pose_estimator,
 )
+from touchgoal.runtime import seeds
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.run_folder import write_json
 
 _CONTACT, _POSE = "contact", "pose"  # folders of the two trainings in that of the run
-
-
-_SEED, _VALIDATION_SEED = 4_000_000, 4_900_000  # of the things placed
 
 
 def run_command(config: Config) -> None:
@@ -67,7 +65,9 @@ def run_command(config: Config) -> None:
     else:
         train_pose_estimator(
             network.pose_estimator,
-            render_placements(env, config.objects, config.placements, _SEED, config.workers),
+            render_placements(
+                env, config.objects, config.placements, seeds.POSE_TRAINING.start, config.workers
+            ),
             config.train,
             pose_out,
             replace(config.trainer, resume=config.resume and has_checkpoint(pose_out)),
@@ -76,7 +76,7 @@ def run_command(config: Config) -> None:
     if not is_first_process():
         return
     others = render_placements(
-        env, max(1, config.objects // 8), 5, _VALIDATION_SEED, config.workers
+        env, max(1, config.objects // 8), 5, seeds.POSE_VALIDATION.start, config.workers
     )
     errors |= pose_errors(network.pose_estimator, others)
     save_estimator(network, out / "estimator", provenance | {"errors": errors})

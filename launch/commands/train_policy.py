@@ -4,12 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.pretrained import find_encoder
 from touchgoal.encoders.training.trainer import is_first_process
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.launch.support.run_folder import write_json
 from touchgoal.launch.support.training_run import (
     check_training,
     open_sets,
@@ -35,10 +33,11 @@ from touchgoal.policies.training.training_data import (
     common_sensor,
     common_task,
 )
+from touchgoal.runtime import seeds
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.run_folder import write_json
 from touchgoal.sim_envs.config import TASKS, TaskConfig, TaskName
 from touchgoal.sim_envs.tasks import task_name
-
-_TRIALS = 2_000_000  # seed of the first trial
 
 
 def run_command(config: Config) -> None:
@@ -149,6 +148,6 @@ def _try(config: Config, task: TaskName, directory: Path) -> Score:
     env = _env(config, task)
     policy = SavedPolicy(directory).check_task(env)
     env = policy.env_config(env)
-    specs = trial_specs(env, config.trials, _TRIALS)
+    specs = trial_specs(env, config.trials, seeds.MODEL_SELECTION.start)
     result = Evaluation(tuple(run_trials(env, policy, specs, config.workers)))
     return result.rate.successes / result.rate.trials, result.progress

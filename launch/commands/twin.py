@@ -4,8 +4,8 @@ import signal
 
 from touchgoal.control.cell.cell_file import cell_table
 from touchgoal.control.cell.config import CellConfig
-from touchgoal.launch.support.run_folder import open_run, write_json
 from touchgoal.launch.twin import Config
+from touchgoal.runtime.run_folder import open_run, write_json
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 
 

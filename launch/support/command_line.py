@@ -20,8 +20,8 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.option_types import RARE, OptionError
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import RARE, OptionError
 from touchgoal.sim_envs.config import EnvConfig
 
 SHOWN = 20  # options that --help shows; --help-all shows all of them

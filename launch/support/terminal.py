@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.control.errors import UserError
+from touchgoal.control.deployment.control_loop import Request, TickStatus
 from touchgoal.control.safety.action_filter import Mode
 from touchgoal.control.sensors.keyboard import Keyboard
-from touchgoal.policies.deploy.control_loop import Request, TickStatus
+from touchgoal.runtime.errors import UserError
 
 HELP = (
     "space or Ctrl-C stops the arm, Enter ends it as done, n as not done; none is an emergency stop"

@@ -5,8 +5,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from touchgoal.control.option_types import checked_dataclass
 from touchgoal.encoders.config import TrainerOptions
+from touchgoal.runtime.option_types import checked_dataclass
 
 
 @checked_dataclass

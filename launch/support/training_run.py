@@ -4,14 +4,14 @@ import os
 from pathlib import Path
 from typing import Any
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.provenance import provenance
 from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.training.checkpoint import check_run_folder
 from touchgoal.encoders.training.trainer import check_device
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.launch.support.run_folder import open_run
 from touchgoal.launch.support.training_options import TrainedOptions
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.provenance import provenance
+from touchgoal.runtime.run_folder import open_run
 
 
 def check_training(options: TrainerOptions, out: Path | None, first: str = "") -> None:

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from touchgoal.control.errors import UserError
-from touchgoal.control.provenance import provenance
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.ssl.frames import TouchFrames, check_sensor, sample_frames
 from touchgoal.encoders.ssl.published_frames import Recorded, sample_recordings
@@ -14,6 +12,8 @@ from touchgoal.episodes.importers.labelled_videos import has_labels
 from touchgoal.episodes.importers.pretraining_clips import read_recordings
 from touchgoal.episodes.importers.video_recordings import read_video_recordings
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.provenance import provenance
 
 Offsets = tuple[int, ...] | None
 Draw = Callable[[int, int, Offsets], TouchFrames]

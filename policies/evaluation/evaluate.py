@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
-from touchgoal.control.progress import track
 from touchgoal.episodes.recording import EpisodeSpec, one_core_workers, run
 from touchgoal.policies.by_name import (
     PolicyMaker,
@@ -26,12 +24,13 @@ from touchgoal.policies.by_name import (
 )
 from touchgoal.policies.checkpoint import LoadedPolicy
 from touchgoal.policies.evaluation.success_rate import SuccessRate
+from touchgoal.runtime import seeds
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.config import TASKS, BeadMazeConfig, TaskConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE
 from touchgoal.sim_envs.tasks import make_env
-
-FIRST_SEED = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,7 @@ def evaluate(
     task: str | TaskConfig = "pick-place",
     *,
     episodes: int = 20,
-    seed: int = FIRST_SEED,
+    seed: int = seeds.EVALUATION.start,
     workers: int = 1,
 ) -> Evaluation:
     """Runs a policy in a task and says how often it succeeds.

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 
 @dataclass(frozen=True)

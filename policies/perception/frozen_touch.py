@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float32
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.frame_history import RecentFrames
 from touchgoal.encoders.ssl.frames import check_sensor
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.runtime.errors import UserError
 
 
 class TouchEmbedder:

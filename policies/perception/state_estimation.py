@@ -15,13 +15,13 @@ from jaxtyping import Float, Float32, UInt8
 from torch import Tensor, nn
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.policies.actions import Normalizer
 from touchgoal.policies.config import PoseEstimatorConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
 from touchgoal.policies.perception.pose_estimator import PoseEstimator
+from touchgoal.runtime.errors import UserError
 
 ESTIMATOR_FORMAT = WeightsFormat(
     "estimator", "estimator", "train one with: touchgoal train-estimators"

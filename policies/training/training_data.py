@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from touchgoal.control.errors import UserError
 from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.runtime.errors import UserError
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from touchgoal.control.atomic_write import write_file
 from touchgoal.rewards.curves import GAMMA, Curves
+from touchgoal.runtime.atomic_write import write_file
 
 # Okabe and Ito, "Color universal design" (2008): told apart by colour-blind readers; the dashes
 # tell them apart in grey.

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from touchgoal.control.features import Observation
 from touchgoal.control.motion.rotations import fingers_across, rotation_matrix, rotation_vector
-from touchgoal.sim_envs.base import Observation
 from touchgoal.sim_envs.bead_maze import BeadMaze
 
 _RETURN = 5.8  # 1/s: rate at which a distance to the course is taken back, a quarter at 20 Hz

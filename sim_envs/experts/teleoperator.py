@@ -7,8 +7,8 @@ direction, and the wire the exact path.
 import numpy as np
 
 from touchgoal.control import features as ft
+from touchgoal.control.features import Observation
 from touchgoal.control.motion.rotations import rotation_matrix
-from touchgoal.sim_envs.base import Observation
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import TeleoperatorConfig
 

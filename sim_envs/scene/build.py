@@ -10,10 +10,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.motion.tool import FRANKA_HAND, SENSOR_BELOW_CARRIAGE, Tool
 from touchgoal.control.safety import limits
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import MAX_CAMERA_SIZE, SceneConfig
 from touchgoal.sim_envs.scene.objects import FIRM, Body
 from touchgoal.sim_envs.scene.ur5e import replace_arm_with_ur5e

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 Shape = Literal["box", "cylinder", "sphere", "capsule", "mesh"]
 SHAPES: tuple[Shape, ...] = ("box", "cylinder", "sphere", "capsule", "mesh")

@@ -5,7 +5,7 @@ import os
 import mujoco
 import numpy as np
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 OPENGL_PACKAGES = "libegl1 libgl1"  # Debian and Ubuntu
 

@@ -12,7 +12,8 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime import seeds
+from touchgoal.runtime.errors import UserError
 
 Family = Literal["fourier", "roller", "helix", "arc", "serpentine"]
 Split = Literal["training", "validation", "test"]
@@ -29,8 +30,6 @@ CLEARANCE = 0.055  # m between parts of a wire, so that the fingers (29 mm) pass
 APART = 0.005  # m: closer than this (`distance`), two wires count as one
 
 _S = np.arange(0.0, LENGTH + STEP / 2, STEP)
-_SEEDS: dict[Split, int] = {"test": 0, "validation": 1_000_000, "training": 2_000_000}
-_RANGE = 1_000_000  # seeds a split owns
 # Test and validation wires are chosen first and for good: training wires give way to them.
 PER_FAMILY: dict[Split, int] = {"test": 50, "validation": 20, "training": 1000}
 
@@ -144,8 +143,8 @@ def choose(split: Split, count: int, families: tuple[Family, ...] = TRAINED) -> 
     Within a family no two wires of any split are closer than `APART`. More wires of a split begin
     with the same ones.
     """
-    if split not in _SEEDS:
-        raise UserError(f"unknown split {split!r}; choose from: {', '.join(_SEEDS)}")
+    if split not in seeds.WIRES:
+        raise UserError(f"unknown split {split!r}; choose from: {', '.join(seeds.WIRES)}")
     for family in families:
         if family not in FAMILIES:
             raise UserError(f"unknown family {family!r}; choose from: {', '.join(FAMILIES)}")
@@ -168,7 +167,7 @@ def _distinct(family: Family, split: Split, count: int) -> tuple[Wire, ...]:
         before += _distinct(family, earlier, PER_FAMILY[earlier])
     shapes = [shape(wire) for wire in before]
     wires: list[Wire] = []
-    for seed in range(_SEEDS[split], _SEEDS[split] + _RANGE):
+    for seed in seeds.WIRES[split]:
         if len(wires) == count:
             break
         wire = make(family, seed)

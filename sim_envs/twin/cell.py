@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.safety.braking import braked_velocity
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.estimated_wrench import WrenchError
 from touchgoal.sim_envs.pick_place import PickPlace

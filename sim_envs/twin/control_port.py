@@ -46,7 +46,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from touchgoal.control.cell.cell_file import read_cell_file
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.lock_step import LockStep
 from touchgoal.sim_envs.twin.pictures import Pictures

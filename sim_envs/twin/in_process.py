@@ -13,7 +13,6 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection, cell_limits
-from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import (
     STOPPED_ON_REQUEST,
     ArmReading,
@@ -26,6 +25,7 @@ from touchgoal.control.interfaces import (
 )
 from touchgoal.control.motion.tracker import Tracker, TrackerState
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import STREAM_SIZE, BeadMazeConfig, PickPlaceConfig, TaskConfig
 from touchgoal.sim_envs.tasks import make_env
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell

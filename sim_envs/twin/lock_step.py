@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.twin.cell import SimulatedCell
 from touchgoal.sim_envs.twin.franka.controller import FrankaArm
 from touchgoal.sim_envs.twin.franka.hand import FrankaHand

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.twin.cell import SimulatedCell
 from touchgoal.sim_envs.twin.picture_process import (
     STATE,

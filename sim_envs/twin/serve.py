@@ -16,9 +16,9 @@ from touchgoal.control.cell.config import (
     TaskSection,
     ToolSection,
 )
-from touchgoal.control.errors import UserError
 from touchgoal.control.safety.limits import FR3, UR5E
 from touchgoal.control.sensors.load_cell import LoadCellConfig
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.config import TaskConfig

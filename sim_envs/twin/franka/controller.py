@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.safety.limits import FR3
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.scene.build import robot_model
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.franka import limits, messages

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from touchgoal.control.errors import UserError
 from touchgoal.control.safety.limits import UR5E
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort
 from touchgoal.sim_envs.twin.ur import messages

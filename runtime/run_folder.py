@@ -7,9 +7,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from touchgoal.control.atomic_write import atomic_write
-from touchgoal.control.errors import UserError
-from touchgoal.control.provenance import hardware, provenance, versions
+from touchgoal.runtime.atomic_write import atomic_write
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.provenance import hardware, provenance, versions
 
 RECORD = "config.json"
 

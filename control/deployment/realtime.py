@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float32
 
 from touchgoal.control import features as ft
-from touchgoal.control.errors import UserError
-from touchgoal.policies.acting import Observation
+from touchgoal.control.features import Observation
+from touchgoal.runtime.errors import UserError
 
 _FIRST_PLAN_TIMEOUT = 20.0  # s for the first plan; it warms everything up
 _CLOSE_TIMEOUT = 2.0  # s for a plan under way when the episode ends

@@ -6,7 +6,7 @@ import weakref
 from contextlib import suppress
 from pathlib import Path
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 
 class FolderLock:

@@ -9,16 +9,16 @@ from jaxtyping import Float32
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.config import CellConfig
-from touchgoal.control.errors import UserError
+from touchgoal.control.deployment.control_loop import DeployedActor
+from touchgoal.control.deployment.realtime import ChunkPlanner, RealTimeActor
+from touchgoal.control.deployment.scripted import PickPlacePoses, pick_and_place
+from touchgoal.control.features import Observation
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import RobotLimits
-from touchgoal.policies.acting import Observation
 from touchgoal.policies.by_name import UserPolicy, find_user_policy
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy, find_policy
-from touchgoal.policies.deploy.control_loop import DeployedActor
-from touchgoal.policies.deploy.realtime import ChunkPlanner, RealTimeActor
-from touchgoal.policies.deploy.scripted import PickPlacePoses, pick_and_place
 from touchgoal.policies.follower import WireFollower
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.servo_lag import ServoLag
 from touchgoal.sim_envs.twin.in_process import env_config_of
 

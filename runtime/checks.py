@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 _MARKS = {True: "ok", False: "MISSING", None: "-"}
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control import features as ft
+from touchgoal.control.features import Observation
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.motion.self_collision import SelfDistance, require_no_self_collision
@@ -17,7 +18,6 @@ from touchgoal.control.motion.trajectories import (
     straight_line,
 )
 from touchgoal.control.safety.action_filter import ActionFilter
-from touchgoal.sim_envs.base import Observation
 
 _SPEED_SHARE = 0.9  # of what the safety layer lets a policy do: a plan should not be clamped
 _START_SPEED_SHARE = 0.3  # of that, for the start move: a person watches where it goes

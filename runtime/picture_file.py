@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from touchgoal.control.errors import UserError
+from touchgoal.runtime.errors import UserError
 
 _MOST_PIXELS = 50_000_000  # a small file may unpack to gigabytes
 

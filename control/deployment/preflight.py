@@ -12,8 +12,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.arms.client_libraries import FRANKY, UR_RTDE, ClientLibrary
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
-from touchgoal.control.checks import CheckResult
-from touchgoal.control.errors import UserError
+from touchgoal.control.deployment.exchanged import Picture, fingertips_exchanged
 from touchgoal.control.interfaces import Camera, DriverError, Gripper, TactileSensor
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.task_ceilings import TASK_FORCES
@@ -23,7 +22,8 @@ from touchgoal.control.tactile.markers import find_markers, without_markers
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.store import EpisodeWriter
-from touchgoal.policies.deploy.exchanged import Picture, fingertips_exchanged
+from touchgoal.runtime.checks import CheckResult
+from touchgoal.runtime.errors import UserError
 
 _MIN_RATE_SHARE = 0.8  # of what the cell says of a camera
 # Counts by which a fingertip may differ from its sensor file's. Simulated units differ by 1 to 2, a

@@ -8,7 +8,6 @@ from jaxtyping import Float, UInt8
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.connection import CellConnection
-from touchgoal.control.errors import UserError
 from touchgoal.control.interfaces import (
     ArmReading,
     DriverError,
@@ -20,6 +19,7 @@ from touchgoal.control.interfaces import (
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.tactile.indentation import IndentationMeter
+from touchgoal.runtime.errors import UserError
 
 _MAX_LOAD_CELL_AGE = 0.5  # s without a good line after which a load cell counts as silent
 

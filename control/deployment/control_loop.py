@@ -16,13 +16,13 @@ import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.connection import CellConnection, RealClock
-from touchgoal.control.errors import UserError
+from touchgoal.control.deployment.held_object import HeldObject
+from touchgoal.control.deployment.observation import CellReading, ObservationReader
+from touchgoal.control.deployment.realtime import RealTimeActor
+from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import STOPPED_ON_REQUEST, ArmReading, DriverError
 from touchgoal.control.safety.action_filter import ActionFilter, Limit, Measurements, SafetyState
-from touchgoal.policies.deploy.held_object import HeldObject
-from touchgoal.policies.deploy.observation import CellReading, ObservationReader
-from touchgoal.policies.deploy.realtime import RealTimeActor
-from touchgoal.sim_envs.base import Observation
+from touchgoal.runtime.errors import UserError
 
 _REST_SPEED = 0.01  # rad/s
 _REST_TIMEOUT = 3.0  # s to wait for that by the loop's clock

@@ -10,12 +10,7 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
-from touchgoal.control.errors import UserError
-from touchgoal.control.interfaces import DriverError
-from touchgoal.control.safety.action_filter import ActionFilter
-from touchgoal.episodes.schema import Episode, MetaValue
-from touchgoal.episodes.store import EpisodeWriter
-from touchgoal.policies.deploy.control_loop import (
+from touchgoal.control.deployment.control_loop import (
     ControlLoop,
     DeployedActor,
     Ending,
@@ -23,9 +18,14 @@ from touchgoal.policies.deploy.control_loop import (
     RunLog,
     TickStatus,
 )
-from touchgoal.policies.deploy.exchanged import Picture, cameras_exchanged
-from touchgoal.policies.deploy.scripted import start_move
-from touchgoal.sim_envs.base import Observation
+from touchgoal.control.deployment.exchanged import Picture, cameras_exchanged
+from touchgoal.control.deployment.scripted import start_move
+from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import DriverError
+from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.episodes.schema import Episode, MetaValue
+from touchgoal.episodes.store import EpisodeWriter
+from touchgoal.runtime.errors import UserError
 
 _START_TOLERANCE = 0.02  # rad from the start pose after the start move
 _CLOSE_TO_START = 0.1  # rad; nearer than that no start move is made
