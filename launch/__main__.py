@@ -92,12 +92,16 @@ def read_options(name: str, options: list[str]) -> tuple[Any, Any]:
     from touchgoal.runtime.run_folder import check_writable
 
     module = importlib.import_module(f"touchgoal.launch.{name.replace('-', '_')}")
+    chosen, prog = module, f"touchgoal {name}"
+    if hasattr(module, "choose"):  # a command of commands: benchmark NAME
+        prog = " ".join([prog, *options[:1]])
+        chosen, options = module.choose(options)
     config = parse(
-        module.Config,
+        chosen.Config,
         options,
-        prog=f"touchgoal {name}",
-        description=module.__doc__ or "",
-        envs=getattr(module, "ENVS", None),
+        prog=prog,
+        description=chosen.__doc__ or "",
+        envs=getattr(chosen, "ENVS", None),
     )
     if hasattr(config, "out"):
         check_writable(config.out)

@@ -1,83 +1,95 @@
 """Print one table of measured figures and keep its numbers."""
 
-import importlib
-from dataclasses import replace
+import sys
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
+from types import ModuleType
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from touchgoal.benchmarks import config as options
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import checked_dataclass
 from touchgoal.runtime.provenance import hardware, provenance
 from touchgoal.runtime.run_folder import open_run, write_json
 
-BENCHMARKS: dict[str, type[options.BenchmarkOptions]] = {
-    "bead-maze": options.BeadMazeOptions,
-    "deploy": options.DeployOptions,
-    "encoder-speed": options.EncoderSpeedOptions,
-    "env-speed": options.EnvSpeedOptions,
-    "faults": options.FaultsOptions,
-    "motion": options.MotionOptions,
-    "policy-delay": options.PolicyDelayOptions,
-    "policy-latency": options.PolicyLatencyOptions,
-    "real-touch": options.RealTouchOptions,
-    "replay": options.ReplayOptions,
-    "reward-quality": options.RewardQualityOptions,
-    "sent-stream": options.SentStreamOptions,
-    "tacbench": options.TacbenchOptions,
-    "tactile-realism": options.TactileRealismOptions,
-    "tactile-speed": options.TactileSpeedOptions,
-    "task-ceilings": options.TaskCeilingsOptions,
-    "touch-probes": options.TouchProbesOptions,
+BENCHMARKS = {
+    "bead-maze": ("papers.bead_maze", "bead maze: success on unseen wires (TacBench T5)"),
+    "reward-quality": ("papers.reward_quality", "dense costs against outcomes (MMWand V-E)"),
+    "tacbench": ("papers.tacbench.benchmark", "force, slip, pose, grasp, cloth from frozen touch"),
+    "real-touch": ("real_touch.videos", "encoders on labelled videos of real touch"),
+    "real-force": ("real_touch.forces", "force and contact on real grasps with a load cell"),
+    "real-markers": ("real_touch.markers", "gel dots of real images against another tracker"),
+    "tactile-realism": ("real_touch.tactile_realism", "simulated against real presses of a ball"),
+    "deploy": ("deployment.deploy", "success through the environment, in process and on the wire"),
+    "faults": ("deployment.faults", "what a deployment does under every fault"),
+    "policy-delay": ("deployment.policy_delay", "success under delays, or by cause of failure"),
+    "replay": ("deployment.replay", "the same actions in the environment and over the wire"),
+    "sent-stream": ("deployment.sent_stream", "commands to the arm against every limit"),
+    "task-ceilings": ("deployment.task_ceilings", "force ceilings from demonstrations"),
+    "encoder-speed": ("speed.encoder_speed", "touch embeddings a second"),
+    "env-speed": ("speed.env_speed", "steps of the environment a second"),
+    "policy-latency": ("speed.policy_latency", "time of a plan, stage by stage"),
+    "tactile-speed": ("speed.tactile_speed", "simulated tactile images a second"),
 }
-IN_FOLDERS = {"tacbench": "tacbench.benchmark"}
-RESULTS = Path(__file__).resolve().parents[1] / "benchmarks" / "results"
-
-Config = (
-    Annotated[options.BeadMazeOptions, tyro.conf.subcommand("bead-maze")]
-    | Annotated[options.DeployOptions, tyro.conf.subcommand("deploy")]
-    | Annotated[options.EncoderSpeedOptions, tyro.conf.subcommand("encoder-speed")]
-    | Annotated[options.EnvSpeedOptions, tyro.conf.subcommand("env-speed")]
-    | Annotated[options.FaultsOptions, tyro.conf.subcommand("faults")]
-    | Annotated[options.MotionOptions, tyro.conf.subcommand("motion")]
-    | Annotated[options.PolicyDelayOptions, tyro.conf.subcommand("policy-delay")]
-    | Annotated[options.PolicyLatencyOptions, tyro.conf.subcommand("policy-latency")]
-    | Annotated[options.RealTouchOptions, tyro.conf.subcommand("real-touch")]
-    | Annotated[options.ReplayOptions, tyro.conf.subcommand("replay")]
-    | Annotated[options.RewardQualityOptions, tyro.conf.subcommand("reward-quality")]
-    | Annotated[options.SentStreamOptions, tyro.conf.subcommand("sent-stream")]
-    | Annotated[options.TacbenchOptions, tyro.conf.subcommand("tacbench")]
-    | Annotated[options.TactileRealismOptions, tyro.conf.subcommand("tactile-realism")]
-    | Annotated[options.TactileSpeedOptions, tyro.conf.subcommand("tactile-speed")]
-    | Annotated[options.TaskCeilingsOptions, tyro.conf.subcommand("task-ceilings")]
-    | Annotated[options.TouchProbesOptions, tyro.conf.subcommand("touch-probes")]
-)
+"""Module in `touchgoal.benchmarks` and meaning of each benchmark."""
 
 
-def main(config: options.BenchmarkOptions) -> None:
-    """Run the chosen benchmark."""
-    name = next(name for name, kind in BENCHMARKS.items() if type(config) is kind)
-    if config.save_result and not (RESULTS.parents[1] / "pyproject.toml").exists():
-        raise UserError("--save-result writes into a checkout, and this is an installed package")
-    module = IN_FOLDERS.get(name, name.replace("-", "_"))
-    benchmark = importlib.import_module(f"touchgoal.benchmarks.{module}")
+@checked_dataclass
+class Config:
+    """Options of benchmark, before those of the chosen one."""
+
+    name: Annotated[Literal[tuple(BENCHMARKS)], tyro.conf.Positional]  # pyright: ignore[reportInvalidTypeForm]
+    """Benchmark to run."""
+    recorded: bool = False
+    """Print the table on record instead."""
+
+
+def choose(arguments: list[str]) -> tuple[ModuleType, list[str]]:
+    """Return the module of the named benchmark and the options that follow the name.
+
+    `--recorded` after the name prints the records instead and exits.
+
+    Raises:
+        UserError: there is no such benchmark or record.
+    """
+    name, *options = arguments or ["--help"]
+    if name in ("-h", "--help"):
+        print(_usage())
+        sys.exit(0)
+    if "--recorded" in options:
+        from touchgoal.benchmarks.records import describe, records_of
+
+        print("\n\n".join(describe(record) for record in records_of(name)))
+        sys.exit(0)
+    if name not in BENCHMARKS:
+        raise UserError(f"there is no benchmark {name!r}; choose from: {', '.join(BENCHMARKS)}")
+    return import_module(f"touchgoal.benchmarks.{BENCHMARKS[name][0]}"), options
+
+
+def main(config: Any) -> None:
+    """Run the benchmark whose `Config` this is."""
+    module = sys.modules[type(config).__module__]
+    path = module.__name__.removeprefix("touchgoal.benchmarks.").removesuffix(".config")
+    name = next(n for n, (p, _) in BENCHMARKS.items() if p.startswith(path))
+    benchmark = import_module(f"touchgoal.benchmarks.{BENCHMARKS[name][0]}")
     out = open_run(config.out, f"benchmark-{name}", config)
-    result = benchmark.run(replace(config, out=out))
+    result = benchmark.run(config)
     print(result.pop("table"))
-    pictures = result.pop("pictures", {})
-    if "picture" in result:
-        pictures["picture"] = result.pop("picture")
-    for title, picture in pictures.items():
+    for title, picture in result.pop("pictures", {}).items():
         _draw(picture, out / f"{title}.png")
     print(f"hardware: {hardware()}")
-    result = {**provenance(), "hardware": hardware(), **result}
-    write_json(out / "metrics.json", result)
+    write_json(out / "metrics.json", {**provenance(), "hardware": hardware(), **result})
     print(f"numbers: {out / 'metrics.json'}")
-    if config.save_result:
-        RESULTS.mkdir(exist_ok=True)
-        write_json(RESULTS / f"{name}.json", result)
-        print(f"to be committed: {RESULTS / f'{name}.json'}")
+
+
+def _usage() -> str:
+    lines = [f"  {name:<17}{meaning}" for name, (_, meaning) in BENCHMARKS.items()]
+    return (
+        "usage: touchgoal benchmark NAME [options]\n       touchgoal benchmark NAME --help\n"
+        "       touchgoal benchmark NAME --recorded   (print the table on record)\n\n"
+        + "\n".join(lines)
+    )
 
 
 def _draw(picture: Any, path: Path) -> None:

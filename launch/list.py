@@ -87,7 +87,7 @@ def benchmarks() -> dict[str, str]:
     """What `touchgoal benchmark` takes."""
     from touchgoal.launch.benchmark import BENCHMARKS
 
-    return {name: (options.__doc__ or "").split("\n")[0] for name, options in BENCHMARKS.items()}
+    return {name: meaning for name, (_, meaning) in BENCHMARKS.items()}
 
 
 KINDS: dict[Kind, Callable[[], dict[str, str]]] = {

@@ -11,8 +11,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from touchgoal.benchmarks import reward_quality
-from touchgoal.benchmarks.reward_quality import collect_goals, is_goal
+from touchgoal.benchmarks.papers import reward_quality
+from touchgoal.benchmarks.papers.reward_quality import collect_goals, is_goal
 from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT, WRIST
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig

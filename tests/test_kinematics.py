@@ -1,11 +1,11 @@
 """CasADi kinematics against MuJoCo, and the inverse against the forward."""
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
-from touchgoal.benchmarks.motion import near_tasks
 from touchgoal.control.motion.arm_models import FR3_ARM
 from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics, Ur5eKinematics
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
@@ -16,6 +16,28 @@ if TYPE_CHECKING:
     import mujoco
 
 POSES = 1000
+NEAR = 0.2  # rad, farthest that a joint is from the solution at the start
+_EDGE = 0.05  # rad from its limit in which a joint counts as near it
+_CANDIDATES = 50  # postures of which the one nearest to a singularity is taken
+
+
+def near_tasks(
+    kinematics: Kinematics, count: int, rng: np.random.Generator
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Goals (rad) anywhere, near limits and near singularities in turn, and starts near them."""
+    lower, upper = kinematics.arm.lower + 1e-3, kinematics.arm.upper - 1e-3
+    for k in range(count):
+        q = rng.uniform(lower, upper)
+        if k % 3 == 1:
+            at = rng.choice(q.size, rng.integers(1, 4), replace=False)
+            inwards, low = rng.uniform(0, _EDGE, at.size), rng.random(at.size) < 0.5
+            q[at] = np.where(low, lower[at] + inwards, upper[at] - inwards)
+        elif k % 3 == 2:
+            candidates = rng.uniform(lower, upper, (_CANDIDATES, q.size))
+            jacobians, _ = kinematics.jacobians(candidates)
+            least = np.linalg.svd(jacobians, compute_uv=False)[:, -1]
+            q = candidates[np.argmin(least)]
+        yield q, np.clip(q + rng.uniform(-NEAR, NEAR, q.size), lower, upper)
 
 
 def check_against_mujoco(

@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 from running_twin import RunningTwin
 
-from touchgoal.benchmarks import kept_deployments
-from touchgoal.benchmarks.deployed_episode import Deployment, Scene
-from touchgoal.benchmarks.kept_deployments import KeptDeployments
-from touchgoal.benchmarks.replay import replay_both
+from touchgoal.benchmarks.deployment.replay import replay_both
 from touchgoal.control import features as ft
 from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.cell.config import CellConfig
@@ -121,36 +118,6 @@ def test_benchmark_deploy_counts_what_deploy_did(tmp_path: Path) -> None:
     done = json.loads((tmp_path / "run" / "metrics.json").read_text())["deployments"]
     assert len(done) == 1 and done[0]["policy"] == "follower" and not done[0]["success"]
     assert "time is up" in done[0]["ending"] and done[0]["progress"] < 0.2
-
-
-def test_deployments_outlive_a_benchmark_that_was_stopped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Those of other code, or of code that nobody committed, do not count; nor does half a line."""
-
-    def of(commit: str, dirty: bool = False) -> KeptDeployments:
-        code = {"touchgoal": "1", "commit": commit, "dirty": dirty}
-        monkeypatch.setattr(kept_deployments, "provenance", lambda: code)
-        return KeptDeployments(tmp_path)
-
-    scenes = [Scene("bead-maze", seed, "helix-3") for seed in range(3)]
-    done = [
-        Deployment(
-            "bead-maze", "follower", "lock-step", scene.seed, "helix-3", True, 1.0, "done", "",
-            9.0, 3.5, {"speed": 0.1}, 0.0,
-        )
-        for scene in scenes
-    ]  # fmt: skip
-    of("a").add(done[0])
-    of("a", dirty=True).add(done[1])
-    file = tmp_path / "deployments.jsonl"
-    file.write_text(file.read_text() + '{"code": {"touchg')
-    again = of("a")
-    assert [again.find(scene, "follower", "lock-step") for scene in scenes] == [done[0], None, None]
-    again.add(done[2])
-    assert of("a").find(scenes[2], "follower", "lock-step") == done[2]
-    assert of("a").find(scenes[0], "follower", "real-time") is None
-    assert of("b").find(scenes[0], "follower", "lock-step") is None
 
 
 @pytest.mark.slow

@@ -11,11 +11,9 @@ from safetensors.torch import save_file
 from sparsh_files import plain_forward, published
 
 import touchgoal
-from touchgoal.benchmarks.config import TouchProbesOptions
-from touchgoal.benchmarks.real_touch_encoders import find_embedder
-from touchgoal.benchmarks.tacbench.data import RigFrames
-from touchgoal.benchmarks.tacbench.probes import frozen_tokens
-from touchgoal.benchmarks.touch_probes import run as run_touch_probes
+from touchgoal.benchmarks.papers.tacbench.data import RigFrames
+from touchgoal.benchmarks.papers.tacbench.probes import frozen_tokens
+from touchgoal.benchmarks.real_touch.embedders import find_embedder
 from touchgoal.encoders.pretrained import find_encoder, load_encoder, save
 from touchgoal.encoders.published import load_published
 from touchgoal.policies.perception.frozen_touch import load_touch
@@ -168,11 +166,3 @@ def test_tacbench_probes_their_tokens_of_the_true_past(tmp_path: Path, method: s
     for row, i in ((0, 1), (1, 8)):
         wanted = expected(weights, frames[3:], i, method)
         np.testing.assert_allclose(tokens[row], wanted, atol=3e-3)
-
-
-def test_touch_probes_take_them(tmp_path: Path) -> None:
-    save_file(published(), tmp_path / "mae_vittiny.safetensors")
-    options = TouchProbesOptions(encoder=str(tmp_path), sensors=("gelsight_mini",), presses=24)
-    rows = run_touch_probes(options)["rows"]
-    assert [row["input"] for row in rows] == ["colours", "shape", "shape, centred"]
-    assert all(0 < row["place_error_mm"] < 3 for row in rows)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from touchgoal.benchmarks.config import RealTouchOptions
-from touchgoal.benchmarks.real_cost import EmbeddedGrasp, cost_table, judge_cost
-from touchgoal.benchmarks.real_touch import embed_touch, read_touch, run
-from touchgoal.benchmarks.real_touch_encoders import find_embedder
+from touchgoal.benchmarks.real_touch import forces, markers
+from touchgoal.benchmarks.real_touch.embedders import find_embedder
+from touchgoal.benchmarks.real_touch.force_onset import EmbeddedGrasp, cost_table, judge_cost
+from touchgoal.benchmarks.real_touch.videos import Config, embed_touch, read_touch, run
 from touchgoal.control.tactile.picture_force import calibrate_force, shrunk, statistics
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.pretrained import find_encoder, load_encoder, load_pooled
@@ -68,7 +68,7 @@ def test_videos_are_read_with_their_labels(clips: Path) -> None:
 
 
 def test_the_benchmark_judges_encoders(clips: Path) -> None:
-    result = run(RealTouchOptions(data=clips, encoders=("pixels", "random:gelsight_mini")))
+    result = run(Config(data=clips, encoders=("pixels", "random:gelsight_mini")))
     row = result["rows"][0]
     assert row["videos"] == 15 and row["things"] == 5
     assert row["nearest"] == 1.0
@@ -262,7 +262,7 @@ def test_things_grasped_once_have_forces_and_no_cost(tmp_path: Path) -> None:
         text = "\n".join(["force_newtons,gripper_width_m", *rows])
         (tmp_path / f"grasp_{thing}.csv").write_text(text)
     (tmp_path / "grasps.csv").write_text("\n".join(table))
-    result = run(RealTouchOptions(data=tmp_path, encoders=("pixels",)))
+    result = forces.run(forces.Config(data=tmp_path, encoders=("pixels",)))
     assert result["cost"] == {} and result["things"] == 3
 
 
@@ -300,7 +300,7 @@ def test_markers_are_compared_with_another_trackers(tmp_path: Path) -> None:
             told[0, 0] += 5  # here the other one is wrong
         tables = [x, y, told, y + 0.5, np.arange(24).reshape(4, 6)]
         (tmp_path / f"gel_{i}.json").write_text(json.dumps([t.tolist() for t in tables]))
-    result = run(RealTouchOptions(data=tmp_path))
+    result = markers.run(markers.Config(data=tmp_path))
     assert result["dots"] == 3 * 24 and result["exchanged"] == result["lost"] == 0
     assert result["near"] == pytest.approx(71 / 72) and result["most_px"] == pytest.approx(
         5, abs=0.2
@@ -308,7 +308,7 @@ def test_markers_are_compared_with_another_trackers(tmp_path: Path) -> None:
     assert result["moved_px"] == pytest.approx(11) and result["apart_px"] == pytest.approx(40)
     (tmp_path / "gel_2.json").write_text("[1, 2]")
     with pytest.raises(UserError, match=r"gel_2.json does not hold 5 tables"):
-        run(RealTouchOptions(data=tmp_path))
+        markers.run(markers.Config(data=tmp_path))
     (tmp_path / "gel_2.png").unlink()
     with pytest.raises(UserError, match=r"gel_2.png is missing"):
-        run(RealTouchOptions(data=tmp_path))
+        markers.run(markers.Config(data=tmp_path))

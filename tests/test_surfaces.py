@@ -3,12 +3,9 @@
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
-from touchgoal.benchmarks.config import TouchProbesOptions
-from touchgoal.benchmarks.touch_probes import run as run_probes
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 from touchgoal.encoders.preprocess import steady_preprocessor_for
@@ -19,7 +16,6 @@ from touchgoal.encoders.ssl.surface_whitening import (
 )
 from touchgoal.encoders.whitening import inverse_square_root
 from touchgoal.sim_envs.tactile.indenters import FOUNDATION_MODULUS, IndenterPose, indent
-from touchgoal.sim_envs.tactile.optics import render_untouched
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 from touchgoal.sim_envs.tactile.surface_press import (
     SurfacePose,
@@ -149,21 +145,3 @@ def test_an_indenter_presses_with_the_force_asked_for() -> None:
     assert reads[1] / reads[0] == pytest.approx(3, rel=0.2)
     expected = np.sqrt(9.0 / (FOUNDATION_MODULUS * np.pi * 7e-3))
     assert reads[1] == pytest.approx(expected, rel=0.25)
-
-
-def test_touch_probes_print_a_row_for_every_pair(tmp_path: Path) -> None:
-    sensors = ("gelsight_mini", "digit")
-    unit, rng = sample_instance(GELSIGHT_MINI, np.random.default_rng(1)), np.random.default_rng(0)
-    pictures = {
-        f"press_{i}": indent("large ball", IndenterPose(0, 0, 0), 3.0 + i, unit, rng)
-        for i in range(6)
-    }
-    for name, picture in {"background": render_untouched(unit, rng), **pictures}.items():
-        cv2.imwrite(str(tmp_path / f"{name}.png"), picture[..., ::-1])
-    result = run_probes(TouchProbesOptions(sensors=sensors, presses=36, real_balls=(tmp_path,)))
-    assert len(result["rows"]) == 12 and len(result["table"].splitlines()) == 15 + 3 + 6
-    read = [row for row in result["rows"] if "real_balls" in row]
-    assert {row["to"] for row in read} == {"gelsight_mini"}
-    assert read[0]["real_balls"] > read[0]["others_called_balls"]
-    own = result["rows"][0]
-    assert own["force_error"] < 4 and own["place_error_mm"] < 1.5

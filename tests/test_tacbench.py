@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from touchgoal.benchmarks.config import TacbenchOptions
-from touchgoal.benchmarks.tacbench.benchmark import run
-from touchgoal.benchmarks.tacbench.data import STRIDE, RigFrames, read_strokes
-from touchgoal.benchmarks.tacbench.force import force_metrics
-from touchgoal.benchmarks.tacbench.pose import CLASSES, PoseTask
-from touchgoal.benchmarks.tacbench.slip import f1_score, slip_metrics
-from touchgoal.benchmarks.tacbench.splits import split_force, split_slip
+from touchgoal.benchmarks.papers.tacbench.benchmark import run
+from touchgoal.benchmarks.papers.tacbench.config import Config
+from touchgoal.benchmarks.papers.tacbench.data import STRIDE, RigFrames, read_strokes
+from touchgoal.benchmarks.papers.tacbench.force import force_metrics
+from touchgoal.benchmarks.papers.tacbench.pose import CLASSES, PoseTask
+from touchgoal.benchmarks.papers.tacbench.slip import f1_score, slip_metrics
+from touchgoal.benchmarks.papers.tacbench.task import split_force, split_slip
 from touchgoal.control.features import TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP
 from touchgoal.control.tactile.markers import MarkerTracker
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
@@ -290,7 +290,7 @@ def test_the_benchmark_judges_every_encoder(
     config = TouchBackboneConfig.for_sensor(PRESETS["tiny"], "gelsight_mini_markers")
     save(TouchBackbone(config), tmp_path / "tiny", {})
     name = str(tmp_path / "tiny")
-    options = TacbenchOptions(
+    options = Config(
         encoders=(name, "end-to-end:tiny"), shares=(1.0, 0.1), rig=RIG, strokes=STROKES, slides=10,
         grasps=10, cloths=10, data=strokes.parent, seeds=1, steps=3, end_to_end_steps=2, workers=1,
     )  # fmt: skip
@@ -314,7 +314,7 @@ def test_the_benchmark_judges_every_encoder(
     for row in [*result["rows"], *shared_out]:
         row.pop("seconds", None)
     assert shared_out == [row for row in result["rows"] if row["task"] == "slip"]
-    wrong = TacbenchOptions(encoders=("gelsight_mini",), rig=RIG, data=strokes.parent)
+    wrong = Config(encoders=("gelsight_mini",), rig=RIG, data=strokes.parent)
     with pytest.raises(UserError, match="the rig has gelsight_mini_markers"):
         run(wrong)
 

@@ -8,15 +8,15 @@ import pytest
 import torch
 from published_files import gel, write_force_batch, write_grasps, write_pose_set
 
-from touchgoal.benchmarks.config import TacbenchOptions
-from touchgoal.benchmarks.tacbench import published_recordings
-from touchgoal.benchmarks.tacbench.benchmark import run
-from touchgoal.benchmarks.tacbench.pose import PoseTask
-from touchgoal.benchmarks.tacbench.published_recordings import (
+from touchgoal.benchmarks.papers.tacbench.benchmark import run
+from touchgoal.benchmarks.papers.tacbench.config import Config
+from touchgoal.benchmarks.papers.tacbench.pose import PoseTask
+from touchgoal.benchmarks.papers.tacbench.published_recordings import (
     find_published,
     read_published_strokes,
 )
-from touchgoal.benchmarks.tacbench.splits import split_force, split_grasp
+from touchgoal.benchmarks.papers.tacbench.task import split_force, split_grasp
+from touchgoal.benchmarks.papers.tacbench_report import published_recordings
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.episodes.importers.tacbench_poses import read_bags
 from touchgoal.runtime.errors import UserError
@@ -98,7 +98,7 @@ def test_the_benchmark_takes_published_files(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_probes(tmp_path / "files", strokes=5)
-    options = TacbenchOptions(
+    options = Config(
         tasks=("force", "slip"),
         encoders=("end-to-end:tiny",),
         shares=(1.0,),

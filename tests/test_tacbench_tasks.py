@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from touchgoal.benchmarks.tacbench.data import read_cloths, read_grasps
-from touchgoal.benchmarks.tacbench.field import field_metrics
-from touchgoal.benchmarks.tacbench.labels import grasp_task, label_metrics, textile_task
-from touchgoal.benchmarks.tacbench.published import published
-from touchgoal.benchmarks.tacbench.splits import split_grasp
+from touchgoal.benchmarks.papers.tacbench.data import read_cloths, read_grasps
+from touchgoal.benchmarks.papers.tacbench.field import field_metrics
+from touchgoal.benchmarks.papers.tacbench.labels import grasp_task, label_metrics, textile_task
+from touchgoal.benchmarks.papers.tacbench.task import split_grasp
+from touchgoal.benchmarks.papers.tacbench_report.published import published
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.probes.dense import DenseProbe

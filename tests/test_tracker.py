@@ -5,7 +5,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from touchgoal.benchmarks.sent_stream import late_by, outside_box, send, wild_commands
+from touchgoal.benchmarks.deployment.sent_stream import late_by, outside_box, send, wild_commands
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.tracker import Tracker
 from touchgoal.control.safety.action_filter import ActionFilter

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import ruckig
 
-from touchgoal.benchmarks.motion import ruckig_duration
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics, Ur5eKinematics
 from touchgoal.control.motion.rotations import fingers_down
@@ -21,6 +21,18 @@ from touchgoal.control.safety.limits import RobotLimits
 from touchgoal.runtime.errors import UserError
 
 ROBOTS = [(robots.FR3, Fr3Kinematics()), (robots.UR5E, Ur5eKinematics())]
+
+
+def ruckig_duration(start: np.ndarray, goal: np.ndarray, limits: JointLimits) -> float:
+    """Seconds of the fastest move from rest to rest; each joint goes its own way in between."""
+    wanted, found = ruckig.InputParameter(start.size), ruckig.Trajectory(start.size)
+    wanted.current_position, wanted.target_position = start.tolist(), goal.tolist()
+    wanted.max_velocity = limits.velocity.tolist()
+    wanted.max_acceleration = limits.acceleration.tolist()
+    wanted.max_jerk = limits.jerk.tolist()
+    if ruckig.Ruckig(start.size).calculate(wanted, found) != ruckig.Result.Working:
+        raise AssertionError("ruckig found no move")
+    return found.duration
 
 
 def peak_shares(trajectory: Trajectory, limits: JointLimits) -> np.ndarray:

@@ -1,0 +1,162 @@
+"""Success of deployed policies by task, policy and arm, with the reason of every failure.
+
+Each deployment is one `touchgoal deploy --execute`; on the wire each has a fresh twin and the cell
+file that the twin writes. All rows of a task share seeds, objects and wires.
+"""
+
+import json
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from touchgoal.benchmarks.deployment.deployed_episode import Deployment, Scene, deploy, limited
+from touchgoal.benchmarks.deployment.deployed_twin import DeployedTwin
+from touchgoal.benchmarks.options import CORES, BenchmarkOptions
+from touchgoal.control.cell.cell_file import cell_table, read_cell_file
+from touchgoal.episodes.recording import EpisodeSpec, one_core_workers
+from touchgoal.policies.by_name import choose_policy, env_config_for, scripted
+from touchgoal.policies.evaluation.evaluate import run_trial, trial_specs
+from touchgoal.policies.evaluation.success_rate import SuccessRate
+from touchgoal.runtime import seeds
+from touchgoal.runtime.option_types import Count, Positive, Seed, checked_dataclass
+from touchgoal.runtime.progress import track
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskName
+
+
+@checked_dataclass
+class Config(BenchmarkOptions):
+    """Options of benchmark deploy."""
+
+    tasks: tuple[TaskName, ...] = ("pick-place", "bead-maze")
+    """Tasks."""
+    policies: tuple[str, ...] = ("scripted", "shipped")
+    """Policies, named as for deploy; scripted: the task's own, the expert or the follower."""
+    arms: tuple[Literal["environment", "in-process", "lock-step", "real-time"], ...] = (
+        "environment",
+        "in-process",
+        "lock-step",
+        "real-time",
+    )
+    """Ways to act. environment: the task's environment. in-process: a simulated arm from the example
+    cell file. lock-step: a fresh twin over libfranka whose time waits for the client. real-time: the
+    same against the wall clock."""
+    episodes: Count = 10
+    """Episodes of each row."""
+    seconds: Positive = 40.0
+    """Time limit of a deployment, s."""
+    seed: Seed = seeds.DEPLOY_TEST.start
+    """Random seed of the first episode; each further one adds one."""
+    workers: Count = CORES
+    """Deployments side by side, in process and in lock-step."""
+
+
+EXAMPLES = {"pick-place": "sim.toml", "bead-maze": "sim_maze.toml"}
+_CELLS = Path(__file__).parents[1] / "control" / "cell" / "examples"
+
+
+def run(config: Config) -> dict[str, Any]:
+    """The table, and every deployment behind it."""
+    head = f"{'task, policy, arm':<34}{'success [95 % Wilson]':<23}{'peak N':>12}{'late ms':>9}{'pace':>6}  clamped"
+    lines, done = [head], []
+    for task in config.tasks:
+        scenes = list(_scenes(task, config))
+        for name in config.policies:
+            policy = scripted(task) if name == "scripted" else name
+            for arm in config.arms:
+                with _side_by_side(arm, len(scenes), config.workers) as pool:
+                    begun = [
+                        pool.submit(_deploy, scene, policy, arm, i, config.seconds)
+                        for i, scene in enumerate(scenes)
+                    ]
+                    bar = f"{task}, {policy}, {arm}"
+                    rows = [job.result() for job in track(begun, bar, "deployment")]
+                lines += _lines(rows)
+                print(
+                    "\n".join(lines[-1 - sum(not row.success for row in rows) :]), file=sys.stderr
+                )
+                done += rows
+    return {"table": "\n".join(lines), "deployments": [asdict(row) for row in done]}
+
+
+def _side_by_side(arm: str, count: int, workers: int) -> AbstractContextManager[Executor]:
+    """Deployments are processes of their own, and wait for nothing but in real time."""
+    if arm == "environment":
+        return one_core_workers(min(count, workers))
+    return ThreadPoolExecutor(1 if arm == "real-time" else workers)
+
+
+def _scenes(task: TaskName, config: Config) -> Iterator[Scene]:
+    """Wires of the test split, each object in turn."""
+    drawn = BeadMazeConfig(split="test") if task == "bead-maze" else PickPlaceConfig()
+    for spec in trial_specs(drawn, config.episodes, config.seed):
+        assert spec.options is not None
+        yield Scene(task, spec.seed, str(next(iter(spec.options.values()))))
+
+
+def _deploy(scene: Scene, policy: str, arm: str, number: int, seconds: float) -> Deployment:
+    if arm == "environment":
+        return _in_environment(scene, policy)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with _cell(scene, arm, folder, number) as cell:
+            return deploy(limited(cell, seconds), scene, policy, arm, folder / "run")
+
+
+@contextmanager
+def _cell(scene: Scene, arm: str, folder: Path, number: int) -> Iterator[Path]:
+    """A cell file whose arm stays for as long as the context."""
+    if arm == "in-process":
+        cell = read_cell_file(_CELLS / EXAMPLES[scene.task])
+        maze = scene.task == "bead-maze"
+        task = replace(
+            cell.task,
+            seed=scene.seed,
+            objects=() if maze else (scene.thing,),
+            wires=(scene.thing,) if maze else (),
+        )
+        path = folder / "cell.json"
+        path.write_text(json.dumps(cell_table(replace(cell, task=task))))
+        yield path
+        return
+    with DeployedTwin(scene.task, scene.seed, scene.thing, arm == "lock-step", folder, number) as t:
+        yield t.cell_file
+
+
+def _in_environment(scene: Scene, policy: str) -> Deployment:
+    task = scene.config()
+    maker = choose_policy(policy, task)
+    trial = run_trial(env_config_for(maker, task), maker, EpisodeSpec(scene.seed))
+    kind = (scene.task, policy, "environment", scene.seed, scene.thing)
+    ending = trial.failure or "done"
+    return Deployment(
+        *kind, trial.success, trial.progress, ending, "", trial.seconds, trial.peak_force, {}, 0.0
+    )
+
+
+def _lines(rows: list[Deployment]) -> list[str]:
+    """One for the row, and one for each of its failures."""
+    first = rows[0]
+    rate = SuccessRate(sum(row.success for row in rows), len(rows))
+    peaks = [row.peak_force for row in rows]
+    limits = sorted({name for row in rows for name in row.clamped})
+    shares = {name: np.mean([row.clamped.get(name, 0.0) for row in rows]) for name in limits}
+    clamped = ", ".join(f"{name} {share:.0%}" for name, share in shares.items() if share >= 5e-3)
+    what = f"{first.task}, {first.policy}, {first.arm}"
+    peak = f"{np.median(peaks):.0f} to {max(peaks):.0f}"
+    late, pace = max(row.late for row in rows), min(row.pace for row in rows)
+    lines = [f"{what:<34}{rate!s:<23}{peak:>12}{late:>9.1f}{pace:>6.2f}  {clamped or 'never'}"]
+    for row in rows:
+        if not row.success:
+            at = "" if row.progress is None else f", progress {row.progress:.2f}"
+            phase = f", {row.phase}" if row.phase else ""
+            lines.append(
+                f"    {row.seed} {row.thing}: {row.ending} at {row.seconds:.1f} s{phase}{at}"
+            )
+    return lines

@@ -1,0 +1,344 @@
+"""Every fault that a deployment must survive, on the twin through the makers' own client libraries.
+
+Each row is one deployment of the pick-and-place expert (or of a broken policy) on an FR3's twin. A
+process of its own runs it, as `deploy --execute` does, the fault comes while the arm moves, and the
+twin's truth says what the arm did.
+"""
+
+import json
+import multiprocessing
+import os
+import resource
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing.context import ForkServerProcess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from touchgoal.benchmarks.options import BenchmarkOptions
+from touchgoal.control import features as ft
+from touchgoal.control.cell.cell_file import cell_table, read_cell_file
+from touchgoal.control.cell.config import CellConfig
+from touchgoal.control.cell.connection import cell_watchdogs, connect_cell
+from touchgoal.control.deployment.control_loop import PLAN_ENDED, ControlLoop, DeployedActor
+from touchgoal.control.deployment.session import Session
+from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import DriverError
+from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.episodes.repair import validate
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.policies.deployed import LearnedActor, make_actor
+from touchgoal.policies.policy import PolicyConfig
+from touchgoal.runtime.atomic_write import write_file
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import checked_dataclass
+from touchgoal.sim_envs.config import PickPlaceConfig
+from touchgoal.sim_envs.twin.control_port import ask_twin
+from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
+
+
+@checked_dataclass
+class Config(BenchmarkOptions):
+    """Does a deployment survive every fault, on the twin through the makers' client libraries?"""
+
+    faults: tuple[str, ...] = ()
+    """Names of faults to try, as the table has them; default: all."""
+    lock_step: bool = True
+    """Simulated time waits for the client: for a machine that is busy."""
+
+
+_TIMEOUT = 300.0  # s for anything to happen, on a machine however loaded
+_IN_THE_AIR = 0.08  # m: height of an object that is carried
+_UNLIMITED = resource.RLIM_INFINITY
+_FORKSERVER = multiprocessing.get_context("forkserver")  # one import of everything serves every row
+_FORKSERVER.set_forkserver_preload([__name__])
+
+
+@dataclass(frozen=True)
+class FaultCase:
+    """One fault: a line to the twin's port, or a signal, or a policy, or none of these."""
+
+    name: str
+    control_line: str = ""
+    policy: str = "expert"
+    kills: bool = False
+    full: bool = False
+    carrying: bool = False  # it comes once the object is in the air, not as soon as the arm moves
+
+
+CASES = (
+    FaultCase("none"),
+    FaultCase("server killed in motion", "kill"),
+    FaultCase("arm's link lost alone", "drop"),
+    FaultCase("link frozen 0.1 s", "freeze 0.1"),
+    FaultCase("link frozen 0.5 s", "freeze 0.5"),
+    FaultCase("link frozen 2 s", "freeze 2"),
+    FaultCase("camera stalled", "stall front 60"),
+    FaultCase("camera frozen on a frame", "repeat front 60"),
+    FaultCase("fingertip: wrong bytes", "break tactile_left 60"),
+    FaultCase("fingertip: half pictures", "halve tactile_left 60"),
+    FaultCase("speeds are no numbers", "nonsense on"),
+    FaultCase("fingertip unplugged", "lose tactile_left 60"),
+    FaultCase("gripper silent", "silence-gripper on"),
+    FaultCase("object lost on the way", "take-object", carrying=True),
+    FaultCase("load cell garbled", "garble load_cell 1.0"),
+    FaultCase("policy: not a number", policy="nan"),
+    FaultCase("policy hangs", policy="hangs"),
+    FaultCase("joint limit ahead", policy="outwards"),
+    FaultCase("force ceiling met", "nudge 0 29 0 3"),
+    FaultCase("contact reflex", "error cartesian_reflex"),
+    FaultCase("user stop", "stop-button on"),
+    FaultCase("deploy killed (-9)", kills=True),
+    FaultCase("disk full", full=True),
+)
+
+
+@dataclass(frozen=True)
+class FaultRow:
+    """What one fault did.
+
+    Attributes:
+        message: what the operator is told.
+        rest: s (simulated) from the fault until the arm is at rest; not a number if the fault stops
+            no arm, or takes the controller, and so the twin, away.
+        excess: rad beyond the maker's joint range; speed: share of the maker's joint speed.
+        force: N, the most that pressed on the robot from outside.
+        episodes_whole: whether all is on disk and whole that had been finished, this run's episode included
+            unless its process or its disk was what failed.
+        late: ms by which 99 % of the ticks were late at most.
+    """
+
+    name: str
+    message: str
+    rest: float
+    excess: float
+    speed: float
+    force: float
+    episodes_whole: bool
+    late: float
+
+
+def run(config: Config) -> dict[str, Any]:
+    """The table and its numbers."""
+    names = [case.name for case in CASES]
+    if unknown := [name for name in config.faults if name not in names]:
+        raise UserError(f"there is no fault {unknown[0]!r}; there are: {', '.join(names)}")
+    cases = [c for c in CASES if not config.faults or c.name in config.faults]
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for i, case in enumerate(cases):
+            rows.append(_run(case, Path(folder) / str(i), config.lock_step, i))
+            print(_line(rows[-1]), file=sys.stderr, flush=True)
+    return {"table": _table(rows), "rows": [vars(row) for row in rows]}
+
+
+def _run(case: FaultCase, folder: Path, lock_step: bool, number: int) -> FaultRow:
+    folder.mkdir()
+    pid = os.getpid()
+    host = f"127.{60 + number}.{pid // 250 % 250}.{1 + pid % 250}"
+    broken_at = folder / "broken_at"
+    twin = _spawn(_serve, host, folder, lock_step)
+    _wait_until(lambda: (folder / "cell.json").exists() or not twin.is_alive())
+    cell = read_cell_file(folder / "cell.json")
+    cell = replace(cell, task=replace(cell.task, start=None))
+    episodes, report = folder / "episodes", folder / "report"
+    deploy = _spawn(_deploy, cell, case, episodes, report, broken_at)
+    try:
+        before, after = _inject(case, cell, deploy, report)
+        deploy.join(_TIMEOUT)
+        hung = deploy.is_alive()
+    finally:
+        for process in (deploy, twin):
+            process.kill()
+            process.join()
+    message, late = "it hangs", float("nan")
+    if report.exists():
+        late, message = report.read_text().split("\n", 1)
+    elif not hung:
+        message = "its process is gone; the driver's process brings the arm to rest"
+    worst = after["worst"] if after else dict.fromkeys(("excess", "speed", "force"), float("nan"))
+    if broken_at.exists():
+        before = float(broken_at.read_text())
+    stops = message != PLAN_ENDED and (case.kills or case.control_line or broken_at.exists())
+    rest = after["time"] - after["rest"] - before if after and stops else float("nan")
+    finished = 1 if case.kills or case.full else 2
+    episodes_whole = len(EpisodeSet(episodes)) == finished and not _damaged(episodes)
+    return FaultRow(
+        case.name, message, rest, **worst, episodes_whole=episodes_whole, late=float(late)
+    )
+
+
+def _inject(
+    case: FaultCase, cell: CellConfig, deploy: ForkServerProcess, report: Path
+) -> tuple[float, dict[str, Any] | None]:
+    """Break it while the arm moves; the twin's time then, and its truth once the arm rests."""
+    port = cell.task.twin
+
+    def truth() -> dict[str, Any]:
+        return ask_twin(port, "truth")
+
+    def begun(now: dict[str, Any]) -> bool:
+        if case.carrying:
+            return now["layout"]["object"][2] > _IN_THE_AIR
+        return max(np.abs(now["dq"])) > 0.1
+
+    _wait_until(lambda: begun(truth()) or report.exists() or not deploy.is_alive())
+    moment = truth()["time"]
+    if case.kills:
+        deploy.kill()
+    elif case.control_line:
+        try:
+            ask_twin(port, case.control_line)
+        except UserError:  # the twin is gone, as asked
+            return moment, None
+    _wait_until(lambda: report.exists() or case.kills or not deploy.is_alive())
+    _wait_until(lambda: truth()["rest"] > 0.2)
+    return moment, truth()
+
+
+def _serve(host: str, folder: Path, lock_step: bool) -> None:
+    """The twin's process."""
+    task = PickPlaceConfig(cameras=("front",), objects=("wooden_block",))
+    twin = Twin(TwinConfig(task, "fr3", 3, host, 0, lock_step, folder))
+    write_file(folder / "cell.json", json.dumps(cell_table(twin.cell_config)).encode())
+    twin.run()
+
+
+def _deploy(
+    cell: CellConfig, case: FaultCase, episodes: Path, report: Path, broken_at: Path
+) -> None:
+    """The deployment's process; a first, short episode is there before the fault comes."""
+    connection = connect_cell(cell, ft.CONTROL_HZ)
+    safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
+    truth = partial(ask_twin, cell.task.twin, "truth")
+
+    def session(make: Callable[[ControlLoop], DeployedActor], seconds: float) -> Session:
+        short = replace(cell, task=replace(cell.task, seconds=seconds))
+        return Session(
+            short, connection, safety, episodes, True, make, lambda: "", lambda _: None, truth
+        )
+
+    def expert(loop: ControlLoop) -> DeployedActor:
+        return make_actor(cell, None, safety, truth, loop.commanded)
+
+    def mark_broken() -> None:
+        broken_at.write_text(str(truth()["time"]))
+
+    def faulty(loop: ControlLoop) -> DeployedActor:
+        if case.policy == "expert":
+            return expert(loop)
+        if case.policy == "hangs":
+            return LearnedActor(HangingPlanner(loop.width, mark_broken), connection.robot)
+        return BrokenPolicy(case.policy, loop, mark_broken)
+
+    late, message = float("nan"), ""
+    try:
+        session(lambda d: BrokenPolicy("still", d, mark_broken), 0.5).run()
+        if case.full:  # a file that may not grow fails as on a full disk, in the middle of a write
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, _UNLIMITED))
+        result = session(faulty, 10.0 if case.policy == "outwards" else 40.0).run()
+        late = 1e3 * float(np.percentile(result.log.lateness or [np.nan], 99))
+        message = result.recording_error or result.ending.reason
+        if case.policy == "outwards":
+            message += "; clamped: " + ", ".join(
+                f"{name} {n}" for name, n in result.log.limit_counts.items()
+            )
+    except (DriverError, UserError) as error:  # nothing has moved
+        message = f"it did not begin: {error}"
+    resource.setrlimit(resource.RLIMIT_FSIZE, (_UNLIMITED, _UNLIMITED))
+    report.write_text(f"{late}\n{message}")
+    connection.close()
+
+
+class BrokenPolicy:
+    """A policy that moves well for a second and then breaks as it is told."""
+
+    done, action_age = False, 0.0
+
+    def __init__(self, how: str, loop: ControlLoop, mark_broken: Callable[[], None]) -> None:
+        self._how, self._loop, self._mark_broken, self._ticks = how, loop, mark_broken, 0
+
+    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """See DeployedActor."""
+        self._ticks += 1
+        n, width = self._loop.commanded().size, self._loop.width
+        step = np.zeros(n)
+        joint = -1 if self._how == "outwards" else 0  # the wrist's end comes before the workspace's
+        step[joint] = 0.0 if self._how == "still" else 0.02
+        if self._how == "nan" and self._ticks > ft.CONTROL_HZ:
+            step[0] = np.nan
+            if self._ticks == ft.CONTROL_HZ + 1:
+                self._mark_broken()
+        return np.append(step, width)
+
+    def close(self) -> None:
+        """Nothing is left behind."""
+
+
+class HangingPlanner:
+    """A planner that turns the base and then never answers again, in the real planning thread."""
+
+    config = PolicyConfig(
+        touch_dim=0, touch="", observation_horizon=1, execution_horizon=8, prediction_horizon=16
+    )
+    ticks_seen = 1
+
+    def __init__(self, width: float, mark_broken: Callable[[], None]) -> None:
+        self._width, self._mark_broken, self._plans = width, mark_broken, 0
+
+    def embed(self, seen: Sequence[Observation]) -> None:
+        """Nothing is embedded ahead."""
+
+    def plan(self, seen: Sequence[Observation]) -> np.ndarray:
+        """Three plans, then none."""
+        self._plans += 1
+        if self._plans > 3:
+            self._mark_broken()
+            threading.Event().wait()
+        plan = np.zeros((self.config.prediction_horizon, ft.N_JOINTS + 1), np.float32)
+        plan[:, 0], plan[:, -1] = 0.02, self._width
+        return plan
+
+
+def _spawn(target: Callable[..., None], *arguments: Any) -> ForkServerProcess:
+    process = _FORKSERVER.Process(target=target, args=arguments)
+    process.start()
+    return process
+
+
+def _wait_until(holds: Callable[[], bool]) -> None:
+    end = time.monotonic() + _TIMEOUT
+    while not holds() and time.monotonic() < end:
+        time.sleep(0.01)
+
+
+def _damaged(episodes: Path) -> bool:
+    """Whether a finished episode is; what an interrupted one left behind belongs to none."""
+    return any("belongs to no episode" not in line for line in validate(episodes))
+
+
+def _line(row: FaultRow) -> str:
+    episodes_whole = "whole" if row.episodes_whole else "LOST"
+    rest = "-" if np.isnan(row.rest) else f"{row.rest:.2f}"
+    limits = f"{'-':>9}{'-':>7}{'-':>8}"
+    if not np.isnan(row.excess):
+        limits = f"{row.excess:>9.3f}{row.speed:>7.0%}{row.force:>8.1f}"
+    late = "-" if np.isnan(row.late) else f"{row.late:.1f}"
+    return f"{row.name:<25}{rest:>7}{limits}{late:>8}  {episodes_whole:<7}{row.message}"
+
+
+def _table(rows: list[FaultRow]) -> str:
+    head = (
+        f"{'fault':<25}{'rest s':>7}{'beyond':>9}{'speed':>7}{'force N':>8}{'late ms':>8}  {'kept':<7}"
+        "what the operator sees"
+    )
+    return "\n".join([head, *(_line(row) for row in rows)])

@@ -1,0 +1,113 @@
+"""How often a policy succeeds in the environment when what it sees, plans and commands comes late.
+
+The arm is as deployed otherwise: `--env.as-deployed` with other delays. With `causes` each part of that
+is put in by itself, and left out by itself. The same seeds in every row.
+"""
+
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from typing import Any
+
+from touchgoal.benchmarks.options import CORES, BenchmarkOptions
+from touchgoal.policies.by_name import choose_policy, env_config_for
+from touchgoal.policies.evaluation.evaluate import Evaluation, Trial, run_trials, trial_specs
+from touchgoal.runtime import seeds
+from touchgoal.runtime.option_types import Count, NotNegative, Positive, Seed, checked_dataclass
+from touchgoal.sim_envs.config import (
+    AS_DEPLOYED,
+    IDEAL_DEPLOYMENT,
+    BeadMazeConfig,
+    DeploymentConfig,
+    PickPlaceConfig,
+    TaskConfig,
+    TaskName,
+)
+
+
+@checked_dataclass
+class Config(BenchmarkOptions):
+    """How often does a policy succeed when everything comes late?"""
+
+    task: TaskName = "pick-place"
+    """In which task; of the maze, on validation wires."""
+    policy: str = "shipped"
+    """Which policy, named as for run-policy."""
+    causes: bool = False
+    """Instead of the delays, an ablation: each effect of a deployment alone, then all but it."""
+    delay: tuple[NotNegative, ...] = (0.0, 50.0, 100.0, 150.0)
+    """Total delay from sensing to command, ms, half of it before the policy and half after; planning adds
+    a tick."""
+    jitter: tuple[NotNegative, ...] = (0.0, 50.0)
+    """By how much each half may be longer, drawn tick by tick, ms."""
+    rates: tuple[Positive, ...] = (30.0, 15.0)
+    """Pictures a second, Hz."""
+    episodes: Count = 20
+    """Number of episodes of each row."""
+    seed: Seed = seeds.POLICY_TEST.start
+    """Random seed of the first episode; each further one adds one."""
+    workers: Count = CORES
+    """Processes that simulate."""
+
+
+# Parts of `--env.as-deployed`, by what a person would call them.
+_PARTS = {
+    "lag, limits and tracker": ("tracker",),
+    "a Franka Hand": ("franka_hand",),
+    "an estimated wrench": ("estimated_wrench",),
+    "late states and pictures": ("state_delay", "picture_delay", "picture_rate", "jitter"),
+    "late commands": ("command_delay",),
+    "late plans": ("plan_ticks",),
+}
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Success by delay, jitter and picture rate, or by cause; `table` and the trials behind it."""
+    cases = _causes() if config.causes else _delays(config)
+    lines = [f"{'':<46}{'success [95 % Wilson]':<24}{'peak N':>7}"]
+    rows = []
+    for what, as_deployed, between in cases:
+        trials = _trials(config, as_deployed, between)
+        peak = max(trial.peak_force for trial in trials)
+        lines.append(f"{what:<46}{Evaluation(trials)!s:<24}{peak:>7.0f}")
+        print(lines[-1], file=sys.stderr, flush=True)
+        rows.append({"what": what, "trials": [asdict(trial) for trial in trials]})
+    return {"table": "\n".join(lines), "rows": rows}
+
+
+def _delays(config: Config) -> Iterator[tuple[str, bool, DeploymentConfig]]:
+    for rate in config.rates:
+        for jitter in config.jitter:
+            for delay in config.delay:
+                half = delay / 2000, delay / 2000  # s: before the policy, and after it
+                between = DeploymentConfig(
+                    state_delay=half,
+                    picture_delay=half,
+                    command_delay=half,
+                    jitter=(jitter / 1000, jitter / 1000),
+                    picture_rate=rate,
+                )
+                what = f"{delay:.0f} ms, jitter {jitter:.0f} ms, pictures {rate:.0f} Hz"
+                yield what, True, between
+
+
+def _causes() -> Iterator[tuple[str, bool, DeploymentConfig]]:
+    yield "the plain environment", False, DeploymentConfig()
+    for what, fields in _PARTS.items():
+        own = {field: getattr(AS_DEPLOYED, field) for field in fields}
+        yield f"only {what}", False, DeploymentConfig(**own)
+    yield "as deployed", True, DeploymentConfig()
+    for what, fields in _PARTS.items():
+        own = {field: getattr(IDEAL_DEPLOYMENT, field) for field in fields}
+        yield f"as deployed, but for {what}", True, DeploymentConfig(**own)
+
+
+def _trials(config: Config, as_deployed: bool, between: DeploymentConfig) -> tuple[Trial, ...]:
+    task: TaskConfig = PickPlaceConfig()
+    if config.task == "bead-maze":
+        task = BeadMazeConfig(split="validation")
+    task = replace(task, as_deployed=as_deployed, deployment=between)
+    policy = choose_policy(config.policy, task)
+    task = env_config_for(policy, task)
+    specs = trial_specs(task, config.episodes, config.seed)
+    return tuple(run_trials(task, policy, specs, config.workers))

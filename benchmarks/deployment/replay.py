@@ -1,0 +1,199 @@
+"""The same actions through the environment as deployed and over the wire: how far do the two arms part?
+
+What is left between a policy's simulator and the arm's own protocol, without any policy: joint changes
+of a wave in free air, and of a closed hand that is pressed onto the table.
+"""
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.benchmarks.deployment.deployed_twin import DeployedTwin
+from touchgoal.benchmarks.options import BenchmarkOptions
+from touchgoal.control import features as ft
+from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.cell.config import CellConfig
+from touchgoal.control.cell.connection import connect_cell
+from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.control.safety.limits import Box, RobotLimits
+from touchgoal.runtime import seeds
+from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
+from touchgoal.sim_envs.config import DeploymentConfig, PickPlaceConfig
+from touchgoal.sim_envs.deployed_arm import all_well
+from touchgoal.sim_envs.pick_place import PickPlace
+from touchgoal.sim_envs.servo_lag import ServoLag
+
+
+@checked_dataclass
+class Config(BenchmarkOptions):
+    """The same actions in the environment as deployed and over the wire: how far do the arms part?"""
+
+    episodes: Count = 3
+    """Waves in free air, and presses onto the table."""
+    seed: Seed = seeds.REPLAY.start
+    """Random seed of the first."""
+
+
+_OBJECT = "wooden_block"
+_HZ = ft.CONTROL_HZ
+_FLOOR = -0.02  # m, of the box here: the table is to be pressed
+_DELAY = 0.005  # s from a command to the arm: half of the two streams' periods
+_WAVE_SECONDS, _WAVE = 2.0, 0.012  # s, and rad a tick at most
+_ABOVE = 0.005  # m of the fingers' lowest corner above the table when it goes on slowly
+_PRESSED = -5e-4  # m, the same as commanded at the end
+_DOWN_SECONDS, _PRESS_SECONDS, _HOLD_SECONDS = 2.5, 2.5, 0.5  # s; faster, and the reflex ends it
+_TOUCHING = 1.0  # N
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What came of a row of actions, tick by tick.
+
+    Attributes:
+        q: measured joint positions, rad.
+        force: on the hand from outside, N (base frame).
+    """
+
+    q: Float[np.ndarray, "t 7"]
+    force: Float[np.ndarray, "t 3"]
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Replay both motions for every seed."""
+    rows, lines = [], [f"{'motion, seed':<18}{'joints rad':>12}{'tool mm':>10}{'force N':>18}"]
+    for k in range(config.episodes):
+        for row in replay_both(config.seed + k, k):
+            rows.append(row)
+            forces = f"{row['force here']:.1f} and {row['force there']:.1f}"
+            lines.append(
+                f"{row['motion'] + ', ' + str(row['seed']):<18}{row['joints']:>12.4f}"
+                f"{1e3 * row['tool']:>10.2f}{forces if row['motion'] == 'press' else '':>18}"
+            )
+    lines.append(
+        "joints and tool: greatest distance at a tick; force: median while the table is pressed,"
+    )
+    lines.append("in the environment and over the wire")
+    return {"rows": rows, "table": "\n".join(lines)}
+
+
+def replay_both(seed: int, number: int = 0) -> Iterator[dict[str, Any]]:
+    """How far the arms part in a wave and in a press, on a twin of their own.
+
+    Joints in rad and the tool in m, the greatest distance at any tick; force in N, the median while the
+    table is pressed in the environment, `here` and `there` (over the wire). Twins of different numbers
+    run side by side.
+    """
+    env = _environment()
+    with (
+        tempfile.TemporaryDirectory() as name,
+        DeployedTwin("pick-place", seed, _OBJECT, True, Path(name), number, exact=True) as twin,
+    ):
+        cell = replace(read_cell_file(twin.cell_file), cameras={}, fingertips=None)
+        for motion, actions_of in (("wave", _wave), ("press", _press)):
+            env.reset(seed=seed)
+            actions = list(actions_of(env, seed))
+            here = _in_environment(env, actions, seed)
+            there = _over_the_wire(cell, actions, seed)
+            yield {"motion": motion, "seed": seed, **_distances(env, here, there)}
+
+
+def _environment() -> PickPlace:
+    between = DeploymentConfig(
+        command_delay=(_DELAY, _DELAY),
+        state_delay=(0.0, 0.0),
+        jitter=(0.0, 0.0),
+        estimated_wrench=False,
+    )
+    # Fingertips as the twin's, which are drawn by the same seed: so arm and object begin alike.
+    config = PickPlaceConfig(objects=(_OBJECT,), cameras=(), as_deployed=True, deployment=between)
+    env = PickPlace(config)
+    env.robot = _able_to_press(env.robot)
+    return env
+
+
+def _able_to_press(robot: RobotLimits) -> RobotLimits:
+    box = robot.fingertips
+    low = np.array([*box.lower[:2], _FLOOR])
+    return replace(robot, fingertips=Box(low, box.upper))
+
+
+def _wave(env: PickPlace, seed: int) -> Iterator[np.ndarray]:
+    """Joint changes that come and go, each joint at its own rate."""
+    rng = np.random.default_rng(seed)
+    rate, phase = rng.uniform(0.3, 1.0, env.n_joints), rng.uniform(0, 2 * np.pi, env.n_joints)
+    for t in np.arange(0, _WAVE_SECONDS, 1 / _HZ):
+        swing = _WAVE * np.sin(2 * np.pi * rate * t + phase) * min(1.0, t)
+        yield np.append(swing, 0.0)
+
+
+def _press(env: PickPlace, _: int) -> Iterator[np.ndarray]:
+    """Straight down onto the table, from just above it, with a closed hand."""
+    q = env.command.copy()
+    position, R = env.kinematics.forward(q)
+    corners = (
+        position
+        + (np.array(env.robot.tool.finger_corners) - [0, 0, env.robot.tool.tcp_offset]) @ R.T
+    )
+    drop = corners[:, 2].min()
+    down = np.concatenate(
+        [
+            np.linspace(0, drop - _ABOVE, round(_DOWN_SECONDS * _HZ)),
+            np.linspace(drop - _ABOVE, drop - _PRESSED, round(_PRESS_SECONDS * _HZ)),
+            np.full(round(_HOLD_SECONDS * _HZ), drop - _PRESSED),
+        ]
+    )
+    for depth in down:
+        wanted = env.kinematics.solve_ik_near(position - [0, 0, depth], R, q).q
+        yield np.append(wanted - q, 0.0)
+        q = wanted
+
+
+def _in_environment(env: PickPlace, actions: list[np.ndarray], seed: int) -> Replayed:
+    env.reset(seed=seed)
+    q, force = [], []
+    for action in actions:
+        env.step(action.astype(np.float32))
+        q.append(env.joints()[0].copy())
+        force.append(env.external_wrench()[:3].copy())
+    return Replayed(np.array(q), np.array(force))
+
+
+def _over_the_wire(cell: CellConfig, actions: list[np.ndarray], seed: int) -> Replayed:
+    connection = connect_cell(replace(cell, task=replace(cell.task, seed=seed)), _HZ)
+    robot = _able_to_press(connection.robot)
+    safety, lag = ActionFilter(robot, _HZ), ServoLag(robot, 1 / _HZ)
+    arm, q, force = connection.arm, [], []
+    state = safety.start(arm.read().q)
+    try:
+        for action in actions:
+            step = lag.update(action[:-1].astype(np.float32).astype(np.float64))
+            state = safety.filter_action(state, step, all_well(state.q))
+            arm.command(state.q)
+            connection.gripper.command(float(action[-1]))
+            connection.clock.wait(connection.clock.now() + 1 / _HZ)
+            reading = arm.read()
+            q.append(reading.q)
+            force.append(reading.wrench[:3])
+    finally:
+        connection.close()
+    return Replayed(np.array(q), np.array(force))
+
+
+def _distances(env: PickPlace, here: Replayed, there: Replayed) -> dict[str, float]:
+    tools = (np.array([env.kinematics.forward(q)[0] for q in r.q]) for r in (here, there))
+    pressing = np.linalg.norm(here.force, axis=1) > _TOUCHING
+    force_here, force_there = (
+        float(np.median(np.linalg.norm(r.force[pressing], axis=1))) if pressing.any() else 0.0
+        for r in (here, there)
+    )
+    return {
+        "joints": float(np.abs(here.q - there.q).max()),
+        "tool": float(np.linalg.norm(np.subtract(*tools), axis=1).max()),
+        "force here": force_here,
+        "force there": force_there,
+    }

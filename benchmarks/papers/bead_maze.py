@@ -1,0 +1,335 @@
+"""Does touch lead a bead along a wire never seen (TacBench T5, Sparsh Table 10), closed loop too?
+
+Every policy of the same recipe counts as one arm, its seeds as repeats. All arms meet the same
+wires and the same starts. Open loop: see `policies/evaluation/open_loop.py`, along expert demonstrations on
+test wires that nothing disturbs unless asked.
+"""
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from pydantic import Field
+
+from touchgoal.benchmarks.options import CORES, BenchmarkOptions
+from touchgoal.control.features import Observation
+from touchgoal.encoders.pretrained import ENCODER_FORMAT
+from touchgoal.encoders.ssl.untrained import Method
+from touchgoal.episodes.recording import Actor, EpisodeSpec, collect
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.policies import checkpoint
+from touchgoal.policies.acting import Planner, PolicyActor
+from touchgoal.policies.by_name import follower
+from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
+from touchgoal.policies.evaluation import open_loop
+from touchgoal.policies.evaluation.evaluate import Trial, run_trials
+from touchgoal.policies.evaluation.open_loop import OpenLoopErrors, Plan, open_loop_errors
+from touchgoal.policies.evaluation.success_rate import SuccessRate
+from touchgoal.policies.heads.diffusion import RegressionConfig
+from touchgoal.policies.perception.frozen_touch import shipped_touch
+from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
+from touchgoal.policies.training.sequence_dataset import (
+    SequenceDataset,
+    cached_embeddings,
+    load_recordings,
+)
+from touchgoal.runtime import seeds
+from touchgoal.runtime.option_types import Count, CountOrNone, checked_dataclass
+from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.config import BeadMazeConfig
+from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
+from touchgoal.sim_envs.scene.wires import HELD_OUT, Wire, choose
+
+
+@checked_dataclass
+class Config(BenchmarkOptions):
+    """Does touch lead a bead along a wire never seen (TacBench T5, Sparsh Table 10)?"""
+
+    policies: tuple[Path, ...] = ()
+    """Folders of policies that train-policy made; those of one recipe count as training seeds of it.
+    Default: the shipped one."""
+    wires: Count = 100
+    """Number of test wires, of the families trained on."""
+    held_out: CountOrNone = 20
+    """Number of test wires of the family held out; 0 leaves it out."""
+    demonstrations: Annotated[int, Field(ge=2)] = 20
+    """Number of test wires on which open-loop errors are measured."""
+    plan_ticks: tuple[CountOrNone, ...] = (1, 2)
+    """Control ticks by which plans come late, tried besides 0 on the first policy."""
+    shuffled: bool = True
+    """Try every policy with frozen touch also with what was felt on another wire."""
+    env: BeadMazeConfig = BeadMazeConfig(split="test")
+    """Options of the maze, e.g. a disturbance; demonstrations are recorded with the same."""
+    workers: Count = CORES
+    """Processes that simulate."""
+
+
+class ShuffledTouchPlanner(Planner):
+    """A planner that feels, tick by tick, what was felt on another wire."""
+
+    recorded_touch: Float[np.ndarray, "t e"]
+    tick = -1
+
+    def plan(self, seen: Any) -> Float[np.ndarray, "h 8"]:
+        """As `Planner.plan`."""
+        self.tick = min(self.tick + self.config.execution_horizon, len(self.recorded_touch) - 1)
+        return super().plan(seen)
+
+    def _embed_touch(self, seen: Sequence[Observation]) -> Float[np.ndarray, " e"]:
+        return self.recorded_touch[max(self.tick, 0)]
+
+
+@dataclass(frozen=True)
+class ShuffledTouch:
+    """Makes a policy whose touch was shuffled: it feels an episode on another wire.
+
+    Which one is drawn by the trial's seed.
+
+    Attributes:
+        policy: makes it, undisturbed.
+        episodes: embedded, see `load_recordings`.
+    """
+
+    policy: SavedPolicy
+    episodes: EpisodeSet
+
+    def __call__(self, env: BeadMaze) -> Actor:
+        """For one episode."""
+        torch.set_num_threads(1)
+        loaded = checkpoint.load(self.policy.directory)
+        touch = self.policy.touch(loaded.config)
+        assert touch is not None
+        planner = ShuffledTouchPlanner(loaded, touch)
+        rows = other_wires(self.episodes, env.wire.name)
+        chosen = rows[int(env.np_random.integers(len(rows)))]
+        planner.recorded_touch = cached_embeddings(self.episodes, chosen, touch).astype(np.float32)
+        return PolicyActor(planner, self.policy.plan_ticks)
+
+
+def other_wires(episodes: EpisodeSet, wire: str) -> list[int]:
+    """Episodes that were not recorded on a wire."""
+    return [i for i in range(len(episodes)) if episodes.meta(i)["wire"] != wire]
+
+
+def _specs(wires: list[Wire], seed: int) -> list[EpisodeSpec]:
+    """One trial on each wire; the seeds, from `seed` on, place the maze and grip the bead."""
+    return [EpisodeSpec(seed + i, options={"wire": w.name}) for i, w in enumerate(wires)]
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Open loop, then closed loop.
+
+    Returns:
+        `table`, and the numbers behind it.
+    """
+    config = replace(config, policies=config.policies or (SHIPPED_POLICIES["bead-maze"],))
+    arms = _group_by_recipe(config.policies)
+    with tempfile.TemporaryDirectory() as folder:
+        recorded = _record(config, Path(folder) / "episodes")
+        opened = {name: _open_loop(arm, recorded, config.workers) for name, arm in arms.items()}
+        closed = _closed_loop(config, arms, recorded)
+    table = "\n\n".join([_closed_table(closed), _open_table(opened)])
+    return {
+        "table": table,
+        "closed_loop": {name: [asdict(t) for t in trials] for name, trials in closed.items()},
+        "open_loop": opened,
+    }
+
+
+def _group_by_recipe(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
+    arms: dict[str, list[Path]] = {}
+    for directory in policies:
+        config = checkpoint.load(directory).config
+        inputs = [f"frozen touch ({_encoder_name(directory, config)})"] if config.touch_dim else []
+        inputs += ["end-to-end touch"] * (config.end_to_end is not None)
+        episodes = checkpoint.POLICY_FORMAT.provenance(directory)["episodes"]
+        name = f"{' and '.join(inputs) or 'state only'}, {episodes} demos"
+        if config.touch_dim and config.touch_input == "embedding":
+            name += ", not taught by wrenches"
+        if isinstance(config.head, RegressionConfig):
+            name += ", regression"
+        arms.setdefault(name, []).append(directory)
+    return arms
+
+
+def _encoder_name(policy: Path, config: PolicyConfig) -> str:
+    """Of its touch encoder: its name if it ships, else what it was trained by, such as `dino`."""
+    if shipped := shipped_touch(config.touch):
+        return shipped
+    known = ENCODER_FORMAT.provenance(policy / checkpoint.TOUCH)
+    return next((n for n in ("align", *get_args(Method), "untrained") if n in known), "another")
+
+
+# ---- closed loop
+
+
+def _closed_loop(
+    config: Config, arms: dict[str, list[Path]], recorded: EpisodeSet
+) -> dict[str, list[Trial]]:
+    maze = config.env
+    blind = replace(maze, tactile=False)
+    jobs = _specs(choose(maze.split, config.wires, maze.families), seeds.POLICY_TEST.start)
+    other = _specs(
+        choose(maze.split, config.held_out, (HELD_OUT,)), seeds.POLICY_TEST.start + 10_000
+    )
+    results: dict[str, list[Trial]] = {}
+
+    def run_arm(name: str, env: BeadMazeConfig, makers: list[Callable], trials: list) -> None:
+        if not trials:
+            return
+        print(f"{name}: {len(makers)} x {len(trials)} wires")
+        results[name] = [t for m in makers for t in run_trials(env, m, trials, config.workers)]
+
+    run_arm("expert (sees the wire)", blind, [BeadMazeExpert], jobs)
+    run_arm("follower (force and first tangent)", blind, [follower], jobs)
+    run_arm(f"follower, {HELD_OUT}", blind, [follower], other)
+    for name, directories in arms.items():
+        makers = [SavedPolicy(d) for d in directories]
+        env = makers[0].env_config(maze)
+        run_arm(name, env, makers, jobs)
+        run_arm(f"{name}, {HELD_OUT}", env, makers, other)
+        if config.shuffled and checkpoint.load(directories[0]).config.touch_dim:
+            shuffled = [ShuffledTouch(maker, recorded) for maker in makers]
+            run_arm(f"{name}, shuffled", blind, shuffled, jobs)
+    first = config.policies[0]
+    for ticks in config.plan_ticks:
+        late = SavedPolicy(first, plan_ticks=ticks)
+        run_arm(f"first policy, {ticks} ticks late", late.env_config(maze), [late], jobs)
+    return results
+
+
+def _closed_table(results: dict[str, list[Trial]]) -> str:
+    width = max(len(name) for name in results) + 2
+    lines = [
+        f"{'closed loop, test wires':<{width}}{'success [95 % Wilson]':<24}"
+        f"{'completed [95 %]':<22}{'drop':>5}{'jam':>5}{'force':>6}{'peak N':>8}"
+    ]
+    for name, trials in results.items():
+        rate = SuccessRate(sum(t.success for t in trials), len(trials))
+        failures = [
+            sum(t.failure == kind for t in trials) for kind in ("drop", "jam", "over_force")
+        ]
+        low, high = bootstrap([(str(t.episode["wire"]), t.progress) for t in trials])
+        done = f"{np.mean([t.progress for t in trials]):.0%} [{low:.0%}, {high:.0%}]"
+        lines.append(
+            f"{name:<{width}}{rate!s:<24}{done:<22}{failures[0]:>5}{failures[1]:>5}{failures[2]:>6}"
+            f"{np.median([t.peak_force for t in trials]):>8.1f}"
+        )
+    return "\n".join(lines)
+
+
+def bootstrap(values: list[tuple[str, float]], draws: int = 5000) -> tuple[float, float]:
+    """95 % interval of the mean: wires (or recordings) are drawn, then, in each, training seeds."""
+    rng = np.random.default_rng(0)
+    groups: dict[str, list[float]] = {}
+    for name, value in values:
+        groups.setdefault(name, []).append(value)
+    rows = np.array(list(groups.values()))  # wires x seeds: every seed met every wire
+    wires = rng.integers(len(rows), size=(draws, len(rows), 1))
+    seeds = rng.integers(rows.shape[1], size=(draws, 1, rows.shape[1]))
+    means = rows[wires, seeds].mean((1, 2))
+    low, high = np.quantile(means, [0.025, 0.975])
+    return float(low), float(high)
+
+
+# ---- open loop
+
+
+def _record(config: Config, root: Path) -> EpisodeSet:
+    """Expert demonstrations, on test wires and undisturbed unless other options are chosen."""
+    maze = config.env
+    wires = choose(maze.split, config.demonstrations, maze.families)
+    collect(root, maze, _specs(wires, seeds.POLICY_TEST.start), config.workers)
+    return EpisodeSet(root)
+
+
+def _open_loop(
+    directories: list[Path], episodes: EpisodeSet, workers: int
+) -> dict[str, dict[str, Any]]:
+    """Errors of an arm and of the trivial baselines, each over demonstrations and seeds."""
+    rows: dict[str, list[tuple[str, OpenLoopErrors]]] = {}
+    count = len(episodes)
+    for seed, directory in enumerate(directories):
+        policy = checkpoint.load(directory)
+        config, horizon = policy.config, policy.config.prediction_horizon
+        touch = SavedPolicy(directory).touch(config)
+        if touch:
+            load_recordings(episodes, range(count), config, touch, workers)  # embeds, all at once
+        recorded = [load_recordings(episodes, [i], config, touch) for i in range(count)]
+        for i in range(count):
+            plans = {"policy": _sampled(policy)}
+            if touch:
+                plans["policy, shuffled touch"] = _with_shuffled_touch(
+                    policy, recorded[(i + 1) % count].touch
+                )
+            if seed == 0:
+                others = [r.actions.mean(0) for k, r in enumerate(recorded) if k != i]
+                plans |= {
+                    "zero motion": open_loop.zero_motion(horizon),
+                    "repeat last": open_loop.repeat_last(config.control_hz, horizon),
+                    "mean action": open_loop.constant_action(torch.stack(others).mean(0), horizon),
+                }
+            for name, plan in plans.items():
+                errors = open_loop_errors(
+                    plan, SequenceDataset(recorded[i], config), config.control_hz
+                )
+                rows.setdefault(name, []).append((str(i), errors))
+    return {name: _summary(errors) for name, errors in rows.items()}
+
+
+def _sampled(policy: Policy) -> Plan:
+    generator = torch.Generator().manual_seed(0)
+    return lambda batch: policy.plan(batch, generator)
+
+
+def _with_shuffled_touch(policy: Policy, recorded_touch: torch.Tensor) -> Plan:
+    plan = _sampled(policy)
+
+    def shuffled(batch: ObservationBatch) -> torch.Tensor:
+        rows = torch.arange(len(batch.touch)) % len(recorded_touch)
+        touch = recorded_touch[rows].float()[:, None].expand_as(batch.touch)
+        return plan(ObservationBatch(touch, batch.state, batch.pictures))
+
+    return shuffled
+
+
+def _summary(rows: list[tuple[str, OpenLoopErrors]]) -> dict[str, Any]:
+    errors = [e for _, e in rows]
+    return {
+        "chunk_mm": np.mean([e.chunk for e in errors], 0).tolist(),
+        "forced_mm": [float(e.teacher_forced.mean()) for e in errors],
+        "forced_interval_mm": bootstrap(
+            [(name, float(e.teacher_forced.mean())) for name, e in rows]
+        ),
+        "forced_final_mm": [float(e.teacher_forced[-1]) for e in errors],
+        "free_mm": [float(e.free_running.mean()) for e in errors],
+        "path_mm": float(np.mean([e.path for e in errors])),
+    }
+
+
+def _open_table(arms: dict[str, dict[str, dict[str, Any]]]) -> str:
+    width = max(len(f"open loop, mm: {arm}") for arm in arms) + 2
+    lines = []
+    for arm, rows in arms.items():
+        path = next(iter(rows.values()))["path_mm"]
+        lines.append(
+            f"{'open loop, mm: ' + arm:<{width}}{'(A) tick 1':>11}{'(A) tick 8':>11}"
+            f"{'(B) mean [95 %]':>24}{'(B) final':>10}{'(C) mean':>10}   way {path:.0f} mm"
+        )
+        lines += [
+            f"{'  ' + name:<{width}}{r['chunk_mm'][0]:>11.2f}{r['chunk_mm'][-1]:>11.2f}"
+            f"{_forced(r):>24}{np.mean(r['forced_final_mm']):>10.2f}"
+            f"{np.mean(r['free_mm']):>10.2f}"
+            for name, r in rows.items()
+        ]
+    return "\n".join(lines)
+
+
+def _forced(row: dict[str, Any]) -> str:
+    low, high = row["forced_interval_mm"]
+    return f"{np.mean(row['forced_mm']):.2f} [{low:.1f}, {high:.1f}]"

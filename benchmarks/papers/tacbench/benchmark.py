@@ -1,0 +1,212 @@
+"""TacBench (Sparsh, Higuera et al. 2024) on a simulated bench: T1, T1A, T2, T3, T4 and T6.
+
+A probe reads each encoder's tokens of two frames 83 ms apart; encoders stay frozen, or are
+trained end to end with the probe from random weights. Labels are thinned to shares of all. Snapshots
+and thresholds are chosen on validation recordings; test recordings are for the table alone. Intervals are a
+bootstrap over test recordings, of the mean over seeds.
+"""
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from touchgoal.benchmarks.papers.tacbench.config import Config
+from touchgoal.benchmarks.papers.tacbench.data import (
+    RigFrames,
+    read_cloths,
+    read_grasps,
+    read_strokes,
+    with_fields,
+)
+from touchgoal.benchmarks.papers.tacbench.probes import (
+    END_TO_END,
+    PairTokens,
+    find_encoder_of,
+    frozen_tokens,
+)
+from touchgoal.benchmarks.papers.tacbench.published_recordings import check_tasks, find_published
+from touchgoal.benchmarks.papers.tacbench.task import Task
+from touchgoal.benchmarks.papers.tacbench.tasks import RECORDED_AS, TASKS, Recording
+from touchgoal.benchmarks.papers.tacbench.trainings import Answers, Job, Subject, work
+from touchgoal.benchmarks.papers.tacbench_report.figures import Read, pictures
+from touchgoal.benchmarks.papers.tacbench_report.tables import table
+from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
+from touchgoal.encoders.preprocess import Preprocessor
+from touchgoal.episodes.bench_recording import (
+    record_cloths,
+    record_grasps,
+    record_slides,
+    record_strokes,
+)
+from touchgoal.episodes.recording import one_core_workers
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.interruption import kept
+from touchgoal.runtime.progress import Progress
+
+_LOG = "training.log"
+_RECORDERS: dict[Recording, Callable[..., EpisodeSet]] = {
+    "strokes": record_strokes,
+    "slides": record_slides,
+    "grasps": record_grasps,
+    "cloths": record_cloths,
+}
+_READERS: dict[Recording, Callable[[EpisodeSet, int, Preprocessor], RigFrames]] = {
+    "strokes": read_strokes,
+    "slides": read_strokes,
+    "grasps": read_grasps,
+    "cloths": read_cloths,
+}
+Reading = Callable[[Preprocessor], RigFrames]
+"""Recordings, as an encoder's preprocessor makes them."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What all trainings share."""
+
+    config: Config
+    sensor: str
+    folder: Path
+    bar: Progress
+    rows: list[dict[str, Any]]
+    reads: list[Read]
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Record the bench, train every probe, judge it on test recordings."""
+    sensor = find_sensor(config.rig.sensor).name
+    published = find_published(config.data, sensor) if config.data else None
+    if published is not None and config.data is not None:
+        check_tasks(published, config.data, config.tasks)
+        sensor = published.sensor
+    encoders = {name: _encoder(name, sensor, config) for name in config.encoders}
+    short = Path(config.rig.sensor).name  # of a sensor file's folder, too
+    folder = Path("runs") / f"tacbench_{short}_{config.rig.seed}"
+    readings: dict[Recording, Reading]
+    if published is None:
+        folder = config.data or folder
+        readings = {what: _record(what, folder, config) for what in _recordings(config)}
+    else:
+        folder.mkdir(parents=True, exist_ok=True)
+        readings = {published.what: partial(published.read, getattr(config, published.what))}
+    trainings = len(encoders) * len(config.tasks) * len(config.shares) * config.seeds
+    with (
+        kept(lambda: f"recordings are kept in {config.data or folder}, trained probes are not"),
+        Progress("probes", trainings, "training") as bar,
+    ):
+        bench = Bench(config, sensor, folder, bar, [], [])
+        for what, reading in readings.items():
+            _run_recording(bench, what, reading, encoders)
+    bench.rows.sort(key=lambda row: config.tasks.index(row["task"]))
+    return {
+        "table": table(bench.rows, sensor, config, config.data if published else None),
+        "rows": bench.rows,
+        "pictures": pictures(bench.rows, bench.reads, sensor),
+    }
+
+
+def _recordings(config: Config) -> list[Recording]:
+    return list(dict.fromkeys(RECORDED_AS[task] for task in config.tasks))
+
+
+def _record(what: Recording, folder: Path, config: Config) -> Reading:
+    """Records what is missing of the bench's recordings."""
+    count = getattr(config, what)
+    episodes = _RECORDERS[what](folder / what, config.rig, count, config.workers)
+    return partial(_READERS[what], episodes, count)
+
+
+def _encoder(name: str, sensor: str, config: Config) -> BaseTouchEncoder:
+    """An encoder that fits the rig's sensor; UserError for another."""
+    encoder = find_encoder_of(name, sensor, config.seed)
+    PairTokens(encoder)  # refuses one without tokens
+    if encoder.preprocess.sensor not in (None, sensor):
+        raise UserError(
+            f"the encoder {name} is for {encoder.preprocess.sensor}, the rig has {sensor}: choose "
+            "--rig.sensor or --encoders"
+        )
+    return encoder
+
+
+def _run_recording(
+    bench: Bench, what: Recording, reading: Reading, encoders: dict[str, BaseTouchEncoder]
+) -> None:
+    """All tasks on one kind of recordings; frames and tokens are kept no longer than for these."""
+    tasks = [name for name in bench.config.tasks if RECORDED_AS[name] == what]
+    with (
+        tempfile.TemporaryDirectory(dir=bench.folder) as files,
+        one_core_workers(bench.config.workers) as workers,
+    ):
+        shared = _share(bench, tasks, reading, encoders, Path(files))
+        jobs = [
+            (Job(subject, task, share, bench.config, bench.folder / _LOG), frames)
+            for subject, frames in shared
+            for task in tasks
+            for share in bench.config.shares
+        ]
+        for (job, frames), answers in zip(
+            jobs, workers.map(work, [job for job, _ in jobs]), strict=True
+        ):
+            _judge(bench, job, frames, answers)
+            bench.bar.update(bench.config.seeds)
+    frames = shared[0][1]
+    for name in tasks:
+        bench.rows.extend(_references(name, TASKS[name](frames)))
+
+
+def _share(
+    bench: Bench,
+    tasks: list[str],
+    reading: Reading,
+    encoders: dict[str, BaseTouchEncoder],
+    files: Path,
+) -> list[tuple[Subject, RigFrames]]:
+    """Leaves what each encoder's probes read in files for the workers."""
+    seen: dict[str, tuple[Path, RigFrames]] = {}
+    shared = []
+    for i, (name, encoder) in enumerate(encoders.items()):
+        key = encoder.preprocess.id
+        if key not in seen:
+            frames = reading(encoder.preprocess)
+            if "field" in tasks:
+                frames = with_fields(frames, bench.config.rig, bench.config.workers)
+            seen[key] = files / f"frames_{i}.pt", frames
+            torch.save(frames, seen[key][0])
+        path, frames = seen[key]
+        tokens = None
+        if not name.startswith(END_TO_END):
+            tokens = files / f"tokens_{i}.pt"
+            torch.save(frozen_tokens(encoder, frames), tokens)
+        shared.append((Subject(name, bench.sensor, path, tokens), frames))
+    return shared
+
+
+def _judge(bench: Bench, job: Job, frames: RigFrames, answers: Answers) -> None:
+    """The rows of one encoder, task and share, one for each set of test frames."""
+    task, name = TASKS[job.task](frames), job.subject.name
+    validation = [torch.from_numpy(outputs) for outputs in answers.validation]
+    facts = {"task": job.task, "encoder": name, "share": job.share, "samples": answers.samples}
+    facts["seconds"] = round(answers.seconds, 1)
+    for test, rows in task.split.tests.items():
+        said = [torch.from_numpy(outputs) for outputs in answers.said[test]]
+        about = facts | {"test": test, "test_samples": len(rows)}
+        bench.rows.append(about | task.judge(said, validation, rows))
+        bench.reads.append(Read(job.task, task, frames, name, job.share, test, rows, said[0]))
+
+
+def _references(name: str, task: Task) -> list[dict[str, Any]]:
+    """Rows of what needs no encoder."""
+    rows = []
+    for test, chosen in task.split.tests.items():
+        facts = {"task": name, "test": test, "share": 1.0, "samples": 0}
+        facts["test_samples"] = len(chosen)
+        for reference, metrics in task.references(chosen).items():
+            rows.append(facts | {"encoder": reference} | metrics)
+    return rows

@@ -1,0 +1,118 @@
+"""T1A: pressure and shear over the pad, cell by cell, against the simulator's own."""
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from touchgoal.benchmarks.papers.tacbench.data import RigFrames, Rows
+from touchgoal.benchmarks.papers.tacbench.task import (
+    Metrics,
+    Outputs,
+    Targets,
+    ValidationOutputs,
+    split_force,
+)
+from touchgoal.encoders.probes.dense import DenseProbe
+from touchgoal.encoders.probes.property_probe import interval
+
+_BETA = 0.02  # of the smooth L1 loss, in shares of the training's range
+_TOUCHED = 10.0  # of the loss: cells that are pressed count so much more than the many that are not
+_PRESSED = 0.5  # kPa above which a cell counts as touched
+
+
+class FieldTask:
+    """Shear along x and y and pressure, kPa, on 24 x 24 cells.
+
+    The paper shows pictures of it alone: on real sensors nobody knows the truth.
+    """
+
+    def __init__(self, frames: RigFrames) -> None:
+        """Of the frames of strokes with their fields."""
+        assert frames.field is not None
+        self._field, self._stroke = frames.field, frames.stroke
+        self.split = split_force(frames)
+        sizes = self._field[self.split.train].abs().flatten(2).amax(2)
+        shear = torch.quantile(sizes[:, :2], 0.99)
+        self._scale = torch.stack([shear, shear, torch.quantile(sizes[:, 2], 0.99)])[:, None, None]
+        self.cells = tuple(self._field.shape[1:])
+
+    def probe(self, features: int, grid: tuple[int, int]) -> nn.Module:
+        """See Task."""
+        return nn.Sequential(DenseProbe(features, grid, 3, self._field.shape[2]), nn.Flatten())
+
+    def targets(self, rows: Rows) -> Targets:
+        """Tractions over their range, cell by cell."""
+        return (self._field[rows] / self._scale).flatten(1)
+
+    def loss(self, outputs: Outputs, targets: Targets) -> Float[Tensor, ""]:
+        """Smooth L1; touched cells count more."""
+        pressure = targets.unflatten(1, self.cells)[:, 2:]
+        touched = pressure > _PRESSED / self._scale[2].to(targets)
+        weight = (1 + (_TOUCHED - 1) * touched.float()).expand(-1, 3, -1, -1).flatten(1)
+        cellwise = F.smooth_l1_loss(outputs, targets, beta=_BETA, reduction="none")
+        return (weight * cellwise).mean()
+
+    def read(self, outputs: Outputs) -> Float[Tensor, "b 3 24 24"]:
+        """Tractions, kPa; pressure is never negative."""
+        field = outputs.unflatten(1, self.cells) * self._scale
+        return torch.cat([field[:, :2], field[:, 2:].clamp(min=0)], 1)
+
+    def truth(self, rows: Rows) -> Float[Tensor, "b 3 24 24"]:
+        """Tractions, kPa."""
+        return self._field[rows]
+
+    def error(self, outputs: Outputs, rows: Rows) -> float:
+        """Root mean square over frames, components and cells, over each component's range."""
+        wrong = (self.read(outputs) - self._field[rows]) / self._scale
+        return float(wrong.square().mean().sqrt())
+
+    def judge(
+        self, said: list[Outputs], validation: list[ValidationOutputs], rows: Rows
+    ) -> Metrics:
+        """See `field_metrics`."""
+        truth = self._field[rows].numpy()
+        read = np.stack([self.read(outputs).numpy() for outputs in said])
+        return field_metrics(read, truth, self._stroke[rows.numpy()])
+
+    def references(self, rows: Rows) -> dict[str, Metrics]:
+        """Nothing anywhere; the mean field of training."""
+        truth, things = self._field[rows].numpy(), self._stroke[rows.numpy()]
+        mean = self._field[self.split.train].mean(0).numpy()
+        guesses = {"(no force anywhere)": 0 * mean, "(mean field of training)": mean}
+        return {
+            name: field_metrics(np.broadcast_to(guess, (1, *truth.shape)), truth, things)
+            for name, guess in guesses.items()
+        }
+
+
+def field_metrics(
+    said: Float[np.ndarray, "seeds n 3 h w"],
+    truth: Float[np.ndarray, "n 3 h w"],
+    things: np.ndarray,
+) -> Metrics:
+    """Of the touched cells: share of the shear's and of the pressure's mean square that is explained.
+
+    1 is all, 0 is what no force anywhere would reach. With root mean square errors, kPa.
+    """
+    touched = truth[:, 2] > _PRESSED
+    sums = []
+    for part in (slice(0, 2), slice(2, 3)):
+        wrong = ((said[:, :, part] - truth[:, part]) ** 2).sum(2).mean(0)
+        size = (truth[:, part] ** 2).sum(1)
+        sums += [(wrong * touched).sum((1, 2)), (size * touched).sum((1, 2))]
+    table = np.stack([*sums, touched.sum((1, 2))], 1).astype(float)
+
+    def explained(values: np.ndarray, k: int) -> float:
+        return float(1 - values[:, k].sum() / max(values[:, k + 1].sum(), 1e-12))
+
+    count = max(table[:, 4].sum(), 1.0)
+    metrics: Metrics = {}
+    for k, name in ((0, "shear"), (2, "pressure")):
+        metrics[f"{name}_explained"] = explained(table, k)
+        metrics[f"{name}_explained_interval"] = list(
+            interval(table, things, lambda values, k=k: explained(values, k))
+        )
+        metrics[f"{name}_rmse_kpa"] = float(np.sqrt(table[:, k].sum() / count))
+    return metrics

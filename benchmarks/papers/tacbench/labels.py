@@ -1,0 +1,98 @@
+"""T4 and T6, one label a pair of frames: whether a grasp will hold, which cloth it is."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from touchgoal.benchmarks.papers.tacbench.data import RigFrames, Rows
+from touchgoal.benchmarks.papers.tacbench.task import (
+    Metrics,
+    Outputs,
+    Split,
+    Targets,
+    ValidationOutputs,
+    split_grasp,
+    split_textile,
+)
+from touchgoal.encoders.probes.attentive import AttentiveProbe
+from touchgoal.encoders.probes.property_probe import interval
+from touchgoal.sim_envs.cloths import CLOTHS
+
+
+class LabelTask:
+    """A label of each pair of frames."""
+
+    def __init__(
+        self, frames: RigFrames, split: Callable[[RigFrames], Split], names: tuple[str, ...]
+    ) -> None:
+        """Of frames with labels, which are numbers of these names."""
+        assert frames.label is not None
+        self._label, self._stroke = frames.label, frames.stroke
+        self.split, self.names = split(frames), names
+        train = self._label[self.split.train]
+        self._known = torch.bincount(train, minlength=len(names))
+        self._weights = len(train) / len(names) / self._known.clamp(min=1)
+
+    def probe(self, features: int, grid: tuple[int, int]) -> nn.Module:
+        """See Task."""
+        return AttentiveProbe(features, len(self.names))
+
+    def targets(self, rows: Rows) -> Targets:
+        """Labels."""
+        return self._label[rows, None].float()
+
+    def loss(self, outputs: Outputs, targets: Targets) -> Float[Tensor, ""]:
+        """Weighted cross entropy."""
+        return F.cross_entropy(outputs, targets[:, 0].long(), self._weights.to(outputs))
+
+    def truth(self, rows: Rows) -> Int[np.ndarray, " b"]:
+        """Labels."""
+        return self._label[rows].numpy()
+
+    def read(self, outputs: Outputs) -> Int[np.ndarray, " b"]:
+        """The likeliest labels."""
+        return outputs.argmax(1).numpy()
+
+    def error(self, outputs: Outputs, rows: Rows) -> float:
+        """1 less the accuracy, and a little of the loss: few recordings make many accuracies equal."""
+        loss = float(self.loss(outputs, self.targets(rows)))
+        return float((self.read(outputs) != self.truth(rows)).mean()) + 0.01 * loss
+
+    def judge(
+        self, said: list[Outputs], validation: list[ValidationOutputs], rows: Rows
+    ) -> Metrics:
+        """See `label_metrics`."""
+        read = np.stack([self.read(outputs) for outputs in said])
+        return label_metrics(read, self.truth(rows), self._stroke[rows.numpy()])
+
+    def references(self, rows: Rows) -> dict[str, Metrics]:
+        """The commonest label of training."""
+        common = np.full((1, len(rows)), int(self._known.argmax()))
+        metrics = label_metrics(common, self.truth(rows), self._stroke[rows.numpy()])
+        return {"(commonest label)": metrics}
+
+
+def label_metrics(
+    said: Int[np.ndarray, "seeds n"], truth: Int[np.ndarray, " n"], things: np.ndarray
+) -> Metrics:
+    """Accuracy, the mean over seeds, with its interval; and the mean of the accuracies of each label."""
+    right = (said == truth).mean(0)
+    return {
+        "accuracy": float(right.mean()),
+        "accuracy_interval": list(interval(right, things)),
+        "balanced_accuracy": float(np.mean([right[truth == k].mean() for k in np.unique(truth)])),
+    }
+
+
+def grasp_task(frames: RigFrames) -> LabelTask:
+    """T4: whether the object is still held after the shake."""
+    return LabelTask(frames, split_grasp, ("falls", "holds"))
+
+
+def textile_task(frames: RigFrames) -> LabelTask:
+    """T6: which cloth."""
+    return LabelTask(frames, split_textile, tuple(cloth.name for cloth in CLOTHS))

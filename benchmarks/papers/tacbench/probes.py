@@ -1,0 +1,202 @@
+"""Probes on frozen encoders, and encoders trained end to end with them: one network and one training."""
+
+import contextlib
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
+
+import torch
+from jaxtyping import Float, Float16
+from torch import Tensor, nn
+
+from touchgoal.benchmarks.papers.tacbench.data import STRIDE, RigFrames, Rows
+from touchgoal.benchmarks.papers.tacbench.task import Outputs, Task
+from touchgoal.benchmarks.real_touch.embedders import untrained, vit_of
+from touchgoal.encoders.backbones.touch_backbone import (
+    BATCH,
+    BaseTouchEncoder,
+    TouchBackbone,
+    TouchBackboneConfig,
+)
+from touchgoal.encoders.backbones.vit import PRESETS
+from touchgoal.encoders.config import TrainerOptions
+from touchgoal.encoders.pretrained import load_encoder
+from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
+from touchgoal.runtime.progress import track
+
+END_TO_END, RANDOM = "end-to-end:", "random:"
+_SNAPSHOTS = 8  # of a training, of which the best on validation frames is kept
+_MAX_VALIDATION = 160  # frames, evenly drawn
+_WEIGHT_DECAY = 0.05
+
+Inputs = Float[Tensor, "b ..."]
+
+
+@dataclass(frozen=True)
+class ProbeTraining:
+    """How a probe is trained.
+
+    Attributes:
+        steps: updates.
+        batch_size: pairs of frames of each, drawn with replacement.
+        lr: highest learning rate of AdamW.
+        seed: of initial weights and the order of the data.
+    """
+
+    steps: int
+    batch_size: int
+    lr: float
+    seed: int
+
+
+class PairTokens(nn.Module):
+    """An encoder's tokens of a frame and of the one before it, side by side at every place.
+
+    An encoder that looks back by itself gives the tokens of what it sees.
+
+    Attributes:
+        offsets: how many frames before the newest each lies that is seen.
+        looks_back: whether the encoder does by itself.
+        features: width of a token.
+        grid: rows and columns of the patches.
+    """
+
+    def __init__(self, encoder: BaseTouchEncoder) -> None:
+        """Of an encoder with a ViT; UserError for any other."""
+        super().__init__()
+        self.vit = vit_of(encoder)
+        self.looks_back, self._stack = len(encoder.offsets) > 1, encoder.stack
+        self.offsets = encoder.offsets if self.looks_back else (0, STRIDE)
+        self.features = self.vit.config.width * (1 if self.looks_back else 2)
+        patch = self.vit.config.patch_size
+        rows, columns = (-(-side // patch) for side in encoder.preprocess.size)
+        self.grid = rows, columns
+
+    def forward(self, seen: Float[Tensor, "b n 3 h w"]) -> Float[Tensor, "b t f"]:
+        """The tokens of frames at `offsets`."""
+        if self.looks_back:
+            return self.vit(self._stack(seen))
+        tokens = self.vit(seen.flatten(0, 1)).unflatten(0, (len(seen), 2))
+        return tokens.transpose(1, 2).flatten(2)
+
+
+def find_encoder_of(name: str, sensor: str, seed: int) -> BaseTouchEncoder:
+    """An encoder by the name that the benchmark gives it.
+
+    Args:
+        name: NAME, random:NAME or end-to-end:NAME of an encoder or its folder; end-to-end:PRESET of a ViT.
+        sensor: of the rig, for which a preset's network is built.
+        seed: of random weights.
+    """
+    preset = name.removeprefix(END_TO_END)
+    if preset != name and preset in PRESETS:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            return TouchBackbone(TouchBackboneConfig.for_sensor(PRESETS[preset], sensor))
+    for prefix in (RANDOM, END_TO_END):
+        if name.startswith(prefix):
+            return untrained(name.removeprefix(prefix), seed)
+    return load_encoder(name).eval()
+
+
+@torch.no_grad()
+def frozen_tokens(encoder: BaseTouchEncoder, frames: RigFrames) -> Float16[Tensor, "n t f"]:
+    """A frozen encoder's tokens of every frame, each computed once, for all probes."""
+    tokens = PairTokens(encoder).eval()
+    every = _batches(torch.arange(len(frames.before)))
+    if tokens.looks_back:
+        seen = (frames.seen(rows, tokens.offsets) for rows in every)
+        return torch.cat([tokens(batch).half() for batch in seen])
+    return torch.cat([tokens.vit(frames.touch[rows].float()).half() for rows in every])
+
+
+def inputs_of_tokens(
+    pairs: PairTokens, tokens: Float16[Tensor, "n t f"], frames: RigFrames
+) -> Callable[[Rows], Inputs]:
+    """What a probe reads of a frozen encoder, by row: see `PairTokens`."""
+    if pairs.looks_back:
+        return lambda rows: tokens[rows].float()
+    return lambda rows: torch.cat([tokens[rows], tokens[frames.before[rows]]], 2).float()
+
+
+def _batches(rows: Rows) -> list[Rows]:
+    return list(track(rows.split(BATCH), "embedding", "batch"))
+
+
+class Reader(nn.Module):
+    """A probe, with or without the encoder that it is trained with."""
+
+    def __init__(self, task: Task, tokens: PairTokens, trained: bool) -> None:
+        """Builds a randomly initialised probe of a task, for an encoder that is trained with it or not."""
+        super().__init__()
+        self.encoder = tokens if trained else None
+        self.probe = task.probe(tokens.features, tokens.grid)
+        self._task = [task]  # in a list: no part of the state
+
+    def outputs(self, inputs: Inputs) -> Outputs:
+        """Of tokens, or of pairs of frames if it has an encoder."""
+        return self.probe(inputs if self.encoder is None else self.encoder(inputs))
+
+    def forward(self, inputs: Inputs, targets: Tensor) -> dict[str, Tensor]:
+        """The loss, for the trainer."""
+        return {"loss": self._task[0].loss(self.outputs(inputs), targets)}
+
+
+def train_reader(
+    reader: Reader,
+    task: Task,
+    inputs_of: Callable[[Rows], Inputs],
+    train: Rows,
+    training: ProbeTraining,
+    scratch: Path,
+    log: TextIO,
+) -> None:
+    """Trains a reader on some frames, and leaves the snapshot that does best on validation frames.
+
+    Args:
+        reader: what is trained.
+        task: by whose loss.
+        inputs_of: rows to what the reader reads.
+        train: rows to learn from.
+        training: for how long.
+        scratch: folder for snapshots while it trains.
+        log: for the trainer's lines.
+    """
+    per_snapshot = max(training.steps // _SNAPSHOTS, 1) * training.batch_size
+    every = max(-(-len(task.split.validation) // _MAX_VALIDATION), 1)
+    validation = task.split.validation[::every]
+    best: dict[str, Tensor] = {}
+    least = float("inf")
+
+    def batch(rows: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+        drawn = train[torch.randint(len(train), (len(rows),), generator=generator)]
+        return {"inputs": inputs_of(drawn), "targets": task.targets(drawn)}
+
+    def evaluate() -> dict[str, float]:
+        nonlocal least
+        error = task.error(read(reader, inputs_of, validation), validation)
+        if error < least:
+            least = error
+            best.update({name: value.clone() for name, value in reader.state_dict().items()})
+        return {"validation_error": error}
+
+    optimizer = OptimizerConfig(
+        min(training.steps, _SNAPSHOTS),
+        training.batch_size,
+        training.lr,
+        _WEIGHT_DECAY,
+        max_grad_norm=1.0,
+    )
+    work = Training(reader, per_snapshot, batch, optimizer, identity={}, evaluate=evaluate)
+    with tempfile.TemporaryDirectory(dir=scratch) as folder, contextlib.redirect_stdout(log):
+        fit(work, Path(folder) / "probe", TrainerOptions(seed=training.seed), {})
+    reader.load_state_dict(best)
+
+
+@torch.no_grad()
+def read(reader: Reader, inputs_of: Callable[[Rows], Inputs], rows: Rows) -> Outputs:
+    """A reader's raw outputs of some frames."""
+    reader.eval()
+    return torch.cat([reader.outputs(inputs_of(part)) for part in rows.split(BATCH)])

@@ -1,0 +1,200 @@
+"""Published recordings as the samples of TacBench: force and slip, pose, and grasps.
+
+Each recording is that which the publisher made in one go: a stroke, a bag, a grasp. Of one of more than
+180 pictures those in the middle are read. Pictures are decoded a recording at a time.
+"""
+
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int64
+from torch import Tensor
+
+from touchgoal.benchmarks.papers.tacbench.data import STRIDE, RigFrames, rows_before
+from touchgoal.benchmarks.papers.tacbench.task import TEST, VALIDATION
+from touchgoal.benchmarks.papers.tacbench.tasks import RECORDED_AS, Recording
+from touchgoal.encoders.preprocess import Preprocessor
+from touchgoal.episodes.importers.feeling_of_success import MOMENTS, is_grasp_set, read_grasps
+from touchgoal.episodes.importers.tacbench_forces import is_force_set, read_strokes
+from touchgoal.episodes.importers.tacbench_poses import is_pose_set, read_bags
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
+
+_LONGEST = 180  # pictures of a recording that are read
+_OF_FIVE = 5
+_PER_METRE, _PER_RADIAN = 1e3, 180 / np.pi
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class Published:
+    """A published folder.
+
+    Attributes:
+        what: it recorded, as the bench calls it.
+        sensor: what recorded it.
+        read: so many recordings of it, preprocessed.
+    """
+
+    what: Recording
+    sensor: str
+    read: Callable[[int, Preprocessor], RigFrames]
+
+
+def find_published(folder: Path, sensor: str) -> Published | None:
+    """What a folder of published files holds; None if it holds none.
+
+    Args:
+        folder: of TacBench's force or pose estimation, or of Feeling of Success.
+        sensor: counts where the files leave a choice, as between gels with and without dots.
+
+    Raises:
+        UserError: the first file is damaged.
+    """
+    if is_force_set(folder):
+        named = _variant(sensor, _first(read_strokes(folder), folder).clip.sensor)
+        return Published("strokes", named, partial(read_published_strokes, folder, named))
+    if is_pose_set(folder):
+        named = _first(read_bags(folder), folder).clip.sensor
+        return Published("slides", named, partial(read_published_bags, folder))
+    if is_grasp_set(folder):
+        named = _variant(sensor, _first(read_grasps(folder), folder).fingers[0].sensor)
+        return Published("grasps", named, partial(read_published_grasps, folder, named))
+    return None
+
+
+def read_published_strokes(
+    folder: Path, sensor: str, count: int, preprocess: Preprocessor
+) -> RigFrames:
+    """About so many strokes, as many of each probe; their uses are those of the bench's strokes."""
+    chosen = _evenly(list(read_strokes(folder, sensor)), lambda stroke: stroke.probe, count)
+    touch, force, slip = [], [], []
+    for stroke in track(chosen, "strokes", "stroke"):
+        part = _middle(len(stroke.rows))
+        frames = stroke.clip.frames(stroke.rows[part])
+        touch.append(torch.from_numpy(preprocess(frames, stroke.background())).half())
+        force.append(stroke.force[part])
+        slip.append(stroke.slip[part])
+    lengths = [len(labels) for labels in slip]
+    return RigFrames(
+        torch.cat(touch),
+        rows_before(lengths, STRIDE),
+        torch.from_numpy(np.concatenate(force)).float(),
+        torch.from_numpy(np.concatenate(slip)),
+        np.repeat(np.arange(len(chosen)), lengths),
+        np.repeat([stroke.probe for stroke in chosen], lengths),
+    )
+
+
+def read_published_bags(folder: Path, count: int, preprocess: Preprocessor) -> RigFrames:
+    """About so many bags of the ring finger; the test bags are the published ones.
+
+    Forces are not known there; the object touches all the time, which 1 N into the gel stands for. The first
+    `STRIDE` of a bag have no motion, and count as untouched.
+    """
+    chosen = _evenly(list(read_bags(folder)), lambda bag: (bag.object, bag.held_out), count)
+    touch, force, pose = [], [], []
+    for bag in track(chosen, "bags", "bag"):
+        part = _middle(len(bag.clip))
+        frames = bag.clip.frames(np.arange(len(bag.clip))[part])
+        touch.append(torch.from_numpy(preprocess(frames, bag.background())).half())
+        pose.append(_poses(bag.change)[part])
+        force.append(np.outer(np.arange(len(frames)) >= STRIDE, (0, 0, 1)))
+    lengths = [len(poses) for poses in pose]
+    n = sum(lengths)
+    return RigFrames(
+        torch.cat(touch),
+        rows_before(lengths, STRIDE),
+        torch.from_numpy(np.concatenate(force)).float(),
+        torch.zeros(n, dtype=torch.bool),
+        np.repeat(np.arange(len(chosen)), lengths),
+        np.repeat([bag.object for bag in chosen], lengths),
+        pose=torch.from_numpy(np.concatenate(pose)),
+        use=np.repeat(_uses([bag.held_out for bag in chosen]), lengths),
+    )
+
+
+def read_published_grasps(
+    folder: Path, sensor: str, count: int, preprocess: Preprocessor
+) -> RigFrames:
+    """About so many grasps, finger by finger; the test grasps are those of the published files."""
+    trials = list(read_grasps(folder, sensor))
+    chosen = _evenly(trials, lambda trial: (trial.held_out, trial.held), count)
+    touch: list[Tensor] = []
+    for trial in track(chosen, "grasps", "attempt"):
+        for finger in trial.fingers:
+            frames = finger.frames(range(len(MOMENTS)))
+            touch.append(torch.from_numpy(preprocess(frames, frames[0])).half())
+    each = 2 * len(MOMENTS)
+    n = each * len(chosen)
+    return RigFrames(
+        torch.cat(touch),
+        rows_before([len(MOMENTS)] * len(touch), 1),
+        torch.zeros(n, 3),
+        torch.zeros(n, dtype=torch.bool),
+        np.repeat(np.arange(len(chosen)), each),
+        np.repeat([trial.object for trial in chosen], each),
+        label=torch.tensor([int(trial.held) for trial in chosen]).repeat_interleave(each),
+        moments=len(MOMENTS),
+        use=np.repeat(_uses([trial.held_out for trial in chosen]), each),
+    )
+
+
+def _first(items: Iterable[Item], folder: Path) -> Item:
+    for item in items:
+        return item
+    raise UserError(f"{folder} holds no recording: get it again, as published")
+
+
+def _variant(asked: str, found: str) -> str:
+    """The sensor asked for if it is the one found, but for dots on its gel."""
+    return asked if asked in (found, f"{found}_markers") else found
+
+
+def _evenly(items: list[Item], group: Callable[[Item], Hashable], count: int) -> list[Item]:
+    """About so many of them, in their order: of each group the same share, evenly, one at least."""
+    groups: dict[Hashable, list[int]] = {}
+    for i, item in enumerate(items):
+        groups.setdefault(group(item), []).append(i)
+    chosen: list[int] = []
+    for own in groups.values():
+        n = min(max(round(count * len(own) / len(items)), 1), len(own))
+        chosen += [own[i] for i in np.linspace(0, len(own) - 1, n).astype(int)]
+    return [items[i] for i in sorted(chosen)]
+
+
+def _middle(length: int) -> slice:
+    """The part of a recording that is read."""
+    start = max(length - _LONGEST, 0) // 2
+    return slice(start, start + min(length, _LONGEST))
+
+
+def _poses(change: Float64[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
+    """Poses (mm and degrees) that change so within a stride: chains that start at 0, `STRIDE` of them."""
+    pose = np.zeros_like(change)
+    for i in range(STRIDE, len(change)):
+        pose[i] = pose[i - STRIDE] + change[i]
+    return (pose * (_PER_METRE, _PER_METRE, _PER_RADIAN)).astype(np.float32)
+
+
+def _uses(held_out: Sequence[bool]) -> Int64[np.ndarray, " n"]:
+    """Held-out recordings are the test, of the others every fifth is for validation."""
+    uses = np.zeros(len(held_out), np.int64)
+    uses[np.flatnonzero(~np.array(held_out))[_OF_FIVE - 1 :: _OF_FIVE]] = VALIDATION
+    uses[np.array(held_out)] = TEST
+    return uses
+
+
+def check_tasks(published: Published, folder: Path, tasks: Sequence[str]) -> None:
+    """Raises UserError if these files are not for a task."""
+    fit = [name for name, what in RECORDED_AS.items() if what == published.what and name != "field"]
+    if wrong := [name for name in tasks if name not in fit]:
+        raise UserError(
+            f"{folder} is not for {' and '.join(wrong)}: choose --tasks {' '.join(fit)}, or other files"
+        )

@@ -1,0 +1,105 @@
+"""T2: whether the probe slips over the pad."""
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from touchgoal.benchmarks.papers.tacbench.data import RigFrames, Rows
+from touchgoal.benchmarks.papers.tacbench.task import (
+    Metrics,
+    Outputs,
+    Targets,
+    ValidationOutputs,
+    split_slip,
+)
+from touchgoal.encoders.probes.attentive import AttentiveProbe
+from touchgoal.encoders.probes.property_probe import interval
+from touchgoal.sim_envs.indenter_rig import FRICTION
+
+_THRESHOLDS = 200
+
+
+class SlipTask:
+    """Whether the probe slides; and by how much the force changed in the pair, learned beside it."""
+
+    def __init__(self, frames: RigFrames) -> None:
+        """Of the frames of strokes."""
+        self._frames = frames
+        self._change = frames.force - frames.force[frames.before]
+        self.split = split_slip(frames)
+        self._scale = self._change[self.split.train].abs().amax(0)
+        share = frames.slip[self.split.train].float().mean()
+        self._weight = (1 - share) / share.clamp(min=1e-3)
+
+    def probe(self, features: int, grid: tuple[int, int]) -> nn.Module:
+        """See Task."""
+        return AttentiveProbe(features, 4)
+
+    def targets(self, rows: Rows) -> Targets:
+        """Slip (0 or 1) and changes of the force over their range."""
+        change = self._change[rows] / self._scale
+        return torch.cat([self._frames.slip[rows, None].float(), change], 1)
+
+    def loss(self, outputs: Outputs, targets: Targets) -> Float[Tensor, ""]:
+        """Weighted cross entropy and mean absolute error."""
+        slip = F.binary_cross_entropy_with_logits(
+            outputs[:, 0], targets[:, 0], pos_weight=self._weight.to(outputs)
+        )
+        return slip + F.l1_loss(outputs[:, 1:], targets[:, 1:])
+
+    def error(self, outputs: Outputs, rows: Rows) -> float:
+        """1 less the F1 score at its best threshold."""
+        truth = self.truth(rows)
+        return 1 - max(f1_score(outputs[:, 0].numpy() > t, truth) for t in _cuts(outputs))
+
+    def threshold(self, outputs: Outputs, rows: Rows) -> float:
+        """Of the raw output: where F1 is best."""
+        truth = self.truth(rows)
+        return max(_cuts(outputs), key=lambda t: f1_score(outputs[:, 0].numpy() > t, truth))
+
+    def truth(self, rows: Rows) -> Bool[np.ndarray, " b"]:
+        """Whether frames slip."""
+        return self._frames.slip[rows].numpy()
+
+    def judge(
+        self, said: list[Outputs], validation: list[ValidationOutputs], rows: Rows
+    ) -> Metrics:
+        """F1 at thresholds chosen on validation frames; mean absolute error of the change of force, mN."""
+        cuts = [self.threshold(outputs, self.split.validation) for outputs in validation]
+        slips = np.stack([o[:, 0].numpy() > t for o, t in zip(said, cuts, strict=True)])
+        errors = [(o[:, 1:] * self._scale - self._change[rows]).abs().mean() for o in said]
+        metrics = slip_metrics(slips, self.truth(rows), self._frames.stroke[rows.numpy()])
+        return metrics | {"change_mae_mn": 1e3 * float(np.mean(errors)), "thresholds": cuts}
+
+    def references(self, rows: Rows) -> dict[str, Metrics]:
+        """Slip always; slip by the true forces and the nominal friction cone."""
+        truth, things = self.truth(rows), self._frames.stroke[rows.numpy()]
+        force = self._frames.force[rows].double().numpy()
+        cone = np.hypot(force[:, 0], force[:, 1]) >= FRICTION * force[:, 2]
+        said = {"(always slips)": np.ones_like(truth), "(true forces, nominal cone)": cone}
+        return {name: slip_metrics(slips[None], truth, things) for name, slips in said.items()}
+
+
+def _cuts(outputs: Outputs) -> list[float]:
+    """Places between raw outputs."""
+    return torch.quantile(outputs[:, 0], torch.linspace(0, 1, _THRESHOLDS)[:-1]).tolist()
+
+
+def f1_score(said: Bool[np.ndarray, " n"], truth: Bool[np.ndarray, " n"]) -> float:
+    """Of the class true; 0 where nothing is right."""
+    right = float((said & truth).sum())
+    return 2 * right / max(float(said.sum() + truth.sum()), 1.0)
+
+
+def slip_metrics(
+    said: Bool[np.ndarray, "seeds n"], truth: Bool[np.ndarray, " n"], things: np.ndarray
+) -> Metrics:
+    """F1 of slipping, the mean over seeds, with its interval."""
+    together = np.vstack([truth, said]).T
+
+    def f1(values: np.ndarray) -> float:
+        return float(np.mean([f1_score(column, values[:, 0]) for column in values.T[1:]]))
+
+    return {"f1": f1(together), "f1_interval": list(interval(together, things, f1))}

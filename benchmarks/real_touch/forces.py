@@ -1,0 +1,127 @@
+"""Contact and force on real grasps with a load cell, on objects outside the calibration."""
+
+from dataclasses import field
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+
+from touchgoal.benchmarks.options import BenchmarkOptions
+from touchgoal.benchmarks.real_touch.embedders import Embedder, find_embedder
+from touchgoal.benchmarks.real_touch.force_onset import EmbeddedGrasp, cost_table, judge_cost
+from touchgoal.control.tactile.background import Background
+from touchgoal.control.tactile.contact import ContactDetector
+from touchgoal.control.tactile.picture_force import calibrate_force, shrunk, statistics
+from touchgoal.encoders.probes.property_probe import interval
+from touchgoal.episodes.importers.force_grasps import ForceGrasp, read_force_grasps
+from touchgoal.runtime.option_types import RARE, Corners, Count, Seed, checked_dataclass
+from touchgoal.runtime.progress import track
+
+
+@checked_dataclass
+class Config(BenchmarkOptions):
+    """Options of benchmark real-force."""
+
+    data: Path = field(kw_only=True)
+    """Folder with grasps.csv, TRIAL.avi and TRIAL.csv, laid out as EstimateModulus'."""
+    encoders: tuple[str, ...] = ("gelsight_mini_surfaces", "pixels")
+    """Touch encoders, named as for benchmark real-touch."""
+    corners: Corners | None = None
+    """Corners of the gel in the image, x and y in px (top left, top right, bottom left, bottom
+    right), for a camera that sees it at an angle; default: the whole image."""
+    every: Annotated[Count, RARE] = 1
+    """Use every n-th grasp."""
+    seed: Seed = 0
+    """Random seed of untrained weights."""
+
+
+RANGE = 25.0
+"""N, up to which forces are judged."""
+_PRESSED = 0.5  # N
+_FIRST = 5  # frames
+_STEADY = 0.2  # N
+_IMPOSSIBLE = 60.0  # N: a spike of the load cell, beyond what the hand can do
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Calibrate on all objects but one, in turn, and judge the one left out."""
+    embedders = {name: find_embedder(name, config.seed) for name in config.encoders}
+    grasps = read_force_grasps(config.data, config.corners)[:: config.every]
+    result = judge_grasps(grasps, embedders)
+    return {"table": force_table(result), **result}
+
+
+def judge_grasps(grasps: list[ForceGrasp], embedders: dict[str, Embedder]) -> dict[str, Any]:
+    """Return force errors on held-out objects, contact delays and each encoder's cost curves."""
+    rows, forces, things, contact = [], [], [], []
+    embedded: dict[str, list[EmbeddedGrasp]] = {name: [] for name in embedders}
+    for grasp in track(grasps, "reading", "grasp"):
+        frames = grasp.frames()
+        force = grasp.force[: len(frames)]
+        # A steady load cell is an open hand with its offset; else the hand is closing already.
+        open_hand = float(np.ptp(force[:_FIRST])) < _STEADY
+        if open_hand:
+            force = force - np.median(force[:_FIRST])
+        untouched = np.median(frames[: _FIRST if open_hand else 1], 0).astype(np.uint8)
+        background = shrunk(untouched)
+        small = [shrunk(frame).astype(np.uint8) for frame in frames]
+        rows.append(np.stack([statistics(frame, background) for frame in small]))
+        forces.append(force)
+        things.append(np.full(len(force), grasp.object))
+        detector = ContactDetector(Background(np.stack(small[:1])))
+        felt = np.array([detector.update(frame) for frame in small])
+        begins = int((force > _PRESSED).argmax()) if (force > _PRESSED).any() else None
+        if open_hand and felt.any() and begins is not None:
+            contact.append(int(felt.argmax()) - begins)
+        firmest = int(np.where(force < _IMPOSSIBLE, force, 0).argmax())
+        for name, embed in embedders.items():
+            seen = embed(frames, untouched).astype(np.float64)
+            start = begins if open_hand else None
+            embedded[name].append(EmbeddedGrasp(grasp.trial, grasp.object, seen, firmest, start))
+    every, force, thing = np.concatenate(rows), np.concatenate(forces), np.concatenate(things)
+    judged = (force <= RANGE) & (force > -1)
+    error = np.full(len(force), np.nan)
+    for name in np.unique(thing):
+        known = judged & (thing != name)
+        reader = calibrate_force(every[known], force[known])
+        own = thing == name
+        error[own] = np.abs(reader.of_statistics(every[own]) - force[own])
+    pressed = judged & (force > _PRESSED)
+    return {
+        "grasps": len(grasps),
+        "things": len(np.unique(thing)),
+        "median_error": float(np.median(error[pressed])),
+        "median_error_interval": interval(
+            error[pressed], thing[pressed], lambda v: float(np.median(v))
+        ),
+        "by_thing": {
+            str(n): float(np.median(error[pressed & (thing == n)])) for n in np.unique(thing)
+        },
+        "contact_delay": contact,
+        # An object grasped once has no other grasp to compare with.
+        "cost": {n: judge_cost(seen) for n, seen in embedded.items()} if _again(grasps) else {},
+    }
+
+
+def _again(grasps: list[ForceGrasp]) -> bool:
+    return len({grasp.object for grasp in grasps}) < len(grasps)
+
+
+def force_table(result: dict[str, Any]) -> str:
+    """Return the result as printed text."""
+    low, high = result["median_error_interval"]
+    delay = result["contact_delay"]
+    things = ", ".join(f"{name} {error:.1f}" for name, error in result["by_thing"].items())
+    lines = [
+        f"{result['grasps']} grasps of {result['things']} objects; each is read with the others' calibration:",
+        f"force of {_PRESSED:g} to {RANGE:g} N off by {result['median_error']:.2f} N (median; 95 % over "
+        f"objects {low:.2f}-{high:.2f}), {100 * result['median_error'] / RANGE:.0f} % of the range",
+        f"by object, N: {things}",
+    ]
+    if delay:
+        lines.append(
+            f"contact is detected {min(delay)} to {max(delay)} frames (median {np.median(delay):g}) after "
+            f"{_PRESSED:g} N on the load cell, in {len(delay)} grasps that start open"
+        )
+    lines += ["\n" + cost_table(cost, name) for name, cost in result["cost"].items()]
+    return "\n".join(lines)

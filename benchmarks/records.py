@@ -1,0 +1,153 @@
+"""Records of measured figures: the command, what it printed, and its metrics.
+
+    python -m touchgoal.benchmarks.records measure NAME ...   # run the command of a record, write it
+    python -m touchgoal.benchmarks.records                    # rewrite the tables of README and docs
+
+A record is `benchmarks/results/NAME.json`. This module is the only one that writes them. It needs a
+clone; an installed package has the records but no pages.
+"""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from touchgoal.benchmarks.quoted import QUOTED
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.provenance import hardware
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "benchmarks" / "results"
+_BLOCK = re.compile(r"(<!-- (headlines|results) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def load_record(name: str) -> dict[str, Any]:
+    """Return a record.
+
+    Returns:
+        `command`, `measured` (date and commit), `hardware`, `printed` (lines), `metrics`.
+
+    Raises:
+        UserError: there is no such record.
+    """
+    if name not in QUOTED:
+        raise UserError(f"there is no record {name!r}; choose from: {', '.join(QUOTED)}")
+    return json.loads((FOLDER / f"{name}.json").read_text())
+
+
+def records_of(benchmark: str) -> list[str]:
+    """Return the names of a benchmark's records, or the record of that very name.
+
+    Raises:
+        UserError: there is none.
+    """
+    start = f"touchgoal benchmark {benchmark} "
+    names = [name for name, quoted in QUOTED.items() if f"{quoted.command} ".startswith(start)]
+    if benchmark in QUOTED and benchmark not in names:
+        names.insert(0, benchmark)
+    if not names:
+        raise UserError(f"nothing is on record for {benchmark!r}; choose from: {', '.join(QUOTED)}")
+    return names
+
+
+def describe(name: str) -> str:
+    """Return a record as printed text: command, date, hardware, table."""
+    record = load_record(name)
+    head = f"{name}: {record['command']}\n{record['measured']}, {record['hardware']}"
+    return "\n".join([head, *record["printed"]])
+
+
+def headline(name: str) -> str:
+    """Return the figure of a record in one line."""
+    return QUOTED[name].headline(load_record(name)["metrics"])
+
+
+def render(page: str) -> str:
+    """Return a page with its tables written anew from the records."""
+    tables = {"headlines": _headlines, "results": _results}
+    return _BLOCK.sub(lambda found: f"{found[1]}{tables[found[2]]()}{found[3]}", page)
+
+
+def pages() -> list[Path]:
+    """Return README and every page of docs/."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def measure(name: str) -> None:
+    """Run the command of a record and write the record.
+
+    Raises:
+        UserError: there is no such record.
+        CalledProcessError: the command failed.
+    """
+    if name not in QUOTED:
+        raise UserError(f"there is no record {name!r}; choose from: {', '.join(QUOTED)}")
+    command, out = QUOTED[name].command, ROOT / "runs" / "results" / name
+    program = [sys.executable, "-m", "touchgoal.launch", *shlex.split(command)[1:]]
+    done = subprocess.run(
+        [*program, "--out", str(out)], check=True, text=True, stdout=subprocess.PIPE
+    )
+    lines = [line.rstrip() for line in done.stdout.splitlines()]
+    printed = [x for x in lines if not (str(out) in x or x.startswith("hardware: "))]
+    write_record(name, command, printed, json.loads((out / "metrics.json").read_text()))
+
+
+def write_record(name: str, command: str, printed: list[str], metrics: dict[str, Any]) -> None:
+    """Write a record; its metrics stand on one line."""
+    asked = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
+    commit = subprocess.run(asked, check=True, capture_output=True, text=True).stdout.strip()
+    record = {
+        "command": command,
+        "measured": f"{date.today()}, commit {commit}",
+        "hardware": metrics.pop("hardware", hardware()),
+        "printed": printed,
+        "metrics": None,
+    }
+    text = json.dumps(record, indent=1).replace(
+        '"metrics": null', f'"metrics": {json.dumps(metrics)}'
+    )
+    (FOLDER / f"{name}.json").write_text(text + "\n")
+
+
+def _headlines() -> str:
+    rows = ["| measured | figure | record |", "|---|---|---|"]
+    rows += [
+        f"| {quoted.claim} | {headline(name)} | `{name}` |"
+        for name, quoted in QUOTED.items()
+        if quoted.in_readme
+    ]
+    return "\n".join(rows) + "\n"
+
+
+def _results() -> str:
+    rows = []
+    for topic in dict.fromkeys(quoted.topic for quoted in QUOTED.values()):
+        rows += [f"**{topic}**", "", "| measured | figure | record |", "|---|---|---|"]
+        rows += [
+            f"| {quoted.claim} | {headline(name)} | `{name}` |"
+            for name, quoted in QUOTED.items()
+            if quoted.topic == topic
+        ]
+        rows.append("")
+    return "\n".join(rows)
+
+
+def main(arguments: list[str]) -> None:
+    """Measure the named records, then rewrite every page."""
+    if arguments and arguments[0] != "measure":
+        raise UserError("usage: python -m touchgoal.benchmarks.records [measure NAME ...]")
+    for name in arguments[1:]:
+        measure(name)
+    for page in pages():
+        page.write_text(render(page.read_text()))
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except UserError as error:
+        sys.exit(str(error))

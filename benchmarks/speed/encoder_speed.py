@@ -1,0 +1,245 @@
+"""Touch embeddings a second on one core (Sparsh, Table 3).
+
+The peer of each ViT is `torch.nn.TransformerEncoder` of the same size, timed in turn with it, with
+and without torch's fused inference; the faster counts. A tick goes from a raw frame to its
+embedding, with earlier frames' preprocessing cached, as policies do it, and without the cache.
+"""
+
+import copy
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Annotated, Any, Literal
+
+import cv2
+import numpy as np
+import torch
+from pydantic import Field
+from torch import nn
+
+from touchgoal.benchmarks.options import BenchmarkOptions
+from touchgoal.benchmarks.real_touch.embedders import vit_of
+from touchgoal.benchmarks.speed.rates import in_turn, one_core
+from touchgoal.encoders.backbones.frame_history import RecentFrames
+from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
+from touchgoal.encoders.backbones.sparsh import sparsh_vit
+from touchgoal.encoders.backbones.sparsh_input import SPARSH
+from touchgoal.encoders.backbones.touch_backbone import (
+    BaseTouchEncoder,
+    TouchBackbone,
+    TouchBackboneConfig,
+)
+from touchgoal.encoders.backbones.vit import ViTConfig
+from touchgoal.encoders.pretrained import load_encoder
+from touchgoal.encoders.published import STRIDES
+from touchgoal.runtime.option_types import RARE, Count, checked_dataclass
+from touchgoal.runtime.progress import track
+
+SparshShape = Literal["mae-tiny", "mae-small", "mae-base", "dino-base", "ijepa-base", "vjepa-base"]
+
+
+@checked_dataclass
+class Config(BenchmarkOptions):
+    """Options of benchmark encoder-speed."""
+
+    encoders: tuple[str, ...] = ("gelsight_mini", "gelsight_mini_surfaces")
+    """Touch encoders by name or folder, or published Sparsh ones by file or id."""
+    shapes: tuple[SparshShape, ...] = (
+        "mae-tiny",
+        "mae-small",
+        "mae-base",
+        "dino-base",
+        "ijepa-base",
+        "vjepa-base",
+    )
+    """Sparsh's networks with random weights, base as published, tiny and small narrower."""
+    precisions: Annotated[tuple[Literal["fp32", "bf16"], ...], Field(min_length=1)] = (
+        "fp32",
+        "bf16",
+    )
+    """Numbers in which networks compute."""
+    batch_size: Count = 8
+    """Frames in a batch."""
+    repeats: Count = 5
+    """Measurements of each figure; the median is printed."""
+    ticks: Annotated[Count, RARE] = 5
+    """Single frames in each of them."""
+
+
+_DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
+_FRAME = 240, 320  # of a sensor, px
+_STREAM = 16  # frames that come again and again
+_PAPER = "MAE 104, DINO 112, I-JEPA 112, V-JEPA 60"  # frames/s of the base presets, Table 3
+
+
+@dataclass(frozen=True)
+class EncoderSpeed:
+    """One encoder at one precision.
+
+    Attributes:
+        encoder: which.
+        parameters: of its own, millions.
+        precision: fp32 or bf16.
+        batched: frames a second in batches, of prepared input.
+        batched_ratio: over that of plain torch; None without a peer.
+        tick: ms from one raw frame to its embedding.
+        tick_anew: the same with all frames that are seen preprocessed anew.
+        tick_ratio: time of plain torch, which does that, over `tick`; None without a peer.
+    """
+
+    encoder: str
+    parameters: float
+    precision: str
+    batched: float
+    batched_ratio: float | None
+    tick: float
+    tick_anew: float
+    tick_ratio: float | None
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Time everything on one core, by processor time, which busy neighbours distort least."""
+    encoders = {name: load_encoder(name).eval() for name in config.encoders}
+    encoders |= {f"Sparsh {name}, random": _random(name) for name in config.shapes}
+    measured = [
+        (name, precision)
+        for name, encoder in encoders.items()
+        for precision in config.precisions
+        if precision == "fp32" or not isinstance(encoder, PooledEncoder)
+    ]
+    threads, cv_threads = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    try:
+        with one_core():
+            rows = [
+                _measure(name, encoders[name], precision, config)
+                for name, precision in track(measured, "timing", "encoder")
+            ]
+    finally:
+        torch.set_num_threads(threads)
+        cv2.setNumThreads(cv_threads)
+    return {"table": _table(rows, config), "rows": [asdict(row) for row in rows]}
+
+
+def _random(name: str) -> TouchBackbone:
+    method, size = name.split("-")
+    vit = sparsh_vit(method, size)
+    stride = STRIDES["clip" if vit.tubelet > 1 else "pair"]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return TouchBackbone(TouchBackboneConfig(vit, None, SPARSH, stride)).eval()
+
+
+@torch.inference_mode()
+def _measure(name: str, encoder: BaseTouchEncoder, precision: str, config: Config) -> EncoderSpeed:
+    dtype = _DTYPES[precision]
+    plain = None
+    if not isinstance(encoder, PooledEncoder):
+        plain = _Peer(vit_of(encoder).config).eval().to(dtype)
+        encoder = copy.deepcopy(encoder).to(dtype)
+    stream = _Stream(encoder, dtype)
+    batch = stream.anew().expand(config.batch_size, *[-1] * (stream.anew().ndim - 1)).contiguous()
+    batched: list[Callable[[], object]] = [lambda: encoder.embed_touch(batch)]
+    ticks: list[Callable[[], object]] = [
+        lambda: encoder.embed_touch(stream.kept()),
+        lambda: encoder.embed_touch(stream.anew()),
+    ]
+    if plain is not None:
+        batched += [partial(_plainly, plain, lambda: batch, fused) for fused in (True, False)]
+        ticks += [partial(_plainly, plain, stream.anew, fused) for fused in (True, False)]
+    ours, *peer = in_turn(batched, config.repeats)
+    kept, anew, *peers_tick = in_turn(ticks, config.repeats * config.ticks)
+    return EncoderSpeed(
+        encoder=name,
+        parameters=sum(p.numel() for p in encoder.parameters()) / 1e6,
+        precision=precision,
+        batched=config.batch_size / ours,
+        batched_ratio=min(peer) / ours if peer else None,
+        tick=1e3 * kept,
+        tick_anew=1e3 * anew,
+        tick_ratio=min(peers_tick) / kept if peers_tick else None,
+    )
+
+
+def _plainly(plain: nn.Module, make: Callable[[], torch.Tensor], fused: bool) -> torch.Tensor:
+    before = torch.backends.mha.get_fastpath_enabled()
+    torch.backends.mha.set_fastpath_enabled(fused)
+    try:
+        return plain(make()).mean(1)
+    finally:
+        torch.backends.mha.set_fastpath_enabled(before)
+
+
+class _Peer(nn.Module):
+    """A ViT of the same size from torch's own layers, with random weights."""
+
+    def __init__(self, config: ViTConfig) -> None:
+        super().__init__()
+        patch = (config.patch_size, config.patch_size)
+        convolution = nn.Conv2d if config.tubelet == 1 else nn.Conv3d
+        size = patch if config.tubelet == 1 else (config.tubelet, *patch)
+        self.patch = convolution(config.channels, config.width, size, size)
+        layer = nn.TransformerEncoderLayer(
+            config.width,
+            config.heads,
+            round(config.mlp_ratio * config.width),
+            0.0,
+            "gelu",
+            batch_first=True,
+            norm_first=True,
+        )
+        self.blocks = nn.TransformerEncoder(layer, config.depth, enable_nested_tensor=False)
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return self.blocks(self.patch(images).flatten(2).transpose(1, 2))
+
+
+class _Stream:
+    """A sensor whose frames come one after the other, as an encoder's input."""
+
+    def __init__(self, encoder: BaseTouchEncoder, dtype: torch.dtype) -> None:
+        drawn = np.random.default_rng(0).integers(90, 130, (_STREAM, *_FRAME, 3), np.uint8)
+        self._frames = [frame.copy() for frame in drawn]
+        self._encoder, self._dtype, self._newest = encoder, dtype, 0
+        self._recent = RecentFrames(encoder.preprocess, encoder.offsets)
+
+    def kept(self) -> torch.Tensor:
+        """The next frame; earlier ones are preprocessed already."""
+        self._newest += 1
+        back = max(self._encoder.offsets)
+        seen = [self._frames[(self._newest - k) % _STREAM] for k in range(back, -1, -1)]
+        return self._stacked(self._recent.latest(seen, self._frames[0]))
+
+    def anew(self) -> torch.Tensor:
+        """The next frame, with all that is seen preprocessed."""
+        self._newest += 1
+        rows = [(self._newest - back) % _STREAM for back in self._encoder.offsets]
+        touch = self._encoder.preprocess(
+            np.stack([self._frames[row] for row in rows]), self._frames[0]
+        )
+        return self._stacked(torch.from_numpy(touch)[None])
+
+    def _stacked(self, touch: torch.Tensor) -> torch.Tensor:
+        return self._encoder.stack(touch).to(self._dtype)
+
+
+def _table(rows: list[EncoderSpeed], config: Config) -> str:
+    lines = [
+        f"one core, processor time, medians; in batches of {config.batch_size}, and one raw frame at a time with the earlier ones'",
+        "preprocessing kept (in brackets: anew); ratio: plain torch's time for the same over ours",
+        f"{'encoder':<30}{'M par.':>8}{'':>6}{'frames/s':>10}{'ratio':>7}{'ms a frame':>20}{'ratio':>7}",
+    ]
+    lines += [
+        f"{row.encoder[-29:]:<30}{row.parameters:>8.2f}{row.precision:>6}{row.batched:>10.1f}"
+        f"{_ratio(row.batched_ratio)}{row.tick:>11.2f}{f'({row.tick_anew:.2f})':>9}{_ratio(row.tick_ratio)}"
+        for row in rows
+    ]
+    lines.append(
+        f"the paper's base encoders, on hardware that it does not name, frames/s: {_PAPER}"
+    )
+    return "\n".join(lines)
+
+
+def _ratio(value: float | None) -> str:
+    return f"{'-' if value is None else f'{value:.2f}':>7}"

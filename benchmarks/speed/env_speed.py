@@ -1,0 +1,129 @@
+"""How fast the simulated cell runs on one core: physics, and whole environment steps."""
+
+import os
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import mujoco
+import numpy as np
+
+from touchgoal.benchmarks.options import BenchmarkOptions
+from touchgoal.benchmarks.speed.rates import Row, measure, one_core, table
+from touchgoal.runtime.option_types import Count, checked_dataclass
+from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
+from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
+from touchgoal.sim_envs.pick_place import PickPlace
+from touchgoal.sim_envs.scene.build import robot_model
+
+
+@checked_dataclass
+class Config(BenchmarkOptions):
+    """How fast does the simulated cell run on one core?"""
+
+    repeats: Count = 7
+    """Measurements of each figure; the median is printed."""
+    physics_steps: Count = 5000
+    """Steps of the physics in one measurement."""
+    env_steps: Count = 40
+    """Control ticks of the environment in one measurement."""
+
+
+NO_MOTION = np.zeros(8)
+TICKS_UNTIL_HELD = 70  # ticks after which the expert holds the object in the air
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Measure everything on one core; wall-clock time."""
+    os.environ["LP_NUM_THREADS"] = "0"  # software OpenGL draws in this thread
+    cv2.setNumThreads(1)
+    with one_core():
+        rows = [*_physics(config), *_env(config), *_maze(config)]
+    return {
+        "rows": [vars(row) for row in rows],
+        "table": table("on one core, wall clock", "per second", rows),
+    }
+
+
+def _physics(config: Config) -> list[Row]:
+    n = config.physics_steps
+    peer = mujoco.MjModel.from_xml_string(_franky_sim_model())
+    peer_data = mujoco.MjData(peer)
+    mujoco.mj_resetDataKeyframe(peer, peer_data, 0)
+    rows = [
+        _rate("peer: bare FR3 of the wheel, its own settings", config, n, peer, peer_data),
+    ]
+    env = PickPlace(PickPlaceConfig(cameras=(), tactile=False))
+    for name, ticks in (("object on the table", 0), ("object held in the air", TICKS_UNTIL_HELD)):
+        _reset_and_run_expert(env, ticks)
+        rows.append(_rate(f"physics, whole cell, {name}", config, n, env.model, env.data))
+    env.close()
+    return rows
+
+
+def _env(config: Config) -> list[Row]:
+    n = config.env_steps
+    rows = []
+    both = ["soda_can", "pebble"]  # a primitive and a mesh
+    for what, task, objects in (
+        ("physics alone", PickPlaceConfig(cameras=(), tactile=False), ["soda_can"]),
+        ("two tactile images", PickPlaceConfig(cameras=()), both),
+        ("two tactile + one 128x128 camera", PickPlaceConfig(cameras=("front",)), both),
+    ):
+        env = PickPlace(replace(task, max_seconds=1e6))
+        for name in objects:
+            _reset_and_run_expert(env, TICKS_UNTIL_HELD, name)
+
+            def step(env: PickPlace = env) -> None:
+                for _ in range(n):
+                    env.step(NO_MOTION)
+
+            rows.append(
+                measure(
+                    f"env step (50 physics steps), {what}, holding {name}", config.repeats, n, step
+                )
+            )
+        env.close()
+    return rows
+
+
+def _maze(config: Config) -> list[Row]:
+    """The bead held on a wire."""
+    rows = []
+    for what, tactile in (("physics alone", False), ("two tactile images", True)):
+        env = BeadMaze(BeadMazeConfig(tactile=tactile, max_seconds=1e6))
+        env.reset(seed=1, options={"wire": "fourier-3"})
+        if not tactile:
+            n = config.physics_steps
+            rows.append(
+                _rate("physics, whole cell, bead on the wire", config, n, env.model, env.data)
+            )
+
+        def step(env: BeadMaze = env) -> None:
+            for _ in range(config.env_steps):
+                env.step(NO_MOTION)
+
+        name = f"env step (50 physics steps), {what}, bead on the wire"
+        rows.append(measure(name, config.repeats, config.env_steps, step))
+        env.close()
+    return rows
+
+
+def _reset_and_run_expert(env: PickPlace, ticks: int, name: str = "soda_can") -> None:
+    """A fresh episode, `ticks` into the expert's plan."""
+    env.reset(seed=1, options={"object": name, "mass": 0.1, "grasp_force": 15.0})
+    expert = PickPlaceExpert(env)
+    for _ in range(ticks):
+        env.step(expert.act({}))
+
+
+def _franky_sim_model() -> str:
+    spec = mujoco.MjSpec.from_file(str(robot_model()))
+    spec.meshdir = str(robot_model().parent / "meshes")
+    spec.option.timestep = 1e-3
+    return spec.to_xml()
+
+
+def _rate(what: str, config: Config, n: int, model: mujoco.MjModel, data: mujoco.MjData) -> Row:
+    return measure(what, config.repeats, n, lambda: mujoco.mj_step(model, data, nstep=n))

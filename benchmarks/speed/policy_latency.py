@@ -1,0 +1,161 @@
+"""How long a plan takes on one core, stage by stage, beside networks of the published sizes.
+
+Warm-up is not counted. The published U-Net and the ViTs of the touch literature carry random
+weights here: they are timed, not used.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from touchgoal.benchmarks.options import BenchmarkOptions
+from touchgoal.benchmarks.speed.rates import one_core
+from touchgoal.control import features as ft
+from touchgoal.encoders.backbones.vit import ViT, ViTConfig
+from touchgoal.policies import checkpoint
+from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
+from touchgoal.policies.config import SamplerConfig
+from touchgoal.policies.heads.diffusion import Diffusion, DiffusionConfig
+from touchgoal.policies.heads.unet import PRESETS
+from touchgoal.policies.perception.end_to_end import difference_images
+from touchgoal.policies.policy import PolicyConfig
+from touchgoal.runtime.option_types import Count, CountOrNone, checked_dataclass
+from touchgoal.sim_envs.config import EnvConfig
+
+
+@checked_dataclass
+class Config(BenchmarkOptions):
+    """How long does a plan take on one core, stage by stage?"""
+
+    policy: Path | None = None
+    """Folder of a policy that train-policy made; default: the shipped one of bead-maze."""
+    repeats: Count = 200
+    """Plans timed."""
+    large_repeats: CountOrNone = 5
+    """Runs of each network of a published size; 0 leaves them out."""
+    control_hz: Count = ft.CONTROL_HZ
+    """Control ticks per second; a plan should fit into one."""
+
+
+_VITS = {
+    "ViT-tiny": ViTConfig((224, 224), width=192, depth=12, heads=3),
+    "ViT-small": ViTConfig((224, 224), width=384, depth=12, heads=6),
+    "ViT-base": ViTConfig((224, 224), width=768, depth=12, heads=12),
+}
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Times of one stage, ms."""
+
+    what: str
+    median: float
+    p95: float
+    slowest: float
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Time all stages on one core; `table` and the numbers behind it."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with one_core(), torch.inference_mode():
+            stages = _stages(config) + _published(config)
+    finally:
+        torch.set_num_threads(threads)
+    period = 1000 / config.control_hz
+    lines = [f"{'one core, ms':<58}{'median':>9}{'p95':>9}{'slowest':>9}"]
+    lines += [f"{s.what:<58}{s.median:>9.1f}{s.p95:>9.1f}{s.slowest:>9.1f}" for s in stages]
+    lines.append(f"a tick at {config.control_hz} Hz has {period:.0f} ms")
+    return {"table": "\n".join(lines), "stages": [asdict(s) for s in stages]}
+
+
+def _stages(config: Config) -> list[Stage]:
+    folder = config.policy or SHIPPED_POLICIES["bead-maze"]
+    maker = SavedPolicy(folder)
+    planner = maker.planner()
+    policy = checkpoint.load(folder)
+    ticks = _observations(policy.config, maker.env_config(EnvConfig()).camera_size)
+    stages = []
+    if planner.touch is not None:
+        encoder = planner.touch.encoder
+        frame = ticks[0][ft.TACTILE_LEFT]
+        both = np.concatenate([encoder.preprocess(frame[None], frame)] * 2)
+        alike = [torch.from_numpy(both)] * len(encoder.offsets)
+        touch = encoder.stack(torch.stack(alike, 1))
+        stages += [
+            _time(
+                "preprocess both fingertips",
+                config.repeats,
+                lambda: [encoder.preprocess(ticks[1][k][None], ticks[0][k]) for k in ft.TACTILE],
+            ),
+            _time("touch encoder, both", config.repeats, lambda: encoder.embed_touch(touch)),
+        ]
+    if (
+        end_to_end := policy.config.end_to_end
+    ) is not None and policy.end_to_end_encoder is not None:
+        pictures = [
+            difference_images(ticks[1][k][None], ticks[0][k], end_to_end.size) for k in ft.TACTILE
+        ]
+        seen = torch.from_numpy(np.stack(pictures, 1))
+        look = policy.end_to_end_encoder
+        stages.append(_time("end-to-end encoder", config.repeats, lambda: look(seen)))
+    condition = torch.zeros(1, policy.condition_dim)
+    generator = torch.Generator().manual_seed(0)
+    stages.append(
+        _time("denoising", config.repeats, lambda: policy.head.sample(condition, generator))
+    )
+    turn, seen = iter(range(10**9)), planner.ticks_seen
+
+    def tick() -> None:
+        i = next(turn)
+        planner.plan([ticks[(i + k) % 8] for k in range(seen)])  # one is new, as on the arm
+
+    stages.append(_time("a whole plan, observation to actions", config.repeats, tick))
+    return stages
+
+
+def _published(config: Config) -> list[Stage]:
+    if config.large_repeats == 0:
+        return []
+    generator = torch.Generator().manual_seed(0)
+    sampler = SamplerConfig("ddim", "epsilon", num_inference_steps=16)
+    head = Diffusion(DiffusionConfig(PRESETS["published"], sampler), 8, 8, 1550).eval()
+    condition = torch.zeros(1, 1550)
+    size = sum(p.numel() for p in head.parameters()) / 1e6
+    name = f"published U-Net, {size:.0f} M, 16 DDIM steps (random weights)"
+    stages = [_time(name, config.large_repeats, lambda: head.sample(condition, generator))]
+    for name, vit in _VITS.items():
+        backbone, both = ViT(vit).eval(), torch.zeros(2, 3, 224, 224)
+        what = f"{name} at 224 x 224, both fingertips (random weights)"
+        stages.append(_time(what, config.large_repeats, lambda t=backbone, b=both: t.features(b)))
+    return stages
+
+
+def _observations(config: PolicyConfig, camera: tuple[int, int]) -> list[dict[str, np.ndarray]]:
+    rng = np.random.default_rng(0)
+    seen = [key for key in config.proprioception if key not in config.estimated]
+    pictures = dict.fromkeys(ft.CAMERAS, (*camera, 3)) | {
+        key: ft.FEATURES[key].shape for key in ft.TACTILE
+    }
+    return [
+        {key: rng.normal(size=ft.FEATURES[key].shape).astype(np.float32) for key in seen}
+        | {key: rng.integers(90, 110, shape, np.uint8) for key, shape in pictures.items()}
+        for _ in range(8)
+    ]
+
+
+def _time(what: str, repeats: int, work: Callable[[], object]) -> Stage:
+    for _ in range(3):
+        work()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        times.append(1e3 * (time.perf_counter() - start))
+    return Stage(what, float(np.median(times)), float(np.quantile(times, 0.95)), max(times))
