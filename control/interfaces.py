@@ -12,6 +12,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from touchgoal.control.features import Observation
 from touchgoal.control.tactile.sensor_models import SensorModel
 
 Joints = Float[np.ndarray, "n"]
@@ -183,3 +184,25 @@ class LoadCell(Protocol):
     def close(self) -> None:
         """Release the port."""
         ...
+
+
+class Actor:
+    """Whatever acts in the control loop; `act` never waits for as long as a tick.
+
+    Attributes:
+        done: whether its plan has ended.
+        action_age: s for which it has had no new answer.
+    """
+
+    done = False
+    action_age = 0.0
+
+    def start(self, observation: Observation) -> None:
+        """Prepare for the first tick, while the arm is still at rest."""
+
+    def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
+        """Return the joint change (rad) of this tick and the gripper's target width (m)."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """End what `start` began."""

@@ -76,6 +76,10 @@ class Planner:
         self._first: Observation = {}
         self._embedded: list[tuple[Observation, np.ndarray, np.ndarray]] = []
 
+    def prepare_thread(self) -> None:
+        """Limit torch to one thread in the planning thread: two lose when the other core is taken."""
+        torch.set_num_threads(1)
+
     def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]:
         """Actions from the latest observation on.
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control import features as ft
+from touchgoal.control.deployment.follower import GRASP_SECONDS
 from touchgoal.control.motion.rotations import fingers_across, rotation_matrix
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.config import BeadMazeConfig, BeadMazeReset
@@ -20,7 +21,6 @@ START, END = 0.03, LENGTH - 0.03  # m of arc: where the bead starts and where it
 
 BEAD_RADIUS, BEAD_LENGTH, BEAD_MASS = 0.010, 0.016, 0.010  # m, m, kg
 HOLE_RADIUS, WIRE_RADIUS = 0.0024, 0.00175  # m
-GRASP_SECONDS = 0.5  # for which a fixture holds the bead while the hand closes on it
 _SAG = 6e-5  # m between the wire and its straight pieces, a tenth of the hole's clearance
 _WOOD = Material(Texture.SMOOTH, 0.0, 1e-3, HARD, 0.8, (0.78, 0.16, 0.12, 1.0))
 BEADS = {

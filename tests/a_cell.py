@@ -8,7 +8,7 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.deployment.control_loop import ControlLoop, Ending, RunLog
-from touchgoal.control.interfaces import ArmReading, Frame, GripperReading, LoadReading
+from touchgoal.control.interfaces import Actor, ArmReading, Frame, GripperReading, LoadReading
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 
@@ -141,14 +141,12 @@ class MadeUpCell:
         loop = ControlLoop(connection, safety, execute, lambda: "", lambda _: None)
         self.log = RunLog()
 
-        class Actor:
-            done, action_age, ticks = False, 0.0, 0
+        class Moves(Actor):
+            ticks = 0
 
             def act(self, observation: dict) -> np.ndarray:
                 self.ticks += 1
                 each_tick(self.ticks)
                 return np.array([step, *[0.0] * 6, width])
 
-            def close(self) -> None: ...
-
-        return loop.run(Actor(), seconds, self.log)
+        return loop.run(Moves(), seconds, self.log)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from touchgoal.control import features as ft
+from touchgoal.control.deployment.follower import WireFollower
 from touchgoal.control.tactile.contact import detect_contact
 from touchgoal.episodes.recording import run
 from touchgoal.policies.evaluation.evaluate import run_trials, trial_specs
-from touchgoal.policies.follower import WireFollower
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze, add_bead_on_wire, add_wire
 from touchgoal.sim_envs.config import BeadMazeConfig

@@ -23,17 +23,24 @@ from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import cell_limits, cell_watchdogs
 from touchgoal.control.deployment.control_loop import ControlLoop, Request, RunLog, TickStatus
-from touchgoal.control.deployment.session import Session
+from touchgoal.control.deployment.session import RecordEpisode, Session
+from touchgoal.control.interfaces import Actor
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
 from touchgoal.control.tactile.indentation import require_readable
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.repair import validate
-from touchgoal.episodes.store import EpisodeSet
+from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
-from touchgoal.launch.commands.deploy import EXAMPLES, NOT_DONE, STOPPED, find_cell_file
+from touchgoal.launch.commands.deploy import (
+    EXAMPLES,
+    NOT_DONE,
+    STOPPED,
+    find_cell_file,
+    load_policy,
+)
 from touchgoal.policies import checkpoint
-from touchgoal.policies.deployed import load_cell_policy
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import BeadMazeConfig
 from touchgoal.sim_envs.twin.in_process import simulate_cell
@@ -204,7 +211,15 @@ def test_without_a_simulator_the_operator_says_whether_it_is_done(
         return request_ if len(ticks) > 2 else ""
 
     session = Session(
-        bare, connection, safety, tmp_path, True, lambda _: actor, wanted, on_tick, truth=None
+        bare,
+        connection,
+        safety,
+        recorded_in(tmp_path),
+        True,
+        lambda _: actor,
+        wanted,
+        on_tick,
+        truth=None,
     )
     assert session.run().success is success
     meta = EpisodeSet(tmp_path).meta(0)
@@ -248,10 +263,14 @@ def test_the_policy_is_loaded_once_and_before_anything_else(
     assert not (tmp_path / "none").exists()
 
 
-class Acts:
-    """Moves the base at 0.2 rad/s, and after `after` ticks does `then`."""
+def recorded_in(folder: Path) -> RecordEpisode:
+    return lambda frames, task, meta: EpisodeWriter(folder, ft.CONTROL_HZ).append(
+        Episode(frames, task, meta)
+    )
 
-    done, action_age = False, 0.0
+
+class Acts(Actor):
+    """Moves the base at 0.2 rad/s, and after `after` ticks does `then`."""
 
     def __init__(self, after: int, then: float) -> None:
         self._left, self._then = after, then
@@ -259,8 +278,6 @@ class Acts:
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         self._left -= 1
         return np.array([0.01 if self._left > 0 else self._then, *np.zeros(6), 0.08])
-
-    def close(self) -> None: ...
 
 
 def deployed(cell: CellConfig, actor: Acts, stop_after: int = 10_000) -> tuple[str, bool, float]:
@@ -311,7 +328,7 @@ def test_example_cell_files_are_read(path: Path) -> None:
     if maze:  # as it was trained: what ships feels with printed dots, and fingers that hardly press
         low, high = BeadMazeConfig().grasp_force
         assert low <= cell.gripper.force <= high
-        assert load_cell_policy(cell) is not None
+        assert load_policy(cell) is not None
 
 
 def test_an_example_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -75,7 +75,7 @@ def preflighted(
     }
     connection = CellConnection(FR3, MadeUpArm(clock), MadeUpGripper(clock), cameras, None, clock)
     safety = ActionFilter(FR3, ft.CONTROL_HZ)
-    lines = preflight(read_cell_file(file), connection, safety, tmp_path / "episodes")
+    lines = preflight(read_cell_file(file), connection, safety, tmp_path / "episodes", lambda: 0)
     return {line.name: line for line in lines}
 
 
@@ -168,7 +168,7 @@ def test_a_run_with_exchanged_cameras_ends_after_the_start_move(
             read_cell_file(file),
             connection,
             ActionFilter(FR3, ft.CONTROL_HZ),
-            tmp_path / "episodes",
+            lambda *_: 0,
             True,
             actor,
             lambda: "",

@@ -96,3 +96,9 @@ def test_control_needs_no_torch() -> None:
     modules = ["touchgoal." + ".".join(f.parts) for f in files]
     program = f"import sys, {', '.join(modules)}; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_the_robots_pc_needs_neither_torch_nor_mujoco() -> None:
+    """With both blocked the scripted plan and a user's policy run on a cell; the command parses."""
+    program = Path(__file__).parent / "without_torch_and_mujoco.py"
+    subprocess.run([sys.executable, program], check=True, timeout=120)

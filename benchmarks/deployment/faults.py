@@ -28,14 +28,16 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import cell_watchdogs, connect_cell
-from touchgoal.control.deployment.control_loop import PLAN_ENDED, ControlLoop, DeployedActor
+from touchgoal.control.deployment.actors import make_actor
+from touchgoal.control.deployment.control_loop import PLAN_ENDED, ControlLoop
+from touchgoal.control.deployment.realtime import RealTimeActor
 from touchgoal.control.deployment.session import Session
 from touchgoal.control.features import Observation
-from touchgoal.control.interfaces import DriverError
+from touchgoal.control.interfaces import Actor, DriverError
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.episodes.repair import validate
-from touchgoal.episodes.store import EpisodeSet
-from touchgoal.policies.deployed import LearnedActor, make_actor
+from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies.policy import PolicyConfig
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
@@ -220,23 +222,26 @@ def _deploy(
     safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
     truth = partial(ask_twin, cell.task.twin, "truth")
 
-    def session(make: Callable[[ControlLoop], DeployedActor], seconds: float) -> Session:
+    def record(frames: dict[str, np.ndarray], task: str, meta: dict[str, Any]) -> int:
+        return EpisodeWriter(episodes, ft.CONTROL_HZ).append(Episode(frames, task, meta))
+
+    def session(make: Callable[[ControlLoop], Actor], seconds: float) -> Session:
         short = replace(cell, task=replace(cell.task, seconds=seconds))
         return Session(
-            short, connection, safety, episodes, True, make, lambda: "", lambda _: None, truth
+            short, connection, safety, record, True, make, lambda: "", lambda _: None, truth
         )
 
-    def expert(loop: ControlLoop) -> DeployedActor:
+    def expert(loop: ControlLoop) -> Actor:
         return make_actor(cell, None, safety, truth, loop.commanded)
 
     def mark_broken() -> None:
         broken_at.write_text(str(truth()["time"]))
 
-    def faulty(loop: ControlLoop) -> DeployedActor:
+    def faulty(loop: ControlLoop) -> Actor:
         if case.policy == "expert":
             return expert(loop)
         if case.policy == "hangs":
-            return LearnedActor(HangingPlanner(loop.width, mark_broken), connection.robot)
+            return RealTimeActor(HangingPlanner(loop.width, mark_broken))
         return BrokenPolicy(case.policy, loop, mark_broken)
 
     late, message = float("nan"), ""
@@ -259,16 +264,14 @@ def _deploy(
     connection.close()
 
 
-class BrokenPolicy:
+class BrokenPolicy(Actor):
     """A policy that moves well for a second and then breaks as it is told."""
-
-    done, action_age = False, 0.0
 
     def __init__(self, how: str, loop: ControlLoop, mark_broken: Callable[[], None]) -> None:
         self._how, self._loop, self._mark_broken, self._ticks = how, loop, mark_broken, 0
 
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        """See DeployedActor."""
+        """See Actor."""
         self._ticks += 1
         n, width = self._loop.commanded().size, self._loop.width
         step = np.zeros(n)
@@ -279,9 +282,6 @@ class BrokenPolicy:
             if self._ticks == ft.CONTROL_HZ + 1:
                 self._mark_broken()
         return np.append(step, width)
-
-    def close(self) -> None:
-        """Nothing is left behind."""
 
 
 class HangingPlanner:
@@ -294,6 +294,9 @@ class HangingPlanner:
 
     def __init__(self, width: float, mark_broken: Callable[[], None]) -> None:
         self._width, self._mark_broken, self._plans = width, mark_broken, 0
+
+    def prepare_thread(self) -> None:
+        """Do nothing."""
 
     def embed(self, seen: Sequence[Observation]) -> None:
         """Nothing is embedded ahead."""

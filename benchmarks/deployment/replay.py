@@ -19,6 +19,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import connect_cell
+from touchgoal.control.motion.servo_lag import ServoLag
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import Box, RobotLimits
 from touchgoal.runtime import seeds
@@ -26,7 +27,6 @@ from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 from touchgoal.sim_envs.config import DeploymentConfig, PickPlaceConfig
 from touchgoal.sim_envs.deployed_arm import all_well
 from touchgoal.sim_envs.pick_place import PickPlace
-from touchgoal.sim_envs.servo_lag import ServoLag
 
 
 @checked_dataclass

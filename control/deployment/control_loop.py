@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
 import numpy as np
 
@@ -18,9 +18,8 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.connection import CellConnection, RealClock
 from touchgoal.control.deployment.held_object import HeldObject
 from touchgoal.control.deployment.observation import CellReading, ObservationReader
-from touchgoal.control.deployment.realtime import RealTimeActor
 from touchgoal.control.features import Observation
-from touchgoal.control.interfaces import STOPPED_ON_REQUEST, ArmReading, DriverError
+from touchgoal.control.interfaces import STOPPED_ON_REQUEST, Actor, ArmReading, DriverError
 from touchgoal.control.safety.action_filter import ActionFilter, Limit, Measurements, SafetyState
 from touchgoal.runtime.errors import UserError
 
@@ -57,27 +56,6 @@ def _realtime_priority() -> Iterator[None]:
         yield
     finally:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-
-
-@runtime_checkable
-class DeployedActor(Protocol):
-    """What acts in the loop, and never waits for as long as a tick.
-
-    Attributes:
-        done: whether it is through.
-        action_age: s for which it has had no answer.
-    """
-
-    done: bool
-    action_age: float
-
-    def act(self, observation: Observation) -> np.ndarray:
-        """Joint change (rad) for this tick and gripper width (m)."""
-        ...
-
-    def close(self) -> None:
-        """End what it has started."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -211,7 +189,7 @@ class ControlLoop:
         """Joint positions (rad) commanded now."""
         return self.state.q
 
-    def run(self, actor: DeployedActor, seconds: float, log: RunLog) -> Ending:
+    def run(self, actor: Actor, seconds: float, log: RunLog) -> Ending:
         """Let it act until it is done, time is up, someone wants it or something is wrong."""
         try:
             real = isinstance(self._connection.clock, RealClock)
@@ -223,10 +201,9 @@ class ControlLoop:
             said = " ".join(str(error).split())
             return self.stop(f"{type(error).__name__}: {said}", "the program or the policy failed")
 
-    def _loop(self, actor: DeployedActor, seconds: float, log: RunLog) -> Ending:
+    def _loop(self, actor: Actor, seconds: float, log: RunLog) -> Ending:
         clock = self._connection.clock
-        if isinstance(actor, RealTimeActor):
-            actor.start(self._read().observation)
+        actor.start(self._read().observation)
         begin = due = clock.now()
         first = True
         while True:
@@ -277,9 +254,7 @@ class ControlLoop:
             return ending
         return replace(ending, reason=f"arm: {fault}; also: {ending.reason}")
 
-    def _tick(
-        self, actor: DeployedActor, log: RunLog, seconds: float, late: float
-    ) -> Ending | None:
+    def _tick(self, actor: Actor, log: RunLog, seconds: float, late: float) -> Ending | None:
         sensed = self._read()
         log.clocks.append((self._connection.clock.now(), sensed.arm.time))
         if not self._execute:

@@ -21,7 +21,6 @@ from touchgoal.control.tactile.indentation import require_readable
 from touchgoal.control.tactile.markers import find_markers, without_markers
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
-from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.runtime.checks import CheckResult
 from touchgoal.runtime.errors import UserError
 
@@ -37,9 +36,18 @@ _CLIENTS = {"fr3": FRANKY, "ur5e": UR_RTDE, "sim": _MUJOCO}
 
 
 def preflight(
-    cell: CellConfig, connection: CellConnection, safety: ActionFilter, episodes: Path
+    cell: CellConfig,
+    connection: CellConnection,
+    safety: ActionFilter,
+    episodes: Path,
+    count_episodes: Callable[[], int],
 ) -> list[CheckResult]:
-    """Every check, in the order of the table."""
+    """Return every check in the order of the table.
+
+    Args:
+        episodes: folder that the run records into.
+        count_episodes: counts those already in it; UserError if it cannot be continued.
+    """
     rates = measure_rates(connection)
     checks: list[tuple[str, Callable[[], str]]] = [
         ("client", lambda: check_client(cell)),
@@ -59,7 +67,7 @@ def preflight(
     checks += [
         ("policy", lambda: f"{cell.task.policy}, at {ft.CONTROL_HZ} Hz"),
         ("disk", lambda: _disk(episodes)),
-        ("episodes", lambda: _episodes(episodes)),
+        ("episodes", lambda: f"{count_episodes()} recorded in {episodes}"),
     ]
     return list(_run_checks(checks))
 
@@ -222,7 +230,3 @@ def _disk(episodes: Path) -> str:
             f"{free / 1e9:.1f} GB are free in {folder}: make room for {_MIN_FREE_BYTES / 1e9:g} GB"
         )
     return f"{free / 1e9:.0f} GB free"
-
-
-def _episodes(episodes: Path) -> str:
-    return f"{len(EpisodeWriter(episodes, fps=ft.CONTROL_HZ))} recorded in {episodes}"

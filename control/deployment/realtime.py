@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-import torch
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import Actor
+from touchgoal.control.motion.servo_lag import ServoLag
 from touchgoal.runtime.errors import UserError
 
 _FIRST_PLAN_TIMEOUT = 20.0  # s for the first plan; it warms everything up
@@ -52,11 +53,12 @@ class ChunkPlanner(Protocol):
     def config(self) -> Horizons: ...  # noqa: D102
     @property
     def ticks_seen(self) -> int: ...  # noqa: D102
+    def prepare_thread(self) -> None: ...  # noqa: D102
     def embed(self, seen: Sequence[Observation]) -> None: ...  # noqa: D102
     def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]: ...  # noqa: D102
 
 
-class RealTimeActor:
+class RealTimeActor(Actor):
     """Answers at once, from the newest plan; the next one is made in a thread.
 
     A plan is stamped with the tick of its observation and meant for the tick after it, always: it is
@@ -64,6 +66,10 @@ class RealTimeActor:
     how fast the machine is. Its action k belongs to the tick k after its observation: a plan that is
     late all the same makes no jump. If plans run out the arm is told to stand still, and that is
     counted. Plans that are no longer than what is done of them are asked for when they are needed.
+
+    A policy has learned on an arm whose servo follows with a lag. An arm that follows at once answers
+    its corrections too soon, and in contact the two shake each other. `lag` puts that lag back; what
+    it has not passed on yet counts as commanded.
 
     Attributes:
         latencies: seconds from an observation to its plan, of every plan but the first.
@@ -73,17 +79,21 @@ class RealTimeActor:
         failure: what ended the planning thread, if something did; `act` raises it.
     """
 
-    def __init__(self, planner: ChunkPlanner, timeout: float | None = None) -> None:
+    def __init__(
+        self, planner: ChunkPlanner, timeout: float | None = None, lag: ServoLag | None = None
+    ) -> None:
         """Starts an episode; `close` ends the thread.
 
         Args:
             planner: of this episode.
             timeout: s for which a plan that should be there is waited for; None: half a tick.
+            lag: of the arm that the policy learned on; None: commands are passed on at once.
         """
         self._planner, self._config = planner, planner.config
         self.latencies: list[float] = []
         self.late_plans = self.ticks_without_plan = 0
-        self.action_age = 0.0
+        self._lag = lag
+        self._before: np.ndarray | None = None  # joints (rad) wanted at the last tick
         self.failure: BaseException | None = None
         half = 0.5 / planner.config.control_hz
         self._timeout = half if timeout is None else timeout
@@ -114,7 +124,18 @@ class RealTimeActor:
             if self.failure is not None:
                 raise self.failure
 
-    def act(self, observation: Observation) -> Float32[np.ndarray, "8"]:
+    def act(self, observation: Observation) -> Float[np.ndarray, "8"]:
+        """Return the action for this tick, as late as the servo passes it on."""
+        if self._lag is None:
+            return self._answer(observation)
+        q = observation[ft.COMMAND][: ft.N_JOINTS] + self._lag.remaining
+        velocity = (q - (q if self._before is None else self._before)) * self._config.control_hz
+        self._before = q
+        wanted = np.concatenate([q, velocity]).astype(np.float32)
+        action = self._answer({**observation, ft.COMMAND: wanted})
+        return np.append(self._lag.update(action[:-1]), action[-1])
+
+    def _answer(self, observation: Observation) -> Float32[np.ndarray, "8"]:
         """The action for this tick; the first one belongs to what `start` has seen, if it was called."""
         if not self._history:
             self.start(observation)
@@ -162,8 +183,8 @@ class RealTimeActor:
         return self._closed or self.failure is not None or self._request is None
 
     def _work(self) -> None:
-        torch.set_num_threads(1)  # of this thread; two lose badly when the other core is taken
         try:
+            self._planner.prepare_thread()
             while (seen := self._wait()) is not None:
                 if isinstance(seen, _Request):
                     self._take(seen, self._planner.plan(seen.seen))

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import Actor
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.motion.self_collision import SelfDistance, require_no_self_collision
@@ -63,15 +64,12 @@ class PlannedMove:
     until_supported: bool = False
 
 
-class ScriptedActor:
+class ScriptedActor(Actor):
     """An actor that walks through moves; the plan waits while the arm is held.
 
     Attributes:
         done: whether the last move is over.
-        action_age: always 0: a script is never late.
     """
-
-    action_age = 0.0
 
     def __init__(self, moves: list[PlannedMove], commanded: Callable[[], np.ndarray], hz: float):
         """An actor.
@@ -84,7 +82,6 @@ class ScriptedActor:
         self._commanded, self._tick = commanded, 1 / hz
         self._wrench, self._measured = np.zeros(6), commanded()
         self._width, self._gripper_still = np.inf, False
-        self.done = False
         self._actions = self._run(moves)
 
     def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
@@ -94,9 +91,6 @@ class ScriptedActor:
         width = float(observation[ft.STATE][-1])
         self._gripper_still, self._width = abs(width - self._width) < _GRIPPER_MOVES, width
         return next(self._actions)
-
-    def close(self) -> None:
-        """Nothing is left behind."""
 
     def _run(self, moves: list[PlannedMove]) -> Iterator[np.ndarray]:
         still, width = np.zeros(self._commanded().size), 0.0

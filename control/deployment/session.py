@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.deployment.control_loop import (
     ControlLoop,
-    DeployedActor,
     Ending,
     Request,
     RunLog,
@@ -21,17 +19,17 @@ from touchgoal.control.deployment.control_loop import (
 from touchgoal.control.deployment.exchanged import Picture, cameras_exchanged
 from touchgoal.control.deployment.scripted import start_move
 from touchgoal.control.features import Observation
-from touchgoal.control.interfaces import DriverError
+from touchgoal.control.interfaces import Actor, DriverError
 from touchgoal.control.safety.action_filter import ActionFilter
-from touchgoal.episodes.schema import Episode, MetaValue
-from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.runtime.errors import UserError
 
 _START_TOLERANCE = 0.02  # rad from the start pose after the start move
 _CLOSE_TO_START = 0.1  # rad; nearer than that no start move is made
 _SETTLE_TIME = 2.0  # s that a simulator may take to see that the task is done
 
-MakeActor = Callable[[ControlLoop], DeployedActor]
+RecordEpisode = Callable[[dict[str, np.ndarray], str, dict[str, Any]], int]
+"""Record frames (key -> (T, ...)), instruction and facts as an episode; return its index."""
+MakeActor = Callable[[ControlLoop], Actor]
 
 
 @dataclass(frozen=True)
@@ -63,6 +61,7 @@ class Session:
     """What a deployment is made of.
 
     Attributes:
+        record: keeps the episode.
         execute: False: a dry run, which records nothing.
         make_actor: the actor, when the arm is at its start.
         operator_request, on_tick, cost, camera_size: see ControlLoop.
@@ -72,7 +71,7 @@ class Session:
     cell: CellConfig
     connection: CellConnection
     safety: ActionFilter
-    episodes: Path
+    record: RecordEpisode
     execute: bool
     make_actor: MakeActor
     operator_request: Callable[[], Request]
@@ -104,7 +103,7 @@ class Session:
         episode, recording_error = None, ""
         if self.execute and log.rows:
             try:
-                episode = self._record(log, ending, success)
+                episode = self._recorded(log, ending, success)
             except (OSError, UserError, MemoryError) as error:
                 recording_error = (
                     f"this episode could not be kept ({error}); those before it are whole"
@@ -184,10 +183,10 @@ class Session:
             return None
         return reading.width if reading.grasped else None
 
-    def _record(self, log: RunLog, ending: Ending, success: bool | None) -> int:
+    def _recorded(self, log: RunLog, ending: Ending, success: bool | None) -> int:
         cell = self.cell
         outcome = {True: "success", False: "failure", None: "unknown"}[success]
-        meta: dict[str, MetaValue] = {
+        meta: dict[str, Any] = {
             "sensor": cell.sensor,
             "arm": cell.arm,
             "policy": cell.task.policy,
@@ -197,5 +196,4 @@ class Session:
         if success is not None:
             meta["success"] = success
         task = cell.task.instruction or cell.task.name
-        episode = Episode(frames=log.frames(), task=task, meta=meta)
-        return EpisodeWriter(self.episodes, fps=ft.CONTROL_HZ).append(episode)
+        return self.record(log.frames(), task, meta)

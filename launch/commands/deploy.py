@@ -14,6 +14,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection, cell_watchdogs, connect_cell
+from touchgoal.control.deployment.actors import SCRIPTED, CellPolicy, load_user_policy, make_actor
 from touchgoal.control.deployment.control_loop import SLOW_ARM, Request, slow_arm
 from touchgoal.control.deployment.preflight import check_client, preflight
 from touchgoal.control.deployment.session import Result, Session
@@ -23,9 +24,10 @@ from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.published import is_published
 from touchgoal.encoders.towers.towers import load_towers
+from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.deploy import Config
 from touchgoal.launch.support.terminal import HELP, Terminal
-from touchgoal.policies.deployed import CellPolicy, load_cell_policy, make_actor
 from touchgoal.rewards.embedding_distance import check_words
 from touchgoal.rewards.goals import parse_goal
 from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
@@ -34,7 +36,7 @@ from touchgoal.rewards.setup import own_towers
 from touchgoal.runtime.checks import require_all_ok
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.run_folder import open_run, write_json
-from touchgoal.sim_envs.config import EnvConfig
+from touchgoal.sim_envs.twin.cell_task import env_config_of
 from touchgoal.sim_envs.twin.control_port import ask_twin, put_scene_back
 from touchgoal.sim_envs.twin.in_process import simulate_cell
 
@@ -50,7 +52,7 @@ _ASKING = 0.2  # s between questions to a twin
 def run_command(config: Config) -> None:
     """Check, connect, ask, run, record, report; the exit status says how it ended."""
     cell = _read(config)
-    policy, cost = load_cell_policy(cell), _load_cost(cell)
+    policy, cost = load_policy(cell), _load_cost(cell)
     check_client(cell)
     try:
         out = open_run(config.out, "deploy", config, adds=True)
@@ -73,6 +75,18 @@ def run_command(config: Config) -> None:
         if cost is not None:
             cost.close()
     _report(result, out)
+
+
+def load_policy(cell: CellConfig) -> CellPolicy | None:
+    """Return the cell's policy, None for a scripted actor; UserError if it does not fit."""
+    if cell.task.policy in SCRIPTED:
+        return None
+    options = env_config_of(cell)
+    if (policy := load_user_policy(cell, options)) is not None:
+        return policy
+    from touchgoal.policies.deployed import load_saved_policy
+
+    return load_saved_policy(cell, options)
 
 
 def find_cell_file(path: Path) -> Path:
@@ -124,7 +138,15 @@ def _deploy(
 ) -> Result:
     safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
     print("checks before anything moves:", flush=True)
-    results = preflight(cell, connection, safety, out / "episodes")
+    episodes = out / "episodes"
+
+    def count_episodes() -> int:
+        return len(EpisodeWriter(episodes, ft.CONTROL_HZ))
+
+    def record(frames: dict[str, np.ndarray], task: str, meta: dict[str, Any]) -> int:
+        return EpisodeWriter(episodes, ft.CONTROL_HZ).append(Episode(frames, task, meta))
+
+    results = preflight(cell, connection, safety, episodes, count_episodes)
     print("\n".join(str(f) for f in results), flush=True)
     require_all_ok(results)
     if config.execute and not config.yes:
@@ -151,14 +173,14 @@ def _deploy(
             cell=cell,
             connection=connection,
             safety=safety,
-            episodes=out / "episodes",
+            record=record,
             execute=config.execute,
             make_actor=lambda loop: make_actor(cell, policy, safety, truth, loop.commanded),
             operator_request=request,
             on_tick=terminal.show_tick,
             truth=truth,
             cost=cost.latest_cost if cost else None,
-            camera_size=policy.camera_size if policy else EnvConfig().camera_size,
+            camera_size=policy.camera_size if policy else ft.CAMERA_SHAPE[:2],
         )
         try:
             return session.run()

@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control import features as ft
+from touchgoal.control.deployment.user_policy import UserPolicy, preferred_env_config
 from touchgoal.episodes.recording import EpisodeSpec, one_core_workers, run
 from touchgoal.policies.by_name import (
     PolicyMaker,
-    UserPolicy,
     choose_policy,
     env_config_for,
-    preferred_env_config,
 )
 from touchgoal.policies.checkpoint import LoadedPolicy
 from touchgoal.policies.evaluation.success_rate import SuccessRate

@@ -10,6 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from touchgoal.control.motion.servo_lag import SERVO_DAMPING
 from touchgoal.control.motion.tool import FRANKA_HAND, SENSOR_BELOW_CARRIAGE, Tool
 from touchgoal.control.safety import limits
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
@@ -28,7 +29,6 @@ _STIFFNESS = {
     "fr3": (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0),
     "ur5e": (4500.0, 4500.0, 4500.0, 2000.0, 2000.0, 2000.0),
 }
-SERVO_DAMPING = 0.1  # s: N m s/rad for each N m/rad of stiffness, fr3.xml
 
 
 def robot_model() -> Path:

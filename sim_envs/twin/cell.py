@@ -8,12 +8,13 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
+from touchgoal.control.motion.servo_lag import SERVO_DAMPING
 from touchgoal.control.safety.braking import braked_velocity
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.estimated_wrench import WrenchError
 from touchgoal.sim_envs.pick_place import PickPlace
-from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE, SERVO_DAMPING
+from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE
 from touchgoal.sim_envs.twin.serial_arm import SerialArm
 
 DT = 1e-3  # s, of the Franka control interface and of the physics

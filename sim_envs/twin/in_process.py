@@ -26,9 +26,10 @@ from touchgoal.control.interfaces import (
 from touchgoal.control.motion.tracker import Tracker, TrackerState
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.config import STREAM_SIZE, BeadMazeConfig, PickPlaceConfig, TaskConfig
+from touchgoal.sim_envs.config import STREAM_SIZE
 from touchgoal.sim_envs.tasks import make_env
 from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
+from touchgoal.sim_envs.twin.cell_task import env_config_of
 
 _HELD_FORCE = 0.5  # N on both pads that mean something is held
 
@@ -213,7 +214,7 @@ class SimulatedLoadCell:
 
 def simulate_cell(config: CellConfig, hz: float) -> CellConnection:
     """The connection of a cell file with `arm = "sim"`: its sensors, task and limits, in simulation."""
-    env = make_env(env_config_of(config))
+    env = make_env(replace(env_config_of(config), camera_size=STREAM_SIZE))
     cell = SimulatedCell(env, config.task.seed, wrench_error=True)
     env.update_contacts()
     arm = SimulatedArm(cell, hz)
@@ -232,19 +233,4 @@ def simulate_cell(config: CellConfig, hz: float) -> CellConnection:
         SimulatedLoadCell(cell) if config.load_cell else None,
         SimulatedClock(cell, arm),
         cell.truth,
-    )
-
-
-def env_config_of(config: CellConfig) -> TaskConfig:
-    """The task's own options with the cell's sensors, at the rate of a deployment."""
-    task: TaskConfig = PickPlaceConfig(objects=config.task.objects)
-    if config.task.name == "bead-maze":
-        task = BeadMazeConfig(wires=config.task.wires)
-    return replace(
-        task,
-        cameras=tuple(config.cameras),
-        camera_size=STREAM_SIZE,
-        tactile=config.fingertips is not None,
-        sensor=config.sensor,
-        control_hz=ft.CONTROL_HZ,
     )

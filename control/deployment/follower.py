@@ -1,13 +1,16 @@
-"""The bead maze's classical baseline: yield to the wire's force, turn to where the hand has moved."""
+"""Classical baseline of the bead maze: yield to the wire's force, go on the way the hand has moved."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from touchgoal.control import features as ft
+from touchgoal.control.features import Observation
+from touchgoal.control.interfaces import Actor
 from touchgoal.control.motion.kinematics import Fr3Kinematics
 from touchgoal.control.motion.rotations import fingers_across
-from touchgoal.sim_envs.bead_maze import GRASP_SECONDS
+
+GRASP_SECONDS = 0.5  # s for which the hand closes on the bead before it moves
 
 
 @dataclass(frozen=True)
@@ -16,10 +19,10 @@ class FollowerConfig:
 
     Attributes:
         speed: along the wire, m/s.
-        compliance: speed at which the hand gives way to a force across the wire, m/s per N; more
-            than 1/(stiffness x lag) of arm and gel swings.
-        memory: time over which the direction of motion is averaged, s.
-        lead: how far the commanded position may be from the measured one, m.
+        compliance: speed of the hand per force across the wire, m/s per N; above 1/(stiffness x lag)
+            of arm and gel it oscillates.
+        memory: time constant of the averaged direction of motion, s.
+        lead: largest distance between commanded and measured position, m.
     """
 
     speed: float = 0.025
@@ -28,11 +31,11 @@ class FollowerConfig:
     lead: float = 0.006
 
 
-class WireFollower:
-    """Follows a wire that it does not know, from force and joint positions.
+class WireFollower(Actor):
+    """Actor that follows an unknown wire from force and joint positions; it never ends by itself.
 
-    While the hand closes it waits. It starts along the hand's x axis, which whoever put the bead into the hand has laid along the
-    wire. Compliance across a constraint and motion along it are Mason's (1981).
+    It waits while the hand closes, and starts along the hand's x axis, which must lie along the wire.
+    Compliance across a constraint and motion along it are Mason's (1981).
     """
 
     def __init__(self, control_hz: int = ft.CONTROL_HZ, config: FollowerConfig | None = None):
@@ -42,8 +45,8 @@ class WireFollower:
         self._command: np.ndarray | None = None
         self._grasping = round(GRASP_SECONDS * control_hz)
 
-    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        """The action for the next tick, from joint positions and the external force."""
+    def act(self, observation: Observation) -> np.ndarray:
+        """Return the action for the next tick."""
         if self._grasping > 0:
             self._grasping -= 1
             return np.zeros(8)

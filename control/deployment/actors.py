@@ -1,0 +1,101 @@
+"""The actor that a cell file's `task.policy` names."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from touchgoal.control import features as ft
+from touchgoal.control.cell.config import CellConfig
+from touchgoal.control.deployment.follower import WireFollower
+from touchgoal.control.deployment.realtime import ChunkPlanner, RealTimeActor
+from touchgoal.control.deployment.scripted import PickPlacePoses, pick_and_place
+from touchgoal.control.deployment.user_policy import UserPolicyPlanner, find_user_policy
+from touchgoal.control.interfaces import Actor
+from touchgoal.control.motion.servo_lag import ServoLag
+from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.runtime.errors import UserError
+
+_SIMULATED_PLAN_TIMEOUT = 20.0  # s for which a simulated arm's time stands still for a plan
+SCRIPTED = ("expert", "follower")
+"""Names of the actors without a policy."""
+
+
+@runtime_checkable
+class PolicyNeeds(Protocol):
+    """The options of an environment that say what a policy observes."""
+
+    @property
+    def tactile(self) -> bool: ...  # noqa: D102
+    @property
+    def cameras(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def camera_size(self) -> tuple[int, int]: ...  # noqa: D102
+
+
+@dataclass(frozen=True)
+class CellPolicy:
+    """A policy that fits a cell, loaded for one run.
+
+    Attributes:
+        planner: its plans.
+        camera_size: rows and columns of the camera images that it observes.
+    """
+
+    planner: ChunkPlanner
+    camera_size: tuple[int, int]
+
+    @classmethod
+    def fitting(cls, cell: CellConfig, planner: ChunkPlanner, needs: PolicyNeeds) -> "CellPolicy":
+        """Return the policy; UserError if the cell lacks a sensor that it needs."""
+        if cell.arm == "ur5e":
+            raise UserError(
+                "the policy commands the seven joints of an FR3, not a UR5e's: use expert"
+            )
+        if needs.tactile and cell.fingertips is None:
+            raise UserError("the policy feels with fingertips, the cell has none: add [fingertips]")
+        for camera in needs.cameras:
+            if camera not in cell.cameras:
+                raise UserError(f"the policy looks at the {camera} camera: add [cameras.{camera}]")
+        return cls(planner, needs.camera_size)
+
+
+def load_user_policy(cell: CellConfig, options: PolicyNeeds) -> CellPolicy | None:
+    """Return the cell's policy if it is a user's class, with the environment options it may change.
+
+    UserError if it does not fit the cell.
+    """
+    if (found := find_user_policy(cell.task.policy)) is None:
+        return None
+    return CellPolicy.fitting(cell, UserPolicyPlanner(found()), found.env_config(options))
+
+
+def make_actor(
+    cell: CellConfig,
+    policy: CellPolicy | None,
+    safety: ActionFilter,
+    truth: Callable[[], dict[str, Any]] | None,
+    commanded: Callable[[], np.ndarray],
+) -> Actor:
+    """Return the actor for one run, from where the arm is now."""
+    if policy is not None:
+        # So a run on a simulated arm repeats on any machine.
+        timeout = _SIMULATED_PLAN_TIMEOUT if cell.time_waits else None
+        return RealTimeActor(policy.planner, timeout, ServoLag(safety.limits, safety.dt))
+    if cell.task.policy == "follower":
+        return WireFollower(ft.CONTROL_HZ)
+    return pick_and_place(_pick_place_poses(cell, truth), safety, commanded)
+
+
+def _pick_place_poses(
+    cell: CellConfig, truth: Callable[[], dict[str, Any]] | None
+) -> PickPlacePoses:
+    """Return the expert's grasp and goal from the cell file, else from the simulator."""
+    task = cell.task
+    if task.grasp and task.goal:
+        return PickPlacePoses(task.grasp, task.goal)
+    if truth is None:
+        raise UserError("task.grasp and task.goal are missing: measure where they are, in metres")
+    layout = truth()["layout"]
+    return PickPlacePoses(tuple(layout["grasp"]), tuple(layout["goal"]))

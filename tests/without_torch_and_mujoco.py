@@ -1,0 +1,90 @@
+"""Runs the scripted expert's plan and a user's policy with torch and MuJoCo blocked."""
+
+import importlib
+import sys
+import tempfile
+from importlib.abc import MetaPathFinder
+from pathlib import Path
+
+BLOCKED = ("torch", "mujoco")
+
+
+class Blocker(MetaPathFinder):
+    def find_spec(self, fullname: str, path: object = None, target: object = None) -> None:
+        if fullname.split(".")[0] in BLOCKED:
+            raise ImportError(f"{fullname} is blocked")
+
+
+sys.meta_path.insert(0, Blocker())
+
+import numpy as np
+from a_cell import MadeUpArm, MadeUpClock, MadeUpGripper
+
+from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.cell.connection import CellConnection
+from touchgoal.control.deployment.actors import load_user_policy, make_actor
+from touchgoal.control.deployment.session import Result, Session
+from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.control.safety.limits import FR3
+from touchgoal.launch import deploy
+from touchgoal.launch.support.command_line import parse
+from touchgoal.sim_envs.twin.cell_task import env_config_of
+
+CELL = """
+arm = "sim"
+gripper = { kind = "franka_hand" }
+[task]
+name = "pick-place"
+policy = "POLICY"
+seconds = 40.0
+grasp = [0.45, 0.0, 0.02, 0.0]
+goal = [0.5, 0.1]
+"""
+USER_POLICY = """
+import numpy as np
+
+class Turns:
+    def reset(self): ...
+    def act(self, observation): return np.array([0.004, *np.zeros(6), 0.08])
+    def env_config(self, config): return config
+"""
+
+
+def run(folder: Path, policy: str, seconds: float) -> tuple[Result, dict]:
+    file = folder / "cell.toml"
+    file.write_text(CELL.replace("POLICY", policy).replace("40.0", str(seconds)))
+    cell, clock, recorded = read_cell_file(file), MadeUpClock(), {}
+    connection = CellConnection(FR3, MadeUpArm(clock), MadeUpGripper(clock), {}, None, clock)
+    safety = ActionFilter(FR3, 20)
+    loaded = load_user_policy(cell, env_config_of(cell))
+
+    def record(frames: dict, task: str, meta: dict) -> int:
+        recorded.update(frames)
+        return 0
+
+    session = Session(
+        cell=cell,
+        connection=connection,
+        safety=safety,
+        record=record,
+        execute=True,
+        make_actor=lambda loop: make_actor(cell, loaded, safety, None, loop.commanded),
+        operator_request=lambda: "",
+        on_tick=lambda _: None,
+        truth=None,
+    )
+    return session.run(), recorded
+
+
+for path in (Path(__file__).parents[1] / "control" / "deployment").glob("*.py"):
+    importlib.import_module(f"touchgoal.control.deployment.{path.stem}")
+assert not set(BLOCKED) & set(sys.modules)
+assert parse(deploy.Config, ["sim"], prog="deploy", description="", envs=None).cell == Path("sim")
+with tempfile.TemporaryDirectory() as name:
+    result, frames = run(Path(name), "expert", 40.0)
+    assert result.ending.reason == "the plan is through", result.ending
+    (Path(name) / "own.py").write_text(USER_POLICY)
+    result, frames = run(Path(name), f"{name}/own.py:Turns", 1.0)
+    assert result.ending.reason.startswith("time is up"), result.ending
+    turned = np.ptp(frames["observation.state"][:, 0])
+    assert 0.04 < turned < 0.1, turned
