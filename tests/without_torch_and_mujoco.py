@@ -1,3 +1,4 @@
+# ruff: noqa: E402
 """Runs the scripted expert's plan and a user's policy with torch and MuJoCo blocked."""
 
 import importlib

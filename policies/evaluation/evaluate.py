@@ -95,7 +95,7 @@ def evaluate(
 
     Args:
         policy: a name or folder as for `--policy`, what `load_policy` returned, or a policy of
-            one's own (see `policies/by_name.py`): its class, or an object of it.
+            one's own (see `control/deployment/user_policy.py`): its class, or an object of it.
         task: "pick-place", "bead-maze" (validation wires), or the config of either.
         episodes: how many; objects are taken in turn, wires one each.
         seed: of the first episode; each further one adds one.
