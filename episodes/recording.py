@@ -23,7 +23,7 @@ from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.base import FrankaTactileEnv
+from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.config import Outcome, TaskConfig
 from touchgoal.sim_envs.scene.filming import SceneRecorder
 from touchgoal.sim_envs.tasks import make_env, make_expert

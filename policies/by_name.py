@@ -13,7 +13,7 @@ from touchgoal.control.deployment.user_policy import find_user_policy, preferred
 from touchgoal.episodes.recording import Actor
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy, find_policy, suggestion
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.base import FrankaTactileEnv
+from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.config import TaskConfig, TaskName
 from touchgoal.sim_envs.tasks import make_expert, task_name
 

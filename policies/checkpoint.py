@@ -31,7 +31,7 @@ from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
 from touchgoal.policies.perception.state_estimation import StateEstimator, load_estimator
 from touchgoal.policies.policy import Policy, PolicyConfig
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.base import FrankaTactileEnv
+from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.config import TASKS, EnvConfig, TaskConfig, TaskName
 from touchgoal.sim_envs.tasks import task_name
 

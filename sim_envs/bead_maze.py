@@ -9,7 +9,7 @@ from jaxtyping import Float
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.follower import GRASP_SECONDS
 from touchgoal.control.motion.rotations import fingers_across, rotation_matrix
-from touchgoal.sim_envs.base import FrankaTactileEnv
+from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.config import BeadMazeConfig, BeadMazeReset
 from touchgoal.sim_envs.options import with_options
 from touchgoal.sim_envs.scene import wires

@@ -15,9 +15,9 @@ from jaxtyping import Float32, UInt8
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.indenter_rig import rig_unit
 from touchgoal.sim_envs.tactile.markers import draw
+from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, press, untouched
+from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance
-from touchgoal.sim_envs.tactile.surface_press import SurfacePose, press, untouched
-from touchgoal.sim_envs.tactile.surfaces import TILE, Surface
 
 FRAMES = 5
 """Of a clip, of which the first is untouched."""

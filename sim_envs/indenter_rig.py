@@ -20,7 +20,7 @@ from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.sim_envs.config import Indenter, RigConfig
 from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Shape, Texture
 from touchgoal.sim_envs.tactile.field_on_picture import tractions
-from touchgoal.sim_envs.tactile.press_bench import PressBench
+from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
 FPS = 60

@@ -29,7 +29,7 @@ from touchgoal.sim_envs.scene.objects import (
     sample_body,
 )
 from touchgoal.sim_envs.tactile.forces import ForceField
-from touchgoal.sim_envs.tactile.press_bench import PressBench
+from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
 HeldObject = Literal["bar", "can"]

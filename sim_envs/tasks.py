@@ -3,8 +3,8 @@
 from typing import Any, Literal, overload
 
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.config import BeadMazeConfig, EnvConfig, Outcome, TaskConfig, TaskName
 from touchgoal.sim_envs.experts.bead_maze import BeadMazeExpert
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert

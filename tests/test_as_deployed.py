@@ -11,8 +11,8 @@ from touchgoal.control import features as ft
 from touchgoal.control.safety.task_ceilings import TASK_FORCES
 from touchgoal.policies.perception.proprioception import network_input, tare
 from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.cell.estimated_wrench import EstimatedWrench
 from touchgoal.sim_envs.config import BeadMazeConfig, DeploymentConfig, PickPlaceConfig
-from touchgoal.sim_envs.estimated_wrench import EstimatedWrench
 from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 

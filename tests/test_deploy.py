@@ -42,8 +42,8 @@ from touchgoal.launch.commands.deploy import (
 )
 from touchgoal.policies import checkpoint
 from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.cell.in_process import simulate_cell
 from touchgoal.sim_envs.config import BeadMazeConfig
-from touchgoal.sim_envs.twin.in_process import simulate_cell
 
 _PATIENCE = 600  # s for a loop, on a machine however loaded
 SIM = """

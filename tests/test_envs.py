@@ -15,8 +15,8 @@ import touchgoal
 from touchgoal.control import features as ft
 from touchgoal.episodes.recording import EpisodeSpec, record_episode
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import OUTCOMES, PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace

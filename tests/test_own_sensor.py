@@ -24,9 +24,9 @@ from touchgoal.control.tactile.sensor_models import (
 )
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, press, untouched
+from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
-from touchgoal.sim_envs.tactile.surface_press import SurfacePose, press, untouched
-from touchgoal.sim_envs.tactile.surfaces import TILE, Surface
 
 BALL = Surface("ball", 4e-3, 1.0, np.zeros((TILE, TILE), np.float32), 1.0)
 RNG = np.random.default_rng(0)

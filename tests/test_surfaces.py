@@ -15,16 +15,16 @@ from touchgoal.encoders.ssl.surface_whitening import (
     train,
 )
 from touchgoal.encoders.whitening import inverse_square_root
-from touchgoal.sim_envs.tactile.indenters import FOUNDATION_MODULUS, IndenterPose, indent
-from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
-from touchgoal.sim_envs.tactile.surface_press import (
+from touchgoal.sim_envs.tactile.rig.indenters import FOUNDATION_MODULUS, IndenterPose, indent
+from touchgoal.sim_envs.tactile.rig.surface_press import (
     SurfacePose,
     overlap,
     press,
     random_pose,
     untouched,
 )
-from touchgoal.sim_envs.tactile.surfaces import TILE, Surface, random_surface
+from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface, random_surface
+from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
 SMOOTH = np.zeros((TILE, TILE), np.float32)
 LEVEL = SurfacePose((0.0, 0.0), 0.0, (0.0, 0.0), (128.0, 128.0), 0.5e-3)

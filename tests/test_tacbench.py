@@ -37,7 +37,7 @@ from touchgoal.sim_envs.object_slides import (
     simulate_slide,
 )
 from touchgoal.sim_envs.scene.objects import CATALOGUE, Body
-from touchgoal.sim_envs.tactile.press_bench import PressBench
+from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 
 RIG = RigConfig(seed=3)
 STROKES = 15

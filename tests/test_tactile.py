@@ -26,7 +26,7 @@ from touchgoal.sim_envs.tactile.geometry import (
 )
 from touchgoal.sim_envs.tactile.optics import colour_change, render
 from touchgoal.sim_envs.tactile.pad import TactileFrame
-from touchgoal.sim_envs.tactile.press_bench import PressBench
+from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
 INSTANCE = sample_instance(MINI, np.random.default_rng(0), NO_RANDOMIZATION)

@@ -19,7 +19,7 @@ from touchgoal.sim_envs.scene.objects import CATALOGUE, Body, ObjectKind
 from touchgoal.sim_envs.tactile.markers import draw
 from touchgoal.sim_envs.tactile.optics import render, render_untouched
 from touchgoal.sim_envs.tactile.pad import TactileFrame
-from touchgoal.sim_envs.tactile.press_bench import PressBench
+from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 from touchgoal.sim_envs.tactile.sensor_instance import COUNT_STEP, SensorInstance, sample_instance
 
 HEIGHT, WIDTH = GELSIGHT_MINI.image_shape

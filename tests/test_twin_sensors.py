@@ -13,11 +13,11 @@ from running_twin import RunningTwin
 from touchgoal.control.sensors.load_cell import parse
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.cell.in_process import SimulatedArm
+from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.twin import control_port
-from touchgoal.sim_envs.twin.cell import SimulatedCell
-from touchgoal.sim_envs.twin.in_process import SimulatedArm
 from touchgoal.sim_envs.twin.mjpeg import Stream
 from touchgoal.sim_envs.twin.pace import Pace
 

@@ -24,8 +24,8 @@ from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import Box, RobotLimits
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
+from touchgoal.sim_envs.cell.deployed_arm import all_well
 from touchgoal.sim_envs.config import DeploymentConfig, PickPlaceConfig
-from touchgoal.sim_envs.deployed_arm import all_well
 from touchgoal.sim_envs.pick_place import PickPlace
 
 

@@ -13,7 +13,7 @@ from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3, UR5E, RobotLimits
 from touchgoal.runtime.option_types import Positive, Seed, checked_dataclass
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.deployed_arm import all_well
+from touchgoal.sim_envs.cell.deployed_arm import all_well
 
 
 @checked_dataclass

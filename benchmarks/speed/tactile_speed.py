@@ -18,7 +18,7 @@ from touchgoal.runtime.errors import install_extra
 from touchgoal.runtime.option_types import Count, checked_dataclass
 from touchgoal.sim_envs.config import NO_RANDOMIZATION
 from touchgoal.sim_envs.scene.objects import CATALOGUE, HARD, Body, Material, ObjectKind, Texture
-from touchgoal.sim_envs.tactile.press_bench import PressBench
+from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
 

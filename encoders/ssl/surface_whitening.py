@@ -22,9 +22,9 @@ from touchgoal.encoders.backbones.pooled_encoder import (
 )
 from touchgoal.encoders.whitening import inverse_square_root
 from touchgoal.runtime.progress import track
+from touchgoal.sim_envs.tactile.rig.surface_press import press, random_pose, untouched
+from touchgoal.sim_envs.tactile.rig.surfaces import random_surface
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
-from touchgoal.sim_envs.tactile.surface_press import press, random_pose, untouched
-from touchgoal.sim_envs.tactile.surfaces import random_surface
 
 _UNITS = 48
 _BATCH = 32

@@ -36,9 +36,9 @@ from touchgoal.rewards.setup import own_towers
 from touchgoal.runtime.checks import require_all_ok
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.run_folder import open_run, write_json
+from touchgoal.sim_envs.cell.in_process import simulate_cell
 from touchgoal.sim_envs.twin.cell_task import env_config_of
 from touchgoal.sim_envs.twin.control_port import ask_twin, put_scene_back
-from touchgoal.sim_envs.twin.in_process import simulate_cell
 
 EXAMPLES = Path(__file__).parents[2] / "control" / "cell" / "examples"
 

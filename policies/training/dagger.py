@@ -11,7 +11,7 @@ from touchgoal.episodes.recording import Actor, EpisodeSpec
 from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import Planner, PolicyActor
 from touchgoal.policies.checkpoint import SavedPolicy
-from touchgoal.sim_envs.base import FrankaTactileEnv
+from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.tasks import make_expert

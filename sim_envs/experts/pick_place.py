@@ -9,7 +9,7 @@ import numpy as np
 from touchgoal.control.features import Observation
 from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH
+from touchgoal.sim_envs.cell.environment import GRIPPER_MAX_WIDTH
 from touchgoal.sim_envs.config import Outcome
 from touchgoal.sim_envs.pick_place import PickPlace
 

@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from touchgoal.control.features import Observation
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
-from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH
+from touchgoal.sim_envs.cell.environment import GRIPPER_MAX_WIDTH
 from touchgoal.sim_envs.experts.pick_place import (
     CLEARANCE,
     LOWEST_GRASP,

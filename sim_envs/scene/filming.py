@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.sim_envs.base import FrankaTactileEnv
+from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.scene.rendering import open_renderer
 
 Picture = UInt8[np.ndarray, "_ _ 3"]  # pictures of different sizes meet in one call

@@ -47,7 +47,7 @@ import numpy as np
 
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
+from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.lock_step import LockStep
 from touchgoal.sim_envs.twin.pictures import Pictures
 from touchgoal.sim_envs.twin.serial.devices import SerialPort

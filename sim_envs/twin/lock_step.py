@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.twin.cell import SimulatedCell
+from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
 from touchgoal.sim_envs.twin.franka.controller import FrankaArm
 from touchgoal.sim_envs.twin.franka.hand import FrankaHand
 from touchgoal.sim_envs.twin.pictures import Pictures

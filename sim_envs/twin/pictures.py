@@ -10,7 +10,7 @@ import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.twin.cell import SimulatedCell
+from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
 from touchgoal.sim_envs.twin.picture_process import (
     STATE,
     Address,

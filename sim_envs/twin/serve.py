@@ -19,12 +19,12 @@ from touchgoal.control.cell.config import (
 from touchgoal.control.safety.limits import FR3, UR5E
 from touchgoal.control.sensors.load_cell import LoadCellConfig
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.base import FrankaTactileEnv
 from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
+from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 from touchgoal.sim_envs.config import TaskConfig
-from touchgoal.sim_envs.tactile.press_bench import warm_up
+from touchgoal.sim_envs.tactile.rig.press_bench import warm_up
 from touchgoal.sim_envs.tasks import make_env
-from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.control_port import ControlPort
 from touchgoal.sim_envs.twin.franka.controller import FrankaArm
 from touchgoal.sim_envs.twin.franka.hand import FrankaHand

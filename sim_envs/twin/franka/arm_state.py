@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
-from touchgoal.sim_envs.twin.cell import SimulatedCell
+from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
 from touchgoal.sim_envs.twin.franka import limits, messages
 from touchgoal.sim_envs.twin.franka.hand_frames import Pose
 from touchgoal.sim_envs.twin.franka.messages import RobotMode

@@ -13,8 +13,8 @@ import numpy as np
 from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.safety.limits import FR3
 from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 from touchgoal.sim_envs.scene.build import robot_model
-from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.franka import limits, messages
 from touchgoal.sim_envs.twin.franka.arm_state import OTHER, ArmState, end_effector
 from touchgoal.sim_envs.twin.franka.hand_frames import describe_hand

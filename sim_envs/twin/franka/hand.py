@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from touchgoal.sim_envs.base import GRIPPER_MAX_WIDTH, GRIPPER_SPEED
+from touchgoal.sim_envs.cell.environment import GRIPPER_MAX_WIDTH, GRIPPER_SPEED
+from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE
-from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.franka import messages
 from touchgoal.sim_envs.twin.franka.messages import HandCommand, HandStatus
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numba import njit
 
 from touchgoal.control.safety.limits import FR3
-from touchgoal.sim_envs.twin.cell import DT
+from touchgoal.sim_envs.cell.simulated_cell import DT
 
 Joints = Float[np.ndarray, "7"]
 Wrench = Float[np.ndarray, "6"]

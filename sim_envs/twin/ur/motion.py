@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from touchgoal.control.motion.rotations import rotation_matrix, rotation_vector
 from touchgoal.control.safety.braking import braked_velocity
-from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
+from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 
 _SERVO_ACCELERATION = 40.0  # rad/s^2, the most that ur-rtde lets a client ask for
 _STILL = 1e-3  # rad/s

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_matrix, rotation_vector
 from touchgoal.control.safety.limits import UR5E
-from touchgoal.sim_envs.twin.cell import SimulatedCell
+from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
 from touchgoal.sim_envs.twin.ur.motion import (
     Activity,
     Force,

@@ -16,9 +16,9 @@ from touchgoal.control.motion.servo_lag import SERVO_DAMPING, ServoLag
 from touchgoal.control.motion.tracker import Tracker
 from touchgoal.control.safety.action_filter import ActionFilter, Measurements
 from touchgoal.control.safety.task_ceilings import TASK_FORCES
+from touchgoal.sim_envs.cell.deployed_hand import DeployedHand
+from touchgoal.sim_envs.cell.estimated_wrench import EstimatedWrench
 from touchgoal.sim_envs.config import DeploymentConfig
-from touchgoal.sim_envs.deployed_hand import DeployedHand
-from touchgoal.sim_envs.estimated_wrench import EstimatedWrench
 
 _DT = 1e-3  # s
 _WRENCH_PERIOD = 10  # ms between readings of the force on the hand

@@ -13,8 +13,8 @@ from jaxtyping import Float32, UInt8
 
 from touchgoal.control.tactile.gel import deform
 from touchgoal.sim_envs.tactile.optics import render, render_untouched
+from touchgoal.sim_envs.tactile.rig.surfaces import TILE, TILE_PITCH, Surface
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance
-from touchgoal.sim_envs.tactile.surfaces import TILE, TILE_PITCH, Surface
 
 DEPTHS = 0.15e-3, 1.3e-3
 """How deep a thing is pressed in, m: least and most of a light hand."""

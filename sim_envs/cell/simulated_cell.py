@@ -11,11 +11,11 @@ from numba import njit
 from touchgoal.control.motion.servo_lag import SERVO_DAMPING
 from touchgoal.control.safety.braking import braked_velocity
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.base import FrankaTactileEnv
-from touchgoal.sim_envs.estimated_wrench import WrenchError
+from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
+from touchgoal.sim_envs.cell.estimated_wrench import WrenchError
+from touchgoal.sim_envs.cell.serial_arm import SerialArm
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE
-from touchgoal.sim_envs.twin.serial_arm import SerialArm
 
 DT = 1e-3  # s, of the Franka control interface and of the physics
 AT_REST = 0.01  # rad/s

@@ -15,13 +15,13 @@ from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.control.motion.tool import FRANKA_HAND
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.cell.deployed_arm import DeployedArm
+from touchgoal.sim_envs.cell.spaces import action_space, observation_space
 from touchgoal.sim_envs.config import IDEAL_DEPLOYMENT, SETPOINT_PERIOD, EnvConfig, SceneConfig
-from touchgoal.sim_envs.deployed_arm import DeployedArm
 from touchgoal.sim_envs.scene.build import ROBOTS, SIDES, arm_joints, build
 from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, ContactReader, PadContact
 from touchgoal.sim_envs.scene.objects import Body
 from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
-from touchgoal.sim_envs.spaces import action_space, observation_space
 from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 

@@ -26,9 +26,9 @@ from touchgoal.control.interfaces import (
 from touchgoal.control.motion.tracker import Tracker, TrackerState
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 from touchgoal.sim_envs.config import STREAM_SIZE
 from touchgoal.sim_envs.tasks import make_env
-from touchgoal.sim_envs.twin.cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.cell_task import env_config_of
 
 _HELD_FORCE = 0.5  # N on both pads that mean something is held
