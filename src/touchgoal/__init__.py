@@ -6,6 +6,8 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+import gymnasium
+
 if TYPE_CHECKING:
     from touchgoal.encoders.pretrained import load_encoder as load_encoder
     from touchgoal.policies.checkpoint import load_policy as load_policy
@@ -38,9 +40,12 @@ if sys.platform == "linux" and "DISPLAY" not in os.environ and "MUJOCO_GL" not i
 # is longer than an arm may go on without news.
 os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
 
-from touchgoal.sim_envs.registration import register_environments  # noqa: E402
-
-register_environments()
+gymnasium.register(
+    "touchgoal/PickPlace-v0", "touchgoal.sim_envs.pick_place:PickPlace", max_episode_steps=160
+)
+gymnasium.register(
+    "touchgoal/BeadMaze-v0", "touchgoal.sim_envs.bead_maze:BeadMaze", max_episode_steps=800
+)
 
 # One call a job. Each is imported when it is first used: `import touchgoal` stays light.
 _INTERFACE = {
