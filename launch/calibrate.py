@@ -57,13 +57,12 @@ def main(config: Config) -> None:
     from touchgoal.control.calibration.pictures import light_compass
     from touchgoal.control.calibration.press_set import read_presses, split
     from touchgoal.control.tactile.sensor_calibration import save
-    from touchgoal.control.tactile.sensor_models import SENSORS
+    from touchgoal.control.tactile.sensor_models import find_model
     from touchgoal.runtime.progress import Progress
     from touchgoal.runtime.provenance import provenance
     from touchgoal.runtime.run_folder import open_run, write_json
 
-    if config.sensor not in SENSORS:
-        raise UserError(f"unknown sensor {config.sensor!r}; choose from: {', '.join(SENSORS)}")
+    find_model(config.sensor)
     pitch = config.mm_per_pixel * 1e-3
     presses = read_presses(config.presses, pitch, config.ball_mm or math.nan)
     if np.isnan(presses.ball_radius).any():

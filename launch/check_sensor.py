@@ -1,12 +1,12 @@
-"""Try a sensor, or a sensor file, on frames of one's own.
+"""Check a sensor, or a sensor file, on your own frames: noise, drift, contact, depth, force, markers.
 
-SOURCE is a USB serial number, a device (/dev/video2) or a stream's address; or a video, or a folder of
-pictures. Leave the gel untouched for the first second, then press: whatever you like, or a ball
-(--ball-mm), or lay a weight on it (--weight-g).
+SOURCE is a USB serial number, a device (/dev/video2), a stream's address, a video, or a folder of
+pictures. Leave the gel untouched for the first second, then press any object, press a ball (--ball-mm),
+or lay a weight on the gel (--weight-g).
 """
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -36,8 +36,25 @@ class Config:
     """Folder of the run."""
 
 
-def main(config: Any) -> None:
-    """Watch, print what the frames say, and draw the firmest presses."""
-    from touchgoal.launch.commands.check_sensor import run_command
+def main(config: Config) -> None:
+    """Read the frames, print what they show, and draw the firmest presses."""
+    from touchgoal.control.calibration import check_report
+    from touchgoal.control.calibration.report import write_picture
+    from touchgoal.control.calibration.sensor_check import check_sensor
+    from touchgoal.control.sensors.fingertip_source import is_recorded, open_frames
+    from touchgoal.control.tactile.sensor_models import find_sensor
+    from touchgoal.runtime.run_folder import open_run, write_json
 
-    run_command(config)
+    sensor = find_sensor(config.sensor)
+    out = open_run(config.out, "check-sensor", config)
+    if not is_recorded(config.source):
+        print(f"leave the gel untouched for a second, then press; {config.seconds:g} s", flush=True)
+    frames = open_frames(
+        config.source, sensor, config.corners, config.exposure, seconds=config.seconds
+    )
+    check = check_sensor(frames, sensor, config.ball_mm and config.ball_mm * 1e-3)
+    figures = check_report.figures(check, config.ball_mm, config.weight_g)
+    print("\n".join(check_report.lines(check, figures)))
+    write_json(out / "metrics.json", figures)
+    write_picture(out / "check.png", check_report.picture(check))
+    print(f"presses, their change and depth: {out / 'check.png'}")

@@ -1,12 +1,12 @@
 """Record presses of a ball all over a sensor's gel, and fit its sensor file to them.
 
-SOURCE is a USB serial number, a device (/dev/video2) or a stream's address; or a video, or a folder
-of pictures, of such a recording. Leave the gel untouched for a second, then press the ball where the
-live picture says, hold still until it is kept, and lift. Ctrl-C ends; what was kept is on disk.
+SOURCE is a USB serial number, a device (/dev/video2), a stream's address, or a recording: a video or a
+folder of pictures. Leave the gel untouched for a second. Then press the ball where the live picture
+shows, hold still until the press is recorded, and lift. Ctrl-C ends; recorded presses are written.
 """
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 from pydantic import Field
@@ -45,8 +45,49 @@ class Config:
     """Folder of the run; the presses go to its `presses/`, the sensor file to `calibration_N/` (N presses)."""
 
 
-def main(config: Any) -> None:
+def main(config: Config) -> None:
     """Record until the map is full, the recording ends or Ctrl-C; then fit."""
-    from touchgoal.launch.commands.record_presses import run_command
+    from contextlib import closing, nullcontext
 
-    run_command(config)
+    from touchgoal.control.calibration.press_recorder import PressRecorder, record
+    from touchgoal.control.calibration.press_set import MINIMUM, write_presses
+    from touchgoal.control.sensors.fingertip_source import is_recorded, open_frames
+    from touchgoal.control.sensors.live_picture import LivePicture
+    from touchgoal.control.tactile.sensor_models import find_model
+    from touchgoal.launch import calibrate
+    from touchgoal.runtime.errors import UserError
+    from touchgoal.runtime.run_folder import open_run
+
+    model, recorded = find_model(config.sensor), is_recorded(config.source)
+    if config.resume and config.out is None:
+        raise UserError("--resume: name the folder of the recording with --out")
+    if config.exposure is None and not recorded and "://" not in config.source:
+        raise UserError(
+            "give --exposure (v4l2-ctl --list-ctrls shows its range): automatic exposure changes the "
+            "light with every press"
+        )
+    frames = open_frames(
+        config.source, model, config.corners, config.exposure, config.white_balance
+    )
+    out = open_run(config.out, "record-presses", config, adds=config.resume)
+    recorder = PressRecorder(model.image_shape, config.presses_per_part)
+    with closing(frames), nullcontext() if recorded else closing(LivePicture(config.port)) as live:
+        if live is not None:
+            print(f"live picture: {live.address}")
+        record(frames, recorder, live)
+    if not recorder.images:
+        raise UserError(f"no press was recorded; the last hint was: {recorder.hint}")
+    folder = out / "presses"
+    earlier = len(list(folder.glob("press_*.png")))
+    write_presses(recorder.presses(config.ball_mm * 1e-3, earlier), folder, adds=config.resume)
+    missing = int((config.presses_per_part - recorder.counts).clip(0).sum())
+    total = earlier + len(recorder.images)
+    print(
+        f"{len(recorder.images)} presses recorded, {missing} missing of the map; {total} in {folder}"
+    )
+    if not config.calibrate:
+        return
+    if total < MINIMUM:
+        raise UserError(f"calibration needs {MINIMUM} presses: go on with --out {out} --resume")
+    result = out / f"calibration_{total}"
+    calibrate.main(calibrate.Config(folder, config.mm_per_pixel, config.sensor, out=result))

@@ -12,8 +12,13 @@ import pytest
 from touchgoal.control.calibration.ball import ball_overlap, press_surface
 from touchgoal.control.calibration.calibrate import fit, median_background
 from touchgoal.control.calibration.held_out_depth import sphere_in
-from touchgoal.control.calibration.light_drift import without_drift
-from touchgoal.control.calibration.press_set import PressSet, read_presses, split, write_presses
+from touchgoal.control.calibration.press_set import (
+    PressSet,
+    read_presses,
+    split,
+    without_drift,
+    write_presses,
+)
 from touchgoal.control.tactile import gel, sensor_calibration
 from touchgoal.control.tactile.sensor_calibration import SensorCalibration
 from touchgoal.control.tactile.sensor_models import SENSORS

@@ -13,7 +13,7 @@ from touchgoal.benchmarks.real_touch import forces, markers
 from touchgoal.benchmarks.real_touch.embedders import find_embedder
 from touchgoal.benchmarks.real_touch.force_onset import EmbeddedGrasp, cost_table, judge_cost
 from touchgoal.benchmarks.real_touch.videos import Config, embed_touch, read_touch, run
-from touchgoal.control.tactile.picture_force import calibrate_force, shrunk, statistics
+from touchgoal.control.tactile.force import calibrate_force, change_statistics, resized
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.pretrained import find_encoder, load_encoder, load_pooled
 from touchgoal.encoders.probes import property_probe
@@ -226,13 +226,13 @@ def test_force_is_read_of_another_thing() -> None:
         for newton in force:
             bump = 4 * newton * np.exp(-((X - 40) ** 2 + (Y - 30) ** 2) / (2 * width**2))
             frame = background + bump[..., None] * [1, -1, 0.5] + rng.normal(0, 1, (60, 80, 3))
-            rows.append(statistics(frame.clip(0, 255).astype(np.uint8), shrunk(background)))
+            rows.append(change_statistics(frame.clip(0, 255).astype(np.uint8), resized(background)))
         return np.stack(rows), force
 
     known = [grasp(width, i) for i, width in enumerate((3.0, 5.0))]
     reader = calibrate_force(*(np.concatenate(part) for part in zip(*known, strict=True)))
     rows, force = grasp(4.0, 9)
-    assert np.median(np.abs(reader.of_statistics(rows) - force)) < 1.5
+    assert np.median(np.abs(reader.predict(rows) - force)) < 1.5
     with pytest.raises(UserError, match="are too few"):
         calibrate_force(rows[:20], force[:20])
 

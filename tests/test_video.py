@@ -14,7 +14,7 @@ import pytest
 
 from touchgoal.control.interfaces import DriverError, TactileSensor
 from touchgoal.control.sensors.fingertip_source import fingertip_video, fingertip_view
-from touchgoal.control.sensors.pictures import (
+from touchgoal.control.sensors.picture_integrity import (
     FrozenParts,
     JpegDecoder,
     gel_picture,

@@ -11,7 +11,7 @@ from touchgoal.benchmarks.real_touch.embedders import Embedder, find_embedder
 from touchgoal.benchmarks.real_touch.force_onset import EmbeddedGrasp, cost_table, judge_cost
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
-from touchgoal.control.tactile.picture_force import calibrate_force, shrunk, statistics
+from touchgoal.control.tactile.force import calibrate_force, change_statistics, resized
 from touchgoal.encoders.probes.property_probe import interval
 from touchgoal.episodes.importers.force_grasps import ForceGrasp, read_force_grasps
 from touchgoal.runtime.option_types import RARE, Corners, Count, Seed, checked_dataclass
@@ -63,9 +63,9 @@ def judge_grasps(grasps: list[ForceGrasp], embedders: dict[str, Embedder]) -> di
         if open_hand:
             force = force - np.median(force[:_FIRST])
         untouched = np.median(frames[: _FIRST if open_hand else 1], 0).astype(np.uint8)
-        background = shrunk(untouched)
-        small = [shrunk(frame).astype(np.uint8) for frame in frames]
-        rows.append(np.stack([statistics(frame, background) for frame in small]))
+        background = resized(untouched)
+        small = [resized(frame).astype(np.uint8) for frame in frames]
+        rows.append(np.stack([change_statistics(frame, background) for frame in small]))
         forces.append(force)
         things.append(np.full(len(force), grasp.object))
         detector = ContactDetector(Background(np.stack(small[:1])))
@@ -85,7 +85,7 @@ def judge_grasps(grasps: list[ForceGrasp], embedders: dict[str, Embedder]) -> di
         known = judged & (thing != name)
         reader = calibrate_force(every[known], force[known])
         own = thing == name
-        error[own] = np.abs(reader.of_statistics(every[own]) - force[own])
+        error[own] = np.abs(reader.predict(every[own]) - force[own])
     pressed = judged & (force > _PRESSED)
     return {
         "grasps": len(grasps),

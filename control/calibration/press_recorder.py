@@ -1,13 +1,16 @@
 """Presses of one ball, picked from a sensor's frames as a person presses all over its gel."""
 
 from collections import deque
+from collections.abc import Iterable
 
 import cv2
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from touchgoal.control.calibration.circles import find_circle
+from touchgoal.control.calibration.ball import find_circle
 from touchgoal.control.calibration.press_set import PressSet
+from touchgoal.control.interfaces import DriverError
+from touchgoal.control.sensors.live_picture import LivePicture
 from touchgoal.control.tactile.background import Background, local_change
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.runtime.errors import UserError
@@ -163,6 +166,25 @@ class PressRecorder:
         row, column = np.unravel_index(int(self.counts.argmin()), self.grid)
         side, place = _name(_SIDES, int(column), columns), _name(_PLACES, int(row), rows)
         return f"at the {place}, {side}"
+
+
+def record(frames: Iterable[Frame], recorder: PressRecorder, live: LivePicture | None) -> None:
+    """Feed the recorder until its map is full, the frames end, the sensor is lost, or Ctrl-C."""
+    hint = ""
+    try:
+        for frame in frames:
+            recorder.update(frame)
+            if live is not None:
+                live.show(recorder.draw_map(frame))
+                if recorder.hint != hint:
+                    hint = recorder.hint
+                    print(hint, flush=True)
+            if recorder.complete:
+                return
+    except KeyboardInterrupt:
+        print("ended")
+    except DriverError as error:  # the presses recorded so far are written
+        print(f"ended: {error}")
 
 
 def _name(names: tuple[str, ...], index: int, count: int) -> str:

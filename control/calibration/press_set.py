@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from touchgoal.control.calibration.circles import find_circle
-from touchgoal.control.calibration.light_drift import without_drift
+from touchgoal.control.calibration.ball import find_circle
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.picture_file import read_picture
 
@@ -22,6 +21,8 @@ MINIMUM = 16
 # A pressed ball changes the picture by tens of counts. Camera noise is about 1 count, half of it
 # in the mean of a few hundred pixels; slow drift of the light reached 7.
 _VISIBLE = 10.0
+_FAR = 3.0  # contact radii beyond which a press leaves the gel at rest
+_LINE_ROUNDS, _LINE_TOLERANCE = 4, 1.0  # of the robust line; counts
 
 
 @dataclass(frozen=True)
@@ -185,3 +186,40 @@ def _check_visible(
     if np.percentile(np.abs(change), 90) < _VISIBLE:
         raise UserError(f"{name} shows no contact in its circle (less than {_VISIBLE:g} counts from "
                         "background.png): drop it, or record the background again")  # fmt: skip
+
+
+def without_drift(
+    image: UInt8[np.ndarray, "h w 3"],
+    background: UInt8[np.ndarray, "h w 3"],
+    circle: Float[np.ndarray, "3"],
+) -> UInt8[np.ndarray, "h w 3"]:
+    """A press as it would look in the background's light.
+
+    Gain and offset of each channel, by a robust line through the pixels far from the contact.
+
+    Args:
+        image: RGB picture of a press.
+        background: the sensor untouched.
+        circle: of the contact, px.
+    """
+    x, y, radius = circle
+    rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
+    far = (columns - x) ** 2 + (rows - y) ** 2 > (_FAR * radius) ** 2
+    if far.mean() < 0.1:
+        return image
+    steady = np.empty_like(image)
+    for channel in range(3):
+        gain, offset = _line(background[far, channel], image[far, channel])
+        steady[..., channel] = np.rint((image[..., channel] - offset) / gain).clip(0, 255)
+    return steady
+
+
+def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Gain and offset with the least absolute error."""
+    terms = np.stack([x, np.ones(len(x))], 1).astype(np.float64)
+    weight, solved = np.ones(len(x)), np.array([1.0, 0.0])
+    for _ in range(_LINE_ROUNDS):
+        weighted = terms * weight[:, None]
+        solved = np.linalg.solve(terms.T @ weighted + 1e-6 * np.eye(2), weighted.T @ y)
+        weight = 1 / np.maximum(np.abs(y - terms @ solved), _LINE_TOLERANCE)
+    return float(solved[0]), float(solved[1])

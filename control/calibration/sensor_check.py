@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from touchgoal.control.calibration.ball import Circle
-from touchgoal.control.calibration.circles import find_circle
+from touchgoal.control.calibration.ball import Circle, find_circle
 from touchgoal.control.calibration.held_out_depth import DepthErrors, sphere_in
 from touchgoal.control.tactile.background import Background, Drift, local_change
 from touchgoal.control.tactile.contact import ContactDetector

@@ -1,5 +1,6 @@
 """One fingertip sensor's frames, from wherever they come: plugged in, streamed, or recorded."""
 
+import math
 import time
 from collections.abc import Generator
 from dataclasses import replace
@@ -37,6 +38,42 @@ Frame = UInt8[np.ndarray, "h w 3"]
 def is_recorded(source: str) -> bool:
     """Whether it is a video file or a folder of pictures, which end."""
     return not source.startswith("/dev/") and Path(source).exists()
+
+
+def open_frames(
+    source: str,
+    model: SensorModel,
+    corners: Corners | None = None,
+    exposure: float | None = None,
+    white_balance: int | None = None,
+    seconds: float = math.inf,
+) -> Generator[Frame, None, None]:
+    """Yield the frames of a recording, or of a live sensor for some time or until Ctrl-C.
+
+    Args:
+        source: see `fingertip_video`, or a video file or a folder of pictures.
+        model: of the sensor.
+        corners: of the gel, px, if the camera sees it at an angle.
+        exposure, white_balance: to lock on a live camera (`VideoConfig`).
+        seconds: after which a live sensor is closed.
+
+    Raises:
+        UserError: the source cannot be read.
+        DriverError: a live sensor sent nothing for 5 s.
+    """
+    if is_recorded(source):
+        yield from recorded_frames(Path(source), model, corners)
+        return
+    video = fingertip_video(source, model, corners)
+    locked = replace(video, exposure=exposure, white_balance=white_balance)
+    end = time.monotonic() + seconds
+    try:
+        for frame in live_frames(locked, model, corners):
+            yield frame
+            if time.monotonic() > end:
+                return
+    except KeyboardInterrupt:
+        print("ended")
 
 
 def fingertip_video(source: str, model: SensorModel, corners: Corners | None = None) -> VideoConfig:

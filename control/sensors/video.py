@@ -17,7 +17,7 @@ import numpy as np
 
 from touchgoal.control.interfaces import Frame
 from touchgoal.control.sensors.latest_value import LatestValue
-from touchgoal.control.sensors.pictures import (
+from touchgoal.control.sensors.picture_integrity import (
     FrozenParts,
     GelPicture,
     JpegDecoder,

@@ -168,6 +168,13 @@ SENSORS = {
 }
 
 
+def find_model(name: str) -> SensorModel:
+    """Return a sensor model by name; UserError if there is none."""
+    if name not in SENSORS:
+        raise UserError(f"unknown sensor {name!r}; choose from: {', '.join(SENSORS)}")
+    return SENSORS[name]
+
+
 def find_sensor(name: str) -> SensorModel:
     """A sensor model by name, or one sensor of it by the folder that `touchgoal calibrate` wrote.
 

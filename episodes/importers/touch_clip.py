@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from touchgoal.control.sensors.pictures import JpegDecoder
+from touchgoal.control.sensors.picture_integrity import JpegDecoder
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.episodes.importers.plain_pickle import StoredBytes, read_plain_pickle
 from touchgoal.runtime.errors import UserError
