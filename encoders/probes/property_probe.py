@@ -1,6 +1,6 @@
-"""What an embedding knows of the things that were touched: who is who, and how they feel.
+"""Object identity and material properties read from touch embeddings.
 
-Videos are samples, things are what generalises: intervals are over things.
+Samples are videos; results generalise over objects, so folds and intervals are over objects.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,61 +18,56 @@ STRENGTHS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 N_RANKS = 3
 _FOLDS = 10
 _BOOTSTRAPS = 1000
-_SHRINKAGE = 0.6  # of the videos' covariance; 0.6 to 0.98 tell things apart alike
+_SHRINKAGE = 0.6  # towards the within-object covariance; 0.6 to 0.98 separate objects alike
 
-Things = Shaped[np.ndarray, " n"]
+Objects = Shaped[np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
-class PropertyReading:
-    """Ranks read out of embeddings of things that the probe has not seen.
+class PropertyPrediction:
+    """Ranks of unseen objects' properties.
 
     Attributes:
-        right: whether each property of each video is.
-        scores: expected rank, 0 to 2.
-        strength: of the ridge.
+        ranks: most probable rank of each property, 0 to 2.
+        scores: expected rank.
     """
 
-    right: Bool[np.ndarray, "n properties"]
+    ranks: Int[np.ndarray, "n properties"]
     scores: Float[np.ndarray, "n properties"]
-    strength: float
-
-    @property
-    def all_right(self) -> Bool[np.ndarray, " n"]:
-        """Whether all properties of a video are right."""
-        return np.asarray(self.right.all(1))
 
 
-def nearest_is_same(embeddings: Float[np.ndarray, "n d"], things: Things) -> Bool[np.ndarray, " n"]:
-    """Whether the nearest other video, by cosine, is of the same thing."""
+def nearest_is_same(
+    embeddings: Float[np.ndarray, "n d"], objects: Objects
+) -> Bool[np.ndarray, " n"]:
+    """Return whether the nearest other video, by cosine, shows the same object."""
     unit = embeddings / np.maximum(np.linalg.norm(embeddings, axis=1, keepdims=True), 1e-12)
     similarity = unit @ unit.T
     np.fill_diagonal(similarity, -np.inf)
-    return np.asarray(things[similarity.argmax(1)] == things)
+    return np.asarray(objects[similarity.argmax(1)] == objects)
 
 
 def adapted_nearest_is_same(
-    embeddings: Float[np.ndarray, "n d"], things: Things
+    embeddings: Float[np.ndarray, "n d"], objects: Objects
 ) -> Bool[np.ndarray, " n"]:
-    """As `nearest_is_same`, centred and whitened by videos of other things: what a user's own data add."""
-    right = np.zeros(len(things), bool)
-    for test, adapted in _adapted(embeddings, things):
-        right[test] = nearest_is_same(adapted, things)[test]
+    """Return `nearest_is_same` after centring and whitening with other objects' videos."""
+    right = np.zeros(len(objects), bool)
+    for test, adapted in _adapted(embeddings, objects):
+        right[test] = nearest_is_same(adapted, objects)[test]
     return right
 
 
 def sentences_right(
     embeddings: Float[np.ndarray, "n d"],
     ranks: Int[np.ndarray, "n properties"],
-    things: Things,
+    objects: Objects,
     embed_texts: EmbedTexts,
 ) -> Bool[np.ndarray, "n properties"]:
-    """Whether the nearest of the three sentences on a property is true.
+    """Return whether the nearest of a property's three sentences is true.
 
-    Sentences are brought to touch by other things, by which embeddings are adapted, too.
+    Text head and whitening are fitted to other objects.
     """
     right = np.zeros(ranks.shape, bool)
-    for test, adapted in _adapted(embeddings, things):
+    for test, adapted in _adapted(embeddings, objects):
         touches = torch.from_numpy(adapted)
         touches = touches / touches.norm(dim=1, keepdim=True).clamp_min(1e-12)
         head = fit_text_head(touches[~test], torch.from_numpy(ranks[~test]), embed_texts)
@@ -82,57 +77,54 @@ def sentences_right(
     return right
 
 
-def read_properties(
-    embeddings: Float[np.ndarray, "n d"],
-    ranks: Int[np.ndarray, "n properties"],
-    train: Bool[np.ndarray, " n"],
-    test: Bool[np.ndarray, " n"],
-) -> PropertyReading:
-    """Fit a ridge on some things and read others; its strength is the best on the others."""
-    readings = [_read(embeddings, ranks, train, test, strength) for strength in STRENGTHS]
-    return max(readings, key=_quality)
+def predict_properties(
+    embeddings: Float[np.ndarray, "n d"], ranks: Int[np.ndarray, "n properties"], objects: Objects
+) -> PropertyPrediction:
+    """Predict each object's properties with a ridge fitted to other objects, in ten folds.
 
-
-def cross_validated(
-    embeddings: Float[np.ndarray, "n d"], ranks: Int[np.ndarray, "n properties"], things: Things
-) -> PropertyReading:
-    """Every thing read by a probe that was fitted to nine tenths of the others."""
-    readings = []
-    for strength in STRENGTHS:
-        right = np.zeros(ranks.shape, bool)
-        scores = np.zeros(ranks.shape)
-        for test in _folds(things):
-            part = _read(embeddings, ranks, ~test, test, strength)
-            right[test], scores[test] = part.right, part.scores
-        readings.append(PropertyReading(right, scores, strength))
-    return max(readings, key=_quality)
+    The ridge's strength is chosen by folds within the training objects, never on the judged ones.
+    """
+    scores = np.zeros((*ranks.shape, N_RANKS))
+    for test in _folds(objects):
+        known = embeddings[~test], ranks[~test], objects[~test]
+        scores[test] = _ridge(*known[:2], embeddings[test], _choose_strength(*known))
+    return PropertyPrediction(scores.argmax(2), scores @ np.arange(N_RANKS))
 
 
 def pair_accuracy(
-    scores: Float[np.ndarray, " n"], ranks: Int[np.ndarray, " n"], things: Things
+    predicted: Int[np.ndarray, " n"], ranks: Int[np.ndarray, " n"], objects: Objects
 ) -> float:
-    """Of two things, is the first more so, less so or the same (PC of Octopi)?"""
+    """Return how often a pair of objects is rightly called more, less or equal (PC of Octopi).
+
+    Args:
+        predicted: most probable rank of each video.
+        ranks: true ranks.
+        objects: object of each video.
+    """
     one, other = np.triu_indices(len(ranks), 1)
-    different = things[one] != things[other]
+    different = objects[one] != objects[other]
     one, other = one[different], other[different]
     if not len(one):
         return float("nan")
-    read = np.rint(scores).clip(0, N_RANKS - 1)
-    return float((np.sign(read[one] - read[other]) == np.sign(ranks[one] - ranks[other])).mean())
+    right = np.sign(predicted[one] - predicted[other]) == np.sign(ranks[one] - ranks[other])
+    return float(right.mean())
 
 
 def most_of_three(
     scores: Float[np.ndarray, " n"],
     ranks: Int[np.ndarray, " n"],
-    things: Things,
+    objects: Objects,
     rng: np.random.Generator,
 ) -> float:
-    """Which of three things is most so (PSS of Octopi); over 2000 draws with one right answer."""
+    """Return how often the object with most of a property is found among three (PSS of Octopi).
+
+    Uses up to 2000 draws with a single right answer.
+    """
     hits = []
     for _ in range(20_000):
         three = rng.choice(len(ranks), 3, replace=False)
         best = ranks[three] == ranks[three].max()
-        if best.sum() == 1 and len(set(things[three])) == 3:
+        if best.sum() == 1 and len(set(objects[three])) == 3:
             hits.append(scores[three].argmax() == best.argmax())
         if len(hits) == 2000:
             break
@@ -141,12 +133,12 @@ def most_of_three(
 
 def interval(
     values: Bool[np.ndarray, "n ..."] | Float[np.ndarray, "n ..."],
-    things: Things,
+    objects: Objects,
     statistic: Callable[[np.ndarray], float] = lambda v: float(np.mean(v)),
 ) -> tuple[float, float]:
-    """95 % bootstrap interval over things, not videos."""
-    rng, names = np.random.default_rng(0), np.unique(things)
-    rows = {name: np.flatnonzero(things == name) for name in names}
+    """Return the 95 % bootstrap interval of a statistic over objects."""
+    rng, names = np.random.default_rng(0), np.unique(objects)
+    rows = {name: np.flatnonzero(objects == name) for name in names}
     drawn = [
         statistic(values[np.concatenate([rows[n] for n in rng.choice(names, len(names))])])
         for _ in range(_BOOTSTRAPS)
@@ -156,35 +148,37 @@ def interval(
 
 
 def _adapted(
-    embeddings: Float[np.ndarray, "n d"], things: Things
+    embeddings: Float[np.ndarray, "n d"], objects: Objects
 ) -> Iterator[tuple[Bool[np.ndarray, " n"], Float[np.ndarray, "n d"]]]:
-    """Which videos are a fold's, and all of them centred and whitened by the others."""
-    for test in _folds(things):
+    """Yield each fold and all videos, centred and whitened by the other folds."""
+    for test in _folds(objects):
         known = embeddings[~test]
-        whitening = inverse_square_root(within_classes(known, things[~test]), _SHRINKAGE)
+        whitening = inverse_square_root(within_classes(known, objects[~test]), _SHRINKAGE)
         yield test, (embeddings - known.mean(0)) @ whitening
 
 
-def _folds(things: Things) -> Iterator[Bool[np.ndarray, " n"]]:
-    """The videos of a tenth of the things, all tenths in turn."""
-    names = np.random.default_rng(0).permutation(np.unique(things))
+def _folds(objects: Objects) -> Iterator[Bool[np.ndarray, " n"]]:
+    """Yield the videos of each tenth of the objects."""
+    names = np.random.default_rng(0).permutation(np.unique(objects))
     for fold in range(_FOLDS):
-        test = np.isin(things, names[fold::_FOLDS])
+        test = np.isin(objects, names[fold::_FOLDS])
         if test.any():
             yield test
 
 
-def _read(
-    embeddings: np.ndarray, ranks: np.ndarray, train: np.ndarray, test: np.ndarray, strength: float
-) -> PropertyReading:
-    right, scores = [], []
-    for k in range(ranks.shape[1]):
-        wanted = np.eye(N_RANKS)[ranks[train, k]]
-        read = ridge_scores(embeddings[train], wanted, embeddings[test], strength)
-        right.append(read.argmax(1) == ranks[test, k])
-        scores.append(read @ np.arange(N_RANKS))
-    return PropertyReading(np.stack(right, 1), np.stack(scores, 1), strength)
+def _choose_strength(embeddings: np.ndarray, ranks: np.ndarray, objects: np.ndarray) -> float:
+    right = dict.fromkeys(STRENGTHS, 0)
+    for test in _folds(objects):
+        for strength in STRENGTHS:
+            scores = _ridge(embeddings[~test], ranks[~test], embeddings[test], strength)
+            right[strength] += int((scores.argmax(2) == ranks[test]).sum())
+    return max(STRENGTHS, key=lambda strength: right[strength])
 
 
-def _quality(reading: PropertyReading) -> float:
-    return float(reading.right.mean() + reading.all_right.mean())
+def _ridge(
+    embeddings: np.ndarray, ranks: np.ndarray, test_embeddings: np.ndarray, strength: float
+) -> Float[np.ndarray, "m properties ranks"]:
+    """Return a score for each rank of each property."""
+    targets = np.eye(N_RANKS)[ranks].reshape(len(ranks), -1)
+    scores = ridge_scores(embeddings, targets, test_embeddings, strength)
+    return scores.reshape(len(test_embeddings), ranks.shape[1], N_RANKS)
