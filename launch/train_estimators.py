@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Annotated, Any
 
-from touchgoal.launch.support.training_options import TrainingOptions
+from touchgoal.encoders.training.options import TrainingOptions
 from touchgoal.policies.config import EstimatorTrainConfig, PoseEstimatorConfig
 from touchgoal.runtime.option_types import RARE, Count, checked_dataclass
 from touchgoal.sim_envs.config import PickPlaceConfig

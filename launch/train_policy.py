@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Annotated, Any
 
-from touchgoal.launch.support.training_options import TrainingOptions
+from touchgoal.encoders.training.options import TrainingOptions
 from touchgoal.policies.config import (
     ActionRepresentation,
     ArmState,

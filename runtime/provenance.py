@@ -12,24 +12,61 @@ from typing import Any
 
 from touchgoal import __version__
 
+_PROGRAM = "touchgoal"
 _PACKAGES = ("numpy", "torch", "mujoco", "opencv-contrib-python-headless")
 
 
 def command_line() -> str:
-    """The command that runs, as it can be typed again."""
-    return shlex.join(["touchgoal", *sys.argv[1:]])
+    """Return the running command as it can be typed again."""
+    return shlex.join([_PROGRAM, *sys.argv[1:]])
+
+
+def portable(record: Any, project: Path | None = None) -> Any:
+    """Return a JSON-able record without folders of this machine.
+
+    Absolute paths, also those in commands, become relative to the project, or lose their folders if
+    they lie elsewhere.
+
+    Args:
+        record: Strings, paths, and containers of them.
+        project: Folder that paths become relative to; default: the working directory.
+    """
+    project = project or Path.cwd()
+    match record:
+        case dict():
+            return {key: portable(value, project) for key, value in record.items()}
+        case list() | tuple():
+            return [portable(value, project) for value in record]
+        case Path():
+            return portable(str(record), project)
+        case str() if record.startswith(f"{_PROGRAM} "):
+            return shlex.join(_portable_path(word, project) for word in shlex.split(record))
+        case str():
+            return _portable_path(record, project)
+        case _:
+            return record
+
+
+def _portable_path(text: str, project: Path) -> str:
+    """Shorten an absolute path, or the one after an option's `=`."""
+    option, equals, value = text.rpartition("=") if text.startswith("-") else ("", "", text)
+    path = Path(value)
+    if not path.is_absolute():
+        return text
+    shorter = path.relative_to(project) if path.is_relative_to(project) else Path(path.name)
+    return f"{option}{equals}{shorter}"
 
 
 def provenance() -> dict[str, Any]:
-    """What every checkpoint and every folder of results records beside its numbers.
+    """Return what every checkpoint and every folder of results records beside its numbers.
 
     Returns:
-        `command`; `commit` and `dirty` (whether files differ from it), None for an installed
-        package; version `touchgoal`; `date`, local time.
+        `command`, without folders of this machine; `commit` and `dirty` (whether files differ from
+        it), None for an installed package; version `touchgoal`; `date`, local time.
     """
     commit, dirty = _commit()
     return {
-        "command": command_line(),
+        "command": portable(command_line()),
         "touchgoal": __version__,
         "commit": commit,
         "dirty": dirty,

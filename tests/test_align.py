@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment import align as align_module
 from touchgoal.encoders.alignment.align import AlignedBatch, align, batch_losses
+from touchgoal.encoders.alignment.config import ALIGN_PRESETS, AlignConfig, Augmentation
 from touchgoal.encoders.alignment.data import (
     TouchData,
     augment,
@@ -26,7 +27,7 @@ from touchgoal.encoders.alignment.retrieval import (
 )
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS as PRESETS_VIT
-from touchgoal.encoders.config import ALIGN_PRESETS, AlignConfig, Augmentation, TrainerOptions
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.episodes.touches import Touches
 from touchgoal.runtime.errors import UserError
 

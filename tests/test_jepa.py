@@ -12,9 +12,9 @@ from killed import killed_in_epoch
 from toy_touches import SENSOR, moving_blobs
 
 from touchgoal.encoders import pretrained
+from touchgoal.encoders.backbones.sparsh import Method, backbone_for, vit_for
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import ViT
-from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.ssl.config import (
     IJEPA_PRESETS,
     VJEPA_PRESETS,
@@ -23,18 +23,19 @@ from touchgoal.encoders.ssl.config import (
     VJepaConfig,
 )
 from touchgoal.encoders.ssl.frames import TouchFrames
-from touchgoal.encoders.ssl.ijepa import IJepa, train_ijepa
+from touchgoal.encoders.ssl.ijepa import IJepa
 from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, Predictor, take
-from touchgoal.encoders.ssl.untrained import Method, backbone_for, vit_for
-from touchgoal.encoders.ssl.vjepa import VJepa, train_vjepa
+from touchgoal.encoders.ssl.train import train_self_distilled
+from touchgoal.encoders.ssl.vjepa import VJepa
+from touchgoal.encoders.training.options import TrainerOptions
 
 SMALL: dict[str, Any] = {"epochs": 3, "batch_size": 12, "momentum": 0.9}
 PREDICTOR: dict[str, Any] = {"predictor_width": 24, "predictor_depth": 1, "predictor_heads": 2}
 ITOY = IJepaConfig(vit="tiny", **SMALL, **PREDICTOR)
 VTOY = VJepaConfig(vit="tiny", small_blocks=3, **SMALL, **PREDICTOR)
 CASES: dict[Any, Any] = {
-    "ijepa": (IJepa, train_ijepa, ITOY, moving_blobs(24)),
-    "vjepa": (VJepa, train_vjepa, VTOY, moving_blobs(24, frames=4)),
+    "ijepa": (IJepa, train_self_distilled, ITOY, moving_blobs(24)),
+    "vjepa": (VJepa, train_self_distilled, VTOY, moving_blobs(24, frames=4)),
 }
 
 

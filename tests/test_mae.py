@@ -10,10 +10,11 @@ from killed import killed_in_epoch
 
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.vit import patchify, random_masking
-from touchgoal.encoders.config import MAE_PRESETS, MaeConfig, TrainerOptions
 from touchgoal.encoders.probes.ridge import ridge_r2
+from touchgoal.encoders.ssl.config import MAE_PRESETS, MaeConfig
 from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.mae import MaskedAutoencoder, train_mae
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.runtime.errors import UserError
 
 SENSOR = "gelsight_mini_markers"

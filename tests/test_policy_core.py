@@ -24,7 +24,7 @@ from toy_policies import (
 from touchgoal.control import features as ft
 from touchgoal.control.motion.arm_models import FR3_ARM
 from touchgoal.control.motion.kinematics import Fr3Kinematics
-from touchgoal.encoders.config import TrainerOptions
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.episodes.repair import validate
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter

@@ -12,7 +12,7 @@ from published_files import UNTOUCHED, encoded, gel, near, write, write_slides
 
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.pretrained import ENCODER_FORMAT, load_encoder
-from touchgoal.encoders.ssl.published_frames import sample_recordings
+from touchgoal.encoders.ssl.frames import sample_recordings
 from touchgoal.episodes.importers.plain_pickle import StoredBytes
 from touchgoal.episodes.importers.pretraining_clips import read_recordings
 from touchgoal.episodes.importers.touch_clip import TouchClip, decode, read_pictures
@@ -97,7 +97,7 @@ def test_an_encoder_learns_from_a_published_folder(
     encoder = load_encoder(str(out / "encoder"))
     assert encoder.embed(np.stack([gel(1), gel(2)])).shape[0] == 2  # upright, as a DIGIT's
     kept = ENCODER_FORMAT.provenance(out / "encoder")
-    assert kept["data"]["train"] == [{"path": str(data), "recordings": 8, "held_out": 2}]
+    assert kept["data"]["train"] == [{"path": data.name, "recordings": 8, "held_out": 2}]
     for words, told in (
         (["--data", str(data), "--sensor", "gelsight_mini"], "with digit, not gelsight_mini"),
         (["--data", str(tmp_path / "none")], "is no folder"),

@@ -22,9 +22,9 @@ from touchgoal.encoders.probes.property_probe import (
     nearest_is_same,
     sentences_right,
 )
-from touchgoal.encoders.ssl.own_videos import adapt
-from touchgoal.encoders.text_head import RANK_WORDS, fit_text_head, rank_sentences
 from touchgoal.encoders.towers.towers import OfflineTowers
+from touchgoal.encoders.whitening.adapt import adapt
+from touchgoal.encoders.whitening.text_head import RANK_WORDS, fit_text_head, rank_sentences
 from touchgoal.episodes.importers.force_grasps import read_force_grasps
 from touchgoal.episodes.importers.labelled_videos import read_labelled_videos
 from touchgoal.episodes.media import write_video

@@ -15,24 +15,24 @@ from toy_touches import SENSOR, moving_blobs
 from touchgoal.control import features as ft
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.frame_history import stack_frames
+from touchgoal.encoders.backbones.sparsh import backbone_for, vit_for
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
-from touchgoal.encoders.config import TrainerOptions
+from touchgoal.encoders.ssl import train
 from touchgoal.encoders.ssl.config import DINO_PRESETS, DinoConfig
 from touchgoal.encoders.ssl.dino import (
     Dino,
     cross_entropy_of_views,
     information,
     sinkhorn,
-    train_dino,
 )
 from touchgoal.encoders.ssl.frames import sample_frames
 from touchgoal.encoders.ssl.masks import cover, cut, draw_blocks, draw_size, draw_targets
 from touchgoal.encoders.ssl.self_distillation import (
     SelfDistillation,
-    train_self_distilled,
 )
-from touchgoal.encoders.ssl.untrained import backbone_for, vit_for
+from touchgoal.encoders.ssl.train import train_self_distilled
 from touchgoal.encoders.ssl.validation import token_statistics
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, parameter_groups
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
@@ -184,22 +184,14 @@ class Flattening(SelfDistillation):
         return {"loss": (self.backbone.vit(self.stacked(touch)) - 1).square().mean()}
 
 
-def test_a_collapsed_training_saves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    data, config = (
-        moving_blobs(24),
-        replace(TOY, epochs=4, lr=0.5, momentum=0.0, final_momentum=0.0),
-    )
-    with pytest.raises(UserError, match=r"collapsed: all touches look the same.*raise --dino.mom"):
-        train_self_distilled(
-            "dino",
-            lambda backbone, steps: Flattening(config, backbone, steps),
-            data,
-            data,
-            config,
-            tmp_path,
-            TrainerOptions(),
-            {},
-        )
+def test_a_collapsed_training_saves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = moving_blobs(24)
+    config = replace(TOY, epochs=4, lr=0.5, momentum=0.0, final_momentum=0.0)
+    monkeypatch.setitem(train._OBJECTIVES, DinoConfig, ("dino", Flattening))
+    with pytest.raises(UserError, match=r"collapsed.* the same embedding.*raise --dino.momentum"):
+        train_self_distilled(data, data, config, tmp_path, TrainerOptions(), {})
     assert not (tmp_path / "encoder").exists()
     assert "WARNING: the embeddings have collapsed" in capsys.readouterr().out
 
@@ -207,10 +199,12 @@ def test_a_collapsed_training_saves_nothing(tmp_path: Path, capsys: pytest.Captu
 @pytest.mark.parametrize("targets", ["centering", "sinkhorn"])
 def test_a_killed_training_ends_with_the_same_weights(tmp_path: Path, targets: str) -> None:
     data, config = moving_blobs(24), replace(TOY, targets=targets)
-    whole = train_dino(data, data, config, tmp_path / "whole", TrainerOptions(), {})
+    whole = train_self_distilled(data, data, config, tmp_path / "whole", TrainerOptions(), {})
     with killed_in_epoch(2):
-        train_dino(data, data, config, tmp_path / "killed", TrainerOptions(), {})
-    resumed = train_dino(data, data, config, tmp_path / "killed", TrainerOptions(resume=True), {})
+        train_self_distilled(data, data, config, tmp_path / "killed", TrainerOptions(), {})
+    resumed = train_self_distilled(
+        data, data, config, tmp_path / "killed", TrainerOptions(resume=True), {}
+    )
     for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(a, b)
     lines = [(tmp_path / run / "metrics.jsonl").read_text() for run in ("whole", "killed")]
@@ -239,7 +233,7 @@ def test_the_student_learns_what_the_teacher_says_of_each_touch() -> None:
 
 def test_a_saved_encoder_sees_the_past(tmp_path: Path) -> None:
     train, val = moving_blobs(48, 0), moving_blobs(24, 1)
-    encoder = train_dino(train, val, TOY, tmp_path, TrainerOptions(), {})
+    encoder = train_self_distilled(train, val, TOY, tmp_path, TrainerOptions(), {})
     metrics = pretrained.ENCODER_FORMAT.provenance(tmp_path / "encoder")["metrics"]
     assert metrics["reconstruction"] > 0.3 and metrics["force_z_r2"] > 0.3
     assert len(list(tmp_path.glob("reconstruction_*.png"))) == 3

@@ -16,7 +16,7 @@ from toy_policies import (
 )
 
 from touchgoal.control import features as ft
-from touchgoal.encoders.config import TrainerOptions
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.policies.acting import Planner
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.config import EstimatorTrainConfig, PoseEstimatorConfig

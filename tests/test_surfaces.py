@@ -10,11 +10,12 @@ from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 from touchgoal.encoders.preprocess import steady_preprocessor_for
 from touchgoal.encoders.pretrained import load_encoder, save
-from touchgoal.encoders.ssl.surface_whitening import (
+from touchgoal.encoders.whitening.covariance import inverse_square_root
+from touchgoal.encoders.whitening.simulated_surfaces import (
     WhiteningConfig,
     train,
 )
-from touchgoal.encoders.whitening import inverse_square_root
+from touchgoal.encoders.whitening.covariance import inverse_square_root
 from touchgoal.sim_envs.tactile.rig.indenters import FOUNDATION_MODULUS, IndenterPose, indent
 from touchgoal.sim_envs.tactile.rig.surface_press import (
     SurfacePose,

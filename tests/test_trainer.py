@@ -10,8 +10,9 @@ import torch
 from torch import nn
 
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
-from touchgoal.encoders.config import MaeConfig, TrainerOptions
+from touchgoal.encoders.ssl.config import MaeConfig
 from touchgoal.encoders.ssl.mae import MaskedAutoencoder
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import (
     OptimizerConfig,
     Training,
@@ -102,7 +103,8 @@ from pathlib import Path
 import torch
 sys.path.insert(0, {tests!r})
 import test_align, test_mae, toy_policies
-from touchgoal.encoders.config import Augmentation, TrainerOptions
+from touchgoal.encoders.alignment.config import Augmentation
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.ssl.mae import train_mae
 from touchgoal.encoders.training.trainer import OptimizerConfig
 from touchgoal.policies.config import TrainConfig

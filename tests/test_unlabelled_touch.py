@@ -8,8 +8,8 @@ import pytest
 import torch
 from published_files import encoded, gel, write, write_slides
 
+from touchgoal.encoders.ssl.unlabelled_touch import open_touch
 from touchgoal.episodes.media import write_video
-from touchgoal.launch.support.unlabelled_touch import open_touch
 from touchgoal.runtime.errors import UserError
 
 SPLITS = "train", "unlabelled", "val", "test"

@@ -18,8 +18,8 @@ from pydantic import Field
 
 from touchgoal.benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.features import Observation
+from touchgoal.encoders.backbones.sparsh import Method
 from touchgoal.encoders.pretrained import ENCODER_FORMAT
-from touchgoal.encoders.ssl.untrained import Method
 from touchgoal.episodes.recording import Actor, EpisodeSpec, collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint

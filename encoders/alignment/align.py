@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from touchgoal.encoders import pretrained
+from touchgoal.encoders.alignment.config import AlignConfig
 from touchgoal.encoders.alignment.data import (
     TouchData,
     augment,
@@ -24,9 +25,9 @@ from touchgoal.encoders.alignment.retrieval import evaluate_retrieval
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS as VIT_PRESETS
 from touchgoal.encoders.backbones.vit import random_masking
-from touchgoal.encoders.config import AlignConfig, TrainerOptions
 from touchgoal.encoders.towers.towers import Towers
 from touchgoal.encoders.training.checkpoint import checksum
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import (
     OptimizerConfig,
     Training,

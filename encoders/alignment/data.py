@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float16, Int
 from torch import Tensor
 
-from touchgoal.encoders.config import Augmentation
+from touchgoal.encoders.alignment.config import Augmentation
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.towers.towers import BATCH, Towers
 from touchgoal.episodes.touches import Touches

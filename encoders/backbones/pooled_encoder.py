@@ -2,7 +2,7 @@
 
 Means and spreads over the picture of four stages say what a surface is like, wherever it touches and
 however it is turned. What differs between presses of one surface (place, turn, depth, unit, light) is
-known from simulation (`ssl.surface_whitening`): directions in which that is large count little.
+known from simulation (`whitening.simulated_surfaces`): directions in which that is large count little.
 
 Whitened noise is as long as a whitened touch. So the direction of an embedding says what is felt, and
 its length, 0 to 1, whether anything is: it comes from the strongest spot of the picture.
@@ -18,9 +18,9 @@ from torch import Tensor
 
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.preprocess import steady_preprocessor_for
-from touchgoal.encoders.text_head import TextHead
 from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_normalised
+from touchgoal.encoders.whitening.text_head import TextHead
 
 # Blocks after which the picture is pooled, and channels there: edges, textures, parts. The last
 # stages know ImageNet's classes and tell touches apart less well.

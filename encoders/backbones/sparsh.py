@@ -1,11 +1,16 @@
-"""The four published Sparsh encoders of size base (Higuera et al. 2024, Table 3), as shapes.
+"""Networks of the four published Sparsh encoders (Higuera et al. 2024, Table 3), and smaller ones.
 
-Table 3's parameter counts are met exactly by these, with patches of 16 pixels (the text says 14).
+With patches of 16 pixels (the text says 14) the base networks have exactly Table 3's parameter counts.
 """
 
 from dataclasses import replace
+from typing import Literal
 
+from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import ViTConfig
+from touchgoal.encoders.preprocess import preprocessor_for
+
+Method = Literal["mae", "dino", "ijepa", "vjepa"]
 
 # Pictures there stand upright; the LayerNorm's epsilon is in no file of weights.
 UPRIGHT, SQUARE, NORM_EPSILON = (320, 240), (224, 224), 1e-6
@@ -43,10 +48,43 @@ SPARSH_BASE: dict[str, ViTConfig] = {
     "ijepa": _base(SQUARE, learned_positions=True),
     "vjepa": _base(SQUARE, channels=3, tubelet=2, frames=CLIP_FRAMES, learned_positions=True),
 }
-_SIZES = {"tiny": (192, 3), "small": (384, 6), "base": (768, 12)}  # width, heads
+_PUBLISHED_SIZES = {"tiny": (192, 3), "small": (384, 6), "base": (768, 12)}  # width, heads
+# Our presets of these names, with widths that three axes divide, for clips.
+_SIZES = {
+    "tiny": ViTConfig(patch_size=40, width=48, depth=2, heads=2, mlp_ratio=2.0),
+    "compact": ViTConfig(width=144, depth=4, heads=4),
+    "small": ViTConfig(),
+}
 
 
 def sparsh_vit(method: str, size: str) -> ViTConfig:
-    """A method's encoder of size tiny, small or base: as wide as ViTs of that name."""
-    width, heads = _SIZES[size]
+    """Return a method's published network, as wide as ViTs of size tiny, small or base."""
+    width, heads = _PUBLISHED_SIZES[size]
     return replace(SPARSH_BASE[method], width=width, heads=heads)
+
+
+def vit_for(method: Method, size: str, image_size: tuple[int, int]) -> ViTConfig:
+    """Return the network of a method: Sparsh's own, or a smaller one with its input and registers.
+
+    Args:
+        method: Decides on the input: two stacked frames, or a clip.
+        size: tiny, compact, small or base, which is Sparsh's.
+        image_size: Height and width of the preprocessor's output, px.
+    """
+    published = replace(SPARSH_BASE[method], image_size=image_size)
+    if size == "base":
+        return published
+    return replace(
+        _SIZES[size],
+        image_size=image_size,
+        channels=published.channels,
+        registers=published.registers,
+        tubelet=published.tubelet,
+        frames=published.frames,
+    )
+
+
+def backbone_for(method: Method, size: str, sensor: str, stride: int) -> TouchBackbone:
+    """Return a randomly initialised backbone for a sensor, with frames `stride` ticks apart."""
+    vit = vit_for(method, size, preprocessor_for(sensor).size)
+    return TouchBackbone(TouchBackboneConfig.for_sensor(vit, sensor, stride))

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 
 from touchgoal.encoders.probes.ridge import ridge_scores
-from touchgoal.encoders.text_head import EmbedTexts, fit_text_head, rank_sentences
-from touchgoal.encoders.whitening import inverse_square_root, within_classes
+from touchgoal.encoders.whitening.covariance import inverse_square_root, within_classes
+from touchgoal.encoders.whitening.text_head import EmbedTexts, fit_text_head, rank_sentences
 
 STRENGTHS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 N_RANKS = 3

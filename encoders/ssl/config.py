@@ -1,7 +1,7 @@
-"""Options of the objectives with a teacher; light to import, for `touchgoal --help` shows them.
+"""Options of self-supervised objectives; light to import, for `touchgoal --help` shows them.
 
-The `paper` values are Sparsh's Table 2 (Higuera et al. 2024); what it leaves open is as in the released
-code, see each objective.
+The `paper` presets are Sparsh's Table 2 (Higuera et al. 2024); what it leaves open is as in the
+released code, see each objective. The predictors' sizes are those of the released code.
 """
 
 from typing import Annotated, Literal
@@ -19,14 +19,82 @@ from touchgoal.runtime.option_types import (
 )
 
 Scale = Annotated[float, Field(gt=0, le=1)]
-"""Share of the patches of a picture."""
+"""Share of the patches of an image."""
 Scales = Annotated[tuple[Scale, Scale], ORDERED]
-"""Least and greatest share of the patches that a block has, drawn for each batch."""
+"""Least and greatest share of the patches in a block, drawn for each batch."""
+
+
+def _check_heads(network: str, width: int, heads: int) -> None:
+    if width % heads:
+        raise ValueError(f"{network}_width {width} must be a multiple of {network}_heads {heads}")
+
+
+@checked_dataclass
+class MaeConfig:
+    """Hyperparameters of masked autoencoding (MAE)."""
+
+    vit: Literal["tiny", "compact", "small", "base"] = "compact"
+    """Size of the backbone, a ViT; base is the paper's and needs --mae.stacked."""
+    stacked: bool = False
+    """Stack an earlier frame as further input channels, as Sparsh does."""
+    mask_ratio: Annotated[float, Field(ge=0, lt=1)] = 0.5
+    """Share of the patches hidden from the backbone."""
+    bottleneck: bool = True
+    """Decode from the mean of the backbone's tokens alone, so that this mean, which is the embedding,
+    must describe the whole image. Otherwise the decoder reads all tokens, as published."""
+    decoder_width: Annotated[Count, RARE] = 96
+    """Width of the decoder's tokens."""
+    decoder_depth: Annotated[Count, RARE] = 2
+    """Number of the decoder's blocks."""
+    decoder_heads: Annotated[Count, RARE] = 4
+    """Attention heads of each decoder block; they divide the decoder's width."""
+    epochs: Count = 30
+    """Passes over the touches."""
+    batch_size: Count = 128
+    """Touches in each step; all of them if there are fewer."""
+    lr: Positive = 1e-3
+    """Highest learning rate of AdamW; it rises from 0 during `warmup`, then falls to 0 by a cosine."""
+    warmup: Annotated[Fraction, RARE] = 0.1
+    """Share of the steps in which the learning rate rises from 0."""
+    second_moment: Annotated[Fraction, RARE] = 0.999
+    """AdamW's beta 2: decay of its running mean of squared gradients."""
+    weight_decay: NotNegative = 0.05
+    """Weight decay of weight matrices and convolutions at the start."""
+    final_weight_decay: Annotated[NotNegative | None, RARE] = None
+    """Weight decay at the end, reached by a cosine; default: as at the start."""
+
+    def __post_init__(self) -> None:
+        """Raise OptionError for a network that cannot be built."""
+        if self.vit == "base" and not self.stacked:
+            raise ValueError("base is Sparsh's, which stacks two frames: it needs stacked")
+        _check_heads("decoder", self.decoder_width, self.decoder_heads)
+
+
+MAE_PRESETS: dict[str, MaeConfig] = {
+    "default": MaeConfig(),
+    # As released, but for the decoder's positions, which are learned there.
+    "paper": MaeConfig(
+        vit="base",
+        stacked=True,
+        mask_ratio=0.75,
+        bottleneck=False,
+        decoder_width=512,
+        decoder_depth=8,
+        decoder_heads=16,
+        epochs=150,
+        batch_size=100,
+        lr=1e-4,
+        warmup=0.2,
+        second_moment=0.95,
+        weight_decay=0.04,
+        final_weight_decay=0.4,
+    ),
+}
 
 
 @checked_dataclass
 class SelfDistillationConfig:
-    """What all objectives with a teacher share: sizes, the optimizer's schedules, the teacher's."""
+    """Hyperparameters that DINO, I-JEPA and V-JEPA share: sizes and schedules."""
 
     vit: Literal["tiny", "compact", "small", "base"] = "compact"
     """Size of the backbone, a ViT; base is the paper's."""
@@ -35,9 +103,9 @@ class SelfDistillationConfig:
     batch_size: Count = 64
     """Touches in each step; all of them if there are fewer."""
     lr: Positive = 1e-3
-    """Highest learning rate of AdamW; reached from 0 in `warmup`, left by a cosine."""
+    """Highest learning rate of AdamW; it rises from 0 during `warmup`, then falls by a cosine."""
     final_lr: Annotated[Fraction, RARE] = 1e-3
-    """Learning rate at the end, as a share of `lr`."""
+    """Learning rate at the end as a share of `lr`."""
     warmup: Annotated[Fraction, RARE] = 0.1
     """Share of the steps in which the learning rate rises from 0."""
     weight_decay: NotNegative = 0.04
@@ -45,44 +113,44 @@ class SelfDistillationConfig:
     final_weight_decay: NotNegative = 0.4
     """Weight decay at the end, reached by a cosine."""
     momentum: Fraction = 0.99
-    """Share of itself that the teacher keeps in each step at the start; the rest is the student's."""
+    """Momentum of the teacher, the moving average of the student's weights, at the start."""
     final_momentum: Fraction = 1.0
-    """The same at the end, reached linearly."""
+    """Momentum of the teacher at the end, reached linearly."""
 
 
 @checked_dataclass
 class DinoConfig(SelfDistillationConfig):
-    """How to train a touch backbone by self-distillation without labels (DINO)."""
+    """Hyperparameters of self-distillation without labels (DINO)."""
 
     reads: Literal["register", "mean"] = "mean"
-    """What of a view the head classifies: a register, as in Sparsh, or the mean of its patches' tokens,
-    which is the embedding."""
+    """Input of the DINO head: a register token, as in Sparsh, or the mean of the patch tokens, which is
+    the embedding that is used afterwards."""
     prototypes: Count = 1024
-    """Classes, which have no meaning but what the teacher gives them."""
+    """Number of prototypes, the classes that the teacher makes up."""
     head_width: Annotated[Count, RARE] = 256
     """Width of the head's two hidden layers."""
     head_bottleneck: Annotated[Count, RARE] = 64
-    """Width of the head's vectors that are compared with prototypes."""
+    """Width of the vectors that are compared with the prototypes."""
     batch_norm: bool = True
-    """Normalise the head's hidden layers over the batch: most touches look much the same to an untrained
-    backbone, and without it all soon get the same answer."""
+    """Use batch norm in the head's hidden layers. Without it the small presets collapse: an untrained
+    backbone gives most touches nearly the same tokens."""
     student_temperature: Positive = 0.1
-    """Of the student's distribution over prototypes."""
+    """Temperature of the student's distribution over prototypes."""
     teacher_temperature: Positive = 0.07
-    """Of the teacher's, which is sharper."""
+    """Temperature of the teacher's distribution, which is sharper."""
     first_teacher_temperature: Annotated[Positive, RARE] = 0.04
-    """Of the teacher's at the start; it rises linearly."""
+    """Teacher's temperature at the start; it rises linearly."""
     teacher_warmup: Annotated[Fraction, RARE] = 0.07
     """Share of the steps in which the teacher's temperature rises."""
     targets: Literal["centering", "sinkhorn"] = "centering"
-    """What keeps the teacher from giving all touches the same class: its mean output is taken away, or
-    every batch is spread over all prototypes alike (Sinkhorn-Knopp, as DINOv2 can)."""
+    """How the teacher avoids giving every touch the same prototype: subtract its mean output, or spread
+    every batch evenly over the prototypes (Sinkhorn-Knopp, as in DINOv2)."""
     center_momentum: Annotated[Fraction, RARE] = 0.9
-    """Share of itself that the mean output keeps in each step."""
+    """Momentum of the teacher's mean output."""
     global_scale: Scales = (0.48, 1.0)
-    """Of the two large views, which the teacher sees."""
+    """Size of the two large views, the teacher's input, as a share of the patches."""
     local_scale: Scales = (0.1, 0.48)
-    """Of the small views, which the student alone sees."""
+    """Size of the small views, which only the student gets, as a share of the patches."""
     local_views: Count = 8
     """Small views of each touch."""
 
@@ -109,57 +177,52 @@ DINO_PRESETS: dict[str, DinoConfig] = {
 
 @checked_dataclass
 class PredictorConfig(SelfDistillationConfig):
-    """What I-JEPA and V-JEPA share: the network that says what the teacher sees elsewhere."""
+    """Hyperparameters of the predictor in I-JEPA and V-JEPA."""
 
     predictor_width: Annotated[int, Field(ge=12, multiple_of=12)] = 96
-    """Size of the predictor's tokens."""
+    """Width of the predictor's tokens."""
     predictor_depth: Annotated[Count, RARE] = 3
-    """Number of its blocks."""
+    """Number of the predictor's blocks."""
     predictor_heads: Annotated[Count, RARE] = 4
-    """Attention heads of each; they divide its width."""
+    """Attention heads of each predictor block; they divide its width."""
     shortest: Annotated[Positive, RARE] = 0.75
-    """Least height over width of a block that is asked for."""
+    """Least height over width of a target block."""
     tallest: Annotated[Positive, RARE] = 1.5
-    """Greatest height over width of a block that is asked for."""
+    """Greatest height over width of a target block."""
 
     def __post_init__(self) -> None:
-        """Raises OptionError for a predictor that cannot be built, or no range."""
-        if self.predictor_width % self.predictor_heads:
-            raise ValueError(
-                f"predictor_width {self.predictor_width} must be a multiple of predictor_heads "
-                f"{self.predictor_heads}"
-            )
+        """Raise OptionError for a predictor that cannot be built, or an empty range."""
+        _check_heads("predictor", self.predictor_width, self.predictor_heads)
         if self.shortest > self.tallest:
             raise ValueError("shortest must not be above tallest")
 
 
 @checked_dataclass
 class IJepaConfig(PredictorConfig):
-    """How to train a touch backbone by predicting what lies in blocks that it does not see (I-JEPA)."""
+    """Hyperparameters of I-JEPA: predict the tokens of hidden blocks."""
 
     context_scale: Scales = (0.85, 1.0)
-    """Size of the block that the backbone sees, but for the target blocks."""
+    """Size of the context block, from which the target blocks are cut out, as a share of the patches."""
     target_scale: Scales = (0.15, 0.2)
-    """Size of each target block."""
+    """Size of each target block, as a share of the patches."""
     target_blocks: Count = 4
-    """Target blocks of each picture."""
+    """Target blocks of each image."""
 
 
 @checked_dataclass
 class VJepaConfig(PredictorConfig):
-    """How to train a touch backbone by predicting hidden tubes of a clip (V-JEPA)."""
+    """Hyperparameters of V-JEPA: predict the tokens of tubes hidden in a clip."""
 
     small_scale: Annotated[Scale, RARE] = 0.15
-    """Size of each of the many blocks that together are hidden in the first of two masks."""
+    """Size of each hidden block of the first mask, as a share of the patches."""
     small_blocks: Count = 8
-    """How many of them."""
+    """Hidden blocks of the first mask."""
     large_scale: Annotated[Scale, RARE] = 0.7
-    """Size of each of the few large blocks that together are hidden in the second mask."""
+    """Size of each hidden block of the second mask, as a share of the patches."""
     large_blocks: Count = 2
-    """How many of them."""
+    """Hidden blocks of the second mask."""
 
 
-# The predictors' sizes are those of the released code.
 IJEPA_PRESETS: dict[str, IJepaConfig] = {
     "default": IJepaConfig(),
     "paper": IJepaConfig(

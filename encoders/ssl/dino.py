@@ -6,7 +6,6 @@ the other, larger ones; classes have no meaning beforehand.
 """
 
 import math
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -16,14 +15,11 @@ from torch import Tensor, nn
 
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.backbones.vit import patch_grid
-from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.ssl.config import DinoConfig
-from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.masks import draw_blocks
 from touchgoal.encoders.ssl.self_distillation import (
     SelfDistillation,
     frozen_copy,
-    train_self_distilled,
 )
 from touchgoal.encoders.training.trainer import gather_batch
 
@@ -165,19 +161,3 @@ def sinkhorn(logits: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
         Q = Q / Q.sum(1, keepdim=True) / len(Q)
     own = torch.distributed.get_rank() * len(logits) if len(every) > len(logits) else 0
     return Q[own : own + len(logits)] * len(Q)
-
-
-def train_dino(
-    train: TouchFrames,
-    val: TouchFrames,
-    config: DinoConfig,
-    out_dir: Path,
-    options: TrainerOptions,
-    recipe: dict[str, Any],
-) -> TouchBackbone:
-    """Trains a backbone by DINO; see `train_self_distilled`."""
-
-    def build(backbone: TouchBackbone, steps: int) -> Dino:
-        return Dino(config, backbone, steps)
-
-    return train_self_distilled("dino", build, train, val, config, out_dir, options, recipe)

@@ -1,10 +1,12 @@
 """What self-supervision trains on: touches drawn from episodes, preprocessed, without labels."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16
+from jaxtyping import Float, Float16, UInt8
 from torch import Tensor
 
 from touchgoal.control.features import TACTILE, TRUTH_PAD_WRENCH
@@ -13,6 +15,25 @@ from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
+
+
+@runtime_checkable  # beartype checks arguments in tests
+class Clip(Protocol):
+    """Pictures in time."""
+
+    def __len__(self) -> int: ...  # noqa: D105
+    def frames(self, rows: Sequence[int]) -> UInt8[np.ndarray, "n h w 3"]: ...  # noqa: D102
+
+
+@runtime_checkable
+class Recorded(Protocol):
+    """One fingertip's pictures in a file, and the sensor untouched."""
+
+    @property
+    def sensor(self) -> str: ...  # noqa: D102
+    @property
+    def held_out(self) -> bool: ...  # noqa: D102
+    def open(self) -> tuple["Clip", UInt8[np.ndarray, "h w 3"]]: ...  # noqa: D102
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +124,36 @@ def sample_frames(
             for name in truth:
                 wrench.append(torch.from_numpy(known[name][:, 6 * side : 6 * side + 6]))
     return TouchFrames.of_moments(touch, torch.cat(wrench) if truth else None, sensor, offsets)
+
+
+def sample_recordings(
+    recordings: Sequence[Recorded],
+    per_recording: int,
+    seed: int,
+    offsets: tuple[int, ...] | None = None,
+) -> TouchFrames:
+    """Draws pictures at random from every recording.
+
+    Args:
+        recordings: Of one sensor, one at least.
+        per_recording: Pictures drawn from each; all of a shorter one.
+        seed: Of the draw; a recording's draw does not depend on how many there are after it.
+        offsets: As in `frames.sample_frames`.
+
+    Raises:
+        UserError: A picture is broken, or not of the sensor's shape.
+    """
+    sensor = recordings[0].sensor
+    preprocess = preprocessor_for(sensor)
+    touch = []
+    for i, recording in enumerate(track(recordings, "touches", "recording")):
+        rng = np.random.default_rng([seed, i])
+        clip, background = recording.open()
+        drawn = np.sort(rng.permutation(len(clip))[:per_recording])
+        seen, where = np.unique(past_rows(drawn, offsets or (0,)), return_inverse=True)
+        rows = preprocess(clip.frames(seen.tolist()), background)
+        touch.append(torch.from_numpy(rows).half()[torch.from_numpy(where.reshape(len(drawn), -1))])
+    return TouchFrames.of_moments(touch, None, sensor, offsets)
 
 
 def check_sensor(episodes: EpisodeSet, i: int, sensor: str) -> None:

@@ -1,6 +1,5 @@
 """I-JEPA (Assran et al. 2023; Sparsh, Higuera et al. 2024) for touch: predict blocks, not their pixels."""
 
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -8,14 +7,10 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.backbones.vit import patch_grid
-from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.ssl.config import IJepaConfig
-from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.masks import cover, cut, draw_blocks, draw_size, draw_targets
 from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, take
-from touchgoal.encoders.ssl.self_distillation import train_self_distilled
 
 _SQUARE = 1.0, 1.0
 
@@ -46,19 +41,3 @@ class IJepa(JointEmbeddingPrediction):
         actual = take(self.targets(images), wanted_ids)
         predicted = self.predict(self.backbone.vit.embed_patches(images), seen_ids, wanted_ids)
         return {"loss": F.smooth_l1_loss(predicted, actual)}
-
-
-def train_ijepa(
-    train: TouchFrames,
-    val: TouchFrames,
-    config: IJepaConfig,
-    out_dir: Path,
-    options: TrainerOptions,
-    recipe: dict[str, Any],
-) -> TouchBackbone:
-    """Trains a backbone by I-JEPA; see `train_self_distilled`."""
-
-    def build(backbone: TouchBackbone, steps: int) -> IJepa:
-        return IJepa(config, backbone, steps)
-
-    return train_self_distilled("ijepa", build, train, val, config, out_dir, options, recipe)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.frame_history import stack_frames
+from touchgoal.encoders.backbones.sparsh import backbone_for
 from touchgoal.encoders.backbones.touch_backbone import BATCH, TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import PRESETS as VIT_PRESETS
 from touchgoal.encoders.backbones.vit import (
@@ -20,11 +21,11 @@ from touchgoal.encoders.backbones.vit import (
     random_masking,
     sinusoidal_positions,
 )
-from touchgoal.encoders.config import MaeConfig, TrainerOptions
+from touchgoal.encoders.ssl.config import MaeConfig
 from touchgoal.encoders.ssl.frames import TouchFrames
-from touchgoal.encoders.ssl.untrained import backbone_for
 from touchgoal.encoders.ssl.validation import forces_line, read_forces
 from touchgoal.encoders.training.checkpoint import checksum
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
 from touchgoal.runtime.errors import UserError
 

@@ -1,6 +1,5 @@
 """V-JEPA (Bardes et al. 2024; Sparsh, Higuera et al. 2024) for touch: predict hidden tubes of a clip."""
 
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -8,14 +7,10 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.backbones.vit import patch_grid
-from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.ssl.config import VJepaConfig
-from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.masks import cover, cut, draw_size, draw_targets
 from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, take
-from touchgoal.encoders.ssl.self_distillation import train_self_distilled
 
 
 class VJepa(JointEmbeddingPrediction):
@@ -65,19 +60,3 @@ class VJepa(JointEmbeddingPrediction):
 def tubes(ids: Int[Tensor, "b k"], times: int, patches: int) -> Int[Tensor, "b j"]:
     """The same patches of all times of a clip, of so many patches each."""
     return torch.cat([ids + time * patches for time in range(times)], 1)
-
-
-def train_vjepa(
-    train: TouchFrames,
-    val: TouchFrames,
-    config: VJepaConfig,
-    out_dir: Path,
-    options: TrainerOptions,
-    recipe: dict[str, Any],
-) -> TouchBackbone:
-    """Trains a backbone by V-JEPA; see `train_self_distilled`."""
-
-    def build(backbone: TouchBackbone, steps: int) -> VJepa:
-        return VJepa(config, backbone, steps)
-
-    return train_self_distilled("vjepa", build, train, val, config, out_dir, options, recipe)

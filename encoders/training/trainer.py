@@ -24,8 +24,8 @@ from torch import Tensor, nn
 from torch.distributed.nn.functional import all_gather
 from tqdm import tqdm
 
-from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.training import checkpoint
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import kept
 from touchgoal.runtime.provenance import command_line

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.provenance import portable
 
 FORMAT = 1
 Config = TypeVar("Config")
@@ -47,8 +48,8 @@ class WeightsFormat:
         config: dict[str, Any],
         provenance: dict[str, Any],
     ) -> None:
-        """Writes both files; older ones in the directory, made if needed, are replaced."""
-        description = {"format": FORMAT, "config": config, "provenance": provenance}
+        """Write both files, the provenance without folders of this machine; older files are replaced."""
+        description = {"format": FORMAT, "config": config, "provenance": portable(provenance)}
         with (
             atomic_write(self._json_path(directory)) as json_file,
             atomic_write(self.weights_path(directory)) as weights_file,

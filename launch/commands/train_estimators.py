@@ -8,13 +8,13 @@ import torch
 from touchgoal.control import features as ft
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.training.checkpoint import has_checkpoint
-from touchgoal.encoders.training.trainer import is_first_process
-from touchgoal.launch.support.training_run import (
+from touchgoal.encoders.training.run import (
     check_training,
     open_sets,
     open_training,
     recipe,
 )
+from touchgoal.encoders.training.trainer import is_first_process
 from touchgoal.launch.train_estimators import Config
 from touchgoal.policies.perception.frozen_touch import load_touch
 from touchgoal.policies.perception.placements import render_placements

@@ -6,14 +6,14 @@ from pathlib import Path
 from touchgoal.control import features as ft
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.pretrained import find_encoder
-from touchgoal.encoders.training.trainer import is_first_process
-from touchgoal.episodes.store import EpisodeSet
-from touchgoal.launch.support.training_run import (
+from touchgoal.encoders.training.run import (
     check_training,
     open_sets,
     open_training,
     recipe,
 )
+from touchgoal.encoders.training.trainer import is_first_process
+from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.train_policy import ENVS, Config
 from touchgoal.policies import checkpoint
 from touchgoal.policies.checkpoint import SavedPolicy

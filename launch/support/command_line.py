@@ -36,6 +36,8 @@ def parse(
 ) -> Any:
     """A command's Config.
 
+    A Config with an option `--preset` has the defaults of each of its values in `PRESETS`.
+
     Args:
         config_type: the dataclass, or a union of those that subcommands take.
         arguments: what was typed after the command's name.
@@ -54,7 +56,8 @@ def parse(
     hidden_of = {name: _hidden(kind, env) for name, kind in _members(config_type)}
     hidden = set().union(*hidden_of.values()) if short else set()
     registry = ConstructorRegistry()
-    registry.struct_rule(partial(_as_options, env=env, hidden=hidden))
+    preset = next(reversed(list(_values(typed, "--preset"))), "")
+    registry.struct_rule(partial(_as_options, env=env, hidden=hidden, preset=preset))
     try:
         return tyro.cli(
             config_type,
@@ -83,15 +86,16 @@ class _OutOfRange(Exception):
 
 
 def _as_options(
-    info: StructTypeInfo, env: EnvConfig | None, hidden: set[tuple[type, str]]
+    info: StructTypeInfo, env: EnvConfig | None, hidden: set[tuple[type, str]], preset: str = ""
 ) -> StructConstructorSpec | None:
     """A dataclass as tyro is to offer it: with our help texts, without what is hidden."""
     if not dataclasses.is_dataclass(info.type) or info.type.__module__.startswith("tyro"):
         return None
     fields = []
+    defaults = getattr(info.type, "PRESETS", {}).get(preset, {})
     for field, annotation, text in _options(info.type):
         offered: Any = annotation
-        default = _default(field, info.default)
+        default = defaults.get(field.name, _default(field, info.default))
         if field.name == "env" and get_origin(annotation) in (Union, UnionType):
             default = env or default
             offered = type(default)  # options of the other task are refused

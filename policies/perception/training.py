@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
 from touchgoal.control import features as ft
-from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.training.checkpoint import checksum
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.config import Box, EstimatorTrainConfig

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
-from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.training.checkpoint import checksum
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
 from touchgoal.policies import checkpoint
 from touchgoal.policies.config import TrainConfig

@@ -21,8 +21,8 @@ from touchgoal.encoders.backbones.touch_backbone import (
     TouchBackboneConfig,
 )
 from touchgoal.encoders.backbones.vit import PRESETS
-from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.pretrained import load_encoder
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
 from touchgoal.runtime.progress import track
 

@@ -6,8 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from touchgoal.encoders.preprocess import preprocessor_for
-from touchgoal.encoders.ssl.frames import TouchFrames, check_sensor, sample_frames
-from touchgoal.encoders.ssl.published_frames import Recorded, sample_recordings
+from touchgoal.encoders.ssl.frames import (
+    Recorded,
+    TouchFrames,
+    check_sensor,
+    sample_frames,
+    sample_recordings,
+)
 from touchgoal.episodes.importers.labelled_videos import has_labels
 from touchgoal.episodes.importers.pretraining_clips import read_recordings
 from touchgoal.episodes.importers.video_recordings import read_video_recordings

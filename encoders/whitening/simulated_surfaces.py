@@ -20,7 +20,7 @@ from touchgoal.encoders.backbones.pooled_encoder import (
     PooledEncoder,
     PooledEncoderConfig,
 )
-from touchgoal.encoders.whitening import inverse_square_root
+from touchgoal.encoders.whitening.covariance import inverse_square_root
 from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.tactile.rig.surface_press import press, random_pose, untouched
 from touchgoal.sim_envs.tactile.rig.surfaces import random_surface

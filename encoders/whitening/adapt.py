@@ -14,9 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
-from touchgoal.encoders.text_head import fit_text_head
 from touchgoal.encoders.towers.towers import Towers
-from touchgoal.encoders.whitening import inverse_square_root, within_classes
+from touchgoal.encoders.whitening.covariance import inverse_square_root, within_classes
+from touchgoal.encoders.whitening.text_head import fit_text_head
 from touchgoal.episodes.importers.labelled_videos import LabelledVideo, firmest_frames
 from touchgoal.episodes.touches import touch_background
 from touchgoal.runtime.errors import UserError

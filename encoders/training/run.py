@@ -1,29 +1,28 @@
-"""What every training command checks before any work, and records beside what it made."""
+"""Start of a training run: checks before any data are read, the run's folder, its provenance."""
 
 import os
 from pathlib import Path
 from typing import Any
 
-from touchgoal.encoders.config import TrainerOptions
 from touchgoal.encoders.training.checkpoint import check_run_folder
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import check_device
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.launch.support.training_options import TrainedOptions
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import provenance
 from touchgoal.runtime.run_folder import open_run
 
 
 def check_training(options: TrainerOptions, out: Path | None, first: str = "") -> None:
-    """Checks what can be checked before any data are read.
+    """Check what can be checked before any data are read.
 
     Args:
-        options: Of the training.
+        options: Options of the training.
         out: Folder of the run.
-        first: Folder in it of the run's first training, if it has several.
+        first: Subfolder of the run's first training, if it has several.
 
     Raises:
-        UserError: No such device, an unfit folder, or no folder where there must be one.
+        UserError: No such device, an unfit folder, or no folder where one is needed.
     """
     check_device(options.device)
     if out is None and options.resume:
@@ -34,28 +33,28 @@ def check_training(options: TrainerOptions, out: Path | None, first: str = "") -
         check_run_folder(out / first, options.resume)
 
 
-def open_training(config: TrainedOptions, command: str) -> Path:
-    """Opens the run's folder; of several processes the first one writes the record."""
+def open_training(config: Any, command: str) -> Path:
+    """Open the folder of a run with `TrainerOptions`; the first of several processes records it."""
     if int(os.environ.get("RANK", 0)) and config.out is not None:
         return config.out
     return open_run(config.out, command, config, adds=config.resume)
 
 
 def open_sets(data: Path, validation: Path) -> tuple[EpisodeSet, EpisodeSet]:
-    """The episodes to learn from and those to judge by.
+    """Open the training and the validation set.
 
     Raises:
         UserError: They are the same, or damaged.
     """
     if data.resolve() == validation.resolve():
         raise UserError(
-            f"--data and --validation are both {data}: judge by episodes that are not learned from"
+            f"--data and --validation are both {data}: validate on episodes that are not trained on"
         )
     return EpisodeSet(data), EpisodeSet(validation)
 
 
 def recipe(data: EpisodeSet, validation: EpisodeSet) -> dict[str, Any]:
-    """Provenance of what was trained: command, code and data."""
+    """Return the provenance of a training: command, code and data."""
     return {
         **provenance(),
         "episodes": len(data),
