@@ -15,7 +15,6 @@ from touchgoal.encoders.whitening.simulated_surfaces import (
     WhiteningConfig,
     train,
 )
-from touchgoal.encoders.whitening.covariance import inverse_square_root
 from touchgoal.sim_envs.tactile.rig.indenters import FOUNDATION_MODULUS, IndenterPose, indent
 from touchgoal.sim_envs.tactile.rig.surface_press import (
     SurfacePose,

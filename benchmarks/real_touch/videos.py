@@ -24,8 +24,8 @@ from touchgoal.encoders.probes.property_probe import (
     predict_properties,
     sentences_right,
 )
-from touchgoal.encoders.whitening.text_head import EmbedTexts
 from touchgoal.encoders.towers.towers import load_towers
+from touchgoal.encoders.whitening.text_head import EmbedTexts
 from touchgoal.episodes.importers.labelled_videos import (
     FIRMEST,
     PROPERTIES,
