@@ -9,7 +9,7 @@ CODE := runtime control sim_envs episodes encoders rewards policies benchmarks l
 # Without compiled files each of the tests' many processes would compile everything anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test interop lint check format build typings weights weights-markers maze-policy pick-place-policy clean
+.PHONY: setup demo test interop lint check format build docs typings weights weights-markers maze-policy pick-place-policy clean
 
 setup: $(READY)
 	@echo "touchgoal is ready: $(BIN)/touchgoal --help"
@@ -61,6 +61,11 @@ build: $(READY)
 	cd dist/touchgoal-*/ && rm -r src && ../../.venv-wheel/bin/python -m pytest -n auto \
 		-m "not slow and not realtime" --ignore tests/test_layout.py \
 		--ignore tests/test_results.py --ignore tests/test_documented_commands.py
+
+# The pages of docs/ with the API reference, as a site in runs/site.
+docs: $(READY)
+	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	$(BIN)/sphinx-build -W --keep-going -q docs runs/site
 
 # How the shipped touch encoder was made: about 25 minutes on 2 cores.
 weights: $(READY)
