@@ -1,7 +1,10 @@
-"""Acting by plans: the policy as an actor in an environment or on the arm."""
+"""A learned policy as it acts: `reset()` begins an episode, `act(observation)` gives each tick's action."""
 
-from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
 import torch
@@ -10,16 +13,22 @@ from torch import Tensor
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
+from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.policies.network import ObservationBatch, PolicyNetwork
 from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.proprioception import tare
-from touchgoal.policies.policy import ObservationBatch, Policy
+from touchgoal.policies.perception.state_estimation import StateEstimator
 from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.config import TASKS, EnvConfig, TaskName
+from touchgoal.sim_envs.tasks import task_name
+
+Task = TypeVar("Task", bound=EnvConfig)
 
 
 @runtime_checkable
 class Estimator(Protocol):
-    """A state estimator, or what stands for one."""
+    """State estimator, or the simulator's ground truth in its place."""
 
     def estimate(
         self, observation: Observation, first: Observation
@@ -28,37 +37,45 @@ class Estimator(Protocol):
         ...
 
 
-class Planner:
-    """From the last observations of an episode to a plan.
+class LearnedPolicy:
+    """A trained network that acts, one episode after the other.
 
-    The same seed and observations give the same plans.
+    It does `execution_horizon` ticks of a plan, then the next plan's. The same seed and observations
+    give the same actions. Torch computes each plan on one thread: two lose badly when the other core
+    is taken.
 
     Attributes:
-        config: of the policy.
-        touch: embedder of the fingertips.
-        ticks_seen: observations to be handed over: the policy's own, and those before them that the embedder looks
-            back to.
+        config: of the network.
+        touch: embedder of the fingertips; None for a policy without touch.
+        directory: where it was read from; None if it never was on disk.
+        plan_ticks: control ticks from an observation to its plan. The next plan is asked for so much
+            earlier, and its actions for the ticks that have gone by are left out.
+        ticks_seen: number of observations that `plan` takes: the network's own, and those before
+            them that the touch encoder looks back to.
     """
 
     def __init__(
         self,
-        policy: Policy,
+        network: PolicyNetwork,
         touch: TouchEmbedder | None,
         estimator: Estimator | None = None,
-        seed: int = 0,
+        plan_ticks: int = 0,
+        directory: Path | None = None,
     ) -> None:
-        """For one episode.
+        """Get ready for an episode.
 
         Args:
-            policy: for inference.
-            touch: embedder of the training; None for a policy without touch.
-            estimator: reads the columns that only a simulator knows; None if there are none.
-            seed: of the plans' noise.
+            network: for inference.
+            touch: the embedder that the network was trained with.
+            estimator: estimates the columns that only a simulator knows; None if there are none.
+            plan_ticks: see above. On the first tick the arm stands, and the plan is waited for.
+            directory: see above.
 
         Raises:
-            UserError: the embedder is not the training's, or an estimator is missing.
+            UserError: the embedder is not the training's, an estimator is missing, or plans are too
+                short to come so late.
         """
-        self.config = config = policy.config
+        self.config = config = network.config
         if (touch.name if touch else "") != config.touch:
             raise UserError(
                 f"the policy was trained with the touch encoder {config.touch or 'none'}, this is "
@@ -66,41 +83,75 @@ class Planner:
             )
         if config.estimated and estimator is None:
             raise UserError(f"the policy acts on {config.estimated[0]}: give it a state estimator")
-        self._policy, self.touch, self._estimator = policy, touch, estimator
+        self._network, self.touch, self._estimator = network, touch, estimator
+        self.plan_ticks, self.directory = plan_ticks, directory
+        self._check_delay(plan_ticks)
         self.ticks_seen = config.observation_horizon + (touch.reach if touch else 0)
-        self.reset(seed)
+        self.reset()
+
+    def __repr__(self) -> str:
+        """Name where it was read from, and its task."""
+        return f"LearnedPolicy({str(self.directory or '')!r}, task={self.config.task!r})"
 
     def reset(self, seed: int = 0) -> None:
-        """Begin another episode; `seed` is of its plans' noise."""
+        """Begin an episode: the next observation is its first one, with nothing touched yet.
+
+        Args:
+            seed: of the plans' noise.
+        """
         self._generator = torch.Generator().manual_seed(seed)
         self._first: Observation = {}
         self._embedded: list[tuple[Observation, np.ndarray, np.ndarray]] = []
+        self._recent: list[Observation] = []
+        self._todo: list[np.ndarray] = []  # actions of the present plan
+        self._next: list[np.ndarray] = []  # of the one that is on its way
+
+    def act(self, observation: Observation) -> Float32[np.ndarray, "8"]:
+        """Return the action (`features.ACTION`) for the next tick."""
+        horizon, first = self.config.execution_horizon, not self._recent
+        before = self._recent or [observation] * self.ticks_seen
+        self._recent = [*before[1:], observation]
+        if first:
+            self._todo = list(self.plan(self._recent)[:horizon])
+        self._begin_next_plan()
+        if len(self._todo) == self.plan_ticks:
+            actions = self.plan(self._recent)[self.plan_ticks : self.plan_ticks + horizon]
+            self._next = list(actions)
+            self._begin_next_plan()
+        return self._todo.pop(0)
+
+    def _begin_next_plan(self) -> None:
+        """Go on with the next plan where the present one is done."""
+        if not self._todo:
+            self._todo, self._next = self._next, []
 
     def prepare_thread(self) -> None:
         """Limit torch to one thread in the planning thread: two lose when the other core is taken."""
         torch.set_num_threads(1)
 
     def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]:
-        """Actions from the latest observation on.
+        """Return actions from the latest observation on.
 
         Args:
-            seen: the last `ticks_seen` observations, oldest first. The oldest one of the first
-                call is the episode's first, untouched one.
+            seen: the last `ticks_seen` observations, oldest first. The oldest one of an episode's
+                first call is its first observation, untouched.
         """
-        self.embed(seen)
-        _, touch, state = zip(*self._embedded, strict=True)
-        touch, state = (torch.from_numpy(np.stack(x)).float()[None] for x in (touch, state))
-        batch = ObservationBatch(touch, state, self._difference_images(seen[-1]))
-        return self._policy.plan(batch, self._generator)[0].numpy()
+        with one_thread():
+            self.embed(seen)
+            _, touch, state = zip(*self._embedded, strict=True)
+            touch, state = (torch.from_numpy(np.stack(x)).float()[None] for x in (touch, state))
+            batch = ObservationBatch(touch, state, self._difference_images(seen[-1]))
+            return self._network.plan(batch, self._generator)[0].numpy()
 
     def embed(self, seen: Sequence[Observation]) -> None:
-        """Embed these ahead of a `plan` that begins with some of them: most of the work."""
+        """Embed observations ahead of a `plan` that begins with some of them: most of the work."""
         self._first = self._first or seen[0]
         ends = range(len(seen) - self.config.observation_horizon + 1, len(seen) + 1)
-        self._embedded = [(seen[end - 1], *self._embed_tick(seen[:end])) for end in ends]
+        with one_thread():
+            self._embedded = [(seen[end - 1], *self._embed_tick(seen[:end])) for end in ends]
 
     def _embed_tick(self, seen: Sequence[Observation]) -> tuple[np.ndarray, np.ndarray]:
-        """The embedding (e,) and the proprioception (s,) of the newest tick."""
+        """Return the touch embedding (e,) and the proprioception (s,) of the latest tick."""
         observation = seen[-1]
         for before, touch, state in self._embedded:
             if before is observation:
@@ -122,58 +173,89 @@ class Planner:
         end_to_end = self.config.end_to_end
         if end_to_end is None:
             return None
-        pictures = [
+        images = [
             difference_images(observation[k][None], self._first[k], end_to_end.size)
             for k in ft.TACTILE
         ]
-        return torch.from_numpy(np.stack(pictures, 1))
+        return torch.from_numpy(np.stack(images, 1))
 
-
-class PolicyActor:
-    """Does `execution_horizon` ticks of a plan, then the next plan's.
-
-    An inference that takes `plan_ticks` control ticks is asked for so much earlier, and the ticks that have
-    gone by when its plan arrives are left out: no tick is done twice, none waits.
-    """
-
-    def __init__(self, planner: Planner, plan_ticks: int = 0) -> None:
-        """Starts an episode.
+    def env_config(self, task: Task | None = None) -> Task:
+        """Return a task's options with the images that the policy reads, and no others.
 
         Args:
-            planner: of this episode.
-            plan_ticks: ticks from an observation to its plan. On the first tick the arm stands, and
-                the plan is waited for.
+            task: the options otherwise; default: those of the policy's task, with its sensor.
 
         Raises:
-            UserError: plans too short to come so late.
+            UserError: the policy cannot act in the task.
         """
-        config = planner.config
+        config = self.config
+        if task is None:
+            if not config.task:
+                raise UserError(f"{self._name} does not name its task: give a config")
+            task = cast(Task, TASKS[cast(TaskName, config.task)](control_hz=config.control_hz))
+            task = replace(task, sensor=config.sensor or task.sensor)
+        self._check_task(task)
+        estimator = self._estimator if isinstance(self._estimator, StateEstimator) else None
+        reads_touch = config.touch_dim > 0 or config.end_to_end is not None or estimator is not None
+        if estimator is None:
+            return replace(task, tactile=reads_touch, cameras=())
+        cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key in estimator.cameras)
+        size = estimator.camera_size
+        return replace(task, tactile=reads_touch, cameras=cameras, camera_size=size)
+
+    @property
+    def _name(self) -> str:
+        return f"the policy in {self.directory}" if self.directory else "the policy"
+
+    def _check_task(self, task: EnvConfig) -> None:
+        """Raise UserError if the policy cannot act in the task."""
+        config, name = self.config, task_name(task)
+        if config.task and config.task != name:
+            raise UserError(
+                f"{self._name} was trained for {config.task}, not for {name}: add "
+                f"--task {config.task}, or choose another policy"
+            )
+        if task.arm != "fr3":
+            raise UserError(
+                f"{self._name} commands the seven joints of an FR3, the task has a {task.arm}: "
+                "leave out --env.arm, or choose the expert"
+            )
+        if task.control_hz != config.control_hz:
+            raise UserError(
+                f"{self._name} acts at {config.control_hz} Hz, not {task.control_hz}: leave out "
+                "--env.control-hz, or train a policy at that rate"
+            )
+        estimator = self._estimator if isinstance(self._estimator, StateEstimator) else None
+        sensor = find_sensor(task.sensor).name
+        trained = {
+            config.sensor,
+            self.touch and self.touch.sensor,
+            estimator and estimator.touch.sensor,
+        }
+        for other in trained - {"", None, sensor}:
+            raise UserError(
+                f"{self._name} was trained with the sensor {other}, the task has {sensor}: choose "
+                f"{other} (--env.sensor {other}), or another policy"
+            )
+        self._check_delay(max(task.resolved_deployment().plan_ticks or (0,)))
+
+    def _check_delay(self, plan_ticks: int) -> None:
+        """Raise UserError if plans are too short to come so late."""
+        config = self.config
         spare = config.prediction_horizon - config.execution_horizon
         if not 0 <= plan_ticks <= min(spare, config.execution_horizon):
             raise UserError(
                 f"a plan of {config.prediction_horizon} ticks, {config.execution_horizon} of them "
                 f"done, cannot come {plan_ticks} ticks late: change execution_horizon"
             )
-        self._planner, self._plan_ticks = planner, plan_ticks
-        self._seen: list[Observation] = []
-        self._todo: list[np.ndarray] = []  # actions of the present plan
-        self._next: list[np.ndarray] = []  # of the one that is on its way
 
-    def act(self, observation: Observation) -> Float32[np.ndarray, "8"]:
-        """The action for the next tick."""
-        config, first = self._planner.config, not self._seen
-        before = self._seen or [observation] * self._planner.ticks_seen
-        self._seen = [*before[1:], observation]
-        if first:
-            self._todo = list(self._planner.plan(self._seen)[: config.execution_horizon])
-        self._take_over()
-        if len(self._todo) == self._plan_ticks:
-            upto = self._plan_ticks + config.execution_horizon
-            self._next = list(self._planner.plan(self._seen)[self._plan_ticks : upto])
-            self._take_over()
-        return self._todo.pop(0)
 
-    def _take_over(self) -> None:
-        """Go on with the next plan where the present one is done."""
-        if not self._todo:
-            self._todo, self._next = self._next, []
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch compute on one thread, and on as many as before afterwards."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -55,7 +55,7 @@ def choose_policy(name: str | Path, task: TaskConfig) -> PolicyMaker:
     if (found := find_user_policy(chosen)) is not None:
         return found
     if chosen == "shipped":
-        return SavedPolicy(SHIPPED_POLICIES[where]).check_task(task)
+        return _fitting(SavedPolicy(SHIPPED_POLICIES[where]), task)
     try:
         folder = find_policy(chosen)
     except UserError as error:
@@ -67,7 +67,13 @@ def choose_policy(name: str | Path, task: TaskConfig) -> PolicyMaker:
             f"there is no policy {chosen!r}: {suggestion(chosen, tuple(BUILT_IN))}, or a class of your "
             "own as module:Class or file.py:Class"
         ) from error
-    return SavedPolicy(folder).check_task(task)
+    return _fitting(SavedPolicy(folder), task)
+
+
+def _fitting(policy: SavedPolicy, task: TaskConfig) -> SavedPolicy:
+    """Return the policy; UserError if it cannot act in the task."""
+    policy.env_config(task)
+    return policy
 
 
 def env_config_for(policy: PolicyMaker, config: TaskConfig) -> TaskConfig:

@@ -10,4 +10,5 @@ def load_saved_policy(cell: CellConfig, task: TaskConfig) -> CellPolicy:
     """Return the policy on disk that the cell names; UserError if it does not fit."""
     shipped = cell.task.policy == "shipped"
     directory = SHIPPED_POLICIES[cell.task.name] if shipped else find_policy(cell.task.policy)
-    return CellPolicy.fitting(cell, *SavedPolicy(directory).planner_for(task))
+    policy = SavedPolicy(directory)()
+    return CellPolicy.fitting(cell, policy, policy.env_config(task))

@@ -21,10 +21,10 @@ from touchgoal.control import features as ft
 from touchgoal.control.deployment.realtime import RealTimeActor
 from touchgoal.encoders.pretrained import find_encoder
 from touchgoal.policies import checkpoint
-from touchgoal.policies.acting import Planner, PolicyActor
+from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
-from touchgoal.policies.policy import ObservationBatch, Policy
+from touchgoal.policies.network import ObservationBatch, PolicyNetwork
 from touchgoal.runtime.errors import UserError
 
 
@@ -33,7 +33,8 @@ def test_an_actor_does_its_plans_in_order_and_on_time(plan_ticks: int) -> None:
     touch = toy_touch_embedder()
     config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
     policy, ticks = toy_policy(config, toy_dataset(config)).eval(), toy_observations(8)
-    actor = PolicyActor(Planner(policy, touch, seed=5), plan_ticks)
+    actor = LearnedPolicy(policy, touch, plan_ticks=plan_ticks)
+    actor.reset(seed=5)
     done = [actor.act(dict(tick)) for tick in ticks]  # nobody else keeps them
     rows = np.stack([touch.embed_tick([tick], ticks[0]) for tick in ticks])
     states = np.stack([np.concatenate([tick[ft.STATE], tick[ft.TCP_POSE]]) for tick in ticks])
@@ -52,19 +53,19 @@ def test_an_actor_does_its_plans_in_order_and_on_time(plan_ticks: int) -> None:
 
 def test_an_actor_refuses_what_it_cannot_do() -> None:
     touch = toy_touch_embedder()
-    policy = Policy(replace(TOY, touch_dim=touch.dim))
+    policy = PolicyNetwork(replace(TOY, touch_dim=touch.dim))
     with pytest.raises(UserError, match="this is none: load the one"):
-        Planner(policy, None)
+        LearnedPolicy(policy, None)
     with pytest.raises(UserError, match="encoder toy, this is another"):
-        Planner(policy, TouchEmbedder(touch.encoder, "another"))
+        LearnedPolicy(policy, TouchEmbedder(touch.encoder, "another"))
     with pytest.raises(UserError, match="5 ticks late"):
-        PolicyActor(Planner(policy, touch), plan_ticks=5)
+        LearnedPolicy(policy, touch, plan_ticks=5)
 
 
-class SlowPlanner(Planner):
+class SlowPolicy(LearnedPolicy):
     """Takes its time; remembers its plans."""
 
-    def __init__(self, policy: Policy, pause: float) -> None:
+    def __init__(self, policy: PolicyNetwork, pause: float) -> None:
         super().__init__(policy, None)
         self.pause, self.plans = pause, []
 
@@ -78,7 +79,7 @@ class SlowPlanner(Planner):
 def test_a_late_plan_is_joined_where_it_should_be_by_now() -> None:
     """Every action is one that a plan meant for this very tick; none waits for a plan."""
     config = replace(TOY, touch_dim=0, touch="", execution_horizon=3)
-    planner = SlowPlanner(toy_policy(config, toy_dataset(config)).eval(), pause=0.05)
+    planner = SlowPolicy(toy_policy(config, toy_dataset(config)).eval(), pause=0.05)
     actor, done = RealTimeActor(planner), []
     for i, tick in enumerate(toy_observations(40)):
         tick[ft.STATE][0] = i
@@ -95,7 +96,7 @@ def test_a_late_plan_is_joined_where_it_should_be_by_now() -> None:
 def test_one_tick_at_a_time_no_observation_is_planned_from_twice() -> None:
     """A slow planner that is asked a tick early for single ticks must not spin on the same one."""
     config = replace(TOY, touch_dim=0, touch="", execution_horizon=1)
-    planner = SlowPlanner(toy_policy(config, toy_dataset(config)).eval(), pause=0.02)
+    planner = SlowPolicy(toy_policy(config, toy_dataset(config)).eval(), pause=0.02)
     actor = RealTimeActor(planner, timeout=0.0)
     for tick in toy_observations(2):
         actor.act(tick)
@@ -111,8 +112,8 @@ def test_however_quick_the_machine_a_plan_is_done_from_the_tick_after_its_observ
     touch = toy_touch_embedder()
     config = replace(TOY, touch_dim=touch.dim, execution_horizon=3)
     policy = toy_policy(config, toy_dataset(config)).eval()
-    threaded = RealTimeActor(Planner(policy, touch), timeout=20.0)
-    plain = PolicyActor(Planner(policy, touch), plan_ticks=1)
+    threaded = RealTimeActor(LearnedPolicy(policy, touch), timeout=20.0)
+    plain = LearnedPolicy(policy, touch, plan_ticks=1)
     for i, tick in enumerate(toy_observations(10)):
         time.sleep(0.03 * (i % 3))
         np.testing.assert_array_equal(threaded.act(tick), plain.act(tick))
@@ -121,7 +122,7 @@ def test_however_quick_the_machine_a_plan_is_done_from_the_tick_after_its_observ
 
 def test_a_failing_planner_stops_the_actor() -> None:
     config = replace(TOY, touch_dim=0, touch="")
-    actor = RealTimeActor(Planner(toy_policy(config, toy_dataset(config)).eval(), None))
+    actor = RealTimeActor(LearnedPolicy(toy_policy(config, toy_dataset(config)).eval(), None))
     with pytest.raises(KeyError):
         actor.act({})
     actor.close()
@@ -129,7 +130,7 @@ def test_a_failing_planner_stops_the_actor() -> None:
 
 def test_a_planner_that_fails_later_is_not_waited_for() -> None:
     config = replace(TOY, touch_dim=0, touch="", execution_horizon=1)
-    planner = Planner(toy_policy(config, toy_dataset(config)).eval(), None)
+    planner = LearnedPolicy(toy_policy(config, toy_dataset(config)).eval(), None)
     actor = RealTimeActor(planner, timeout=3600)
     actor.act(toy_observations(1)[0])
     with pytest.raises(KeyError):

@@ -14,7 +14,7 @@ from touchgoal.policies.evaluation.open_loop import (
     repeat_last,
     zero_motion,
 )
-from touchgoal.policies.policy import ObservationBatch
+from touchgoal.policies.network import ObservationBatch
 from touchgoal.policies.training.sequence_dataset import Recordings, SequenceDataset
 
 import mujoco  # isort: skip - after touchgoal, which chooses the OpenGL platform

@@ -14,9 +14,9 @@ from touchgoal.encoders.backbones.touch_backbone import BATCH, TouchBackbone, To
 from touchgoal.encoders.backbones.vit import PRESETS, ViTConfig
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.pretrained import load_encoder, save
-from touchgoal.policies.acting import Planner, PolicyActor
+from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
-from touchgoal.policies.policy import Policy
+from touchgoal.policies.network import PolicyNetwork
 
 STRIDE = 3
 PAIR = replace(PRESETS["tiny"], channels=6)
@@ -59,7 +59,7 @@ def test_a_policy_feels_what_its_training_did(vit: ViTConfig, real_time: bool) -
     """Also between plans, when nobody asks: the past is what was observed, not what was embedded."""
     touch, ticks = TouchEmbedder(backbone(vit), "toy"), toy_observations(14)
     config = replace(TOY, touch_dim=touch.dim, execution_horizon=4)
-    planner, felt = Planner(Policy(config).eval(), touch), {}
+    planner, felt = LearnedPolicy(PolicyNetwork(config).eval(), touch), {}
     embed = planner._embed_touch
 
     def watched(seen):
@@ -68,7 +68,7 @@ def test_a_policy_feels_what_its_training_did(vit: ViTConfig, real_time: bool) -
         return rows
 
     planner._embed_touch = watched
-    actor = RealTimeActor(planner, timeout=10.0) if real_time else PolicyActor(planner)
+    actor = RealTimeActor(planner, timeout=10.0) if real_time else planner
     for tick in ticks:
         actor.act(dict(tick))
     if isinstance(actor, RealTimeActor):

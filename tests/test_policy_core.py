@@ -30,14 +30,16 @@ from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies import checkpoint
 from touchgoal.policies.actions import Normalizer, to_actions, to_representation
+from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.policies.config import ActionRepresentation, TrainConfig
 from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.perception.proprioception import network_input
-from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
+from touchgoal.policies.network import ObservationBatch, PolicyNetwork, PolicyConfig
 from touchgoal.policies.training import train as train_module
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
 from touchgoal.policies.training.train import ema_decay, train
 from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.config import PickPlaceConfig
 
 import mujoco  # isort: skip - after touchgoal, which chooses the OpenGL platform
 
@@ -234,7 +236,7 @@ def test_a_saved_policy_plans_the_same(
     for weight in policy.parameters():
         weight.data = weight.data.half().float()
     checkpoint.save(policy, tmp_path, {})
-    loaded = checkpoint.load(tmp_path, control_hz=20)
+    loaded = checkpoint.load(tmp_path)
     assert loaded.config == config
     condition, _ = windows.take(torch.arange(3))
     assert torch.equal(loaded.plan(condition, torch_rng()), policy.plan(condition, torch_rng()))
@@ -271,9 +273,9 @@ def test_a_turn_looks_the_same_by_either_quaternion() -> None:
 def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no policy in"):
         checkpoint.load(tmp_path)
-    checkpoint.save(Policy(TOY), tmp_path, {})
+    checkpoint.save(PolicyNetwork(TOY), tmp_path, {})
     with pytest.raises(UserError, match="acts at 20 Hz"):
-        checkpoint.load(tmp_path, control_hz=10)
+        SavedPolicy(tmp_path).env_config(PickPlaceConfig(control_hz=10))
     weights, path = load_file(tmp_path / "policy.safetensors"), tmp_path / "policy.json"
     save_file(weights | {"read.4.bias": torch.zeros(9)}, tmp_path / "policy.safetensors")
     with pytest.raises(UserError, match="read.4.bias is"):
@@ -317,7 +319,7 @@ def test_episodes_are_embedded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         load_recordings(episodes, [0], config, None)
     blind = load_recordings(episodes, [0], replace(config, touch_dim=0, touch=""), None)
     assert blind.touch.shape == (4, 0)
-    Policy(replace(config, touch_dim=0)).plan(
+    PolicyNetwork(replace(config, touch_dim=0)).plan(
         ObservationBatch(blind.touch[None, :2].float(), blind.state[None, :2]), torch_rng()
     )
 
@@ -337,12 +339,3 @@ def test_two_sets_beside_each_other_share_no_embeddings(tmp_path: Path) -> None:
         fresh = torch.from_numpy(embedder.embed(episodes, 0)).half()
         assert torch.equal(touches[-1], fresh)
     assert not torch.equal(*touches)
-
-
-def test_policies_of_older_names_load(tmp_path: Path) -> None:
-    config = replace(TOY, touch_input="embedding", representation="relative")
-    checkpoint.save(Policy(config), tmp_path, {})
-    text = (tmp_path / "policy.json").read_text()
-    older = text.replace('"touch_input": "embedding"', '"touch_reading": "free"')
-    (tmp_path / "policy.json").write_text(older.replace('"relative"', '"chunk"'))
-    assert "touch_reading" in older and checkpoint.load(tmp_path).config == config

@@ -17,7 +17,7 @@ from toy_policies import (
 
 from touchgoal.control import features as ft
 from touchgoal.encoders.training.options import TrainerOptions
-from touchgoal.policies.acting import Planner
+from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.config import EstimatorTrainConfig, PoseEstimatorConfig
 from touchgoal.policies.perception.placements import Placements
@@ -134,8 +134,8 @@ def test_a_policy_acts_on_its_senses() -> None:
     for tick in ticks:
         tick[ft.FRONT] = np.zeros((16, 16, 3), np.uint8)
     with pytest.raises(UserError, match=r"truth\.contact"):
-        Planner(policy, None)
-    planner = Planner(policy, None, toy_estimator())
+        LearnedPolicy(policy, None)
+    planner = LearnedPolicy(policy, None, toy_estimator())
     plans = [planner.plan(ticks[i : i + 2]) for i in range(2)]
     assert plans[0].shape == (config.prediction_horizon, 8) and np.isfinite(plans).all()
 
@@ -158,5 +158,4 @@ def test_a_rearrangement_is_a_beginning() -> None:
 @pytest.mark.parametrize("task", SHIPPED_POLICIES)
 def test_what_ships_fits_its_task(task: str) -> None:
     config = BeadMazeConfig() if task == "bead-maze" else PickPlaceConfig()
-    maker = SavedPolicy(SHIPPED_POLICIES[task]).check_task(config)
-    assert maker.env_config(config).tactile
+    assert SavedPolicy(SHIPPED_POLICIES[task]).env_config(config).tactile

@@ -10,7 +10,7 @@ from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.diffusion import DiffusionConfig
 from touchgoal.policies.heads.unet import PRESETS
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
-from touchgoal.policies.policy import WRENCH_DIM, Policy, PolicyConfig
+from touchgoal.policies.network import WRENCH_DIM, PolicyNetwork, PolicyConfig
 from touchgoal.policies.training.sequence_dataset import Recordings, SequenceDataset
 
 DIFFUSION = DiffusionConfig(PRESETS["tiny"], SamplerConfig(num_inference_steps=5))
@@ -37,9 +37,9 @@ def toy_dataset(
     )
 
 
-def toy_policy(config: PolicyConfig, windows: SequenceDataset, seed: int = 0) -> Policy:
+def toy_policy(config: PolicyConfig, windows: SequenceDataset, seed: int = 0) -> PolicyNetwork:
     torch.manual_seed(seed)
-    policy, recorded = Policy(config), windows.recorded
+    policy, recorded = PolicyNetwork(config), windows.recorded
     touch, actions = recorded.touch.float(), windows.actions
     policy.fit_normalizers(
         touch, recorded.state, windows.joints, actions, recorded.wrench, windows.action_is_pad

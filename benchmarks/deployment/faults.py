@@ -38,7 +38,7 @@ from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.episodes.repair import validate
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.policies.policy import PolicyConfig
+from touchgoal.policies.network import PolicyConfig
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import checked_dataclass

@@ -23,7 +23,7 @@ from touchgoal.encoders.pretrained import ENCODER_FORMAT
 from touchgoal.episodes.recording import Actor, EpisodeSpec, collect
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies import checkpoint
-from touchgoal.policies.acting import Planner, PolicyActor
+from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.by_name import follower
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.evaluation import open_loop
@@ -32,7 +32,7 @@ from touchgoal.policies.evaluation.open_loop import OpenLoopErrors, Plan, open_l
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.heads.diffusion import RegressionConfig
 from touchgoal.policies.perception.frozen_touch import shipped_touch
-from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
+from touchgoal.policies.network import ObservationBatch, PolicyNetwork, PolicyConfig
 from touchgoal.policies.training.sequence_dataset import (
     SequenceDataset,
     cached_embeddings,
@@ -69,14 +69,14 @@ class Config(BenchmarkOptions):
     """Processes that simulate."""
 
 
-class ShuffledTouchPlanner(Planner):
-    """A planner that feels, tick by tick, what was felt on another wire."""
+class ShuffledTouchPolicy(LearnedPolicy):
+    """A policy whose touch embeddings are, tick by tick, those of an episode on another wire."""
 
     recorded_touch: Float[np.ndarray, "t e"]
     tick = -1
 
     def plan(self, seen: Any) -> Float[np.ndarray, "h 8"]:
-        """As `Planner.plan`."""
+        """See LearnedPolicy."""
         self.tick = min(self.tick + self.config.execution_horizon, len(self.recorded_touch) - 1)
         return super().plan(seen)
 
@@ -100,15 +100,14 @@ class ShuffledTouch:
 
     def __call__(self, env: BeadMaze) -> Actor:
         """For one episode."""
-        torch.set_num_threads(1)
-        loaded = checkpoint.load(self.policy.directory)
-        touch = self.policy.touch(loaded.config)
+        touch = self.policy().touch
         assert touch is not None
-        planner = ShuffledTouchPlanner(loaded, touch)
+        ticks = self.policy.plan_ticks
+        policy = ShuffledTouchPolicy(self.policy.network(), touch, plan_ticks=ticks)
         rows = other_wires(self.episodes, env.wire.name)
         chosen = rows[int(env.np_random.integers(len(rows)))]
-        planner.recorded_touch = cached_embeddings(self.episodes, chosen, touch).astype(np.float32)
-        return PolicyActor(planner, self.policy.plan_ticks)
+        policy.recorded_touch = cached_embeddings(self.episodes, chosen, touch).astype(np.float32)
+        return policy
 
 
 def other_wires(episodes: EpisodeSet, wire: str) -> list[int]:
@@ -257,7 +256,7 @@ def _open_loop(
     for seed, directory in enumerate(directories):
         policy = checkpoint.load(directory)
         config, horizon = policy.config, policy.config.prediction_horizon
-        touch = SavedPolicy(directory).touch(config)
+        touch = SavedPolicy(directory)().touch
         if touch:
             load_recordings(episodes, range(count), config, touch, workers)  # embeds, all at once
         recorded = [load_recordings(episodes, [i], config, touch) for i in range(count)]
@@ -282,12 +281,12 @@ def _open_loop(
     return {name: _summary(errors) for name, errors in rows.items()}
 
 
-def _sampled(policy: Policy) -> Plan:
+def _sampled(policy: PolicyNetwork) -> Plan:
     generator = torch.Generator().manual_seed(0)
     return lambda batch: policy.plan(batch, generator)
 
 
-def _with_shuffled_touch(policy: Policy, recorded_touch: torch.Tensor) -> Plan:
+def _with_shuffled_touch(policy: PolicyNetwork, recorded_touch: torch.Tensor) -> Plan:
     plan = _sampled(policy)
 
     def shuffled(batch: ObservationBatch) -> torch.Tensor:

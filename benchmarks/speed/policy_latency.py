@@ -23,7 +23,7 @@ from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.diffusion import Diffusion, DiffusionConfig
 from touchgoal.policies.heads.unet import PRESETS
 from touchgoal.policies.perception.end_to_end import difference_images
-from touchgoal.policies.policy import PolicyConfig
+from touchgoal.policies.network import PolicyConfig
 from touchgoal.runtime.option_types import Count, CountOrNone, checked_dataclass
 from touchgoal.sim_envs.config import EnvConfig
 
@@ -78,8 +78,7 @@ def run(config: Config) -> dict[str, Any]:
 def _stages(config: Config) -> list[Stage]:
     folder = config.policy or SHIPPED_POLICIES["bead-maze"]
     maker = SavedPolicy(folder)
-    planner = maker.planner()
-    policy = checkpoint.load(folder)
+    planner, policy = maker(), maker.network()
     ticks = _observations(policy.config, maker.env_config(EnvConfig()).camera_size)
     stages = []
     if planner.touch is not None:

@@ -23,7 +23,7 @@ from touchgoal.policies.heads.unet import PRESETS
 from touchgoal.policies.perception.end_to_end import EndToEndConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
 from touchgoal.policies.perception.state_estimation import ESTIMATED, load_estimator
-from touchgoal.policies.policy import PolicyConfig
+from touchgoal.policies.network import PolicyConfig
 from touchgoal.policies.training.model_selection import Score, add_parts, select
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
 from touchgoal.policies.training.train import POLICY, train
@@ -146,7 +146,7 @@ def _check_sensor(config: Config, task: TaskName, sensor: str) -> None:
 
 def _try(config: Config, task: TaskName, directory: Path) -> Score:
     env = _env(config, task)
-    policy = SavedPolicy(directory).check_task(env)
+    policy = SavedPolicy(directory)
     env = policy.env_config(env)
     specs = trial_specs(env, config.trials, seeds.MODEL_SELECTION.start)
     result = Evaluation(tuple(run_trials(env, policy, specs, config.workers)))

@@ -21,7 +21,8 @@ from touchgoal.policies.by_name import (
     choose_policy,
     env_config_for,
 )
-from touchgoal.policies.checkpoint import LoadedPolicy
+from touchgoal.policies.acting import LearnedPolicy
+from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import UserError
@@ -84,7 +85,7 @@ class Evaluation:
 
 
 def evaluate(
-    policy: str | Path | LoadedPolicy | UserPolicy | type,
+    policy: str | Path | LearnedPolicy | UserPolicy | type,
     task: str | TaskConfig = "pick-place",
     *,
     episodes: int = 20,
@@ -108,9 +109,8 @@ def evaluate(
     if episodes < 1 or workers < 1:
         raise UserError("evaluate needs at least one episode and one worker")
     config = _task_config(task)
-    if isinstance(policy, LoadedPolicy):
-        policy.saved.check_task(config)
-        maker: PolicyMaker = policy.saved
+    if isinstance(policy, LearnedPolicy) and policy.directory is not None:
+        maker: PolicyMaker = SavedPolicy(policy.directory, policy.plan_ticks)
     elif isinstance(policy, str | Path):
         maker = choose_policy(policy, config)
     else:

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from touchgoal.control.motion.kinematics import Fr3Kinematics
-from touchgoal.policies.policy import ObservationBatch
+from touchgoal.policies.network import ObservationBatch
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 Plan = Callable[[ObservationBatch], Float[Tensor, "b h 8"]]
@@ -47,7 +47,7 @@ def open_loop_errors(plan: Plan, demonstration: SequenceDataset, control_hz: int
     """Errors of a planner along one demonstration.
 
     Args:
-        plan: observation batches to actions, such as `Policy.plan` or a baseline.
+        plan: observation batches to actions, such as `PolicyNetwork.plan` or a baseline.
         demonstration: windows of one episode, whose state is `features.STATE` and TCP pose.
         control_hz: ticks per second, which turns joint changes to velocities for `free_running`.
     """

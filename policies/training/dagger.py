@@ -8,8 +8,7 @@ import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.episodes.recording import Actor, EpisodeSpec
-from touchgoal.policies import checkpoint
-from touchgoal.policies.acting import Planner, PolicyActor
+from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
@@ -41,11 +40,9 @@ class DaggerRoles:
         if self.policy is None:
             return expert, expert
         if isinstance(self.policy, SavedPolicy) and isinstance(env, PickPlace):
-            policy = checkpoint.load(self.policy.directory)
-            if policy.config.estimated:
-                return PolicyActor(
-                    Planner(policy, None, _NearlyTrueState(env)), env.plan_ticks
-                ), expert
+            network = self.policy.network()
+            if network.config.estimated:
+                return LearnedPolicy(network, None, _NearlyTrueState(env), env.plan_ticks), expert
         return self.policy(env), expert
 
 

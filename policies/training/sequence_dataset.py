@@ -20,7 +20,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.proprioception import tare
-from touchgoal.policies.policy import ObservationBatch, PolicyConfig
+from touchgoal.policies.network import ObservationBatch, PolicyConfig
 from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track

@@ -17,7 +17,7 @@ from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
 from touchgoal.policies import checkpoint
 from touchgoal.policies.config import TrainConfig
-from touchgoal.policies.policy import ObservationBatch, Policy, PolicyConfig
+from touchgoal.policies.network import ObservationBatch, PolicyNetwork, PolicyConfig
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 POLICY, SNAPSHOTS = "policy", "snapshots"  # folders of a run
@@ -31,7 +31,7 @@ def train(
     out_dir: Path,
     options: TrainerOptions,
     recipe: dict[str, Any],
-) -> Policy:
+) -> PolicyNetwork:
     """Trains a policy; the moving average of its weights is what is kept.
 
     Writes what `trainer.fit` does, a policy to `snapshots/epoch-<n>/` every so often and at the end,
@@ -58,13 +58,13 @@ def train(
     policy = replace(policy, gripper_widths=tuple(widths) if len(widths) == 2 else ())
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
-        network = Policy(policy)
+        network = PolicyNetwork(policy)
     network.fit_normalizers(
         recorded.touch.float(), recorded.state, windows.joints, windows.actions,
         recorded.wrench, windows.action_is_pad,
     )  # fmt: skip
     average = AveragedModel(network, multi_avg_fn=_update_average).eval().requires_grad_(False)
-    averaged = cast(Policy, average.module)
+    averaged = cast(PolicyNetwork, average.module)
 
     def keep_snapshot(history: list[dict[str, float]], provenance: dict[str, Any]) -> None:
         known = {"train": asdict(config), "windows": len(windows), "metrics": history[-1]}
@@ -116,7 +116,7 @@ def _update_average(average: Sequence[Tensor], weights: Sequence[Tensor], n_aver
 class _PolicyLoss(nn.Module):
     """A policy's training loss, for the trainer."""
 
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: PolicyNetwork) -> None:
         super().__init__()
         self.policy = policy
 
@@ -148,7 +148,7 @@ def _make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, 
 
 @torch.no_grad()
 def _validate(
-    policy: Policy, windows: SequenceDataset, config: TrainConfig, seed: int
+    policy: PolicyNetwork, windows: SequenceDataset, config: TrainConfig, seed: int
 ) -> dict[str, float]:
     """The average's loss, and the error of the joint change (rad) it plans over the chunk."""
     n = min(config.validation_windows, len(windows))

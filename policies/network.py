@@ -151,8 +151,8 @@ class ObservationBatch:
         return self.state[:, -1, : ft.N_JOINTS]
 
 
-class Policy(nn.Module):
-    """Observation batch to actions, with all normalizers inside."""
+class PolicyNetwork(nn.Module):
+    """Network from an observation batch to actions, with its normalizers inside."""
 
     def __init__(self, config: PolicyConfig) -> None:
         """Randomly initialised; `fit_normalizers` comes before training."""
