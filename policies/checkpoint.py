@@ -20,10 +20,10 @@ from touchgoal.policies.acting import LearnedPolicy, Task
 from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.heads.unet import UNetConfig
+from touchgoal.policies.network import PolicyConfig, PolicyNetwork
 from touchgoal.policies.perception.end_to_end import EndToEndConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
 from touchgoal.policies.perception.state_estimation import StateEstimator, load_estimator
-from touchgoal.policies.network import PolicyNetwork, PolicyConfig
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 
@@ -86,7 +86,9 @@ class SavedPolicy:
         return self._parts()[0]
 
     def _parts(self) -> tuple[PolicyNetwork, TouchEmbedder | None, StateEstimator | None]:
-        return _load_parts(self.directory, tuple(map(_stamp, self.directory.rglob("*.safetensors"))))
+        return _load_parts(
+            self.directory, tuple(map(_stamp, self.directory.rglob("*.safetensors")))
+        )
 
 
 @lru_cache(maxsize=4)

@@ -23,9 +23,10 @@ from touchgoal.encoders.pretrained import find_encoder
 from touchgoal.policies import checkpoint
 from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES
-from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
 from touchgoal.policies.network import ObservationBatch, PolicyNetwork
+from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch_of
 from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.config import PickPlaceConfig
 
 
 @pytest.mark.parametrize("plan_ticks", [0, 1, 3])
@@ -60,6 +61,12 @@ def test_an_actor_refuses_what_it_cannot_do() -> None:
         LearnedPolicy(policy, TouchEmbedder(touch.encoder, "another"))
     with pytest.raises(UserError, match="5 ticks late"):
         LearnedPolicy(policy, touch, plan_ticks=5)
+    for options, message in {
+        (("control_hz", 10),): "acts at 20 Hz, not 10",
+        (("arm", "ur5e"),): "seven joints of an FR3, the task has a ur5e",
+    }.items():
+        with pytest.raises(UserError, match=message):
+            LearnedPolicy(policy, touch).env_config(PickPlaceConfig(**dict(options)))
 
 
 class SlowPolicy(LearnedPolicy):

@@ -15,8 +15,8 @@ from touchgoal.encoders.backbones.vit import PRESETS, ViTConfig
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.pretrained import load_encoder, save
 from touchgoal.policies.acting import LearnedPolicy
-from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.network import PolicyNetwork
+from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 
 STRIDE = 3
 PAIR = replace(PRESETS["tiny"], channels=6)

@@ -9,8 +9,8 @@ from touchgoal.encoders.backbones.vit import PRESETS as VITS
 from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.diffusion import DiffusionConfig
 from touchgoal.policies.heads.unet import PRESETS
+from touchgoal.policies.network import WRENCH_DIM, PolicyConfig, PolicyNetwork
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
-from touchgoal.policies.network import WRENCH_DIM, PolicyNetwork, PolicyConfig
 from touchgoal.policies.training.sequence_dataset import Recordings, SequenceDataset
 
 DIFFUSION = DiffusionConfig(PRESETS["tiny"], SamplerConfig(num_inference_steps=5))

@@ -31,8 +31,8 @@ from touchgoal.policies.evaluation.evaluate import Trial, run_trials
 from touchgoal.policies.evaluation.open_loop import OpenLoopErrors, Plan, open_loop_errors
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.heads.diffusion import RegressionConfig
+from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNetwork
 from touchgoal.policies.perception.frozen_touch import shipped_touch
-from touchgoal.policies.network import ObservationBatch, PolicyNetwork, PolicyConfig
 from touchgoal.policies.training.sequence_dataset import (
     SequenceDataset,
     cached_embeddings,

@@ -17,13 +17,12 @@ from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.benchmarks.speed.rates import one_core
 from touchgoal.control import features as ft
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
-from touchgoal.policies import checkpoint
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.diffusion import Diffusion, DiffusionConfig
 from touchgoal.policies.heads.unet import PRESETS
-from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.policies.network import PolicyConfig
+from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.runtime.option_types import Count, CountOrNone, checked_dataclass
 from touchgoal.sim_envs.config import EnvConfig
 

@@ -20,10 +20,10 @@ from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.policies.evaluation.evaluate import Evaluation, run_trials, trial_specs
 from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
 from touchgoal.policies.heads.unet import PRESETS
+from touchgoal.policies.network import PolicyConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder, load_touch
 from touchgoal.policies.perception.state_estimation import ESTIMATED, load_estimator
-from touchgoal.policies.network import PolicyConfig
 from touchgoal.policies.training.model_selection import Score, add_parts, select
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
 from touchgoal.policies.training.train import POLICY, train

@@ -16,12 +16,12 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.user_policy import UserPolicy, preferred_env_config
 from touchgoal.episodes.recording import EpisodeSpec, one_core_workers, run
+from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.by_name import (
     PolicyMaker,
     choose_policy,
     env_config_for,
 )
-from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import SavedPolicy
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.runtime import seeds

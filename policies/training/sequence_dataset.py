@@ -17,10 +17,10 @@ from torch import Tensor
 from touchgoal.control import features as ft
 from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.policies.network import ObservationBatch, PolicyConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 from touchgoal.policies.perception.proprioception import tare
-from touchgoal.policies.network import ObservationBatch, PolicyConfig
 from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track

@@ -17,7 +17,7 @@ from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
 from touchgoal.policies import checkpoint
 from touchgoal.policies.config import TrainConfig
-from touchgoal.policies.network import ObservationBatch, PolicyNetwork, PolicyConfig
+from touchgoal.policies.network import ObservationBatch, PolicyConfig, PolicyNetwork
 from touchgoal.policies.training.sequence_dataset import SequenceDataset
 
 POLICY, SNAPSHOTS = "policy", "snapshots"  # folders of a run
