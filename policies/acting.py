@@ -125,10 +125,6 @@ class LearnedPolicy:
         if not self._todo:
             self._todo, self._next = self._next, []
 
-    def prepare_thread(self) -> None:
-        """Limit torch to one thread in the planning thread: two lose when the other core is taken."""
-        torch.set_num_threads(1)
-
     def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]:
         """Return actions from the latest observation on.
 

@@ -83,28 +83,34 @@ class SavedPolicy:
 
     def network(self) -> PolicyNetwork:
         """Return the network alone."""
-        return self._parts()[0]
+        return _load_once(self.directory, _stamp(self.directory))
 
     def _parts(self) -> tuple[PolicyNetwork, TouchEmbedder | None, StateEstimator | None]:
-        return _load_parts(
-            self.directory, tuple(map(_stamp, self.directory.rglob("*.safetensors")))
-        )
+        return _load_parts(self.directory, _stamp(self.directory))
+
+
+_Stamp = tuple[tuple[str, int, int], ...]
+
+
+def _stamp(directory: Path) -> _Stamp:
+    """Name, time and size of a policy's files, by which a cached policy is known to be current."""
+    paths = sorted(directory.rglob("*.safetensors"))
+    return tuple((str(p), p.stat().st_mtime_ns, p.stat().st_size) for p in paths)
+
+
+@lru_cache(maxsize=4)
+def _load_once(directory: Path, stamp: _Stamp) -> PolicyNetwork:
+    return load(directory)
 
 
 @lru_cache(maxsize=4)
 def _load_parts(
-    directory: Path, stamps: tuple[object, ...]
+    directory: Path, stamp: _Stamp
 ) -> tuple[PolicyNetwork, TouchEmbedder | None, StateEstimator | None]:
-    """Read the networks of a policy once per process, while its files stay as they are."""
-    network = load(directory)
+    network = _load_once(directory, stamp)
     config = network.config
     touch = load_touch_of(directory / TOUCH, config.touch) if config.touch_dim else None
     return network, touch, load_estimator(directory / ESTIMATOR) if config.estimated else None
-
-
-def _stamp(path: Path) -> tuple[str, int, int]:
-    status = path.stat()
-    return str(path), status.st_mtime_ns, status.st_size
 
 
 def load_policy(name_or_path: str | Path, plan_ticks: int = 0) -> LearnedPolicy:

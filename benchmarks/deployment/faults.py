@@ -295,9 +295,6 @@ class HangingPlanner:
     def __init__(self, width: float, mark_broken: Callable[[], None]) -> None:
         self._width, self._mark_broken, self._plans = width, mark_broken, 0
 
-    def prepare_thread(self) -> None:
-        """Do nothing."""
-
     def embed(self, seen: Sequence[Observation]) -> None:
         """Nothing is embedded ahead."""
 

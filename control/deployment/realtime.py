@@ -53,7 +53,6 @@ class ChunkPlanner(Protocol):
     def config(self) -> Horizons: ...  # noqa: D102
     @property
     def ticks_seen(self) -> int: ...  # noqa: D102
-    def prepare_thread(self) -> None: ...  # noqa: D102
     def embed(self, seen: Sequence[Observation]) -> None: ...  # noqa: D102
     def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]: ...  # noqa: D102
 
@@ -184,7 +183,6 @@ class RealTimeActor(Actor):
 
     def _work(self) -> None:
         try:
-            self._planner.prepare_thread()
             while (seen := self._wait()) is not None:
                 if isinstance(seen, _Request):
                     self._take(seen, self._planner.plan(seen.seen))

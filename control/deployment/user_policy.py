@@ -121,9 +121,6 @@ class UserPolicyPlanner:
     def __init__(self, policy: UserPolicy) -> None:
         self._policy = policy
 
-    def prepare_thread(self) -> None:
-        """Do nothing: a user's policy chooses its own threads."""
-
     def embed(self, seen: Sequence[Observation]) -> None:
         """Do nothing: no work is done ahead."""
 
