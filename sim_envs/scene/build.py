@@ -17,12 +17,12 @@ from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import MAX_CAMERA_SIZE, SceneConfig
 from touchgoal.sim_envs.scene.objects import FIRM, Body
-from touchgoal.sim_envs.scene.ur5e import replace_arm_with_ur5e
 
 SIDES = ("left", "right")
 OBJECT_GROUP, VISUAL_GROUP, HIDDEN_GROUP = 1, 2, 3
 GRIPPER_MAX_FORCE = 80.0  # N, both fingers; opening never needs a limit below it
 
+_UR5E = Path(__file__).with_name("ur5e.xml")
 ROBOTS = {"fr3": limits.FR3, "ur5e": limits.UR5E}
 # N m/rad. Franka's default joint impedance: fr3.xml. Stiff enough for the UR5e, too: our choice.
 _STIFFNESS = {
@@ -43,14 +43,14 @@ def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpe
     """The scene's spec; tasks add to it before they compile it."""
     config = config or SceneConfig()
     if config.arm == "ur5e":
-        spec = mujoco.MjSpec.from_string(replace_arm_with_ur5e(robot_model()))
+        spec = mujoco.MjSpec.from_file(str(_UR5E))
     else:
         spec = mujoco.MjSpec.from_file(str(robot_model()))
+        spec.meshdir = str(robot_model().parent / "meshes")
         # No posture brings these together (none of 20,000 random ones did), but they lie so near
-        # that each pair would be looked at closely in every step.
+        # that the solver would examine each pair in every step.
         for i, k in ((0, 2), (2, 4), (3, 5)):
             spec.add_exclude(bodyname1=f"fr3_link{i}", bodyname2=f"fr3_link{k}")
-    spec.meshdir = str(robot_model().parent / "meshes")
     set_options(spec, config)
     _strip(spec, config)
     _compensate_gravity(spec.body("base"))

@@ -16,7 +16,7 @@ from numba import njit
 NO_SURFACE = np.float32(-0.95)  # m: nothing there
 HeightField = Float32[np.ndarray, "h w"]
 
-BOX, CYLINDER, SPHERE, CAPSULE, ELLIPSOID = 0, 1, 2, 3, 4
+BOX, CYLINDER, SPHERE, CAPSULE = range(4)
 
 
 @dataclass(frozen=True)
@@ -45,19 +45,6 @@ def _sphere(ox, oy, oz, d, radius):
     b = ox * d[0] + oy * d[1] + oz * d[2]
     disc = b * b - (ox * ox + oy * oy + oz * oz - radius * radius)
     t = -b - math.sqrt(max(disc, np.float32(0.0)))
-    return t if disc >= 0 else _FAR
-
-
-@njit(inline="always", fastmath=True, error_model="numpy")
-@no_type_check
-def _ellipsoid(ox, oy, oz, d, size):
-    """A unit sphere once every axis is divided by its half length."""
-    ox, oy, oz = ox / size[0], oy / size[1], oz / size[2]
-    dx, dy, dz = d[0] / size[0], d[1] / size[1], d[2] / size[2]
-    a = dx * dx + dy * dy + dz * dz
-    b = ox * dx + oy * dy + oz * dz
-    disc = b * b - a * (ox * ox + oy * oy + oz * oz - np.float32(1.0))
-    t = (-b - math.sqrt(max(disc, np.float32(0.0)))) / a
     return t if disc >= 0 else _FAR
 
 
@@ -166,15 +153,10 @@ def _add_primitive(out, pitch, kind, position, rotation, size, bound):
                 ox, oy, oz = ax + n * ex, ay + n * ey, az + n * ez
                 t = _cylinder(ox, oy, oz, d, across, inverse[2], size, near_end)
                 row[j] = max(row[j], -z - t)
-        elif kind == CAPSULE:
-            for j in range(right - left):
-                n = along[j]
-                t = _capsule(ax + n * ex, ay + n * ey, az + n * ez, d, across, size)
-                row[j] = max(row[j], -z - t)
         else:
             for j in range(right - left):
                 n = along[j]
-                t = _ellipsoid(ax + n * ex, ay + n * ey, az + n * ez, d, size)
+                t = _capsule(ax + n * ex, ay + n * ey, az + n * ez, d, across, size)
                 row[j] = max(row[j], -z - t)
 
 
@@ -183,8 +165,6 @@ def _bounding_radius(kind: int, size: Float[np.ndarray, "3"]) -> float:
         return float(size[0])
     if kind == CAPSULE:
         return float(size[0] + size[1])
-    if kind == ELLIPSOID:
-        return float(size.max())
     return float(np.linalg.norm(size if kind == BOX else size[:2]))
 
 
@@ -201,7 +181,7 @@ def add_primitive(
     float32: at fingertip distances its rounding is 4 nm.
 
     Args:
-        kind: BOX, CYLINDER, SPHERE, CAPSULE or ELLIPSOID.
+        kind: BOX, CYLINDER, SPHERE or CAPSULE.
         position, rotation: of the primitive in the sensor frame.
         size: as MuJoCo takes it, m.
     """

@@ -18,7 +18,6 @@ from touchgoal.sim_envs.tactile.geometry import (
     BOX,
     CAPSULE,
     CYLINDER,
-    ELLIPSOID,
     SPHERE,
     Grid,
     HeightField,
@@ -37,7 +36,6 @@ _PRIMITIVES = {
     int(mujoco.mjtGeom.mjGEOM_CYLINDER): CYLINDER,
     int(mujoco.mjtGeom.mjGEOM_SPHERE): SPHERE,
     int(mujoco.mjtGeom.mjGEOM_CAPSULE): CAPSULE,
-    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): ELLIPSOID,
 }
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 # Surfaces at half the image's resolution: between two of its rays a 20 mm ball deviates from a

@@ -1,4 +1,4 @@
-"""ur-rtde against the address given: moves, servoJ, servoC, freedrive, forceMode, outputs, dashboard.
+"""ur-rtde against the address given: moves, servoJ, dashboard.
 
 It answers with one line of JSON; `run.py` judges it.
 """
@@ -11,7 +11,6 @@ import time
 import numpy as np
 from dashboard_client import DashboardClient
 from rtde_control import RTDEControlInterface
-from rtde_io import RTDEIOInterface
 from rtde_receive import RTDEReceiveInterface
 
 
@@ -37,31 +36,6 @@ def main(address: str) -> None:
     control.servoStop()
     said["servoJ"] = moved()
     control.moveJ(start.tolist(), 0.5, 1.0)
-    goal = (pose + [0, 0, 0.03, 0, 0, 0]).tolist()
-    for _ in range(250):
-        control.servoC(goal, 0.25, 1.2, 0.0)
-        time.sleep(0.008)
-    control.servoStop()
-    said["servoC"] = (np.array(receive.getActualTCPPose()) - pose)[:3].tolist()
-    control.moveJ(start.tolist(), 0.5, 1.0)
-    control.zeroFtSensor()
-    for _ in range(150):  # nothing is there: it goes on down as fast as it may
-        control.forceMode([0.0] * 6, [0, 0, 1, 0, 0, 0], [0, 0, -5.0, 0, 0, 0], 2, [0.02] * 6)
-        time.sleep(0.008)
-    control.forceModeStop()
-    said["force"] = (np.array(receive.getActualTCPPose()) - pose)[:3].tolist()
-    control.moveJ(start.tolist(), 0.5, 1.0)
-    control.freedriveMode([1, 1, 1, 1, 1, 1])
-    said["freedrive"] = control.getFreedriveStatus()
-    control.endFreedriveMode()
-    said["still"] = moved()
-    outputs = RTDEIOInterface(address)
-    outputs.setStandardDigitalOut(3, True)
-    time.sleep(0.5)
-    said["output"] = receive.getDigitalOutState(3)
-    outputs.setStandardDigitalOut(3, False)
-    time.sleep(0.5)
-    said["output off"] = receive.getDigitalOutState(3)
     dashboard = DashboardClient(address)
     dashboard.connect()
     said["dashboard"] = [dashboard.robotmode(), dashboard.safetystatus(), dashboard.running()]

@@ -1,4 +1,9 @@
-"""A UR controller in front of the cell: RTDE, dashboard and script port; ur-rtde's clients fit."""
+"""A UR controller in front of the cell, for ur-rtde's control, receive and dashboard clients.
+
+Simulated: RTDE, the dashboard's state, power and stop commands, the script port for ur-rtde's own
+control program (`program.py` lists its commands). Not simulated: other URScript, rtde_io, force mode,
+freedrive, speed scaling by safety, the primary and secondary interface (their ports accept and say nothing).
+"""
 
 import re
 from collections.abc import Sequence
@@ -11,7 +16,6 @@ from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort
 from touchgoal.sim_envs.twin.ur import messages
 from touchgoal.sim_envs.twin.ur.messages import Package, Safety
-from touchgoal.sim_envs.twin.ur.outputs import Outputs
 from touchgoal.sim_envs.twin.ur.program import UrProgram
 
 _CYCLE = 2  # ms, of a controller of the e-Series
@@ -54,9 +58,8 @@ class UrController:
             ListeningPort(host, messages.SECONDARY),
         ]
         self._clients: dict[ClientConnection, Client] = {}
-        self._values_sent: dict[
-            str, float | Sequence[float]
-        ] = {}  # in this millisecond, to any client
+        # Values of this millisecond, shared by all clients.
+        self._values_sent: dict[str, float | Sequence[float]] = {}
         self._inputs: dict[str, float] = dict.fromkeys(messages.INPUTS, 0)
         self.frozen = False
         self.safety, self._mode = Safety.NORMAL, _RUNNING
@@ -64,8 +67,7 @@ class UrController:
         self._clock = 0.0
         self._speed_fraction = 1.0
         self._nonsense = False
-        self._io = Outputs()
-        self._felt, self._zero, self._wrench = np.zeros(6), np.zeros(6), np.zeros(6)
+        self._estimate, self._zero, self._wrench = np.zeros(6), np.zeros(6), np.zeros(6)
         self._program = self._new_program()
         self._program.running = False
 
@@ -91,7 +93,7 @@ class UrController:
                 self.protective_stop()
 
     def hold(self) -> None:
-        """A UR's time never stands: nobody answers every one of its states."""
+        """Do nothing: a UR cannot run in lock-step, for its clients answer no states."""
 
     def send(self) -> None:
         """Look for collisions after a millisecond, and send data that is due."""
@@ -135,7 +137,7 @@ class UrController:
             self.safety = Safety.NORMAL
 
     def freeze(self, frozen: bool) -> None:
-        """Let nothing through in either direction, or let it through again."""
+        """Block or unblock both directions."""
         self.frozen = frozen
 
     def stop_button(self, pressed: bool) -> None:
@@ -146,11 +148,11 @@ class UrController:
             self._program.end()
 
     def silence_gripper(self, silent: bool) -> None:
-        """Its gripper is on a serial port: UserError."""
+        """Raise UserError: the gripper is on a serial port."""
         raise UserError("this gripper is a serial device: unplug gripper")
 
     def set_nonsense(self, on: bool) -> None:
-        """Say that the joints' speeds are not numbers, or say them again."""
+        """Send NaN for joint speeds, or stop doing so."""
         self._nonsense = on
 
     def drop(self) -> None:
@@ -174,7 +176,6 @@ class UrController:
                 connection.close()
 
     def _poll_dashboard_and_script(self) -> None:
-        """Dashboard and scripts."""
         for client in self._dashboard.poll():
             for line in client.lines():
                 client.send(self._dashboard_answer(line).encode() + b"\n")
@@ -223,7 +224,6 @@ class UrController:
             self.protective_stop()
             return
         self._inputs.update(zip(names, values, strict=True))
-        self._io.update(self._inputs, names)
         self._last_input_at = self._clock
         if "speed_slider_mask" in names and self._inputs["speed_slider_mask"]:
             self._speed_fraction = float(np.clip(self._inputs["speed_slider_fraction"], 0.0, 1.0))
@@ -231,7 +231,7 @@ class UrController:
             self._program.cycle()
 
     def _play(self, script: str) -> None:
-        """Start an uploaded program; of one that is not ur-rtde's control script nothing can be run."""
+        """Start ur-rtde's control program; refuse any other script."""
         name = re.match(r"def\s+(\w+)", script)
         if self.safety is Safety.NORMAL and self._mode == _RUNNING:
             self._program.end()
@@ -239,31 +239,24 @@ class UrController:
             self._program.running = name is not None and name[1] == "rtde_control"
             self._last_input_at = self._clock
             if not self._program.running:
-                print(
-                    "REFUSED: the twin does not run URScript of one's own; protective stop",
-                    flush=True,
-                )
+                print("REFUSED: the twin runs no URScript of a client; protective stop", flush=True)
                 self.protective_stop()
-                self._program.say_done()
+                self._program.report_done()
 
     def _new_program(self) -> UrProgram:
-        return UrProgram(
-            self.cell, self._inputs, self.protective_stop, self._zero_force, lambda: self._wrench
-        )
+        return UrProgram(self.cell, self._inputs, self.protective_stop, self._zero_force)
 
     def _zero_force(self) -> None:
-        """What is felt now counts as nothing, as after URScript's zero_ftsensor."""
-        self._zero = self._felt.copy()
+        """Take the present wrench as zero, as URScript's zero_ftsensor does."""
+        self._zero = self._estimate.copy()
 
     def _dashboard_answer(self, line: str) -> str:
-        """The dashboard's."""
         safety = self.safety.name
         running = self._program.running
-        said = {
+        answers = {
             "polyscopeversion": "URSoftware {}.{}.{}.{} (Jan 01 2026)".format(*messages.VERSION),
             "get serial number": "20265500001",
             "get robot model": "UR5",
-            "get loaded program": "Loaded program: /programs/none.urp",
             "is in remote control": "true",
             "robotmode": "Robotmode: "
             + {_POWER_OFF: "POWER_OFF", _IDLE: "IDLE", _RUNNING: "RUNNING"}[self._mode],
@@ -274,8 +267,8 @@ class UrController:
             "quit": "Disconnected",
         }
         command = line.lower()
-        if command in said:
-            return said[command]
+        if command in answers:
+            return answers[command]
         if command == "stop":
             self._program.end()
             return "Stopped"
@@ -283,8 +276,6 @@ class UrController:
             return self._unlock()
         if command in ("power on", "power off", "brake release"):
             return self._power(command)
-        if command.split(" ")[0] in ("popup", "close", "addtolog", "restart"):
-            return f"{line} done"
         return f"could not understand: '{line}'"
 
     def _unlock(self) -> str:
@@ -307,11 +298,11 @@ class UrController:
     # Data.
 
     def _estimate_wrench(self) -> None:
-        """The wrench on the TCP that joint torques say is there, base frame, less the sensor's zero."""
+        """Estimate the wrench on the TCP from joint torques, base frame, less the sensor's zero."""
         _, _, J = self.cell.kinematics(self.cell.q, np.zeros(3))
         known = np.linalg.solve(J @ J.T + 1e-8 * np.eye(6), J @ self.cell.tau_ext)
-        self._felt = known + self.cell.wrench_error
-        self._wrench = self._felt - self._zero
+        self._estimate = known + self.cell.wrench_error
+        self._wrench = self._estimate - self._zero
 
     def _data(self, client: Client) -> bytes:
         numbers: list[float] = []
@@ -345,9 +336,6 @@ _CONSTANTS: dict[str, float | Sequence[float]] = {
     "joint_temperatures": [30.0] * 6,
 }
 _VARIABLES = {
-    "actual_digital_output_bits": lambda c, p, cell: c._io.digital,
-    "standard_analog_output0": lambda c, p, cell: c._io.analog[0],
-    "standard_analog_output1": lambda c, p, cell: c._io.analog[1],
     "timestamp": lambda c, p, cell: c._clock,
     "target_q": lambda c, p, cell: cell.q_d,
     "target_qd": lambda c, p, cell: cell.dq_d,
@@ -361,9 +349,9 @@ _VARIABLES = {
     "actual_TCP_force": lambda c, p, cell: c._wrench,
     "ft_raw_wrench": lambda c, p, cell: c._wrench,
     "tcp_force_scalar": lambda c, p, cell: float(np.linalg.norm(c._wrench[:3])),
-    "runtime_state": lambda c, p, cell: _PLAYING if p.says_running else _STOPPED,
+    "runtime_state": lambda c, p, cell: _PLAYING if p.reported_running else _STOPPED,
     "robot_mode": lambda c, p, cell: c._mode,
-    "robot_status_bits": lambda c, p, cell: int(c._mode != _POWER_OFF) | p.says_running << 1,
+    "robot_status_bits": lambda c, p, cell: int(c._mode != _POWER_OFF) | p.reported_running << 1,
     "safety_mode": lambda c, p, cell: int(c.safety),
     "safety_status": lambda c, p, cell: int(c.safety),
     "safety_status_bits": lambda c, p, cell: c.safety.bits,
@@ -373,7 +361,7 @@ _VARIABLES = {
 
 
 def _recipe(payload: bytes, known: dict[str, str]) -> tuple[list[str], bytes]:
-    """Names of a recipe that are known, and the kinds to answer with."""
+    """Return the known names of a recipe, and the kinds to answer with."""
     names = [name for name in payload.decode().split(",") if name]
     kinds = ",".join(known.get(name, "NOT_FOUND") for name in names)
     return [name for name in names if name in known], kinds.encode()

@@ -1,4 +1,4 @@
-"""What a UR says over the wire: RTDE packages and variables, the dashboard's phrases.
+"""A UR's wire format: RTDE packages and variables.
 
 Source: Universal Robots' RTDE guide and dashboard server manual (e-Series, PolyScope 5).
 """
@@ -24,7 +24,7 @@ class Package(IntEnum):
 
 
 class Safety(IntEnum):
-    """Safety mode; what follows each is its pattern of `safety_status_bits`."""
+    """Safety mode of the controller."""
 
     NORMAL = 1
     PROTECTIVE_STOP = 3
@@ -72,27 +72,27 @@ OUTPUTS = _types(
 )
 INPUTS = _types(
     UINT32="speed_slider_mask input_bit_registers0_to_31 input_bit_registers32_to_63",
-    DOUBLE="speed_slider_fraction standard_analog_output_0 standard_analog_output_1 "
-    + " ".join(f"input_double_register_{i}" for i in _REGISTERS),
-    UINT8="standard_digital_output_mask standard_digital_output configurable_digital_output_mask "
-    "configurable_digital_output tool_digital_output_mask tool_digital_output "
-    "standard_analog_output_mask standard_analog_output_type",
+    DOUBLE="speed_slider_fraction " + " ".join(f"input_double_register_{i}" for i in _REGISTERS),
     VECTOR6D="external_force_torque",
     INT32=" ".join(f"input_int_register_{i}" for i in _REGISTERS),
 )
 
 
 def package(kind: Package, payload: bytes) -> bytes:
-    """A package's bytes."""
+    """Return a package's bytes."""
     return struct.pack(">HB", 3 + len(payload), kind) + payload
 
 
 class MalformedError(ValueError):
-    """What a client has sent is no RTDE package."""
+    """Bytes that are no RTDE package."""
 
 
 def split(unread: bytes) -> tuple[list[tuple[int, bytes]], bytes]:
-    """Whole packages (kind, payload), and what is left; MalformedError for a length that cannot be."""
+    """Split off whole packages (kind, payload); return them and the rest.
+
+    Raises:
+        MalformedError: a length is impossible.
+    """
     found = []
     while len(unread) >= 3:
         length, kind = struct.unpack_from(">HB", unread)
@@ -106,5 +106,5 @@ def split(unread: bytes) -> tuple[list[tuple[int, bytes]], bytes]:
 
 
 def layout(names: list[str], kinds: dict[str, str]) -> struct.Struct:
-    """Of the variables in a recipe."""
+    """Return the binary layout of a recipe's variables."""
     return struct.Struct(">" + "".join(FORMATS[kinds[name]] for name in names))

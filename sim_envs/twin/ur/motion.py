@@ -1,11 +1,10 @@
 """How a UR moves between commands: moves with trapezoidal speed, servo, speed, stop."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from touchgoal.control.motion.rotations import rotation_matrix, rotation_vector
 from touchgoal.control.safety.braking import braked_velocity
@@ -13,25 +12,24 @@ from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 
 _SERVO_ACCELERATION = 40.0  # rad/s^2, the most that ur-rtde lets a client ask for
 _STILL = 1e-3  # rad/s
-# Our choices: the maker's controllers are unpublished.
-_FORCE_GAIN, _FORCE_SPEED = 2e-3, 0.1  # m/s for each N missing, and m/s at most; likewise rad, Nm
-_FREEDRIVE_GAIN, _FREEDRIVE_SPEED = 0.05, 0.5  # rad/s for each Nm, and rad/s at most
+_DAMPING = 1e-6  # m^2: keeps joint speeds finite near singular poses
 
+Vector3 = Float[np.ndarray, "3"]
 Joints = Float[np.ndarray, "6"]
 Target = tuple[Joints, Joints]  # rad, rad/s
 
 
 @runtime_checkable
 class Activity(Protocol):
-    """Something the arm is doing."""
+    """One motion of the arm."""
 
     def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
-        """The next millisecond's target after the last one; `speed_fraction`: the speed slider."""
+        """Return the next millisecond's target after the last one, under a speed slider."""
         ...
 
     @property
     def done(self) -> bool:
-        """Whether it has come to its end."""
+        """Whether the motion has ended."""
         ...
 
 
@@ -51,7 +49,7 @@ class _Trapezoid:
         self.duration = self.length / self.speed + self.speed / self.acceleration
 
     def advance(self, dt: float) -> tuple[float, float]:
-        """Share of the way after another `dt` s, and its rate (1/s)."""
+        """Return the share of the way after another `dt` s, and its rate (1/s)."""
         self.time = min(self.time + dt, self.duration)
         ramp, left = self.speed / self.acceleration, self.duration - self.time
         if self.time < ramp:
@@ -61,6 +59,11 @@ class _Trapezoid:
         else:
             way, rate = self.length - self.acceleration * left**2 / 2, self.acceleration * left
         return way / max(self.length, 1e-12), rate / max(self.length, 1e-12)
+
+    @property
+    def done(self) -> bool:
+        """Whether the end is reached."""
+        return bool(self.time >= self.duration)
 
 
 class JointMove:
@@ -74,7 +77,7 @@ class JointMove:
         self._profile: _Trapezoid | None = None
 
     def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
-        """The next target."""
+        """Return the next target."""
         if self._profile is None:
             if np.abs(dq).max() > _STILL:
                 dq = braked_velocity(dq, np.full(6, self._acceleration), DT)
@@ -89,7 +92,7 @@ class JointMove:
     @property
     def done(self) -> bool:
         """Whether the goal is reached."""
-        return self._profile is not None and bool(self._profile.time >= self._profile.duration)
+        return self._profile is not None and self._profile.done
 
 
 class LineMove:
@@ -98,8 +101,8 @@ class LineMove:
     def __init__(
         self,
         cell: SimulatedCell,
-        offset: Float[np.ndarray, "3"],
-        position: Float[np.ndarray, "3"],
+        offset: Vector3,
+        position: Vector3,
         rotation: Float[np.ndarray, "3 3"],
         speed: float,
         acceleration: float,
@@ -111,21 +114,20 @@ class LineMove:
         self._profile = _Trapezoid(length, speed, acceleration)
 
     def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
-        """The next target, by differential inverse kinematics that corrects its own drift."""
-        share, rate = self._profile.advance(speed_fraction * DT)
-        position, R, jacobian = self._cell.kinematics(q, self._offset)
-        wanted = rotation_matrix(share * self._turn) @ self._R
+        """Return the next target; differential inverse kinematics that corrects its own drift."""
+        share, _ = self._profile.advance(speed_fraction * DT)
+        position, R, _ = self._cell.kinematics(q, self._offset)
+        target = rotation_matrix(share * self._turn) @ self._R
         error = np.concatenate(
-            [self._from + share * self._way - position, rotation_vector(wanted @ R.T)]
+            [self._from + share * self._way - position, rotation_vector(target @ R.T)]
         )
-        J = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + 1e-6 * np.eye(6))
-        dq = J @ (error / DT)
+        dq = _joint_velocity(self._cell, q, error / DT, self._offset)
         return q + DT * dq, dq * (not self.done)
 
     @property
     def done(self) -> bool:
         """Whether the goal is reached."""
-        return bool(self._profile.time >= self._profile.duration)
+        return self._profile.done
 
 
 @dataclass
@@ -138,16 +140,16 @@ class Servo:
     done: bool = field(default=False, init=False)
 
     def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
-        """The next target."""
-        wanted = np.clip((self.goal - q) / self.lookahead, -self.speed, self.speed)
+        """Return the next target."""
+        desired = np.clip((self.goal - q) / self.lookahead, -self.speed, self.speed)
         change = _SERVO_ACCELERATION * DT
-        dq = dq + np.clip(wanted - dq, -change, change)
+        dq = dq + np.clip(desired - dq, -change, change)
         return q + DT * dq, dq
 
 
 @dataclass
 class Speed:
-    """`speedj` or `speedl`: go on at a joint speed (rad/s), or a TCP twist (m/s, rad/s)."""
+    """`speedj` or `speedl`: a constant joint speed (rad/s), or with a cell a TCP twist (m/s, rad/s)."""
 
     goal: Joints
     acceleration: float
@@ -155,11 +157,10 @@ class Speed:
     done: bool = field(default=False, init=False)
 
     def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
-        """The next target."""
+        """Return the next target."""
         goal = self.goal
         if self.cell is not None:
-            _, _, J = self.cell.kinematics(q, np.zeros(3))
-            goal = J.T @ np.linalg.solve(J @ J.T + 1e-6 * np.eye(6), self.goal)
+            goal = _joint_velocity(self.cell, q, self.goal, np.zeros(3))
         missing = goal - dq
         most = np.abs(missing).max()
         dq = dq + missing * min(1.0, self.acceleration * DT / max(most, 1e-12))
@@ -174,7 +175,7 @@ class Stop:
     done: bool = field(default=False, init=False)
 
     def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
-        """The next target."""
+        """Return the next target."""
         fastest = float(np.abs(dq).max())
         left = max(0.0, fastest - self.deceleration * DT)
         dq = dq * (left / fastest if fastest > 0 else 0.0)
@@ -182,44 +183,9 @@ class Stop:
         return q + DT * dq, dq
 
 
-@dataclass
-class Force:
-    """`force_mode`: along free axes of the base the arm gives way until it pushes as hard as asked.
-
-    Attributes:
-        free: which of x, y, z, rx, ry, rz are.
-        wanted: N and Nm that the robot is to apply to its environment.
-        limits: m/s and rad/s of the free axes.
-        wrench: reads what the environment does to the robot.
-    """
-
-    cell: SimulatedCell
-    free: Bool[np.ndarray, "6"]
-    wanted: Float[np.ndarray, "6"]
-    limits: Float[np.ndarray, "6"]
-    wrench: Callable[[], Float[np.ndarray, "6"]]
-    done: bool = field(default=False, init=False)
-
-    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
-        """The next target."""
-        missing = self.wanted + self.wrench()
-        most = np.minimum(self.limits, _FORCE_SPEED)
-        twist = self.free * np.clip(_FORCE_GAIN * missing, -most, most)
-        _, _, J = self.cell.kinematics(q, np.zeros(3))
-        goal = J.T @ np.linalg.solve(J @ J.T + 1e-6 * np.eye(6), twist)
-        dq = dq + np.clip(goal - dq, -_SERVO_ACCELERATION * DT, _SERVO_ACCELERATION * DT)
-        return q + DT * dq, dq
-
-
-@dataclass
-class Freedrive:
-    """`freedrive_mode`: every joint gives way to what pushes it."""
-
-    cell: SimulatedCell
-    done: bool = field(default=False, init=False)
-
-    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
-        """The next target."""
-        goal = np.clip(_FREEDRIVE_GAIN * self.cell.tau_ext, -_FREEDRIVE_SPEED, _FREEDRIVE_SPEED)
-        dq = dq + np.clip(goal - dq, -_SERVO_ACCELERATION * DT, _SERVO_ACCELERATION * DT)
-        return q + DT * dq, dq
+def _joint_velocity(
+    cell: SimulatedCell, q: Joints, twist: Float[np.ndarray, "6"], offset: Vector3
+) -> Joints:
+    """Joint velocity (rad/s) for a twist (m/s, rad/s) of the point `offset` m from the hand's TCP."""
+    _, _, J = cell.kinematics(q, offset)
+    return J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(6), twist)

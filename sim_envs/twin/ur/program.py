@@ -1,8 +1,10 @@
-"""The control program that ur-rtde uploads, as the controller would run it: register by register.
+"""The control program that ur-rtde uploads, executed command by command.
 
-The URScript itself is not interpreted. What it does with each command number is done here: arguments
-lie in the input registers, answers in the output registers, and output register 0 says 1 (ready for
-a command) or 2 (done).
+The URScript itself is not interpreted. Arguments of a command lie in the input registers, answers in
+the output registers; output register 0 is 1 (ready for a command) or 2 (done). Simulated: moveJ, moveL,
+servoJ, servoL, speedJ, speedL, their stops, the watchdog, the TCP, kinematics, zeroFtSensor and
+protective stops. Payload and gains are accepted without effect. All else is refused: servoC, paths, force
+mode, freedrive, jogging, contact detection, joint torques, pose arithmetic, digital and analog outputs.
 """
 
 from collections.abc import Callable
@@ -14,44 +16,17 @@ from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.motion.rotations import rotation_matrix, rotation_vector
 from touchgoal.control.safety.limits import UR5E
 from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
-from touchgoal.sim_envs.twin.ur.motion import (
-    Activity,
-    Force,
-    Freedrive,
-    JointMove,
-    LineMove,
-    Servo,
-    Speed,
-    Stop,
-)
+from touchgoal.sim_envs.twin.ur.motion import Activity, JointMove, LineMove, Servo, Speed, Stop
 
 _READY, _DONE = 1, 2
-_STREAMED = {
-    6,
-    9,
-    10,
-    11,
-    12,
-    24,
-    25,
-    26,
-    27,
-    38,
-    58,
-    66,
-    67,
-    68,
-    69,
-    70,
-    71,
-}  # acknowledged at once
-_IGNORED = {0, 13, 14, 17, 20, 21, 48, 59, 65, 99}  # payload, outputs, a kick
-_UNANSWERED = {25, 66}  # toolContact, directTorque
+# Numbers of ur-rtde's commands. Streamed ones are acknowledged at once.
+_STREAMED = {6, 9, 10, 11, 12, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71}
+_WITHOUT_EFFECT = {0, 13, 14, 17, 20, 21, 48, 59, 65, 99}  # payload, gains, a kick of the watchdog
+_UNANSWERED = {25, 66}  # toolContact, directTorque: clients do not read an answer
 _REFUSAL_CYCLES = 250  # 0.5 s at most; a client that waits for an answer has given up long before
 _STOP_SCRIPT = 255
 _LONGEST_TOOL = 10.0  # m and rad
-_END_OF_FREEDRIVE = 5.0  # rad/s^2
-_PACE = 1e-3, 40.0  # rad/s or m/s, and those per s
+_PACE = 1e-3, 40.0  # rad/s or m/s, and those per s: least and most that ur-rtde lets through
 _REACH = 0.85  # m, UR5e data sheet
 _FLANGE_TO_TCP = np.array([0.0, 0.0, UR5E.tool.tcp_offset])
 
@@ -62,29 +37,28 @@ class UrProgram:
     """One run of the control program.
 
     Attributes:
-        activity: what the arm is doing for it.
+        activity: the motion in progress.
         ints, doubles: output registers.
         inputs: the client's input registers by name.
-        running: false once it has ended.
+        running: false once the program has ended.
+        watchdog: s without a command after which the program ends.
     """
 
     def __init__(
         self,
         cell: SimulatedCell,
         inputs: dict[str, float],
-        stop: Callable[[], None],
+        protective_stop: Callable[[], None],
         zero_force: Callable[[], None],
-        wrench: Callable[[], Float[np.ndarray, "6"]],
     ) -> None:
-        """What it calls for a protective stop, to zero the force sensor, and to read it."""
-        self.cell, self.inputs, self._wrench = cell, inputs, wrench
-        self._freedriving = False
-        self._protective_stop, self._zero_force = stop, zero_force
+        """`protective_stop` stops the arm; `zero_force` zeroes the force sensor."""
+        self.cell, self.inputs = cell, inputs
+        self._protective_stop, self._zero_force = protective_stop, zero_force
         self.activity: Activity | None = None
         self.ints, self.doubles = [0] * 48, [0.0] * 48
         self.ints[0], self.running = _READY, True
         self._refused = self._cycles_refused = 0
-        self.watchdog = np.inf  # s without a command after which the program ends
+        self.watchdog = np.inf
         self.tcp = np.concatenate([_FLANGE_TO_TCP, np.zeros(3)])
         self._executing = self._waiting = self._asynchronous = False
         self._started = 0
@@ -117,13 +91,13 @@ class UrProgram:
                 self.ints[0] = _DONE
 
     @property
-    def says_running(self) -> bool:
-        """What clients are told of `running`; not so while a command is refused."""
+    def reported_running(self) -> bool:
+        """Whether clients are told that the program runs: not while a command is refused."""
         refusing = self._refused and self._cycles_refused < _REFUSAL_CYCLES
         return self.running and not refusing
 
     def pose(self, q: Float[np.ndarray, "6"]) -> Pose:
-        """Of the configured TCP at joint positions (rad), base frame."""
+        """Return the pose of the configured TCP at joint positions (rad), base frame."""
         position, R, _ = self.cell.kinematics(q, self._offset())
         return np.concatenate([position, rotation_vector(R @ rotation_matrix(self.tcp[3:]))])
 
@@ -132,53 +106,41 @@ class UrProgram:
     def _execute(self, command: int) -> None:
         actions = {
             1: lambda: self._move(JointMove(self._doubles(0), *self._pace())),
-            2: lambda: self._move_to_pose(),
+            2: lambda: self._move(JointMove(self._inverse(self.cell.q_d), *self._pace())),
             3: lambda: self._move(self._line(self._doubles(0))),
             4: lambda: self._move(self._line(self.pose(self._doubles(0)))),
-            6: self._force_mode,
-            7: lambda: self._stop(asynchronous=False),
             8: self._zero_force,
-            12: lambda: self._servo(self._inverse(self._doubles(0), self.cell.q_d)),
-            18: lambda: self._freedrive(True),
-            19: lambda: self._freedrive(False),
-            52: lambda: self._freedrive(True),
-            53: lambda: self._freedrive(False),
-            54: lambda: self._answer_int(0 if self._freedriving else 1),
             9: lambda: self._go(Speed(self._doubles(0), self._double(6))),
             10: lambda: self._go(Speed(self._doubles(0), self._double(6), self.cell)),
             11: lambda: self._servo(self._doubles(0)),
             15: lambda: self._stop(asynchronous=False),
             16: lambda: self._stop(asynchronous=False),
-            24: lambda: self._servo(self._inverse(self._doubles(0), self.cell.q_d)),
-            26: lambda: self._answer([0.002]),
+            24: lambda: self._servo(self._inverse(self.cell.q_d)),
             28: lambda: self._answer(self.pose(self.cell.q_d)),
             29: self._set_tcp,
-            30: lambda: self._answer(self._inverse(self._doubles(0), self._doubles(6))),
+            30: lambda: self._answer(self._inverse(self._doubles(6))),
             31: self._protective_stop,
             33: lambda: self._stop(asynchronous=self._int(1) == 1),
             34: lambda: self._stop(asynchronous=self._int(1) == 1),
             35: self._set_watchdog,
-            36: lambda: self._answer_bool(bool(np.linalg.norm(self._doubles(0)[:3]) < _REACH)),
-            37: lambda: self._answer_bool(_inside(self._doubles(0))),
-            38: lambda: self._answer(self.cell.joint_torque),
+            37: self._answer_joints_inside,
             40: lambda: self._answer(self.tcp),
             43: lambda: self._answer(self.pose(self.cell.q)),
             44: self._forward,
-            46: lambda: self._answer(self._inverse(self._doubles(0), self.cell.q)),
-            47: lambda: self._answer_bool(not self.cell.moving),
-            58: lambda: self._answer(self._flange()),
+            46: lambda: self._answer(self._inverse(self.cell.q)),
+            47: self._answer_steady,
             _STOP_SCRIPT: self.end,
         }
         if command in actions:
             actions[command]()
-        elif command not in _IGNORED:
+        elif command not in _WITHOUT_EFFECT:
             self._refuse(command)
 
     def _refuse(self, command: int) -> None:
-        """What is not simulated: ur-rtde's call fails, and the program goes on.
+        """Let ur-rtde's call fail while the program goes on.
 
-        The client gives up on a command when the program is said to have stopped. Some of its calls
-        look at no answer; a protective stop tells those.
+        The client gives up on a command when the program is reported as stopped. A call that reads no
+        answer gets a protective stop.
         """
         print(f"REFUSED: the twin does not simulate ur-rtde's command {command}", flush=True)
         if command in _UNANSWERED:
@@ -187,21 +149,20 @@ class UrProgram:
             self._refused, self._cycles_refused = command, 0
 
     def end(self) -> None:
-        """The program ends; the arm comes to rest."""
+        """End the program; the arm comes to rest."""
         self.running, self.activity = False, None
         self._waiting, self.ints[0] = False, 0
         self.cell.brake(UR5E.hardware.acceleration)
 
-    def say_done(self) -> None:
-        """Of a script of the client's own, which it waits 300 s for.
+    def report_done(self) -> None:
+        """Report a client's own script, for which it would wait 300 s, as done.
 
-        It then uploads the control program again, and its call raises because that does not run within
-        5 s: a protective stop is what a UR does to a script that it cannot go on with.
+        The client then uploads the control program again; because that does not run within 5 s, its call
+        raises. A protective stop is what a UR does to a script that it cannot go on with.
         """
         self.ints[0] = _DONE
 
     def _go(self, activity: Activity) -> None:
-        """Stream: what is going on in the same way goes on with the new numbers."""
         self.activity = activity
 
     def _servo(self, goal: np.ndarray) -> None:
@@ -211,19 +172,6 @@ class UrProgram:
         lookahead = min(max(self._double(9), 0.03), 0.2)
         self._go(Servo(UR5E.hardware.velocity, goal, lookahead))
 
-    def _force_mode(self) -> None:
-        """In the base's axes; a task frame that is turned counts as unturned."""
-        free = np.array([self._int(i) for i in range(2, 8)]) != 0
-        limits = np.abs(self._doubles(12))
-        self._go(Force(self.cell, free, self._doubles(6), limits, self._wrench))
-
-    def _freedrive(self, on: bool) -> None:
-        self._freedriving = on
-        if on:
-            self._go(Freedrive(self.cell))
-        else:
-            self.activity = Stop(_END_OF_FREEDRIVE)
-
     def _move(self, activity: Activity) -> None:
         self.activity = activity
         if self._int(1) == 1:
@@ -232,10 +180,6 @@ class UrProgram:
             self.ints[2] = self._started << 24 | 1 << 15
         else:
             self._waiting = True
-
-    def _move_to_pose(self) -> None:
-        q = self._inverse(self._doubles(0), self.cell.q_d)
-        self._move(JointMove(q, *self._pace()))
 
     def _stop(self, asynchronous: bool) -> None:
         self._asynchronous, self.ints[2] = False, self._started << 24
@@ -250,47 +194,48 @@ class UrProgram:
             self.tcp = self._doubles(0)
 
     def _forward(self) -> None:
-        kept, self.tcp = self.tcp, self._doubles(6)
+        own, self.tcp = self.tcp, self._doubles(6)
         self._answer(self.pose(self._doubles(0)))
-        self.tcp = kept
+        self.tcp = own
+
+    def _answer_joints_inside(self) -> None:
+        q, hardware = self._doubles(0), UR5E.hardware
+        self.ints[1] = int(((q >= hardware.lower) & (q <= hardware.upper)).all())
+
+    def _answer_steady(self) -> None:
+        self.ints[1] = int(not self.cell.moving)
 
     # Geometry.
 
     def _offset(self) -> Float[np.ndarray, "3"]:
-        """Of the configured TCP from the hand's own, in the hand frame, m."""
+        """Offset of the configured TCP from the hand's own, in the hand frame, m."""
         return self.tcp[:3] - _FLANGE_TO_TCP
 
     def _target(self, pose: Pose) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-        """Where the hand's own TCP has to be for the configured one to have a pose."""
+        """Pose of the hand's own TCP that brings the configured one to `pose`."""
         R = rotation_matrix(pose[3:]) @ rotation_matrix(self.tcp[3:]).T
         return pose[:3] - R @ self._offset(), R
 
     def _line(self, pose: Pose) -> LineMove:
-        R = rotation_matrix(pose[3:]) @ rotation_matrix(self.tcp[3:]).T
+        _, R = self._target(pose)
         return LineMove(self.cell, self._offset(), pose[:3], R, *self._pace())
 
-    def _inverse(self, pose: Pose, near: np.ndarray) -> Float[np.ndarray, "6"]:
-        """Joint positions, by the nearest way; without a solution a UR stops its program."""
-        position, R = self._target(pose)
-        if not (np.abs(position) < 2 * _REACH).all() or not np.isfinite(R).all():
-            self._protective_stop()
-            return self.cell.q_d.copy()
-        solution = self._kinematics.solve_ik_near(position, R, near, posture=0.0)
-        if not solution.reached:
-            print("the twin's UR found no inverse kinematics; protective stop")
-            self._protective_stop()
-            return self.cell.q_d.copy()
-        return solution.q
-
-    def _flange(self) -> Pose:
-        position, R, _ = self.cell.kinematics(self.cell.q, -_FLANGE_TO_TCP)
-        return np.concatenate([position, rotation_vector(R)])
+    def _inverse(self, near: np.ndarray) -> Float[np.ndarray, "6"]:
+        """Joint positions for the pose in the registers; without a solution a UR stops its program."""
+        position, R = self._target(self._doubles(0))
+        if (np.abs(position) < 2 * _REACH).all() and np.isfinite(R).all():
+            solution = self._kinematics.solve_ik_near(position, R, near, posture=0.0)
+            if solution.reached:
+                return solution.q
+        print("the twin's UR found no inverse kinematics; protective stop")
+        self._protective_stop()
+        return self.cell.q_d.copy()
 
     # Registers.
 
     def _pace(self) -> tuple[float, float]:
-        """Speed and acceleration of a move, inside what ur-rtde lets through."""
-        return tuple(float(np.clip(self._double(i), *_PACE)) for i in (6, 7))  # pyright: ignore
+        """Speed and acceleration of a move."""
+        return float(np.clip(self._double(6), *_PACE)), float(np.clip(self._double(7), *_PACE))
 
     def _int(self, index: int) -> int:
         return int(self.inputs[f"input_int_register_{index}"])
@@ -301,15 +246,5 @@ class UrProgram:
     def _doubles(self, index: int) -> Float[np.ndarray, "6"]:
         return np.array([self._double(index + i) for i in range(6)])
 
-    def _answer(self, numbers) -> None:
-        self.doubles[: len(numbers)] = [float(number) for number in numbers]
-
-    def _answer_int(self, number: int) -> None:
-        self.ints[1] = number
-
-    def _answer_bool(self, yes: bool) -> None:
-        self.ints[1] = int(yes)
-
-
-def _inside(q: Float[np.ndarray, "6"]) -> bool:
-    return bool(((q >= UR5E.hardware.lower) & (q <= UR5E.hardware.upper)).all())
+    def _answer(self, numbers: Float[np.ndarray, " n"]) -> None:
+        self.doubles[: len(numbers)] = numbers.tolist()
