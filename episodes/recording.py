@@ -103,7 +103,11 @@ def record_with_film(
     spec: EpisodeSpec,
     policy: Callable[[Any], Actor] | None = None,
 ) -> tuple[Episode, UInt8[np.ndarray, "n h w 3"]]:
-    """Record and film, tick by tick, the expert or what a policy makes for the environment."""
+    """Record and film an episode of the expert, or of the actor that `policy` makes.
+
+    Returns:
+        The episode, and pictures for `episodes.film.write_film`.
+    """
     observation, info = env.reset(seed=spec.seed, options=spec.options)
     actor = policy(env) if policy else make_expert(env, spec.outcome)
     film = SceneRecorder(env)
@@ -113,7 +117,7 @@ def record_with_film(
         ticks.append(tick)
         film.capture()
     film.close()
-    return to_episode(env, ticks, spec), np.stack(film.frames)
+    return to_episode(env, ticks, spec), film.pictures
 
 
 def to_episode(

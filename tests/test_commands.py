@@ -111,7 +111,7 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     for name in ("episode.mp4", "curves.png", "curves.csv", "metrics.json", "config.json"):
         assert (tmp_path / name).stat().st_size > 0
     frames, fps = read_frames(tmp_path / "episode.mp4")
-    assert frames.shape[1:] == (480, 800, 3) and fps == 20
+    assert frames.shape[1:] == (264, 720, 3) and fps == 10
     printed = capsys.readouterr().out
     assert "image+tactile" in printed and str(tmp_path / "curves.png") in printed
 

@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from touchgoal.episodes.media import write_video
+from touchgoal.episodes.film import write_film
 from touchgoal.episodes.recording import Actor, EpisodeSpec, record_with_film
 from touchgoal.launch.run_policy import Config
 from touchgoal.policies.by_name import choose_policy, env_config_for
@@ -59,8 +59,8 @@ def _film(
     env = make_env(replace(task, tactile=True))
     for name in list(places)[: len(ranked)]:
         spec = ranked[places[name]]
-        _, frames = record_with_film(env, spec, policy)
-        write_video(out / f"{name}.mp4", frames, task.control_hz)
+        episode, pictures = record_with_film(env, spec, policy)
+        write_film(out / f"{name}.mp4", pictures, episode, task.control_hz)
         print(f"{name} episode (seed {spec.seed}): {out / f'{name}.mp4'}")
     env.close()
 

@@ -1,4 +1,4 @@
-"""Pictures for people: the scene with the robot's full meshes, beside the touch pictures."""
+"""Films of an environment: the scene with the robot's full meshes, beside the tactile images."""
 
 from dataclasses import replace
 
@@ -10,15 +10,15 @@ from jaxtyping import UInt8
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.scene.rendering import open_renderer
 
-Picture = UInt8[np.ndarray, "_ _ 3"]  # pictures of different sizes meet in one call
-_HEIGHT = 480
+TICKS_PER_PICTURE = 2
+_HEIGHT = 240  # px
 
 
 class SceneRecorder:
-    """Films an environment after its reset: front camera left, the two sensors right.
+    """Films an environment after its reset: front camera left, both tactile images right.
 
-    The full meshes (242k triangles) are drawn in a model of their own; the environment, its
-    observations and its speed stay as they are.
+    The full meshes (242k triangles) are drawn in a model of their own, so that the environment, its
+    observations and its speed do not change.
     """
 
     def __init__(self, env: FrankaTactileEnv) -> None:
@@ -27,28 +27,35 @@ class SceneRecorder:
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         self._renderer = open_renderer(self._model, _HEIGHT, _HEIGHT)
-        self.frames: list[Picture] = []
+        self._ticks = 0
+        self._pictures: list[np.ndarray] = []
 
     def capture(self) -> None:
-        """Take and keep a picture of the environment as it is now."""
+        """Draw the environment as it is now; call it once a tick, of which every second is drawn."""
+        self._ticks += 1
+        if self._ticks % TICKS_PER_PICTURE != 1:
+            return
         self._data.qpos[:] = self._env.data.qpos
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, "front")
-        scene = self._renderer.render()
-        self.frames.append(scene_beside_touch(scene, [f.image for f in self._env.tactile_frames()]))
+        touch = [frame.image for frame in self._env.tactile_frames()]
+        self._pictures.append(_beside(self._renderer.render(), touch))
+
+    @property
+    def pictures(self) -> UInt8[np.ndarray, "n h w 3"]:
+        """The pictures so far, one every `TICKS_PER_PICTURE` ticks."""
+        return np.stack(self._pictures)
 
     def close(self) -> None:
         """Free the OpenGL context."""
         self._renderer.close()
 
 
-def scene_beside_touch(scene: Picture, tactile: list[Picture]) -> Picture:
-    """The scene with the tactile images, labelled, in a column right of it."""
-    labelled = []
+def _beside(scene: np.ndarray, tactile: list[np.ndarray]) -> np.ndarray:
+    """Return the scene with the tactile images, labelled, in a column right of it."""
+    column = []
     for name, image in zip(("left", "right"), tactile, strict=False):
-        image = image.copy()
-        cv2.putText(
-            image, name, (8, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA
-        )
-        labelled.append(image)
-    return np.hstack([scene, np.vstack(labelled)]) if labelled else scene
+        small = cv2.resize(image, (2 * _HEIGHT // 3, _HEIGHT // 2), interpolation=cv2.INTER_AREA)
+        cv2.putText(small, name, (5, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1, cv2.LINE_AA)  # fmt: skip
+        column.append(small)
+    return np.hstack([scene, np.vstack(column)]) if column else scene
