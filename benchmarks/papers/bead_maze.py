@@ -1,8 +1,7 @@
-"""Does touch lead a bead along a wire never seen (TacBench T5, Sparsh Table 10), closed loop too?
+"""Bead maze: success on unseen wires, and errors along recorded ones (TacBench T5, Sparsh Table 10).
 
-Every policy of the same recipe counts as one arm, its seeds as repeats. All arms meet the same
-wires and the same starts. Open loop: see `policies/evaluation/open_loop.py`, along expert demonstrations on
-test wires that nothing disturbs unless asked.
+Policies of one recipe count as one arm, its training seeds as repeats. All arms get the same wires
+and starts. The open-loop part is in `policies/evaluation/open_loop.py`.
 """
 
 import tempfile
@@ -48,23 +47,23 @@ from touchgoal.sim_envs.scene.wires import HELD_OUT, Wire, choose
 
 @checked_dataclass
 class Config(BenchmarkOptions):
-    """Does touch lead a bead along a wire never seen (TacBench T5, Sparsh Table 10)?"""
+    """Options of benchmark bead-maze."""
 
     policies: tuple[Path, ...] = ()
-    """Folders of policies that train-policy made; those of one recipe count as training seeds of it.
-    Default: the shipped one."""
+    """Folders of policies from train-policy; policies of one recipe count as training seeds.
+    Default: the shipped policy."""
     wires: Count = 100
-    """Number of test wires, of the families trained on."""
+    """Test wires of the trained families."""
     held_out: CountOrNone = 20
-    """Number of test wires of the family held out; 0 leaves it out."""
+    """Test wires of the held-out family; 0 leaves them out."""
     demonstrations: Annotated[int, Field(ge=2)] = 20
-    """Number of test wires on which open-loop errors are measured."""
+    """Test wires on which open-loop errors are measured."""
     plan_ticks: tuple[CountOrNone, ...] = (1, 2)
-    """Control ticks by which plans come late, tried besides 0 on the first policy."""
+    """Delays of plans, in control ticks, tried besides 0 on the first policy."""
     shuffled: bool = True
-    """Try every policy with frozen touch also with what was felt on another wire."""
+    """Also try every policy on frozen touch with the touch of another wire."""
     env: BeadMazeConfig = BeadMazeConfig(split="test")
-    """Options of the maze, e.g. a disturbance; demonstrations are recorded with the same."""
+    """Options of the maze; demonstrations are recorded with the same."""
     workers: Count = CORES
     """Processes that simulate."""
 
@@ -86,20 +85,18 @@ class ShuffledTouchPolicy(LearnedPolicy):
 
 @dataclass(frozen=True)
 class ShuffledTouch:
-    """Makes a policy whose touch was shuffled: it feels an episode on another wire.
-
-    Which one is drawn by the trial's seed.
+    """Makes a policy whose touch comes from an episode on another wire, drawn by the trial's seed.
 
     Attributes:
-        policy: makes it, undisturbed.
-        episodes: embedded, see `load_recordings`.
+        policy: makes the policy with its own touch.
+        episodes: embedded episodes, see `load_recordings`.
     """
 
     policy: SavedPolicy
     episodes: EpisodeSet
 
     def __call__(self, env: BeadMaze) -> Actor:
-        """For one episode."""
+        """Make the policy for one episode."""
         touch = self.policy().touch
         assert touch is not None
         ticks = self.policy.plan_ticks
@@ -111,17 +108,17 @@ class ShuffledTouch:
 
 
 def other_wires(episodes: EpisodeSet, wire: str) -> list[int]:
-    """Episodes that were not recorded on a wire."""
+    """Return episodes that were recorded on other wires."""
     return [i for i in range(len(episodes)) if episodes.meta(i)["wire"] != wire]
 
 
 def _specs(wires: list[Wire], seed: int) -> list[EpisodeSpec]:
-    """One trial on each wire; the seeds, from `seed` on, place the maze and grip the bead."""
+    """Return one trial on each wire; seeds place the maze and the grip."""
     return [EpisodeSpec(seed + i, options={"wire": w.name}) for i, w in enumerate(wires)]
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Open loop, then closed loop.
+    """Measure open loop, then closed loop.
 
     Returns:
         `table`, and the numbers behind it.
@@ -157,7 +154,7 @@ def _group_by_recipe(policies: tuple[Path, ...]) -> dict[str, list[Path]]:
 
 
 def _encoder_name(policy: Path, config: PolicyConfig) -> str:
-    """Of its touch encoder: its name if it ships, else what it was trained by, such as `dino`."""
+    """Return the encoder's name if it ships, else its training method."""
     if shipped := shipped_touch(config.touch):
         return shipped
     known = ENCODER_FORMAT.provenance(policy / checkpoint.TOUCH)
@@ -223,12 +220,12 @@ def _closed_table(results: dict[str, list[Trial]]) -> str:
 
 
 def bootstrap(values: list[tuple[str, float]], draws: int = 5000) -> tuple[float, float]:
-    """95 % interval of the mean: wires (or recordings) are drawn, then, in each, training seeds."""
+    """Return the 95 % interval of the mean: wires are drawn, then training seeds within each."""
     rng = np.random.default_rng(0)
     groups: dict[str, list[float]] = {}
     for name, value in values:
         groups.setdefault(name, []).append(value)
-    rows = np.array(list(groups.values()))  # wires x seeds: every seed met every wire
+    rows = np.array(list(groups.values()))  # wires x seeds: every seed ran on every wire
     wires = rng.integers(len(rows), size=(draws, len(rows), 1))
     seeds = rng.integers(rows.shape[1], size=(draws, 1, rows.shape[1]))
     means = rows[wires, seeds].mean((1, 2))
@@ -240,7 +237,7 @@ def bootstrap(values: list[tuple[str, float]], draws: int = 5000) -> tuple[float
 
 
 def _record(config: Config, root: Path) -> EpisodeSet:
-    """Expert demonstrations, on test wires and undisturbed unless other options are chosen."""
+    """Record expert demonstrations on test wires."""
     maze = config.env
     wires = choose(maze.split, config.demonstrations, maze.families)
     collect(root, maze, _specs(wires, seeds.POLICY_TEST.start), config.workers)
@@ -250,7 +247,7 @@ def _record(config: Config, root: Path) -> EpisodeSet:
 def _open_loop(
     directories: list[Path], episodes: EpisodeSet, workers: int
 ) -> dict[str, dict[str, Any]]:
-    """Errors of an arm and of the trivial baselines, each over demonstrations and seeds."""
+    """Return errors of an arm and of trivial baselines over demonstrations and seeds."""
     rows: dict[str, list[tuple[str, OpenLoopErrors]]] = {}
     count = len(episodes)
     for seed, directory in enumerate(directories):

@@ -1,9 +1,8 @@
-"""Do the paper's claims about dense costs hold (MMWand, section V-E, Figures 8 and 9)?
+"""MMWand's claims about dense costs (section V-E, Figures 8 and 9), on expert episodes and failures.
 
-Expert episodes on seeds that no training saw, and failures to order, measured with the shipped
-encoder. Every definition was fixed before the first result was seen: a curve "drops" at the first
-frame by which half of its net drop has fallen; peaks of an episode's curves are counted above one
-common noise level, the largest of theirs; goals and sentences are named below.
+Definitions were fixed before the first result: a curve "drops" at the first frame by which half of
+its net drop has fallen; peaks of an episode's curves are counted above one common noise level, the
+largest of theirs.
 """
 
 import tempfile
@@ -39,17 +38,17 @@ from touchgoal.sim_envs.scene.objects import CATALOGUE
 
 @checked_dataclass
 class Config(BenchmarkOptions):
-    """Do the MMWand paper's claims about dense costs hold (section V-E, Figures 8 and 9)?"""
+    """Options of benchmark reward-quality."""
 
     encoder: str = "gelsight_mini"
-    """Touch encoder, by name or folder; the simulated sensor is the one that it was trained on."""
+    """Touch encoder, by name or folder; the simulated sensor is the encoder's."""
     episodes: Count = 20
-    """Number of held-out episodes of each outcome."""
+    """Held-out episodes of each outcome."""
     workers: Count = CORES
     """Processes that simulate."""
 
 
-# New wordings: none of these sentences was trained on.
+# new wordings: no training saw these sentences
 SENTENCES = {
     "glass_ball": "a hard smooth round object",
     "golf_ball": "a hard ball full of little dents",
@@ -80,9 +79,9 @@ class HeldOutEpisode:
     """One held-out episode, measured against three kinds of goal.
 
     Attributes:
-        own: to its own last frame (Figure 8).
-        words: touch to a sentence (Figure 9), image to the own last frame.
-        other: to the end of another, successful episode with the wanted object.
+        own: cost to its own last frame (Figure 8).
+        words: touch to a sentence (Figure 9), image to its own last frame.
+        other: cost to the end of another, successful episode with the same object.
     """
 
     outcome: str
@@ -92,7 +91,7 @@ class HeldOutEpisode:
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Record, measure, judge."""
+    """Record, measure and judge."""
     directory = pretrained.find_encoder(config.encoder)
     encoder = pretrained.load_aligned(directory)
     normalizer = DistanceNormalizer.load(directory / NORMALIZER)
@@ -131,7 +130,7 @@ def record_and_measure(
     normalizer: DistanceNormalizer,
     folder: Path,
 ) -> list[HeldOutEpisode]:
-    """Simulate goal and test episodes, felt with one sensor, and measure each test."""
+    """Simulate goal and test episodes with one sensor and measure each test."""
     names = [list(CATALOGUE)[i % len(CATALOGUE)] for i in range(config.episodes)]
     ends = collect_goals(names, sensor, folder, config.workers)
     tests = []
@@ -159,7 +158,7 @@ def record_and_measure(
 def collect_goals(
     names: Sequence[str], sensor: str, folder: Path, workers: int
 ) -> list[EpisodeEnd]:
-    """The end of a successful episode with each object; what failed is tried on other seeds.
+    """Return the end of a successful episode with each object, trying further seeds after a failure.
 
     Raises:
         UserError: an object was not placed in `_GOAL_ATTEMPTS` attempts.
@@ -186,7 +185,7 @@ def collect_goals(
 
 
 def is_goal(meta: Mapping[str, MetaValue], sensor: str) -> bool:
-    """Whether an episode's end may be a goal: a success. UserError if another sensor felt it."""
+    """Return whether an episode succeeded; UserError if another sensor recorded it."""
     if meta["sensor"] != sensor:
         raise UserError(f"a goal was felt with {meta['sensor']}, the encoder is for {sensor}")
     return bool(meta["success"])
@@ -200,7 +199,7 @@ def _curves(
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim, judged.
+    """One claim with its verdict.
 
     Attributes:
         verdict: "holds", "fails", or "unsure" where the interval of a mean includes 0.
@@ -212,14 +211,14 @@ class Claim:
 
     @property
     def line(self) -> str:
-        """For the table."""
+        """Return the claim's line in the table."""
         return f"  {self.verdict:<8}{self.claim}: {self.evidence}"
 
 
 def judge_claims(
     successes: Sequence[HeldOutEpisode], untouched: Sequence[HeldOutEpisode]
 ) -> list[Claim]:
-    """The claims of Figures 8 and 9, and that an episode without touch does not look done."""
+    """Judge the claims of Figures 8 and 9, and that an untouched episode does not look done."""
     own = [_metrics_at_common_noise(t.own) for t in successes]
     lags = [m["tactile"].contact_lag for m in own]
     known = [lag for lag in lags if lag is not None]
@@ -263,20 +262,20 @@ def judge_claims(
 
 
 def _frames_earlier(episodes: Sequence[dict[str, CurveMetrics]], drop: str) -> list[float]:
-    """Frames by which the fused curve drops before the tactile one, where both do."""
+    """Return the frames by which the fused curve drops before the tactile one, where both drop."""
     pairs = [(getattr(m["tactile"], drop), getattr(m["image+tactile"], drop)) for m in episodes]
     return [float(a - b) for a, b in pairs if a is not None and b is not None]
 
 
 def _metrics_at_common_noise(curves: Curves) -> dict[str, CurveMetrics]:
-    """Metrics with one noise level for all curves of an episode."""
+    """Return metrics with one noise level for all curves of an episode."""
     contact = curves.contact.frame
     eps = max(measure_curve(d, contact).eps for d in curves.costs.values())
     return {n: measure_curve(d, contact, eps) for n, d in curves.costs.items()}
 
 
 def _fall_after_contact(curves: Curves) -> float:
-    """Fall of the text cost from the second before contact to the second after it."""
+    """Return the fall of the text cost from the second before contact to the second after it."""
     d, contact = curves.costs["text"], curves.contact.frame
     assert contact is not None  # the expert's successes touch
     second = round(curves.fps)
@@ -286,7 +285,7 @@ def _fall_after_contact(curves: Curves) -> float:
 
 
 def failure_auc(tests: Sequence[HeldOutEpisode], outcome: str) -> dict[str, float]:
-    """Chance that a success ends nearer the goal than such a failure, by kind of curve."""
+    """Return the AUC of the last cost, success against each failure, by kind of curve."""
     return {
         name: _auc(
             [t.other.unclipped[name][-1] for t in tests if t.outcome == "success"],
@@ -297,7 +296,7 @@ def failure_auc(tests: Sequence[HeldOutEpisode], outcome: str) -> dict[str, floa
 
 
 def failure_table(tests: Sequence[HeldOutEpisode]) -> str:
-    """Area under ROC of success against each failure; 0.5 is chance."""
+    """Return the AUC table as text; 0.5 is chance."""
     names = list(tests[0].other.unclipped)
     lines = [f"{'failure':<15}" + "".join(f"{n:>15}" for n in names)]
     for outcome in OUTCOMES[1:]:
@@ -307,7 +306,7 @@ def failure_table(tests: Sequence[HeldOutEpisode]) -> str:
 
 
 def _auc(low: list[float], high: list[float]) -> float:
-    """Share of pairs in which the value of `high` is the larger; ties count half."""
+    """Return the share of pairs in which `high` has the larger value; ties count half."""
     return float(stats.mannwhitneyu(high, low).statistic / (len(high) * len(low)))
 
 
@@ -316,13 +315,13 @@ def _verdict_of_rate(rate: SuccessRate) -> str:
 
 
 def _verdict_of_mean(values: Sequence[float]) -> str:
-    """Whether a mean that is claimed to be positive is."""
+    """Return the verdict on a mean that is claimed to be positive."""
     low, high = _bootstrap(values)
     return "holds" if low > 0 else "fails" if high < 0 else "unsure"
 
 
 def _bootstrap(values: Sequence[float]) -> tuple[float, float]:
-    """95 % percentile interval of the mean over the episodes."""
+    """Return the 95 % percentile interval of the mean over episodes."""
     if len(set(values)) == 1:  # nothing to resample
         return values[0], values[0]
     result = stats.bootstrap((values,), np.mean, method="percentile", n_resamples=10_000, rng=0)

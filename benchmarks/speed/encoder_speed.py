@@ -43,7 +43,7 @@ class Config(BenchmarkOptions):
     """Options of benchmark encoder-speed."""
 
     encoders: tuple[str, ...] = ("gelsight_mini", "gelsight_mini_surfaces")
-    """Touch encoders by name or folder, or published Sparsh ones by file or id."""
+    """Touch encoders: a name, a folder, or a published Sparsh file or id."""
     shapes: tuple[SparshShape, ...] = (
         "mae-tiny",
         "mae-small",
@@ -52,23 +52,23 @@ class Config(BenchmarkOptions):
         "ijepa-base",
         "vjepa-base",
     )
-    """Sparsh's networks with random weights, base as published, tiny and small narrower."""
+    """Sparsh's networks with random weights: base as published, tiny and small narrower."""
     precisions: Annotated[tuple[Literal["fp32", "bf16"], ...], Field(min_length=1)] = (
         "fp32",
         "bf16",
     )
-    """Numbers in which networks compute."""
+    """Number formats of the networks."""
     batch_size: Count = 8
     """Frames in a batch."""
     repeats: Count = 5
     """Measurements of each figure; the median is printed."""
     ticks: Annotated[Count, RARE] = 5
-    """Single frames in each of them."""
+    """Single frames in each measurement."""
 
 
 _DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
-_FRAME = 240, 320  # of a sensor, px
-_STREAM = 16  # frames that come again and again
+_FRAME = 240, 320  # px, of a sensor
+_STREAM = 16  # distinct frames
 _PAPER = "MAE 104, DINO 112, I-JEPA 112, V-JEPA 60"  # frames/s of the base presets, Table 3
 
 
@@ -77,14 +77,14 @@ class EncoderSpeed:
     """One encoder at one precision.
 
     Attributes:
-        encoder: which.
-        parameters: of its own, millions.
+        encoder: its name.
+        parameters: parameters, millions.
         precision: fp32 or bf16.
-        batched: frames a second in batches, of prepared input.
-        batched_ratio: over that of plain torch; None without a peer.
-        tick: ms from one raw frame to its embedding.
-        tick_anew: the same with all frames that are seen preprocessed anew.
-        tick_ratio: time of plain torch, which does that, over `tick`; None without a peer.
+        batched: frames a second in batches of prepared input.
+        batched_ratio: the same over the peer's; None without a peer.
+        tick: ms from a raw frame to its embedding, with cached preprocessing.
+        tick_anew: the same without the cache.
+        tick_ratio: the peer's time over `tick`; None without a peer.
     """
 
     encoder: str
@@ -98,7 +98,7 @@ class EncoderSpeed:
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Time everything on one core, by processor time, which busy neighbours distort least."""
+    """Time everything on one core, in processor time, which other processes distort least."""
     encoders = {name: load_encoder(name).eval() for name in config.encoders}
     encoders |= {f"Sparsh {name}, random": _random(name) for name in config.shapes}
     measured = [
@@ -196,7 +196,7 @@ class _Peer(nn.Module):
 
 
 class _Stream:
-    """A sensor whose frames come one after the other, as an encoder's input."""
+    """A stream of sensor frames as an encoder's input."""
 
     def __init__(self, encoder: BaseTouchEncoder, dtype: torch.dtype) -> None:
         drawn = np.random.default_rng(0).integers(90, 130, (_STREAM, *_FRAME, 3), np.uint8)
@@ -205,14 +205,14 @@ class _Stream:
         self._recent = RecentFrames(encoder.preprocess, encoder.offsets)
 
     def kept(self) -> torch.Tensor:
-        """The next frame; earlier ones are preprocessed already."""
+        """Return the next frame's input with cached preprocessing."""
         self._newest += 1
         back = max(self._encoder.offsets)
         seen = [self._frames[(self._newest - k) % _STREAM] for k in range(back, -1, -1)]
         return self._stacked(self._recent.latest(seen, self._frames[0]))
 
     def anew(self) -> torch.Tensor:
-        """The next frame, with all that is seen preprocessed."""
+        """Return the next frame's input with everything preprocessed."""
         self._newest += 1
         rows = [(self._newest - back) % _STREAM for back in self._encoder.offsets]
         touch = self._encoder.preprocess(

@@ -1,4 +1,4 @@
-"""How fast the simulated cell runs on one core: physics, and whole environment steps."""
+"""Speed of the simulated cell on one core: physics, and whole environment steps."""
 
 import os
 from dataclasses import replace
@@ -20,14 +20,14 @@ from touchgoal.sim_envs.scene.build import robot_model
 
 @checked_dataclass
 class Config(BenchmarkOptions):
-    """How fast does the simulated cell run on one core?"""
+    """Options of benchmark env-speed."""
 
     repeats: Count = 7
     """Measurements of each figure; the median is printed."""
     physics_steps: Count = 5000
-    """Steps of the physics in one measurement."""
+    """Physics steps in a measurement."""
     env_steps: Count = 40
-    """Control ticks of the environment in one measurement."""
+    """Control ticks in a measurement."""
 
 
 NO_MOTION = np.zeros(8)
@@ -35,7 +35,7 @@ TICKS_UNTIL_HELD = 70  # ticks after which the expert holds the object in the ai
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Measure everything on one core; wall-clock time."""
+    """Measure everything on one core, in wall-clock time."""
     os.environ["LP_NUM_THREADS"] = "0"  # software OpenGL draws in this thread
     cv2.setNumThreads(1)
     with one_core():
@@ -89,7 +89,7 @@ def _env(config: Config) -> list[Row]:
 
 
 def _maze(config: Config) -> list[Row]:
-    """The bead held on a wire."""
+    """Return the maze with the bead held on a wire."""
     rows = []
     for what, tactile in (("physics alone", False), ("two tactile images", True)):
         env = BeadMaze(BeadMazeConfig(tactile=tactile, max_seconds=1e6))
@@ -111,7 +111,7 @@ def _maze(config: Config) -> list[Row]:
 
 
 def _reset_and_run_expert(env: PickPlace, ticks: int, name: str = "soda_can") -> None:
-    """A fresh episode, `ticks` into the expert's plan."""
+    """Reset and run the expert for some ticks."""
     env.reset(seed=1, options={"object": name, "mass": 0.1, "grasp_force": 15.0})
     expert = PickPlaceExpert(env)
     for _ in range(ticks):

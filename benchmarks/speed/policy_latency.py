@@ -1,7 +1,6 @@
-"""How long a plan takes on one core, stage by stage, beside networks of the published sizes.
+"""Time of a plan on one core, stage by stage, beside networks of published sizes.
 
-Warm-up is not counted. The published U-Net and the ViTs of the touch literature carry random
-weights here: they are timed, not used.
+Warm-up is left out. Networks of published sizes carry random weights.
 """
 
 import time
@@ -29,12 +28,12 @@ from touchgoal.sim_envs.config import EnvConfig
 
 @checked_dataclass
 class Config(BenchmarkOptions):
-    """How long does a plan take on one core, stage by stage?"""
+    """Options of benchmark policy-latency."""
 
     policy: Path | None = None
-    """Folder of a policy that train-policy made; default: the shipped one of bead-maze."""
+    """Folder of a policy from train-policy; default: the shipped one of bead-maze."""
     repeats: Count = 200
-    """Plans timed."""
+    """Plans to time."""
     large_repeats: CountOrNone = 5
     """Runs of each network of a published size; 0 leaves them out."""
     control_hz: Count = ft.CONTROL_HZ
@@ -59,7 +58,7 @@ class Stage:
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Time all stages on one core; `table` and the numbers behind it."""
+    """Time all stages on one core."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -112,7 +111,7 @@ def _stages(config: Config) -> list[Stage]:
 
     def tick() -> None:
         i = next(turn)
-        planner.plan([ticks[(i + k) % 8] for k in range(seen)])  # one is new, as on the arm
+        planner.plan([ticks[(i + k) % 8] for k in range(seen)])  # one tick is new, as on the arm
 
     stages.append(_time("a whole plan, observation to actions", config.repeats, tick))
     return stages

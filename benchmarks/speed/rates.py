@@ -21,7 +21,7 @@ class Row:
 
 @contextmanager
 def one_core() -> Iterator[None]:
-    """Keep this process on one core, where the system lets it choose (Linux)."""
+    """Keep this process on one core (Linux)."""
     if not hasattr(os, "sched_setaffinity"):
         yield
         return
@@ -40,7 +40,7 @@ def measure(
     work: Callable[[], object],
     clock: Callable[[], float] = time.perf_counter,
 ) -> Row:
-    """How often something happens per second of a clock, if each `work` does it `count` times."""
+    """Return how often something happens per second, if each `work` does it `count` times."""
     work()
     rates = []
     for _ in range(repeats):
@@ -51,7 +51,7 @@ def measure(
 
 
 def in_turn(works: Sequence[Callable[[], object]], repeats: int) -> list[float]:
-    """Median processor seconds of each of some works that are compared: done in turn on the same machine."""
+    """Return the median processor seconds of works that are timed in turn."""
     times: list[list[float]] = [[] for _ in works]
     for work in works:
         work()
@@ -64,7 +64,7 @@ def in_turn(works: Sequence[Callable[[], object]], repeats: int) -> list[float]:
 
 
 def table(what: str, unit: str, rows: Sequence[Row]) -> str:
-    """The rates as people read them, one a line."""
+    """Return the rows as text."""
     lines = [f"{what:<72}{unit:>11}{'slowest':>10}{'fastest':>10}"]
     lines += [f"{r.what:<72}{r.median:>11,.0f}{r.slowest:>10,.0f}{r.fastest:>10,.0f}" for r in rows]
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""How fast a simulated pad makes its pictures on one core, beside the machine's limit and a peer."""
+"""Speed of a simulated pad on one core, beside the machine's limit and a peer."""
 
 import os
 import time
@@ -24,23 +24,23 @@ from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_in
 
 @checked_dataclass
 class Config(BenchmarkOptions):
-    """How fast does a simulated pad make its pictures on one core?"""
+    """Options of benchmark tactile-speed."""
 
     repeats: Count = 7
     """Measurements of each figure; the median is printed."""
     frames: Count = 100
-    """Frames in one measurement."""
+    """Frames in a measurement."""
 
 
-# What one 240x320 frame of a ball at least does, counted by hand from the kernels: multiplications
-# and additions, and bytes that leave or enter the first-level cache.
+# Least work of one 240x320 frame of a ball, counted by hand from the kernels: multiplications and
+# additions, and bytes through the first-level cache.
 FRAME_FLOP = 19_200 * (2 * 25 + 3 * 60 + 60) + 76_800 * 3 * 9
 FRAME_BYTES = 19_200 * 4 * 45 + 76_800 * 3 * (2 + 1 + 1 + 2)
 _TEXTURED = Material(Texture.DOTTED, 40e-6, 1.5e-3, HARD, 0.8, (0.7, 0.7, 0.7, 1.0))
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Measure everything on one core. Processor time, which busy neighbours distort least."""
+    """Measure everything on one core, in processor time, which other processes distort least."""
     cv2.setNumThreads(1)
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     with one_core():
@@ -66,7 +66,8 @@ def _ours(config: Config) -> list[Row]:
 
 
 def _frame(bench: PressBench, force: float = 8.0) -> Callable[[], object]:
-    """All stages: geometry, force balance, stick and slip, gel, shadows, colours, noise, dots."""
+    """Return a function that renders all stages: geometry, forces, slip, gel, shadows, colours,
+    noise, dots."""
     rng = np.random.default_rng(0)
     return lambda: bench.sense(force, rng, shear=(1.5, 0.5), centre=(1e-3, -0.5e-3))
 
@@ -86,7 +87,7 @@ def _instance(sensor: SensorModel) -> SensorInstance:
 
 
 def _bodies() -> list[tuple[str, Body, float]]:
-    """Name, body, and how far its centre lies above its near side, m."""
+    """Yield name, body, and height of its centre above its near side, m."""
     ball, pebble = CATALOGUE["glass_ball"], CATALOGUE["pebble"]
     can = replace(ball, shape="cylinder")
     box, rod = replace(ball, shape="box"), replace(ball, shape="capsule")
@@ -107,7 +108,7 @@ def _textured(kind: ObjectKind) -> ObjectKind:
 
 
 def _sphere_points(n: int) -> np.ndarray:
-    """n points spread evenly over the unit sphere; their hull has 2 n - 4 triangles."""
+    """Return n points spread evenly over the unit sphere; their hull has 2 n - 4 triangles."""
     k = np.arange(n) + 0.5
     z, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
     across = np.sqrt(1 - z * z)
@@ -115,7 +116,7 @@ def _sphere_points(n: int) -> np.ndarray:
 
 
 def _peer(config: Config) -> list[Row]:
-    """Taxim's JAX port, where it is installed, with its own Mini calibration and a ball."""
+    """Return Taxim's JAX port with its own Mini calibration and a ball, where it is installed."""
     if not (has_taxim() and has_jax()):
         print(f"no peer; to measure taxim beside us: {install_extra('peers')}")
         return []
@@ -143,7 +144,7 @@ def _measure(
     work: Callable[[], object],
     clock: Callable[[], float] = time.thread_time,
 ) -> Row:
-    """Rate of one `work` of many in a row."""
+    """Return the rate of one `work` out of many in a row."""
 
     def frames() -> None:
         for _ in range(config.frames):
@@ -153,7 +154,7 @@ def _measure(
 
 
 def _limits(config: Config) -> dict[str, float]:
-    """What this core can do at best, and how many frames a second that would be."""
+    """Return the core's own limits and the frame rate that they would allow."""
     copied = max(_copy_rate(config, offset) for offset in (0, 16, 1024))
     flop = _measure("fma", replace(config, frames=20), _multiply_and_add).median * _FMA_FLOP
     return {
@@ -165,9 +166,9 @@ def _limits(config: Config) -> dict[str, float]:
 
 
 def _copy_rate(config: Config, offset: int) -> float:
-    """Bytes read and written a second by copies of 256 kB, as large as a frame's arrays.
+    """Return bytes read and written a second by copies of 256 kB, as large as a frame's arrays.
 
-    Where the two arrays lie to each other changes it tenfold on some machines: the best counts.
+    The best of several counts: alignment of the two arrays changes it tenfold on some machines.
     """
     source = np.ones((1 << 16) + offset, np.float32)[offset:]
     target = np.ones(1 << 16, np.float32)

@@ -1,9 +1,8 @@
 """TacBench (Sparsh, Higuera et al. 2024) on a simulated bench: T1, T1A, T2, T3, T4 and T6.
 
-A probe reads each encoder's tokens of two frames 83 ms apart; encoders stay frozen, or are
-trained end to end with the probe from random weights. Labels are thinned to shares of all. Snapshots
-and thresholds are chosen on validation recordings; test recordings are for the table alone. Intervals are a
-bootstrap over test recordings, of the mean over seeds.
+A probe reads each encoder's tokens of two frames 83 ms apart. Encoders are frozen, or trained with the
+probe from random weights. Snapshots and thresholds are chosen on validation recordings; intervals are
+a bootstrap over test recordings of the mean over seeds.
 """
 
 import tempfile
@@ -64,12 +63,12 @@ _READERS: dict[Recording, Callable[[EpisodeSet, int, Preprocessor], RigFrames]] 
     "cloths": read_cloths,
 }
 Reading = Callable[[Preprocessor], RigFrames]
-"""Recordings, as an encoder's preprocessor makes them."""
+"""Reads the recordings with an encoder's preprocessor."""
 
 
 @dataclass(frozen=True)
 class Bench:
-    """What all trainings share."""
+    """State shared by all trainings."""
 
     config: Config
     sensor: str
@@ -80,14 +79,14 @@ class Bench:
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Record the bench, train every probe, judge it on test recordings."""
+    """Record the bench, train every probe and judge it on test recordings."""
     sensor = find_sensor(config.rig.sensor).name
     published = find_published(config.data, sensor) if config.data else None
     if published is not None and config.data is not None:
         check_tasks(published, config.data, config.tasks)
         sensor = published.sensor
     encoders = {name: _encoder(name, sensor, config) for name in config.encoders}
-    short = Path(config.rig.sensor).name  # of a sensor file's folder, too
+    short = Path(config.rig.sensor).name  # also the name of a sensor file's folder
     folder = Path("runs") / f"tacbench_{short}_{config.rig.seed}"
     readings: dict[Recording, Reading]
     if published is None:
@@ -117,14 +116,14 @@ def _recordings(config: Config) -> list[Recording]:
 
 
 def _record(what: Recording, folder: Path, config: Config) -> Reading:
-    """Records what is missing of the bench's recordings."""
+    """Record what is missing and return its reader."""
     count = getattr(config, what)
     episodes = _RECORDERS[what](folder / what, config.rig, count, config.workers)
     return partial(_READERS[what], episodes, count)
 
 
 def _encoder(name: str, sensor: str, config: Config) -> BaseTouchEncoder:
-    """An encoder that fits the rig's sensor; UserError for another."""
+    """Return an encoder of the rig's sensor; UserError for another sensor."""
     encoder = find_encoder_of(name, sensor, config.seed)
     PairTokens(encoder)  # refuses one without tokens
     if encoder.preprocess.sensor not in (None, sensor):
@@ -138,7 +137,7 @@ def _encoder(name: str, sensor: str, config: Config) -> BaseTouchEncoder:
 def _run_recording(
     bench: Bench, what: Recording, reading: Reading, encoders: dict[str, BaseTouchEncoder]
 ) -> None:
-    """All tasks on one kind of recordings; frames and tokens are kept no longer than for these."""
+    """Run all tasks on one kind of recordings; frames and tokens are freed afterwards."""
     tasks = [name for name in bench.config.tasks if RECORDED_AS[name] == what]
     with (
         tempfile.TemporaryDirectory(dir=bench.folder) as files,
@@ -168,7 +167,7 @@ def _share(
     encoders: dict[str, BaseTouchEncoder],
     files: Path,
 ) -> list[tuple[Subject, RigFrames]]:
-    """Leaves what each encoder's probes read in files for the workers."""
+    """Write each encoder's frames and tokens into files for the workers."""
     seen: dict[str, tuple[Path, RigFrames]] = {}
     shared = []
     for i, (name, encoder) in enumerate(encoders.items()):
@@ -189,7 +188,7 @@ def _share(
 
 
 def _judge(bench: Bench, job: Job, frames: RigFrames, answers: Answers) -> None:
-    """The rows of one encoder, task and share, one for each set of test frames."""
+    """Add the rows of one encoder, task and share, one for each test set."""
     task, name = TASKS[job.task](frames), job.subject.name
     validation = [torch.from_numpy(outputs) for outputs in answers.validation]
     facts = {"task": job.task, "encoder": name, "share": job.share, "samples": answers.samples}
@@ -202,7 +201,7 @@ def _judge(bench: Bench, job: Job, frames: RigFrames, answers: Answers) -> None:
 
 
 def _references(name: str, task: Task) -> list[dict[str, Any]]:
-    """Rows of what needs no encoder."""
+    """Return the rows of references that need no encoder."""
     rows = []
     for test, chosen in task.split.tests.items():
         facts = {"task": name, "test": test, "share": 1.0, "samples": 0}

@@ -25,50 +25,49 @@ class Config(BenchmarkOptions):
         "grasp",
         "textile",
     )
-    """T1, the force on the pad; T1A, the field of forces over it; T2, whether it slips; T3, how the pose of a held
-    object changes; T4, whether a grasp will hold; T6, which cloth it is."""
+    """Tasks: force (T1), field (T1A, forces over the pad), slip (T2), pose (T3, change of a held
+    object's pose), grasp (T4, success of a grasp), textile (T6)."""
     encoders: Annotated[tuple[str, ...], Field(min_length=1)] = (
         "gelsight_mini_markers_mae",
         "gelsight_mini_markers",
         "random:gelsight_mini_markers_mae",
         "end-to-end:compact",
     )
-    """Touch encoders with a ViT, frozen, by name or folder, or published Sparsh ones by file or id
-    (facebook/sparsh-dino-base); `random:NAME` for the same network untrained, `end-to-end:NAME` for the same one
-    trained with the probe, from random weights; `end-to-end:PRESET` for a ViT of `train-encoder`'s presets."""
+    """Touch encoders with a ViT, frozen: a name, a folder, or a published Sparsh file or id.
+    `random:NAME` has random weights; `end-to-end:NAME`, or `end-to-end:PRESET` of
+    train-encoder, is trained with the probe."""
     shares: Annotated[tuple[Share, ...], Field(min_length=1)] = (1.0, 0.33, 0.1, 0.01)
     """Shares of the training labels."""
     rig: RigConfig = RigConfig()
-    """The simulated bench's sensor and loads."""
+    """Sensor and loads of the simulated bench."""
     strokes: Annotated[int, Field(ge=15)] = 180
-    """Presses and slides simulated, for T1 and T2; of every five of a probe three are for training, one for
-    validation, one for the test."""
+    """Presses and slides to simulate for T1 and T2. Of every five, three train, one validates,
+    one tests."""
     slides: Annotated[int, Field(ge=10)] = 60
-    """Slides of held objects simulated, for T3; used as the strokes are, and so are the others."""
+    """Slides of held objects to simulate for T3."""
     grasps: Annotated[int, Field(ge=10)] = 400
-    """Grasp attempts simulated, of the catalogue's 20 objects in turn, for T4."""
+    """Grasps to simulate for T4, of 20 objects in turn."""
     cloths: Annotated[int, Field(ge=10)] = 600
-    """Presses of 20 cloths in turn simulated, for T6."""
+    """Presses of 20 cloths in turn to simulate for T6."""
     data: Path | None = None
-    """Folder of the recordings: made there if it is new, gone on with if some are missing. Default:
-    runs/tacbench_<sensor>_<seed>. Or a folder of published files: TacBench's force estimation (--tasks force
-    slip) or pose estimation (pose), or Feeling of Success (grasp); about as many recordings are read
-    as would be simulated."""
+    """Folder of the recordings; missing ones are made. Default: runs/tacbench_<sensor>_<seed>. A
+    folder of published files works instead: TacBench's force (--tasks force slip) or pose
+    estimation (pose), or Feeling of Success (grasp)."""
     seeds: Count = 3
-    """Training seeds of each row: of labels drawn, initial weights and order."""
+    """Training seeds of each row: labels drawn, initial weights, order."""
     seed: Seed = 0
-    """The first of them."""
+    """First training seed."""
     steps: Annotated[Count, RARE] = 400
     """Updates of a probe on a frozen encoder."""
     end_to_end_steps: Annotated[Count, RARE] = 100
-    """Updates of an encoder with its probe."""
+    """Updates of an encoder trained with its probe."""
     batch_size: Annotated[Count, RARE] = 32
-    """Pairs of frames in each update of a probe."""
+    """Pairs of frames in an update of a probe."""
     end_to_end_batch_size: Annotated[Count, RARE] = 16
-    """Pairs of frames in each update of an encoder with its probe."""
+    """Pairs of frames in an update of an encoder trained with its probe."""
     lr: Annotated[Positive, RARE] = 1e-3
-    """Highest learning rate of a probe."""
+    """Peak learning rate of a probe."""
     end_to_end_lr: Annotated[Positive, RARE] = 5e-4
-    """Highest learning rate of an encoder with its probe."""
+    """Peak learning rate of an encoder trained with its probe."""
     workers: Count = CORES
     """Processes that simulate and train."""

@@ -1,4 +1,4 @@
-"""What the bench recorded as the samples of TacBench: frames of one sensor in time, and their labels."""
+"""Samples of TacBench from the bench's recordings: frames of one sensor, and their labels."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -35,21 +35,21 @@ Rows = Int[Tensor, " _"]
 
 @dataclass(frozen=True, eq=False)
 class RigFrames:
-    """n frames of recordings, each of them some frames in a row.
+    """Labelled frames of n rows; a recording's frames are consecutive.
 
     Attributes:
-        touch: preprocessed; half precision, for they fill the memory.
-        before: row of the other frame of a pair: `STRIDE` earlier, or a recording's first one; of a grasp
-            the moment before.
-        force: on the pad, N: shear x and y, and the normal force, positive when pressed.
+        touch: preprocessed images, half precision to save memory.
+        before: row of the pair's other frame: `STRIDE` earlier, or the recording's first; for a grasp the
+            moment before.
+        force: force on the pad, N: shear x and y, and normal, positive when pressed.
         slip: whether the probe slides.
-        stroke: which recording; of a grasp both fingers' are one.
+        stroke: recording of each frame; both fingers of a grasp share one.
         indenter: name of the probe, object or cloth.
-        pose: of the object on the gel, x and y (mm) and turn (degrees); None if the set does not say.
-        label: of a grasp whether it holds in the end, of a cloth its number; None if the set has none.
-        field: shear along x and y and pressure over the picture, kPa; None if it is not known.
-        moments: of each finger in a row, for grasps; 0 for recordings in time.
-        use: what a recording is for, as published (see `splits`); None to have it chosen.
+        pose: object pose on the gel, x and y (mm) and turn (degrees); None if unknown.
+        label: grasp success, or number of the cloth; None if the set has none.
+        field: shear along x and y and pressure over the image, kPa; None if unknown.
+        moments: frames of each finger of a grasp; 0 for recordings in time.
+        use: published use of a recording (see `task.Split`); None to assign one.
     """
 
     touch: Float16[Tensor, "n 3 h w"]
@@ -65,9 +65,9 @@ class RigFrames:
     use: Int[np.ndarray, " n"] | None = None
 
     def seen(self, rows: Rows, offsets: tuple[int, ...]) -> Float[Tensor, "k t 3 h w"]:
-        """Frames, and those so many frames before each; of a stroke's first frames its first.
+        """Return frames and those before each; a stroke's first frames repeat its first.
 
-        Of a grasp, whose moments are seconds apart, `STRIDE` frames are one moment.
+        For grasps, whose moments are seconds apart, `STRIDE` frames are one moment.
         """
         newest = rows.numpy()
         first = np.searchsorted(self.stroke, self.stroke[newest])
@@ -78,17 +78,17 @@ class RigFrames:
 
     @property
     def pressed(self) -> Bool[np.ndarray, " n"]:
-        """Where the probe touches."""
+        """Frames in which the probe touches."""
         return (self.force[:, 2] > 0).numpy()
 
     @property
     def later(self) -> Bool[np.ndarray, " n"]:
-        """All but the first of each recording, which is untouched."""
+        """Frames other than each recording's first, untouched one."""
         return (self.before != torch.arange(len(self.before))).numpy()
 
 
 def read_strokes(strokes: EpisodeSet, count: int, preprocess: Preprocessor) -> RigFrames:
-    """All frames of the first so many strokes or slides; a stroke's background is its first frame."""
+    """Read the first strokes or slides; a stroke's background is its first frame."""
     keys = [TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP]
     keys += [TRUTH_OBJECT_POSE] if TRUTH_OBJECT_POSE in strokes.features else []
     touch, force, slip, pose = [], [], [], []
@@ -112,7 +112,7 @@ def read_strokes(strokes: EpisodeSet, count: int, preprocess: Preprocessor) -> R
 
 
 def read_grasps(grasps: EpisodeSet, count: int, preprocess: Preprocessor) -> RigFrames:
-    """The first so many grasp attempts, finger by finger: before, gripped, lifted."""
+    """Read the first grasps, finger by finger: before, gripped, lifted."""
     touch, force, label = [], [], []
     for i in track(range(count), "grasps", "attempt"):
         keys = [TACTILE_LEFT, TACTILE_RIGHT, TRUTH_PAD_WRENCH, TRUTH_SUCCESS]
@@ -136,7 +136,7 @@ def read_grasps(grasps: EpisodeSet, count: int, preprocess: Preprocessor) -> Rig
 
 
 def read_cloths(clips: EpisodeSet, count: int, preprocess: Preprocessor) -> RigFrames:
-    """All frames of the first so many presses of cloth."""
+    """Read the first presses of cloth."""
     numbers = {cloth.name: i for i, cloth in enumerate(CLOTHS)}
     touch = [
         _preprocessed(clips.read(i, [TACTILE_LEFT]).frames[TACTILE_LEFT], preprocess)
@@ -156,7 +156,7 @@ def read_cloths(clips: EpisodeSet, count: int, preprocess: Preprocessor) -> RigF
 
 
 def with_fields(frames: RigFrames, rig: RigConfig, workers: int) -> RigFrames:
-    """Strokes with the true field on the gel: recordings leave it out, the same strokes give it again."""
+    """Add the true field, simulated again from the same strokes."""
     count = int(frames.stroke[-1]) + 1
     with one_core_workers(workers) as pool:
         made: Iterable = pool.map(partial(_field, rig), range(count))
@@ -171,12 +171,12 @@ def _field(rig: RigConfig, index: int) -> Float32[np.ndarray, "t 3 24 24"]:
 def _preprocessed(
     pictures: UInt8[np.ndarray, "t h w 3"], preprocess: Preprocessor
 ) -> Float16[Tensor, "t 3 H W"]:
-    """The first picture is the background."""
+    """Preprocess with the first image as background."""
     return torch.from_numpy(preprocess(pictures, pictures[0])).half()
 
 
 def rows_before(lengths: list[int], stride: int) -> Rows:
-    """Rows so many frames earlier, or the first of each recording."""
+    """Return the rows some frames earlier, or the first of each recording."""
     starts = np.repeat(np.cumsum(lengths) - lengths, lengths)
     return torch.from_numpy(np.maximum(np.arange(sum(lengths)) - stride, starts))
 
@@ -186,6 +186,6 @@ def _names(episodes: EpisodeSet, count: int) -> list[str]:
 
 
 def _planar(pose: Float32[np.ndarray, "t 7"]) -> Float32[np.ndarray, "t 3"]:
-    """x and y, mm; turn about z, degrees."""
+    """Return x and y in mm and the turn about z in degrees."""
     turn = 2 * np.degrees(np.arctan2(pose[:, 6], pose[:, 3]))
     return np.column_stack([1e3 * pose[:, :2], turn]).astype(np.float32)

@@ -17,19 +17,19 @@ from touchgoal.benchmarks.papers.tacbench.task import (
 from touchgoal.encoders.probes.dense import DenseProbe
 from touchgoal.encoders.probes.property_probe import interval
 
-_BETA = 0.02  # of the smooth L1 loss, in shares of the training's range
-_TOUCHED = 10.0  # of the loss: cells that are pressed count so much more than the many that are not
+_BETA = 0.02  # smooth L1 loss, in shares of the training range
+_TOUCHED = 10.0  # weight of pressed cells, which are few
 _PRESSED = 0.5  # kPa above which a cell counts as touched
 
 
 class FieldTask:
     """Shear along x and y and pressure, kPa, on 24 x 24 cells.
 
-    The paper shows pictures of it alone: on real sensors nobody knows the truth.
+    The paper shows images alone: real sensors have no ground truth.
     """
 
     def __init__(self, frames: RigFrames) -> None:
-        """Of the frames of strokes with their fields."""
+        """Take frames of strokes with their fields."""
         assert frames.field is not None
         self._field, self._stroke = frames.field, frames.stroke
         self.split = split_force(frames)
@@ -43,11 +43,11 @@ class FieldTask:
         return nn.Sequential(DenseProbe(features, grid, 3, self._field.shape[2]), nn.Flatten())
 
     def targets(self, rows: Rows) -> Targets:
-        """Tractions over their range, cell by cell."""
+        """Return tractions over their range, by cell."""
         return (self._field[rows] / self._scale).flatten(1)
 
     def loss(self, outputs: Outputs, targets: Targets) -> Float[Tensor, ""]:
-        """Smooth L1; touched cells count more."""
+        """Return the smooth L1 loss, weighted towards touched cells."""
         pressure = targets.unflatten(1, self.cells)[:, 2:]
         touched = pressure > _PRESSED / self._scale[2].to(targets)
         weight = (1 + (_TOUCHED - 1) * touched.float()).expand(-1, 3, -1, -1).flatten(1)
@@ -55,16 +55,16 @@ class FieldTask:
         return (weight * cellwise).mean()
 
     def read(self, outputs: Outputs) -> Float[Tensor, "b 3 24 24"]:
-        """Tractions, kPa; pressure is never negative."""
+        """Return tractions, kPa; pressure is never negative."""
         field = outputs.unflatten(1, self.cells) * self._scale
         return torch.cat([field[:, :2], field[:, 2:].clamp(min=0)], 1)
 
     def truth(self, rows: Rows) -> Float[Tensor, "b 3 24 24"]:
-        """Tractions, kPa."""
+        """Return true tractions, kPa."""
         return self._field[rows]
 
     def error(self, outputs: Outputs, rows: Rows) -> float:
-        """Root mean square over frames, components and cells, over each component's range."""
+        """Return the root mean square error over frames, components and cells, over each range."""
         wrong = (self.read(outputs) - self._field[rows]) / self._scale
         return float(wrong.square().mean().sqrt())
 
@@ -77,7 +77,7 @@ class FieldTask:
         return field_metrics(read, truth, self._stroke[rows.numpy()])
 
     def references(self, rows: Rows) -> dict[str, Metrics]:
-        """Nothing anywhere; the mean field of training."""
+        """Return the metrics of a zero field and of the training mean."""
         truth, things = self._field[rows].numpy(), self._stroke[rows.numpy()]
         mean = self._field[self.split.train].mean(0).numpy()
         guesses = {"(no force anywhere)": 0 * mean, "(mean field of training)": mean}
@@ -92,9 +92,9 @@ def field_metrics(
     truth: Float[np.ndarray, "n 3 h w"],
     things: np.ndarray,
 ) -> Metrics:
-    """Of the touched cells: share of the shear's and of the pressure's mean square that is explained.
+    """Return explained shares of shear and pressure in touched cells, and errors in kPa.
 
-    1 is all, 0 is what no force anywhere would reach. With root mean square errors, kPa.
+    1 explains all; 0 is what a zero field reaches.
     """
     touched = truth[:, 2] > _PRESSED
     sums = []

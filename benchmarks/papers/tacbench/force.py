@@ -17,17 +17,17 @@ from touchgoal.benchmarks.papers.tacbench.task import (
 from touchgoal.encoders.probes.attentive import AttentiveProbe
 from touchgoal.encoders.probes.property_probe import interval
 
-_BETA = 0.02  # of the smooth L1 loss, in shares of the force's range: Sparsh's
+_BETA = 0.02  # smooth L1 loss, in shares of the force's range, as Sparsh
 
 
 class ForceTask:
     """Shear along x and y, and normal force.
 
-    Outputs are squashed and stand for shares of the largest force of each axis in training.
+    Outputs are squashed to shares of each axis' largest training force.
     """
 
     def __init__(self, frames: RigFrames) -> None:
-        """Of the frames of strokes."""
+        """Take frames of strokes."""
         self._frames = frames
         self.split = split_force(frames)
         self._scale = 1.1 * frames.force[self.split.train].abs().amax(0)
@@ -37,19 +37,19 @@ class ForceTask:
         return AttentiveProbe(features, 3)
 
     def targets(self, rows: Rows) -> Targets:
-        """Forces over their range."""
+        """Return forces over their range."""
         return self._frames.force[rows] / self._scale
 
     def loss(self, outputs: Outputs, targets: Targets) -> Float[Tensor, ""]:
-        """Smooth L1."""
+        """Return the smooth L1 loss."""
         return F.smooth_l1_loss(_squash(outputs), targets, beta=_BETA)
 
     def read(self, outputs: Outputs) -> Float[Tensor, "b 3"]:
-        """Forces, N."""
+        """Return forces, N."""
         return _squash(outputs) * self._scale
 
     def error(self, outputs: Outputs, rows: Rows) -> float:
-        """Root mean square over frames and axes, N."""
+        """Return the root mean square error over frames and axes, N."""
         return float((self.read(outputs) - self._frames.force[rows]).square().mean().sqrt())
 
     def judge(
@@ -61,7 +61,7 @@ class ForceTask:
         return force_metrics(errors, self._frames.stroke[rows.numpy()])
 
     def references(self, rows: Rows) -> dict[str, Metrics]:
-        """The mean force of training."""
+        """Return the metrics of the training mean."""
         force, things = self._frames.force, self._frames.stroke[rows.numpy()]
         errors = force[self.split.train].mean(0) - force[rows]
         return {"(mean force of training)": force_metrics(errors.double().numpy()[None], things)}
@@ -72,7 +72,8 @@ def _squash(outputs: Outputs) -> Outputs:
 
 
 def force_metrics(errors: Float[np.ndarray, "seeds n 3"], things: np.ndarray) -> Metrics:
-    """Root mean square and mean absolute errors (mN): of each axis and of all, with intervals."""
+    """Return root mean square and mean absolute errors (mN), by axis and over all, with
+    intervals."""
     squares, sizes = 1e6 * (errors**2).mean(0), 1e3 * np.abs(errors).mean(0)
 
     def root(values: np.ndarray) -> float:

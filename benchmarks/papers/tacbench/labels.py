@@ -1,4 +1,4 @@
-"""T4 and T6, one label a pair of frames: whether a grasp will hold, which cloth it is."""
+"""T4 and T6: one label a pair of frames, whether a grasp holds or which cloth it is."""
 
 from collections.abc import Callable
 
@@ -24,12 +24,12 @@ from touchgoal.sim_envs.cloths import CLOTHS
 
 
 class LabelTask:
-    """A label of each pair of frames."""
+    """One label for each pair of frames."""
 
     def __init__(
         self, frames: RigFrames, split: Callable[[RigFrames], Split], names: tuple[str, ...]
     ) -> None:
-        """Of frames with labels, which are numbers of these names."""
+        """Take frames whose labels are numbers of these names."""
         assert frames.label is not None
         self._label, self._stroke = frames.label, frames.stroke
         self.split, self.names = split(frames), names
@@ -42,23 +42,23 @@ class LabelTask:
         return AttentiveProbe(features, len(self.names))
 
     def targets(self, rows: Rows) -> Targets:
-        """Labels."""
+        """Return the labels."""
         return self._label[rows, None].float()
 
     def loss(self, outputs: Outputs, targets: Targets) -> Float[Tensor, ""]:
-        """Weighted cross entropy."""
+        """Return the weighted cross entropy."""
         return F.cross_entropy(outputs, targets[:, 0].long(), self._weights.to(outputs))
 
     def truth(self, rows: Rows) -> Int[np.ndarray, " b"]:
-        """Labels."""
+        """Return the true labels."""
         return self._label[rows].numpy()
 
     def read(self, outputs: Outputs) -> Int[np.ndarray, " b"]:
-        """The likeliest labels."""
+        """Return the most probable labels."""
         return outputs.argmax(1).numpy()
 
     def error(self, outputs: Outputs, rows: Rows) -> float:
-        """1 less the accuracy, and a little of the loss: few recordings make many accuracies equal."""
+        """Return 1 - accuracy plus a little of the loss, which breaks ties of few recordings."""
         loss = float(self.loss(outputs, self.targets(rows)))
         return float((self.read(outputs) != self.truth(rows)).mean()) + 0.01 * loss
 
@@ -70,7 +70,7 @@ class LabelTask:
         return label_metrics(read, self.truth(rows), self._stroke[rows.numpy()])
 
     def references(self, rows: Rows) -> dict[str, Metrics]:
-        """The commonest label of training."""
+        """Return the metrics of the most frequent training label."""
         common = np.full((1, len(rows)), int(self._known.argmax()))
         metrics = label_metrics(common, self.truth(rows), self._stroke[rows.numpy()])
         return {"(commonest label)": metrics}
@@ -79,7 +79,7 @@ class LabelTask:
 def label_metrics(
     said: Int[np.ndarray, "seeds n"], truth: Int[np.ndarray, " n"], things: np.ndarray
 ) -> Metrics:
-    """Accuracy, the mean over seeds, with its interval; and the mean of the accuracies of each label."""
+    """Return accuracy, mean over seeds, with its interval, and the mean accuracy of the labels."""
     right = (said == truth).mean(0)
     return {
         "accuracy": float(right.mean()),
@@ -89,10 +89,10 @@ def label_metrics(
 
 
 def grasp_task(frames: RigFrames) -> LabelTask:
-    """T4: whether the object is still held after the shake."""
+    """Return T4: whether the object is still held after the shake."""
     return LabelTask(frames, split_grasp, ("falls", "holds"))
 
 
 def textile_task(frames: RigFrames) -> LabelTask:
-    """T6: which cloth."""
+    """Return T6: which cloth."""
     return LabelTask(frames, split_textile, tuple(cloth.name for cloth in CLOTHS))

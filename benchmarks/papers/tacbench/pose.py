@@ -1,4 +1,4 @@
-"""T3: how an object moves over the pad."""
+"""T3: change of an object's pose on the pad."""
 
 import numpy as np
 import torch
@@ -18,15 +18,15 @@ from touchgoal.encoders.probes.attentive import AttentiveProbe
 from touchgoal.encoders.probes.property_probe import interval
 
 SHIFT_BINS, TURN_BINS = (0.1, 0.5, 1.0, 2.0, 5.0), (0.03, 0.2, 0.5, 1.0, 2.0)
-"""Bounds of the classes on either side of 0, mm and degrees: Sparsh's."""
+"""Bounds of the classes on either side of 0, mm and degrees, as Sparsh."""
 CLASSES = 2 * len(SHIFT_BINS) + 1
 
 
 class PoseTask:
-    """The change of an object's pose in the pair, along x and y and about z, in 11 classes each."""
+    """Pose change within a pair, along x, along y and about z, in 11 classes each."""
 
     def __init__(self, frames: RigFrames) -> None:
-        """Of the frames of slides."""
+        """Take frames of slides."""
         assert frames.pose is not None
         self._frames = frames
         self.split = split_pose(frames)
@@ -35,7 +35,7 @@ class PoseTask:
         self.classes = torch.stack([_classes(change[:, k], bins[k]) for k in range(3)], 1)
         train = self.classes[self.split.train]
         self._known = [torch.bincount(train[:, k], minlength=CLASSES) for k in range(3)]
-        # rare classes count more; none more than one of a hundredth of the frames
+        # rare classes weigh more, but none more than a class of a hundredth of the frames
         least = len(train) / 100
         self._weights = [len(train) / CLASSES / n.clamp(min=least) for n in self._known]
 
@@ -44,11 +44,11 @@ class PoseTask:
         return AttentiveProbe(features, 3 * CLASSES)
 
     def targets(self, rows: Rows) -> Targets:
-        """Classes, by axis."""
+        """Return the classes by axis."""
         return self.classes[rows].float()
 
     def loss(self, outputs: Outputs, targets: Targets) -> Float[Tensor, ""]:
-        """Sum over axes of the weighted cross entropy."""
+        """Return the sum over axes of the weighted cross entropy."""
         parts = outputs.unflatten(1, (3, CLASSES)).unbind(1)
         losses = [
             F.cross_entropy(part, targets[:, k].long(), self._weights[k].to(part))
@@ -57,11 +57,11 @@ class PoseTask:
         return torch.stack(losses).sum()
 
     def read(self, outputs: Outputs) -> Int[Tensor, "b 3"]:
-        """The likeliest classes."""
+        """Return the most probable classes."""
         return outputs.unflatten(1, (3, CLASSES)).argmax(2)
 
     def error(self, outputs: Outputs, rows: Rows) -> float:
-        """1 less the accuracy, the mean over axes."""
+        """Return 1 - accuracy, mean over axes."""
         return float((self.read(outputs) != self.classes[rows]).float().mean())
 
     def judge(
@@ -72,7 +72,7 @@ class PoseTask:
         return pose_metrics(read, self.classes[rows].numpy(), self._frames.stroke[rows.numpy()])
 
     def references(self, rows: Rows) -> dict[str, Metrics]:
-        """The commonest classes of training."""
+        """Return the metrics of the most frequent training classes."""
         truth = self.classes[rows].numpy()
         common = np.broadcast_to([int(n.argmax()) for n in self._known], truth.shape)
         things = self._frames.stroke[rows.numpy()]
@@ -80,7 +80,7 @@ class PoseTask:
 
 
 def _classes(change: Float[Tensor, " n"], bins: tuple[float, ...]) -> Int[Tensor, " n"]:
-    """0 to 10: how many of the bounds -5 to 5 lie at or below a change."""
+    """Return classes 0 to 10: the number of bounds at or below a change."""
     bounds = torch.tensor([*(-b for b in reversed(bins)), *bins])
     return torch.bucketize(change.contiguous(), bounds, right=True)
 
@@ -88,7 +88,7 @@ def _classes(change: Float[Tensor, " n"], bins: tuple[float, ...]) -> Int[Tensor
 def pose_metrics(
     said: Int[np.ndarray, "seeds n 3"], truth: Int[np.ndarray, "n 3"], things: np.ndarray
 ) -> Metrics:
-    """Accuracy, the mean over axes, with its interval; by axis; and within one class of the truth."""
+    """Return accuracy (mean over axes) with its interval, by axis, and within one class."""
     right = (said == truth).mean(0)
     return {
         "accuracy": float(right.mean()),

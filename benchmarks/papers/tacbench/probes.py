@@ -1,4 +1,4 @@
-"""Probes on frozen encoders, and encoders trained end to end with them: one network and one training."""
+"""Probes on frozen encoders, and encoders trained end to end with them."""
 
 import contextlib
 import tempfile
@@ -27,7 +27,7 @@ from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
 from touchgoal.runtime.progress import track
 
 END_TO_END, RANDOM = "end-to-end:", "random:"
-_SNAPSHOTS = 8  # of a training, of which the best on validation frames is kept
+_SNAPSHOTS = 8  # of a training; the best on validation frames wins
 _MAX_VALIDATION = 160  # frames, evenly drawn
 _WEIGHT_DECAY = 0.05
 
@@ -36,13 +36,13 @@ Inputs = Float[Tensor, "b ..."]
 
 @dataclass(frozen=True)
 class ProbeTraining:
-    """How a probe is trained.
+    """Schedule of a probe's training.
 
     Attributes:
         steps: updates.
-        batch_size: pairs of frames of each, drawn with replacement.
-        lr: highest learning rate of AdamW.
-        seed: of initial weights and the order of the data.
+        batch_size: pairs of frames in each, drawn with replacement.
+        lr: peak learning rate of AdamW.
+        seed: seed of initial weights and data order.
     """
 
     steps: int
@@ -52,19 +52,19 @@ class ProbeTraining:
 
 
 class PairTokens(nn.Module):
-    """An encoder's tokens of a frame and of the one before it, side by side at every place.
+    """An encoder's tokens of a frame and of the one before it, side by side at every patch.
 
-    An encoder that looks back by itself gives the tokens of what it sees.
+    An encoder that looks back by itself gives its own tokens.
 
     Attributes:
-        offsets: how many frames before the newest each lies that is seen.
-        looks_back: whether the encoder does by itself.
+        offsets: frames before the newest that are read.
+        looks_back: whether the encoder itself reads earlier frames.
         features: width of a token.
         grid: rows and columns of the patches.
     """
 
     def __init__(self, encoder: BaseTouchEncoder) -> None:
-        """Of an encoder with a ViT; UserError for any other."""
+        """Take an encoder with a ViT; UserError for any other."""
         super().__init__()
         self.vit = vit_of(encoder)
         self.looks_back, self._stack = len(encoder.offsets) > 1, encoder.stack
@@ -75,7 +75,7 @@ class PairTokens(nn.Module):
         self.grid = rows, columns
 
     def forward(self, seen: Float[Tensor, "b n 3 h w"]) -> Float[Tensor, "b t f"]:
-        """The tokens of frames at `offsets`."""
+        """Return the tokens of frames at `offsets`."""
         if self.looks_back:
             return self.vit(self._stack(seen))
         tokens = self.vit(seen.flatten(0, 1)).unflatten(0, (len(seen), 2))
@@ -83,12 +83,12 @@ class PairTokens(nn.Module):
 
 
 def find_encoder_of(name: str, sensor: str, seed: int) -> BaseTouchEncoder:
-    """An encoder by the name that the benchmark gives it.
+    """Find an encoder by its name in the benchmark.
 
     Args:
         name: NAME, random:NAME or end-to-end:NAME of an encoder or its folder; end-to-end:PRESET of a ViT.
-        sensor: of the rig, for which a preset's network is built.
-        seed: of random weights.
+        sensor: sensor of the rig, for a preset's network.
+        seed: seed of random weights.
     """
     preset = name.removeprefix(END_TO_END)
     if preset != name and preset in PRESETS:
@@ -103,7 +103,7 @@ def find_encoder_of(name: str, sensor: str, seed: int) -> BaseTouchEncoder:
 
 @torch.no_grad()
 def frozen_tokens(encoder: BaseTouchEncoder, frames: RigFrames) -> Float16[Tensor, "n t f"]:
-    """A frozen encoder's tokens of every frame, each computed once, for all probes."""
+    """Return a frozen encoder's tokens of every frame, each computed once."""
     tokens = PairTokens(encoder).eval()
     every = _batches(torch.arange(len(frames.before)))
     if tokens.looks_back:
@@ -115,7 +115,7 @@ def frozen_tokens(encoder: BaseTouchEncoder, frames: RigFrames) -> Float16[Tenso
 def inputs_of_tokens(
     pairs: PairTokens, tokens: Float16[Tensor, "n t f"], frames: RigFrames
 ) -> Callable[[Rows], Inputs]:
-    """What a probe reads of a frozen encoder, by row: see `PairTokens`."""
+    """Return a frozen encoder's input to the probe by row, see `PairTokens`."""
     if pairs.looks_back:
         return lambda rows: tokens[rows].float()
     return lambda rows: torch.cat([tokens[rows], tokens[frames.before[rows]]], 2).float()
@@ -126,21 +126,22 @@ def _batches(rows: Rows) -> list[Rows]:
 
 
 class Reader(nn.Module):
-    """A probe, with or without the encoder that it is trained with."""
+    """A probe, with its encoder if that is trained."""
 
     def __init__(self, task: Task, tokens: PairTokens, trained: bool) -> None:
-        """Builds a randomly initialised probe of a task, for an encoder that is trained with it or not."""
+        """Build a task's probe with random weights, and an encoder to train if one is given."""
         super().__init__()
         self.encoder = tokens if trained else None
         self.probe = task.probe(tokens.features, tokens.grid)
-        self._task = [task]  # in a list: no part of the state
+        self._task = [task]  # in a list: not part of the state
 
     def outputs(self, inputs: Inputs) -> Outputs:
-        """Of tokens, or of pairs of frames if it has an encoder."""
+        """Return the probe's outputs on frozen tokens, or on frame pairs when it trains its
+        encoder."""
         return self.probe(inputs if self.encoder is None else self.encoder(inputs))
 
     def forward(self, inputs: Inputs, targets: Tensor) -> dict[str, Tensor]:
-        """The loss, for the trainer."""
+        """Return the loss, for the trainer."""
         return {"loss": self._task[0].loss(self.outputs(inputs), targets)}
 
 
@@ -153,16 +154,16 @@ def train_reader(
     scratch: Path,
     log: TextIO,
 ) -> None:
-    """Trains a reader on some frames, and leaves the snapshot that does best on validation frames.
+    """Train a reader and keep the snapshot that does best on validation frames.
 
     Args:
-        reader: what is trained.
-        task: by whose loss.
-        inputs_of: rows to what the reader reads.
-        train: rows to learn from.
-        training: for how long.
-        scratch: folder for snapshots while it trains.
-        log: for the trainer's lines.
+        reader: probe to train.
+        task: gives the loss.
+        inputs_of: rows to the reader's input.
+        train: training rows.
+        training: schedule.
+        scratch: folder for snapshots.
+        log: file for the trainer's lines.
     """
     per_snapshot = max(training.steps // _SNAPSHOTS, 1) * training.batch_size
     every = max(-(-len(task.split.validation) // _MAX_VALIDATION), 1)
@@ -197,6 +198,6 @@ def train_reader(
 
 @torch.no_grad()
 def read(reader: Reader, inputs_of: Callable[[Rows], Inputs], rows: Rows) -> Outputs:
-    """A reader's raw outputs of some frames."""
+    """Return a reader's raw outputs of some frames."""
     reader.eval()
     return torch.cat([reader.outputs(inputs_of(part)) for part in rows.split(BATCH)])

@@ -1,7 +1,7 @@
-"""Published recordings as the samples of TacBench: force and slip, pose, and grasps.
+"""Published recordings as samples of TacBench: force and slip, pose, grasps.
 
-Each recording is that which the publisher made in one go: a stroke, a bag, a grasp. Of one of more than
-180 pictures those in the middle are read. Pictures are decoded a recording at a time.
+A recording is what the publisher made in one go: a stroke, a bag, a grasp. Of recordings above 180
+images the middle is read. Images are decoded one recording at a time.
 """
 
 from collections.abc import Callable, Hashable, Iterable, Sequence
@@ -25,7 +25,7 @@ from touchgoal.episodes.importers.tacbench_poses import is_pose_set, read_bags
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
-_LONGEST = 180  # pictures of a recording that are read
+_LONGEST = 180  # images of a recording that are read
 _OF_FIVE = 5
 _PER_METRE, _PER_RADIAN = 1e3, 180 / np.pi
 
@@ -37,9 +37,9 @@ class Published:
     """A published folder.
 
     Attributes:
-        what: it recorded, as the bench calls it.
-        sensor: what recorded it.
-        read: so many recordings of it, preprocessed.
+        what: kind of recordings, in the bench's terms.
+        sensor: sensor that recorded it.
+        read: reads a number of recordings, preprocessed.
     """
 
     what: Recording
@@ -48,11 +48,11 @@ class Published:
 
 
 def find_published(folder: Path, sensor: str) -> Published | None:
-    """What a folder of published files holds; None if it holds none.
+    """Return a folder's published files; None if it has none.
 
     Args:
-        folder: of TacBench's force or pose estimation, or of Feeling of Success.
-        sensor: counts where the files leave a choice, as between gels with and without dots.
+        folder: TacBench's force or pose estimation, or Feeling of Success.
+        sensor: decides between gels with and without dots, where the files do not.
 
     Raises:
         UserError: the first file is damaged.
@@ -72,7 +72,8 @@ def find_published(folder: Path, sensor: str) -> Published | None:
 def read_published_strokes(
     folder: Path, sensor: str, count: int, preprocess: Preprocessor
 ) -> RigFrames:
-    """About so many strokes, as many of each probe; their uses are those of the bench's strokes."""
+    """Read about that many strokes, as many of each probe; uses are assigned as in the
+    simulation."""
     chosen = _evenly(list(read_strokes(folder, sensor)), lambda stroke: stroke.probe, count)
     touch, force, slip = [], [], []
     for stroke in track(chosen, "strokes", "stroke"):
@@ -93,10 +94,10 @@ def read_published_strokes(
 
 
 def read_published_bags(folder: Path, count: int, preprocess: Preprocessor) -> RigFrames:
-    """About so many bags of the ring finger; the test bags are the published ones.
+    """Read about that many bags of the ring finger; test bags are the published ones.
 
-    Forces are not known there; the object touches all the time, which 1 N into the gel stands for. The first
-    `STRIDE` of a bag have no motion, and count as untouched.
+    Forces are unknown there. The object always touches, entered as 1 N into the gel. The first `STRIDE`
+    frames of a bag have no motion and count as untouched.
     """
     chosen = _evenly(list(read_bags(folder)), lambda bag: (bag.object, bag.held_out), count)
     touch, force, pose = [], [], []
@@ -123,7 +124,7 @@ def read_published_bags(folder: Path, count: int, preprocess: Preprocessor) -> R
 def read_published_grasps(
     folder: Path, sensor: str, count: int, preprocess: Preprocessor
 ) -> RigFrames:
-    """About so many grasps, finger by finger; the test grasps are those of the published files."""
+    """Read about that many grasps, finger by finger; test grasps are the published ones."""
     trials = list(read_grasps(folder, sensor))
     chosen = _evenly(trials, lambda trial: (trial.held_out, trial.held), count)
     touch: list[Tensor] = []
@@ -153,12 +154,13 @@ def _first(items: Iterable[Item], folder: Path) -> Item:
 
 
 def _variant(asked: str, found: str) -> str:
-    """The sensor asked for if it is the one found, but for dots on its gel."""
+    """Return the requested sensor if it differs from the found one in dots alone."""
     return asked if asked in (found, f"{found}_markers") else found
 
 
 def _evenly(items: list[Item], group: Callable[[Item], Hashable], count: int) -> list[Item]:
-    """About so many of them, in their order: of each group the same share, evenly, one at least."""
+    """Return about that many, in order, evenly and in the same share from each group, at least
+    one."""
     groups: dict[Hashable, list[int]] = {}
     for i, item in enumerate(items):
         groups.setdefault(group(item), []).append(i)
@@ -170,13 +172,13 @@ def _evenly(items: list[Item], group: Callable[[Item], Hashable], count: int) ->
 
 
 def _middle(length: int) -> slice:
-    """The part of a recording that is read."""
+    """Return the part of a recording that is read."""
     start = max(length - _LONGEST, 0) // 2
     return slice(start, start + min(length, _LONGEST))
 
 
 def _poses(change: Float64[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
-    """Poses (mm and degrees) that change so within a stride: chains that start at 0, `STRIDE` of them."""
+    """Return poses (mm, degrees) whose change over a stride is as published."""
     pose = np.zeros_like(change)
     for i in range(STRIDE, len(change)):
         pose[i] = pose[i - STRIDE] + change[i]
@@ -184,7 +186,7 @@ def _poses(change: Float64[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
 
 
 def _uses(held_out: Sequence[bool]) -> Int64[np.ndarray, " n"]:
-    """Held-out recordings are the test, of the others every fifth is for validation."""
+    """Assign the held-out recordings to the test and every fifth other to validation."""
     uses = np.zeros(len(held_out), np.int64)
     uses[np.flatnonzero(~np.array(held_out))[_OF_FIVE - 1 :: _OF_FIVE]] = VALIDATION
     uses[np.array(held_out)] = TEST
@@ -192,7 +194,7 @@ def _uses(held_out: Sequence[bool]) -> Int64[np.ndarray, " n"]:
 
 
 def check_tasks(published: Published, folder: Path, tasks: Sequence[str]) -> None:
-    """Raises UserError if these files are not for a task."""
+    """Raise UserError if these files do not serve a task."""
     fit = [name for name, what in RECORDED_AS.items() if what == published.what and name != "field"]
     if wrong := [name for name in tasks if name not in fit]:
         raise UserError(

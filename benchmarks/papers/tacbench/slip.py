@@ -22,10 +22,10 @@ _THRESHOLDS = 200
 
 
 class SlipTask:
-    """Whether the probe slides; and by how much the force changed in the pair, learned beside it."""
+    """Whether the probe slides, learned together with the force change within the pair."""
 
     def __init__(self, frames: RigFrames) -> None:
-        """Of the frames of strokes."""
+        """Take frames of strokes."""
         self._frames = frames
         self._change = frames.force - frames.force[frames.before]
         self.split = split_slip(frames)
@@ -38,35 +38,36 @@ class SlipTask:
         return AttentiveProbe(features, 4)
 
     def targets(self, rows: Rows) -> Targets:
-        """Slip (0 or 1) and changes of the force over their range."""
+        """Return slip (0 or 1) and force changes over their range."""
         change = self._change[rows] / self._scale
         return torch.cat([self._frames.slip[rows, None].float(), change], 1)
 
     def loss(self, outputs: Outputs, targets: Targets) -> Float[Tensor, ""]:
-        """Weighted cross entropy and mean absolute error."""
+        """Return weighted cross entropy plus mean absolute error."""
         slip = F.binary_cross_entropy_with_logits(
             outputs[:, 0], targets[:, 0], pos_weight=self._weight.to(outputs)
         )
         return slip + F.l1_loss(outputs[:, 1:], targets[:, 1:])
 
     def error(self, outputs: Outputs, rows: Rows) -> float:
-        """1 less the F1 score at its best threshold."""
+        """Return 1 - F1 at its best threshold."""
         truth = self.truth(rows)
         return 1 - max(f1_score(outputs[:, 0].numpy() > t, truth) for t in _cuts(outputs))
 
     def threshold(self, outputs: Outputs, rows: Rows) -> float:
-        """Of the raw output: where F1 is best."""
+        """Return the threshold on the raw output with the best F1."""
         truth = self.truth(rows)
         return max(_cuts(outputs), key=lambda t: f1_score(outputs[:, 0].numpy() > t, truth))
 
     def truth(self, rows: Rows) -> Bool[np.ndarray, " b"]:
-        """Whether frames slip."""
+        """Return whether frames slip."""
         return self._frames.slip[rows].numpy()
 
     def judge(
         self, said: list[Outputs], validation: list[ValidationOutputs], rows: Rows
     ) -> Metrics:
-        """F1 at thresholds chosen on validation frames; mean absolute error of the change of force, mN."""
+        """Return F1 at validation thresholds, and the mean absolute error of the force change,
+        mN."""
         cuts = [self.threshold(outputs, self.split.validation) for outputs in validation]
         slips = np.stack([o[:, 0].numpy() > t for o, t in zip(said, cuts, strict=True)])
         errors = [(o[:, 1:] * self._scale - self._change[rows]).abs().mean() for o in said]
@@ -74,7 +75,8 @@ class SlipTask:
         return metrics | {"change_mae_mn": 1e3 * float(np.mean(errors)), "thresholds": cuts}
 
     def references(self, rows: Rows) -> dict[str, Metrics]:
-        """Slip always; slip by the true forces and the nominal friction cone."""
+        """Return the metrics of "always slips" and of the true forces with the nominal friction
+        cone."""
         truth, things = self.truth(rows), self._frames.stroke[rows.numpy()]
         force = self._frames.force[rows].double().numpy()
         cone = np.hypot(force[:, 0], force[:, 1]) >= FRICTION * force[:, 2]
@@ -83,12 +85,12 @@ class SlipTask:
 
 
 def _cuts(outputs: Outputs) -> list[float]:
-    """Places between raw outputs."""
+    """Return thresholds between raw outputs."""
     return torch.quantile(outputs[:, 0], torch.linspace(0, 1, _THRESHOLDS)[:-1]).tolist()
 
 
 def f1_score(said: Bool[np.ndarray, " n"], truth: Bool[np.ndarray, " n"]) -> float:
-    """Of the class true; 0 where nothing is right."""
+    """Return the F1 score of the class true; 0 where no prediction is right."""
     right = float((said & truth).sum())
     return 2 * right / max(float(said.sum() + truth.sum()), 1.0)
 
@@ -96,7 +98,7 @@ def f1_score(said: Bool[np.ndarray, " n"], truth: Bool[np.ndarray, " n"]) -> flo
 def slip_metrics(
     said: Bool[np.ndarray, "seeds n"], truth: Bool[np.ndarray, " n"], things: np.ndarray
 ) -> Metrics:
-    """F1 of slipping, the mean over seeds, with its interval."""
+    """Return the F1 of slip, mean over seeds, with its interval."""
     together = np.vstack([truth, said]).T
 
     def f1(values: np.ndarray) -> float:

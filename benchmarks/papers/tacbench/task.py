@@ -34,7 +34,7 @@ Outputs = Float[Tensor, "b k"]
 ValidationOutputs = Float[Tensor, "v k"]
 Targets = Float[Tensor, "b _"]
 Metrics = dict[str, Any]
-"""Numbers by name; one that is called NAME_interval has the 95 % interval of NAME over recordings."""
+"""Numbers by name; NAME_interval is the 95 % interval of NAME over recordings."""
 
 
 @runtime_checkable

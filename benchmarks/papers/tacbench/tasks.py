@@ -1,4 +1,4 @@
-"""TacBench's tasks by name, each with what it is recorded from."""
+"""TacBench's tasks by name, each with its kind of recordings."""
 
 from collections.abc import Callable
 from typing import Literal

@@ -1,4 +1,4 @@
-"""Trainings of probes on workers: the frames and tokens that they read lie in files, mapped and not copied."""
+"""Trainings of probes on workers; frames and tokens lie in mapped files."""
 
 import time
 from collections.abc import Callable
@@ -35,10 +35,10 @@ class Subject:
     """One encoder on one kind of recordings.
 
     Attributes:
-        name: of the encoder, as the user gave it.
-        sensor: of the rig.
-        frames: file of `RigFrames`, as the encoder's preprocessor makes them.
-        tokens: file of a frozen encoder's tokens of these; None for one that is trained with each probe.
+        name: encoder, as the user named it.
+        sensor: sensor of the rig.
+        frames: file of `RigFrames` from the encoder's preprocessor.
+        tokens: file of a frozen encoder's tokens; None for one that is trained.
     """
 
     name: str
@@ -49,14 +49,14 @@ class Subject:
 
 @dataclass(frozen=True)
 class Job:
-    """One encoder, task and share of the labels; all seeds.
+    """One encoder, task and share of the labels, all seeds.
 
     Attributes:
-        subject: the encoder and what it sees.
-        task: by name.
-        share: of the training labels.
-        config: for how long, from which seeds.
-        log: file to which the trainer's lines are added.
+        subject: encoder and its data.
+        task: task by name.
+        share: share of the training labels.
+        config: schedule and seeds.
+        log: file for the trainer's lines.
     """
 
     subject: Subject
@@ -68,13 +68,13 @@ class Job:
 
 @dataclass(frozen=True)
 class Answers:
-    """What a job's readers put out.
+    """Outputs of a job's probes.
 
     Attributes:
-        said: of each test, by seed.
-        validation: of the validation frames, by seed.
-        samples: labels learned from.
-        seconds: that each training took.
+        predicted: outputs on each test set, by seed.
+        validation: outputs on the validation frames, by seed.
+        samples: number of training labels.
+        seconds: time of each training.
     """
 
     said: dict[str, _Answered]
@@ -84,7 +84,7 @@ class Answers:
 
 
 def work(job: Job) -> Answers:
-    """Train a job's readers, one for each seed, and let them read the test frames; on one core."""
+    """Train a job's probes, one a seed, and read the test frames; on one core."""
     torch.set_num_threads(1)
     config, began, scratch = job.config, time.monotonic(), job.subject.frames.parent
     frames = _mapped(job.subject.frames)
@@ -108,7 +108,7 @@ def work(job: Job) -> Answers:
 
 @lru_cache(maxsize=2)
 def _mapped(path: Path) -> RigFrames:
-    return torch.load(path, mmap=True, weights_only=False)  # ours, of this run
+    return torch.load(path, mmap=True, weights_only=False)  # written by this run
 
 
 @lru_cache(maxsize=1)
@@ -119,7 +119,7 @@ def _encoder(name: str, sensor: str, seed: int) -> BaseTouchEncoder:
 def _inputs_of(
     subject: Subject, encoder: BaseTouchEncoder, frames: RigFrames
 ) -> Callable[[Rows], Inputs]:
-    """Rows of the frames to what a reader reads."""
+    """Return the map from rows to a probe's input."""
     pairs = PairTokens(encoder)
     if subject.tokens is None:
         return partial(frames.seen, offsets=pairs.offsets)
@@ -127,7 +127,7 @@ def _inputs_of(
 
 
 def _reader(subject: Subject, encoder: BaseTouchEncoder, task: Task, seed: int) -> Reader:
-    """Randomly initialised, with an encoder of its own if that is trained with it."""
+    """Return a probe with random weights, with an encoder if that is trained."""
     trained = subject.tokens is None
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

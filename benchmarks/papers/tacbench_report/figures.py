@@ -1,4 +1,4 @@
-"""TacBench as pictures, laid out as the paper's: every task by share of labels, and what probes read."""
+"""TacBench's figures, laid out as the paper's: tasks by share of labels, and predictions."""
 
 from collections.abc import Callable
 from typing import Any
@@ -22,7 +22,7 @@ from touchgoal.benchmarks.papers.tacbench_report.task_figures import (
 )
 
 Picture = UInt8[np.ndarray, "h w 3"]
-_CONTRASTED_AT = 1 / 3  # of the labels, as the paper's figures are
+_CONTRASTED_AT = 1 / 3  # of the labels, as in the paper's figures
 _TITLES = {
     "force": "T1: mean absolute error of the force (mN)",
     "field": "T1A: share of the shear field explained",
@@ -34,7 +34,7 @@ _TITLES = {
 
 
 def pictures(rows: list[dict[str, Any]], reads: list[Read], sensor: str) -> dict[str, Picture]:
-    """All that the run's numbers give, by name."""
+    """Return all figures that the run's numbers give, by name."""
     drawn = {"by_labels": _draw_by_labels(rows, sensor)}
     for name in dict.fromkeys(read.name for read in reads):
         contrasted = _contrasted(rows, [read for read in reads if read.name == name])
@@ -43,7 +43,7 @@ def pictures(rows: list[dict[str, Any]], reads: list[Read], sensor: str) -> dict
 
 
 def _contrasted(rows: list[dict[str, Any]], reads: list[Read]) -> list[Read]:
-    """The best frozen encoder, and the best one trained end to end, at about a third of the labels."""
+    """Return the best frozen encoder and the best end-to-end one at about a third of the labels."""
     share = min({read.share for read in reads}, key=lambda s: abs(s - _CONTRASTED_AT))
     test = reads[0].test
     layout = LAYOUTS[reads[0].name]
@@ -74,7 +74,7 @@ def _draw_task(name: str, contrasted: list[Read]) -> Picture:
         "textile": (draw_labels, 1, 8.0),
     }
     drawer, columns, height = drawers[name]
-    across = name in ("grasp", "textile")  # the encoders side by side
+    across = name in ("grasp", "textile")  # encoders side by side
     lines = 1 if across else len(contrasted) * (2 if name == "field" else 1)
     wide = len(contrasted) * columns if across else columns
     each = height * (1.25 if across else 1.1)
@@ -92,7 +92,8 @@ def _draw_task(name: str, contrasted: list[Read]) -> Picture:
 
 
 def _draw_by_labels(rows: list[dict[str, Any]], sensor: str) -> Picture:
-    """Bars for each share of the labels, with 95 % intervals; the paper's numbers as marks."""
+    """Draw bars for each share of the labels with 95 % intervals, and the paper's numbers as
+    marks."""
     shown = [
         (task, test)
         for task in dict.fromkeys(row["task"] for row in rows)
@@ -148,7 +149,7 @@ def _draw_bars(axis: Axes, rows: list[dict[str, Any]], task: str, test: str, sen
             bbox=box,
             zorder=5,
         )
-    if not LAYOUTS[task].less_is_better:  # a share explained may be far below 0
+    if not LAYOUTS[task].less_is_better:  # an explained share may be far below 0
         axis.set_ylim(max(axis.get_ylim()[0], -0.5), 1.02)
     _draw_published(axis, shares, task, sensor)
     axis.set_xticks(range(len(shares)), [_share_name(share) for share in shares])
@@ -175,7 +176,7 @@ def _draw_published(axis: Axes, shares: list[float], task: str, sensor: str) -> 
 
 
 def _of_paper(share: float) -> int | None:
-    """Which of the paper's shares this is."""
+    """Return which of the paper's shares this is."""
     near = [i for i, own in enumerate(SHARES) if abs(share / own - 1) < 0.05]
     return near[0] if near else None
 

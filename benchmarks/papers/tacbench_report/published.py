@@ -1,14 +1,14 @@
-"""What the paper measured on real sensors: Tables 5 to 9 of Sparsh."""
+"""The paper's figures on real sensors: Tables 5 to 9 of Sparsh."""
 
 from dataclasses import dataclass
 
 SHARES = (1.0, 1 / 3, 0.1, 0.01)
-"""Of the labels."""
+"""Shares of the labels."""
 
 
 @dataclass(frozen=True)
 class Published:
-    """A table: of each encoder the measure at every share of the labels."""
+    """A table: each encoder's measure at every share of the labels."""
 
     task: str
     sensor: str
@@ -17,8 +17,8 @@ class Published:
     values: dict[str, tuple[float, float, float, float]]
 
 
-# What the paper calls RMSE of the force is computed as a mean absolute error over the axes (its code);
-# its tables of slip and pose are a DIGIT's, that of grasps is of two GelSights with dots.
+# The paper's "RMSE" of the force is a mean absolute error over the axes (its code); its slip and
+# pose tables are a DIGIT's, its grasp table is of two GelSights with dots.
 _FORCE = "MAE, there called RMSE, mN"
 PAPER = (
     Published("force", "gelsight_mini", _FORCE, 0, {
@@ -57,12 +57,12 @@ PAPER = (
         "Sparsh (VJEPA)": (0.809, 0.702, 0.743, 0.523),
     }),
 )  # fmt: skip
-# Of Table 11, "Best SSL vs E2E" in %; its shares of labels are not said.
+# Table 11, "Best SSL vs E2E" in %; the paper does not give its shares of labels.
 BEST_AGAINST_END_TO_END = {"force": 59.74, "slip": 242.70, "pose": 235.89, "grasp": 5.14}
 
 
 def published(task: str, sensor: str) -> Published | None:
-    """The table of a task: of this sensor, if there is one, else the only one there is."""
+    """Return a task's table of this sensor, or else its only table."""
     kind = sensor.removesuffix("_markers")
     own = [t for t in PAPER if t.task == task and t.sensor == kind]
     others = [t for t in PAPER if t.task == task]

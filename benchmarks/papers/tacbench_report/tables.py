@@ -1,4 +1,4 @@
-"""TacBench as a table, beside the numbers that the paper measured on real sensors."""
+"""TacBench as a table, beside the paper's figures on real sensors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Layout:
-    """How a task's rows are printed.
+    """Layout of a task's rows.
 
     Attributes:
-        title: above them.
-        measure: the number that counts, in the row under this key.
-        digits: of it after the point.
+        title: heading.
+        measure: key of the main number.
+        digits: its decimals.
         less_is_better: whether it is an error.
-        others: further numbers of a row, by header.
+        others: further numbers by header.
     """
 
     title: str
@@ -97,7 +97,7 @@ LAYOUTS: dict[str, Layout] = {
 
 
 def table(rows: list[Row], sensor: str, config: Config, published_in: Path | None = None) -> str:
-    """As people read it; `published_in` is the folder of real recordings, if they are."""
+    """Return the table as text; `published_in` is the folder of real recordings, if any."""
     recorded = (
         f"simulated: {sensor}, {config.strokes} strokes, {config.slides} slides, {config.grasps} "
         f"grasps, {config.cloths} presses of cloth"
@@ -133,7 +133,7 @@ def _task_lines(rows: list[Row], task: str) -> list[str]:
 
 
 def _published_lines(task: str, sensor: str) -> list[str]:
-    """The paper's rows of a task, if it has any."""
+    """Return the paper's rows of a task."""
     known = published(task, sensor)
     if known is None:
         return []
@@ -146,7 +146,8 @@ def _published_lines(task: str, sensor: str) -> list[str]:
 
 
 def _summary(rows: list[Row], config: Config) -> list[str]:
-    """As Table 11: the best frozen encoder, chosen by task and share, against the best trained end to end."""
+    """Compare the best frozen encoder with the best end-to-end one by task and share, as Table
+    11."""
     shares = "".join(f"{share:>14.2g}" for share in config.shares)
     lines = [
         f"{'best frozen encoder against end to end, %; * intervals apart':<66}{shares}   paper"
@@ -162,7 +163,7 @@ def _summary(rows: list[Row], config: Config) -> list[str]:
 
 
 def _gain(rows: list[Row], task: str, test: str, share: float) -> str:
-    """By how many percent frozen is better; empty without either kind."""
+    """Return by how many percent frozen is better; empty without either kind."""
     layout = LAYOUTS[task]
     key, sign = layout.measure, -1 if layout.less_is_better else 1
     same = [r for r in rows if (r["task"], r["test"], r["share"]) == (task, test, share)]

@@ -1,4 +1,4 @@
-"""What one probe read of test frames, drawn as the paper draws it."""
+"""One probe's predictions of test frames, drawn as in the paper."""
 
 from dataclasses import dataclass
 
@@ -18,12 +18,12 @@ from touchgoal.benchmarks.papers.tacbench.task import Task
 from touchgoal.sim_envs.indenter_rig import FRICTION
 
 _AXES = "xyz"
-_WORST = 0.1  # of the largest normal force: the error at the end of the colours
+_WORST = 0.1  # share of the largest normal force at the end of the error's colours
 
 
 @dataclass(frozen=True)
 class Read:
-    """What the first seed's probe put out for test frames: `outputs` of the frames `rows`."""
+    """The first seed's outputs of test frames: `outputs` of the frames `rows`."""
 
     name: str
     task: Task
@@ -36,7 +36,7 @@ class Read:
 
 
 def draw_force(axes: np.ndarray, one: Read) -> None:
-    """The friction cone, coloured by each axis' error (Figures 7 and 8); predicted against true."""
+    """Draw the friction cone coloured by error (Figures 7 and 8), and predicted against true."""
     assert isinstance(one.task, ForceTask)
     truth, said = one.frames.force[one.rows].numpy(), one.task.read(one.outputs).numpy()
     error = 1e3 * np.abs(said - truth)
@@ -60,7 +60,7 @@ def draw_force(axes: np.ndarray, one: Read) -> None:
 
 
 def draw_slip(axes: np.ndarray, one: Read) -> None:
-    """Four test strokes with slip over time (Figure 11)."""
+    """Draw four test strokes with slip over time (Figure 11)."""
     assert isinstance(one.task, SlipTask)
     stroke, truth = one.frames.stroke[one.rows.numpy()], one.task.truth(one.rows)
     likely = torch.sigmoid(one.outputs[:, 0]).numpy()
@@ -83,7 +83,7 @@ def draw_slip(axes: np.ndarray, one: Read) -> None:
 
 
 def draw_pose(axes: np.ndarray, one: Read) -> None:
-    """Confusion matrices (Figure 13), and a test slide over time (Figure 14)."""
+    """Draw confusion matrices (Figure 13) and a test slide over time (Figure 14)."""
     assert isinstance(one.task, PoseTask)
     truth, said = one.task.classes[one.rows].numpy(), one.task.read(one.outputs).numpy()
     names = ("x", "y", "turn")
@@ -111,7 +111,7 @@ def draw_pose(axes: np.ndarray, one: Read) -> None:
 
 
 def draw_labels(axes: np.ndarray, one: Read) -> None:
-    """Confusion matrix (Figure 15), and with few labels where it is wrong."""
+    """Draw the confusion matrix (Figure 15) and, with few labels, where errors lie."""
     assert isinstance(one.task, LabelTask)
     truth, said, names = one.task.truth(one.rows), one.task.read(one.outputs), one.task.names
     _draw_confusion(axes[0], truth, said, len(names), numbers=len(names) < 5)
@@ -135,7 +135,8 @@ def draw_labels(axes: np.ndarray, one: Read) -> None:
 
 
 def draw_field(axes: np.ndarray, one: Read) -> None:
-    """True field above, predicted below: pressure in colour, shear as arrows (Figure 9)."""
+    """Draw the true field above and the predicted one below (Figure 9): pressure as colour,
+    shear as arrows."""
     assert isinstance(one.task, FieldTask)
     truth, said = one.task.truth(one.rows).numpy(), one.task.read(one.outputs).numpy()
     stroke = one.frames.stroke[one.rows.numpy()]
@@ -154,7 +155,7 @@ def draw_field(axes: np.ndarray, one: Read) -> None:
 
 
 def _draw_arrows(axis: Axes, field: np.ndarray, like: np.ndarray, picture: tuple[int, int]) -> None:
-    """A field over a picture of so many rows and columns, on the scale of another."""
+    """Draw a field over an image, on the scale of another field."""
     h, w = picture
     rows, columns = field.shape[1:]
     image = axis.imshow(
