@@ -44,9 +44,9 @@ class Config(BenchmarkOptions):
         "lock-step",
         "real-time",
     )
-    """Ways to act. environment: the task's environment. in-process: a simulated arm from the example
-    cell file. lock-step: a fresh twin over libfranka whose time waits for the client. real-time: the
-    same against the wall clock."""
+    """Ways to act. environment: the task's environment; in-process: a simulated arm from the
+    example cell file; lock-step: a fresh twin over libfranka whose time waits for the client;
+    real-time: the same against the wall clock."""
     episodes: Count = 10
     """Episodes of each row."""
     seconds: Positive = 40.0
@@ -62,7 +62,7 @@ _CELLS = Path(__file__).parents[1] / "control" / "cell" / "examples"
 
 
 def run(config: Config) -> dict[str, Any]:
-    """The table, and every deployment behind it."""
+    """Run every deployment and return the table."""
     head = f"{'task, policy, arm':<34}{'success [95 % Wilson]':<23}{'peak N':>12}{'late ms':>9}{'pace':>6}  clamped"
     lines, done = [head], []
     for task in config.tasks:
@@ -86,14 +86,14 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def _side_by_side(arm: str, count: int, workers: int) -> AbstractContextManager[Executor]:
-    """Deployments are processes of their own, and wait for nothing but in real time."""
+    """Return a pool; deployments are processes, and real-time ones run alone."""
     if arm == "environment":
         return one_core_workers(min(count, workers))
     return ThreadPoolExecutor(1 if arm == "real-time" else workers)
 
 
 def _scenes(task: TaskName, config: Config) -> Iterator[Scene]:
-    """Wires of the test split, each object in turn."""
+    """Yield test wires, or each object in turn."""
     drawn = BeadMazeConfig(split="test") if task == "bead-maze" else PickPlaceConfig()
     for spec in trial_specs(drawn, config.episodes, config.seed):
         assert spec.options is not None
@@ -111,7 +111,7 @@ def _deploy(scene: Scene, policy: str, arm: str, number: int, seconds: float) ->
 
 @contextmanager
 def _cell(scene: Scene, arm: str, folder: Path, number: int) -> Iterator[Path]:
-    """A cell file whose arm stays for as long as the context."""
+    """Provide a cell file whose arm lasts as long as the context."""
     if arm == "in-process":
         cell = read_cell_file(_CELLS / EXAMPLES[scene.task])
         maze = scene.task == "bead-maze"
@@ -141,7 +141,7 @@ def _in_environment(scene: Scene, policy: str) -> Deployment:
 
 
 def _lines(rows: list[Deployment]) -> list[str]:
-    """One for the row, and one for each of its failures."""
+    """Return one line for the row and one for each failure."""
     first = rows[0]
     rate = SuccessRate(sum(row.success for row in rows), len(rows))
     peaks = [row.peak_force for row in rows]

@@ -1,4 +1,4 @@
-"""One deployment by `touchgoal deploy --execute`, and what came of it."""
+"""One deployment by `touchgoal deploy --execute`, with its result."""
 
 import json
 import os
@@ -11,20 +11,20 @@ from touchgoal.control import features as ft
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 
-_TIMEOUT = 1800.0  # s for one deployment, on a machine however loaded
-_SHUT = 0.01  # m by which fingers must have closed to have tried a grasp
+_TIMEOUT = 1800.0  # s for one deployment on a loaded machine
+_SHUT = 0.01  # m that fingers must have closed for an attempted grasp
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One episode: what the environment, the twin and the cell file are to draw alike."""
+    """One episode that environment, twin and cell file draw alike."""
 
     task: TaskName
     seed: int
-    thing: str  # the object or the wire
+    thing: str  # object or wire
 
     def config(self) -> TaskConfig:
-        """Of the environment."""
+        """Return the environment's options."""
         if self.task == "bead-maze":
             return BeadMazeConfig(wires=(self.thing,))
         return PickPlaceConfig(objects=(self.thing,))
@@ -32,16 +32,16 @@ class Scene:
 
 @dataclass(frozen=True)
 class Deployment:
-    """One deployment and what came of it.
+    """Result of one deployment.
 
     Attributes:
-        progress: of the task at the end, in [0, 1]; None if nobody knows.
-        ending: how it ended, for a person.
-        phase: what the fingers were doing then.
-        peak_force: greatest external force on the hand, N.
+        progress: progress of the task at the end, in [0, 1]; None if unknown.
+        ending: how it ended.
+        phase: state of the fingers at the end.
+        peak_force: largest external force on the hand, N.
         clamped: share of the ticks in which each limit changed the command.
-        late: ms by which 99 % of the ticks were late at most.
-        pace: of the arm's clock by the clock on the wall, in the median second; 1 where it waits.
+        late: 99th percentile of the ticks' lateness, ms.
+        pace: arm clock over wall clock in the median second; 1 in lock-step.
     """
 
     task: str
@@ -61,7 +61,7 @@ class Deployment:
 
 
 def limited(cell: Path, seconds: float) -> Path:
-    """A cell file (JSON) with that time for a deployment."""
+    """Set the time limit of a cell file (JSON)."""
     table = json.loads(cell.read_text())
     table["task"]["seconds"] = seconds
     cell.write_text(json.dumps(table))
@@ -69,7 +69,7 @@ def limited(cell: Path, seconds: float) -> Path:
 
 
 def deploy(cell: Path, scene: Scene, policy: str, arm: str, out: Path) -> Deployment:
-    """`touchgoal deploy --execute` of a cell file, in a process of its own."""
+    """Run `touchgoal deploy --execute` on a cell file in its own process."""
     command = [sys.executable, "-m", "touchgoal.launch", "deploy", str(cell), "--policy", policy]
     done = subprocess.run(
         [*command, "--execute", "--yes", "--seed", str(scene.seed), "--out", str(out)],
@@ -80,7 +80,7 @@ def deploy(cell: Path, scene: Scene, policy: str, arm: str, out: Path) -> Deploy
     )
     kind = (scene.task, policy, arm, scene.seed, scene.thing)
     report = out / "metrics.json"
-    if not report.exists():  # refused, or worse
+    if not report.exists():  # refused, or crashed
         ending = f"refused: {' '.join(done.stderr.split())[-300:]}"
         return Deployment(*kind, False, None, ending, "", 0.0, 0.0, {}, 0.0)
     said = json.loads(report.read_text())
@@ -100,7 +100,7 @@ def deploy(cell: Path, scene: Scene, policy: str, arm: str, out: Path) -> Deploy
 
 
 def _phase(episodes: Path, holding: bool) -> str:
-    """What the fingers were doing at the end of the episode."""
+    """Return the state of the fingers at the end of the episode."""
     if holding:
         return "holding"
     if not episodes.exists() or not len(found := EpisodeSet(episodes)):

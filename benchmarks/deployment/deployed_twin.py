@@ -10,14 +10,14 @@ from pathlib import Path
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import TaskName
 
-_START_TIMEOUT, _END_TIMEOUT = 300.0, 60.0  # s, on a machine however loaded
+_START_TIMEOUT, _END_TIMEOUT = 300.0, 60.0  # s, on a loaded machine
 
 
 class DeployedTwin:
-    """`touchgoal twin`, until the context ends.
+    """A running `touchgoal twin`.
 
     Attributes:
-        cell_file: that it has written.
+        cell_file: cell file that it wrote.
     """
 
     def __init__(
@@ -30,9 +30,9 @@ class DeployedTwin:
         number: int,
         exact: bool = False,
     ) -> None:
-        """Start one with an object or a wire; twins of different numbers run side by side.
+        """Start a twin with an object or a wire; twins of different numbers run side by side.
 
-        An exact one estimates forces as they are, no arm does.
+        An exact twin reports true forces, without an arm's estimation error.
         """
         pid = os.getpid()
         host = f"127.{100 + number % 100}.{pid // 250 % 250}.{1 + pid % 250}"
@@ -54,11 +54,11 @@ class DeployedTwin:
             time.sleep(0.05)
 
     def __enter__(self) -> "DeployedTwin":
-        """It runs already."""
+        """Return itself; it runs already."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Ctrl-C; killed if it does not end by that."""
+        """Interrupt the twin, and kill it if it does not end."""
         self._process.send_signal(signal.SIGINT)
         try:
             self._process.wait(_END_TIMEOUT)

@@ -1,7 +1,7 @@
-"""How often a policy succeeds in the environment when what it sees, plans and commands comes late.
+"""Success in the environment under late observations, plans and commands, or by cause.
 
-The arm is as deployed otherwise: `--env.as-deployed` with other delays. With `causes` each part of that
-is put in by itself, and left out by itself. The same seeds in every row.
+The arm is as deployed otherwise. With `causes`, each part of `--env.as-deployed` is added alone and
+left out alone. All rows share their seeds.
 """
 
 import sys
@@ -27,30 +27,30 @@ from touchgoal.sim_envs.config import (
 
 @checked_dataclass
 class Config(BenchmarkOptions):
-    """How often does a policy succeed when everything comes late?"""
+    """Options of benchmark policy-delay."""
 
     task: TaskName = "pick-place"
-    """In which task; of the maze, on validation wires."""
+    """Task; for the maze, on validation wires."""
     policy: str = "shipped"
-    """Which policy, named as for run-policy."""
+    """Policy, named as for run-policy."""
     causes: bool = False
-    """Instead of the delays, an ablation: each effect of a deployment alone, then all but it."""
+    """Run an ablation instead of delays: each effect of a deployment alone, then all but it."""
     delay: tuple[NotNegative, ...] = (0.0, 50.0, 100.0, 150.0)
-    """Total delay from sensing to command, ms, half of it before the policy and half after; planning adds
-    a tick."""
+    """Total delay from sensing to command, ms, half before the policy and half after; planning
+    adds a tick."""
     jitter: tuple[NotNegative, ...] = (0.0, 50.0)
-    """By how much each half may be longer, drawn tick by tick, ms."""
+    """Largest extra delay of each half, drawn each tick, ms."""
     rates: tuple[Positive, ...] = (30.0, 15.0)
-    """Pictures a second, Hz."""
+    """Image rates, Hz."""
     episodes: Count = 20
-    """Number of episodes of each row."""
+    """Episodes of each row."""
     seed: Seed = seeds.POLICY_TEST.start
     """Random seed of the first episode; each further one adds one."""
     workers: Count = CORES
     """Processes that simulate."""
 
 
-# Parts of `--env.as-deployed`, by what a person would call them.
+# parts of `--env.as-deployed`
 _PARTS = {
     "lag, limits and tracker": ("tracker",),
     "a Franka Hand": ("franka_hand",),
@@ -62,7 +62,7 @@ _PARTS = {
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Success by delay, jitter and picture rate, or by cause; `table` and the trials behind it."""
+    """Return success by delay, jitter and image rate, or by cause, with the trials."""
     cases = _causes() if config.causes else _delays(config)
     lines = [f"{'':<46}{'success [95 % Wilson]':<24}{'peak N':>7}"]
     rows = []

@@ -1,7 +1,6 @@
-"""The same actions through the environment as deployed and over the wire: how far do the two arms part?
+"""The same actions in the environment as deployed and over the wire: distance between the two arms.
 
-What is left between a policy's simulator and the arm's own protocol, without any policy: joint changes
-of a wave in free air, and of a closed hand that is pressed onto the table.
+No policy acts: the joints wave in free air, and a closed hand presses onto the table.
 """
 
 import tempfile
@@ -31,32 +30,36 @@ from touchgoal.sim_envs.pick_place import PickPlace
 
 @checked_dataclass
 class Config(BenchmarkOptions):
-    """The same actions in the environment as deployed and over the wire: how far do the arms part?"""
+    """Options of benchmark replay."""
 
     episodes: Count = 3
-    """Waves in free air, and presses onto the table."""
+    """Seeds; each waves and presses."""
     seed: Seed = seeds.REPLAY.start
-    """Random seed of the first."""
+    """First random seed."""
 
 
 _OBJECT = "wooden_block"
 _HZ = ft.CONTROL_HZ
-_FLOOR = -0.02  # m, of the box here: the table is to be pressed
+_FLOOR = -0.02  # m, lower bound of the box here, so that the table can be pressed
 _DELAY = 0.005  # s from a command to the arm: half of the two streams' periods
 _WAVE_SECONDS, _WAVE = 2.0, 0.012  # s, and rad a tick at most
-_ABOVE = 0.005  # m of the fingers' lowest corner above the table when it goes on slowly
+_ABOVE = 0.005  # m of the fingers' lowest corner above the table where it slows down
 _PRESSED = -5e-4  # m, the same as commanded at the end
-_DOWN_SECONDS, _PRESS_SECONDS, _HOLD_SECONDS = 2.5, 2.5, 0.5  # s; faster, and the reflex ends it
+_DOWN_SECONDS, _PRESS_SECONDS, _HOLD_SECONDS = (
+    2.5,
+    2.5,
+    0.5,
+)  # s; faster, and the arm's reflex would end it
 _TOUCHING = 1.0  # N
 
 
 @dataclass(frozen=True)
 class Replayed:
-    """What came of a row of actions, tick by tick.
+    """Measurements of a sequence of actions, tick by tick.
 
     Attributes:
         q: measured joint positions, rad.
-        force: on the hand from outside, N (base frame).
+        force: external force on the hand, N (base frame).
     """
 
     q: Float[np.ndarray, "t 7"]
@@ -82,11 +85,11 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def replay_both(seed: int, number: int = 0) -> Iterator[dict[str, Any]]:
-    """How far the arms part in a wave and in a press, on a twin of their own.
+    """Yield the distance of the arms in a wave and in a press, on a twin of their own.
 
-    Joints in rad and the tool in m, the greatest distance at any tick; force in N, the median while the
-    table is pressed in the environment, `here` and `there` (over the wire). Twins of different numbers
-    run side by side.
+    `joints` (rad) and `tool` (m): greatest distance at any tick. `force here`, `force there`: median force
+    (N) while the table is pressed, in the environment and over the wire. Twins of different numbers run
+    side by side.
     """
     env = _environment()
     with (
@@ -109,7 +112,7 @@ def _environment() -> PickPlace:
         jitter=(0.0, 0.0),
         estimated_wrench=False,
     )
-    # Fingertips as the twin's, which are drawn by the same seed: so arm and object begin alike.
+    # fingertips as the twin's, drawn by the same seed, so that arm and object begin alike
     config = PickPlaceConfig(objects=(_OBJECT,), cameras=(), as_deployed=True, deployment=between)
     env = PickPlace(config)
     env.robot = _able_to_press(env.robot)
@@ -123,7 +126,7 @@ def _able_to_press(robot: RobotLimits) -> RobotLimits:
 
 
 def _wave(env: PickPlace, seed: int) -> Iterator[np.ndarray]:
-    """Joint changes that come and go, each joint at its own rate."""
+    """Yield joint changes that swing, each joint at its own rate."""
     rng = np.random.default_rng(seed)
     rate, phase = rng.uniform(0.3, 1.0, env.n_joints), rng.uniform(0, 2 * np.pi, env.n_joints)
     for t in np.arange(0, _WAVE_SECONDS, 1 / _HZ):
@@ -132,7 +135,7 @@ def _wave(env: PickPlace, seed: int) -> Iterator[np.ndarray]:
 
 
 def _press(env: PickPlace, _: int) -> Iterator[np.ndarray]:
-    """Straight down onto the table, from just above it, with a closed hand."""
+    """Yield a slow descent onto the table with a closed hand."""
     q = env.command.copy()
     position, R = env.kinematics.forward(q)
     corners = (

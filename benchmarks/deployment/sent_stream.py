@@ -1,4 +1,4 @@
-"""Does what is sent to the arm stay inside the workspace box and every limit, whatever a policy says?"""
+"""Commands to the arm against the workspace box and every limit, under wild policies."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -18,26 +18,28 @@ from touchgoal.sim_envs.cell.deployed_arm import all_well
 
 @checked_dataclass
 class Config(BenchmarkOptions):
-    """Does what is sent to the arm stay inside the box and every limit, whatever a policy says?"""
+    """Options of benchmark sent-stream."""
 
     seconds: Positive = 3600.0
-    """Simulated seconds of motion, over both arms, 20, 50 and 125 Hz; an hour takes about 8 minutes."""
+    """Simulated seconds of motion over both arms at 20, 50 and 125 Hz; an hour takes about 8
+    minutes."""
     seed: Seed = 0
-    """Random seed of what the policy wants."""
+    """Random seed of the policy's wishes."""
 
 
 Joints = Float[np.ndarray, " n"]
 Path = Float[np.ndarray, "t n"]
 
 _DT = 1e-3  # s
-_LATE = 0.3  # share of the commands that come late, by up to a tick
-_PUSH_SECONDS = 1.25  # for which a wild policy pushes one way
+_LATE = 0.3  # share of the commands that are late, by up to a tick
+_PUSH_SECONDS = 1.25  # s for which a wild policy pushes one way
 _ROUNDING = 1e-12  # rad
-_PIECE = 10.0  # s of motion that are looked at together
+_PIECE = 10.0  # s of motion that are judged together
 
 
 def wild_commands(layer: ActionFilter, ticks: int, rng: np.random.Generator) -> list[Joints]:
-    """What the safety layer makes of a policy that pushes anywhere, often with all its might; rad."""
+    """Return the filtered joint targets (rad) of a policy that pushes anywhere, often at full
+    force."""
     n = layer.joints.lower.size
     state, push, commands = layer.start(layer.limits.arm.home), np.zeros(n), []
     for tick in range(ticks):
@@ -49,14 +51,14 @@ def wild_commands(layer: ActionFilter, ticks: int, rng: np.random.Generator) -> 
 
 
 def late_by(ticks: int, period: int, rng: np.random.Generator) -> Int[np.ndarray, " t"]:
-    """By how many ms each command comes late: most by nothing, some by up to a period (ms)."""
+    """Return the lateness of each command (ms): mostly none, sometimes up to a period."""
     return rng.integers(0, period, ticks) * (rng.random(ticks) < _LATE)
 
 
 def send(
     robot: RobotLimits, hz: int, commands: Sequence[Joints], late: Sequence[int]
 ) -> Iterator[Joints]:
-    """The 1 kHz set-points (rad) that the tracker makes of commands, each late by so many ms."""
+    """Return the tracker's 1 kHz set-points (rad) for commands with these delays."""
     tracker, period = Tracker(robot.interface, robot.policy.velocity, 1 / hz, _DT), 1000 // hz
     state = tracker.start(robot.arm.home)
     for command, delay in zip(commands, late, strict=True):
@@ -68,7 +70,7 @@ def send(
 
 
 def outside_box(layer: ActionFilter, q: Path) -> float:
-    """By how much (m) flange or fingers are outside their boxes at the worst; negative inside."""
+    """Return how far (m) flange or fingers leave their boxes at worst; negative inside."""
     points, limits = layer.monitored_points(q), layer.limits
     beyond = [
         np.maximum(box.lower - p, p - box.upper).max()
@@ -78,7 +80,7 @@ def outside_box(layer: ActionFilter, q: Path) -> float:
 
 
 def shares_of_limits(limits: JointLimits, q: Path) -> tuple[float, float, float]:
-    """Greatest speed, acceleration and jerk of a 1 kHz path over what the limits allow."""
+    """Return the greatest speed, acceleration and jerk of a 1 kHz path over the limits."""
     allowed = (limits.velocity, limits.acceleration, limits.jerk)
     most = (np.abs(np.diff(q, k, axis=0)) / _DT**k for k in (1, 2, 3))
     speed, acceleration, jerk = (float((m / a).max()) for m, a in zip(most, allowed, strict=True))
@@ -86,7 +88,7 @@ def shares_of_limits(limits: JointLimits, q: Path) -> tuple[float, float, float]
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Push both arms about at three rates, with commands in time and late."""
+    """Push both arms at three rates, with commands in time and late."""
     cases = [
         (robot, hz, late) for robot in (FR3, UR5E) for hz in (20, 50, 125) for late in (False, True)
     ]

@@ -1,4 +1,4 @@
-"""How hard do demonstrations of a task press, and which ceilings follow for its deployments?"""
+"""Force and indentation of demonstrations, and the ceilings that follow for deployments."""
 
 from collections.abc import Mapping
 from dataclasses import field
@@ -24,20 +24,21 @@ from touchgoal.runtime.progress import track
 
 @checked_dataclass
 class Config(BenchmarkOptions):
-    """How hard do demonstrations press, and which force and touch ceilings follow?"""
+    """Options of benchmark task-ceilings."""
 
     data: Path = field(kw_only=True)
-    """Folder of episodes, of the expert or of a person who leads the arm; with fingertips' pictures for
-    the ceiling of touch."""
+    """Folder of episodes of the expert or of a teleoperator; with tactile images for the ceiling
+    of touch."""
 
 
 def peak_force(episode: Episode) -> float:
-    """Greatest force on the hand, N."""
+    """Return the largest force on the hand, N."""
     return float(np.linalg.norm(episode.frames[ft.WRENCH][:, :3], axis=1).max())
 
 
 def peak_indentation(episode: Episode, sensor: str) -> float:
-    """Deepest point of either gel, m, read as a deployment reads it; 0 without fingertips' pictures."""
+    """Return the deepest indentation of either gel, m, read as in a deployment; 0 without
+    tactile images."""
     peaks = [0.0]
     for key in set(ft.TACTILE) & set(episode.frames):
         pictures = episode.frames[key]

@@ -1,4 +1,4 @@
-"""Whatever turns pictures of a real fingertip into embeddings, for `real_touch`: ours, or others'."""
+"""Embedders of real tactile images: our encoders, published ones, and baselines."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +19,7 @@ from touchgoal.encoders.towers.towers import imagenet_pixels
 from touchgoal.runtime.errors import UserError, install_extra
 
 CONTRAST = 4
-"""By which a change of colour is drawn, about grey, for networks that know pictures alone."""
+"""Factor on the colour change, drawn about grey for networks of plain images."""
 
 Frames = UInt8[np.ndarray, "n h w 3"]
 Embeddings = Float32[np.ndarray, "_ d"]
@@ -28,17 +28,17 @@ Untouched = UInt8[np.ndarray, "h w 3"]
 
 @runtime_checkable  # beartype checks arguments in tests
 class Embedder(Protocol):
-    """Frames of one sensor to embeddings."""
+    """Maps one sensor's frames to embeddings."""
 
     def __call__(
         self, frames: Frames, background: Untouched, rows: Int[np.ndarray, " k"] | None = None
     ) -> Embeddings:
-        """Embeddings of some rows, or of all.
+        """Return the embeddings of some rows, or of all.
 
         Args:
-            frames: One after the other, as they were recorded: an encoder may look back.
-            background: The same sensor untouched.
-            rows: Which to embed; all when None.
+            frames: consecutive frames; an encoder may look back.
+            background: untouched frame of the same sensor.
+            rows: rows to embed; default: all.
         """
         ...
 
@@ -47,16 +47,16 @@ _PIXELS = 20, 15  # width and height
 
 
 def find_embedder(name: str, seed: int) -> Embedder:
-    """An encoder by its name.
+    """Find an embedder by name.
 
     Args:
-        name: a shipped touch encoder or the folder of one, or a published Sparsh encoder (a file or an
-            id of Hugging Face); `random:` and such a name for the same network untrained; `pixels` for 20 x 15 pixels of change; `efficientnet` for the ImageNet
-            network of the offline towers; otherwise a vision model of Hugging Face, by id or folder.
-        seed: of untrained weights.
+        name: a shipped touch encoder, a folder, or a published Sparsh file or id; `random:NAME` for the
+            same network untrained; `pixels` for 20 x 15 pixels of change; `efficientnet` for the offline
+            towers' ImageNet network; or the id or folder of a Hugging Face vision model.
+        seed: seed of random weights.
 
     Raises:
-        UserError: none of these.
+        UserError: there is no such embedder.
     """
     if name == "pixels":
         return _one_by_one(_embed_pixels)
@@ -73,7 +73,7 @@ def find_embedder(name: str, seed: int) -> Embedder:
 
 
 def untrained(name: str, seed: int) -> BaseTouchEncoder:
-    """The network of a touch encoder, by name or folder, with random weights."""
+    """Return a touch encoder's network with random weights."""
     encoder = load_encoder(name)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -82,7 +82,7 @@ def untrained(name: str, seed: int) -> BaseTouchEncoder:
 
 
 def vit_of(encoder: BaseTouchEncoder) -> ViT:
-    """The ViT of a touch encoder, whose tokens probes read; UserError if it has none."""
+    """Return the ViT of a touch encoder; UserError if it has none."""
     if isinstance(encoder, TouchEncoder):
         return encoder.backbone
     if isinstance(encoder, TouchBackbone):
@@ -93,13 +93,13 @@ def vit_of(encoder: BaseTouchEncoder) -> ViT:
 
 
 def difference_pictures(frames: Frames, background: Untouched) -> Frames:
-    """The change against the untouched sensor as a picture about grey."""
+    """Return the change against the untouched image as an image about grey."""
     change = frames.astype(np.float32) - background
     return np.clip(128 + CONTRAST * change, 0, 255).astype(np.uint8)
 
 
 def _one_by_one(embed_all: Callable[[Frames, Untouched], Embeddings]) -> Embedder:
-    """Of what sees single frames."""
+    """Return an embedder from a function of single frames."""
 
     def embed(
         frames: Frames, background: Untouched, rows: Int[np.ndarray, " k"] | None = None
@@ -124,7 +124,8 @@ def _of_pictures(network: Callable[[Frames], torch.Tensor]) -> Embedder:
 
 
 def _hugging_face(name: str) -> Embedder:
-    """The pooled output of any vision model; of an image-text model, its image tower."""
+    """Return the pooled output of a Hugging Face vision model, or of an image-text model's image
+    tower."""
     try:
         from transformers import AutoImageProcessor, AutoModel
     except ImportError as error:

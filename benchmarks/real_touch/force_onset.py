@@ -1,4 +1,5 @@
-"""Whether the tactile cost of real grasps falls when force begins, and tells the wrong thing."""
+"""Tactile cost of real grasps: when it falls after first force, and whether it separates
+objects."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -16,13 +17,13 @@ _NEAR = 3  # frames
 
 @dataclass(frozen=True, eq=False)
 class EmbeddedGrasp:
-    """One grasp as an encoder sees it.
+    """One grasp with one encoder's embeddings.
 
     Attributes:
-        trial, object: its name, and what is grasped.
-        embeddings: of its frames.
+        trial, object: names of the trial and the object.
+        embeddings: embedding of each frame.
         firmest: frame of the largest force.
-        begins: frame from which on the load cell shows 0.5 N; None if the hand was not open before.
+        begins: first frame with 0.5 N on the load cell; None if the hand was not open before.
     """
 
     trial: str
@@ -33,19 +34,19 @@ class EmbeddedGrasp:
 
     @property
     def goal(self) -> Float[np.ndarray, " d"]:
-        """What is felt at the largest force."""
+        """Embedding at the largest force."""
         return self.embeddings[self.firmest]
 
 
 def cost(
     embeddings: Float[np.ndarray, "*n d"], goal: Float[np.ndarray, " d"]
 ) -> Float[np.ndarray, "*n"]:
-    """Share of the goal's touch that is missing: 1 untouched, 0 at the goal."""
+    """Return the cost to a goal: 1 untouched, 0 at the goal."""
     return 1 - embeddings @ goal / max(float(goal @ goal), 1e-12)
 
 
 def judge_cost(grasps: list[EmbeddedGrasp]) -> dict[str, Any]:
-    """When the cost to another grasp of the same thing falls, and how it compares with other things'."""
+    """Judge costs to another grasp of the same object and to other objects' grasps."""
     delays = [
         delay
         for grasp in grasps
@@ -69,7 +70,7 @@ def judge_cost(grasps: list[EmbeddedGrasp]) -> dict[str, Any]:
 
 
 def cost_table(result: dict[str, Any], encoder: str) -> str:
-    """As people read it."""
+    """Return the result as printed text."""
     names = list(result["auc_of_pairs"])
     low, high = result["auc_interval"]
     delays = result["delays"]
@@ -91,7 +92,7 @@ def cost_table(result: dict[str, Any], encoder: str) -> str:
 
 
 def _delay(grasp: EmbeddedGrasp, goal: np.ndarray) -> int | None:
-    """Frames from 0.5 N to where the cost falls, to stay below for a while; None if it never does."""
+    """Return frames from 0.5 N to a lasting fall of the cost; None if it never falls."""
     assert grasp.begins is not None
     costs = cost(grasp.embeddings, goal)
     open_hand = costs[: min(_UNTOUCHED, max(grasp.begins, 1))]
@@ -107,7 +108,7 @@ def _first_lasting(down: Bool[np.ndarray, " n"]) -> int | None:
 
 
 def _aucs(costs: np.ndarray, things: np.ndarray) -> dict[str, dict[str, float]]:
-    """Of every goal's thing and every other: how often the other's grasp costs more than its own."""
+    """Return, for each pair of objects, how often the other object's grasp has the higher cost."""
     table: dict[str, dict[str, float]] = {}
     for goal in np.unique(things):
         own = costs[np.ix_(things == goal, things == goal)]

@@ -36,11 +36,11 @@ class Config(BenchmarkOptions):
 
 
 RANGE = 25.0
-"""N, up to which forces are judged."""
+"""Largest force that is judged, N."""
 _PRESSED = 0.5  # N
 _FIRST = 5  # frames
 _STEADY = 0.2  # N
-_IMPOSSIBLE = 60.0  # N: a spike of the load cell, beyond what the hand can do
+_IMPOSSIBLE = 60.0  # N, a spike of the load cell: the hand cannot do that
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -58,7 +58,7 @@ def judge_grasps(grasps: list[ForceGrasp], embedders: dict[str, Embedder]) -> di
     for grasp in track(grasps, "reading", "grasp"):
         frames = grasp.frames()
         force = grasp.force[: len(frames)]
-        # A steady load cell is an open hand with its offset; else the hand is closing already.
+        # With a steady load cell the hand is open and shows its offset; otherwise it is closing already.
         open_hand = float(np.ptp(force[:_FIRST])) < _STEADY
         if open_hand:
             force = force - np.median(force[:_FIRST])

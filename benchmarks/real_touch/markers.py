@@ -32,7 +32,7 @@ class Config(BenchmarkOptions):
 
 
 NEAR = 1.0
-"""px within which both trackers agree."""
+"""Distance within which both trackers agree, px."""
 
 
 def run(config: Config) -> dict[str, Any]:

@@ -1,8 +1,8 @@
-"""How close simulated presses come to real ones that the fit has not seen.
+"""Simulated against held-out real presses of a ball on two sensors.
 
-Real presses of a ball on two sensors (the taxim wheel). Each split fits a sensor file to some and
-predicts the others, beside the background alone and beside Taxim's table, which was made from all
-of them. Everything about the model was chosen on the fitted presses of the first split.
+Each split fits a sensor file to some presses (of the taxim wheel) and predicts the others, beside the
+background alone and Taxim's table, which was made from all of them. Model choices were made on the
+fitted presses of the first split.
 """
 
 from collections.abc import Iterator
@@ -33,26 +33,26 @@ from touchgoal.runtime.progress import track
 
 @checked_dataclass
 class Config(BenchmarkOptions):
-    """How close do simulated presses come to real ones that the fit has not seen?"""
+    """Options of benchmark tactile-realism."""
 
     splits: Count = 5
-    """Ways to part the presses into fitted and held-out ones; the median over them is printed."""
+    """Splits into fitted and held-out presses; the median is printed."""
     sensors: tuple[Literal["gelsight", "gelsight_mini"], ...] = ("gelsight", "gelsight_mini")
-    """Sensors whose presses are taken."""
+    """Sensors."""
     save_presses: Path | None = None
-    """Also write the real presses into this folder, as `touchgoal calibrate` reads them."""
+    """Also write the real presses into this folder, in the layout of `touchgoal calibrate`."""
 
 
 N_TEST_PRESSES = {"gelsight": 12, "gelsight_mini": 6}
 MAIN_METHOD = "ours, circles corrected"
-# L1 (counts, at most) and PSNR (dB, at least) around the contact that the project set itself.
+# L1 (counts, at most) and PSNR (dB, at least) around the contact: the project's targets
 TARGETS = {"gelsight": (3.9, 33.2), "gelsight_mini": (3.6, 30.5)}
-# Where red, green and blue stand by two sources. GelSight: an earlier fit to the same presses.
-# Mini: mean of the normal networks of gs_sdk and gsrobotics, fitted to other units. Their normals
-# point to the other side: turned by 180 degrees here. Shadows fall away from these directions.
+# Azimuths of red, green and blue by two sources. GelSight: an earlier fit to the same presses.
+# Mini: mean of the normal networks of gs_sdk and gsrobotics, fitted to other sensors. Their normals
+# have the opposite sign, hence 180 degrees here. Shadows fall away from these directions.
 OTHER_AZIMUTHS = {"gelsight": (0.0, -116.0, 126.0), "gelsight_mini": (-99.0, 8.5, 84.0)}
-# Ball radius (m) and contact share with which Taxim does best on the fitted presses, of 1 to 4 mm
-# and both shares: for circles as labelled, and as registered.
+# Ball radius (m) and contact share at which Taxim does best on the fitted presses, of 1 to 4 mm and
+# both shares: for circles as labelled, and as registered.
 _TAXIM_LABELLED = {"gelsight": (2e-3, 0.4), "gelsight_mini": (3e-3, 0.0)}
 _TAXIM_MOVED = {"gelsight": (2e-3, 0.4), "gelsight_mini": (1e-3, 0.4)}
 _LEGEND = """corrected: labels put through the line that the fitted presses show between label and contact,
@@ -64,7 +64,7 @@ Colours = Float32[np.ndarray, "h w 3"]
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Fit, predict, compare."""
+    """Fit, predict and compare."""
     cv2.setNumThreads(1)
     rows: list[dict[str, Any]] = []
     lights: dict[str, tuple[float, ...]] = {}
@@ -103,7 +103,7 @@ def _methods(
     test: PressSet,
     taxim: TaximRenderer | None,
 ) -> Iterator[tuple[str, list[Colours]]]:
-    """Each way to predict the held-out pictures, by name."""
+    """Return each method's predictions of the held-out images, by name."""
     background = fitted.calibration.background.astype(np.float32)
     moved, balls = fitted.fit_circles(test), fitted.ball_radii(test)
     yield "background alone", [test.background.astype(np.float32)] * len(test)
@@ -117,14 +117,14 @@ def _methods(
         return
     labelled = [taxim.render(c, *_TAXIM_LABELLED[sensor]) for c in test.circles]
     yield "taxim table", labelled
-    # What the table adds to its own untouched picture, on the background that ours has.
+    # the table's change of its own untouched image, on our background
     yield "taxim table, on our background", [p - taxim.untouched + background for p in labelled]
     better = [taxim.render(c, *_TAXIM_MOVED[sensor]) for c in moved]
     yield "the same, circles moved", [p - taxim.untouched + background for p in better]
 
 
 def _examples(test: PressSet, simulated: list[Colours]) -> list[tuple[Colours, Colours]]:
-    """The first presses, cut out around the contact: measured and simulated."""
+    """Return the first presses, cut out around the contact, measured and simulated."""
     height, width = _CUT
     cuts = []
     for image, picture, circle in zip(test.images, simulated, test.circles, strict=True):

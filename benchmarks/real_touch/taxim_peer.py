@@ -1,7 +1,7 @@
-"""The taxim wheel: real GelSight presses with circles drawn by hand, and a table-based simulator.
+"""The taxim wheel: real GelSight presses with hand-drawn circles, and a table-based simulator.
 
-taxim 1.4.1 (MIT) is Tim Schneider's port of Taxim (Si and Yuan 2022); its tables were made from the
-very presses that ship with it.
+taxim 1.4.1 (MIT) is Tim Schneider's port of Taxim (Si and Yuan 2022). Its tables were made from the
+presses that ship with it.
 """
 
 import importlib.util
@@ -19,14 +19,14 @@ from touchgoal.runtime.errors import UserError, install_extra
 PIXEL_PITCH = 0.059e-3
 """m per pixel of the presses here: half of the wheel's 640x480 at 0.0295 mm (its params.json)."""
 
-_BALLS = {"gelsight": 2.0e-3, "gelsight_mini": np.nan}  # m; the Mini's is not recorded
+_BALLS = {"gelsight": 2.0e-3, "gelsight_mini": np.nan}  # m; the Mini's radius is not recorded
 _DOWNSAMPLING = 2  # taxim's pixels to one of ours
 _FULL_SHAPE = 480, 640
 _UNTOUCHED_HEIGHT = 5.0  # mm above the gel
 
 
 def real_presses(sensor: str) -> PressSet:
-    """The wheel's presses of `gelsight` (48) or `gelsight_mini` (24), at 320x240.
+    """Return the wheel's presses of `gelsight` (48) or `gelsight_mini` (24), at 320x240.
 
     Raises:
         UserError: the wheel is not installed.
@@ -36,7 +36,7 @@ def real_presses(sensor: str) -> PressSet:
         raise UserError(f"the real presses ship with a peer: {install_extra('peers')}")
     pack = np.load(Path(spec.origin).parent / "calib" / sensor / "dataPack.npz", allow_pickle=True)
     images = np.stack([_downsample(image) for image in pack["imgs"]])
-    # The centre of pixel 0 is 0 at both sizes; two pixels 0 and 1 become one.
+    # the centre of pixel 0 is 0 at both sizes; pixels 0 and 1 become one
     centres = (pack["touch_center"].astype(float) + 0.5) / _DOWNSAMPLING - 0.5
     circles = np.column_stack([centres, pack["touch_radius"] / _DOWNSAMPLING])
     files = tuple(f"press_{i:02d}.png" for i in range(len(images)))
@@ -45,21 +45,20 @@ def real_presses(sensor: str) -> PressSet:
 
 
 def has_taxim() -> bool:
-    """Whether the wheel is installed."""
+    """Return whether the wheel is installed."""
     return importlib.util.find_spec("taxim") is not None
 
 
 def has_jax() -> bool:
-    """Whether taxim can draw: the wheel's other back end needs torchvision."""
+    """Return whether taxim can render: its other back end needs torchvision."""
     return importlib.util.find_spec("jax") is not None
 
 
 class TaximRenderer:
-    """Taxim's pictures of a ball, RGB counts at 320x240, with shadows.
+    """Taxim's images of a ball, RGB counts at 320x240, with shadows.
 
     Attributes:
-        untouched: its picture of the gel without contact, off the real one by 4 (GelSight) to 18
-            counts (Mini).
+        untouched: its untouched image, off the real one by 4 (GelSight) to 18 counts (Mini).
     """
 
     def __init__(self, sensor: str) -> None:
@@ -74,12 +73,12 @@ class TaximRenderer:
     def render(
         self, circle: Circle, ball_radius: float, contact_share: float
     ) -> Float32[np.ndarray, "h w 3"]:
-        """Picture of one press.
+        """Render one press.
 
         Args:
-            circle: in which ball and gel touch, px.
+            circle: circle of contact, px.
             ball_radius: m.
-            contact_share: of the deepest overlap that counts as touching. 0: the circle is where the ball
+            contact_share: share of the deepest overlap that counts as contact. 0: the circle where the ball
                 cuts the flat gel; 0.4: where taxim's own gel model clings to it.
         """
         return self._picture(_ball_height(circle, ball_radius, contact_share))
@@ -94,7 +93,7 @@ class TaximRenderer:
 def _ball_height(
     circle: Circle, ball_radius: float, contact_share: float
 ) -> Float32[np.ndarray, "h w"]:
-    """Height (mm) of a ball over taxim's flat gel, negative where pressed in."""
+    """Return the height (mm) of a ball over taxim's flat gel, negative where pressed in."""
     x, y = (circle[:2] + 0.5) * _DOWNSAMPLING - 0.5
     contact = min(circle[2] * PIXEL_PITCH, 0.98 * ball_radius)
     rows, columns = np.indices(_FULL_SHAPE)
@@ -105,7 +104,7 @@ def _ball_height(
 
 
 def _downsample(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Half the size; the wheel stores BGR."""
+    """Halve the size; the wheel stores BGR."""
     size = image.shape[1] // _DOWNSAMPLING, image.shape[0] // _DOWNSAMPLING
     rgb = np.ascontiguousarray(image[..., ::-1])
     return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
