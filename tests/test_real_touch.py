@@ -265,7 +265,7 @@ def test_things_grasped_once_have_forces_and_no_cost(tmp_path: Path) -> None:
         (tmp_path / f"grasp_{thing}.csv").write_text(text)
     (tmp_path / "grasps.csv").write_text("\n".join(table))
     result = forces.run(forces.Config(data=tmp_path, encoders=("pixels",)))
-    assert result["cost"] == {} and result["things"] == 3
+    assert result["cost"] == {} and result["objects"] == 3
 
 
 def test_videos_of_other_things_tell_what_differs_without_meaning() -> None:

@@ -118,14 +118,14 @@ def _cell(scene: Scene, arm: str, folder: Path, number: int) -> Iterator[Path]:
         task = replace(
             cell.task,
             seed=scene.seed,
-            objects=() if maze else (scene.thing,),
-            wires=(scene.thing,) if maze else (),
+            objects=() if maze else (scene.item,),
+            wires=(scene.item,) if maze else (),
         )
         path = folder / "cell.json"
         path.write_text(json.dumps(cell_table(replace(cell, task=task))))
         yield path
         return
-    with DeployedTwin(scene.task, scene.seed, scene.thing, arm == "lock-step", folder, number) as t:
+    with DeployedTwin(scene.task, scene.seed, scene.item, arm == "lock-step", folder, number) as t:
         yield t.cell_file
 
 
@@ -133,7 +133,7 @@ def _in_environment(scene: Scene, policy: str) -> Deployment:
     task = scene.config()
     maker = choose_policy(policy, task)
     trial = run_trial(env_config_for(maker, task), maker, EpisodeSpec(scene.seed))
-    kind = (scene.task, policy, "environment", scene.seed, scene.thing)
+    kind = (scene.task, policy, "environment", scene.seed, scene.item)
     ending = trial.failure or "done"
     return Deployment(
         *kind, trial.success, trial.progress, ending, "", trial.seconds, trial.peak_force, {}, 0.0
@@ -157,6 +157,6 @@ def _lines(rows: list[Deployment]) -> list[str]:
             at = "" if row.progress is None else f", progress {row.progress:.2f}"
             phase = f", {row.phase}" if row.phase else ""
             lines.append(
-                f"    {row.seed} {row.thing}: {row.ending} at {row.seconds:.1f} s{phase}{at}"
+                f"    {row.seed} {row.item}: {row.ending} at {row.seconds:.1f} s{phase}{at}"
             )
     return lines

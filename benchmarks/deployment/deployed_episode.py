@@ -21,13 +21,13 @@ class Scene:
 
     task: TaskName
     seed: int
-    thing: str  # object or wire
+    item: str  # object or wire
 
     def config(self) -> TaskConfig:
         """Return the environment's options."""
         if self.task == "bead-maze":
-            return BeadMazeConfig(wires=(self.thing,))
-        return PickPlaceConfig(objects=(self.thing,))
+            return BeadMazeConfig(wires=(self.item,))
+        return PickPlaceConfig(objects=(self.item,))
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Deployment:
     policy: str
     arm: str
     seed: int
-    thing: str
+    item: str
     success: bool
     progress: float | None
     ending: str
@@ -78,24 +78,24 @@ def deploy(cell: Path, scene: Scene, policy: str, arm: str, out: Path) -> Deploy
         timeout=_TIMEOUT,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
-    kind = (scene.task, policy, arm, scene.seed, scene.thing)
+    kind = (scene.task, policy, arm, scene.seed, scene.item)
     report = out / "metrics.json"
     if not report.exists():  # refused, or crashed
         ending = f"refused: {' '.join(done.stderr.split())[-300:]}"
         return Deployment(*kind, False, None, ending, "", 0.0, 0.0, {}, 0.0)
-    said = json.loads(report.read_text())
-    ticks = max(1, said["ticks"])
+    metrics = json.loads(report.read_text())
+    ticks = max(1, metrics["ticks"])
     return Deployment(
         *kind,
-        bool(said["success"]),
-        said["progress"],
-        said["reason"],
-        _phase(out / "episodes", said["held_width"] is not None),
-        said["ticks"] / ft.CONTROL_HZ,
-        said["force_max_newtons"],
-        {name: count / ticks for name, count in said["clamped"].items()},
-        said["late_p99_ms"],
-        said["arm_pace"],
+        bool(metrics["success"]),
+        metrics["progress"],
+        metrics["reason"],
+        _phase(out / "episodes", metrics["held_width"] is not None),
+        metrics["ticks"] / ft.CONTROL_HZ,
+        metrics["force_max_newtons"],
+        {name: count / ticks for name, count in metrics["clamped"].items()},
+        metrics["late_p99_ms"],
+        metrics["arm_pace"],
     )
 
 

@@ -24,7 +24,7 @@ class DeployedTwin:
         self,
         task: TaskName,
         seed: int,
-        thing: str,
+        item: str,
         lock_step: bool,
         folder: Path,
         number: int,
@@ -37,7 +37,7 @@ class DeployedTwin:
         pid = os.getpid()
         host = f"127.{100 + number % 100}.{pid // 250 % 250}.{1 + pid % 250}"
         kind = "--env.wires" if task == "bead-maze" else "--env.objects"
-        command = [sys.executable, "-m", "touchgoal.launch", "twin", "--task", task, kind, thing]
+        command = [sys.executable, "-m", "touchgoal.launch", "twin", "--task", task, kind, item]
         command += ["--seed", str(seed), "--host", host, "--port", "0", "--out", str(folder)]
         self._log = (folder / "twin.log").open("w")
         self._process = subprocess.Popen(

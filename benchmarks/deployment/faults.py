@@ -108,7 +108,7 @@ class FaultRow:
     """What one fault did.
 
     Attributes:
-        message: what the operator is told.
+        message: message to the operator.
         rest: s (simulated) from the fault until the arm is at rest; not a number if the fault stops
             no arm, or takes the controller, and so the twin, away.
         excess: rad beyond the maker's joint range; speed: share of the maker's joint speed.
@@ -265,7 +265,7 @@ def _deploy(
 
 
 class BrokenPolicy(Actor):
-    """A policy that moves well for a second and then breaks as it is told."""
+    """A policy that moves well for a second and then breaks."""
 
     def __init__(self, how: str, loop: ControlLoop, mark_broken: Callable[[], None]) -> None:
         self._how, self._loop, self._mark_broken, self._ticks = how, loop, mark_broken, 0
@@ -295,10 +295,10 @@ class HangingPlanner:
     def __init__(self, width: float, mark_broken: Callable[[], None]) -> None:
         self._width, self._mark_broken, self._plans = width, mark_broken, 0
 
-    def embed(self, seen: Sequence[Observation]) -> None:
+    def embed(self, observations: Sequence[Observation]) -> None:
         """Nothing is embedded ahead."""
 
-    def plan(self, seen: Sequence[Observation]) -> np.ndarray:
+    def plan(self, observations: Sequence[Observation]) -> np.ndarray:
         """Three plans, then none."""
         self._plans += 1
         if self._plans > 3:
@@ -338,7 +338,7 @@ def _line(row: FaultRow) -> str:
 
 def _table(rows: list[FaultRow]) -> str:
     head = (
-        f"{'fault':<25}{'rest s':>7}{'beyond':>9}{'speed':>7}{'force N':>8}{'late ms':>8}  {'kept':<7}"
+        f"{'fault':<25}{'rest s':>7}{'beyond':>9}{'speed':>7}{'force N':>8}{'late ms':>8}  {'whole':<7}"
         "what the operator sees"
     )
     return "\n".join([head, *(_line(row) for row in rows)])

@@ -187,7 +187,7 @@ def collect_goals(
 def is_goal(meta: Mapping[str, MetaValue], sensor: str) -> bool:
     """Return whether an episode succeeded; UserError if another sensor recorded it."""
     if meta["sensor"] != sensor:
-        raise UserError(f"a goal was felt with {meta['sensor']}, the encoder is for {sensor}")
+        raise UserError(f"a goal was recorded with {meta['sensor']}, the encoder is for {sensor}")
     return bool(meta["success"])
 
 
@@ -227,7 +227,9 @@ def judge_claims(
     peaks_saved = [a - b for a, b in zip(peaks["image"], peaks["image+tactile"], strict=True)]
     frames_earlier = {f: _frames_earlier(own, f) for f in ("t_drop_50", "t_drop_25", "t_drop_10")}
     falls = [_fall_after_contact(t.words) for t in successes]
-    kept = [t.other.raw["tactile"][-1] / np.median(t.other.raw["tactile"][:5]) for t in untouched]
+    remaining = [
+        t.other.raw["tactile"][-1] / np.median(t.other.raw["tactile"][:5]) for t in untouched
+    ]
     fell = SuccessRate(sum(f > 0 for f in falls), len(falls))
     return [
         Claim(
@@ -255,8 +257,8 @@ def judge_claims(
         ),
         Claim(
             "an episode that never touches keeps 3/4 of its tactile cost",
-            "holds" if min(kept) >= 0.75 else "fails",
-            f"least {min(kept):.2f}, mean {np.mean(kept):.2f} of where it began",
+            "holds" if min(remaining) >= 0.75 else "fails",
+            f"least {min(remaining):.2f}, mean {np.mean(remaining):.2f} of where it began",
         ),
     ]
 

@@ -55,9 +55,9 @@ def judge_cost(grasps: list[EmbeddedGrasp]) -> dict[str, Any]:
         if (delay := _delay(grasp, other.goal)) is not None
     ]
     firm = np.stack([grasp.goal for grasp in grasps])
-    things = np.array([grasp.object for grasp in grasps])
+    objects = np.array([grasp.object for grasp in grasps])
     costs = np.stack([cost(firm, goal) for goal in firm], 1)
-    pairs = _aucs(costs, things)
+    pairs = _aucs(costs, objects)
     by_goal = {name: float(np.mean(list(row.values()))) for name, row in pairs.items()}
     values, names = np.array(list(by_goal.values())), np.array(list(by_goal))
     return {
@@ -81,7 +81,7 @@ def cost_table(result: dict[str, Any], encoder: str) -> str:
             f"load cell, within {_NEAR} frames in {100 * result['near']:.0f} % of {len(delays)} pairs of grasps"
         )
     lines += [
-        f"tells the wrong thing: area under ROC {result['auc']:.2f} ({low:.2f}-{high:.2f}); by goal (row) and thing:",
+        f"separates other objects: area under ROC {result['auc']:.2f} ({low:.2f}-{high:.2f}); by goal (row) and object:",
         " " * 27 + "".join(f"{name[:11]:>13}" for name in names),
     ]
     for name in names:
@@ -107,17 +107,17 @@ def _first_lasting(down: Bool[np.ndarray, " n"]) -> int | None:
     return int(lasting.argmax()) if lasting.any() else None
 
 
-def _aucs(costs: np.ndarray, things: np.ndarray) -> dict[str, dict[str, float]]:
+def _aucs(costs: np.ndarray, objects: np.ndarray) -> dict[str, dict[str, float]]:
     """Return, for each pair of objects, how often the other object's grasp has the higher cost."""
     table: dict[str, dict[str, float]] = {}
-    for goal in np.unique(things):
-        own = costs[np.ix_(things == goal, things == goal)]
+    for goal in np.unique(objects):
+        own = costs[np.ix_(objects == goal, objects == goal)]
         own = own[~np.eye(len(own), dtype=bool)]
         table[str(goal)] = {
-            str(thing): float(
-                (own[:, None] < costs[np.ix_(things == thing, things == goal)].ravel()).mean()
+            str(other): float(
+                (own[:, None] < costs[np.ix_(objects == other, objects == goal)].ravel()).mean()
             )
-            for thing in np.unique(things)
-            if thing != goal and len(own)
+            for other in np.unique(objects)
+            if other != goal and len(own)
         }
     return {name: row for name, row in table.items() if row}

@@ -53,7 +53,7 @@ def run(config: Config) -> dict[str, Any]:
 
 def judge_grasps(grasps: list[ForceGrasp], embedders: dict[str, Embedder]) -> dict[str, Any]:
     """Return force errors on held-out objects, contact delays and each encoder's cost curves."""
-    rows, forces, things, contact = [], [], [], []
+    rows, forces, objects, contact = [], [], [], []
     embedded: dict[str, list[EmbeddedGrasp]] = {name: [] for name in embedders}
     for grasp in track(grasps, "reading", "grasp"):
         frames = grasp.frames()
@@ -67,39 +67,48 @@ def judge_grasps(grasps: list[ForceGrasp], embedders: dict[str, Embedder]) -> di
         small = [resized(frame).astype(np.uint8) for frame in frames]
         rows.append(np.stack([change_statistics(frame, background) for frame in small]))
         forces.append(force)
-        things.append(np.full(len(force), grasp.object))
+        objects.append(np.full(len(force), grasp.object))
         detector = ContactDetector(Background(np.stack(small[:1])))
-        felt = np.array([detector.update(frame) for frame in small])
+        touched = np.array([detector.update(frame) for frame in small])
         begins = int((force > _PRESSED).argmax()) if (force > _PRESSED).any() else None
-        if open_hand and felt.any() and begins is not None:
-            contact.append(int(felt.argmax()) - begins)
+        if open_hand and touched.any() and begins is not None:
+            contact.append(int(touched.argmax()) - begins)
         firmest = int(np.where(force < _IMPOSSIBLE, force, 0).argmax())
         for name, embed in embedders.items():
-            seen = embed(frames, untouched).astype(np.float64)
+            embeddings = embed(frames, untouched).astype(np.float64)
             start = begins if open_hand else None
-            embedded[name].append(EmbeddedGrasp(grasp.trial, grasp.object, seen, firmest, start))
-    every, force, thing = np.concatenate(rows), np.concatenate(forces), np.concatenate(things)
+            embedded[name].append(
+                EmbeddedGrasp(grasp.trial, grasp.object, embeddings, firmest, start)
+            )
+    every, force, frame_objects = (
+        np.concatenate(rows),
+        np.concatenate(forces),
+        np.concatenate(objects),
+    )
     judged = (force <= RANGE) & (force > -1)
     error = np.full(len(force), np.nan)
-    for name in np.unique(thing):
-        known = judged & (thing != name)
+    for name in np.unique(frame_objects):
+        known = judged & (frame_objects != name)
         reader = calibrate_force(every[known], force[known])
-        own = thing == name
+        own = frame_objects == name
         error[own] = np.abs(reader.predict(every[own]) - force[own])
     pressed = judged & (force > _PRESSED)
     return {
         "grasps": len(grasps),
-        "things": len(np.unique(thing)),
+        "objects": len(np.unique(frame_objects)),
         "median_error": float(np.median(error[pressed])),
         "median_error_interval": interval(
-            error[pressed], thing[pressed], lambda v: float(np.median(v))
+            error[pressed], frame_objects[pressed], lambda v: float(np.median(v))
         ),
-        "by_thing": {
-            str(n): float(np.median(error[pressed & (thing == n)])) for n in np.unique(thing)
+        "by_object": {
+            str(n): float(np.median(error[pressed & (frame_objects == n)]))
+            for n in np.unique(frame_objects)
         },
         "contact_delay": contact,
         # An object grasped once has no other grasp to compare with.
-        "cost": {n: judge_cost(seen) for n, seen in embedded.items()} if _again(grasps) else {},
+        "cost": {n: judge_cost(embeddings) for n, embeddings in embedded.items()}
+        if _again(grasps)
+        else {},
     }
 
 
@@ -111,12 +120,12 @@ def force_table(result: dict[str, Any]) -> str:
     """Return the result as printed text."""
     low, high = result["median_error_interval"]
     delay = result["contact_delay"]
-    things = ", ".join(f"{name} {error:.1f}" for name, error in result["by_thing"].items())
+    objects = ", ".join(f"{name} {error:.1f}" for name, error in result["by_object"].items())
     lines = [
-        f"{result['grasps']} grasps of {result['things']} objects; each is read with the others' calibration:",
+        f"{result['grasps']} grasps of {result['objects']} objects; each is read with the others' calibration:",
         f"force of {_PRESSED:g} to {RANGE:g} N off by {result['median_error']:.2f} N (median; 95 % over "
         f"objects {low:.2f}-{high:.2f}), {100 * result['median_error'] / RANGE:.0f} % of the range",
-        f"by object, N: {things}",
+        f"by object, N: {objects}",
     ]
     if delay:
         lines.append(

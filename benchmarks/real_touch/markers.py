@@ -94,13 +94,13 @@ def _follow(
     rows = []
     for picture in others:
         now = tracker.update(picture.frame())
-        seen = picture.seen & first.seen
+        found = picture.seen & first.seen
         theirs = picture.positions - first.positions
         off = np.linalg.norm(tracker.displacement - theirs, axis=-1)
         ours = (now.positions - middle).reshape(-1, 2)
         apart = np.linalg.norm(ours[:, None] - picture.positions.reshape(-1, 2), axis=-1)
-        other = (apart.argmin(1) != np.arange(len(ours))).reshape(seen.shape)
-        rows.append([x[seen] for x in (np.linalg.norm(theirs, axis=-1), off, other, ~now.found)])
+        other = (apart.argmin(1) != np.arange(len(ours))).reshape(found.shape)
+        rows.append([x[found] for x in (np.linalg.norm(theirs, axis=-1), off, other, ~now.found)])
     moved, off, exchanged, lost = (np.concatenate(column) for column in zip(*rows, strict=True))
     return moved, off, exchanged, lost
 

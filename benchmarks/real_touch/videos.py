@@ -109,9 +109,7 @@ def run(config: Config) -> dict[str, Any]:
         for name, embed in embedders.items():
             embedded[name].append(embed_touch(touches[-1], frames, embed))
     embed_texts = load_towers("offline").embed_texts
-    rows = [
-        {"encoder": name, **judge(touches, seen, embed_texts)} for name, seen in embedded.items()
-    ]
+    rows = [{"encoder": name, **judge(touches, own, embed_texts)} for name, own in embedded.items()]
     return {"table": "\n".join([_table(rows), "", _contact_line(touches)]), "rows": rows}
 
 
@@ -192,10 +190,10 @@ def light_shift(touches: list[VideoTouch], embedded: list[VideoEmbedding]) -> di
     The lightest touch is the 5 % quantile: a few clips are touched from their first frame on.
     """
     moved, touched = [], []
-    for touch, seen in zip(touches, embedded, strict=True):
-        moved.append(np.linalg.norm(seen.brighter - seen.rest))
+    for touch, own in zip(touches, embedded, strict=True):
+        moved.append(np.linalg.norm(own.brighter - own.rest))
         if touch.peak > touch.threshold and touch.video.ranks is not None:
-            touched.append(np.linalg.norm(seen.touch - seen.rest))
+            touched.append(np.linalg.norm(own.touch - own.rest))
     light, lightest, usual = np.median(moved), np.quantile(touched, 0.05), np.median(touched)
     return {"light": float(light), "lightest": float(lightest), "usual": float(usual)}
 

@@ -142,23 +142,23 @@ def _measure(name: str, encoder: BaseTouchEncoder, precision: str, config: Confi
     batch = stream.anew().expand(config.batch_size, *[-1] * (stream.anew().ndim - 1)).contiguous()
     batched: list[Callable[[], object]] = [lambda: encoder.embed_touch(batch)]
     ticks: list[Callable[[], object]] = [
-        lambda: encoder.embed_touch(stream.kept()),
+        lambda: encoder.embed_touch(stream.cached()),
         lambda: encoder.embed_touch(stream.anew()),
     ]
     if plain is not None:
         batched += [partial(_plainly, plain, lambda: batch, fused) for fused in (True, False)]
         ticks += [partial(_plainly, plain, stream.anew, fused) for fused in (True, False)]
     ours, *peer = in_turn(batched, config.repeats)
-    kept, anew, *peers_tick = in_turn(ticks, config.repeats * config.ticks)
+    cached, anew, *peers_tick = in_turn(ticks, config.repeats * config.ticks)
     return EncoderSpeed(
         encoder=name,
         parameters=sum(p.numel() for p in encoder.parameters()) / 1e6,
         precision=precision,
         batched=config.batch_size / ours,
         batched_ratio=min(peer) / ours if peer else None,
-        tick=1e3 * kept,
+        tick=1e3 * cached,
         tick_anew=1e3 * anew,
-        tick_ratio=min(peers_tick) / kept if peers_tick else None,
+        tick_ratio=min(peers_tick) / cached if peers_tick else None,
     )
 
 
@@ -204,12 +204,12 @@ class _Stream:
         self._encoder, self._dtype, self._newest = encoder, dtype, 0
         self._recent = RecentFrames(encoder.preprocess, encoder.offsets)
 
-    def kept(self) -> torch.Tensor:
+    def cached(self) -> torch.Tensor:
         """Return the next frame's input with cached preprocessing."""
         self._newest += 1
         back = max(self._encoder.offsets)
-        seen = [self._frames[(self._newest - k) % _STREAM] for k in range(back, -1, -1)]
-        return self._stacked(self._recent.latest(seen, self._frames[0]))
+        frames = [self._frames[(self._newest - k) % _STREAM] for k in range(back, -1, -1)]
+        return self._stacked(self._recent.latest(frames, self._frames[0]))
 
     def anew(self) -> torch.Tensor:
         """Return the next frame's input with everything preprocessed."""
@@ -227,7 +227,7 @@ class _Stream:
 def _table(rows: list[EncoderSpeed], config: Config) -> str:
     lines = [
         f"one core, processor time, medians; in batches of {config.batch_size}, and one raw frame at a time with the earlier ones'",
-        "preprocessing kept (in brackets: anew); ratio: plain torch's time for the same over ours",
+        "preprocessing cached (in brackets: anew); ratio: plain torch's time for the same over ours",
         f"{'encoder':<30}{'M par.':>8}{'':>6}{'frames/s':>10}{'ratio':>7}{'ms a frame':>20}{'ratio':>7}",
     ]
     lines += [

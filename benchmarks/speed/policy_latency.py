@@ -99,19 +99,19 @@ def _stages(config: Config) -> list[Stage]:
         pictures = [
             difference_images(ticks[1][k][None], ticks[0][k], end_to_end.size) for k in ft.TACTILE
         ]
-        seen = torch.from_numpy(np.stack(pictures, 1))
+        images = torch.from_numpy(np.stack(pictures, 1))
         look = policy.end_to_end_encoder
-        stages.append(_time("end-to-end encoder", config.repeats, lambda: look(seen)))
+        stages.append(_time("end-to-end encoder", config.repeats, lambda: look(images)))
     condition = torch.zeros(1, policy.condition_dim)
     generator = torch.Generator().manual_seed(0)
     stages.append(
         _time("denoising", config.repeats, lambda: policy.head.sample(condition, generator))
     )
-    turn, seen = iter(range(10**9)), planner.ticks_seen
+    turn, horizon = iter(range(10**9)), planner.ticks_seen
 
     def tick() -> None:
         i = next(turn)
-        planner.plan([ticks[(i + k) % 8] for k in range(seen)])  # one tick is new, as on the arm
+        planner.plan([ticks[(i + k) % 8] for k in range(horizon)])  # one tick is new, as on the arm
 
     stages.append(_time("a whole plan, observation to actions", config.repeats, tick))
     return stages
@@ -136,12 +136,12 @@ def _published(config: Config) -> list[Stage]:
 
 def _observations(config: PolicyConfig, camera: tuple[int, int]) -> list[dict[str, np.ndarray]]:
     rng = np.random.default_rng(0)
-    seen = [key for key in config.proprioception if key not in config.estimated]
+    keys = [key for key in config.proprioception if key not in config.estimated]
     pictures = dict.fromkeys(ft.CAMERAS, (*camera, 3)) | {
         key: ft.FEATURES[key].shape for key in ft.TACTILE
     }
     return [
-        {key: rng.normal(size=ft.FEATURES[key].shape).astype(np.float32) for key in seen}
+        {key: rng.normal(size=ft.FEATURES[key].shape).astype(np.float32) for key in keys}
         | {key: rng.integers(90, 110, shape, np.uint8) for key, shape in pictures.items()}
         for _ in range(8)
     ]

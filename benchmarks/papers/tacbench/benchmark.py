@@ -168,17 +168,17 @@ def _share(
     files: Path,
 ) -> list[tuple[Subject, RigFrames]]:
     """Write each encoder's frames and tokens into files for the workers."""
-    seen: dict[str, tuple[Path, RigFrames]] = {}
+    shared_frames: dict[str, tuple[Path, RigFrames]] = {}
     shared = []
     for i, (name, encoder) in enumerate(encoders.items()):
         key = encoder.preprocess.id
-        if key not in seen:
+        if key not in shared_frames:
             frames = reading(encoder.preprocess)
             if "field" in tasks:
                 frames = with_fields(frames, bench.config.rig, bench.config.workers)
-            seen[key] = files / f"frames_{i}.pt", frames
-            torch.save(frames, seen[key][0])
-        path, frames = seen[key]
+            shared_frames[key] = files / f"frames_{i}.pt", frames
+            torch.save(frames, shared_frames[key][0])
+        path, frames = shared_frames[key]
         tokens = None
         if not name.startswith(END_TO_END):
             tokens = files / f"tokens_{i}.pt"
@@ -194,10 +194,10 @@ def _judge(bench: Bench, job: Job, frames: RigFrames, answers: Answers) -> None:
     facts = {"task": job.task, "encoder": name, "share": job.share, "samples": answers.samples}
     facts["seconds"] = round(answers.seconds, 1)
     for test, rows in task.split.tests.items():
-        said = [torch.from_numpy(outputs) for outputs in answers.said[test]]
+        predicted = [torch.from_numpy(outputs) for outputs in answers.predicted[test]]
         about = facts | {"test": test, "test_samples": len(rows)}
-        bench.rows.append(about | task.judge(said, validation, rows))
-        bench.reads.append(Read(job.task, task, frames, name, job.share, test, rows, said[0]))
+        bench.rows.append(about | task.judge(predicted, validation, rows))
+        bench.reads.append(Read(job.task, task, frames, name, job.share, test, rows, predicted[0]))
 
 
 def _references(name: str, task: Task) -> list[dict[str, Any]]:

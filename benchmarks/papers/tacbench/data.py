@@ -64,7 +64,7 @@ class RigFrames:
     moments: int = 0
     use: Int[np.ndarray, " n"] | None = None
 
-    def seen(self, rows: Rows, offsets: tuple[int, ...]) -> Float[Tensor, "k t 3 h w"]:
+    def stacked(self, rows: Rows, offsets: tuple[int, ...]) -> Float[Tensor, "k t 3 h w"]:
         """Return frames and those before each; a stroke's first frames repeat its first.
 
         For grasps, whose moments are seconds apart, `STRIDE` frames are one moment.

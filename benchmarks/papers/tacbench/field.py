@@ -69,28 +69,28 @@ class FieldTask:
         return float(wrong.square().mean().sqrt())
 
     def judge(
-        self, said: list[Outputs], validation: list[ValidationOutputs], rows: Rows
+        self, predicted: list[Outputs], validation: list[ValidationOutputs], rows: Rows
     ) -> Metrics:
         """See `field_metrics`."""
         truth = self._field[rows].numpy()
-        read = np.stack([self.read(outputs).numpy() for outputs in said])
+        read = np.stack([self.read(outputs).numpy() for outputs in predicted])
         return field_metrics(read, truth, self._stroke[rows.numpy()])
 
     def references(self, rows: Rows) -> dict[str, Metrics]:
         """Return the metrics of a zero field and of the training mean."""
-        truth, things = self._field[rows].numpy(), self._stroke[rows.numpy()]
+        truth, objects = self._field[rows].numpy(), self._stroke[rows.numpy()]
         mean = self._field[self.split.train].mean(0).numpy()
         guesses = {"(no force anywhere)": 0 * mean, "(mean field of training)": mean}
         return {
-            name: field_metrics(np.broadcast_to(guess, (1, *truth.shape)), truth, things)
+            name: field_metrics(np.broadcast_to(guess, (1, *truth.shape)), truth, objects)
             for name, guess in guesses.items()
         }
 
 
 def field_metrics(
-    said: Float[np.ndarray, "seeds n 3 h w"],
+    predicted: Float[np.ndarray, "seeds n 3 h w"],
     truth: Float[np.ndarray, "n 3 h w"],
-    things: np.ndarray,
+    objects: np.ndarray,
 ) -> Metrics:
     """Return explained shares of shear and pressure in touched cells, and errors in kPa.
 
@@ -99,7 +99,7 @@ def field_metrics(
     touched = truth[:, 2] > _PRESSED
     sums = []
     for part in (slice(0, 2), slice(2, 3)):
-        wrong = ((said[:, :, part] - truth[:, part]) ** 2).sum(2).mean(0)
+        wrong = ((predicted[:, :, part] - truth[:, part]) ** 2).sum(2).mean(0)
         size = (truth[:, part] ** 2).sum(1)
         sums += [(wrong * touched).sum((1, 2)), (size * touched).sum((1, 2))]
     table = np.stack([*sums, touched.sum((1, 2))], 1).astype(float)
@@ -112,7 +112,7 @@ def field_metrics(
     for k, name in ((0, "shear"), (2, "pressure")):
         metrics[f"{name}_explained"] = explained(table, k)
         metrics[f"{name}_explained_interval"] = list(
-            interval(table, things, lambda values, k=k: explained(values, k))
+            interval(table, objects, lambda values, k=k: explained(values, k))
         )
         metrics[f"{name}_rmse_kpa"] = float(np.sqrt(table[:, k].sum() / count))
     return metrics

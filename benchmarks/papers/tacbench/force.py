@@ -53,25 +53,25 @@ class ForceTask:
         return float((self.read(outputs) - self._frames.force[rows]).square().mean().sqrt())
 
     def judge(
-        self, said: list[Outputs], validation: list[ValidationOutputs], rows: Rows
+        self, predicted: list[Outputs], validation: list[ValidationOutputs], rows: Rows
     ) -> Metrics:
         """See `force_metrics`."""
         truth = self._frames.force[rows]
-        errors = np.stack([(self.read(o) - truth).double().numpy() for o in said])
+        errors = np.stack([(self.read(o) - truth).double().numpy() for o in predicted])
         return force_metrics(errors, self._frames.stroke[rows.numpy()])
 
     def references(self, rows: Rows) -> dict[str, Metrics]:
         """Return the metrics of the training mean."""
-        force, things = self._frames.force, self._frames.stroke[rows.numpy()]
+        force, objects = self._frames.force, self._frames.stroke[rows.numpy()]
         errors = force[self.split.train].mean(0) - force[rows]
-        return {"(mean force of training)": force_metrics(errors.double().numpy()[None], things)}
+        return {"(mean force of training)": force_metrics(errors.double().numpy()[None], objects)}
 
 
 def _squash(outputs: Outputs) -> Outputs:
     return torch.cat([outputs[:, :2].tanh(), outputs[:, 2:].sigmoid()], 1)
 
 
-def force_metrics(errors: Float[np.ndarray, "seeds n 3"], things: np.ndarray) -> Metrics:
+def force_metrics(errors: Float[np.ndarray, "seeds n 3"], objects: np.ndarray) -> Metrics:
     """Return root mean square and mean absolute errors (mN), by axis and over all, with
     intervals."""
     squares, sizes = 1e6 * (errors**2).mean(0), 1e3 * np.abs(errors).mean(0)
@@ -81,9 +81,9 @@ def force_metrics(errors: Float[np.ndarray, "seeds n 3"], things: np.ndarray) ->
 
     return {
         "rmse_mn": root(squares),
-        "rmse_mn_interval": list(interval(squares, things, root)),
+        "rmse_mn_interval": list(interval(squares, objects, root)),
         "mae_mn": float(sizes.mean()),
-        "mae_mn_interval": list(interval(sizes, things)),
+        "mae_mn_interval": list(interval(sizes, objects)),
         "rmse_mn_by_axis": np.sqrt(squares.mean(0)).tolist(),
         "mae_mn_by_axis": sizes.mean(0).tolist(),
     }

@@ -63,10 +63,10 @@ class LabelTask:
         return float((self.read(outputs) != self.truth(rows)).mean()) + 0.01 * loss
 
     def judge(
-        self, said: list[Outputs], validation: list[ValidationOutputs], rows: Rows
+        self, predicted: list[Outputs], validation: list[ValidationOutputs], rows: Rows
     ) -> Metrics:
         """See `label_metrics`."""
-        read = np.stack([self.read(outputs) for outputs in said])
+        read = np.stack([self.read(outputs) for outputs in predicted])
         return label_metrics(read, self.truth(rows), self._stroke[rows.numpy()])
 
     def references(self, rows: Rows) -> dict[str, Metrics]:
@@ -77,13 +77,13 @@ class LabelTask:
 
 
 def label_metrics(
-    said: Int[np.ndarray, "seeds n"], truth: Int[np.ndarray, " n"], things: np.ndarray
+    predicted: Int[np.ndarray, "seeds n"], truth: Int[np.ndarray, " n"], objects: np.ndarray
 ) -> Metrics:
     """Return accuracy, mean over seeds, with its interval, and the mean accuracy of the labels."""
-    right = (said == truth).mean(0)
+    right = (predicted == truth).mean(0)
     return {
         "accuracy": float(right.mean()),
-        "accuracy_interval": list(interval(right, things)),
+        "accuracy_interval": list(interval(right, objects)),
         "balanced_accuracy": float(np.mean([right[truth == k].mean() for k in np.unique(truth)])),
     }
 

@@ -65,18 +65,18 @@ class PoseTask:
         return float((self.read(outputs) != self.classes[rows]).float().mean())
 
     def judge(
-        self, said: list[Outputs], validation: list[ValidationOutputs], rows: Rows
+        self, predicted: list[Outputs], validation: list[ValidationOutputs], rows: Rows
     ) -> Metrics:
         """See `pose_metrics`."""
-        read = np.stack([self.read(outputs).numpy() for outputs in said])
+        read = np.stack([self.read(outputs).numpy() for outputs in predicted])
         return pose_metrics(read, self.classes[rows].numpy(), self._frames.stroke[rows.numpy()])
 
     def references(self, rows: Rows) -> dict[str, Metrics]:
         """Return the metrics of the most frequent training classes."""
         truth = self.classes[rows].numpy()
         common = np.broadcast_to([int(n.argmax()) for n in self._known], truth.shape)
-        things = self._frames.stroke[rows.numpy()]
-        return {"(commonest classes)": pose_metrics(common[None], truth, things)}
+        objects = self._frames.stroke[rows.numpy()]
+        return {"(commonest classes)": pose_metrics(common[None], truth, objects)}
 
 
 def _classes(change: Float[Tensor, " n"], bins: tuple[float, ...]) -> Int[Tensor, " n"]:
@@ -86,13 +86,13 @@ def _classes(change: Float[Tensor, " n"], bins: tuple[float, ...]) -> Int[Tensor
 
 
 def pose_metrics(
-    said: Int[np.ndarray, "seeds n 3"], truth: Int[np.ndarray, "n 3"], things: np.ndarray
+    predicted: Int[np.ndarray, "seeds n 3"], truth: Int[np.ndarray, "n 3"], objects: np.ndarray
 ) -> Metrics:
     """Return accuracy (mean over axes) with its interval, by axis, and within one class."""
-    right = (said == truth).mean(0)
+    right = (predicted == truth).mean(0)
     return {
         "accuracy": float(right.mean()),
-        "accuracy_interval": list(interval(right, things)),
+        "accuracy_interval": list(interval(right, objects)),
         "accuracy_by_axis": right.mean(0).tolist(),
-        "within_one_class": float((np.abs(said - truth) <= 1).mean()),
+        "within_one_class": float((np.abs(predicted - truth) <= 1).mean()),
     }

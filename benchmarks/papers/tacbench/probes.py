@@ -74,11 +74,11 @@ class PairTokens(nn.Module):
         rows, columns = (-(-side // patch) for side in encoder.preprocess.size)
         self.grid = rows, columns
 
-    def forward(self, seen: Float[Tensor, "b n 3 h w"]) -> Float[Tensor, "b t f"]:
+    def forward(self, frames: Float[Tensor, "b n 3 h w"]) -> Float[Tensor, "b t f"]:
         """Return the tokens of frames at `offsets`."""
         if self.looks_back:
-            return self.vit(self._stack(seen))
-        tokens = self.vit(seen.flatten(0, 1)).unflatten(0, (len(seen), 2))
+            return self.vit(self._stack(frames))
+        tokens = self.vit(frames.flatten(0, 1)).unflatten(0, (len(frames), 2))
         return tokens.transpose(1, 2).flatten(2)
 
 
@@ -107,8 +107,8 @@ def frozen_tokens(encoder: BaseTouchEncoder, frames: RigFrames) -> Float16[Tenso
     tokens = PairTokens(encoder).eval()
     every = _batches(torch.arange(len(frames.before)))
     if tokens.looks_back:
-        seen = (frames.seen(rows, tokens.offsets) for rows in every)
-        return torch.cat([tokens(batch).half() for batch in seen])
+        batches = (frames.stacked(rows, tokens.offsets) for rows in every)
+        return torch.cat([tokens(batch).half() for batch in batches])
     return torch.cat([tokens.vit(frames.touch[rows].float()).half() for rows in every])
 
 

@@ -64,24 +64,26 @@ class SlipTask:
         return self._frames.slip[rows].numpy()
 
     def judge(
-        self, said: list[Outputs], validation: list[ValidationOutputs], rows: Rows
+        self, predicted: list[Outputs], validation: list[ValidationOutputs], rows: Rows
     ) -> Metrics:
         """Return F1 at validation thresholds, and the mean absolute error of the force change,
         mN."""
         cuts = [self.threshold(outputs, self.split.validation) for outputs in validation]
-        slips = np.stack([o[:, 0].numpy() > t for o, t in zip(said, cuts, strict=True)])
-        errors = [(o[:, 1:] * self._scale - self._change[rows]).abs().mean() for o in said]
+        slips = np.stack([o[:, 0].numpy() > t for o, t in zip(predicted, cuts, strict=True)])
+        errors = [(o[:, 1:] * self._scale - self._change[rows]).abs().mean() for o in predicted]
         metrics = slip_metrics(slips, self.truth(rows), self._frames.stroke[rows.numpy()])
         return metrics | {"change_mae_mn": 1e3 * float(np.mean(errors)), "thresholds": cuts}
 
     def references(self, rows: Rows) -> dict[str, Metrics]:
         """Return the metrics of "always slips" and of the true forces with the nominal friction
         cone."""
-        truth, things = self.truth(rows), self._frames.stroke[rows.numpy()]
+        truth, objects = self.truth(rows), self._frames.stroke[rows.numpy()]
         force = self._frames.force[rows].double().numpy()
         cone = np.hypot(force[:, 0], force[:, 1]) >= FRICTION * force[:, 2]
-        said = {"(always slips)": np.ones_like(truth), "(true forces, nominal cone)": cone}
-        return {name: slip_metrics(slips[None], truth, things) for name, slips in said.items()}
+        predicted = {"(always slips)": np.ones_like(truth), "(true forces, nominal cone)": cone}
+        return {
+            name: slip_metrics(slips[None], truth, objects) for name, slips in predicted.items()
+        }
 
 
 def _cuts(outputs: Outputs) -> list[float]:
@@ -89,19 +91,19 @@ def _cuts(outputs: Outputs) -> list[float]:
     return torch.quantile(outputs[:, 0], torch.linspace(0, 1, _THRESHOLDS)[:-1]).tolist()
 
 
-def f1_score(said: Bool[np.ndarray, " n"], truth: Bool[np.ndarray, " n"]) -> float:
+def f1_score(predicted: Bool[np.ndarray, " n"], truth: Bool[np.ndarray, " n"]) -> float:
     """Return the F1 score of the class true; 0 where no prediction is right."""
-    right = float((said & truth).sum())
-    return 2 * right / max(float(said.sum() + truth.sum()), 1.0)
+    right = float((predicted & truth).sum())
+    return 2 * right / max(float(predicted.sum() + truth.sum()), 1.0)
 
 
 def slip_metrics(
-    said: Bool[np.ndarray, "seeds n"], truth: Bool[np.ndarray, " n"], things: np.ndarray
+    predicted: Bool[np.ndarray, "seeds n"], truth: Bool[np.ndarray, " n"], objects: np.ndarray
 ) -> Metrics:
     """Return the F1 of slip, mean over seeds, with its interval."""
-    together = np.vstack([truth, said]).T
+    together = np.vstack([truth, predicted]).T
 
     def f1(values: np.ndarray) -> float:
         return float(np.mean([f1_score(column, values[:, 0]) for column in values.T[1:]]))
 
-    return {"f1": f1(together), "f1_interval": list(interval(together, things, f1))}
+    return {"f1": f1(together), "f1_interval": list(interval(together, objects, f1))}

@@ -77,7 +77,7 @@ class Answers:
         seconds: time of each training.
     """
 
-    said: dict[str, _Answered]
+    predicted: dict[str, _Answered]
     validation: _Answered
     samples: int
     seconds: float
@@ -92,7 +92,7 @@ def work(job: Job) -> Answers:
     encoder = _encoder(job.subject.name, job.subject.sensor, config.seed)
     inputs_of = _inputs_of(job.subject, encoder, frames)
     count = max(round(job.share * len(task.split.train)), _LEAST_SAMPLES)
-    said: dict[str, _Answered] = {test: [] for test in task.split.tests}
+    predicted: dict[str, _Answered] = {test: [] for test in task.split.tests}
     validation: _Answered = []
     for seed in range(config.seed, config.seed + config.seeds):
         reader = _reader(job.subject, encoder, task, seed)
@@ -102,8 +102,8 @@ def work(job: Job) -> Answers:
             train_reader(reader, task, inputs_of, train, training, scratch, log)
         validation.append(read(reader, inputs_of, task.split.validation).numpy())
         for test, rows in task.split.tests.items():
-            said[test].append(read(reader, inputs_of, rows).numpy())
-    return Answers(said, validation, count, (time.monotonic() - began) / config.seeds)
+            predicted[test].append(read(reader, inputs_of, rows).numpy())
+    return Answers(predicted, validation, count, (time.monotonic() - began) / config.seeds)
 
 
 @lru_cache(maxsize=2)
@@ -122,7 +122,7 @@ def _inputs_of(
     """Return the map from rows to a probe's input."""
     pairs = PairTokens(encoder)
     if subject.tokens is None:
-        return partial(frames.seen, offsets=pairs.offsets)
+        return partial(frames.stacked, offsets=pairs.offsets)
     return inputs_of_tokens(pairs, torch.load(subject.tokens, mmap=True), frames)
 
 

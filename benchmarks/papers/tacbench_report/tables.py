@@ -157,8 +157,8 @@ def _summary(rows: list[Row], config: Config) -> list[str]:
             cells = [_gain(rows, task, test, share) for share in config.shares]
             if any(cells):
                 paper = BEST_AGAINST_END_TO_END.get(task)
-                said = "" if paper is None else f"{paper:8.0f}"
-                lines.append(f"{f'  {task}, {test}':<66}{''.join(f'{c:>14}' for c in cells)}{said}")
+                cell = "" if paper is None else f"{paper:8.0f}"
+                lines.append(f"{f'  {task}, {test}':<66}{''.join(f'{c:>14}' for c in cells)}{cell}")
     return lines if len(lines) > 1 else []
 
 

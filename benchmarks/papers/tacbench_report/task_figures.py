@@ -38,8 +38,8 @@ class Read:
 def draw_force(axes: np.ndarray, one: Read) -> None:
     """Draw the friction cone coloured by error (Figures 7 and 8), and predicted against true."""
     assert isinstance(one.task, ForceTask)
-    truth, said = one.frames.force[one.rows].numpy(), one.task.read(one.outputs).numpy()
-    error = 1e3 * np.abs(said - truth)
+    truth, predicted = one.frames.force[one.rows].numpy(), one.task.read(one.outputs).numpy()
+    error = 1e3 * np.abs(predicted - truth)
     worst = 1e3 * _WORST * truth[:, 2].max()
     for k, axis in enumerate(axes[:3]):
         most = truth[:, 2].max()
@@ -51,10 +51,10 @@ def draw_force(axes: np.ndarray, one: Read) -> None:
         axis.figure.colorbar(points, ax=axis, label="error (mN)")
         axis.set(xlabel="shear x (N)", ylabel="normal force (N)")
         axis.set_title(f"{one.encoder}: error in {_AXES[k]}", fontsize=9)
-    ends = [min(truth.min(), said.min()), max(truth.max(), said.max())]
+    ends = [min(truth.min(), predicted.min()), max(truth.max(), predicted.max())]
     axes[3].plot(ends, ends, color="0.6", linewidth=1)
     for k in range(3):
-        axes[3].scatter(truth[:, k], said[:, k], s=4, alpha=0.4, label=_AXES[k])
+        axes[3].scatter(truth[:, k], predicted[:, k], s=4, alpha=0.4, label=_AXES[k])
     axes[3].legend(fontsize=8, markerscale=3)
     axes[3].set(xlabel="true force (N)", ylabel="predicted (N)")
 
@@ -85,23 +85,23 @@ def draw_slip(axes: np.ndarray, one: Read) -> None:
 def draw_pose(axes: np.ndarray, one: Read) -> None:
     """Draw confusion matrices (Figure 13) and a test slide over time (Figure 14)."""
     assert isinstance(one.task, PoseTask)
-    truth, said = one.task.classes[one.rows].numpy(), one.task.read(one.outputs).numpy()
+    truth, predicted = one.task.classes[one.rows].numpy(), one.task.read(one.outputs).numpy()
     names = ("x", "y", "turn")
     for k, axis in enumerate(axes[:3]):
         units, bins = ("mm", SHIFT_BINS) if k < 2 else ("degrees", TURN_BINS)
         bounds = [*(-b for b in reversed(bins)), *bins]
-        _draw_confusion(axis, truth[:, k], said[:, k], CLASSES)
+        _draw_confusion(axis, truth[:, k], predicted[:, k], CLASSES)
         axis.set_xticks(np.arange(CLASSES - 1) + 0.5, [f"{b:g}" for b in bounds], rotation=90)
         axis.set_yticks(np.arange(CLASSES - 1) + 0.5, [f"{b:g}" for b in bounds])
         axis.set(xlabel=f"predicted ({units})", ylabel=f"true ({units})")
-        right = (truth[:, k] == said[:, k]).mean()
+        right = (truth[:, k] == predicted[:, k]).mean()
         axis.set_title(f"{one.encoder}: {names[k]}, {right:.2f} right", fontsize=9)
     stroke = one.frames.stroke[one.rows.numpy()]
     own = stroke == stroke[0]
     frames = np.arange(own.sum())
     shade = ScalarMappable(Normalize(0, CLASSES - 1), "inferno")
     for k, name in enumerate(names):
-        off = np.abs(truth[own, k] - said[own, k])
+        off = np.abs(truth[own, k] - predicted[own, k])
         axes[3].step(frames, truth[own, k] + 12 * k, color="0.7", linewidth=1, where="mid")
         axes[3].scatter(frames, truth[own, k] + 12 * k, c=shade.to_rgba(off), s=10)
         axes[3].text(0, 12 * k + 10.2, name, fontsize=8)
@@ -113,19 +113,19 @@ def draw_pose(axes: np.ndarray, one: Read) -> None:
 def draw_labels(axes: np.ndarray, one: Read) -> None:
     """Draw the confusion matrix (Figure 15) and, with few labels, where errors lie."""
     assert isinstance(one.task, LabelTask)
-    truth, said, names = one.task.truth(one.rows), one.task.read(one.outputs), one.task.names
-    _draw_confusion(axes[0], truth, said, len(names), numbers=len(names) < 5)
+    truth, predicted, names = one.task.truth(one.rows), one.task.read(one.outputs), one.task.names
+    _draw_confusion(axes[0], truth, predicted, len(names), numbers=len(names) < 5)
     for ticks in (axes[0].set_xticks, axes[0].set_yticks):
         ticks(range(len(names)), names, fontsize=8)
     axes[0].tick_params(axis="x", rotation=90 if len(names) > 4 else 0)
     axes[0].set(xlabel="predicted", ylabel="true")
-    axes[0].set_title(f"{one.encoder}: {(truth == said).mean():.2f} right", fontsize=9)
+    axes[0].set_title(f"{one.encoder}: {(truth == predicted).mean():.2f} right", fontsize=9)
     if len(axes) > 1:
         force = one.frames.force[one.rows].numpy()
         shear, normal = np.hypot(force[:, 0], force[:, 1]), force[:, 2]
         for k, name in enumerate(names):
             for right, marker in ((True, "o"), (False, "x")):
-                own = (truth == k) & ((said == truth) == right)
+                own = (truth == k) & ((predicted == truth) == right)
                 label = f"{name}, {'right' if right else 'wrong'}"
                 axes[1].scatter(
                     normal[own], shear[own], s=18, marker=marker, color=f"C{k}", label=label
@@ -138,7 +138,7 @@ def draw_field(axes: np.ndarray, one: Read) -> None:
     """Draw the true field above and the predicted one below (Figure 9): pressure as colour,
     shear as arrows."""
     assert isinstance(one.task, FieldTask)
-    truth, said = one.task.truth(one.rows).numpy(), one.task.read(one.outputs).numpy()
+    truth, predicted = one.task.truth(one.rows).numpy(), one.task.read(one.outputs).numpy()
     stroke = one.frames.stroke[one.rows.numpy()]
     shear = np.hypot(truth[:, 0], truth[:, 1]).sum((1, 2))
     ends = [np.flatnonzero(stroke == s)[shear[stroke == s].argmax()] for s in np.unique(stroke)]
@@ -148,7 +148,7 @@ def draw_field(axes: np.ndarray, one: Read) -> None:
         _draw_arrows(axis, truth[i], truth[i], size)
         axis.set_title(f"true, stroke {stroke[i]}", fontsize=9)
     for axis, i in zip(axes[1], chosen, strict=False):
-        _draw_arrows(axis, said[i], truth[i], size)
+        _draw_arrows(axis, predicted[i], truth[i], size)
         axis.set_title(one.encoder, fontsize=9)
     for axis in axes[:, len(chosen) :].flat:
         axis.axis("off")
@@ -173,10 +173,10 @@ def _draw_arrows(axis: Axes, field: np.ndarray, like: np.ndarray, picture: tuple
 
 
 def _draw_confusion(
-    axis: Axes, truth: np.ndarray, said: np.ndarray, classes: int, numbers: bool = False
+    axis: Axes, truth: np.ndarray, predicted: np.ndarray, classes: int, numbers: bool = False
 ) -> None:
     counts = np.zeros((classes, classes))
-    np.add.at(counts, (truth, said), 1)
+    np.add.at(counts, (truth, predicted), 1)
     shares = counts / np.maximum(counts.sum(1, keepdims=True), 1)
     image = axis.imshow(shares, vmin=0, vmax=1, cmap="Blues")
     axis.figure.colorbar(image, ax=axis, shrink=0.8)
