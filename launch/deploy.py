@@ -3,16 +3,26 @@
 A dry run unless --execute is given: everything is read, checked and planned, nothing is commanded.
 
 Exit status: 0 the task is done, or nobody can tell, or a dry run; 1 something is missing or wrong, and
-nothing moved, or the episode could not be kept; 3 the task is not done, or time was up; 4 the arm was
+nothing moved, or the episode could not be saved; 3 the task is not done, or time was up; 4 the arm was
 stopped, by a fault or the operator.
 """
 
+import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Seed, checked_dataclass
+
+if TYPE_CHECKING:
+    from touchgoal.control.cell.config import CellConfig
+    from touchgoal.control.cell.connection import CellConnection
+    from touchgoal.control.deployment.actors import CellPolicy
+    from touchgoal.control.deployment.session import Result
+
+NOT_DONE, STOPPED = 3, 4  # exit status
 
 
 @checked_dataclass
@@ -22,8 +32,8 @@ class Config:
     cell: Annotated[Path, tyro.conf.Positional]
     """Cell file: your own (.toml), the cell.json of a twin, or a shipped example by name, such as sim."""
     policy: str = ""
-    """Who acts, in place of the cell file's: expert, follower, shipped, a folder that train-policy
-    made, or a class of your own as module:Class or file.py:Class."""
+    """Policy in place of the cell file's: expert, follower, shipped, a folder that train-policy made, or
+    a class of your own as module:Class or file.py:Class, whose code then runs."""
     execute: bool = False
     """Move the arm. Without it this is a dry run."""
     yes: bool = False
@@ -36,8 +46,159 @@ class Config:
     """Folder of the run; the episode goes to its `episodes/`, after those already there."""
 
 
-def main(config: Any) -> None:
+def main(config: Config) -> None:
     """Check, connect, ask, run, record, report; the exit status says how it ended."""
-    from touchgoal.launch.commands.deploy import run_command
+    from touchgoal.control.cell.cell_file import find_cell_file, read_cell_file
+    from touchgoal.control.deployment.preflight import check_client
+    from touchgoal.runtime.run_folder import open_run
 
-    run_command(config)
+    cell = read_cell_file(find_cell_file(config.cell), config.policy, config.sim, config.seed)
+    policy = load_policy(cell)
+    cost = None
+    if cell.task.rewards:
+        from touchgoal.rewards.cell_cost import load_cell_cost
+
+        cost = load_cell_cost(cell)
+    check_client(cell)
+    try:
+        out = open_run(config.out, "deploy", config, adds=True)
+    except OSError as error:
+        raise UserError(
+            f"cannot write into the folder of this run ({error.strerror}): give another --out"
+        ) from error
+    print(_summary(cell, config), flush=True)
+    connection = _connect(cell)
+    try:
+        result = _deploy(config, cell, policy, cost, connection, out / "episodes")
+    finally:
+        connection.close()
+        if cost is not None:
+            cost.close()
+    _report(result, out)
+
+
+def load_policy(cell: "CellConfig") -> "CellPolicy | None":
+    """Return the cell's policy, None for a scripted actor; UserError if it does not fit."""
+    from touchgoal.control.deployment.actors import SCRIPTED, load_user_policy
+    from touchgoal.sim_envs.twin.cell_task import env_config_of
+
+    if cell.task.policy in SCRIPTED:
+        return None
+    options = env_config_of(cell)
+    if (policy := load_user_policy(cell, options)) is not None:
+        return policy
+    from touchgoal.policies.deployed import load_saved_policy
+
+    return load_saved_policy(cell, options)
+
+
+def _connect(cell: "CellConfig") -> "CellConnection":
+    """Connect to the cell, once a twin has put its scene back."""
+    from touchgoal.control import features as ft
+    from touchgoal.control.cell.connection import connect_cell
+    from touchgoal.control.cell.twin_client import put_scene_back
+    from touchgoal.control.interfaces import DriverError
+
+    if cell.arm == "sim":
+        from touchgoal.sim_envs.cell.in_process import simulate_cell
+
+        return simulate_cell(cell, ft.CONTROL_HZ)
+    if cell.task.twin:
+        put_scene_back(cell.task.twin, cell.task.seed)
+        print(f"the twin has put its scene back (seed {cell.task.seed})", flush=True)
+    try:
+        return connect_cell(cell, ft.CONTROL_HZ)
+    except DriverError as error:
+        raise UserError(str(error)) from error
+
+
+def _summary(cell: "CellConfig", config: Config) -> str:
+    """Say what is going to happen, in one line."""
+    where = "a simulated FR3 in this program" if cell.arm == "sim" else f"{cell.arm} {cell.address}"
+    moves = "it moves" if config.execute else "a dry run, nothing moves"
+    return f"{cell.task.name} by {cell.task.policy} on {where}, {cell.task.seconds:g} s at most: {moves}"
+
+
+def _deploy(
+    config: Config,
+    cell: "CellConfig",
+    policy: "CellPolicy | None",
+    cost: Any,
+    connection: "CellConnection",
+    episodes: Path,
+) -> "Result":
+    import numpy as np
+
+    from touchgoal.control import features as ft
+    from touchgoal.control.cell.connection import cell_watchdogs
+    from touchgoal.control.deployment.actors import make_actor
+    from touchgoal.control.deployment.preflight import preflight
+    from touchgoal.control.deployment.session import Session
+    from touchgoal.control.deployment.terminal import HELP, Terminal
+    from touchgoal.control.safety.action_filter import ActionFilter
+    from touchgoal.episodes.schema import Episode
+    from touchgoal.episodes.store import EpisodeWriter
+    from touchgoal.runtime.checks import require_all_ok
+
+    def count_episodes() -> int:
+        return len(EpisodeWriter(episodes, ft.CONTROL_HZ))
+
+    def record(frames: dict[str, np.ndarray], task: str, meta: dict[str, Any]) -> int:
+        return EpisodeWriter(episodes, ft.CONTROL_HZ).append(Episode(frames, task, meta))
+
+    safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
+    print("checks before anything moves:", flush=True)
+    results = preflight(cell, connection, safety, episodes, count_episodes)
+    print("\n".join(str(f) for f in results), flush=True)
+    require_all_ok(results)
+    if config.execute and not config.yes:
+        _confirm(cell)
+    terminal = Terminal()
+    print(f"{'MOVING' if config.execute else 'dry run'}: {HELP}", flush=True)
+    session = Session(
+        cell=cell,
+        connection=connection,
+        safety=safety,
+        record=record,
+        execute=config.execute,
+        make_actor=lambda loop: make_actor(cell, policy, safety, connection.truth, loop.commanded),
+        operator_request=terminal.operator_request,
+        on_tick=terminal.show_tick,
+        cost=cost.latest_cost if cost else None,
+        camera_size=policy.camera_size if policy else ft.CAMERA_SHAPE[:2],
+    )
+    with terminal.watching():
+        return session.run()
+
+
+def _confirm(cell: "CellConfig") -> None:
+    """UserError unless the operator types which arm is to move."""
+    name = f"{cell.arm} {cell.address}".strip()
+    if sys.stdin is None or not sys.stdin.isatty():
+        raise UserError("nobody is there to confirm: run it in a terminal, or add --yes")
+    print(f"The arm will move. One hand on its stop, nobody in reach? Type: {name}")
+    if input("> ").strip() != name:
+        raise UserError("not confirmed; nothing has moved")
+
+
+def _report(result: "Result", out: Path) -> None:
+    """Write the numbers, print the report, exit with the status."""
+    from touchgoal.control.deployment.report import metrics, report
+    from touchgoal.control.deployment.terminal import say
+    from touchgoal.runtime.run_folder import write_json
+
+    numbers, lost = metrics(result), [result.recording_error] if result.recording_error else []
+    try:
+        write_json(out / "metrics.json", numbers)
+    except OSError as error:  # the table is printed all the same
+        lost.append(f"metrics.json could not be written ({error.strerror}): make room on the disk")
+    say(report(result, numbers, str(out / "episodes")))
+    if result.ending.stopped:
+        line = "; ".join([f"touchgoal deploy: stopped: {result.ending.reason}", *lost])
+        print(line, file=sys.stderr)
+        sys.exit(STOPPED)
+    if lost:
+        raise UserError("; ".join(lost))
+    if result.success is False:
+        print("touchgoal deploy: the task is not done", file=sys.stderr)
+        sys.exit(NOT_DONE)

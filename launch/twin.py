@@ -1,11 +1,14 @@
 """Serve the simulated cell over the robot's and the sensors' own wire protocols.
 
 Any libfranka or RTDE client, any MJPEG reader and any serial client can drive it. It runs until
-Ctrl-C; where everything is stands in a table and in `cell.json`.
+Ctrl-C; a table and `cell.json` list every address.
 """
 
+import ipaddress
+import signal
+import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
@@ -18,6 +21,9 @@ from touchgoal.sim_envs.config import (
     TaskConfig,
     TaskName,
 )
+
+if TYPE_CHECKING:
+    from touchgoal.control.cell.config import CellConfig
 
 ENVS: dict[TaskName, TaskConfig] = {
     "pick-place": PickPlaceConfig(camera_size=STREAM_SIZE),
@@ -32,15 +38,16 @@ class Config:
     """Options of twin."""
 
     task: TaskName = "pick-place"
-    """Which task the cell is set up for."""
+    """Task that the cell is set up for."""
     arm: Literal["fr3", "ur5e"] = "fr3"
-    """An FR3 with the Franka Hand, or a UR5e whose gripper talks as a Robotiq does."""
+    """FR3 with the Franka Hand, or UR5e with a Robotiq gripper."""
     lock_step: bool = False
     """Wait for the client that drives the arm, so that runs repeat (for tests)."""
     wrench_error: bool = True
-    """The arm's estimate of force has noise, bias and drift, as a real arm's."""
+    """Give the arm's force estimate noise, bias and drift, as on a real arm."""
     host: str = "127.0.0.1"
-    """Loopback address; twins at different ones run side by side."""
+    """Address to serve at; twins at different loopback addresses run side by side. At any other address
+    the whole network can drive this twin and see its pictures."""
     port: Annotated[int, Field(ge=0, le=65534)] = 8080
     """TCP port of the pictures; the next one is the control port. 0: any that are free."""
     seed: Seed = seeds.EVALUATION.start
@@ -51,8 +58,90 @@ class Config:
     """Options of the task."""
 
 
-def main(config: Any) -> None:
-    """Open the twin, say where it is, serve until told to stop."""
-    from touchgoal.launch.commands.twin import run_command
+def main(config: Config) -> None:
+    """Open the twin, print its addresses, serve until a signal ends it."""
+    from touchgoal.control.cell.cell_file import cell_table
+    from touchgoal.runtime.run_folder import open_run, write_json
+    from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 
-    run_command(config)
+    out = open_run(config.out, "twin", config, adds=True).resolve()
+    twin = Twin(
+        TwinConfig(
+            task=config.env,
+            arm=config.arm,
+            seed=config.seed,
+            host=config.host,
+            port=config.port,
+            lock_step=config.lock_step,
+            folder=out,
+            wrench_error=config.wrench_error,
+        )
+    )
+
+    def stop(*_: object) -> None:
+        twin.stopped = True
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    cell_file = out / "cell.json"
+    write_json(cell_file, cell_table(twin.cell_config))
+    if warning := open_to_network(config.host):
+        print(f"touchgoal twin: {warning}", file=sys.stderr)
+    print(
+        f"{_table(twin.cell_config)}\n{'cell file':<18}{cell_file}\n"
+        f"The cell runs. In another terminal: touchgoal deploy {cell_file} --execute\n"
+        "Each deployment first puts the scene back. Ctrl-C ends the twin.",
+        flush=True,
+    )
+    try:
+        twin.run()
+    finally:
+        twin.close()
+    numbers: dict[str, float] = {
+        **twin.pace.summary(),
+        "pictures_taken": twin.pictures.taken,
+        "pictures_left_out": twin.pictures.left_out,
+    }
+    write_json(out / "metrics.json", numbers)
+    print("\n" + "\n".join(_pace_lines(numbers)) + "stopped")
+
+
+def open_to_network(host: str) -> str:
+    """Return a warning if others than this computer can reach the host; empty for loopback."""
+    try:
+        if ipaddress.ip_address(host).is_loopback:
+            return ""
+    except ValueError:  # a name
+        if host == "localhost":
+            return ""
+    return (
+        f"--host {host} is open to the network: any computer there can drive this arm and see its "
+        "pictures; only the control port asks for a token"
+    )
+
+
+def _table(cell: "CellConfig") -> str:
+    """List every address."""
+    assert cell.load_cell is not None
+    lines = {"task": cell.task.instruction, f"arm ({cell.arm})": cell.address}
+    lines["gripper"] = cell.gripper.port or cell.gripper.address
+    lines |= {name: camera.source for name, camera in cell.cameras.items()}
+    if cell.fingertips is not None:
+        lines |= {"left fingertip": cell.fingertips.left, "right fingertip": cell.fingertips.right}
+    lines |= {"load cell": cell.load_cell.port, "control port": cell.task.twin}
+    return "\n".join(f"{name:<18}{where}" for name, where in lines.items())
+
+
+def _pace_lines(numbers: dict[str, float]) -> list[str]:
+    """Say how well the twin kept up with real time."""
+    if not numbers["seconds"]:
+        return [""]
+    return [
+        f"{numbers['seconds']} s with a client that drives the arm: simulated over wall time "
+        f"{numbers['pace_median']:.2f} in the median second, {numbers['pace_slowest']:.2f} in the slowest",
+        f"pictures left out to keep pace: {numbers['pictures_left_out']} of "
+        f"{numbers['pictures_taken'] + numbers['pictures_left_out']}",
+        f"processor time a simulated second: {numbers['processor_twin']:.2f} s, and "
+        f"{numbers['processor_pictures']:.2f} s for pictures",
+        "",
+    ]

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from touchgoal.control.cell import twin_client
 from touchgoal.control.cell.cell_file import read_cell_file
-from touchgoal.sim_envs.twin import control_port
 
 
 class RunningTwin:
@@ -48,7 +48,7 @@ class RunningTwin:
 
     def ask(self, line: str) -> dict[str, Any]:
         """What the twin answers to an order or a question."""
-        return control_port.ask_twin(self.cell.task.twin, line)
+        return twin_client.ask_twin(self.cell.task.twin, line)
 
     def at_rest(self) -> dict[str, Any]:
         """The truth once the arm is at rest."""

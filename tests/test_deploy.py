@@ -19,7 +19,7 @@ from running_twin import RunningTwin
 
 from touchgoal.control import features as ft
 from touchgoal.control.arms.client_libraries import FRANKY
-from touchgoal.control.cell.cell_file import cell_table, read_cell_file
+from touchgoal.control.cell.cell_file import EXAMPLES, cell_table, find_cell_file, read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import cell_limits, cell_watchdogs
 from touchgoal.control.deployment.control_loop import ControlLoop, Request, RunLog, TickStatus
@@ -33,13 +33,8 @@ from touchgoal.episodes.repair import validate
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
-from touchgoal.launch.commands.deploy import (
-    EXAMPLES,
-    NOT_DONE,
-    STOPPED,
-    find_cell_file,
-    load_policy,
-)
+from touchgoal.launch.deploy import NOT_DONE, STOPPED, load_policy
+from touchgoal.launch.twin import open_to_network
 from touchgoal.policies import checkpoint
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.in_process import simulate_cell
@@ -167,7 +162,7 @@ def test_a_disk_that_fills_up_costs_one_episode_and_is_said_in_a_line(
         run(*arguments)
     said = capsys.readouterr()
     assert "ticks of the control loop" in said.out and "ended: time is up" in said.out
-    assert "could not be kept" in f"{ended.value.code}{said.err}"
+    assert "could not be saved" in f"{ended.value.code}{said.err}"
     full.unlink()
     assert len(EpisodeSet(small_disk / "run" / "episodes")) == 1
     assert not any(
@@ -199,7 +194,7 @@ def test_without_a_simulator_the_operator_says_whether_it_is_done(
     request_: Request, success: bool | None, outcome: str, bare: CellConfig, tmp_path: Path
 ) -> None:
     """A plan that ends by itself is no success: nobody has seen it."""
-    connection = simulate_cell(bare, ft.CONTROL_HZ)
+    connection = replace(simulate_cell(bare, ft.CONTROL_HZ), truth=None)
     safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(bare))
     actor, ticks = Acts(0, 0.0), []
 
@@ -293,7 +288,7 @@ def deployed(cell: CellConfig, actor: Acts, stop_after: int = 10_000) -> tuple[s
     far = [0.0]
 
     def show(status: TickStatus) -> None:
-        far[0] = max(far[0], float(status.sensed.arm.q[0]))
+        far[0] = max(far[0], float(status.reading.arm.q[0]))
 
     safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
     loop = ControlLoop(connection, safety, True, wanted, show)
@@ -426,3 +421,10 @@ def test_a_bad_cell_file_is_one_line(wrong: str, message: str, tmp_path: Path) -
         read_cell_file(write_cell_file(tmp_path, wrong))
     assert "cell.toml" in str(error.value) and message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_twin_beyond_loopback_says_that_the_network_can_drive_it() -> None:
+    for host in ("127.0.0.1", "127.3.0.9", "localhost", "::1"):
+        assert not open_to_network(host)
+    for host in ("0.0.0.0", "192.168.1.7", "robot-pc"):
+        assert "any computer there can drive this arm" in open_to_network(host)

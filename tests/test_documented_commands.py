@@ -27,12 +27,12 @@ from documented_commands import (
 )
 
 from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.control.tactile import sensor_models
 from touchgoal.episodes.media import write_video
 from touchgoal.episodes.recording import one_core_workers
 from touchgoal.launch.__main__ import COMMANDS, read_options
-from touchgoal.launch.commands.deploy import NOT_DONE
-from touchgoal.sim_envs.twin.control_port import ask_twin
+from touchgoal.launch.deploy import NOT_DONE
 
 Shell = Callable[[list[str]], int]
 ALL = list(commands())

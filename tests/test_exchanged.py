@@ -15,13 +15,13 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.deployment.control_loop import ControlLoop
-from touchgoal.control.deployment.exchanged import cameras_exchanged, fingertips_exchanged
 from touchgoal.control.deployment.preflight import preflight
 from touchgoal.control.deployment.scripted import ScriptedActor
 from touchgoal.control.deployment.session import Session
 from touchgoal.control.interfaces import Camera, Frame
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
+from touchgoal.control.sensors.exchanged import cameras_exchanged, fingertips_exchanged
 from touchgoal.control.sensors.tactile_camera import NO_CROP, TactileCamera
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, find_sensor
 from touchgoal.runtime.checks import CheckResult
@@ -173,7 +173,6 @@ def test_a_run_with_exchanged_cameras_ends_after_the_start_move(
             actor,
             lambda: "",
             lambda _: None,
-            None,
         )
         .run()
         .ending

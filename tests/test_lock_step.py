@@ -12,15 +12,14 @@ from running_twin import RunningTwin
 from touchgoal.benchmarks.deployment.replay import replay_both
 from touchgoal.control import features as ft
 from touchgoal.control.arms.client_libraries import FRANKY
+from touchgoal.control.cell.cell_file import EXAMPLES
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import connect_cell
-from touchgoal.control.cell.lock_step import connect_control_port
+from touchgoal.control.cell.twin_client import connect_control_port, put_scene_back
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.__main__ import main
-from touchgoal.launch.commands.deploy import EXAMPLES
 from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.twin.control_port import put_scene_back
 
 _TICKS = 8
 _SMALL = [

@@ -15,7 +15,7 @@ from sparsh_files import published
 from test_episode_embedder import PaintTowers, recorded
 
 import touchgoal
-from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.cell.cell_file import EXAMPLES, read_cell_file
 from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT
 from touchgoal.control.interfaces import DriverError
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
@@ -24,8 +24,8 @@ from touchgoal.episodes.media import write_video
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.__main__ import main
-from touchgoal.launch.commands.deploy import EXAMPLES, _load_cost
 from touchgoal.rewards.api import reward_curve
+from touchgoal.rewards.cell_cost import load_cell_cost
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
 from touchgoal.rewards.goals import PictureFile, Sentence, assign_goals
 from touchgoal.rewards.normalizer import DistanceNormalizer
@@ -296,9 +296,9 @@ def test_a_cell_chooses_the_encoder_of_its_rewards(tmp_path: Path) -> None:
     words = 'rewards = ["text:a hard ball"]\nencoder = "gelsight_mini_surfaces"'
     cell.write_text(text.replace("[task]", f"[task]\n{words}"))
     with pytest.raises(UserError, match="was not aligned with texts"):
-        _load_cost(read_cell_file(cell))
+        load_cell_cost(read_cell_file(cell))
     cell.write_text(
         text.replace("[task]", f"[task]\n{words}".replace("gelsight_mini_surfaces", "x"))
     )
     with pytest.raises(UserError, match="there is no touch encoder 'x'"):
-        _load_cost(read_cell_file(cell))
+        load_cell_cost(read_cell_file(cell))

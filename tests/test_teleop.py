@@ -106,14 +106,14 @@ def test_a_person_leads_the_bead(tmp_path: Path) -> None:
         [*command, *options, "--out", str(tmp_path)], stdin=terminal, stdout=terminal
     )
     typed, seen = {"1 of 3": "w", "2 of 3": "q", "3 of 3": "\x03"}, ""
-    while program.poll() is None and "episodes kept" not in seen:
+    while program.poll() is None and "episodes saved" not in seen:
         assert select.select([end], [], [], 60)[0], seen
         seen += os.read(end, 4096).decode()
         header = max(typed, key=seen.rfind)
         if "of the way" in seen[seen.rfind(header) :] and typed[header]:
             os.write(end, typed[header].encode())
             typed[header] = "w" if header == "1 of 3" else ""
-    assert program.wait(20) == 130 and "1 of 3 episodes kept" in seen
+    assert program.wait(20) == 130 and "1 of 3 episodes saved" in seen
     assert "out of time" in seen and "given up" in seen
     assert termios.tcgetattr(terminal) == settings
     for one in (end, terminal):

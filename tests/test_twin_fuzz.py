@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 from running_twin import client
 
+from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import PickPlaceConfig
-from touchgoal.sim_envs.twin.control_port import ask_twin
 from touchgoal.sim_envs.twin.franka import messages as fci
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 from touchgoal.sim_envs.twin.ur import messages as rtde

@@ -10,6 +10,7 @@ import pytest
 import serial
 from running_twin import RunningTwin
 
+from touchgoal.control.cell import twin_client
 from touchgoal.control.sensors.load_cell import parse
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze
@@ -17,7 +18,6 @@ from touchgoal.sim_envs.cell.in_process import SimulatedArm
 from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
-from touchgoal.sim_envs.twin import control_port
 from touchgoal.sim_envs.twin.mjpeg import Stream
 from touchgoal.sim_envs.twin.pace import Pace
 
@@ -151,7 +151,7 @@ def test_mistakes_say_what_to_do(fr3: RunningTwin) -> None:
     with pytest.raises(UserError, match="unknown object 'teapot'"):
         fr3.ask('reset 0 {"object": "teapot"}')
     with pytest.raises(UserError, match="no twin answers at 127.0.0.1:9"):
-        control_port.ask_twin("127.0.0.1:9", "truth")
+        twin_client.ask_twin("127.0.0.1:9", "truth")
 
 
 def test_pace_is_of_whole_seconds_in_which_a_client_drives(monkeypatch: pytest.MonkeyPatch) -> None:

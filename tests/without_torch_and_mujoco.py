@@ -72,7 +72,6 @@ def run(folder: Path, policy: str, seconds: float) -> tuple[Result, dict]:
         make_actor=lambda loop: make_actor(cell, loaded, safety, None, loop.commanded),
         operator_request=lambda: "",
         on_tick=lambda _: None,
-        truth=None,
     )
     return session.run(), recorded
 

@@ -16,7 +16,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import cell_watchdogs, connect_cell
+from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.control.deployment.actors import make_actor
 from touchgoal.control.deployment.control_loop import PLAN_ENDED, ControlLoop
 from touchgoal.control.deployment.realtime import RealTimeActor
@@ -43,7 +43,6 @@ from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import checked_dataclass
 from touchgoal.sim_envs.config import PickPlaceConfig
-from touchgoal.sim_envs.twin.control_port import ask_twin
 from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 
 
@@ -220,16 +219,15 @@ def _deploy(
     """The deployment's process; a first, short episode is there before the fault comes."""
     connection = connect_cell(cell, ft.CONTROL_HZ)
     safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
-    truth = partial(ask_twin, cell.task.twin, "truth")
+    truth = connection.truth
+    assert truth is not None
 
     def record(frames: dict[str, np.ndarray], task: str, meta: dict[str, Any]) -> int:
         return EpisodeWriter(episodes, ft.CONTROL_HZ).append(Episode(frames, task, meta))
 
     def session(make: Callable[[ControlLoop], Actor], seconds: float) -> Session:
         short = replace(cell, task=replace(cell.task, seconds=seconds))
-        return Session(
-            short, connection, safety, record, True, make, lambda: "", lambda _: None, truth
-        )
+        return Session(short, connection, safety, record, True, make, lambda: "", lambda _: None)
 
     def expert(loop: ControlLoop) -> Actor:
         return make_actor(cell, None, safety, truth, loop.commanded)

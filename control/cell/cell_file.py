@@ -17,12 +17,32 @@ _CELL = TypeAdapter(CellConfig)
 _RENAMED = {"safety.touch": "safety.indentation", "task.scale": "task.normalizer"}
 
 
-def read_cell_file(path: Path, policy: str = "") -> CellConfig:
+EXAMPLES = Path(__file__).parent / "examples"
+
+
+def find_cell_file(path: Path) -> Path:
+    """Return the path, or the shipped example of that name; UserError if there is neither."""
+    if path.is_file():
+        return path
+    names = sorted(example.stem for example in EXAMPLES.glob("*.toml"))
+    example = EXAMPLES / f"{path.name.removesuffix('.toml')}.toml"
+    if path.parent in (Path("."), Path("control/cell/examples")) and example.is_file():
+        return example
+    raise UserError(
+        f"there is no cell file {path}; a twin writes its own (touchgoal twin), and these examples "
+        f"can be named: {', '.join(names)} (in {EXAMPLES})"
+    )
+
+
+def read_cell_file(
+    path: Path, policy: str = "", sim: bool = False, seed: int | None = None
+) -> CellConfig:
     """Read a cell file: TOML, or the `cell.json` that a twin has written.
 
     Args:
         path: of the file.
-        policy: in place of the file's, if given.
+        policy, seed: in place of the file's, if given.
+        sim: a simulated arm in place of the file's.
 
     Raises:
         UserError: no such file, bad syntax, an unknown key, or a value that is missing or not
@@ -47,6 +67,14 @@ def read_cell_file(path: Path, policy: str = "") -> CellConfig:
         if policy:
             cell = replace(cell, task=replace(cell.task, policy=policy))
         check(cell)
+        if sim:
+            cell = replace(cell, arm="sim")
+        if seed is not None:
+            if cell.arm != "sim" and not cell.task.twin:
+                raise UserError(
+                    "--seed is of a simulated arm or a twin: nobody can set a real scene"
+                )
+            cell = replace(cell, task=replace(cell.task, seed=seed))
     except ValidationError as error:
         raise UserError(f"{path}: {_explain(error)}") from error
     except UserError as error:

@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -19,6 +20,7 @@ from touchgoal.control.cell.config import (
     ToolSection,
 )
 from touchgoal.control.cell.lock_step import LockStepClock
+from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.control.grippers.franka_hand import FrankaHand
 from touchgoal.control.grippers.non_blocking import NonBlockingGripper
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
@@ -167,7 +169,8 @@ def connect_cell(cell: CellConfig, hz: float) -> CellConnection:
         elif cell.lock_step:
             clock = ArmClock(arm)
         undo.pop_all()
-    return CellConnection(robot, arm, gripper, cameras, load_cell, clock)
+    truth = partial(ask_twin, cell.task.twin, "truth") if cell.task.twin else None
+    return CellConnection(robot, arm, gripper, cameras, load_cell, clock, truth)
 
 
 def cell_limits(cell: CellConfig) -> RobotLimits:

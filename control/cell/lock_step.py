@@ -6,7 +6,6 @@ waited for before time goes on. libfranka's own 1 kHz loop takes part in every m
 """
 
 import json
-import socket
 import time
 from collections import deque
 from contextlib import suppress
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control.arms.streaming import ArmProcess
+from touchgoal.control.cell.twin_client import connect_control_port
 from touchgoal.control.grippers.franka_hand import PERIOD, FrankaHand
 from touchgoal.control.interfaces import Camera, DriverError
 from touchgoal.control.sensors.load_cell import SerialLoadCell
@@ -22,21 +22,9 @@ from touchgoal.runtime.errors import UserError
 
 _DT = 1e-3  # s of a step of the twin
 _STREAM_STEPS = 5  # of them between two commands of the arm's stream, `arms.franka.RATE`
-_ANSWER_TIMEOUT = 60.0  # s for a few steps, on a machine however loaded
 _PICTURE_TIMEOUT = 2.0  # s for a picture that was sent
 _SETTLING = 0.3  # s without a picture after which none is on its way
 _HISTORY_LENGTH = 400  # of a few steps each, for the ages of readings
-
-
-def connect_control_port(address: str) -> socket.socket:
-    """To a twin's control port at (token@)host:port; UserError if no twin answers there."""
-    host, _, port = address.rpartition("@")[2].rpartition(":")
-    try:
-        return socket.create_connection((host, int(port)), _ANSWER_TIMEOUT)
-    except (OSError, ValueError) as error:
-        raise UserError(
-            f"no twin answers at {address or 'task.twin'}; start one: touchgoal twin"
-        ) from error
 
 
 class LockStepClock:

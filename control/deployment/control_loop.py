@@ -140,7 +140,7 @@ class TickStatus:
 
     seconds: float
     state: SafetyState
-    sensed: CellReading
+    reading: CellReading
     width: float
     late: float
     cost: float | None

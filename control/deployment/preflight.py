@@ -12,10 +12,10 @@ from touchgoal.control import features as ft
 from touchgoal.control.arms.client_libraries import FRANKY, UR_RTDE, ClientLibrary
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
-from touchgoal.control.deployment.exchanged import Picture, fingertips_exchanged
 from touchgoal.control.interfaces import Camera, DriverError, Gripper, TactileSensor
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.task_ceilings import TASK_FORCES
+from touchgoal.control.sensors.exchanged import Picture, fingertips_exchanged
 from touchgoal.control.tactile.contact import contact_strength
 from touchgoal.control.tactile.indentation import require_readable
 from touchgoal.control.tactile.markers import find_markers, without_markers

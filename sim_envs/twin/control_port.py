@@ -36,9 +36,7 @@ import os
 import re
 import secrets
 import signal
-import socket
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -46,6 +44,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from touchgoal.control.cell.cell_file import read_cell_file
+from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.lock_step import LockStep
@@ -55,7 +54,6 @@ from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort
 
 _HTTP = re.compile(r" HTTP/\d")  # what any browser's first line ends in
 _STRONGEST_NUDGE = 500.0  # N
-_REST_TIMEOUT, _POLL_INTERVAL = 10.0, 0.1  # s for the arm of the run before to come to rest
 
 
 @runtime_checkable
@@ -226,37 +224,6 @@ class ControlPort:
 def _require_finite(*numbers: float) -> None:
     if not np.isfinite(numbers).all():
         raise UserError("numbers must be finite")
-
-
-def ask_twin(address: str, line: str) -> dict[str, Any]:
-    """Send one line to a twin's port (`token@host:port`) and return the answer.
-
-    Raises:
-        UserError: the twin refuses, or has ended.
-    """
-    token, _, where = address.rpartition("@")
-    host, _, port = where.rpartition(":")
-    try:
-        with socket.create_connection((host, int(port)), timeout=10) as connection:
-            connection.sendall(f"{token} {line}\n".encode())
-            answer = json.loads(connection.makefile().readline())
-    except (OSError, json.JSONDecodeError) as error:
-        raise UserError(f"no twin answers at {where}; start one: touchgoal twin") from error
-    if "error" in answer:
-        raise UserError(answer["error"])
-    return answer
-
-
-def put_scene_back(address: str, seed: int) -> None:
-    """Let a twin begin the episode of a seed, once its arm rests: arm, open hand and objects.
-
-    Raises:
-        UserError: the arm goes on moving, another program drives it, or there is no twin.
-    """
-    end = time.monotonic() + _REST_TIMEOUT
-    while ask_twin(address, "truth")["rest"] == 0 and time.monotonic() < end:
-        time.sleep(_POLL_INTERVAL)
-    ask_twin(address, f"reset {seed}")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
-"""The operator's terminal during a deployment: keys, signals, and one line that is written over."""
+"""The operator's terminal during a deployment: keys, signals, and one status line."""
 
+import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -24,19 +25,30 @@ _KEY_REQUESTS: dict[str, Request] = {
     "q": "stop",
 }
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_TICKS_PER_LINE = 4  # ticks between lines
+_TICKS_PER_LINE = 4
+
+
+def say(text: str) -> None:
+    """Print the report; on stderr where nobody reads stdout any more (Ctrl-C ends `tee`, too)."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+        sys.stdout.flush()  # the text is still in the buffer
 
 
 class Terminal:
-    """Asked every tick what the operator wants; shows every few ticks what happens."""
+    """Takes the operator's requests, and shows the state every few ticks."""
 
     def __init__(self) -> None:
         self._request: Request = ""
         self._tick_count = 0
-        self._keyboard = Keyboard(sys.stdin) if sys.stdin.isatty() else None
+        has_keys = sys.stdin is not None and sys.stdin.isatty()
+        self._keyboard = Keyboard(sys.stdin) if has_keys else None
+        self._shows = sys.stdout is not None and sys.stdout.isatty()
 
     def operator_request(self) -> Request:
-        """See ControlLoop. A stop outweighs what was typed before it."""
+        """Return the operator's request; a stop outweighs what was typed before it."""
         if self._keyboard is not None and self._request != "stop":
             try:
                 typed = self._keyboard.read_keys()
@@ -49,28 +61,25 @@ class Terminal:
         return self._request
 
     def show_tick(self, status: TickStatus) -> None:
-        """See ControlLoop."""
+        """Write the status line anew, every few ticks."""
         self._tick_count += 1
-        if self._tick_count % _TICKS_PER_LINE or not sys.stdout.isatty():
+        if self._tick_count % _TICKS_PER_LINE or not self._shows:
             return
-        state, sensed = status.state, status.sensed
-        active_limits = ", ".join(state.active_limits)
-        mode = (
-            state.mode
-            if state.mode is not Mode.MOVE or not active_limits
-            else f"{state.mode} ({active_limits})"
-        )
-        force = float(np.linalg.norm(sensed.arm.wrench[:3]))
+        state, reading = status.state, status.reading
+        limits = ", ".join(state.active_limits)
+        mode = f"{state.mode} ({limits})" if state.mode is Mode.MOVE and limits else state.mode
+        force = float(np.linalg.norm(reading.arm.wrench[:3]))
         cost = "" if status.cost is None else f"cost {status.cost:5.2f}"
         line = (
-            f"{status.seconds:6.1f} s  {mode:<24}  {force:5.1f} N  gel {1e3 * sensed.indentation.max():3.1f} mm  gripper {1e3 * status.width:3.0f} mm"
-            f"  pictures {1e3 * sensed.age:4.0f} ms  late {1e3 * status.late:4.1f} ms  {cost}"
+            f"{status.seconds:6.1f} s  {mode:<24}  {force:5.1f} N  "
+            f"gel {1e3 * reading.indentation.max():3.1f} mm  gripper {1e3 * status.width:3.0f} mm  "
+            f"pictures {1e3 * reading.age:4.0f} ms  late {1e3 * status.late:4.1f} ms  {cost}"
         )
         print(f"\r{line[:118]:<118}", end="", flush=True)
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Keys and signals are taken as requests while this lasts, and then as before."""
+        """Take keys and signals as requests while this lasts."""
         before = {number: signal.signal(number, self._on_signal) for number in _SIGNALS}
         try:
             with self._keyboard or nullcontext():
@@ -78,7 +87,7 @@ class Terminal:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
-            if sys.stdout.isatty():
+            if self._shows:
                 print()
 
     def _on_signal(self, *_: Any) -> None:
