@@ -1,8 +1,9 @@
-"""Run a policy in a task and say how often it succeeds, with a 95 % Wilson interval."""
+"""Run a policy in a task and print its success rate, with a 95 % Wilson interval."""
 
 import os
+import shlex
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
@@ -12,7 +13,7 @@ ENVS: dict[TaskName, TaskConfig] = {
     "pick-place": PickPlaceConfig(),
     "bead-maze": BeadMazeConfig(split="validation"),
 }
-"""Options of the environment of each task, unless others are typed."""
+"""Default options of each task's environment."""
 
 
 @checked_dataclass
@@ -22,9 +23,9 @@ class Config:
     task: TaskName = "pick-place"
     """Task to run it in."""
     policy: str = "shipped"
-    """Which policy: shipped; a folder that train-policy made; expert, which sees the simulator's
-    state; follower (bead-maze), the classical one, which feels the force on the hand; or a class of
-    your own, as module:Class or file.py:Class (docs/own_policy.md)."""
+    """Policy: shipped; a folder that train-policy made; expert, which sees the simulator's state;
+    follower (bead-maze), classical control from the force on the hand; or a class of your own, as
+    module:Class or file.py:Class (docs/own_policy.md)."""
     out: Path | None = None
     """Folder of the run."""
     episodes: Count = 20
@@ -36,11 +37,22 @@ class Config:
     video: bool = True
     """Film the worst, the median and the best episode."""
     env: PickPlaceConfig | BeadMazeConfig = ENVS["pick-place"]
-    """Options of the task; what the policy does not look at is not rendered."""
+    """Options of the task. Only images that the policy reads are rendered."""
 
 
-def main(config: Any) -> None:
+def main(config: Config) -> None:
     """Run the episodes, print the table, film three of them."""
-    from touchgoal.launch.commands.run_policy import run_command
+    from touchgoal.policies.by_name import prepare_policy
+    from touchgoal.policies.evaluation.evaluate import run_trials, trial_specs
+    from touchgoal.policies.evaluation.report import film_trials, record_trials
+    from touchgoal.runtime.run_folder import open_run
 
-    run_command(config)
+    policy, env = prepare_policy(config.policy, config.env)
+    specs = trial_specs(env, config.episodes, config.seed)
+    out = open_run(config.out, "run-policy", replace(config, env=env))
+    trials = record_trials(out, run_trials(env, policy, specs, config.workers), len(specs))
+    if config.video:
+        film_trials(out, env, specs, trials, policy, config.workers)
+    cell = "sim" if config.task == "pick-place" else "sim_maze"
+    command = f"touchgoal deploy {cell} --execute --policy {shlex.quote(config.policy)}"
+    print(f"next, in the control loop of a real arm: {command}")

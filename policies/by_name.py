@@ -1,16 +1,17 @@
-"""Which policy is meant: `--policy expert`, `shipped`, a folder, or a class of one's own.
+"""Policies by name: `expert`, `follower`, `shipped`, a folder, or a user's class.
 
-A user's own class: see `control/deployment/user_policy.py`.
+For a user's own class see `control/deployment/user_policy.py`.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from touchgoal.control.deployment.follower import WireFollower
-from touchgoal.control.deployment.user_policy import find_user_policy, preferred_env_config
+from touchgoal.control.deployment.user_policy import Policy, UserPolicy, find_user_policy
 from touchgoal.episodes.recording import Actor
+from touchgoal.policies.acting import LearnedPolicy
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy, find_policy, suggestion
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
@@ -19,70 +20,99 @@ from touchgoal.sim_envs.tasks import make_expert, task_name
 
 BUILT_IN = {
     "expert": "the task's expert, which sees the simulator's state",
-    "follower": "bead-maze: the classical one, which feels the force on the hand",
+    "follower": "bead-maze: classical control from the force on the hand",
     "shipped": "the policy that ships for the task",
     **{name: f"the policy that ships for {name}" for name in SHIPPED_POLICIES},
 }
 """Names of policies, and what they are."""
 
 PolicyMaker = Callable[[Any], Actor]
-"""Makes an actor for one episode of an environment, after its reset; it must pickle."""
+"""Makes the policy for one episode of an environment, after its reset; it must pickle."""
+AnyPolicy = str | Path | LearnedPolicy | Policy | type
+"""A name or folder as for `--policy`, a loaded policy, or a user's class or an object of it."""
 
 
 def scripted(task: TaskName) -> str:
-    """The task's own policy without learning that an arm can do: it does not see the simulator's state
-    but for where things are at the start."""
+    """Return the task's policy without learning that an arm can run."""
     return "follower" if task == "bead-maze" else "expert"
 
 
-def choose_policy(name: str | Path, task: TaskConfig) -> PolicyMaker:
-    """What makes the policy that a command or a script names.
-
-    Args:
-        name: one of `BUILT_IN`, a folder that train-policy made, `module:Class` or `file.py:Class`.
-        task: options of the task it is to act in.
+def prepare_policy(policy: AnyPolicy, task: TaskConfig) -> tuple[PolicyMaker, TaskConfig]:
+    """Return the maker of a policy, and the task's options with the images that it reads.
 
     Raises:
-        UserError: no such policy, or it cannot act in the task. Nothing was simulated yet.
+        UserError: no such policy, it cannot act in the task, or an option of the task is set to
+            something else than the policy needs.
     """
-    chosen, where = str(name), task_name(task)
-    if chosen == "expert":
+    maker = choose_policy(policy, task)
+    needed = env_config_for(maker, task)
+    default = type(task)()
+    for name in (field.name for field in fields(task)):
+        given, runs = getattr(task, name), getattr(needed, name)
+        unread = name == "camera_size" and not needed.cameras
+        if given != getattr(default, name) and (given != runs or unread):
+            instead = "reads no camera" if unread else f"runs with {_option(name, runs)}"
+            raise UserError(
+                f"{_option(name, given)}: the policy {policy} {instead}; leave the option out"
+            )
+    return maker, needed
+
+
+def _option(name: str, value: object) -> str:
+    """Return an option of the environment as it is typed."""
+    name = name.replace("_", "-")
+    if isinstance(value, bool):
+        return f"--env.{name}" if value else f"--env.no-{name}"
+    words = map(str, value) if isinstance(value, tuple) else [str(value)]
+    return " ".join([f"--env.{name}", *words])
+
+
+def choose_policy(policy: AnyPolicy, task: TaskConfig) -> PolicyMaker:
+    """Return the maker of a policy that is named, loaded, or a user's own.
+
+    Raises:
+        UserError: no such policy.
+    """
+    if isinstance(policy, LearnedPolicy) and policy.directory is not None:
+        return SavedPolicy(policy.directory, policy.plan_ticks)
+    if not isinstance(policy, str | Path):
+        kind = policy if isinstance(policy, type) else type(policy)
+        return UserPolicy(kind.__name__, policy)
+    name, where = str(policy), task_name(task)
+    if name == "expert":
         return make_expert
-    if chosen == "follower":
+    if name == "follower":
         if where != "bead-maze":
             raise UserError("the follower is for the bead maze; add: --task bead-maze")
         return follower
-    if (found := find_user_policy(chosen)) is not None:
+    if (found := find_user_policy(name)) is not None:
         return found
-    if chosen == "shipped":
-        return _fitting(SavedPolicy(SHIPPED_POLICIES[where]), task)
+    if name == "shipped":
+        return SavedPolicy(SHIPPED_POLICIES[where])
     try:
-        folder = find_policy(chosen)
+        return SavedPolicy(find_policy(name))
     except UserError as error:
-        if Path(chosen).is_dir():
+        if Path(name).is_dir():
             raise UserError(
-                f"no policy in {chosen}: train one with touchgoal train-policy"
+                f"no policy in {name}: train one with touchgoal train-policy"
             ) from error
         raise UserError(
-            f"there is no policy {chosen!r}: {suggestion(chosen, tuple(BUILT_IN))}, or a class of your "
+            f"there is no policy {name!r}: {suggestion(name, tuple(BUILT_IN))}, or a class of your "
             "own as module:Class or file.py:Class"
         ) from error
-    return _fitting(SavedPolicy(folder), task)
 
 
-def _fitting(policy: SavedPolicy, task: TaskConfig) -> SavedPolicy:
-    """Return the policy; UserError if it cannot act in the task."""
-    policy.env_config(task)
-    return policy
+def env_config_for(maker: PolicyMaker, task: TaskConfig) -> TaskConfig:
+    """Return the task's options with the images that the policy reads: no others are rendered.
 
-
-def env_config_for(policy: PolicyMaker, config: TaskConfig) -> TaskConfig:
-    """The task's options with the pictures that the policy looks at: no others are rendered."""
-    if policy in (make_expert, follower):
-        return replace(config, tactile=False, cameras=())
-    return preferred_env_config(policy, config)
+    Raises:
+        UserError: the policy cannot act in the task.
+    """
+    if isinstance(maker, SavedPolicy | UserPolicy):
+        return maker.env_config(task)
+    return replace(task, tactile=False, cameras=())
 
 
 def follower(env: FrankaTactileEnv) -> WireFollower:
-    """The bead maze's classical policy."""
+    """Return the bead maze's classical policy."""
     return WireFollower(env.config.control_hz)

@@ -15,6 +15,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.policies.acting import LearnedPolicy, Task
 from touchgoal.policies.config import SamplerConfig
@@ -53,7 +55,8 @@ def save(policy: PolicyNetwork, directory: Path, provenance: dict[str, Any]) -> 
 
 def load(directory: Path) -> PolicyNetwork:
     """Read a network for inference, as float32 on the CPU; UserError if there is none or it is damaged."""
-    network = PolicyNetwork(POLICY_FORMAT.read_config(directory, _config))
+    with torch.random.fork_rng(devices=[]):  # its initialisation draws from the global generator
+        network = PolicyNetwork(POLICY_FORMAT.read_config(directory, _config))
     POLICY_FORMAT.load_weights(network, directory)
     return network
 
@@ -109,8 +112,10 @@ def _load_parts(
 ) -> tuple[PolicyNetwork, TouchEmbedder | None, StateEstimator | None]:
     network = _load_once(directory, stamp)
     config = network.config
-    touch = load_touch_of(directory / TOUCH, config.touch) if config.touch_dim else None
-    return network, touch, load_estimator(directory / ESTIMATOR) if config.estimated else None
+    with torch.random.fork_rng(devices=[]):
+        touch = load_touch_of(directory / TOUCH, config.touch) if config.touch_dim else None
+        estimator = load_estimator(directory / ESTIMATOR) if config.estimated else None
+    return network, touch, estimator
 
 
 def load_policy(name_or_path: str | Path, plan_ticks: int = 0) -> LearnedPolicy:

@@ -7,26 +7,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from touchgoal.control import features as ft
+from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.episodes.recording import EpisodeSpec, collect
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.launch.collect_demos import Config as CollectConfig
 from touchgoal.launch.commands import collect_demos
-from touchgoal.policies.by_name import choose_policy
+from touchgoal.policies import checkpoint
+from touchgoal.policies.by_name import prepare_policy
 from touchgoal.policies.checkpoint import load_policy
 from touchgoal.policies.evaluation import evaluate as evaluation
 from touchgoal.policies.evaluation.evaluate import evaluate, run_trials
 from touchgoal.policies.evaluation.success_rate import SuccessRate
+from touchgoal.policies.evaluation.table import table
 from touchgoal.policies.training.training_data import (
     choose_episodes,
     common_sensor,
     common_task,
 )
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.config import PickPlaceConfig
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.tasks import make_env
 
@@ -102,11 +106,83 @@ def test_a_policy_of_ones_own_is_judged(tmp_path: Path) -> None:
         str(tmp_path): "train one with",
     }.items():
         with pytest.raises(UserError, match=message):
-            choose_policy(name, config)
-    with pytest.raises(UserError, match=r"--env\.sensor gelsight_mini"):
-        choose_policy("shipped", replace(config, sensor="digit"))
+            prepare_policy(name, config)
     with pytest.raises(UserError, match="there is no task 'pick'"):
         evaluate("expert", "pick")
+
+
+@pytest.mark.parametrize(
+    ("policy", "options", "message"),
+    [
+        ("shipped", {"sensor": "digit"}, r"--env\.sensor gelsight_mini"),
+        ("shipped", {"tactile": False}, r"--env\.no-tactile: .* runs with --env\.tactile; leave"),
+        ("shipped", {"cameras": ()}, r"--env\.cameras: .* runs with --env\.cameras front"),
+        ("shipped", {"camera_size": (64, 64)}, "camera-size 64 64: .* camera-size 256 256"),
+        (
+            "expert",
+            {"camera_size": (64, 64)},
+            "camera-size 64 64: the policy expert reads no camera",
+        ),
+        ("shipped", {"arm": "ur5e"}, "seven joints of an FR3"),
+    ],
+)
+def test_an_option_that_the_policy_fixes_is_not_overridden(
+    policy: str, options: dict, message: str
+) -> None:
+    with pytest.raises(UserError, match=message):
+        prepare_policy(policy, PickPlaceConfig(**options))
+
+
+class Seven(Still):
+    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        return np.zeros(7)
+
+
+class NotANumber(Still):
+    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        return np.full(8, np.nan)
+
+
+class Sized(Still):
+    def __init__(self, size: int) -> None: ...
+
+
+class Degrees(Still):
+    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        return np.full(8, 57.0)
+
+
+def test_a_wrong_policy_of_ones_own_is_one_line_with_its_name() -> None:
+    config = PickPlaceConfig(max_seconds=0.2)
+    for policy, message in {
+        Seven: r"Seven: act gave an array of shape \(7,\); return 7 joint changes",
+        NotANumber: r"NotANumber: act gave \[nan, ",
+        Sized: "Sized: missing a required argument: 'size'",
+    }.items():
+        with pytest.raises(UserError, match=message):
+            evaluate(policy, config, episodes=1)
+    (trial,) = evaluate(Degrees, config, episodes=1).trials
+    assert trial.clamped == 1 and "100% of the actions are beyond" in table([trial])
+
+
+def test_evaluation_leaves_torch_alone_and_reads_weights_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    read, load_weights = [], WeightsFormat.load_weights
+    monkeypatch.setattr(
+        WeightsFormat, "load_weights", lambda f, *a: read.append(f.stem) or load_weights(f, *a)
+    )
+    checkpoint._load_parts.cache_clear()
+    checkpoint._load_once.cache_clear()
+    threads, state = torch.get_num_threads(), torch.get_rng_state()
+    torch.set_num_threads(threads + 1)
+    try:
+        evaluate("bead-maze", BeadMazeConfig(max_seconds=0.2), episodes=2)
+        assert torch.get_num_threads() == threads + 1
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert sorted(read) == ["encoder", "policy"]
 
 
 def test_every_outcome_meets_every_object() -> None:

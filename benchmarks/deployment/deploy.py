@@ -21,7 +21,7 @@ from touchgoal.benchmarks.deployment.deployed_twin import DeployedTwin
 from touchgoal.benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.episodes.recording import EpisodeSpec, one_core_workers
-from touchgoal.policies.by_name import choose_policy, env_config_for, scripted
+from touchgoal.policies.by_name import prepare_policy, scripted
 from touchgoal.policies.evaluation.evaluate import run_trial, trial_specs
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.runtime import seeds
@@ -131,8 +131,8 @@ def _cell(scene: Scene, arm: str, folder: Path, number: int) -> Iterator[Path]:
 
 def _in_environment(scene: Scene, policy: str) -> Deployment:
     task = scene.config()
-    maker = choose_policy(policy, task)
-    trial = run_trial(env_config_for(maker, task), maker, EpisodeSpec(scene.seed))
+    maker, task = prepare_policy(policy, task)
+    trial = run_trial(task, maker, EpisodeSpec(scene.seed))
     kind = (scene.task, policy, "environment", scene.seed, scene.item)
     ending = trial.failure or "done"
     return Deployment(

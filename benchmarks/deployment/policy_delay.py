@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from touchgoal.benchmarks.options import CORES, BenchmarkOptions
-from touchgoal.policies.by_name import choose_policy, env_config_for
+from touchgoal.policies.by_name import prepare_policy
 from touchgoal.policies.evaluation.evaluate import Evaluation, Trial, run_trials, trial_specs
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, NotNegative, Positive, Seed, checked_dataclass
@@ -107,7 +107,6 @@ def _trials(config: Config, as_deployed: bool, between: DeploymentConfig) -> tup
     if config.task == "bead-maze":
         task = BeadMazeConfig(split="validation")
     task = replace(task, as_deployed=as_deployed, deployment=between)
-    policy = choose_policy(config.policy, task)
-    task = env_config_for(policy, task)
+    policy, task = prepare_policy(config.policy, task)
     specs = trial_specs(task, config.episodes, config.seed)
     return tuple(run_trials(task, policy, specs, config.workers))

@@ -11,7 +11,7 @@ from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.deployment.follower import WireFollower
 from touchgoal.control.deployment.realtime import ChunkPlanner, RealTimeActor
 from touchgoal.control.deployment.scripted import PickPlacePoses, pick_and_place
-from touchgoal.control.deployment.user_policy import UserPolicyPlanner, find_user_policy
+from touchgoal.control.deployment.user_policy import find_user_policy
 from touchgoal.control.interfaces import Actor
 from touchgoal.control.motion.servo_lag import ServoLag
 from touchgoal.control.safety.action_filter import ActionFilter
@@ -68,7 +68,7 @@ def load_user_policy(cell: CellConfig, options: PolicyNeeds) -> CellPolicy | Non
     """
     if (found := find_user_policy(cell.task.policy)) is None:
         return None
-    return CellPolicy.fitting(cell, UserPolicyPlanner(found()), found.env_config(options))
+    return CellPolicy.fitting(cell, found(), found.env_config(options))
 
 
 def make_actor(

@@ -14,8 +14,9 @@ method `env_config(config)` returns the options of the environment that it needs
 
 import importlib
 import importlib.util
+import inspect
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -32,7 +33,7 @@ Config = TypeVar("Config")
 
 
 @runtime_checkable
-class UserPolicy(Protocol):
+class Policy(Protocol):
     """A policy: two methods."""
 
     def reset(self) -> None:
@@ -45,65 +46,6 @@ class UserPolicy(Protocol):
 
 
 @dataclass(frozen=True)
-class ImportedPolicy:
-    """Maker of a user's policy, in any process.
-
-    Attributes:
-        module: importable name, or path of a Python file.
-        attribute: name of the class.
-    """
-
-    module: str
-    attribute: str
-
-    def __call__(self, env: object = None) -> UserPolicy:
-        """Make one for an episode."""
-        policy = self.load()()
-        policy.reset()
-        return policy
-
-    def env_config(self, config: Config) -> Config:
-        """Return the options of the environment with what the policy asks for, if it does."""
-        return preferred_env_config(self.load()(), config)
-
-    def load(self) -> Callable[[], UserPolicy]:
-        """Return the class; UserError if there is none, or it lacks a method."""
-        is_file = self.module.endswith(".py")
-        module = _import_file(Path(self.module)) if is_file else _import(self.module)
-        found = getattr(module, self.attribute, None)
-        if found is None:
-            close = get_close_matches(self.attribute, vars(module), 1)
-            guess = f": did you mean {close[0]}?" if close else ""
-            raise UserError(f"{self.module} has no {self.attribute}{guess}")
-        for method in ("reset", "act"):
-            if not callable(getattr(found, method, None)):
-                raise UserError(
-                    f"{self.module}:{self.attribute} has no method {method}: a policy has "
-                    "reset() and act(observation)"
-                )
-        return found
-
-
-def find_user_policy(name: str) -> ImportedPolicy | None:
-    """Return the user's policy `module:Class` or `file.py:Class`; None for any other name.
-
-    UserError if the class is not there, or lacks a method.
-    """
-    module, colon, attribute = name.rpartition(":")
-    if not colon or not attribute.isidentifier():
-        return None
-    policy = ImportedPolicy(module, attribute)
-    policy.load()
-    return policy
-
-
-def preferred_env_config(policy: object, config: Config) -> Config:
-    """Return what the policy's `env_config` makes of these options; without one they stay."""
-    make = getattr(policy, "env_config", None)
-    return config if make is None else make(config)
-
-
-@dataclass(frozen=True)
 class _EveryTick:
     """Horizons of a policy that answers every tick."""
 
@@ -112,27 +54,114 @@ class _EveryTick:
     control_hz: int = ft.CONTROL_HZ
 
 
-class UserPolicyPlanner:
-    """A user's policy as plans of one tick, so that the control loop never waits for a slow one."""
+class CheckedPolicy:
+    """A user's policy at work: a wrong action is a UserError with the policy's name.
+
+    For the control loop it also plans, one tick at a time, so that the loop never waits for a slow one.
+    """
 
     config = _EveryTick()
     ticks_seen = 1
 
-    def __init__(self, policy: UserPolicy) -> None:
-        self._policy = policy
+    def __init__(self, policy: Policy, name: str, n_joints: int = ft.N_JOINTS) -> None:
+        self._policy, self._name, self._n_joints = policy, name, n_joints
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self._policy.reset()
+
+    def act(self, observation: Observation) -> Float32[np.ndarray, " a"]:
+        """Return the action for the next tick.
+
+        Raises:
+            UserError: it has another shape than the robot's, or is not finite.
+        """
+        answer = self._policy.act(dict(observation))
+        wanted = f"{self._n_joints} joint changes (rad) and the gripper's width (m)"
+        try:
+            action = np.asarray(answer, np.float32)
+        except (TypeError, ValueError):
+            raise UserError(f"{self._name}: act gave {answer!r:.60}; return {wanted}") from None
+        if action.shape != (self._n_joints + 1,):
+            raise UserError(
+                f"{self._name}: act gave an array of shape {action.shape}; return {wanted}"
+            )
+        if not np.isfinite(action).all():
+            raise UserError(
+                f"{self._name}: act gave {np.round(action, 3).tolist()}; return finite numbers"
+            )
+        return action
 
     def embed(self, seen: Sequence[Observation]) -> None:
         """Do nothing: no work is done ahead."""
 
-    def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "1 8"]:
-        """Return the action for the next tick; UserError if it has another shape."""
-        action = np.asarray(self._policy.act(dict(seen[-1])), np.float32)
-        if action.shape != (ft.N_JOINTS + 1,):
+    def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "1 a"]:
+        """Return the action for the next tick as a plan."""
+        return self.act(seen[-1])[None]
+
+
+@dataclass(frozen=True)
+class UserPolicy:
+    """Maker of a user's policy for one episode, in any process.
+
+    Attributes:
+        name: `module:Class` or `file.py:Class`.
+        given: the class or an object of it; None: it is imported by its name.
+    """
+
+    name: str
+    given: Any = None
+
+    def __call__(self, env: Any = None) -> CheckedPolicy:
+        """Make one at an episode's beginning, for the environment's robot or else an FR3."""
+        n_joints = ft.N_JOINTS if env is None else env.n_joints
+        policy = CheckedPolicy(self._make(), self.name, n_joints)
+        policy.reset()
+        return policy
+
+    def env_config(self, config: Config) -> Config:
+        """Return the environment's options as the policy's own `env_config` changes them.
+
+        Raises:
+            UserError: there is no such class, it lacks a method, or it takes arguments.
+        """
+        change = getattr(self._make(), "env_config", None)
+        return config if change is None else change(config)
+
+    def _make(self) -> Policy:
+        found = self._import() if self.given is None else self.given
+        for method in ("reset", "act"):
+            if not callable(getattr(found, method, None)):
+                raise UserError(
+                    f"{self.name} has no method {method}: a policy has reset() and act(observation)"
+                )
+        if not isinstance(found, type):
+            return found
+        try:
+            inspect.signature(found).bind()
+        except TypeError as error:
             raise UserError(
-                f"the policy's action has the shape {action.shape}: give {ft.N_JOINTS} joint changes "
-                "(rad) and the gripper's width (m)"
-            )
-        return action[None]
+                f"{self.name}: {error}; the class is made without arguments, so give them defaults"
+            ) from None
+        except ValueError:  # no signature, as of a class from C
+            pass
+        return found()
+
+    def _import(self) -> Any:
+        place, _, attribute = self.name.rpartition(":")
+        module = _import_file(Path(place)) if place.endswith(".py") else _import(place)
+        found = getattr(module, attribute, None)
+        if found is None:
+            close = get_close_matches(attribute, vars(module), 1)
+            guess = f": did you mean {close[0]}?" if close else ""
+            raise UserError(f"{place} has no {attribute}{guess}")
+        return found
+
+
+def find_user_policy(name: str) -> UserPolicy | None:
+    """Return the user's policy `module:Class` or `file.py:Class`; None for any other name."""
+    _, colon, attribute = name.rpartition(":")
+    return UserPolicy(name) if colon and attribute.isidentifier() else None
 
 
 def _import(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""How often does a policy succeed? Many episodes of a task, judged by the simulator.
+"""Success rate of a policy over many episodes of a task, judged by the simulator.
 
 From Python::
 
@@ -8,21 +8,14 @@ From Python::
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.control.deployment.user_policy import UserPolicy, preferred_env_config
 from touchgoal.episodes.recording import EpisodeSpec, one_core_workers, run
-from touchgoal.policies.acting import LearnedPolicy
-from touchgoal.policies.by_name import (
-    PolicyMaker,
-    choose_policy,
-    env_config_for,
-)
-from touchgoal.policies.checkpoint import SavedPolicy
+from touchgoal.policies.by_name import AnyPolicy, PolicyMaker, prepare_policy
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import UserError
@@ -32,22 +25,25 @@ from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE
 from touchgoal.sim_envs.tasks import make_env
 
+_TOLERANCE = 1e-3  # rad or m by which an action may exceed a limit before it counts as clamped
+
 
 @dataclass(frozen=True)
 class Trial:
-    """One episode's result.
+    """Result of one episode.
 
     Attributes:
-        seed: of the episode.
+        seed: random seed of the episode.
         success: as the task defines it.
         progress: the greatest reached, in [0, 1].
-        failure: what ended it: drop, jam, over_force, time (is up), or nothing.
+        failure: what ended it: drop, jam, over_force or time; "" after a success.
         peak_force: greatest external force on the hand, N.
         mean_force: its mean, N.
         peak_pad_force: greatest normal force on a fingertip, N.
         goal_distance: of the object from its goal at the end, m; None where the task has no goal
             position.
         seconds: length.
+        clamped: share of the ticks whose action was beyond the arm's or the gripper's limits.
         episode: what distinguishes it: the object, its mass, or the wire.
     """
 
@@ -60,18 +56,19 @@ class Trial:
     peak_pad_force: float
     goal_distance: float | None
     seconds: float
+    clamped: float
     episode: dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How often a policy succeeded, and every trial."""
+    """Trials of a policy and their summary."""
 
     trials: tuple[Trial, ...]
 
     @property
     def rate(self) -> SuccessRate:
-        """Successes among the trials, with a 95 % interval."""
+        """Success rate, with a 95 % interval."""
         return SuccessRate(sum(t.success for t in self.trials), len(self.trials))
 
     @property
@@ -80,48 +77,42 @@ class Evaluation:
         return float(np.mean([t.progress for t in self.trials]))
 
     def __str__(self) -> str:
-        """Such as 49/50 [0.90, 1.00]."""
+        """Return the success rate, such as 49/50 [0.90, 1.00]."""
         return str(self.rate)
 
 
 def evaluate(
-    policy: str | Path | LearnedPolicy | UserPolicy | type,
+    policy: AnyPolicy,
     task: str | TaskConfig = "pick-place",
     *,
     episodes: int = 20,
     seed: int = seeds.EVALUATION.start,
     workers: int = 1,
 ) -> Evaluation:
-    """Runs a policy in a task and says how often it succeeds.
+    """Run a policy in a task and return how often it succeeds.
 
     Args:
-        policy: a name or folder as for `--policy`, what `load_policy` returned, or a policy of
-            one's own (see `control/deployment/user_policy.py`): its class, or an object of it.
+        policy: a name or folder as for `--policy`, what `load_policy` returned, or a user's own
+            policy (see `control/deployment/user_policy.py`): its class, or an object of it.
         task: "pick-place", "bead-maze" (validation wires), or the config of either.
-        episodes: how many; objects are taken in turn, wires one each.
+        episodes: number of episodes; objects are taken in turn, wires one each.
         seed: of the first episode; each further one adds one.
         workers: processes that simulate; with more than one, start from a script that guards its
             main part by `if __name__ == "__main__"`.
 
     Raises:
-        UserError: no such task or policy, or one that cannot act in the other.
+        UserError: no such task or policy, or the policy cannot act in the task.
     """
     if episodes < 1 or workers < 1:
         raise UserError("evaluate needs at least one episode and one worker")
-    config = _task_config(task)
-    if isinstance(policy, LearnedPolicy) and policy.directory is not None:
-        maker: PolicyMaker = SavedPolicy(policy.directory, policy.plan_ticks)
-    elif isinstance(policy, str | Path):
-        maker = choose_policy(policy, config)
-    else:
-        maker = _UserPolicyMaker(policy)
-    config = env_config_for(maker, config)
-    specs = trial_specs(config, episodes, seed)
-    return Evaluation(tuple(run_trials(config, maker, specs, workers)))
+    maker, config = prepare_policy(policy, _task_config(task))
+    return Evaluation(
+        tuple(run_trials(config, maker, trial_specs(config, episodes, seed), workers))
+    )
 
 
 def trial_specs(config: TaskConfig, count: int, seed: int) -> list[EpisodeSpec]:
-    """So many trials: objects in turn, wires one each; the seeds, from `seed` on, do the rest."""
+    """Return `count` episodes: objects in turn, wires one each; seeds count up from `seed`."""
     if isinstance(config, BeadMazeConfig):
         wires = config.chosen_wires(count)
         return [EpisodeSpec(seed + i, options={"wire": w.name}) for i, w in enumerate(wires)]
@@ -132,37 +123,37 @@ def trial_specs(config: TaskConfig, count: int, seed: int) -> list[EpisodeSpec]:
 def run_trials(
     config: TaskConfig, policy: PolicyMaker, specs: Sequence[EpisodeSpec], workers: int
 ) -> Iterator[Trial]:
-    """Runs what `policy` makes in each episode; yields the trials in their order as they end.
+    """Run a policy in each episode; yield the trials in order as they end.
 
     Args:
         config: of the task.
-        policy: makes an actor for an episode; must pickle if there are several workers.
+        policy: makes the policy for an episode; must pickle if there are several workers.
         specs: the episodes.
-        workers: processes; one: in this process.
+        workers: processes; with one, all runs in this process.
     """
     if workers == 1:
         for spec in track(specs, "trials", "episode"):
             yield run_trial(config, policy, spec)
         return
-    n = len(specs)
-    with one_core_workers(min(workers, n)) as pool:
-        results = pool.map(run_trial, [config] * n, [policy] * n, specs)
-        yield from track(results, "trials", "episode", total=n)
+    with one_core_workers(min(workers, len(specs))) as pool:
+        results = pool.map(partial(run_trial, config, policy), specs)
+        yield from track(results, "trials", "episode", total=len(specs))
 
 
 def run_trial(config: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec) -> Trial:
-    """One episode."""
+    """Run one episode."""
     env = make_env(config)
     try:
         observation, info = env.reset(seed=spec.seed, options=spec.options)
-        keys = (ft.WRENCH, ft.TRUTH_PAD_WRENCH, ft.TRUTH_PROGRESS)
+        keys = (ft.WRENCH, ft.TRUTH_PAD_WRENCH, ft.TRUTH_PROGRESS, ft.ACTION)
         rows, last = [], info
         for last in run(env, policy(env), observation, info):
-            rows.append([last[key] for key in keys])  # pictures would fill the memory
-        wrench, pads, progress = (np.stack(column) for column in zip(*rows, strict=True))
+            rows.append([last[key] for key in keys])  # images would fill the memory
+        wrench, pads, progress, actions = (np.stack(column) for column in zip(*rows, strict=True))
         force = np.linalg.norm(wrench[:, :3], axis=1)
         goal = env.goal if isinstance(env, PickPlace) else None
         away = None if goal is None else np.linalg.norm(last[ft.TRUTH_OBJECT_POSE][:2] - goal)
+        low, high = env.action_space.low - _TOLERANCE, env.action_space.high + _TOLERANCE
         return Trial(
             seed=spec.seed,
             success=bool(last[ft.TRUTH_SUCCESS][0]),
@@ -173,6 +164,7 @@ def run_trial(config: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec) -> Tri
             peak_pad_force=float(np.abs(pads[:, [2, 8]]).max()),
             goal_distance=None if away is None else float(away),
             seconds=(len(rows) - 1) / config.control_hz,
+            clamped=float(((actions < low) | (actions > high)).any(1)[:-1].mean()),
             episode=env.episode_info(),
         )
     finally:
@@ -185,21 +177,3 @@ def _task_config(task: str | TaskConfig) -> TaskConfig:
     if task not in TASKS:
         raise UserError(f"there is no task {task!r}: choose from {', '.join(TASKS)}")
     return BeadMazeConfig(split="validation") if task == "bead-maze" else TASKS[task]()
-
-
-@dataclass(frozen=True)
-class _UserPolicyMaker:
-    """Makes actors of a class or an object of one's own."""
-
-    policy: Any
-
-    def __call__(self, env: object = None) -> UserPolicy:
-        policy = self._object()
-        policy.reset()
-        return policy
-
-    def env_config(self, config: TaskConfig) -> TaskConfig:
-        return preferred_env_config(self._object(), config)
-
-    def _object(self) -> UserPolicy:
-        return self.policy() if isinstance(self.policy, type) else self.policy

@@ -1,4 +1,4 @@
-"""How sure a success rate is."""
+"""Success rate with its confidence interval."""
 
 from dataclasses import dataclass
 
@@ -19,6 +19,6 @@ class SuccessRate:
         return float(interval.low), float(interval.high)
 
     def __str__(self) -> str:
-        """Such as 49/50 [0.90, 1.00]."""
+        """Return such as 49/50 [0.90, 1.00]."""
         low, high = self.interval
         return f"{self.successes}/{self.trials} [{low:.2f}, {high:.2f}]"

@@ -1,4 +1,4 @@
-"""A table of trials: success by kind of object or wire and in all, and what went wrong."""
+"""Table of trials: success by shape of object or family of wires and in all, and what went wrong."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -9,37 +9,46 @@ from touchgoal.policies.evaluation.evaluate import Evaluation, Trial
 from touchgoal.sim_envs.scene.objects import SHAPES
 from touchgoal.sim_envs.scene.wires import FAMILIES
 
+_MUCH_CLAMPED = 0.05  # share of the ticks
+
 
 def table(trials: Sequence[Trial]) -> str:
-    """Success with its interval, progress, forces on the hand; placing error where there is a goal."""
+    """Return the table with its legend; the goal error only where the task has a goal position."""
     placed = any(t.goal_distance is not None for t in trials)
     lines = [
-        f"{'':<12}{'success [95 % Wilson]':<24}{'completed':>10}{'mean force N':>14}"
-        f"{'peak force N':>14}{'seconds':>9}" + f"{'off goal mm':>13}" * placed
+        f"{'':<12}{'success [95 % Wilson]':<24}{'progress':>9}{'force N, mean':>15}{'max':>7}"
+        f"{'seconds':>9}" + f"{'goal error mm':>15}" * placed
     ]
     for group in (*SHAPES, *FAMILIES, "all"):
         some = [t for t in trials if group in (group_of(t), "all")]
         if some:
             lines.append(_row(group, some, placed))
+    lines.append("progress: greatest share of the task done; force: external, on the hand")
     if placed:
+        lines.append("goal error: distance of the object from its goal at the end")
         episodes = [t.episode for t in trials]
         masses, forces = [e["mass"] for e in episodes], [e["grasp_force"] for e in episodes]
         lines.append(
-            f"masses {1e3 * min(masses):.0f} to {1e3 * max(masses):.0f} g, "
-            f"grasp forces {min(forces):.1f} to {max(forces):.1f} N"
+            f"objects of {1e3 * min(masses):.0f} to {1e3 * max(masses):.0f} g, gripped with "
+            f"{min(forces):.1f} to {max(forces):.1f} N"
         )
     failures = Counter(t.failure for t in trials if t.failure)
     lines.append("failures: " + (", ".join(f"{k} {n}" for k, n in failures.items()) or "none"))
+    if (clamped := np.mean([t.clamped for t in trials])) > _MUCH_CLAMPED:
+        lines.append(
+            f"clamped: {clamped:.0%} of the actions are beyond the arm's limits; an action is the "
+            "joint changes of one tick (rad) and the gripper's width (m)"
+        )
     return "\n".join(lines)
 
 
 def group_of(trial: Trial) -> str:
-    """Family of the trial's wire, or shape of its object."""
+    """Return the family of the trial's wire, or the shape of its object."""
     return str(trial.episode.get("family") or trial.episode["shape"])
 
 
 def worst_first(trials: Sequence[Trial]) -> list[int]:
-    """Indices of the trials, by progress, then by distance from the goal or by force."""
+    """Return indices of the trials, ranked by progress, then by distance from the goal or force."""
     return sorted(
         range(len(trials)),
         key=lambda i: (
@@ -54,10 +63,10 @@ def worst_first(trials: Sequence[Trial]) -> list[int]:
 def _row(group: str, some: list[Trial], placed: bool) -> str:
     result = Evaluation(tuple(some))
     row = (
-        f"{group:<12}{result.rate!s:<24}{result.progress:>10.0%}"
-        f"{np.mean([t.mean_force for t in some]):>14.1f}{max(t.peak_force for t in some):>14.1f}"
+        f"{group:<12}{result.rate!s:<24}{result.progress:>9.0%}"
+        f"{np.mean([t.mean_force for t in some]):>15.1f}{max(t.peak_force for t in some):>7.1f}"
         f"{np.mean([t.seconds for t in some]):>9.1f}"
     )
     if placed:
-        row += f"{1e3 * np.mean([t.goal_distance or 0.0 for t in some]):>13.1f}"
+        row += f"{1e3 * np.mean([t.goal_distance or 0.0 for t in some]):>15.1f}"
     return row

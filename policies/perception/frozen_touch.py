@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -100,5 +101,10 @@ def shipped_touch(name: str) -> str | None:
 
 
 def _digest(directory: Path) -> str:
-    weights = pretrained.ENCODER_FORMAT.weights_path(directory).read_bytes()
-    return hashlib.sha256(weights).hexdigest()[:12]
+    path = pretrained.ENCODER_FORMAT.weights_path(directory)
+    return _hash_once(path, path.stat().st_mtime_ns)
+
+
+@cache
+def _hash_once(path: Path, modified: int) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]

@@ -1,0 +1,85 @@
+"""Record of an evaluation: each trial as it ends, the table, films of three episodes."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from touchgoal.episodes.film import write_film
+from touchgoal.episodes.recording import EpisodeSpec, one_core_workers, record_with_film
+from touchgoal.policies.by_name import PolicyMaker
+from touchgoal.policies.evaluation.evaluate import Evaluation, Trial
+from touchgoal.policies.evaluation.table import table, worst_first
+from touchgoal.runtime.run_folder import write_json
+from touchgoal.sim_envs.config import TaskConfig
+from touchgoal.sim_envs.tasks import make_env
+
+TRIALS, METRICS = "trials.jsonl", "metrics.json"
+
+
+def record_trials(out: Path, trials: Iterator[Trial], count: int) -> list[Trial]:
+    """Write each trial as it ends, then the metrics; print the table.
+
+    After Ctrl-C the trials that have ended are reported, and the interruption goes on.
+
+    Args:
+        out: folder of the run.
+        trials: of `run_trials`.
+        count: number of trials that were asked for.
+    """
+    ended: list[Trial] = []
+    try:
+        with open(out / TRIALS, "w") as file:
+            for trial in trials:
+                ended.append(trial)
+                file.write(json.dumps(asdict(trial)) + "\n")
+                file.flush()
+    except KeyboardInterrupt:
+        if not ended:
+            print(f"\nstopped before the first of {count} episodes ended: nothing to keep")
+            raise
+        write_json(out / METRICS, _summary(ended) | {"stopped": True, "asked": count})
+        print(f"\nstopped after {len(ended)} of {count} episodes: {Evaluation(tuple(ended))}")
+        print(f"{table(ended)}\nkept: {out / TRIALS} and {out / METRICS}")
+        raise
+    write_json(out / METRICS, _summary(ended))
+    print(f"{table(ended)}\nall trials: {out / METRICS}")
+    return ended
+
+
+def film_trials(
+    out: Path,
+    task: TaskConfig,
+    specs: Sequence[EpisodeSpec],
+    trials: Sequence[Trial],
+    policy: PolicyMaker,
+    workers: int,
+) -> None:
+    """Run the worst, the median and the best episode again, and film them side by side."""
+    ranked = [specs[i] for i in worst_first(trials)]
+    chosen = {"worst": ranked[0], "median": ranked[len(ranked) // 2], "best": ranked[-1]}
+    names = list(chosen)[: len(ranked)]
+    paths = [out / f"{name}.mp4" for name in names]
+    with one_core_workers(min(workers, len(names))) as pool:
+        count = len(names)
+        rows = [task] * count, [policy] * count, [chosen[name] for name in names], paths
+        for name, path, _ in zip(names, paths, pool.map(_film, *rows), strict=True):
+            print(f"{name} episode (seed {chosen[name].seed}): {path}")
+
+
+def _film(task: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec, path: Path) -> None:
+    env = make_env(replace(task, tactile=True))
+    episode, images = record_with_film(env, spec, policy)
+    write_film(path, images, episode, task.control_hz)
+    env.close()
+
+
+def _summary(trials: list[Trial]) -> dict[str, Any]:
+    rate = Evaluation(tuple(trials)).rate
+    return {
+        "successes": rate.successes,
+        "trials": rate.trials,
+        "wilson_95": rate.interval,
+        "episodes": [asdict(t) for t in trials],
+    }
