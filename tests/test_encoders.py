@@ -134,7 +134,7 @@ def test_position_matters() -> None:
 
 def test_random_masking_are_distinct_and_seeded() -> None:
     drawn = [
-        random_masking(PRESETS["tiny"], 50, 0.5, torch.Generator().manual_seed(1)) for _ in range(2)
+        random_masking(PRESETS["tiny"], 0.5, 50, torch.Generator().manual_seed(1)) for _ in range(2)
     ]
     assert drawn[0].shape == (50, 6) and torch.equal(drawn[0], drawn[1])
     assert all(len(set(row)) == 6 for row in drawn[0].tolist())

@@ -109,7 +109,7 @@ def test_one_visible_patch_is_enough(tmp_path: Path) -> None:
     for mask_ratio, bottleneck, seen in ((0.99, True, 1), (0.99, False, 1), (0.0, True, 12)):
         config = replace(TOY, mask_ratio=mask_ratio, bottleneck=bottleneck, epochs=1)
         model = MaskedAutoencoder(config, SENSOR)
-        ids_keep = random_masking(model.backbone.config.vit, 16, mask_ratio, rng)
+        ids_keep = random_masking(model.backbone.config.vit, mask_ratio, 16, rng)
         assert ids_keep.shape == (16, seen)
         assert model.loss(data.touch.float(), ids_keep).isfinite()
     nothing_masked = replace(TOY, mask_ratio=0.01, bottleneck=False)
@@ -122,7 +122,7 @@ def test_only_masked_patches_count_where_tokens_are_seen() -> None:
     model = MaskedAutoencoder(replace(TOY, bottleneck=False), SENSOR)
     vit = model.backbone.config.vit
     touch = torch.randn(2, 3, 120, 160)
-    ids_keep = random_masking(vit, 2, 0.5, torch.Generator().manual_seed(0))
+    ids_keep = random_masking(vit, 0.5, 2, torch.Generator().manual_seed(0))
     reconstructed, real = model.reconstruct(touch, ids_keep), patchify(touch, vit)
     seen = torch.zeros(reconstructed.shape[:2], dtype=torch.bool).scatter(1, ids_keep, True)
     expected = ((reconstructed - real) ** 2)[~seen].mean()

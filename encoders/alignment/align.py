@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncode
 from touchgoal.encoders.backbones.vit import PRESETS as VIT_PRESETS
 from touchgoal.encoders.backbones.vit import random_masking
 from touchgoal.encoders.towers.towers import Towers
+from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import (
@@ -50,28 +52,28 @@ def align(
     options: TrainerOptions,
     recipe: dict[str, Any],
 ) -> TouchEncoder:
-    """Trains a touch encoder.
+    """Train a touch encoder.
 
     Writes what `trainer.fit` does, and at the end the epoch with the best retrieval (mean of both
-    mAPs) on one half of the validation episodes to `encoder/`; its retrieval on the other half, which
-    chose nothing, is kept beside as `test_metrics`. Killed and resumed, it ends with the same weights
-    as uninterrupted.
+    mAPs) on one half of the validation episodes to `encoder/`. Its retrieval on the other half, the
+    test set, is stored as `test_metrics`. Killed and resumed, it ends with the same weights as
+    uninterrupted.
 
     Args:
-        train: Touches to learn from.
+        train: Training touches.
         val: Touches of other episodes.
-        towers: Frozen towers, run once over all pictures and sentences.
-        config: How to train.
+        towers: Frozen towers, run once over all images and sentences.
+        config: Hyperparameters.
         sensor: Name of the fingertip sensor.
-        out_dir: A new run's directory, or one to go on with.
-        options: Seed, device, precision, whether to go on.
-        recipe: JSON-able; where the touches come from, kept with the weights.
+        out_dir: A new run's folder, or one to resume.
+        options: Seed, device, precision, whether to resume.
+        recipe: JSON-able provenance of the touches, stored with the weights.
 
     Returns:
         The encoder as saved in `out_dir/encoder`, in evaluation mode, on the CPU.
 
     Raises:
-        UserError: Unfit data, no such device, or a directory that does not fit `options.resume`.
+        UserError: Unfit data, no such device, or a folder that does not fit `options.resume`.
     """
     data, val_data = (
         prepare_touch_data(t, towers, sensor, config.no_contact_texts) for t in (train, val)
@@ -93,7 +95,7 @@ def align(
     training = Training(
         loss=loss,
         n_samples=len(data),
-        batch=lambda rows, generator: make_batch(data, rows, config, generator),
+        batch=lambda rows, noise: make_batch(data, rows, config, noise),
         optimizer=OptimizerConfig(
             config.epochs,
             config.batch_size,
@@ -137,24 +139,24 @@ class BestEpoch:
         self.weights: dict[str, Tensor] = {}
 
     def state_dict(self) -> dict[str, Tensor]:
-        """For the checkpoint."""
+        """Return the weights for the checkpoint."""
         return self.weights
 
     def load_state_dict(self, weights: dict[str, Tensor]) -> None:
-        """From the checkpoint."""
+        """Take the weights of a checkpoint."""
         self.weights = weights
 
 
 @dataclass(frozen=True, eq=False)
 class AlignedBatch:
-    """b touches with their partners, as unit vectors of the shared space.
+    """b touches with their sentences and images, as unit vectors of the shared space.
 
     Attributes:
-        touch: Embedded touches.
-        text: A sentence for each.
-        image: A picture for each, meaningless where there is no contact.
-        contact: Which touches have a picture.
-        same: Touch i and touch j feel the same object or carry the same sentence.
+        touch: Touch embeddings.
+        text: Embedding of one sentence for each touch.
+        image: Embedding of one image for each touch, meaningless without contact.
+        contact: Whether the touch has an image.
+        same: Whether touches i and j have the same object or the same sentence.
     """
 
     touch: Float[Tensor, "b d"]
@@ -165,14 +167,14 @@ class AlignedBatch:
 
 
 def make_batch(
-    data: TouchData, rows: Int[Tensor, " b"], config: AlignConfig, generator: torch.Generator
+    data: TouchData, rows: Int[Tensor, " b"], config: AlignConfig, noise: BatchNoise
 ) -> dict[str, Tensor | None]:
-    """What `AlignmentLoss` is called with: changed and masked touches beside their partners."""
-    sentence = data.draw_sentences(rows, generator)
-    touch, ids_keep = augment(data.touch[rows].float(), config.augmentation, generator), None
+    """Return the arguments of `AlignmentLoss`: augmented, masked touches with sentences and images."""
+    sentence = data.draw_sentences(rows, noise)
+    touch, ids_keep = augment(data.touch[rows].float(), config.augmentation, noise), None
     if config.mask_ratio > 0:
-        vit = VIT_PRESETS[config.vit]
-        ids_keep = random_masking(vit, len(rows), config.mask_ratio, generator)
+        masking = partial(random_masking, VIT_PRESETS[config.vit], config.mask_ratio)
+        ids_keep = noise.draw(len(rows), masking)
     return {
         "touch": touch,
         "ids_keep": ids_keep,
@@ -185,21 +187,21 @@ def make_batch(
 
 
 class AlignmentLoss(nn.Module):
-    """An encoder and its loss; batches of several processes are compared as one."""
+    """A touch encoder and its contrastive loss over the batches of all processes."""
 
     def __init__(self, encoder: TouchEncoder, config: AlignConfig) -> None:
-        """Of an encoder, which is trained."""
+        """Take the encoder to train."""
         super().__init__()
         self.encoder, self.config = encoder, config
 
     def forward(self, **batch: Tensor | None) -> dict[str, Float[Tensor, ""]]:
-        """The losses of what `make_batch` returns, for the trainer."""
+        """Return the losses of what `make_batch` returns, for the trainer."""
         return self.losses(self.embed(batch, gather_batch))
 
     def embed(
         self, batch: Mapping[str, Any], gather: Callable[[Tensor], Tensor] = lambda rows: rows
     ) -> AlignedBatch:
-        """A batch in the shared space, put together from all processes by `gather`."""
+        """Embed a batch in the shared space; `gather` joins the rows of all processes."""
         touch = self.encoder.embed_touch(batch["touch"], batch["ids_keep"]).float()
         with torch.autocast(touch.device.type, enabled=False):
             text = self.encoder.project_text(batch["text"])
@@ -216,7 +218,7 @@ class AlignmentLoss(nn.Module):
         )
 
     def losses(self, batch: AlignedBatch) -> dict[str, Float[Tensor, ""]]:
-        """See `batch_losses`; in float32 whatever the precision."""
+        """Return `batch_losses`, in float32 whatever the precision."""
         with torch.autocast(batch.touch.device.type, enabled=False):
             return batch_losses(batch, self.encoder.config.pretrained_together, self.config)
 
@@ -224,9 +226,9 @@ class AlignmentLoss(nn.Module):
 def batch_losses(
     batch: AlignedBatch, pretrained_together: bool, config: AlignConfig
 ) -> dict[str, Float[Tensor, ""]]:
-    """The weighted sum "loss" (the paper's Eq. 2) and its terms.
+    """Return the weighted sum "loss" (the paper's Eq. 2) and its terms.
 
-    Touches without contact have no picture and take part in touch-text only. A batch with fewer than
+    Touches without contact have no image and take part in touch-text only. A batch with fewer than
     two touches in contact has no image terms.
     """
     nce = symmetric_info_nce if config.symmetric else info_nce
@@ -248,10 +250,10 @@ def batch_losses(
 
 @torch.no_grad()
 def loss_and_floors(loss: AlignmentLoss, data: TouchData) -> dict[str, float]:
-    """One direction's loss on a fixed batch of `data` beside the least that its targets allow."""
+    """Return the losses from touch on a fixed batch of `data`, and their lower bounds."""
     config, device = loss.config, loss.encoder.device
     rows = torch.linspace(0, len(data) - 1, min(config.batch_size, len(data))).long()
-    made = make_batch(data, rows, config, torch.Generator().manual_seed(0))
+    made = make_batch(data, rows, config, BatchNoise(torch.Generator().manual_seed(0)))
     batch = loss.embed(send_to_device(made, device))
     c = batch.contact
     floors = {}
@@ -266,16 +268,16 @@ def loss_and_floors(loss: AlignmentLoss, data: TouchData) -> dict[str, float]:
 
 
 def _score(metrics: dict[str, Any]) -> float:
-    """Mean of the mAPs that are defined."""
+    """Return the mean of the mAPs that are defined."""
     found = [metrics[f"touch_to_{other}_map"] for other in ("text", "image")]
     return float(np.mean([x for x in found if x is not None]))
 
 
 def _progress(m: dict[str, Any]) -> str:
     image = m["touch_to_image_top1"]
-    image = "not measured (one episode an object)" if image is None else f"{image:.1%}"
+    image = "not measured (one episode per object)" if image is None else f"{image:.1%}"
     return (
-        f"loss {m['loss']:.3f}; touch to text {m['touch_to_text_loss']:.2f} (at least "
-        f"{m['touch_to_text_floor']:.2f}); right object by touch: in sentences "
-        f"{m['touch_to_text_top1']:.1%}, in pictures {image} (chance {m['chance_top1']:.1%})"
+        f"loss {m['loss']:.3f}; touch to text {m['touch_to_text_loss']:.2f} (lower bound "
+        f"{m['touch_to_text_floor']:.2f}); object retrieved by touch: among sentences "
+        f"{m['touch_to_text_top1']:.1%}, among images {image} (chance {m['chance_top1']:.1%})"
     )

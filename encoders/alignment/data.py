@@ -1,4 +1,4 @@
-"""What alignment trains on: preprocessed touches beside the cached embeddings of the towers."""
+"""Training data of the alignment: preprocessed touches and cached embeddings of the towers."""
 
 from dataclasses import dataclass, replace
 
@@ -11,6 +11,7 @@ from torch import Tensor
 from touchgoal.encoders.alignment.config import Augmentation
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.towers.towers import BATCH, Towers
+from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.episodes.touches import Touches
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
@@ -20,17 +21,17 @@ NO_CONTACT = ""
 
 @dataclass(frozen=True, eq=False)
 class TouchData:
-    """n touches of `names` (catalogue ids, and "" for no contact), with their partners.
+    """n touches of the objects in `names`, with their images and sentences.
 
     Attributes:
-        touch: Preprocessed frames; half precision, for they fill the memory.
-        label: Row of `names` that each touch feels.
-        contact: False for touches without contact, which have texts but no picture.
+        touch: Preprocessed frames in half precision, to save memory.
+        label: Row of `names` of each touch.
+        contact: False for touches without contact, which have sentences but no image.
         view_index: Row of `images` of each touch.
-        images: The image tower's embedding of each view, not normalised.
-        texts: The text tower's embedding of each sentence, not normalised.
-        describes: Sentence j describes name i.
-        names: Sorted, so "" comes first.
+        images: Image tower's embedding of each view, not normalised.
+        texts: Text tower's embedding of each sentence, not normalised.
+        describes: Whether sentence j describes name i.
+        names: Catalogue ids, sorted; "" stands for no contact and comes first.
     """
 
     touch: Float16[Tensor, "n 3 h w"]
@@ -46,32 +47,30 @@ class TouchData:
         """Number of touches."""
         return len(self.label)
 
-    def draw_sentences(
-        self, rows: Int[Tensor, " b"], generator: torch.Generator
-    ) -> Int[Tensor, " b"]:
-        """One random sentence (row of `texts`) for each of these touches."""
-        return torch.multinomial(self.describes[self.label[rows]].float(), 1, generator=generator)[
-            :, 0
-        ]
+    def draw_sentences(self, rows: Int[Tensor, " b"], noise: BatchNoise) -> Int[Tensor, " b"]:
+        """Draw one sentence (row of `texts`) for each of these touches."""
+        describes = self.describes[self.label[rows]]
+        order = (noise.rand((len(rows),)) * describes.sum(1)).long()
+        return (describes.cumsum(1) > order[:, None]).int().argmax(1)
 
 
 def prepare_touch_data(
     touches: Touches, towers: Towers, sensor: str, no_contact_texts: tuple[str, ...]
 ) -> TouchData:
-    """Runs preprocessor and towers once over everything.
+    """Run the preprocessor and the towers once over all data.
 
     Args:
         touches: Raw frames.
         towers: Frozen towers.
         sensor: Name of the fingertip sensor.
-        no_contact_texts: What is said of touches without contact; without any, those are left out.
+        no_contact_texts: Sentences for touches without contact; with none, these are left out.
 
     Raises:
         UserError: Frames of another sensor, an object without descriptions, or no contact.
     """
     objects = np.asarray(touches.object)
-    kept = np.flatnonzero((objects != NO_CONTACT) | bool(no_contact_texts))
-    objects = objects[kept]
+    used = np.flatnonzero((objects != NO_CONTACT) | bool(no_contact_texts))
+    objects = objects[used]
     if not (objects != NO_CONTACT).any():
         raise UserError("no touch is in contact: record episodes that touch something")
     names = tuple(sorted(set(objects.tolist())))
@@ -79,10 +78,10 @@ def prepare_touch_data(
         names, touches.descriptions | {NO_CONTACT: list(no_contact_texts)}
     )
     return TouchData(
-        touch=_preprocess(touches, kept, sensor),
+        touch=_preprocess(touches, used, sensor),
         label=torch.from_numpy(np.searchsorted(names, objects)),
         contact=torch.from_numpy(objects != NO_CONTACT),
-        view_index=torch.from_numpy(touches.view_index[kept].astype(np.int64)),
+        view_index=torch.from_numpy(touches.view_index[used].astype(np.int64)),
         images=_embed_views(touches.view, towers),
         texts=towers.embed_texts(sentences),
         describes=describes,
@@ -91,12 +90,7 @@ def prepare_touch_data(
 
 
 def split_by_episode(data: TouchData, seed: int) -> tuple[TouchData, TouchData]:
-    """Two halves of the episodes that touch something, of every object as nearly as can be.
-
-    Args:
-        data: Touches; each episode has one view.
-        seed: Of the split.
-    """
+    """Split the episodes with contact into halves, balanced over objects; each has one view."""
     episodes = data.view_index[data.contact].unique()
     label = torch.zeros(len(data.images), dtype=torch.long)
     label[data.view_index[data.contact]] = data.label[data.contact]
@@ -123,7 +117,7 @@ def _sentences(
 ) -> tuple[list[str], Bool[Tensor, "k m"]]:
     for name in names:
         if not descriptions.get(name):
-            raise UserError(f"the object '{name}' has no descriptions: say how it feels")
+            raise UserError(f"the object '{name}' has no descriptions: add sentences about its feel")
     sentences = sorted({sentence for name in names for sentence in descriptions[name]})
     describes = torch.tensor([[s in descriptions[name] for s in sentences] for name in names])
     return sentences, describes
@@ -144,21 +138,20 @@ def _embed_views(views: np.ndarray, towers: Towers) -> Float[Tensor, "e i"]:
 
 
 def augment(
-    touch: Float[Tensor, "b 3 h w"], by: Augmentation, generator: torch.Generator
+    touch: Float[Tensor, "b 3 h w"], by: Augmentation, noise: BatchNoise
 ) -> Float[Tensor, "b 3 h w"]:
-    """Randomly changed copies of preprocessed touches."""
-    touch = _shifted(touch, by.shift, generator) if by.shift else touch
-    gain = 1 + by.gain * _uniform((len(touch), 3, 1, 1), generator)
-    offset = by.offset * _uniform((len(touch), 3, 1, 1), generator)
-    touch = touch * gain + offset
+    """Return randomly changed copies of preprocessed touches."""
+    touch = _shifted(touch, by.shift, noise) if by.shift else touch
+    gain, offset = (2 * noise.rand((len(touch), 3, 1, 1)) - 1 for _ in range(2))
+    touch = touch * (1 + by.gain * gain) + by.offset * offset
     if by.noise:
-        touch = touch + by.noise * torch.randn(touch.shape, generator=generator)
+        touch = touch + by.noise * noise.randn(touch.shape)
     return touch
 
 
-def _shifted(touch: Tensor, most: int, generator: torch.Generator) -> Tensor:
+def _shifted(touch: Tensor, most: int, noise: BatchNoise) -> Tensor:
     height, width = touch.shape[2:]
-    moves = torch.randint(0, 2 * most + 1, (len(touch), 2), generator=generator).tolist()
+    moves = noise.randint(0, 2 * most + 1, (len(touch), 2)).tolist()
     padded = F.pad(touch, (most,) * 4)
     return torch.stack(
         [
@@ -166,7 +159,3 @@ def _shifted(touch: Tensor, most: int, generator: torch.Generator) -> Tensor:
             for image, (y, x) in zip(padded, moves, strict=True)
         ]
     )
-
-
-def _uniform(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
-    return 2 * torch.rand(shape, generator=generator) - 1

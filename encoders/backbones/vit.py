@@ -280,15 +280,15 @@ def _patch_projection(config: ViTConfig) -> nn.Conv2d | nn.Conv3d:
 
 
 def random_masking(
-    config: ViTConfig, count: int, mask_ratio: float, generator: torch.Generator
+    config: ViTConfig, mask_ratio: float, count: int, generator: torch.Generator
 ) -> Int[Tensor, "{count} k"]:
-    """Draws which patches of `count` images of the configured size to keep, for `ViT.forward`.
+    """Draw which patches of `count` images of the configured size to keep, for `ViT.forward`.
 
     Args:
         config: Size of the images and patches.
-        count: Images.
-        mask_ratio: Share of the patches left out, in [0, 1); at least one patch is kept.
-        generator: Of the draw.
+        mask_ratio: Share of the patches to drop, in [0, 1); at least one patch stays.
+        count: Number of images.
+        generator: Random generator on the CPU.
     """
     rows, columns = patch_grid(config)
     order = torch.rand(count, rows * columns, generator=generator).argsort(1)

@@ -1,6 +1,7 @@
 """Masked autoencoding of touch (He et al. 2022; Sparsh, Higuera et al. 2024): no labels needed."""
 
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from touchgoal.encoders.backbones.vit import (
 from touchgoal.encoders.ssl.config import MaeConfig
 from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.validation import forces_line, read_forces
+from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
@@ -104,7 +106,7 @@ class MaskedAutoencoder(nn.Module):
 
     def _check_mask(self, vit: ViTConfig) -> None:
         rows, columns = patch_grid(vit)
-        seen = random_masking(vit, 1, self.config.mask_ratio, torch.Generator()).shape[1]
+        seen = random_masking(vit, self.config.mask_ratio, 1, torch.Generator()).shape[1]
         if seen == rows * columns and not self.config.bottleneck:
             raise UserError(
                 f"mask_ratio {self.config.mask_ratio} masks none of {seen} patches, and without "
@@ -143,11 +145,10 @@ def train_mae(
         torch.manual_seed(options.seed)
         model = MaskedAutoencoder(config, train.sensor, train.stride)
 
-    def batch(rows: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-        ids_keep = random_masking(
-            model.backbone.config.vit, len(rows), config.mask_ratio, generator
-        )
-        return {"touch": train.touch[rows], "ids_keep": ids_keep}
+    masking = partial(random_masking, model.backbone.config.vit, config.mask_ratio)
+
+    def batch(rows: Tensor, noise: BatchNoise) -> dict[str, Tensor]:
+        return {"touch": train.touch[rows], "ids_keep": noise.draw(len(rows), masking)}
 
     training = Training(
         loss=model,
@@ -195,7 +196,7 @@ def validate(model: MaskedAutoencoder, train: TouchFrames, val: TouchFrames) -> 
     total, blank = 0.0, 0.0
     for batch in val.touch.split(BATCH):
         touch = model.images(batch.to(device))
-        ids_keep = random_masking(vit, len(touch), model.config.mask_ratio, generator).to(device)
+        ids_keep = random_masking(vit, model.config.mask_ratio, len(touch), generator).to(device)
         total += model.loss(touch, ids_keep).item() * len(touch)
         blank += patchify(touch, vit).square().mean().item() * len(touch)
     return {

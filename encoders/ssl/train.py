@@ -21,6 +21,7 @@ from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.ijepa import IJepa
 from touchgoal.encoders.ssl.validation import Validation
 from touchgoal.encoders.ssl.vjepa import VJepa
+from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
@@ -80,8 +81,8 @@ def train_self_distilled(
         model = objective(config, backbone, optimizer.steps(len(train)))
     validation = Validation(model, train, val, out_dir, config.epochs)
 
-    def batch(rows: Tensor, generator: torch.Generator) -> dict[str, Any]:
-        return {"touch": train.touch[rows], **model.draw(len(rows), generator)}
+    def batch(rows: Tensor, noise: BatchNoise) -> dict[str, Any]:
+        return {"touch": train.touch[rows], **noise.draw(len(rows), model.draw)}
 
     training = Training(
         loss=model,

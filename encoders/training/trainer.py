@@ -1,11 +1,12 @@
 """The one loop by which all networks here are trained, on Accelerate.
 
 A training is a module that computes the loss, a function that makes a batch, an optimizer's settings
-and a few plain functions called on the way. The loop adds devices, bfloat16, several GPUs (`torchrun`),
-gradient clipping, the learning rate's schedule, checkpoints, `metrics.jsonl` and TensorBoard.
+and a few callbacks. The loop adds devices, bfloat16, several GPUs (`torchrun`), gradient clipping,
+learning rate schedules, checkpoints, `metrics.jsonl` and TensorBoard.
 
-An epoch's randomness depends on seed and number alone, so a training that was stopped and resumed ends
-with the same weights, bit for bit, as an uninterrupted one.
+An epoch's randomness depends on the seed and the epoch alone, so a resumed training ends with the same
+weights, bit for bit, as an uninterrupted one. Several processes share each batch and its noise, so
+their curve is that of one process, up to rounding.
 """
 
 import math
@@ -17,14 +18,14 @@ from typing import Any, cast
 
 import torch
 from accelerate import Accelerator
-from accelerate.state import AcceleratorState
 from accelerate.utils import send_to_device
 from jaxtyping import Int, Shaped
 from torch import Tensor, nn
-from torch.distributed.nn.functional import all_gather
+from torch.distributed._functional_collectives import all_gather_single
 from tqdm import tqdm
 
 from touchgoal.encoders.training import checkpoint
+from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import kept
@@ -36,22 +37,23 @@ Metrics = dict[str, Any]
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """How weights are updated.
+    """Settings of Adam and its schedules.
 
     Attributes:
         epochs: Passes over the data.
-        batch_size: Samples a step, all processes together; all of them if there are fewer. Samples
-            that fill no batch are left out of their epoch.
+        batch_size: Samples a step over all processes; all of them if there are fewer. Samples that
+            fill no batch are left out of their epoch.
         lr: Highest learning rate.
-        weight_decay: Of weight matrices and convolutions; biases, norms, tokens have none.
-        final_weight_decay: The same at the end, reached by a cosine; None: it stays.
-        betas: Of Adam.
+        weight_decay: Weight decay of weight matrices and convolutions; biases, norms and tokens have
+            none.
+        final_weight_decay: Weight decay at the end, reached by a cosine; None keeps it constant.
+        betas: Adam's betas.
         decoupled_weight_decay: AdamW (Loshchilov and Hutter 2019); otherwise Adam with weight decay
             as an L2 term in the gradient.
         warmup: Share of the steps in which the rate rises linearly from 0.
-        max_warmup_steps: No more than so many.
+        max_warmup_steps: Upper bound of these steps.
         final_lr: Rate at the end over `lr`, reached by a cosine; 1 keeps the rate constant.
-        max_grad_norm: Gradients are clipped to this norm; None: they are not.
+        max_grad_norm: Norm that gradients are clipped to; None clips nothing.
     """
 
     epochs: int
@@ -67,19 +69,19 @@ class OptimizerConfig:
     final_weight_decay: float | None = None
 
     def __post_init__(self) -> None:
-        """Raises UserError for settings that cannot train."""
+        """Raise UserError for settings that cannot train."""
         if self.epochs < 1 or self.batch_size < 1:
             raise UserError("training needs at least 1 epoch and a batch size of at least 1")
         if not (math.isfinite(self.lr) and self.lr > 0 and self.weight_decay >= 0):
             raise UserError("training needs a learning rate above 0 and weight decay of at least 0")
 
     def build(self, module: nn.Module) -> torch.optim.Optimizer:
-        """The optimizer of a module's parameters."""
+        """Return the optimizer of a module's parameters."""
         kind = torch.optim.AdamW if self.decoupled_weight_decay else torch.optim.Adam
         return kind(parameter_groups(module, self.weight_decay), lr=self.lr, betas=self.betas)
 
     def learning_rate(self, step: int, steps: int) -> float:
-        """The rate of a step (from 0) of so many."""
+        """Return the rate of a step, counted from 0, of `steps`."""
         warmup = min(self.max_warmup_steps, int(self.warmup * steps))
         if step < warmup:
             return self.lr * (step + 1) / (warmup + 1)
@@ -87,19 +89,19 @@ class OptimizerConfig:
         return self.lr * (self.final_lr + (1 - self.final_lr) * cosine)
 
     def decay(self, step: int, steps: int) -> float:
-        """The weight decay of a step (from 0) of so many."""
+        """Return the weight decay of a step, counted from 0, of `steps`."""
         if self.final_weight_decay is None:
             return self.weight_decay
         share = (1 - math.cos(math.pi * step / steps)) / 2
         return self.weight_decay + share * (self.final_weight_decay - self.weight_decay)
 
     def steps(self, n_samples: int) -> int:
-        """Updates of a whole training on so many samples an epoch."""
+        """Return the number of updates of a training with `n_samples` an epoch."""
         return self.epochs * (n_samples // min(self.batch_size, n_samples))
 
 
 def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
-    """First weights of linear layers and convolutions, which decay; then biases, norms and learned tokens."""
+    """Return the weights of linear layers and convolutions, which decay, then all other parameters."""
     decayed, others = [], []
     for name, parameter in module.named_parameters():
         if not parameter.requires_grad:
@@ -118,28 +120,27 @@ def _nothing(*_: Any) -> None:
 
 @dataclass(eq=False)
 class Training:
-    """What is trained, and how.
+    """A training: its loss, its data and its callbacks.
 
     Attributes:
-        loss: Called with what `batch` returns; gives named scalars, of which "loss" is minimised.
-            Its parameters are what is trained, but for those that require no gradient.
+        loss: Module called with a batch; returns named scalars, of which "loss" is minimised. Its
+            parameters that require a gradient are trained.
         n_samples: Samples of an epoch.
-        batch: Makes a batch of these samples on the CPU, drawing all that is random from the
-            generator.
-        optimizer: How weights are updated.
-        identity: JSON-able: data (a checksum) and settings. A run goes on only with the same.
-        evaluate: Called after every epoch; its metrics are kept beside the mean losses.
-        progress: The line printed of an epoch's metrics.
+        batch: Makes a batch of these samples on the CPU; all that is random about it, and one entry a
+            sample, comes from the noise.
+        optimizer: Settings of the optimizer.
+        identity: JSON-able checksum of the data and settings. A run resumes only with the same.
+        evaluate: Called after every epoch; returns metrics to record beside the mean losses.
+        progress: Returns the line to print for an epoch's metrics.
         after_step: Called after every update of the weights.
         after_epoch: Called with all metrics so far and the provenance before the checkpoint is
             written; in every process, see `on_first_process`.
-        extra_state: What else must survive an interruption: objects with `state_dict` and
-            `load_state_dict`.
+        extra_state: Further objects with `state_dict` and `load_state_dict` for the checkpoint.
     """
 
     loss: nn.Module
     n_samples: int
-    batch: Callable[[Int[Tensor, " b"], torch.Generator], dict[str, Any]]
+    batch: Callable[[Int[Tensor, " b"], BatchNoise], dict[str, Any]]
     optimizer: OptimizerConfig
     identity: Mapping[str, Any]
     evaluate: Callable[[], Metrics] = dict
@@ -152,30 +153,30 @@ class Training:
 def fit(
     training: Training, out_dir: Path, options: TrainerOptions, recipe: Mapping[str, Any]
 ) -> tuple[list[Metrics], dict[str, Any]]:
-    """Trains; Ctrl-C keeps the finished epochs.
+    """Train; Ctrl-C keeps the finished epochs.
 
     Writes `metrics.jsonl` (a line an epoch), TensorBoard's event files and `checkpoint.pt` (after
     every epoch).
 
     Args:
-        training: What is trained; its modules are moved to the device, and changed.
-        out_dir: A new run's folder, or with `options.resume` the one to go on with.
+        training: What to train; its modules are moved to the device, and changed.
+        out_dir: A new run's folder, or with `options.resume` the one to resume.
         options: Seed, device, precision.
-        recipe: JSON-able provenance: command, commit, where the data come from and their checksum.
+        recipe: JSON-able provenance: command, commit, data and their checksum.
 
     Returns:
-        The metrics of every epoch; the provenance to keep beside the weights.
+        The metrics of every epoch, and the provenance to store beside the weights.
 
     Raises:
         UserError: No such device, or a folder that does not fit `options.resume`.
     """
     checkpoint.check_run_folder(out_dir, options.resume)
-    accelerator = _accelerator(options)
+    accelerator = _accelerator(options.device)
     config, size = training.optimizer, min(training.optimizer.batch_size, training.n_samples)
     if size % accelerator.num_processes:
         raise UserError(
-            f"batches of {size} cannot be shared by {accelerator.num_processes} processes: choose a "
-            "batch size that is a multiple"
+            f"{accelerator.num_processes} processes cannot share batches of {size}: choose a batch size "
+            "that is a multiple of their number"
         )
     for module in (training.loss, *training.extra_state.values()):
         if isinstance(module, nn.Module):
@@ -197,9 +198,9 @@ def fit(
     )
     model, optimizer = accelerator.prepare(training.loss, optimizer)
     try:
-        with kept(lambda: _how_to_go_on(out_dir, len(history), config.epochs)):
+        with kept(lambda: _how_to_resume(out_dir, len(history), config.epochs)):
             for epoch in range(len(history), config.epochs):
-                losses = _train_epoch(training, accelerator, model, optimizer, options.seed, epoch)
+                losses = _train_epoch(training, accelerator, model, optimizer, options, epoch)
                 training.loss.eval()
                 history.append({"epoch": epoch + 1, **losses, **training.evaluate()})
                 training.after_epoch(history, provenance)
@@ -220,31 +221,33 @@ def _train_epoch(
     accelerator: Accelerator,
     model: nn.Module,
     optimizer: torch.optim.Optimizer,
-    seed: int,
+    options: TrainerOptions,
     epoch: int,
 ) -> Metrics:
-    """One pass over the data: the mean of each loss."""
+    """Train one pass over the data; return the mean of each loss."""
     config = training.optimizer
     size = min(config.batch_size, training.n_samples)
     rank, world = accelerator.process_index, accelerator.num_processes
-    generator, batches = epoch_batches(training.n_samples, size, seed, epoch)
-    if rank:
-        generator.manual_seed(generator.initial_seed() + rank * 2**32)
+    generator, batches = epoch_batches(training.n_samples, size, options.seed, epoch)
+    noise = BatchNoise(generator, rank, world)
+    mixed = torch.autocast(
+        accelerator.device.type, torch.bfloat16, enabled=options.precision == "bf16"
+    )
     steps = config.steps(training.n_samples)
     model.train()
     losses: list[dict[str, Tensor]] = []
     name = f"epoch {epoch + 1}/{config.epochs}"
-    for i, rows in enumerate(
-        tqdm(batches, desc=name, leave=False, disable=None if not rank else True)
-    ):
+    for i, rows in enumerate(tqdm(batches, desc=name, leave=False, disable=rank > 0 or None)):
         step = epoch * len(batches) + i
         for group in optimizer.param_groups:
             group["lr"] = config.learning_rate(step, steps)
         optimizer.param_groups[0]["weight_decay"] = config.decay(step, steps)
-        batch = send_to_device(training.batch(rows[rank::world], generator), accelerator.device)
-        terms = model(**batch)
+        own = rows.chunk(world)[rank]
+        batch = send_to_device(training.batch(own, noise), accelerator.device)
+        with mixed:
+            terms = model(**batch)
         optimizer.zero_grad()
-        accelerator.backward(terms["loss"])
+        accelerator.backward(terms["loss"].float())
         if config.max_grad_norm is not None:
             accelerator.clip_grad_norm_(model.parameters(), config.max_grad_norm)
         optimizer.step()
@@ -254,7 +257,7 @@ def _train_epoch(
 
 
 def _mean_over_steps(losses: list[dict[str, Tensor]], accelerator: Accelerator) -> Metrics:
-    """Mean of each term over all steps (absent ones count 0) and processes."""
+    """Return the mean of each term over all steps (absent ones count 0) and processes."""
     means = {}
     for name in {name: None for terms in losses for name in terms}:
         values = torch.stack([terms[name].float() for terms in losses if name in terms])
@@ -263,7 +266,7 @@ def _mean_over_steps(losses: list[dict[str, Tensor]], accelerator: Accelerator) 
     return means
 
 
-def _how_to_go_on(out_dir: Path, done: int, epochs: int) -> str:
+def _how_to_resume(out_dir: Path, done: int, epochs: int) -> str:
     if not done:
         return f"no epoch was finished, nothing is kept in {out_dir}"
     command = command_line()
@@ -277,21 +280,21 @@ def _how_to_go_on(out_dir: Path, done: int, epochs: int) -> str:
 def epoch_batches(
     n_samples: int, batch_size: int, seed: int, epoch: int
 ) -> tuple[torch.Generator, tuple[Int[Tensor, " b"], ...]]:
-    """An epoch's generator, and its batches of rows; rows that fill no batch are left out."""
+    """Return an epoch's generator and its batches of rows; rows that fill no batch are left out."""
     generator = torch.Generator().manual_seed(seed * 1_000_003 + epoch)
     order = torch.randperm(n_samples, generator=generator)
     return generator, order[: n_samples // batch_size * batch_size].split(batch_size)
 
 
 def gather_batch(rows: Shaped[Tensor, "b ..."]) -> Shaped[Tensor, "n ..."]:
-    """The rows of all processes, with gradients, for losses that compare samples with each other."""
+    """Return the rows of all processes, in order and with gradients, for losses between samples."""
     if not torch.distributed.is_initialized():
         return rows
-    return torch.cat(list(all_gather(rows.contiguous())))
+    return all_gather_single(rows.contiguous(), 0, torch.distributed.group.WORLD)
 
 
 def on_first_process(action: Callable[[], object]) -> None:
-    """Does something once, in the first of several processes, while the others wait."""
+    """Run `action` in the first of several processes, while the others wait."""
     if is_first_process():
         action()
     if torch.distributed.is_initialized():
@@ -299,12 +302,12 @@ def on_first_process(action: Callable[[], object]) -> None:
 
 
 def is_first_process() -> bool:
-    """Whether this is the only process, or the first of several."""
+    """Return whether this is the only process, or the first of several."""
     return not torch.distributed.is_initialized() or torch.distributed.get_rank() == 0
 
 
 def check_device(device: str) -> None:
-    """Raises UserError if there is no such device here."""
+    """Raise UserError if this machine has no such device."""
     kind, _, index = device.partition(":")
     if kind not in ("cpu", "cuda", "mps") or (index and not (kind == "cuda" and index.isdigit())):
         raise UserError(f"unknown device '{device}': choose cpu, cuda, cuda:<number> or mps")
@@ -314,11 +317,21 @@ def check_device(device: str) -> None:
         raise UserError("there is no device mps here: choose the device cpu")
 
 
-def _accelerator(options: TrainerOptions) -> Accelerator:
-    check_device(options.device)
-    kind, _, index = options.device.partition(":")
+def _accelerator(device: str) -> Accelerator:
+    """Return an Accelerator for a device.
+
+    Accelerate fixes device and precision for the life of a process, so bfloat16 is left to autocast.
+    """
+    check_device(device)
+    kind, _, index = device.partition(":")
     if index:
         torch.cuda.set_device(int(index))
-    # Accelerate keeps device and precision for the life of a process; two trainings may differ
-    AcceleratorState._reset_state(reset_partial_state=True)
-    return Accelerator(cpu=kind == "cpu", mixed_precision=options.precision)
+    try:
+        accelerator = Accelerator(cpu=kind == "cpu", mixed_precision="no")
+    except ValueError:  # the state of this process is of a GPU
+        accelerator = Accelerator(mixed_precision="no")
+    if accelerator.device.type != kind:
+        raise UserError(
+            f"this process has trained on {accelerator.device.type} already: train on {device} in a new one"
+        )
+    return accelerator

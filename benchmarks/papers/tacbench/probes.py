@@ -22,6 +22,7 @@ from touchgoal.encoders.backbones.touch_backbone import (
 )
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.encoders.pretrained import load_encoder
+from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
 from touchgoal.runtime.progress import track
@@ -171,8 +172,8 @@ def train_reader(
     best: dict[str, Tensor] = {}
     least = float("inf")
 
-    def batch(rows: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-        drawn = train[torch.randint(len(train), (len(rows),), generator=generator)]
+    def batch(rows: Tensor, noise: BatchNoise) -> dict[str, Tensor]:
+        drawn = train[noise.randint(0, len(train), (len(rows),))]
         return {"inputs": inputs_of(drawn), "targets": task.targets(drawn)}
 
     def evaluate() -> dict[str, float]:
