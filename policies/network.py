@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
 from touchgoal.control import features as ft
+from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.policies.actions import (
     ACTION_DIM,
     Normalizer,
@@ -214,7 +215,7 @@ class PolicyNetwork(nn.Module):
         self,
         batch: ObservationBatch,
         actions: Float[Tensor, "b h 8"],
-        generator: torch.Generator,
+        noise: BatchNoise,
         wrench: Float[Tensor, "b o 12"] | None = None,
         action_is_pad: Bool[Tensor, "b h"] | None = None,
     ) -> Float[Tensor, ""]:
@@ -223,19 +224,19 @@ class PolicyNetwork(nn.Module):
         Args:
             batch: what was seen.
             actions: what was done.
-            generator: the CPU's.
+            noise: random numbers of the batch.
             wrench: what acted on both pads, where touch is read as that.
             action_is_pad: the ticks that lie after the episode's end, of which nothing is learned.
         """
         chunk = to_representation(actions, batch.joints, self.config.representation)
-        touch = self._encode_touch(batch, generator)
+        touch = self._encode_touch(batch, noise)
         wrench_loss = torch.zeros((), device=touch.device)
         if self.config.reads_wrench:
             assert wrench is not None, "this policy learns to read wrenches"
             wrench_loss = F.mse_loss(touch, self.wrench_normalizer(wrench))
             touch = touch.detach()
-        encoded = self._encode(batch, touch, generator)
-        loss = self.head.loss(self.action_normalizer(chunk), encoded, generator, action_is_pad)
+        encoded = self._encode(batch, touch, noise)
+        loss = self.head.loss(self.action_normalizer(chunk), encoded, noise, action_is_pad)
         return loss + wrench_loss
 
     @torch.inference_mode()
@@ -252,14 +253,14 @@ class PolicyNetwork(nn.Module):
         return actions
 
     def _encode_touch(
-        self, batch: ObservationBatch, noise: torch.Generator | None = None
+        self, batch: ObservationBatch, noise: BatchNoise | None = None
     ) -> Float[Tensor, "b o w"]:
         """What touch tells the head, with the training's noise if there is a generator for it."""
         if self.touch_readout is None:
             return batch.state[..., :0]
         touch = self.touch_normalizer(batch.touch).clamp(-_CLIP, _CLIP)
         if noise is not None:
-            noise_drawn = torch.randn(touch.shape, generator=noise).to(touch)
+            noise_drawn = noise.randn(touch.shape).to(touch)
             touch = touch + self.config.touch_noise * noise_drawn
         return self.touch_readout(touch)
 
@@ -267,14 +268,14 @@ class PolicyNetwork(nn.Module):
         self,
         batch: ObservationBatch,
         touch: Float[Tensor, "b o w"],
-        noise: torch.Generator | None = None,
+        noise: BatchNoise | None = None,
     ) -> Float[Tensor, "b c"]:
         """What the head sees, with the training's noise if there is a generator for it."""
         columns, kind = self.config.proprioception, self.config.representation
         state = network_input(batch.state, columns, kind)
         seen = self.state_normalizer(state).clamp(-_CLIP, _CLIP)
         if noise is not None:
-            shift = torch.randn(len(seen), 1, seen.shape[2], generator=noise).to(seen)
+            shift = noise.randn((len(seen), 1, seen.shape[2])).to(seen)
             seen = seen + self.config.position_noise * shift * is_position(columns, kind).to(seen)
         seen = torch.cat([touch, seen], -1)
         if self.end_to_end_encoder is None:

@@ -134,7 +134,10 @@ def test_prepared_data_pairs_touch_with_object_and_view() -> None:
     assert data.touch.shape == (36, 3, 120, 160)
     assert data.describes.sum(1).tolist() == [len(CONFIG.no_contact_texts), 3, 3, 3]
     rows = torch.arange(36)
-    drawn = [data.draw_sentences(rows, BatchNoise(torch.Generator().manual_seed(seed))) for seed in (0, 0, 1)]
+    drawn = [
+        data.draw_sentences(rows, BatchNoise(torch.Generator().manual_seed(seed)))
+        for seed in (0, 0, 1)
+    ]
     assert torch.equal(drawn[0], drawn[1]) and not torch.equal(drawn[0], drawn[2])
     assert data.describes[data.label, drawn[0]].all()
 

@@ -24,6 +24,7 @@ from toy_policies import (
 from touchgoal.control import features as ft
 from touchgoal.control.motion.arm_models import FR3_ARM
 from touchgoal.control.motion.kinematics import Fr3Kinematics
+from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.episodes.repair import validate
 from touchgoal.episodes.schema import Episode
@@ -138,13 +139,13 @@ def test_nothing_is_learned_of_what_lies_after_the_end(head) -> None:
     policy = toy_policy(config, dataset)
     losses = []
     for chunk in (actions, other):
-        loss = policy.loss(batch, chunk, torch_rng(), wrench, is_pad)
+        loss = policy.loss(batch, chunk, BatchNoise(torch_rng()), wrench, is_pad)
         losses.append(torch.autograd.grad(loss, list(policy.head.parameters())))
     if isinstance(head, RegressionConfig):  # a U-Net sees the padding, noised, beside the rest
         for one, two in zip(*losses, strict=True):
             torch.testing.assert_close(one, two)
     everything = policy.head.loss(torch.zeros(2, 8, 8), torch.zeros(2, policy.condition_dim),
-                                  torch_rng(), torch.ones(2, 8, dtype=torch.bool))  # fmt: skip
+                                  BatchNoise(torch_rng()), torch.ones(2, 8, dtype=torch.bool))  # fmt: skip
     assert everything == 0
     wild = toy_dataset(config, (3, 20))
     wild.recorded.actions[[2, 22]] = 9.0  # the last tick's, never done
@@ -169,7 +170,7 @@ def test_a_toy_batch_is_learned_by_heart(config: PolicyConfig) -> None:
     (condition, actions), wrench = windows.take(rows), windows.wrench(rows)
     optimiser, generator = torch.optim.Adam(policy.parameters(), 5e-3), torch_rng()
     for _ in range(120):
-        loss = policy.loss(condition, actions, generator, wrench, windows.action_is_pad)
+        loss = policy.loss(condition, actions, BatchNoise(generator), wrench, windows.action_is_pad)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

@@ -6,6 +6,7 @@ import pytest
 import torch
 from toy_policies import torch_rng
 
+from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.samplers import (
     FLOW_TIME_SCALE,
@@ -81,7 +82,7 @@ def test_exact_denoiser_gives_the_gaussian_back(config: SamplerConfig) -> None:
 def test_forward_process_has_the_schedules_statistics(predict: str) -> None:
     config = SamplerConfig(prediction_type=predict, num_train_timesteps=10)  # pyright: ignore[reportArgumentType]
     clean = torch.full((20_000, 2, 1), 0.7)
-    noisy, step, target = add_noise(config, clean, torch_rng())
+    noisy, step, target = add_noise(config, clean, BatchNoise(torch_rng()))
     for t, power in enumerate(alphas_cumprod(10).tolist()):
         at = noisy[step == t]
         assert at.mean().item() == pytest.approx(0.7 * power**0.5, abs=0.05)
@@ -93,7 +94,9 @@ def test_forward_process_has_the_schedules_statistics(predict: str) -> None:
 
 def test_flow_goes_straight() -> None:
     clean = torch.randn(50, 4, 2, generator=torch_rng())
-    noisy, step, velocity = add_noise(SamplerConfig("flow", "velocity"), clean, torch_rng(1))
+    noisy, step, velocity = add_noise(
+        SamplerConfig("flow", "velocity"), clean, BatchNoise(torch_rng(1))
+    )
     left = 1 - step.view(-1, 1, 1) / FLOW_TIME_SCALE
     torch.testing.assert_close(noisy + left * velocity, clean)
 

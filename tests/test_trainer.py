@@ -102,48 +102,50 @@ from dataclasses import replace
 from pathlib import Path
 import torch
 sys.path.insert(0, {tests!r})
-import test_align, test_mae, toy_policies
-from touchgoal.encoders.alignment.config import Augmentation
-from touchgoal.encoders.training.options import TrainerOptions
+import test_align, test_mae, test_self_distillation, toy_policies
 from touchgoal.encoders.ssl.mae import train_mae
+from touchgoal.encoders.ssl.train import train_self_distilled
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig
 from touchgoal.policies.config import TrainConfig
 from touchgoal.policies.training.train import train
 
 # plain gradient descent: Adam would not show gradients that are twice too large
 OptimizerConfig.build = lambda self, module: torch.optim.SGD(module.parameters(), self.lr)
-out = Path(sys.argv[1])
-config = replace(test_mae.TOY, mask_ratio=0.0, epochs=2, lr=0.1)
+out, options = Path(sys.argv[1]), TrainerOptions()
 data = test_mae.blobs(32, 0)
-train_mae(data, data, config, out / "mae", TrainerOptions(), {{}})
-names = {{name: texts[:1] for name, texts in test_align.DESCRIPTIONS.items()}}
-touches = replace(test_align.TRAIN, descriptions=names)
-config = replace(test_align.CONFIG, lr=0.1, mask_ratio=0.0, augmentation=Augmentation(), no_contact_texts=("free",))
-test_align.run_align(touches, test_align.VAL, test_align.FakeTowers(), config, out / "align", {{}})
+train_mae(data, data, replace(test_mae.TOY, epochs=2, lr=0.1), out / "mae", options, {{}})
+config = replace(test_align.CONFIG, lr=0.1)
+test_align.run_align(test_align.TRAIN, test_align.VAL, test_align.FakeTowers(), config, out / "align", {{}})
+data = test_self_distillation.moving_blobs(32)
+config = replace(test_self_distillation.TOY, epochs=2, lr=0.1, targets="sinkhorn", batch_norm=True)
+train_self_distilled(data, data, config, out / "dino", options, {{}})
 windows, config = toy_policies.toy_dataset(toy_policies.TOY), TrainConfig(epochs=2, batch_size=8)
-train(toy_policies.TOY, windows, windows, config, out / "policy", TrainerOptions(), {{}})
+train(toy_policies.TOY, windows, windows, config, out / "policy", options, {{}})
 """
 
 
 @pytest.mark.slow
 def test_two_processes_train_as_one(tmp_path: Path) -> None:
-    """The same batches, shared: gradients, and so the weights, are those of one process.
-
-    A policy's loss draws noise, each process its own, so it is only seen to run.
-    """
     script, tests = tmp_path / "worker.py", Path(__file__).parent
     script.write_text(WORKER.format(tests=str(tests)))
-    weights = {}
+    names = ("mae", "align", "dino", "policy")
+    runs = {}
     for n in (1, 2):
-        torchrun = "-m torch.distributed.run --standalone --nproc-per-node".split()
-        command = [sys.executable, *torchrun, str(n), str(script), str(tmp_path / str(n))]
+        torchrun = "-W error::FutureWarning -m torch.distributed.run --standalone".split()
+        command = [sys.executable, *torchrun, f"--nproc-per-node={n}", script, tmp_path / str(n)]
         done = subprocess.run(
-            command, env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True
+            [str(word) for word in command],
+            env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "error::FutureWarning"},
+            capture_output=True,
         )
         assert done.returncode == 0, done.stderr.decode()[-3000:]
-        for name in ("mae", "align"):
+        for name in names:
             path = tmp_path / str(n) / name / "checkpoint.pt"
-            weights[name, n] = torch.load(path, weights_only=True)["model"]
-    for name in ("mae", "align"):
-        for key, weight in weights[name, 1].items():
-            torch.testing.assert_close(weights[name, 2][key], weight, rtol=1e-3, atol=1e-5, msg=key)
+            runs[name, n] = torch.load(path, weights_only=True)
+    for name in names:
+        one, two = runs[name, 1], runs[name, 2]
+        for a, b in zip(one["history"], two["history"], strict=True):
+            assert a["loss"] == pytest.approx(b["loss"], rel=1e-3), name
+        for key, weight in one["model"].items():
+            torch.testing.assert_close(two["model"][key], weight, rtol=1e-3, atol=1e-5, msg=key)

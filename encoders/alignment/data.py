@@ -117,7 +117,9 @@ def _sentences(
 ) -> tuple[list[str], Bool[Tensor, "k m"]]:
     for name in names:
         if not descriptions.get(name):
-            raise UserError(f"the object '{name}' has no descriptions: add sentences about its feel")
+            raise UserError(
+                f"the object '{name}' has no descriptions: add sentences about its feel"
+            )
     sentences = sorted({sentence for name in names for sentence in descriptions[name]})
     describes = torch.tensor([[s in descriptions[name] for s in sentences] for name in names])
     return sentences, describes

@@ -21,7 +21,7 @@ from touchgoal.encoders.ssl.self_distillation import (
     SelfDistillation,
     frozen_copy,
 )
-from touchgoal.encoders.training.trainer import gather_batch
+from touchgoal.encoders.training.trainer import gather_batch, own_rows
 
 _GLOBAL_VIEWS = 2
 _SINKHORN_ROUNDS = 3
@@ -37,7 +37,7 @@ class DinoHead(nn.Module):
         layers: list[nn.Module] = []
         for size in (width, hidden):
             layers += [nn.Linear(size, hidden)]
-            layers += [nn.BatchNorm1d(hidden)] if config.batch_norm else []
+            layers += [_SharedBatchNorm(hidden)] if config.batch_norm else []
             layers += [nn.GELU()]
         self.mlp = nn.Sequential(*layers, nn.Linear(hidden, config.head_bottleneck))
         bottleneck, prototypes = config.head_bottleneck, config.prototypes
@@ -48,6 +48,15 @@ class DinoHead(nn.Module):
         unit = F.normalize(self.mlp(x).float(), dim=1)
         with torch.autocast(x.device.type, enabled=False):  # temperatures blow rounding up
             return unit @ F.normalize(self.prototypes.weight, dim=1).T
+
+
+class _SharedBatchNorm(nn.BatchNorm1d):
+    """Batch norm over the batch of all processes, on any device."""
+
+    def forward(self, input: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
+        if not self.training:
+            return super().forward(input)
+        return own_rows(super().forward(gather_batch(input)), len(input))
 
 
 class Dino(SelfDistillation):
@@ -93,7 +102,8 @@ class Dino(SelfDistillation):
             loss = cross_entropy_of_views(targets, student / self.config.student_temperature)
         if self.training:
             self._move_center(scores)
-        return {"loss": loss, "teacher_information": information(targets)}
+        every = gather_batch(targets.transpose(0, 1)).transpose(0, 1)
+        return {"loss": loss, "teacher_information": information(every)}
 
     def _scores(
         self, backbone: TouchBackbone, head: DinoHead, images: Tensor, views: list[Tensor]
@@ -159,5 +169,4 @@ def sinkhorn(logits: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
     for _ in range(_SINKHORN_ROUNDS):
         Q = Q / Q.sum(0) / Q.shape[1]
         Q = Q / Q.sum(1, keepdim=True) / len(Q)
-    own = torch.distributed.get_rank() * len(logits) if len(every) > len(logits) else 0
-    return Q[own : own + len(logits)] * len(Q)
+    return own_rows(Q, len(logits)) * len(Q)

@@ -293,6 +293,12 @@ def gather_batch(rows: Shaped[Tensor, "b ..."]) -> Shaped[Tensor, "n ..."]:
     return all_gather_single(rows.contiguous(), 0, torch.distributed.group.WORLD)
 
 
+def own_rows(rows: Shaped[Tensor, "n ..."], count: int) -> Shaped[Tensor, "{count} ..."]:
+    """Return this process's rows of what `gather_batch` returned."""
+    first = torch.distributed.get_rank() * count if torch.distributed.is_initialized() else 0
+    return rows[first : first + count]
+
+
 def on_first_process(action: Callable[[], object]) -> None:
     """Run `action` in the first of several processes, while the others wait."""
     if is_first_process():

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from touchgoal.encoders.training.batch_noise import BatchNoise
+from touchgoal.encoders.training.trainer import gather_batch
 from touchgoal.policies.config import SamplerConfig
 from touchgoal.policies.heads.samplers import add_noise, denoise
 from touchgoal.policies.heads.unet import PRESETS, UNet, UNetConfig
@@ -35,11 +37,11 @@ class Diffusion(nn.Module):
         self,
         chunk: Float[Tensor, "b h a"],
         condition: Float[Tensor, "b c"],
-        generator: torch.Generator,
+        noise: BatchNoise,
         is_pad: Bool[Tensor, "b h"] | None = None,
     ) -> Float[Tensor, ""]:
         """Mean squared error of the network's answer at random steps, padded ticks left out."""
-        noisy, step, target = add_noise(self.config.sampler, chunk, generator)
+        noisy, step, target = add_noise(self.config.sampler, chunk, noise)
         error = (self.network(noisy, step, condition) - target).square()
         return masked_mean(error, is_pad)
 
@@ -82,24 +84,29 @@ class Regression(nn.Module):
         self,
         chunk: Float[Tensor, "b h a"],
         condition: Float[Tensor, "b c"],
-        generator: torch.Generator,
+        noise: BatchNoise,
         is_pad: Bool[Tensor, "b h"] | None = None,
     ) -> Float[Tensor, ""]:
         """Mean absolute error, padded ticks left out; nothing is random."""
-        return masked_mean((self.sample(condition, generator) - chunk).abs(), is_pad)
+        return masked_mean((self._predict(condition) - chunk).abs(), is_pad)
 
     def sample(
         self, condition: Float[Tensor, "b c"], generator: torch.Generator
     ) -> Float[Tensor, "b h a"]:
         """The chunk for every condition; nothing is random."""
+        return self._predict(condition)
+
+    def _predict(self, condition: Float[Tensor, "b c"]) -> Float[Tensor, "b h a"]:
         return self.network(condition).unflatten(1, self._shape)
 
 
 def masked_mean(
     error: Float[Tensor, "b h a"], is_pad: Bool[Tensor, "b h"] | None
 ) -> Float[Tensor, ""]:
-    """Mean over the ticks that are not padding; 0 if all are."""
+    """Return the mean over the ticks of all processes that are not padding; 0 if all are."""
     if is_pad is None:
         return error.mean()
-    counts = ~is_pad[..., None]
-    return (error * counts).sum() / (counts.sum() * error.shape[-1]).clamp(min=1)
+    valid = ~is_pad[..., None]
+    # A process averages over its rows: what it divides by must be the same in all.
+    count = gather_batch(valid.sum()[None]).float().mean()
+    return (error * valid).sum() / (count * error.shape[-1]).clamp(min=1)

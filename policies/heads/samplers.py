@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.policies.config import SamplerConfig
 
 FLOW_TIME_SCALE = (
@@ -41,29 +42,29 @@ def inference_timesteps(config: SamplerConfig) -> Int[Tensor, " {config.num_infe
 
 
 def add_noise(
-    config: SamplerConfig, clean: Float[Tensor, "b h a"], generator: torch.Generator
+    config: SamplerConfig, clean: Float[Tensor, "b h a"], noise: BatchNoise
 ) -> tuple[Float[Tensor, "b h a"], Float[Tensor, " b"], Float[Tensor, "b h a"]]:
     """A training example of every sample, at a random step.
 
     Args:
         config: the sampler trained for.
         clean: samples.
-        generator: of step and noise, on the CPU.
+        noise: random numbers for step and noise.
 
     Returns:
         Noisy samples, the step to tell the network, what the network should answer.
     """
     b = len(clean)
-    noise = torch.randn(clean.shape, generator=generator).to(clean)
+    added = noise.randn(clean.shape).to(clean)
     if config.kind == "flow":
-        time = torch.rand(b, generator=generator).to(clean)
+        time = noise.rand((b,)).to(clean)
         t = _broadcast(time, clean)
-        target = clean - noise if config.prediction_type == "velocity" else clean
-        return (1 - t) * noise + t * clean, FLOW_TIME_SCALE * time, target
-    step = torch.randint(config.num_train_timesteps, (b,), generator=generator)
+        target = clean - added if config.prediction_type == "velocity" else clean
+        return (1 - t) * added + t * clean, FLOW_TIME_SCALE * time, target
+    step = noise.randint(0, config.num_train_timesteps, (b,))
     power = _broadcast(alphas_cumprod(config.num_train_timesteps)[step].to(clean), clean)
-    noisy = power.sqrt() * clean + (1 - power).sqrt() * noise
-    return noisy, step.to(clean), noise if config.prediction_type == "epsilon" else clean
+    noisy = power.sqrt() * clean + (1 - power).sqrt() * added
+    return noisy, step.to(clean), added if config.prediction_type == "epsilon" else clean
 
 
 def denoise(

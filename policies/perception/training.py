@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
 from touchgoal.control import features as ft
+from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit
@@ -49,8 +50,8 @@ def train_contact_estimator(
     network.touch_normalizer.fit_mean_std(sides)
     noise = config.touch_noise * network.touch_normalizer.scale.repeat(len(ft.TACTILE))
 
-    def batch(rows: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-        drawn = torch.randn(len(rows), touch.shape[1], generator=generator)
+    def batch(rows: Tensor, batch_noise: BatchNoise) -> dict[str, Tensor]:
+        drawn = batch_noise.randn((len(rows), touch.shape[1]))
         return {"touch": touch[rows] + noise * drawn, "contact": contact[rows]}
 
     training = Training(
@@ -90,11 +91,9 @@ def train_pose_estimator(
     estimator.tcp_normalizer.fit_mean_std(placements.tcp)
     estimator.start_normalizer.fit_mean_std(placements.start)
 
-    def batch(rows: Tensor, generator: torch.Generator) -> dict[str, Any]:
+    def batch(rows: Tensor, noise: BatchNoise) -> dict[str, Any]:
         pictures = {
-            key: _add_pixel_noise(
-                placements.pictures[key][rows], box, config.pixel_noise, generator
-            )
+            key: _add_pixel_noise(placements.pictures[key][rows], box, config.pixel_noise, noise)
             for key, box in estimator.config.crops
         }
         return {"pictures": pictures, "tcp": placements.tcp[rows], "start": placements.start[rows]}
@@ -129,13 +128,18 @@ class _PoseLoss(nn.Module):
 
 
 def _add_pixel_noise(
-    pictures: UInt8[Tensor, "b h w 3"], box: Box, counts: int, generator: torch.Generator
+    pictures: UInt8[Tensor, "b h w 3"], box: Box, counts: int, noise: BatchNoise
 ) -> UInt8[Tensor, "b h w 3"]:
     """Changes, and returns, the pictures; outside the box nobody looks."""
     top, bottom, left, right = box
     seen = pictures[:, top:bottom, left:right]
-    noise = torch.randint(-counts, counts + 1, seen.shape, dtype=torch.int16, generator=generator)
-    seen.copy_((seen + noise).clamp(0, 255))
+    added = noise.draw(
+        len(seen),
+        lambda n, g: torch.randint(
+            -counts, counts + 1, (n, *seen.shape[1:]), dtype=torch.int16, generator=g
+        ),
+    )
+    seen.copy_((seen + added).clamp(0, 255))
     return pictures
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
+from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.checkpoint import checksum
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
@@ -78,7 +79,7 @@ def train(
     training = Training(
         loss=_PolicyLoss(network),
         n_samples=len(windows),
-        batch=lambda rows, generator: _make_batch(windows, rows) | {"generator": generator},
+        batch=lambda rows, noise: _make_batch(windows, rows) | {"noise": noise},
         optimizer=OptimizerConfig(
             config.epochs,
             config.batch_size,
@@ -128,10 +129,10 @@ class _PolicyLoss(nn.Module):
         wrench: Float[Tensor, "b o 12"] | None,
         actions: Float[Tensor, "b h 8"],
         action_is_pad: Bool[Tensor, "b h"],
-        generator: torch.Generator,
+        noise: BatchNoise,
     ) -> dict[str, Tensor]:
         batch = ObservationBatch(touch, state, pictures)
-        return {"loss": self.policy.loss(batch, actions, generator, wrench, action_is_pad)}
+        return {"loss": self.policy.loss(batch, actions, noise, wrench, action_is_pad)}
 
 
 def _make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, Any]:
@@ -161,7 +162,7 @@ def _validate(
     is_pad = batch["action_is_pad"]
     off = (planned - batch["actions"])[..., :7].masked_fill(is_pad[..., None], 0.0)
     error = off.sum(1).norm(dim=1).mean()
-    loss = policy.loss(seen, batch["actions"], generator, batch["wrench"], is_pad)
+    loss = policy.loss(seen, batch["actions"], BatchNoise(generator), batch["wrench"], is_pad)
     return {"validation_loss": loss.item(), "validation_error": error.item()}
 
 
