@@ -122,7 +122,7 @@ class MadeUpCell:
         self,
         each_tick: Callable[[int], None],
         step: float = 0.0,
-        width: float = 0.0,
+        width: float = 0.04,
         seconds: float = 5.0,
         execute: bool = True,
     ) -> Ending:
@@ -130,7 +130,7 @@ class MadeUpCell:
 
         Args:
             step: rad that the first joint is to go each tick.
-            width: m asked of the gripper.
+            width: m asked of the gripper, which stands at 0.04 m: closer, it does not follow.
             seconds: after which it ends.
             execute: False: a dry run.
         """

@@ -206,15 +206,7 @@ def test_without_a_simulator_the_operator_says_whether_it_is_done(
         return request_ if len(ticks) > 2 else ""
 
     session = Session(
-        bare,
-        connection,
-        safety,
-        recorded_in(tmp_path),
-        True,
-        lambda _: actor,
-        wanted,
-        on_tick,
-        truth=None,
+        bare, connection, safety, recorded_in(tmp_path), True, lambda _: actor, wanted, on_tick
     )
     assert session.run().success is success
     meta = EpisodeSet(tmp_path).meta(0)

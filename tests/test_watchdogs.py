@@ -10,7 +10,7 @@ import pytest
 from a_cell import MadeUpCell, MadeUpLoadCell
 
 from touchgoal.control import features as ft
-from touchgoal.control.deployment.held_object import HeldObject
+from touchgoal.control.deployment.hand import HandMonitor, HeldObject
 from touchgoal.control.grippers.franka_hand import FrankaHandClient
 from touchgoal.control.grippers.non_blocking import NonBlockingGripper
 from touchgoal.control.interfaces import DriverError, GripperReading, LoadReading
@@ -130,7 +130,7 @@ def test_an_object_lost_on_the_way_stops_the_arm() -> None:
     cell = MadeUpCell()
     set_(cell.gripper, width=0.04, grasped=True)()
     ending = cell.run(at(20, set_(cell.gripper, width=0.0, grasped=False)))
-    assert ending.stopped and "lost what it held" in ending.reason
+    assert ending.stopped and "lost its object" in ending.reason
 
 
 def reading(width: float, grasped: bool) -> GripperReading:
@@ -149,6 +149,44 @@ def test_opening_the_hand_loses_nothing_and_lifting_is_carrying() -> None:
     held.update(reading(0.04, True), 0.0, 0.12)
     held.update(reading(0.045, False), 0.06, 0.10)
     assert not held.lost and not held.carried
+
+
+def hand_fault(
+    readings: list[tuple[float, bool]], commanded: float, indentation: float | None = 0.5e-3
+) -> str:
+    """The first fault that these readings (width, grasped), one a tick of 50 ms, lead to."""
+    monitor = HandMonitor(FR3.tool)
+    touched = None if indentation is None else np.full(2, indentation)
+    faults = (
+        monitor.update(reading(width, grasped), commanded, touched, 0.05 * tick)
+        for tick, (width, grasped) in enumerate(readings)
+    )
+    return next((fault for fault in faults if fault), "")
+
+
+def test_a_hand_that_does_not_follow_is_found() -> None:
+    closing = [(0.08 - 0.005 * k, False) for k in range(17)]
+    dead, jammed = [(0.08, False)] * 40, [*closing[:7], *[(0.05, True)] * 40]
+    assert "commanded 0 mm, is 80 mm for 1.3 s" in hand_fault(dead, 0.0)
+    assert "commanded 80 mm, is 0 mm" in hand_fault([(0.0, False)] * 40, 0.08)
+    assert "object 50 mm wide, but neither fingertip" in hand_fault(jammed, 0.0, 0.0)
+    assert "commanded 0 mm, is 50 mm" in hand_fault([(w, False) for w, _ in jammed], 0.0, 0.0)
+
+
+def test_a_hand_that_follows_is_left_alone() -> None:
+    closing = [(0.08 - 0.005 * k, False) for k in range(17)]
+    assert not hand_fault([*closing, *[(0.0, False)] * 40], 0.0)  # on nothing
+    assert not hand_fault([*closing[:9], *[(0.04, True)] * 40], 0.0)  # on an object
+    assert not hand_fault([*closing[:9], *[(0.04, True)] * 40], 0.0, None)  # without fingertips
+    assert not hand_fault([(0.066, False)] * 40, 0.08)  # homed with fingertips mounted
+
+
+def test_a_dead_hand_stops_the_arm() -> None:
+    cell = MadeUpCell()
+    set_(cell.gripper, width=0.08)()
+    ending = cell.run(lambda _: None, step=0.001, width=0.0)
+    assert ending.stopped and "the hand does not follow" in ending.reason
+    assert "check its cable" in ending.advice
 
 
 class Slow:

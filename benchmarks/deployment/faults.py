@@ -89,6 +89,8 @@ CASES = (
     FaultCase("speeds are no numbers", "nonsense on"),
     FaultCase("fingertip unplugged", "lose tactile_left 60"),
     FaultCase("gripper silent", "silence-gripper on"),
+    FaultCase("hand does not close", "jam-gripper 0.08"),
+    FaultCase("hand jams at 50 mm on air", "jam-gripper 0.05"),
     FaultCase("object lost on the way", "take-object", carrying=True),
     FaultCase("load cell garbled", "garble load_cell 1.0"),
     FaultCase("policy: not a number", policy="nan"),

@@ -1,8 +1,7 @@
-"""The control loop: senses, actor, safety layer, arm, gripper, recorder, once a control tick.
+"""The control loop: read, act, filter, command and record once a control tick.
 
-It ends in good order whatever happens: the arm is stopped and watched until it is at rest, and what
-has been recorded is kept. A dry run reads and plans, imagining that the arm follows, and commands
-nothing.
+It ends in good order whatever happens: the arm is stopped and watched until it is at rest, and the
+recorded ticks are returned. A dry run reads and plans as if the arm followed, and commands nothing.
 """
 
 import os
@@ -16,7 +15,7 @@ import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.connection import CellConnection, RealClock
-from touchgoal.control.deployment.held_object import HeldObject
+from touchgoal.control.deployment.hand import HandMonitor, HeldObject
 from touchgoal.control.deployment.observation import CellReading, ObservationReader
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import STOPPED_ON_REQUEST, Actor, ArmReading, DriverError
@@ -42,14 +41,17 @@ ADVICE = {
     "it was carrying something",
     Limit.TRACKING: "the arm does not follow: look for what blocks it",
 }
+_HAND_ADVICE = (
+    "look at the hand: clear its fingers, check its cable and supply, home it (a Franka's in Desk)"
+)
 
 
 @contextmanager
 def _realtime_priority() -> Iterator[None]:
-    """This thread, and none that it starts, before all that is not real-time, where that is allowed."""
+    """Run this thread before all that is not real-time, where that is allowed."""
     try:
         os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
-    except PermissionError:  # as on most machines; the loop then says how late it was
+    except PermissionError:  # as on most machines; the loop then reports how late it was
         yield
         return
     try:
@@ -64,10 +66,10 @@ class Ending:
 
     Attributes:
         reason: what happened, for a person.
-        done: whether the task is done, as far as this ending tells; None: it does not tell.
-        stopped: whether the arm was stopped, by a fault or a person, rather than came to its end.
+        done: whether the task is done, as far as this ending tells; None: unknown.
+        stopped: whether the arm was stopped, by a fault or a person.
         advice: what to do about it.
-        rest_seconds: s from the decision to stop until the arm was at rest; infinite if it was not seen.
+        rest_seconds: s from the decision to stop until the arm was at rest; infinite if it never was.
     """
 
     reason: str
@@ -77,7 +79,7 @@ class Ending:
     rest_seconds: float = 0.0
 
     def __str__(self) -> str:
-        """The fault report."""
+        """Return the fault report, or the reason of an ordinary end."""
         if not self.stopped:
             return self.reason
         rest = (
@@ -89,7 +91,7 @@ class Ending:
 
 
 Request = Literal["", "stop", "done", "not done", "success"]
-"""Of the operator: go on, stop the arm, end with the task done or not; success: of a simulator."""
+"""Operator's request: go on, stop the arm, end with the task done or not; success: a simulator's."""
 PLAN_ENDED = "the plan is through"
 _REQUESTED_ENDINGS: dict[Request, Ending] = {
     "done": Ending("the operator says that the task is done", done=True),
@@ -100,14 +102,14 @@ _REQUESTED_ENDINGS: dict[Request, Ending] = {
 
 @dataclass
 class RunLog:
-    """What has been recorded.
+    """Record of a run.
 
     Attributes:
-        rows: of each tick: observation and what was commanded, by key.
+        rows: observation and command of each tick, by key.
         lateness: s by which each tick began too late.
-        answer_times: s after which the actor had answered, each time.
+        answer_times: s that each answer of the actor took.
         limit_counts: how often each limit changed a command.
-        clocks: s, the loop's and the arm's, at each tick.
+        clocks: the loop's and the arm's clock at each tick, s.
     """
 
     rows: list[dict[str, np.ndarray]] = field(default_factory=list)
@@ -118,10 +120,10 @@ class RunLog:
 
     @property
     def arm_pace(self) -> float:
-        """Share of real time at which the arm's clock goes, in the median second; 1 if that is unknown.
+        """Pace of the arm's clock as a share of real time, in the median second; 1 if unknown.
 
-        Below 1 it is a twin on a machine that is too slow for it: in its own time everything comes
-        late, and it looks like an arm that does not follow.
+        Below 1 it is a twin on a machine that is too slow for it: everything comes late in its own
+        time, and it looks like an arm that does not follow.
         """
         ticks = np.array(self.clocks)
         if len(ticks) < 2 or ticks[-1, 0] - ticks[0, 0] < 1:
@@ -136,7 +138,7 @@ class RunLog:
 
 @dataclass(frozen=True)
 class TickStatus:
-    """A tick, for whoever watches; no cost without a goal."""
+    """One tick, for the display; `cost` is None without a goal."""
 
     seconds: float
     state: SafetyState
@@ -164,19 +166,19 @@ class ControlLoop:
         cost: Callable[[Observation], float] | None = None,
         camera_size: tuple[int, int] = ft.CAMERA_SHAPE[:2],
     ) -> None:
-        """The arm is at rest.
+        """Begin with the arm at rest.
 
         Args:
-            connection: what is read and commanded.
+            connection: devices to read and command.
             safety: its limits, and the control rate.
             execute: False: a dry run.
-            operator_request: asked every tick; what it answers stops or ends the run.
-            on_tick: told of every tick; must not wait.
-            cost: measures how far from its goal a tick is, for the view and the record.
-            camera_size: rows and columns of cameras' pictures, as observed and recorded.
+            operator_request: asked every tick; its answer stops or ends the run.
+            on_tick: called every tick; must not wait.
+            cost: measures how far a tick is from its goal, for the display and the record.
+            camera_size: rows and columns of the camera images observed and recorded.
 
         Raises:
-            UserError: the arm rests where it may not be, or a camera's pictures are too small.
+            UserError: the arm rests outside its limits, or a camera's images are too small.
         """
         self._connection, self._safety, self._execute = connection, safety, execute
         self._operator_request, self._on_tick, self._cost = operator_request, on_tick, cost
@@ -184,13 +186,14 @@ class ControlLoop:
         self.state = safety.start(connection.arm.read().q)
         self.width = connection.gripper.read().width
         self._held = HeldObject()
+        self._hand = HandMonitor(safety.limits.tool)
 
     def commanded(self) -> np.ndarray:
         """Joint positions (rad) commanded now."""
         return self.state.q
 
     def run(self, actor: Actor, seconds: float, log: RunLog) -> Ending:
-        """Let it act until it is done, time is up, someone wants it or something is wrong."""
+        """Run the actor until it is done, time is up, a person ends it or a fault stops it."""
         try:
             real = isinstance(self._connection.clock, RealClock)
             with _realtime_priority() if real else nullcontext():
@@ -198,8 +201,10 @@ class ControlLoop:
         except (DriverError, UserError) as error:
             return self._arm_first(self.stop(str(error), "check what it names, then start again"))
         except Exception as error:  # the policy's, most likely; the arm must not go on
-            said = " ".join(str(error).split())
-            return self.stop(f"{type(error).__name__}: {said}", "the program or the policy failed")
+            message = " ".join(str(error).split())
+            return self.stop(
+                f"{type(error).__name__}: {message}", "the program or the policy failed"
+            )
 
     def _loop(self, actor: Actor, seconds: float, log: RunLog) -> Ending:
         clock = self._connection.clock
@@ -217,7 +222,7 @@ class ControlLoop:
                 return ending
             if not first:
                 log.lateness.append(late)
-            # What was missed is not made up for.
+            # Missed ticks are not made up for.
             dt, now = self._safety.dt, clock.now()
             due = now + dt if first else max(due + dt, now - dt)
             first = False
@@ -228,7 +233,7 @@ class ControlLoop:
 
         Args:
             reason, advice: for the operator.
-            release_to: width (m) that the gripper opens to; None: it stays, and what it holds is held.
+            release_to: width (m) that the gripper opens to; None: it stays, and holds its object.
         """
         if not self._execute:
             return Ending(reason, False, True, advice)
@@ -248,98 +253,112 @@ class ControlLoop:
         return Ending(reason, False, True, advice, rest)
 
     def _arm_first(self, ending: Ending) -> Ending:
-        """With the arm's own fault, if it has one by now: what takes it away takes other devices along."""
+        """Put the arm's own fault first, if it has one by now: it takes other devices along."""
         fault = self._connection.arm.read().fault
         if not fault or fault.startswith(STOPPED_ON_REQUEST) or fault in ending.reason:
             return ending
         return replace(ending, reason=f"arm: {fault}; also: {ending.reason}")
 
     def _tick(self, actor: Actor, log: RunLog, seconds: float, late: float) -> Ending | None:
-        sensed = self._read()
-        log.clocks.append((self._connection.clock.now(), sensed.arm.time))
+        reading = self._read()
+        log.clocks.append((self._connection.clock.now(), reading.arm.time))
         if not self._execute:
-            sensed = self._as_commanded(sensed)
-        if sensed.fault:
-            return self.stop(sensed.fault, "see above; then start deploy again")
-        self._held.update(sensed.gripper, self.width, float(sensed.observation[ft.TCP_POSE][2]))
-        if self._held.lost:
-            return self.stop("the hand has lost what it held", "put it back, then start again")
+            reading = self._as_commanded(reading)
+        if ending := self._device_fault(reading):
+            return ending
         if request := self._operator_request():
             if request == "stop":
                 return self.stop("stopped by the operator", "start deploy again when you are ready")
             return _REQUESTED_ENDINGS[request]
         asked = time.perf_counter()
-        action = np.asarray(actor.act(sensed.observation), np.float64)
+        action = np.asarray(actor.act(reading.observation), np.float64)
         log.answer_times.append(time.perf_counter() - asked)
-        reading = Measurements(
-            q=sensed.arm.q,
-            force=sensed.arm.wrench[:3],
-            torque=sensed.arm.torque,
-            indentation=sensed.indentation,
-            observation_age=sensed.age,
-            action_age=actor.action_age,
-            state_age=self._connection.clock.age(sensed.arm.stamp) if self._execute else 0.0,
-            gripper_age=self._connection.clock.age(sensed.gripper.stamp),
-            load=self.reader.added_load(sensed.load),
-        )
-        before, self.state = (
-            self.state,
-            self._safety.filter_action(self.state, action[:-1], reading),
-        )
+        before, measured = self.state, self._measurements(reading, actor.action_age)
+        self.state = self._safety.filter_action(before, action[:-1], measured)
         self.width = self._safety.filter_width(self.state, float(action[-1]), self.width)
         for limit in self.state.active_limits:
             log.limit_counts[limit] = log.limit_counts.get(limit, 0) + 1
-        cost = self._cost(sensed.observation) if self._cost else None
-        self._on_tick(TickStatus(seconds, self.state, sensed, self.width, late, cost))
+        cost = self._cost(reading.observation) if self._cost else None
+        self._on_tick(TickStatus(seconds, self.state, reading, self.width, late, cost))
         if self.state.fault is not None:
-            return self._stop_for_fault(sensed, log.arm_pace)
+            return self._stop_for_fault(reading, log.arm_pace)
         if self._execute:
             self._connection.arm.command(self.state.q)
             self._connection.gripper.command(self.width)
         done = np.append(self.state.q - before.q, self.width).astype(np.float32)
-        row = {**sensed.observation, ft.ACTION: done}
+        row = {**reading.observation, ft.ACTION: done}
         if cost is not None:
             row[ft.COST] = np.array([cost], np.float32)
         log.rows.append(row)
         return None
 
-    def _read(self) -> CellReading:
-        """What the devices say, and where the arm has been sent."""
-        sensed = self.reader.read()
-        command = np.concatenate([self.state.q, self.state.velocity]).astype(np.float32)
-        return replace(sensed, observation={**sensed.observation, ft.COMMAND: command})
+    def _device_fault(self, reading: CellReading) -> Ending | None:
+        """Stop for a device that reports a fault, for a lost object or a hand that does not follow."""
+        if reading.fault:
+            return self.stop(reading.fault, "see above; then start deploy again")
+        self._held.update(reading.gripper, self.width, float(reading.observation[ft.TCP_POSE][2]))
+        if self._held.lost:
+            return self.stop("the hand has lost its object", "put it back, then start again")
+        if not self._execute:
+            return None
+        indentation = reading.indentation if self.reader.has_fingertips else None
+        now = self._connection.clock.now()
+        if wrong := self._hand.update(reading.gripper, self.width, indentation, now):
+            return self.stop(wrong, _HAND_ADVICE)
+        return None
 
-    def _stop_for_fault(self, sensed: CellReading, arm_pace: float) -> Ending:
+    def _measurements(self, reading: CellReading, action_age: float) -> Measurements:
+        age = self._connection.clock.age
+        return Measurements(
+            q=reading.arm.q,
+            force=reading.arm.wrench[:3],
+            torque=reading.arm.torque,
+            indentation=reading.indentation,
+            observation_age=reading.age,
+            action_age=action_age,
+            state_age=age(reading.arm.stamp) if self._execute else 0.0,
+            gripper_age=age(reading.gripper.stamp),
+            load=self.reader.added_load(reading.load),
+        )
+
+    def _read(self) -> CellReading:
+        """Read the devices, with the commanded positions in the observation."""
+        reading = self.reader.read()
+        command = np.concatenate([self.state.q, self.state.velocity]).astype(np.float32)
+        return replace(reading, observation={**reading.observation, ft.COMMAND: command})
+
+    def _stop_for_fault(self, reading: CellReading, arm_pace: float) -> Ending:
         fault = self.state.fault
         assert fault is not None
         reason = str(fault)
         if fault.limit == Limit.STALE_OBSERVATION:
-            reason += f" s ({sensed.oldest_source}; {self.reader.problem() or 'it is slow'})"
+            reason += f" s ({reading.oldest_source}; {self.reader.problem() or 'it is slow'})"
         elif self.reader.unsound and fault.limit in (Limit.STALE_STATE, Limit.STALE_GRIPPER):
             reason += f" s ({self.reader.unsound})"
         release_to = None
         if fault.limit == Limit.INDENTATION and not self._held.carried:
-            # Open by as much as both gels give way; what is carried would fall.
-            width = sensed.gripper.width + 2 * self._safety.limits.indentation
+            # Open by as much as both gels give way; a carried object would fall.
+            width = reading.gripper.width + 2 * self._safety.limits.indentation
             release_to = min(width, self._safety.limits.tool.stroke[1])
         advice = ADVICE.get(fault.limit, "look at what it names")
         if fault.limit == Limit.FORCE and np.isnan(fault.value):
-            advice = "the arm is near a singularity, where it feels no forces: keep the task away"
+            advice = (
+                "the arm is near a singularity, where it measures no forces: keep the task away"
+            )
         if arm_pace < SLOW_ARM:
             advice = slow_arm(arm_pace)
         return self.stop(reason, advice, release_to)
 
-    def _as_commanded(self, sensed: CellReading) -> CellReading:
-        """As if arm and hand had followed, through free air: what the real one feels still stops it."""
-        arm = replace(sensed.arm, q=self.state.q, velocity=self.state.velocity)
-        gripper = replace(sensed.gripper, width=self.width)
-        felt = replace(arm, wrench=np.zeros(6))
-        imagined = self.reader.proprioception(felt, gripper)
-        return replace(sensed, arm=arm, observation={**sensed.observation, **imagined})
+    def _as_commanded(self, reading: CellReading) -> CellReading:
+        """Return the reading as if arm and hand had followed through free air; real forces still stop."""
+        arm = replace(reading.arm, q=self.state.q, velocity=self.state.velocity)
+        gripper = replace(reading.gripper, width=self.width)
+        imagined = self.reader.proprioception(replace(arm, wrench=np.zeros(6)), gripper)
+        return replace(reading, arm=arm, observation={**reading.observation, **imagined})
 
 
 def slow_arm(pace: float) -> str:
-    """What to do about an arm whose clock goes at this share of real time."""
+    """Say what to do about an arm whose clock goes at this share of real time."""
     return (
         f"the arm's clock goes at {pace:.2f} of real time: this twin cannot keep up, and "
         "everything comes late in its time; free the machine, or start it with --lock-step"
@@ -347,7 +366,7 @@ def slow_arm(pace: float) -> str:
 
 
 def _speed(before: ArmReading, now: ArmReading) -> float:
-    """Of the fastest joint, rad/s; by differences if the arm does not tell."""
+    """Speed of the fastest joint, rad/s; from differences if the arm reports none."""
     if np.isfinite(now.velocity).all():
         return float(np.abs(now.velocity).max())
     return float(np.abs(now.q - before.q).max()) / (now.time - before.time)

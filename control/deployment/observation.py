@@ -53,7 +53,8 @@ class ObservationReader:
     It never waits: drivers keep the newest reading of everything.
 
     Attributes:
-        unsound: what is not a number in the newest readings of arm and gripper; empty if all is.
+        unsound: values of the newest arm and gripper readings that are not numbers; empty if none.
+        has_fingertips: whether `indentation` is measured.
     """
 
     def __init__(
@@ -75,6 +76,7 @@ class ObservationReader:
             for key, camera in connection.cameras.items()
             if isinstance(camera, TactileSensor)
         }
+        self.has_fingertips = bool(self._meters)
         self._indentations: dict[
             str, tuple[int, float]
         ] = {}  # sequence of the last frame, indentation

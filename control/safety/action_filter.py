@@ -58,6 +58,8 @@ class Fault:
 
     def __str__(self) -> str:
         """For the operator."""
+        if self.limit == Limit.NOT_A_NUMBER:
+            return f"the policy's action was not a number for {self.value:.2f} s"
         if np.isnan(self.value):
             return f"{self.limit} is unknown"
         return f"{self.limit} {self.value:.3g} above {self.ceiling:.3g}"

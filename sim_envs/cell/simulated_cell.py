@@ -71,6 +71,7 @@ class SimulatedCell:
         tau_ext: torque (N m) on each joint from outside, filtered.
         wrench_error: N, N m, by which the arm's estimate of the wrench on the hand is wrong.
         gripper_command: the gripper's orders.
+        least_width: width (m) below which the fingers jam; 0: none.
     """
 
     def __init__(self, env: FrankaTactileEnv, seed: int, wrench_error: bool = False) -> None:
@@ -104,6 +105,7 @@ class SimulatedCell:
             env.width_target(), env.robot.tool.speed, env.grasp_force
         )
         self.worst = WorstCase()
+        self.least_width = 0.0
         self.progress, self.success, self.failures = 0.0, False, set[str]()
         self._grasp_begun = (
             False  # nobody knows when a client comes: the clock waits for the first grasp
@@ -139,7 +141,7 @@ class SimulatedCell:
     def command_gripper(self, width: float, speed: float, force: float) -> None:
         """Send the gripper to `width` (m) at `speed` (m/s), pressing with `force` (N) a finger."""
         tool = self.env.robot.tool
-        width = float(np.clip(width, *tool.stroke))
+        width = float(np.clip(width, max(tool.stroke[0], self.least_width), tool.stroke[1]))
         self._grasp_begun |= width < self.gripper_command.width
         self.gripper_command = GripperCommand(
             width, min(speed, tool.speed), min(force, GRIPPER_MAX_FORCE / 2)

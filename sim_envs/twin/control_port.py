@@ -18,6 +18,7 @@ for the truth.
     stall|repeat|lose NAME SECONDS  a camera or sensor sends nothing, one picture, cuts clients off
     break|halve NAME SECONDS      its JPEGs come with wrong bytes, or cut in half
     silence-gripper on|off  a Franka Hand says nothing any more
+    jam-gripper WIDTH             the fingers close to WIDTH (m) and no further, until the next reset
     take-object                   take the object of pick-and-place out of the hand, or from its place
     nonsense on|off               the arm says that its joints' speeds are not numbers
     garble NAME SHARE             a serial port's messages lose bytes
@@ -168,6 +169,7 @@ class ControlPort:
             "break": lambda: self._set_stream_fault("broken", *rest.split()),
             "halve": lambda: self._set_stream_fault("halved", *rest.split()),
             "silence-gripper": lambda: self._arm.silence_gripper({"on": True, "off": False}[rest]),
+            "jam-gripper": lambda: self._jam_gripper(float(rest)),
             "take-object": self._cell.take_object,
             "nonsense": lambda: self._arm.set_nonsense({"on": True, "off": False}[rest]),
             "garble": lambda: self._garble(*rest.split()),
@@ -216,6 +218,10 @@ class ControlPort:
 
     def _set_stream_fault(self, fault: str, name: str, seconds: str) -> None:
         self._pictures.set_fault(name, fault, float(seconds))
+
+    def _jam_gripper(self, width: float) -> None:
+        _require_finite(width)
+        self._cell.least_width = width
 
     def _garble(self, name: str, share: str) -> None:
         self._ports[name].garble = float(share)

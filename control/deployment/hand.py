@@ -1,0 +1,102 @@
+"""What the hand does, from its readings: holds an object, has lost it, does not follow commands."""
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.control.interfaces import GripperReading
+from touchgoal.control.motion.tool import Tool
+
+_CONFIRMING = 2  # readings in a row that must agree before an object counts as held
+_SLIPPED = 0.003  # m that the fingers close further when the object is gone
+_LIFTED = 0.005  # m above where it was grasped: no longer carried by the table
+_MOVES = 0.001  # m between widths of a moving hand
+_CLOSING_ERROR = 0.003  # m above the commanded width at which a closed hand may stand
+# Share of the stroke that an open hand may stand below the command: one that was homed with
+# fingertips mounted does not open as far as its model.
+_OPENING_ERROR = 0.25
+_REACTION_TIME = 0.5  # s from a command to its answer, besides the motion
+
+
+class HeldObject:
+    """Follows the held object tick by tick.
+
+    Attributes:
+        lost: whether an object was held and is gone, though no command opened the hand.
+        carried: whether an object is held above where it was grasped; also if it was held before the
+            first tick, when its height at the grasp is unknown.
+    """
+
+    def __init__(self) -> None:
+        self.lost = self.carried = False
+        self._held_ticks, self._ticks = 0, 0
+        self._width = self._height = 0.0  # m, when it was grasped
+
+    def update(self, gripper: GripperReading, commanded: float, height: float) -> None:
+        """Take the next reading, the width (m) commanded before it, and the TCP's height (m)."""
+        self._ticks += 1
+        if gripper.grasped:
+            self._held_ticks += 1
+            if self._held_ticks == _CONFIRMING:
+                self._width = gripper.width
+                self._height = -float("inf") if self._ticks == _CONFIRMING else height
+            self.carried = self._held_ticks >= _CONFIRMING and height > self._height + _LIFTED
+            return
+        held = self._held_ticks >= _CONFIRMING
+        closing = commanded <= self._width
+        if held and closing and gripper.width > self._width - _SLIPPED:
+            return  # a driver that reports motion for a moment
+        self.lost = self.lost or (held and closing)
+        self._held_ticks, self.carried = 0, False
+
+
+class HandMonitor:
+    """Finds a hand that does not move as commanded, or reports an object that no fingertip touches.
+
+    After a command the width must change, or an object be grasped, within stroke / speed + 0.5 s.
+    """
+
+    def __init__(self, tool: Tool) -> None:
+        """Begin at rest."""
+        opened = tool.stroke[1] - tool.stroke[0]
+        self._timeout = opened / tool.speed + _REACTION_TIME
+        self._opening_error = _OPENING_ERROR * opened
+        self._width = -np.inf  # m, when it last moved
+        self._still_since = self._touched_at = -np.inf  # s
+
+    def update(
+        self,
+        gripper: GripperReading,
+        commanded: float,
+        indentation: Float[np.ndarray, "2"] | None,
+        time: float,
+    ) -> str:
+        """Return what is wrong; empty if nothing.
+
+        Args:
+            gripper: the newest reading.
+            commanded: width (m) commanded before it.
+            indentation: of the two gels, m; None without fingertips.
+            time: s, of the reading.
+        """
+        if abs(gripper.width - self._width) > _MOVES:
+            self._width, self._still_since = gripper.width, time
+        if self._follows(gripper, commanded):
+            self._still_since = time
+        if not gripper.grasped or indentation is None or indentation.any():
+            self._touched_at = time
+        if (still := time - self._still_since) > self._timeout:
+            return (
+                f"the hand does not follow: commanded {1e3 * commanded:.0f} mm, is "
+                f"{1e3 * gripper.width:.0f} mm for {still:.1f} s"
+            )
+        if (untouched := time - self._touched_at) > self._timeout:
+            return (
+                f"the hand reports an object {1e3 * gripper.width:.0f} mm wide, but neither fingertip "
+                f"has touched anything for {untouched:.1f} s"
+            )
+        return ""
+
+    def _follows(self, gripper: GripperReading, commanded: float) -> bool:
+        if commanded > gripper.width:
+            return commanded - gripper.width <= self._opening_error
+        return gripper.grasped or gripper.width - commanded <= _CLOSING_ERROR
