@@ -29,7 +29,7 @@ from touchgoal.episodes.encoding import (
 from touchgoal.episodes.media import decode_video
 from touchgoal.episodes.metadata import Row, SetMetadata
 from touchgoal.episodes.repair import contradictions_in_meta, unlisted_files
-from touchgoal.episodes.schema import INDEX_DTYPES, Episode, MetaValue, is_camera
+from touchgoal.episodes.schema import INDEX_DTYPES, Episode, MetaValue, is_camera, is_image
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.folder_lock import FolderLock
@@ -173,6 +173,18 @@ class EpisodeSet:
         said = {k: v for k, v in row.items() if k == "length" or k.startswith(metadata.META_PREFIX)}
         said |= {k: v for k, v in row.items() if k.endswith("/crc32")}
         return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+    def frame_checksums(self, i: int, key: str) -> frozenset[int]:
+        """Return checksums of the frames of a feature of episode i, comparable in this process."""
+        if not is_image(key):
+            return frozenset(hash(values.tobytes()) for values in self.read(i, [key]).frames[key])
+        name = metadata.data_path(metadata.file_number_of(self._row(i)))
+        try:
+            with pq.ParquetFile(self.root / name, page_checksum_verification=True) as file:
+                images = file.read([f"{key}.bytes"])[key].combine_chunks().field("bytes")
+                return frozenset(hash(image.as_py()) for image in images)
+        except (OSError, pa.ArrowException) as error:
+            raise metadata.unreadable(self.root, name, error) from error
 
     def meta(self, i: int) -> dict[str, MetaValue]:
         """The facts about episode i."""

@@ -58,7 +58,7 @@ def main(config: Config) -> None:
     from touchgoal.control.calibration.press_set import read_presses, split
     from touchgoal.control.tactile.sensor_calibration import save
     from touchgoal.control.tactile.sensor_models import find_model
-    from touchgoal.runtime.progress import Progress
+    from touchgoal.runtime.progress import progress_bar
     from touchgoal.runtime.provenance import provenance
     from touchgoal.runtime.run_folder import open_run, write_json
 
@@ -74,9 +74,11 @@ def main(config: Config) -> None:
     train, test = split(presses, round(config.held_out * len(presses)), config.seed)
     power = config.illumination_exponent
     if power is None:
-        with Progress("finding how the light varies", len(ILLUMINATION_EXPONENTS), "fit") as bar:
+        with progress_bar(
+            "finding how the light varies", len(ILLUMINATION_EXPONENTS), "fit"
+        ) as bar:
             power = select_illumination_exponent(train, pitch, config.sensor, bar.update)
-    with Progress("fitting", 2 * STEPS, "step") as bar:
+    with progress_bar("fitting", 2 * STEPS, "step") as bar:
         judged = fit(train, pitch, config.sensor, bar.update, illumination_exponent=power)
         fitted = fit(presses, pitch, config.sensor, bar.update, illumination_exponent=power)
     errors = report.held_out_errors(judged, test)

@@ -29,7 +29,7 @@ def main(config: Any) -> None:
     """Record what is missing."""
     from touchgoal.control.tactile.sensor_models import find_sensor
     from touchgoal.episodes.bench_recording import record_catalogue_slides
-    from touchgoal.runtime.interruption import kept
+    from touchgoal.runtime.interruption import on_interruption
     from touchgoal.runtime.run_folder import open_run
     from touchgoal.sim_envs.config import RigConfig
 
@@ -37,7 +37,7 @@ def main(config: Any) -> None:
     out = open_run(config.out, "collect-touches", config, adds=True)
     root = out / "episodes"
     rig = RigConfig(sensor=config.sensor, seed=config.seed)
-    with kept(
+    with on_interruption(
         lambda: f"what was recorded is kept in {root}; the same line with --out {out} goes on"
     ):
         episodes = record_catalogue_slides(root, rig, config.episodes, config.workers)

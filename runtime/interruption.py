@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: what is done is kept, and the last line says so."""
+"""Ctrl-C and SIGTERM: finished work stays, and the command's last line says so."""
 
 import signal
 import threading
@@ -8,16 +8,16 @@ from types import FrameType
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM; handled as Ctrl-C is."""
+    """SIGTERM, handled as Ctrl-C."""
 
 
 @contextmanager
-def kept(message: Callable[[], str]) -> Iterator[None]:
-    """Say what an interruption inside leaves behind.
+def on_interruption(message: Callable[[], str]) -> Iterator[None]:
+    """Add a note to an interruption of the block.
 
     Args:
-        message: asked only when interrupted: what was kept, and the command that goes on, such as
-            "kept 7 of 20 episodes in runs/x; go on with: touchgoal … --resume".
+        message: Returns what is saved and the command that continues, such as
+            "7 of 20 episodes are in runs/x; to continue: touchgoal …"; called on interruption only.
     """
     try:
         yield
@@ -28,7 +28,7 @@ def kept(message: Callable[[], str]) -> Iterator[None]:
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """While this lasts, SIGTERM raises `Terminated` in the main thread."""
+    """Raise `Terminated` in the main thread on SIGTERM during the block."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,6 +1,5 @@
 """What every command shares: help, options, one line for a mistake, the run's folder, Ctrl-C."""
 
-import itertools
 import json
 import os
 import signal
@@ -17,11 +16,9 @@ from touchgoal import __version__
 from touchgoal.launch.__main__ import COMMANDS, main
 from touchgoal.launch.list import KINDS
 from touchgoal.launch.support.command_line import SHOWN, _all_options, _members, docstrings, parse
-from touchgoal.runtime import progress
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.interruption import Terminated, kept, terminable
+from touchgoal.runtime.interruption import Terminated, on_interruption, terminable
 from touchgoal.runtime.option_types import checked_dataclass
-from touchgoal.runtime.progress import track
 from touchgoal.runtime.run_folder import check_writable, open_run
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 
@@ -150,7 +147,7 @@ def test_an_interrupted_command_says_what_was_kept(
     from touchgoal.launch import list as command
 
     def work(_: object) -> None:
-        with kept(lambda: "kept 1 of 2"):
+        with on_interruption(lambda: "kept 1 of 2"):
             os.kill(os.getpid(), number)
             time.sleep(5)
 
@@ -194,20 +191,6 @@ def test_sigterm_is_taken_in_the_main_thread_alone() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(5)
     assert signal.getsignal(signal.SIGTERM) is before
-
-
-def test_progress_in_a_pipe_is_a_line_now_and_then(
-    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert list(track(range(200), "embedding", "frame")) == list(range(200))
-    assert capsys.readouterr().err == ""  # work that is done at once needs no words
-    clock = itertools.count(step=1.0)
-    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
-    assert list(track(range(200), "embedding", "frame")) == list(range(200))
-    lines = capsys.readouterr().err.splitlines()
-    assert lines == [f"embedding: {n} of 200 frames, {n} s, 1 s each" for n in range(20, 201, 20)]
-    assert list(track(iter("ab"), "reading", "file")) == ["a", "b"]
-    assert capsys.readouterr().err == ""  # no total, and half a minute has not passed
 
 
 def test_help_imports_nothing_heavy() -> None:

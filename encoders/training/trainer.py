@@ -28,7 +28,7 @@ from touchgoal.encoders.training import checkpoint
 from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.interruption import kept
+from touchgoal.runtime.interruption import on_interruption
 from touchgoal.runtime.provenance import command_line
 
 Metrics = dict[str, Any]
@@ -198,7 +198,7 @@ def fit(
     )
     model, optimizer = accelerator.prepare(training.loss, optimizer)
     try:
-        with kept(lambda: _how_to_resume(out_dir, len(history), config.epochs)):
+        with on_interruption(lambda: _how_to_resume(out_dir, len(history), config.epochs)):
             for epoch in range(len(history), config.epochs):
                 losses = _train_epoch(training, accelerator, model, optimizer, options, epoch)
                 training.loss.eval()

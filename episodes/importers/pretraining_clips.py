@@ -60,6 +60,15 @@ class Recording:
         """What recorded it."""
         return self.clip.sensor
 
+    @property
+    def name(self) -> str:
+        """Name for messages."""
+        return self.clip.name
+
+    def frame_checksums(self) -> frozenset[int]:
+        """Return checksums of the encoded pictures, comparable in this process."""
+        return frozenset(hash(picture.read()) for picture in self.clip.pictures)
+
     def open(self) -> tuple[TouchClip, UInt8[np.ndarray, "h w 3"]]:
         """Its pictures, decoded when asked for, and the untouched sensor."""
         return self.clip, self.background()

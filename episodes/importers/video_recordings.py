@@ -31,6 +31,15 @@ class VideoRecording:
         """Not to be learned from: of the split `val` or `test`."""
         return self.video.split not in _LEARNED
 
+    @property
+    def name(self) -> str:
+        """Name for messages."""
+        return str(self.video.path)
+
+    def frame_checksums(self) -> frozenset[int]:
+        """Return checksums of the pictures, comparable in this process."""
+        return frozenset(hash(picture.tobytes()) for picture in self.video.frames())
+
     def open(self) -> tuple["DecodedVideo", UInt8[np.ndarray, "h w 3"]]:
         """All its pictures, and the untouched sensor: the median of the first five."""
         pictures = self.video.frames()

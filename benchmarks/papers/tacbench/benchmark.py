@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tqdm import tqdm
 
 from touchgoal.benchmarks.papers.tacbench.config import Config
 from touchgoal.benchmarks.papers.tacbench.data import (
@@ -46,8 +47,8 @@ from touchgoal.episodes.bench_recording import (
 from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.interruption import kept
-from touchgoal.runtime.progress import Progress
+from touchgoal.runtime.interruption import on_interruption
+from touchgoal.runtime.progress import progress_bar
 
 _LOG = "training.log"
 _RECORDERS: dict[Recording, Callable[..., EpisodeSet]] = {
@@ -73,7 +74,7 @@ class Bench:
     config: Config
     sensor: str
     folder: Path
-    bar: Progress
+    bar: tqdm
     rows: list[dict[str, Any]]
     reads: list[Read]
 
@@ -97,8 +98,8 @@ def run(config: Config) -> dict[str, Any]:
         readings = {published.what: partial(published.read, getattr(config, published.what))}
     trainings = len(encoders) * len(config.tasks) * len(config.shares) * config.seeds
     with (
-        kept(lambda: f"recordings are kept in {config.data or folder}, trained probes are not"),
-        Progress("probes", trainings, "training") as bar,
+        on_interruption(lambda: f"recordings are in {config.data or folder}; probes are not saved"),
+        progress_bar("probes", trainings, "training") as bar,
     ):
         bench = Bench(config, sensor, folder, bar, [], [])
         for what, reading in readings.items():
