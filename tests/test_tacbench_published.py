@@ -16,7 +16,7 @@ from touchgoal.benchmarks.papers.tacbench.published_recordings import (
     read_published_strokes,
 )
 from touchgoal.benchmarks.papers.tacbench.task import split_force, split_grasp
-from touchgoal.benchmarks.papers.tacbench_report import published_recordings
+from touchgoal.benchmarks.papers.tacbench import published_recordings
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.episodes.importers.tacbench_poses import read_bags
 from touchgoal.runtime.errors import UserError
