@@ -98,6 +98,7 @@ def measure(name: str) -> None:
 
 def write_record(name: str, command: str, printed: list[str], metrics: dict[str, Any]) -> None:
     """Write a record; its metrics stand on one line."""
+    metrics.pop("command", None)  # has the folders of this machine
     asked = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
     commit = subprocess.run(asked, check=True, capture_output=True, text=True).stdout.strip()
     record = {

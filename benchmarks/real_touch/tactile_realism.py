@@ -45,12 +45,6 @@ class Config(BenchmarkOptions):
 
 N_TEST_PRESSES = {"gelsight": 12, "gelsight_mini": 6}
 MAIN_METHOD = "ours, circles corrected"
-# L1 (counts, at most) and PSNR (dB, at least) around the contact: the project's targets
-TARGETS = {"gelsight": (3.9, 33.2), "gelsight_mini": (3.6, 30.5)}
-# Azimuths of red, green and blue by two sources. GelSight: an earlier fit to the same presses.
-# Mini: mean of the normal networks of gs_sdk and gsrobotics, fitted to other sensors. Their normals
-# have the opposite sign, hence 180 degrees here. Shadows fall away from these directions.
-OTHER_AZIMUTHS = {"gelsight": (0.0, -116.0, 126.0), "gelsight_mini": (-99.0, 8.5, 84.0)}
 # Ball radius (m) and contact share at which Taxim does best on the fitted presses, of 1 to 4 mm and
 # both shares: for circles as labelled, and as registered.
 _TAXIM_LABELLED = {"gelsight": (2e-3, 0.4), "gelsight_mini": (3e-3, 0.0)}
@@ -67,7 +61,6 @@ def run(config: Config) -> dict[str, Any]:
     """Fit, predict and compare."""
     cv2.setNumThreads(1)
     rows: list[dict[str, Any]] = []
-    lights: dict[str, tuple[float, ...]] = {}
     examples: list[tuple[Colours, Colours]] = []
     for sensor in config.sensors:
         presses = real_presses(sensor)
@@ -82,13 +75,11 @@ def run(config: Config) -> dict[str, Any]:
                 rows.append({"sensor": sensor, "method": method, "seed": seed, **asdict(errors)})
                 if method == MAIN_METHOD and seed == 0:
                     examples += _examples(test, simulated)
-                    lights[sensor] = fitted.calibration.light_azimuths
-    lines = [_table(rows), _LEGEND, "", _light_table(lights), "", *_verdicts(rows, lights)]
+    lines = [_table(rows), _LEGEND]
     if not has_jax():
         lines.append(f"taxim's pictures are left out; to compare: {install_extra('peers')}")
     return {
         "rows": rows,
-        "light_azimuths": lights,
         "table": "\n".join(lines),
         "pictures": {
             "pictures": side_by_side([real for real, _ in examples], [made for _, made in examples])
@@ -157,34 +148,3 @@ def _table(rows: list[dict[str, Any]]) -> str:
                 f"{whole:>9.2f}"
             )
     return "\n".join(lines)
-
-
-def _light_table(lights: dict[str, tuple[float, ...]]) -> str:
-    lines = ["lights, degrees from right towards down: red, green, blue (by other sources)"]
-    for sensor, azimuths in lights.items():
-        pairs = zip(azimuths, OTHER_AZIMUTHS[sensor], strict=True)
-        lines.append(
-            f"{sensor:<15}" + ", ".join(f"{ours:.0f} ({other:.0f})" for ours, other in pairs)
-        )
-    return "\n".join(lines)
-
-
-def _verdicts(rows: list[dict[str, Any]], lights: dict[str, tuple[float, ...]]) -> list[str]:
-    lines = []
-    for sensor, azimuths in lights.items():
-        l1, psnr = (_median(rows, sensor, MAIN_METHOD, error) for error in ("l1_near", "psnr_near"))
-        most, least = TARGETS[sensor]
-        reached = "reached" if l1 <= most and psnr >= least else "MISSED"
-        off = max(
-            abs((ours - other + 180) % 360 - 180)
-            for ours, other in zip(azimuths, OTHER_AZIMUTHS[sensor], strict=True)
-        )
-        own = [r for r in rows if r["sensor"] == sensor and r["method"] == MAIN_METHOD]
-        worst = (
-            f"{max(r['l1_near'] for r in own):.2f} and {min(r['psnr_near'] for r in own):.1f} dB"
-        )
-        lines.append(
-            f"{sensor}: L1 at most {most} and PSNR at least {least} dB {reached} (worst split: {worst}); "
-            f"lights within {off:.0f} degrees of the other sources"
-        )
-    return lines
