@@ -8,6 +8,7 @@ import pytest
 import torch
 from published_files import gel, write_force_batch, write_grasps, write_pose_set
 
+from touchgoal.benchmarks.papers.tacbench import published_recordings
 from touchgoal.benchmarks.papers.tacbench.benchmark import run
 from touchgoal.benchmarks.papers.tacbench.config import Config
 from touchgoal.benchmarks.papers.tacbench.pose import PoseTask
@@ -16,7 +17,6 @@ from touchgoal.benchmarks.papers.tacbench.published_recordings import (
     read_published_strokes,
 )
 from touchgoal.benchmarks.papers.tacbench.task import split_force, split_grasp
-from touchgoal.benchmarks.papers.tacbench import published_recordings
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.episodes.importers.tacbench_poses import read_bags
 from touchgoal.runtime.errors import UserError
