@@ -1,4 +1,4 @@
-"""Published Sparsh encoders as touch encoders: a file, a folder or an id of Hugging Face."""
+"""Published Sparsh encoders as touch encoders: a file, a folder or a Hugging Face id."""
 
 import re
 from pathlib import Path
@@ -12,38 +12,50 @@ _FILES = (".safetensors", ".ckpt")  # the former holds the encoder alone
 _PATTERN = "*_vit*"  # e.g. dino_vitbase.safetensors
 _HUB_ID = re.compile(r"[\w.-]+/sparsh[\w.-]*", re.IGNORECASE)  # e.g. facebook/sparsh-dino-base
 STRIDES = {"pair": 5, "clip": 2}
-"""As trained, of two stacked frames and of clips: frames of a sensor at 60 Hz."""
+"""Frames between those of two stacked frames or a clip, as trained with sensors at 60 Hz."""
 
 
-def is_published(name: str | Path) -> bool:
-    """Whether this names weights in Sparsh's layout, there or not, rather than an encoder of ours."""
+def find_published(name: str | Path) -> Path | None:
+    """Return the file of published weights, fetched if need be; None if the name means no such.
+
+    Args:
+        name: A file of weights, a folder with one, or a Hugging Face id.
+
+    Raises:
+        UserError: Several files, or an id that cannot be fetched.
+    """
     path = Path(name)
+    if path.suffix in _FILES:
+        return path
     if path.is_dir():
-        return not (path / "encoder.json").exists() and bool(_found(path))
-    return path.suffix in _FILES or (not path.exists() and bool(_HUB_ID.fullmatch(str(name))))
+        return _only(path) if _weights_in(path) else None
+    return _only(_fetch(str(name))) if _HUB_ID.fullmatch(str(name)) else None
 
 
 def load_published(
     name: str | Path, stride: int | None = None, subtract: bool = True
 ) -> TouchBackbone:
-    """A published encoder that makes its own input, for inference, on the CPU.
+    """Load a published encoder with its own preprocessing, for inference, on the CPU.
 
-    To use one in `train-policy --encoder`, save it as a folder of ours first, with the stride that a control tick
-    asks for (two ticks of 20 Hz are 0.1 s, five frames of 60 Hz 0.083 s):
+    For `train-policy --encoder`, save it as a folder of ours first, with the stride that fits a control
+    tick (two ticks of 20 Hz are 0.1 s, five frames of 60 Hz 0.083 s):
 
         save(load_published("facebook/sparsh-dino-base", stride=2), Path("sparsh-dino"), {}, half=False)
 
     Args:
-        name: A file of weights, a folder with one, or an id of Hugging Face.
-        stride: Frames from one that an embedding sees to the one before. Default: 5 for two stacked
-            frames and 2 for clips, as trained, with sensors at 60 Hz.
-        subtract: Take out the untouched sensor, as Sparsh does for the DIGIT and the GelSight Mini and not
-            for the GelSight of 2017.
+        name: A file of weights, a folder with one, or a Hugging Face id.
+        stride: Frames between those that an embedding uses. Default: 5 for two stacked frames and 2
+            for clips, as trained, with sensors at 60 Hz.
+        subtract: Subtract the untouched sensor, as Sparsh does for the DIGIT and the GelSight Mini and
+            not for the GelSight of 2017.
 
     Raises:
-        UserError: None there, not to be fetched, or weights that do not fit, which are listed.
+        UserError: No such weights, or tensors that do not fit, which are listed.
     """
-    vit = load_sparsh(_file(name))
+    path = find_published(name)
+    if path is None:
+        raise UserError(f"no Sparsh encoder in {name}: give a file of weights")
+    vit = load_sparsh(path)
     default = STRIDES["pair" if vit.config.tubelet == 1 else "clip"]
     config = TouchBackboneConfig(
         vit.config,
@@ -51,47 +63,39 @@ def load_published(
         preprocessor=SPARSH if subtract else SPARSH_PLAIN,
         stride=default if stride is None else stride,
     )
-    encoder = TouchBackbone(config, vit)
-    return encoder.eval().requires_grad_(False)
+    return TouchBackbone(config, vit).eval().requires_grad_(False)
 
 
-def _file(name: str | Path) -> Path:
-    path = Path(name)
-    if path.is_file() or path.suffix in _FILES:
-        return path
-    return _only(path if path.is_dir() else _fetched(str(name)))
-
-
-def _found(folder: Path) -> list[Path]:
-    """Weights of the shortest kind that there is."""
+def _weights_in(folder: Path) -> list[Path]:
+    """Return the folder's `.safetensors` weights, or its `.ckpt` ones if there are none."""
     kinds = (sorted(folder.glob(_PATTERN + suffix)) for suffix in _FILES)
     return next((files for files in kinds if files), [])
 
 
 def _only(folder: Path) -> Path:
-    files = _found(folder)
+    files = _weights_in(folder)
     if len(files) != 1:
-        named = ", ".join(file.name for file in files) or "none"
-        raise UserError(f"{folder} holds not one Sparsh encoder but {named}: give the file")
+        found = ", ".join(file.name for file in files) or "none"
+        raise UserError(f"{folder} must hold one Sparsh encoder, it holds {found}: give the file")
     return files[0]
 
 
-def _fetched(repository: str) -> Path:
-    """A folder of Hugging Face's cache with the weights of a repository."""
+def _fetch(repository: str) -> Path:
+    """Return the folder in Hugging Face's cache with the weights of a repository."""
     try:
         from huggingface_hub import snapshot_download
     except ImportError as error:
         raise UserError(f"encoders of Hugging Face need: {install_extra('towers')}") from error
     folder = Path()
-    for suffix in _FILES:  # the next one only if there is none of the former
+    for suffix in _FILES:
         try:
             folder = Path(snapshot_download(repository, allow_patterns=_PATTERN + suffix))
         except Exception as error:  # the client raises whatever its parts raise
             raise UserError(
-                f"{repository} is neither in Hugging Face's cache nor to be fetched from here "
+                f"{repository} is not in Hugging Face's cache and cannot be fetched "
                 f"({str(error).splitlines()[0]}): give a file of weights, or first run: "
                 f"hf download {repository}"
             ) from error
-        if _found(folder):
+        if _weights_in(folder):
             break
     return folder

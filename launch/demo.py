@@ -51,9 +51,9 @@ def main(config: Config) -> None:
 
     sensor = find_sensor(config.env.sensor).name
     directory = pretrained.shipped_encoder_for(sensor)
-    encoder = pretrained.load_aligned(directory, sensor=sensor)
+    encoder = pretrained.load_encoder(directory, sensor)
     normalizer = DistanceNormalizer.load(directory / NORMALIZER)
-    embedder = EpisodeEmbedder(load_towers(encoder.config.towers), encoder)
+    embedder = EpisodeEmbedder(load_towers(encoder.towers or "offline"), encoder)
     out = open_run(config.out, "demo", config)
 
     env = PickPlace(config.env)

@@ -80,11 +80,11 @@ def towers() -> CheckResult:
 
 def weights() -> CheckResult:
     """The shipped touch encoder and the normalizer of its costs."""
-    from touchgoal.encoders.pretrained import DEFAULT_ENCODER, ENCODER_FORMAT, load_aligned
+    from touchgoal.encoders.pretrained import DEFAULT_ENCODER, ENCODER_FORMAT, load_encoder
     from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
 
     try:
-        encoder = load_aligned(DEFAULT_ENCODER)
+        encoder = load_encoder(DEFAULT_ENCODER)
         DistanceNormalizer.load(DEFAULT_ENCODER / NORMALIZER)
     except UserError as error:
         return CheckResult("touch encoder", False, DEFAULT_ENCODER.name, str(error))

@@ -4,7 +4,6 @@ from pathlib import Path
 
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.published import is_published
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.rewards.embedding_distance import check_words
 from touchgoal.rewards.goals import parse_goal
@@ -21,7 +20,7 @@ def load_cell_cost(cell: CellConfig) -> OnlineCost:
     check_words(goals, encoder)
     simulated = cell.arm == "sim" or bool(cell.task.twin)
     path = Path(cell.task.normalizer)
-    if not cell.task.normalizer and simulated and not is_published(chosen):
+    if not cell.task.normalizer and simulated:
         path = pretrained.find_encoder(chosen) / NORMALIZER
     normalizer = DistanceNormalizer.load(path) if path.is_file() or cell.task.normalizer else None
     return OnlineCost(CostMeter(load_towers(own_towers(encoder)), encoder, normalizer, goals))

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.pretrained import AnyTouchEncoder, load_encoder
-from touchgoal.encoders.published import is_published
 from touchgoal.encoders.towers.towers import OfflineTowers, load_towers
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder, check_words, compute_curves
@@ -112,10 +111,9 @@ def load_touch(source: Source, encoder: str | None) -> tuple[AnyTouchEncoder | N
     Raises:
         UserError: nothing ships for the sensor, or the encoder is for another one.
     """
-    if encoder is not None and source.sides and is_published(encoder):
-        return load_encoder(encoder), None
-    folder = _encoder_folder(source, encoder)
-    return (None if folder is None else load_encoder(folder, source.sensor)), folder
+    path = _find_encoder(source, encoder)
+    touch = None if path is None else load_encoder(path, source.sensor)
+    return touch, path if path is not None and path.is_dir() else None
 
 
 def embedder_for(
@@ -139,7 +137,7 @@ def own_towers(touch: AnyTouchEncoder | None) -> str:
     return (touch and touch.towers) or OfflineTowers.name
 
 
-def _encoder_folder(source: Source, encoder: str | None) -> Path | None:
+def _find_encoder(source: Source, encoder: str | None) -> Path | None:
     if not source.sides:
         if encoder is not None:
             raise UserError(f"{source.path} has no touch: leave --encoder out")

@@ -249,7 +249,7 @@ def test_what_is_returned_is_what_is_saved(tmp_path: Path) -> None:
     encoder = run_align(
         TRAIN, VAL, FakeTowers(), replace(CONFIG, epochs=1), tmp_path, {"data": "toy"}
     )
-    saved = pretrained.load_aligned(tmp_path / "encoder", sensor="gelsight_mini", towers="fake")
+    saved = pretrained.load_encoder(tmp_path / "encoder", "gelsight_mini")
     assert torch.equal(weights(saved), weights(encoder))
     provenance = pretrained.ENCODER_FORMAT.provenance(tmp_path / "encoder")
     assert (

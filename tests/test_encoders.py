@@ -19,6 +19,7 @@ from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncode
 from touchgoal.encoders.backbones.vit import PRESETS, ViT, ViTConfig, random_masking
 from touchgoal.encoders.preprocess import PREPROCESSORS, check_pictures
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.provenance import portable
 
 MINI = PREPROCESSORS["gelsight_mini"]
 
@@ -246,13 +247,13 @@ def test_saved_encoder_is_the_same(tmp_path: Path) -> None:
     encoder = make_encoder()
     touch = torch.randn(8, 3, 120, 160)
     pretrained.save(encoder, tmp_path / "full", {"seed": 3}, half=False)
-    full = pretrained.load_aligned(tmp_path / "full", sensor="gelsight_mini", towers="fake")
+    full = pretrained.load_encoder(tmp_path / "full", "gelsight_mini")
     assert torch.equal(full.embed_touch(touch), encoder.embed_touch(touch))
     assert full.config == encoder.config and not full.training
     assert pretrained.ENCODER_FORMAT.provenance(tmp_path / "full") == {"seed": 3}
 
     pretrained.save(encoder, tmp_path / "half", {})
-    half = pretrained.load_aligned(tmp_path / "half")
+    half = pretrained.load_encoder(tmp_path / "half")
     cosine = (half.embed_touch(touch) * encoder.embed_touch(touch)).sum(1)
     assert (1 - cosine).max() < 1e-3
     full_bytes, half_bytes = (
@@ -291,7 +292,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no json inside": (lambda d: (d / "encoder.json").write_text("{"), "damaged"),
     "old preprocessor": (
         lambda d: edit_json(d, lambda j: j["config"].update(preprocessor="gelsight_mini/v0")),
-        "gelsight_mini/v0, this is gelsight_mini/v1",
+        "gelsight_mini/v0, this version has gelsight_mini/v1",
     ),
     "unknown sensor": (
         lambda d: edit_json(d, lambda j: j["config"].update(sensor="nose")),
@@ -301,6 +302,8 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda d: edit_json(d, lambda j: j["config"].update(colour="red")),
         "damaged.*colour",
     ),
+    "no kind": (lambda d: edit_json(d, lambda j: j["config"].pop("kind")), "damaged.*kind"),
+    "unknown kind": (lambda d: edit_json(d, lambda j: j["config"].update(kind="x")), "damaged.*x"),
     "future format": (lambda d: edit_json(d, lambda j: j.update(format=99)), "format 99"),
     "wrong shape": (wrong_shape, r"touch_head.weight is \(16, 31\), not \(16, 32\)"),
     "missing tensor": (missing_tensor, "text_head.weight is None"),
@@ -314,16 +317,14 @@ def test_damaged_files_are_refused(tmp_path: Path, damage: str) -> None:
     spoil, message = DAMAGES[damage]
     spoil(tmp_path)
     with pytest.raises(UserError, match=message) as error:
-        pretrained.load_aligned(tmp_path)
+        pretrained.load_encoder(tmp_path)
     assert "\n" not in str(error.value)
 
 
 def test_encoder_for_another_use_is_refused(tmp_path: Path) -> None:
     pretrained.save(make_encoder(), tmp_path, {})
     with pytest.raises(UserError, match="is for gelsight_mini, not digit"):
-        pretrained.load_aligned(tmp_path, sensor="digit")
-    with pytest.raises(UserError, match="with the towers fake, not offline"):
-        pretrained.load_aligned(tmp_path, towers="offline")
+        pretrained.load_encoder(tmp_path, sensor="digit")
 
 
 @pytest.mark.parametrize(
@@ -370,3 +371,18 @@ def test_encoders_are_found_by_name_or_path(tmp_path: Path) -> None:
         pretrained.load_encoder("gelsigt")
     with pytest.raises(UserError, match="no touch encoder in"):
         pretrained.load_encoder(tmp_path)
+
+
+def test_no_file_of_weights_names_a_folder_of_this_machine(tmp_path: Path) -> None:
+    made_from = {
+        "command": f"touchgoal train-encoder mae --data {tmp_path}/a/b --out={Path.cwd()}/runs/x",
+        "data": [{"path": str(tmp_path / "set"), "checksum": "a/b"}],
+    }
+    pretrained.save(make_encoder(), tmp_path, made_from)
+    assert pretrained.ENCODER_FORMAT.provenance(tmp_path) == {
+        "command": "touchgoal train-encoder mae --data b --out=runs/x",
+        "data": [{"path": "set", "checksum": "a/b"}],
+    }
+    for name in pretrained.encoder_names():
+        record = json.loads((pretrained.find_encoder(name) / "encoder.json").read_text())
+        assert portable(record) == record

@@ -143,12 +143,3 @@ def test_ridge_reads_what_is_linear_and_nothing_else() -> None:
     targets = torch.cat([inputs @ weights + 3, torch.randn(400, 1)], 1)
     r2 = ridge_r2(inputs[:300], targets[:300], inputs[300:], targets[300:])
     assert r2[0] > 0.99 and r2[1] < 0.1
-
-
-def test_an_encoder_of_the_other_kind_is_refused(tmp_path: Path) -> None:
-    pretrained.save(MaskedAutoencoder(TOY, SENSOR).backbone, tmp_path, {})
-    assert pretrained.load_encoder(tmp_path).config.sensor == "gelsight_mini_markers"
-    with pytest.raises(UserError, match="is damaged"):
-        pretrained.load_aligned(tmp_path)
-    with pytest.raises(UserError, match="is damaged"):
-        pretrained.load_touch_backbone(pretrained.DEFAULT_ENCODER)

@@ -84,8 +84,8 @@ def test_options_and_a_folder_of_ours(tmp_path: Path) -> None:
     wanted = expected(weights, shifted, 4, "mae", subtract=False)
     both = np.stack([frames[3], frames[8]])
     np.testing.assert_allclose(encoder.embed(both)[1], wanted, atol=2e-5)
-    with pytest.raises(UserError, match="this takes a folder of ours"):
-        find_encoder(tmp_path)
+    with pytest.raises(UserError, match="needs an encoder of ours"):
+        find_encoder(tmp_path, published=False)
     save(encoder, tmp_path / "ours", {}, half=False)
     again = load_touch(tmp_path / "ours")
     assert again.reach == 1 and again.sensor is None
@@ -110,7 +110,7 @@ def test_ids_of_hugging_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     constants = pytest.importorskip("huggingface_hub.constants")
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(UserError, match="sparsh-mae-toy is neither in") as refusal:
+    with pytest.raises(UserError, match="sparsh-mae-toy is not in") as refusal:
         load_encoder("facebook/sparsh-mae-toy")
     assert "\n" not in str(refusal.value) and "hf download" in str(refusal.value)
     commit = "0" * 40

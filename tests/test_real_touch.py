@@ -15,7 +15,7 @@ from touchgoal.benchmarks.real_touch.force_onset import EmbeddedGrasp, cost_tabl
 from touchgoal.benchmarks.real_touch.videos import Config, embed_touch, read_touch, run
 from touchgoal.control.tactile.force import calibrate_force, change_statistics, resized
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
-from touchgoal.encoders.pretrained import find_encoder, load_encoder, load_pooled
+from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.probes import property_probe
 from touchgoal.encoders.probes.property_probe import (
     adapted_nearest_is_same,
@@ -112,12 +112,12 @@ def test_sentences_are_judged_on_things_never_seen() -> None:
 
 
 def test_adapting_says_what_it_needs(clips: Path, tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match="was not fitted by"):
+    with pytest.raises(SystemExit, match="was not trained by"):
         main(["train-encoder", "adapt", "--data", str(clips), "--encoder", "gelsight_mini",
               "--out", str(tmp_path / "a")])  # fmt: skip
     one = [video for video in read_labelled_videos(clips) if video.path.stem.endswith("_0")]
     with pytest.raises(UserError, match="no thing has two videos"):
-        adapt(load_pooled(find_encoder("gelsight_mini_surfaces")), one, 0.1, OfflineTowers())
+        adapt(load_encoder("gelsight_mini_surfaces"), one, 0.1, OfflineTowers())
 
 
 def test_sentences_lie_where_what_they_tell_of_is_felt() -> None:

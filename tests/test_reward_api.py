@@ -178,7 +178,7 @@ def test_told_before_any_encoder_is_loaded(
         raise AssertionError("the encoders were loaded first")
 
     monkeypatch.chdir(run_folder)
-    monkeypatch.setattr("touchgoal.encoders.pretrained.load_aligned", loaded)
+    monkeypatch.setattr("touchgoal.encoders.pretrained.load_encoder", loaded)
     monkeypatch.setattr("touchgoal.rewards.setup.load_towers", loaded)
     with pytest.raises(SystemExit, match=message):
         main(["reward-curves", *arguments, "--out", "out"])

@@ -93,9 +93,9 @@ class HeldOutEpisode:
 def run(config: Config) -> dict[str, Any]:
     """Record, measure and judge."""
     directory = pretrained.find_encoder(config.encoder)
-    encoder = pretrained.load_aligned(directory)
+    encoder = pretrained.load_encoder(directory)
     normalizer = DistanceNormalizer.load(directory / NORMALIZER)
-    embedder = EpisodeEmbedder(load_towers(encoder.config.towers), encoder)
+    embedder = EpisodeEmbedder(load_towers(encoder.towers or "offline"), encoder)
     with tempfile.TemporaryDirectory() as folder:
         tests = record_and_measure(
             config, encoder.config.sensor, embedder, normalizer, Path(folder)

@@ -13,7 +13,7 @@ from touchgoal.encoders.alignment.touch_encoder import TouchEncoder
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder, TouchBackbone
 from touchgoal.encoders.backbones.vit import ViT
 from touchgoal.encoders.pretrained import load_encoder
-from touchgoal.encoders.published import is_published
+from touchgoal.encoders.published import find_published
 from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_pixels
 from touchgoal.runtime.errors import UserError, install_extra
@@ -67,7 +67,7 @@ def find_embedder(name: str, seed: int) -> Embedder:
         return untrained(name.removeprefix("random:"), seed).embed_frames
     # Names on Hugging Face are OWNER/MODEL; ours are plain, and a folder says what it holds.
     foreign = (Path(name) / "config.json").is_file() or ("/" in name and not Path(name).exists())
-    if foreign and not is_published(name):
+    if foreign and find_published(name) is None:
         return _hugging_face(name)
     return load_encoder(name).eval().embed_frames
 

@@ -51,7 +51,7 @@ def align(
     out_dir: Path,
     options: TrainerOptions,
     recipe: dict[str, Any],
-) -> TouchEncoder:
+) -> pretrained.AnyTouchEncoder:
     """Train a touch encoder.
 
     Writes what `trainer.fit` does, and at the end the epoch with the best retrieval (mean of both
@@ -124,7 +124,7 @@ def align(
         "test_metrics": evaluate_retrieval(encoder, test),
     }
     on_first_process(lambda: pretrained.save(encoder, out_dir / _ENCODER, provenance))
-    return pretrained.load_aligned(out_dir / _ENCODER)
+    return pretrained.load_encoder(out_dir / _ENCODER)
 
 
 def _checksum(touches: Touches) -> str:

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.sparsh import Method, backbone_for
-from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.ssl.config import (
     DinoConfig,
     IJepaConfig,
@@ -43,7 +42,7 @@ def train_self_distilled(
     out_dir: Path,
     options: TrainerOptions,
     recipe: dict[str, Any],
-) -> TouchBackbone:
+) -> pretrained.AnyTouchEncoder:
     """Train a backbone by the objective of `config`.
 
     Writes what `trainer.fit` does, images reconstructed from the tokens, and at the end the teacher's
@@ -113,4 +112,4 @@ def train_self_distilled(
         "metrics": history[-1],
     }
     on_first_process(lambda: pretrained.save(model.teacher, out_dir / _ENCODER, provenance))
-    return pretrained.load_touch_backbone(out_dir / _ENCODER)
+    return pretrained.load_encoder(out_dir / _ENCODER)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -50,7 +50,7 @@ class BatchNoise:
         )
 
 
-def _take(drawn, own: slice):
+def _take(drawn: Any, own: slice) -> Any:
     if isinstance(drawn, dict):
         return {name: _take(value, own) for name, value in drawn.items()}
     if isinstance(drawn, list):

@@ -288,9 +288,8 @@ def epoch_batches(
 
 def gather_batch(rows: Shaped[Tensor, "b ..."]) -> Shaped[Tensor, "n ..."]:
     """Return the rows of all processes, in order and with gradients, for losses between samples."""
-    if not torch.distributed.is_initialized():
-        return rows
-    return all_gather_single(rows.contiguous(), 0, torch.distributed.group.WORLD)
+    group = torch.distributed.group.WORLD if torch.distributed.is_initialized() else None
+    return rows if group is None else all_gather_single(rows.contiguous(), 0, group)
 
 
 def own_rows(rows: Shaped[Tensor, "n ..."], count: int) -> Shaped[Tensor, "{count} ..."]:

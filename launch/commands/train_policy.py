@@ -48,7 +48,7 @@ def run_command(config: Config) -> None:
     parts = {
         name: folder
         for name, folder in (
-            (checkpoint.TOUCH, config.encoder and find_encoder(config.encoder)),
+            (checkpoint.TOUCH, config.encoder and find_encoder(config.encoder, published=False)),
             (checkpoint.ESTIMATOR, config.estimator),
         )
         if folder

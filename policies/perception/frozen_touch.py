@@ -70,7 +70,7 @@ def load_touch(name_or_path: str | Path) -> TouchEmbedder:
 
     Embeddings are named after the weights, not after the folder, which may move.
     """
-    directory = pretrained.find_encoder(name_or_path)
+    directory = pretrained.find_encoder(name_or_path, published=False)
     encoder = pretrained.load_encoder(directory)
     offsets = encoder.offsets
     seen = f"/frames{'-'.join(map(str, offsets))}" if len(offsets) > 1 else ""
