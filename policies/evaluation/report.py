@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +69,7 @@ def film_trials(
 
 
 def _film(task: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec, path: Path) -> None:
-    env = make_env(replace(task, tactile=True))
+    env = make_env(task)  # with other images it would draw other random numbers
     episode, images = record_with_film(env, spec, policy)
     write_film(path, images, episode, task.control_hz)
     env.close()
