@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -102,6 +102,7 @@ def record_with_film(
     env: FrankaTactileEnv,
     spec: EpisodeSpec,
     policy: Callable[[Any], Actor] | None = None,
+    meshes: Literal["fast", "full"] = "full",
 ) -> tuple[Episode, UInt8[np.ndarray, "n h w 3"]]:
     """Record and film an episode of the expert, or of the actor that `policy` makes.
 
@@ -110,7 +111,7 @@ def record_with_film(
     """
     observation, info = env.reset(seed=spec.seed, options=spec.options)
     actor = policy(env) if policy else make_expert(env, spec.outcome)
-    film = SceneRecorder(env)
+    film = SceneRecorder(env, meshes)
     ticks = []
     at_most = round(env.config.max_seconds * env.config.control_hz)
     for tick in track(run(env, actor, observation, info), "filming", "frame", total=at_most):

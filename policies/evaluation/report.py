@@ -70,7 +70,7 @@ def film_trials(
 
 def _film(task: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec, path: Path) -> None:
     env = make_env(task)  # with other images it would draw other random numbers
-    episode, images = record_with_film(env, spec, policy)
+    episode, images = record_with_film(env, spec, policy, meshes="fast")
     write_film(path, images, episode, task.control_hz)
     env.close()
 
