@@ -117,7 +117,11 @@ def test_a_policy_of_ones_own_is_judged(tmp_path: Path) -> None:
         ("shipped", {"sensor": "digit"}, r"--env\.sensor gelsight_mini"),
         ("shipped", {"tactile": False}, r"--env\.no-tactile: .* runs with --env\.tactile; leave"),
         ("shipped", {"cameras": ()}, r"--env\.cameras: .* runs with --env\.cameras front"),
-        ("shipped", {"camera_size": (64, 64)}, r"camera-size 64 64: .* runs with --env\.camera-size 256 256"),
+        (
+            "shipped",
+            {"camera_size": (64, 64)},
+            r"camera-size 64 64: .* runs with --env\.camera-size 256 256",
+        ),
         (
             "expert",
             {"camera_size": (64, 64)},
