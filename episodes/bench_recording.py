@@ -21,11 +21,11 @@ from touchgoal.control.features import (
     TRUTH_SUCCESS,
 )
 from touchgoal.episodes.encoding import EncodedEpisode, encode
-from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
+from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.cloths import CLOTHS, press_cloth
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.grasp_rig import attempt_grasp

@@ -1,31 +1,28 @@
-"""From acting in an environment to episodes on disk, on all cores."""
+"""Acting in an environment and recording it as episodes on disk, on all cores."""
 
-import multiprocessing
-import os
-import signal
-import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
-from touchgoal.episodes.encoding import EncodedEpisode, encode
+from touchgoal.episodes import metadata
+from touchgoal.episodes.encoding import Description, EncodedEpisode, encode
 from touchgoal.episodes.schema import Episode, MetaValue
-from touchgoal.episodes.store import EpisodeWriter
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.progress import track
+from touchgoal.runtime.progress import progress_bar, track
+from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
-from touchgoal.sim_envs.config import Outcome, TaskConfig
+from touchgoal.sim_envs.config import BeadMazeConfig, Outcome, TaskConfig
 from touchgoal.sim_envs.scene.filming import SceneRecorder
+from touchgoal.sim_envs.scene.objects import CATALOGUE
 from touchgoal.sim_envs.tasks import make_env, make_expert
 
 
@@ -34,29 +31,74 @@ class Actor(Protocol):
     """Anything that acts: an expert, a policy, a person."""
 
     def act(self, observation: Observation) -> np.ndarray:
-        """The action (8,) for the next tick."""
+        """Return the action (8,) for the next tick."""
         ...
 
 
 @dataclass(frozen=True)
 class EpisodeSpec:
-    """One episode to record: the same spec always gives the same episode."""
+    """One episode to record; the same spec always gives the same episode."""
 
     seed: int
     outcome: Outcome = "success"
     options: dict[str, Any] = field(default_factory=dict)
 
 
-CORRECTED = "corrected"  # outcome of an episode in which a learner acted and an expert answered
+CORRECTED = "corrected"
+"""Outcome of an episode in which a policy acted while an expert's actions were recorded."""
 Roles = Callable[[Any, EpisodeSpec], tuple[Actor, Actor]]
-"""Who acts in an environment after its reset, and whose answers to all that is seen are recorded:
-one and the same expert, or a learner and the expert that corrects it."""
+"""Returns for an environment after its reset the actor, and the expert whose actions are recorded; both
+are one object where the expert acts itself."""
+
+
+class NoSuccessError(UserError):
+    """The first episodes of a recording all failed."""
 
 
 def expert_alone(env: FrankaTactileEnv, spec: EpisodeSpec) -> tuple[Actor, Actor]:
-    """The task's expert, succeeding or failing as the spec asks; see Roles."""
+    """Return the task's expert, which succeeds or fails as the spec asks, in both roles."""
     expert = make_expert(env, spec.outcome)
     return expert, expert
+
+
+def episode_specs(
+    env: TaskConfig, outcomes: Sequence[Outcome], episodes: int, first_seed: int
+) -> list[EpisodeSpec]:
+    """Return specs that take the objects (or wires) in turn, each with every outcome once.
+
+    Args:
+        env: Options of the task.
+        outcomes: Outcomes to ask the expert for.
+        episodes: Number of episodes of each outcome.
+        first_seed: Seed of the first episode; each further one adds one.
+    """
+    if isinstance(env, BeadMazeConfig):
+        options = [{"wire": wire.name} for wire in env.chosen_wires()]
+    else:
+        options = [{"object": name} for name in env.objects or CATALOGUE]
+    n = len(outcomes)
+    return [
+        EpisodeSpec(first_seed + i, outcomes[i % n], options[i // n % len(options)])
+        for i in range(n * episodes)
+    ]
+
+
+def missing_specs(
+    root: Path, specs: Sequence[EpisodeSpec], corrected: bool = False
+) -> list[EpisodeSpec]:
+    """Return the specs whose seeds a set does not hold; all of them where nothing is recorded yet.
+
+    Args:
+        root: Folder of the set.
+        specs: Episodes to record.
+        corrected: Whether they are recorded while a policy acts: such an episode does not replace
+            the expert's with the same seed.
+    """
+    if not (root / metadata.INFO).exists():
+        return list(specs)
+    metas = [episodes.meta(i) for episodes in [EpisodeSet(root)] for i in range(len(episodes))]
+    recorded = {meta.get("seed") for meta in metas if (meta["outcome"] == CORRECTED) == corrected}
+    return [spec for spec in specs if spec.seed not in recorded]
 
 
 def run(
@@ -66,29 +108,30 @@ def run(
     info: dict[str, Any],
     expert: Actor | None = None,
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Act until the episode ends; yields what was seen, done and true at each tick.
+    """Act until the episode ends; yield each tick's observation, action and ground truth.
 
     Args:
-        env: after its reset.
-        actor: chooses the actions.
-        observation, info: what the reset returned.
-        expert: if given, what it would have done stands for what was done.
+        env: Environment after its reset.
+        actor: Chooses the actions.
+        observation: First observation, from the reset.
+        info: First ground truth, from the reset.
+        expert: Its actions are recorded in place of the actor's, if given.
     """
     while True:
         action = np.asarray(actor.act(observation), np.float32)
-        answer = np.asarray(expert.act(observation), np.float32) if expert else action
-        yield {**observation, ft.ACTION: answer, **info}
+        recorded = np.asarray(expert.act(observation), np.float32) if expert else action
+        yield {**observation, ft.ACTION: recorded, **info}
         observation, _, terminated, truncated, info = env.step(action)
         if terminated or truncated:
             break
-    still = np.append(np.zeros(env.n_joints), answer[-1]).astype(np.float32)
+    still = np.append(np.zeros(env.n_joints), recorded[-1]).astype(np.float32)
     yield {**observation, ft.ACTION: still, **info}
 
 
 def record_episode(
     env: FrankaTactileEnv, spec: EpisodeSpec, roles: Roles = expert_alone
 ) -> Episode:
-    """Record an expert's answers."""
+    """Record one episode with the expert's actions."""
     observation, info = env.reset(seed=spec.seed, options=spec.options)
     actor, expert = roles(env, spec)
     if expert is actor:
@@ -104,10 +147,12 @@ def record_with_film(
     policy: Callable[[Any], Actor] | None = None,
     meshes: Literal["fast", "full"] = "full",
 ) -> tuple[Episode, UInt8[np.ndarray, "n h w 3"]]:
-    """Record and film an episode of the expert, or of the actor that `policy` makes.
+    """Record and film an episode, tick by tick.
 
-    Returns:
-        The episode, and pictures for `episodes.film.write_film`.
+    Args:
+        env: Environment.
+        spec: Episode to record.
+        policy: Makes the actor for the environment after its reset; None for the expert.
     """
     observation, info = env.reset(seed=spec.seed, options=spec.options)
     actor = policy(env) if policy else make_expert(env, spec.outcome)
@@ -118,13 +163,13 @@ def record_with_film(
         ticks.append(tick)
         film.capture()
     film.close()
-    return to_episode(env, ticks, spec), film.pictures
+    return to_episode(env, ticks, spec), np.stack(film.frames)
 
 
 def to_episode(
     env: FrankaTactileEnv, ticks: list[dict[str, np.ndarray]], spec: EpisodeSpec
 ) -> Episode:
-    """The episode of the ticks that were run in an environment."""
+    """Return the ticks that `run` yielded as an episode."""
     success = bool(ticks[-1][ft.TRUTH_SUCCESS][0])
     asked_to_fail = spec.outcome != "success"
     return Episode(
@@ -146,66 +191,71 @@ def collect(
     specs: Sequence[EpisodeSpec],
     workers: int,
     roles: Roles = expert_alone,
+    max_failures: int | None = None,
 ) -> list[dict[str, MetaValue]]:
     """Append episodes to the set in `root`, in the order of their specs.
 
     Workers simulate and encode; this process alone writes, so that an interruption loses at most
-    the episodes in progress. The roles must pickle.
+    the episodes in progress. The progress bar counts successes and names the commonest failure.
+
+    Args:
+        root: Folder of the set.
+        config: Options of the task.
+        specs: Episodes to record.
+        workers: Number of processes.
+        roles: Actor and expert; must pickle.
+        max_failures: Stop after so many first episodes without a success; None for never.
 
     Returns:
         The `meta` of each episode, outcome and success included.
 
     Raises:
-        UserError: nothing to record, the set cannot be continued, or another process records
+        UserError: Nothing to record, the set cannot be continued, or another process records
             into it.
+        NoSuccessError: The first `max_failures` episodes failed; they are recorded.
     """
     if not specs:
         raise UserError("nothing to collect: ask for at least one episode")
-    metas = []
+    metas, failures = [], Counter[str]()
     writer = EpisodeWriter(root, fps=config.control_hz)  # refuses a second recorder at once
     try:
-        with one_core_workers(workers) as pool:
-            encoded = pool.map(partial(_record, config, roles), specs)
-            for episode in track(encoded, "recording", "episode", total=len(specs)):
+        with (
+            one_core_workers(workers) as pool,
+            progress_bar("recording", len(specs), "episode") as bar,
+        ):
+            for episode in pool.map(partial(_record, config, roles), specs):
                 writer.append(episode)
                 metas.append(episode.description.meta)
+                if reason := _failure(episode.description):
+                    failures[reason] += 1
+                bar.set_postfix_str(_count(len(metas), failures), refresh=False)
+                bar.update()
+                if len(metas) == failures.total() == max_failures:
+                    raise NoSuccessError(f"stopped: {_count(len(metas), failures)}")
     finally:
         writer.close()
     return metas
 
 
-@contextmanager
-def one_core_workers(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Workers that use one core each.
-
-    OpenGL contexts do not survive a fork, so they are forked from a server that never renders; it
-    imports once, for all workers of this process, what this process has imported.
-
-    Should anything end the block early, Ctrl-C for example, the workers end at once: what they
-    have in hand is lost.
-    """
-    others = set(multiprocessing.active_children())
-    forkserver = multiprocessing.get_context("forkserver")
-    forkserver.set_forkserver_preload([m for m in sys.modules if m.startswith("touchgoal.")])
-    pool = ProcessPoolExecutor(workers, mp_context=forkserver, initializer=_begin_work)
-    try:
-        yield pool
-    except BaseException:
-        for worker in set(multiprocessing.active_children()) - others:
-            worker.terminate()
-        pool.shutdown(cancel_futures=True)
-        raise
-    pool.shutdown()
+def _failure(description: Description) -> str:
+    """Return why an episode failed that was to succeed; "" if it did not."""
+    meta, stats = description.meta, description.stats
+    if meta["success"] or meta["outcome"] not in ("failure", CORRECTED):
+        return ""
+    names = ft.FEATURES[ft.TRUTH_FAILURE].names
+    for name, value in zip(names, stats.get(ft.TRUTH_FAILURE, {}).get("max", []), strict=False):
+        if value:
+            return name.replace("_", " ")
+    if ft.TRUTH_CONTACT in stats and not any(stats[ft.TRUTH_CONTACT]["max"]):
+        return "time is up before any contact"
+    return "time is up"
 
 
-def _begin_work() -> None:
-    """Leave Ctrl-C to the process that started this one, and the other cores to the others.
-
-    OpenCV and software OpenGL would start threads there.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    cv2.setNumThreads(1)
-    os.environ["LP_NUM_THREADS"] = "1"
+def _count(episodes: int, failures: Counter[str]) -> str:
+    text = f"{episodes - failures.total()} of {episodes} succeeded"
+    for reason, count in failures.most_common(1):
+        text += f", most often failed: {reason} ({count})"
+    return text
 
 
 def _record(config: TaskConfig, roles: Roles, spec: EpisodeSpec) -> EncodedEpisode:

@@ -1,8 +1,9 @@
-"""Record an expert's episodes of a task, or failures on purpose, as a LeRobot-v3 data set."""
+"""Record an expert's episodes of a task, or failures on purpose, as a LeRobot v3 data set."""
 
 import os
+import sys
+from collections import Counter
 from pathlib import Path
-from typing import Any
 
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 from touchgoal.sim_envs.config import (
@@ -15,9 +16,11 @@ from touchgoal.sim_envs.config import (
 
 ENVS: dict[TaskName, TaskConfig] = {
     "pick-place": PickPlaceConfig(),
-    "bead-maze": BeadMazeConfig(disturbance=0.004),  # shows how to come back
+    "bead-maze": BeadMazeConfig(disturbance=0.004),  # demonstrates recovery
 }
-"""Options of the environment of each task, unless others are typed."""
+"""Default options of each task's environment."""
+NO_SUCCESS = 3  # exit status
+_MAX_FAILURES = 10
 
 
 @checked_dataclass
@@ -25,31 +28,74 @@ class Config:
     """Options of collect-demos."""
 
     task: TaskName = "pick-place"
-    """Task that is demonstrated."""
+    """Task to demonstrate."""
     out: Path | None = None
-    """Folder of the run; the episodes go to its `episodes/`, after those already there."""
+    """Folder of the run; episodes are appended to its `episodes/`. Seeds that it holds are skipped, so
+    the same line continues an interrupted recording."""
     episodes: Count = 10
     """Number of episodes of each outcome."""
     outcomes: tuple[Outcome, ...] = ("success",)
-    """What the expert shall do: succeed, or (pick-place) fail in one of four ways."""
+    """Outcomes to ask the expert for: success, or (pick-place) one of four failures."""
     feedback: bool = False
-    """pick-place: the expert decides anew at every tick instead of following a planned path; a policy
-    learns better from that."""
+    """pick-place: the expert plans anew at every tick instead of following one path; policies learn
+    better from that."""
     policy: str | None = None
-    """A policy that acts in the expert's place, while what the expert would have done is recorded
-    (DAgger): named as for run-policy."""
+    """Policy that acts while the expert's actions are recorded (DAgger), named as for run-policy."""
     seed: Seed = 0
     """Random seed of the first episode; each further one adds one."""
-    resume: bool = False
-    """Go on with an interrupted recording in `out`: leave out the seeds that it holds already."""
     workers: Count = os.cpu_count() or 1
-    """Processes that simulate."""
+    """Number of simulating processes."""
     env: PickPlaceConfig | BeadMazeConfig = ENVS["pick-place"]
     """Options of the task; its objects or wires are taken in turn."""
 
 
-def main(config: Any) -> None:
-    """Record the episodes and say what came of them."""
-    from touchgoal.launch.commands.collect_demos import run_command
+def main(config: Config) -> None:
+    """Record the episodes and print how many of each outcome there are."""
+    from touchgoal.episodes.recording import (
+        NoSuccessError,
+        collect,
+        episode_specs,
+        expert_alone,
+        missing_specs,
+    )
+    from touchgoal.episodes.store import EpisodeSet
+    from touchgoal.policies.evaluation.success_rate import SuccessRate
+    from touchgoal.policies.training.dagger import dagger_roles
+    from touchgoal.runtime.errors import UserError
+    from touchgoal.runtime.interruption import on_interruption
+    from touchgoal.runtime.run_folder import open_run, write_json
 
-    run_command(config)
+    roles, acts = expert_alone, config.policy not in (None, "expert")
+    if config.feedback or config.policy is not None:
+        if config.outcomes != ("success",):
+            raise UserError(
+                "--outcomes needs the planned expert: leave out --feedback and --policy"
+            )
+        roles = dagger_roles(config.policy, config.env, config.feedback)
+    specs = episode_specs(config.env, config.outcomes, config.episodes, config.seed)
+    out = open_run(config.out, "collect-demos", config, adds=True)
+    root = out / "episodes"
+    missing = missing_specs(root, specs, corrected=acts)
+    if len(missing) < len(specs):
+        print(f"{len(specs) - len(missing)} of {len(specs)} seeds are recorded in {root}: skipped")
+    if not missing:
+        next_seed = specs[-1].seed + 1
+        print(f"nothing left to record: {len(EpisodeSet(root))} episodes; more: --seed {next_seed}")
+        return
+    again = f"the same line with --out {out} continues"
+    try:
+        with on_interruption(lambda: f"finished episodes are in {root}; {again}"):
+            metas = collect(
+                root, config.env, missing, config.workers, roles, None if acts else _MAX_FAILURES
+            )
+    except NoSuccessError as error:
+        print(f"{error}; look at one: touchgoal run-policy --task {config.task}", file=sys.stderr)
+        sys.exit(NO_SUCCESS)
+    outcomes = Counter(str(meta["outcome"]) for meta in metas)
+    write_json(out / "metrics.json", {"outcomes": outcomes, "episodes": metas})
+    print(f"{len(metas)} episodes recorded, {len(EpisodeSet(root))} in {root}")
+    for outcome, count in outcomes.items():
+        print(f"  {outcome:<14}{count}")
+    if acts:
+        rate = SuccessRate(sum(bool(meta["success"]) for meta in metas), len(metas))
+        print(f"the policy succeeded in {rate}")

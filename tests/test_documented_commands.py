@@ -30,9 +30,9 @@ from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.control.tactile import sensor_models
 from touchgoal.episodes.media import write_video
-from touchgoal.episodes.recording import one_core_workers
 from touchgoal.launch.__main__ import COMMANDS, read_options
 from touchgoal.launch.deploy import NOT_DONE
+from touchgoal.runtime.worker_pool import one_core_workers
 
 Shell = Callable[[list[str]], int]
 ALL = list(commands())

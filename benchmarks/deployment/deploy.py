@@ -20,13 +20,14 @@ from touchgoal.benchmarks.deployment.deployed_episode import Deployment, Scene, 
 from touchgoal.benchmarks.deployment.deployed_twin import DeployedTwin
 from touchgoal.benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
-from touchgoal.episodes.recording import EpisodeSpec, one_core_workers
+from touchgoal.episodes.recording import EpisodeSpec
 from touchgoal.policies.by_name import prepare_policy, scripted
 from touchgoal.policies.evaluation.evaluate import run_trial, trial_specs
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Positive, Seed, checked_dataclass
 from touchgoal.runtime.progress import track
+from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskName
 
 

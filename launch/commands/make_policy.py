@@ -65,7 +65,8 @@ def _what(command: str) -> str:
 def _run(step: list[str]) -> None:
     """A command; where it was interrupted it goes on."""
     folder = Path(step[step.index("--out") + 1])
-    begun = folder.exists() and any(folder.iterdir())
+    # collect-demos skips what is recorded; a training has to be asked to resume
+    begun = step[0] != "collect-demos" and folder.exists() and any(folder.iterdir())
     module, options = read_options(step[0], [*step[1:], *["--resume"] * begun])
     module.main(options)
 

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control import features as ft
-from touchgoal.episodes.recording import EpisodeSpec, one_core_workers, run
+from touchgoal.episodes.recording import EpisodeSpec, run
 from touchgoal.policies.by_name import AnyPolicy, PolicyMaker, prepare_policy
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
+from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.config import TASKS, BeadMazeConfig, TaskConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE

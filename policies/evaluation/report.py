@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from touchgoal.episodes.film import write_film
-from touchgoal.episodes.recording import EpisodeSpec, one_core_workers, record_with_film
+from touchgoal.episodes.recording import EpisodeSpec, record_with_film
 from touchgoal.policies.by_name import PolicyMaker
 from touchgoal.policies.evaluation.evaluate import Evaluation, Trial
 from touchgoal.policies.evaluation.table import table, worst_first
 from touchgoal.runtime.run_folder import write_json
+from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.config import TaskConfig
 from touchgoal.sim_envs.tasks import make_env
 

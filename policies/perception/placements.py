@@ -8,8 +8,8 @@ from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 from touchgoal.control import features as ft
-from touchgoal.episodes.recording import one_core_workers
 from touchgoal.runtime.progress import track
+from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 

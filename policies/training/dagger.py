@@ -9,8 +9,11 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.episodes.recording import Actor, EpisodeSpec
 from touchgoal.policies.acting import LearnedPolicy
+from touchgoal.policies.by_name import choose_policy, env_config_for
 from touchgoal.policies.checkpoint import SavedPolicy
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig
 from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.tasks import make_expert
@@ -44,6 +47,36 @@ class DaggerRoles:
             if network.config.estimated:
                 return LearnedPolicy(network, None, _NearlyTrueState(env), env.plan_ticks), expert
         return self.policy(env), expert
+
+
+def dagger_roles(policy: str | None, task: TaskConfig, feedback: bool) -> DaggerRoles:
+    """Return the roles of a recording by an expert that is asked at every tick.
+
+    Args:
+        policy: Name of the policy that acts; None for the expert itself.
+        task: Options of the task.
+        feedback: Whether the feedback expert was asked for.
+
+    Raises:
+        UserError: The policy or the expert cannot act in the task.
+    """
+    if feedback and isinstance(task, BeadMazeConfig):
+        raise UserError("--feedback is for pick-place: the bead maze's expert always has feedback")
+    if isinstance(task, PickPlaceConfig) and task.release:
+        raise UserError("--env.release needs the planned expert: leave out --feedback and --policy")
+    if policy is None or policy == "expert":
+        return DaggerRoles()
+    maker = choose_policy(policy, task)
+    needed = env_config_for(maker, task)
+    if isinstance(maker, SavedPolicy) and maker.network().config.estimated:
+        return DaggerRoles(maker)
+    missing = [f"the {name} camera" for name in needed.cameras if name not in task.cameras]
+    missing += ["the fingertips"] * (needed.tactile and not task.tactile)
+    if missing:
+        raise UserError(
+            f"the policy reads {missing[0]}: record that too (--env.cameras, --env.tactile)"
+        )
+    return DaggerRoles(maker)
 
 
 class _NearlyTrueState:

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float, Float16, Float32, Int, UInt8
 from torch import Tensor
 
 from touchgoal.control import features as ft
-from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.network import ObservationBatch, PolicyConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, difference_images
@@ -24,6 +23,7 @@ from touchgoal.policies.perception.proprioception import tare
 from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
+from touchgoal.runtime.worker_pool import one_core_workers
 
 
 @dataclass(frozen=True, eq=False)

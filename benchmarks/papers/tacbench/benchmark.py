@@ -44,11 +44,11 @@ from touchgoal.episodes.bench_recording import (
     record_slides,
     record_strokes,
 )
-from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import on_interruption
 from touchgoal.runtime.progress import progress_bar
+from touchgoal.runtime.worker_pool import one_core_workers
 
 _LOG = "training.log"
 _RECORDERS: dict[Recording, Callable[..., EpisodeSet]] = {

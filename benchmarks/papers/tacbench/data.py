@@ -19,9 +19,9 @@ from touchgoal.control.features import (
 )
 from touchgoal.encoders.backbones.frame_history import past_rows
 from touchgoal.encoders.preprocess import Preprocessor
-from touchgoal.episodes.recording import one_core_workers
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.progress import track
+from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.cloths import CLOTHS
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.indenter_rig import simulate
