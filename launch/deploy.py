@@ -130,7 +130,7 @@ def _deploy(
     import numpy as np
 
     from touchgoal.control import features as ft
-    from touchgoal.control.cell.connection import cell_watchdogs
+    from touchgoal.control.cell.limits import cell_watchdogs
     from touchgoal.control.deployment.actors import make_actor
     from touchgoal.control.deployment.preflight import preflight
     from touchgoal.control.deployment.session import Session

@@ -5,6 +5,7 @@ The block that is picked up and placed over the wire: test_documented_commands.p
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -21,7 +22,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.cell.cell_file import EXAMPLES, cell_table, find_cell_file, read_cell_file
 from touchgoal.control.cell.config import CellConfig
-from touchgoal.control.cell.connection import cell_limits, cell_watchdogs
+from touchgoal.control.cell.limits import cell_limits, cell_watchdogs
 from touchgoal.control.deployment.control_loop import ControlLoop, Request, RunLog, TickStatus
 from touchgoal.control.deployment.session import RecordEpisode, Session
 from touchgoal.control.interfaces import Actor
@@ -47,6 +48,9 @@ gripper = { kind = "franka_hand" }
 cameras.front = { source = "simulated" }
 task = { name = "pick-place", policy = "expert", objects = ["wooden_block"], seed = 3 }
 """
+
+
+REAL = (EXAMPLES / "fr3_two_minis.toml").read_text()
 
 
 def run(*arguments: object) -> None:
@@ -356,6 +360,10 @@ def test_a_touch_ceiling_that_no_picture_can_show_is_refused() -> None:
         require_readable(find_sensor("gelsight_mini"), 5e-3)
 
 
+def test_a_byte_order_mark_is_read_over(tmp_path: Path) -> None:
+    assert read_cell_file(write_cell_file(tmp_path, "\ufeff" + SIM)).arm == "sim"
+
+
 def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
     """What is written into its JSON by hand counts, or is refused."""
     cell = read_cell_file(write_cell_file(tmp_path, SIM))
@@ -387,10 +395,6 @@ def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
         ),
         (SIM + "speed = 3", "speed is unknown: There are: arm, "),
         (SIM.replace("cameras.front", "cameras.back"), "cameras.back must be 'front' or 'wrist'"),
-        (
-            SIM + "safety = { touch = 0.001 }",
-            "safety.touch is called safety.indentation now: rename",
-        ),
         (SIM.replace("policy =", "polcy ="), "task.polcy is unknown: did you mean policy?"),
         (SIM.replace("seed = 3", 'seed = "3"'), "task.seed must be a valid integer, not '3'"),
         (SIM.replace("seed = 3", "start = [0.0]"), "task.start must be 7 joint positions"),
@@ -406,6 +410,22 @@ def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
         (SIM + "safety = 3", "safety must be a section with keys of its own"),
         (SIM + 'fingertips = { sensor = "digt", left = "", right = "" }', "fingertips.sensor: dig"),
         ("arm =", "is no TOML"),
+        (
+            SIM.replace("seed = 3", r'instruction = "\u001b[2J"'),
+            "task.instruction has control char",
+        ),
+        (
+            SIM.replace("seed = 3", "grasp = [0.5, 0, -0.2, 0]"),
+            "task.grasp [0.5, 0.0, -0.2] is outs",
+        ),
+        (
+            SIM.replace("seed = 3", "goal = [1.9, 0]"),
+            "task.goal [1.9, 0.0] is outside the fingertips",
+        ),
+        (REAL.replace("-0.01", "3.6"), "tool.centre_of_mass.0 must be less than or equal to 0.5"),
+        (re.sub(r"0\.1(539|209)", "0.0", REAL), "tool.finger_corners span [29.0, 140.0, 0.0] mm"),
+        (REAL.replace("tcp = 0.1374", "tcp = 0.4"), "tool.finger_corners leave out the TCP"),
+        (REAL.replace("2BNKH4TQ", "2BNK9P3X"), "fingertips.left and fingertips.right are both"),
     ],
 )
 def test_a_bad_cell_file_is_one_line(wrong: str, message: str, tmp_path: Path) -> None:

@@ -26,7 +26,8 @@ from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.control.cell.config import CellConfig
-from touchgoal.control.cell.connection import cell_watchdogs, connect_cell
+from touchgoal.control.cell.connection import connect_cell
+from touchgoal.control.cell.limits import cell_watchdogs
 from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.control.deployment.actors import make_actor
 from touchgoal.control.deployment.control_loop import PLAN_ENDED, ControlLoop

@@ -9,12 +9,11 @@ from typing import Any, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from touchgoal.control.cell.config import CellConfig, check
+from touchgoal.control.cell.checks import check
+from touchgoal.control.cell.config import CellConfig
 from touchgoal.runtime.errors import UserError
 
 _CELL = TypeAdapter(CellConfig)
-# Keys of older cell files.
-_RENAMED = {"safety.touch": "safety.indentation", "task.scale": "task.normalizer"}
 
 
 EXAMPLES = Path(__file__).parent / "examples"
@@ -49,7 +48,7 @@ def read_cell_file(
             allowed; one line with file, key, what is allowed and what is meant.
     """
     try:
-        text = path.read_text()
+        text = path.read_text(encoding="utf-8-sig")  # with or without a byte-order mark
         table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
     except OSError as error:
         raise UserError(f"cannot read the cell file {path}: {error.strerror}") from error
@@ -61,6 +60,7 @@ def read_cell_file(
     ) as error:
         form = "JSON" if path.suffix == ".json" else "TOML"
         raise UserError(f"{path} is no {form}: {error}") from error
+    _refuse_control_characters(path, table)
     try:
         # By way of JSON, in which lists pass for tuples and nothing else is converted.
         cell = _CELL.validate_json(json.dumps(table, default=str), strict=True)
@@ -87,6 +87,18 @@ def cell_table(cell: CellConfig) -> dict[str, Any]:
     return _CELL.dump_python(cell, mode="json", exclude_defaults=True)
 
 
+def _refuse_control_characters(path: Path, value: Any, name: str = "") -> None:
+    """UserError if a text has escapes or line breaks: it is printed on the operator's terminal."""
+    if isinstance(value, dict):
+        for key, part in value.items():
+            _refuse_control_characters(path, part, f"{name}.{key}".lstrip("."))
+    elif isinstance(value, list):
+        for part in value:
+            _refuse_control_characters(path, part, name)
+    elif isinstance(value, str) and not value.isprintable():
+        raise UserError(f"{path}: {name} has control characters, {value!r}: leave them out")
+
+
 def _explain(error: ValidationError) -> str:
     """The first mistake in one line; unknown keys first, as they are often missing ones misspelt."""
     found = error.errors()
@@ -94,8 +106,6 @@ def _explain(error: ValidationError) -> str:
     first = (unknown or found)[0]
     *where, key = (str(part) for part in first["loc"] if part != "[key]")
     name = ".".join((*where, key))
-    if name in _RENAMED:
-        return f"{name} is called {_RENAMED[name]} now: rename it"
     if unknown:
         keys = list(_section(where).__pydantic_fields__)
         near = get_close_matches(key, keys, 1)

@@ -10,15 +10,14 @@ from typing import Annotated, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from touchgoal.control.motion.tool import ROBOTIQ_2F85
 from touchgoal.control.sensors.load_cell import LoadCellConfig
-from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.runtime import seeds
-from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import STRICT, Corners, Seed
 
 Coordinate = Annotated[float, Field(ge=-3, le=3)]  # m, base frame
 Corner = tuple[Coordinate, Coordinate, Coordinate]
+HandCoordinate = Annotated[float, Field(ge=-0.5, le=0.5)]  # m, hand frame
+HandPoint = tuple[HandCoordinate, HandCoordinate, HandCoordinate]
 Angle = Annotated[float, Field(ge=-6.3, le=6.3)]  # rad
 Rate = Annotated[float, Field(gt=0, le=1000)]  # Hz
 Seconds = Annotated[float, Field(gt=0, le=5)]
@@ -26,10 +25,6 @@ Pixels = Annotated[int, Field(ge=16, le=8192)]
 Exposure = Annotated[float, Field(gt=0, le=100_000)]
 Kelvin = Annotated[int, Field(ge=1000, le=15_000)]
 CameraName = Literal["front", "wrist"]
-
-# N, what a gripper can be set to. A real Franka Hand does no less than 30; a simulated one does.
-_FORCES = {"franka_hand": (0.0, 70.0), "robotiq": ROBOTIQ_2F85.force}
-_JOINTS = {"fr3": 7, "ur5e": 6, "sim": 7}
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -64,9 +59,9 @@ class ToolSection:
     """Distance from the flange to the middle between the two gels' centres, along the hand's z axis, m."""
     mass: Annotated[float, Field(gt=0, le=10)]
     """Mass of all beyond the flange, kg."""
-    centre_of_mass: Corner
-    """Where that mass has its centre, m (hand frame)."""
-    finger_corners: Annotated[tuple[Corner, ...], Field(min_length=4)]
+    centre_of_mass: HandPoint
+    """Centre of that mass, m (hand frame)."""
+    finger_corners: Annotated[tuple[HandPoint, ...], Field(min_length=4)]
     """Corners of a box around the fingertips when the hand is open, m (hand frame)."""
 
 
@@ -218,64 +213,3 @@ class CellConfig:
     def sensor(self) -> str:
         """The fingertips' model."""
         return self.fingertips.sensor if self.fingertips else "gelsight_mini"
-
-
-def check(cell: CellConfig) -> None:
-    """What no field says by itself; UserError with the key and what is meant."""
-    gripper, task, safety = cell.gripper, cell.task, cell.safety
-    if cell.arm != "sim" and not cell.address:
-        raise UserError("address is missing: give the arm's, such as 172.16.0.2")
-    needed = {"franka_hand": "address", "robotiq": "port"}[gripper.kind]
-    if cell.arm != "sim" and not getattr(gripper, needed):
-        raise UserError(f"gripper.{needed} is missing: a {gripper.kind} needs it")
-    if cell.arm != "sim" and cell.tool is None:
-        raise UserError(
-            "tool is missing: measure tcp, mass, centre_of_mass and finger_corners of what the arm "
-            "carries; control/cell/examples/fr3_two_minis.toml and ur5e.toml show those of two GelSight Minis"
-        )
-    least, most = _FORCES[gripper.kind]
-    if not least <= gripper.force <= most:
-        raise UserError(
-            f"gripper.force must lie between {least:g} and {most:g} N, what a {gripper.kind} can do, "
-            f"not {gripper.force:g}"
-        )
-    if gripper.widths[0] <= gripper.widths[1]:
-        raise UserError("gripper.widths must be the open width, then the closed one, in metres")
-    for box in ("flange", "fingertips"):
-        lower, upper = getattr(safety, f"{box}_lower"), getattr(safety, f"{box}_upper")
-        if lower and upper and any(a >= b for a, b in zip(lower, upper, strict=True)):
-            raise UserError(f"safety.{box}_lower is not below safety.{box}_upper: swap them")
-    if task.start is not None and len(task.start) != _JOINTS[cell.arm]:
-        raise UserError(
-            f"task.start must be {_JOINTS[cell.arm]} joint positions of the {cell.arm} in rad, "
-            f"not {len(task.start)}"
-        )
-    if cell.fingertips is not None:
-        try:
-            model = find_sensor(cell.fingertips.sensor)
-        except UserError as error:
-            raise UserError(f"fingertips.sensor: {error}") from error
-        for folder in cell.fingertips.sensor_files or ():
-            try:
-                own = find_sensor(folder)
-            except UserError as error:
-                raise UserError(f"fingertips.sensor_files: {error}") from error
-            if own.image_shape != model.image_shape:
-                raise UserError(f"fingertips.sensor_files: {folder} is of a {own.name}")
-    if task.name == "pick-place" and task.wires or task.name == "bead-maze" and task.objects:
-        other = "wires" if task.wires else "objects"
-        raise UserError(f"task.{other} does nothing in {task.name}: leave it out")
-    _check_policy(cell)
-
-
-def _check_policy(cell: CellConfig) -> None:
-    task = cell.task
-    if task.policy == "expert" and task.name == "bead-maze":
-        raise UserError(
-            "task.policy: the maze's expert lives in the simulator; use follower or shipped"
-        )
-    if task.policy == "follower" and task.name != "bead-maze":
-        raise UserError("task.policy: the follower is for the bead-maze; use expert or a folder")
-    knows = task.twin or (task.grasp and task.goal)
-    if task.policy == "expert" and cell.arm != "sim" and not knows:
-        raise UserError("task.grasp and task.goal are missing: measure where they are, in metres")

@@ -13,34 +13,24 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.control.arms import franka, ur
 from touchgoal.control.arms.streaming import ArmConfig, ArmProcess
-from touchgoal.control.cell.config import (
-    CellConfig,
-    FingertipsSection,
-    SafetySection,
-    ToolSection,
-)
+from touchgoal.control.cell.config import CellConfig, FingertipsSection
+from touchgoal.control.cell.limits import cell_limits
 from touchgoal.control.cell.lock_step import LockStepClock
 from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.control.grippers.franka_hand import FrankaHand
 from touchgoal.control.grippers.non_blocking import NonBlockingGripper
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
 from touchgoal.control.interfaces import Arm, Camera, Gripper, LoadCell
-from touchgoal.control.motion.tool import Tool
-from touchgoal.control.safety.action_filter import Deadline, Watchdogs
-from touchgoal.control.safety.limits import FR3, UR5E, Box, RobotLimits
-from touchgoal.control.safety.task_ceilings import TASK_FORCES
+from touchgoal.control.safety.limits import RobotLimits
 from touchgoal.control.sensors.fingertip_source import fingertip_video, fingertip_view
 from touchgoal.control.sensors.load_cell import SerialLoadCell
 from touchgoal.control.sensors.tactile_camera import TactileCamera
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
-from touchgoal.control.tactile.indentation import deepest_readable
 from touchgoal.control.tactile.sensor_models import find_sensor
-from touchgoal.runtime.errors import UserError
 
 # Hz, and s without a picture, on the wall: what a machine however loaded still manages.
 _LOCK_STEP_RATE, _LOCK_STEP_TIMEOUT = 0.1, 10.0
 _TWIN_RATE = 25.0  # pictures of a twin in a second of its time, at least
-_STOP_FACTOR = 5  # times the age at which the arm holds
 _CLOCK_TIMEOUT = 1.0  # s on the wall for which an arm's clock may stand
 _POLL_INTERVAL = 0.002  # s between looks at it
 _HISTORY_LENGTH = 2000  # of them
@@ -171,59 +161,6 @@ def connect_cell(cell: CellConfig, hz: float) -> CellConnection:
         undo.pop_all()
     truth = partial(ask_twin, cell.task.twin, "truth") if cell.task.twin else None
     return CellConnection(robot, arm, gripper, cameras, load_cell, clock, truth)
-
-
-def cell_limits(cell: CellConfig) -> RobotLimits:
-    """The robot's limits with the task's ceilings and the cell's own in place of some."""
-    robot, own = UR5E if cell.arm == "ur5e" else FR3, cell.safety
-    if cell.tool is not None and cell.arm != "sim":
-        robot = replace(robot, tool=_tool(robot.tool, cell.tool))
-    forces = TASK_FORCES[cell.task.name]
-    given = {"force": forces.force_ceiling, "torque": forces.torque_ceiling}
-    if cell.fingertips is not None:
-        sensor = find_sensor(cell.fingertips.sensor)
-        given["indentation"] = deepest_readable(sensor, forces.indentation_ceiling)
-    given |= {
-        name: value
-        for name in ("tip_speed", "velocity_share", "force", "torque", "indentation")
-        if (value := getattr(own, name)) is not None
-    }
-    boxes = {name: _box(getattr(robot, name), own, name) for name in ("flange", "fingertips")}
-    return replace(robot, **given, **boxes)
-
-
-def cell_watchdogs(cell: CellConfig) -> Watchdogs:
-    """The cell's own deadlines."""
-    own = cell.safety
-    return replace(
-        Watchdogs(),
-        observation=Deadline(own.observation_age, _STOP_FACTOR * own.observation_age),
-        state=Deadline(own.state_age, _STOP_FACTOR * own.state_age),
-    )
-
-
-def _tool(tool: Tool, own: ToolSection) -> Tool:
-    return replace(
-        tool,
-        tcp_offset=own.tcp,
-        mass=own.mass,
-        centre_of_mass=own.centre_of_mass,
-        finger_corners=own.finger_corners,
-    )
-
-
-def _box(box: Box, own: SafetySection, name: str) -> Box:
-    lower, upper = getattr(own, f"{name}_lower"), getattr(own, f"{name}_upper")
-    box = Box(
-        box.lower if lower is None else np.array(lower),
-        box.upper if upper is None else np.array(upper),
-    )
-    if (box.lower >= box.upper).any():  # one given, the other as by default
-        raise UserError(
-            f"safety.{name}_lower {box.lower.tolist()} is not below safety.{name}_upper "
-            f"{box.upper.tolist()}: give both corners"
-        )
-    return box
 
 
 def _arm(cell: CellConfig, robot: RobotLimits, hz: float) -> ArmProcess:

@@ -12,7 +12,8 @@ import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.config import CellConfig
-from touchgoal.control.cell.connection import CellConnection, cell_limits
+from touchgoal.control.cell.connection import CellConnection
+from touchgoal.control.cell.limits import cell_limits
 from touchgoal.control.interfaces import (
     STOPPED_ON_REQUEST,
     ArmReading,
