@@ -1,0 +1,267 @@
+"""Check that the pictures of a fingertip are its sensor's: whole, in RGB order, and the right way round.
+
+The untouched picture is compared with the sensor file's under other orders of the channels, mirrors,
+scales and shifts; each channel may be brighter or darker as a whole. A hypothesis that fits clearly better
+is the fault. A gel's picture changes smoothly, so a step across half of it is the seam of a torn or rolled
+one. Presses decide what the untouched picture leaves open: a Mini's is nearly the same mirrored left to
+right, but the sensor file then explains no press. Printed dots and dust do not count.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from touchgoal.control.tactile.background import local_change
+from touchgoal.control.tactile.depth import DepthEstimator
+from touchgoal.control.tactile.sensor_calibration import SensorCalibration, load, shade
+from touchgoal.control.tactile.sensor_models import SensorModel
+from touchgoal.runtime.errors import UserError
+
+# Thresholds lie between what whole pictures and faulty ones reach, on the real frames of three Minis and two
+# DIGITs (tests/measure_picture_guard.py prints the table).
+_SEAM = 3.5  # times the usual step from row to row
+_EDGE = 10  # share of a picture (1/n) at either end where a seam may be the sensor's case
+_SEAM_PARTS = 32  # along a row, half of which must show the step
+_CLEARLY = 0.85  # of the difference that another order or mirror may leave
+_CLEARLY_MOVED = 0.75  # of the difference that another scale or shift may leave
+_SAME_UNIT = 0.035  # difference below which the file is of this very unit: others are cut differently
+_OPEN = 1.5  # times the difference up to which presses have to decide
+_EXPLAINS = 0.8  # of the unexplained change that another order or mirror may leave
+UNEXPLAINED = 0.65
+"""Share of a press's change that a sensor file may leave unexplained."""
+_MAX_PRESSES, _CELL = 6, 8  # px
+_STRONGEST = 0.1  # share of the picture over which the explanation is judged
+_COARSE = 4  # px of the sensor's picture to a cell of the comparison
+_DARK = 8.0  # counts added before the logarithm: noise in the dark is no difference
+_MOST = 0.5  # logarithm of light: a spot counts no more
+_EXCHANGED = 1.5  # times that both fingertips must be more like the other's sensor file
+_COLOURS = "red", "green", "blue"
+
+Picture = UInt8[np.ndarray, "h w 3"]
+Log = Float32[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True)
+class _View:
+    """One way in which a picture may have been changed on its way: channels in an order, mirrored."""
+
+    order: tuple[int, int, int]
+    rows: bool  # mirrored top to bottom
+    columns: bool  # mirrored left to right
+
+    def undo(self, image: np.ndarray) -> np.ndarray:
+        """Return the picture as it was before."""
+        image = image[..., list(self.order)]
+        image = image[::-1] if self.rows else image
+        return np.ascontiguousarray(image[:, ::-1] if self.columns else image)
+
+    def __str__(self) -> str:
+        """Name the fault and its remedy."""
+        faults = []
+        exchanged = [c for c in range(3) if self.order[c] != c]
+        if len(exchanged) == 2:
+            names = " and ".join(_COLOURS[c] for c in exchanged)
+            faults.append(f"{names} are exchanged")
+        elif exchanged:
+            sent = [_COLOURS[self.order.index(c)] for c in range(3)]
+            faults.append(f"its channels come in the order {', '.join(sent)}")
+        if self.rows and self.columns:
+            faults.append("it is turned by 180 degrees")
+        elif self.rows or self.columns:
+            faults.append(f"it is mirrored {'top to bottom' if self.rows else 'left to right'}")
+        remedy = "give RGB as the camera sees it" if exchanged else "give it as the camera sees it"
+        return f"{' and '.join(faults)}: {remedy}"
+
+
+_VIEWS = [_View(*v) for v in product(permutations(range(3)), (False, True), (False, True))]
+_AS_IS, _OTHERS = _VIEWS[0], _VIEWS[1:]
+# (scale along x, along y, shift along x, along y in cells)
+_MOVES = [(x, y, 0, 0) for x, y in product((0.926, 1, 1.08), repeat=2) if (x, y) != (1, 1)]
+_MOVES += [(1, 1, x, y) for x, y in product((-6, -3, 0, 3, 6), repeat=2) if (x, y) != (0, 0)]
+
+
+def seam(picture: Picture) -> str:
+    """Return where a picture is torn or rolled, in words; "" if it is whole.
+
+    Half of a row, or of a column, steps away from the one before it by more than is usual.
+    """
+    for name, lines in (("row", picture), ("column", np.swapaxes(picture, 0, 1))):
+        count = lines.shape[0]
+        margin = count // _EDGE
+        if margin < 3:  # too small to tell
+            return ""
+        size = (_SEAM_PARTS, count)
+        light = cv2.resize(lines.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        step = np.diff(light, axis=0)
+        jump = np.abs(step[1:-1] - (step[:-2] + step[2:]) / 2).sum(2)
+        usual = np.median(jump, 1)[margin:-margin]
+        if usual.max() > _SEAM * (np.quantile(usual, 0.95) + 0.3):
+            at = int(usual.argmax()) + margin + 2
+            return f"it is torn or rolled at {name} {at}: check the cable and how it is decoded"
+    return ""
+
+
+def check_untouched(picture: Picture, sensor: SensorModel, name: str) -> None:
+    """Refuse an untouched picture that contradicts its sensor file.
+
+    Args:
+        picture: RGB, the gel untouched.
+        sensor: its model, or its own sensor file (`find_sensor`).
+        name: of the picture, for the message.
+
+    Raises:
+        UserError: it is torn or rolled, its channels are exchanged, it is mirrored, stretched or shifted.
+    """
+    if fault := seam(picture) or _fault(_compare(picture, sensor)):
+        raise UserError(f"{name} is no picture of a {sensor.name} as its sensor file shows it: {fault}")
+
+
+def check_presses(
+    untouched: Picture, presses: Sequence[Picture], sensor: SensorModel, name: str
+) -> None:
+    """Refuse pictures of presses that the sensor file explains clearly better when turned or reordered.
+
+    Args:
+        untouched: RGB, the same gel untouched; `check_untouched` has passed it.
+        presses: RGB, dots painted over; the strongest six are looked at.
+        sensor: its model, or its own sensor file.
+        name: of the pictures, for the message.
+
+    Raises:
+        UserError: channels are exchanged, or the pictures are mirrored.
+    """
+    differences = _compare(untouched, sensor)
+    least = differences[_AS_IS]
+    others = [view for view in _OTHERS if differences[view] < _OPEN * least]
+    strength = [float(local_change(press, untouched).max()) for press in presses]
+    chosen = [presses[i] for i in np.argsort(strength)[::-1][:_MAX_PRESSES]]
+    if not others or len(chosen) < 3:
+        return
+    calibration = load(sensor.sensor_file)
+    estimator = DepthEstimator(calibration, _CELL)
+
+    def unexplained(view: _View) -> Float32[np.ndarray, " n"]:
+        background = view.undo(untouched).astype(np.float32)
+        read = [explain(estimator, calibration, view.undo(x), background) for x in chosen]
+        return np.array([explanation.unexplained for explanation in read], np.float32)
+
+    as_is = unexplained(_AS_IS)
+    share = {view: float(np.median(unexplained(view) / as_is)) for view in others}
+    best = min(share, key=lambda view: share[view])
+    if share[best] < _EXPLAINS:
+        raise UserError(f"{name} are no presses of a {sensor.name} as its sensor file shows them: {best}")
+
+
+def fingertips_exchanged(
+    frames: tuple[Picture, Picture], backgrounds: tuple[Picture, Picture]
+) -> bool:
+    """Whether each of two untouched fingertips looks clearly more like the other one's sensor file.
+
+    Both must: light drifts, and a file may be old.
+
+    Args:
+        frames: of the left and of the right finger.
+        backgrounds: of the left one's and of the right one's sensor file.
+    """
+    unlike = [
+        [float(local_change(frame, background).mean()) for background in backgrounds]
+        for frame in frames
+    ]
+    return all(_EXCHANGED * unlike[side][1 - side] < unlike[side][side] for side in (0, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A frame as its sensor file explains it.
+
+    Attributes:
+        depth: of the gel, m.
+        left: change that the depth does not explain, counts.
+        unexplained: the share of that in the strongest tenth of the change.
+    """
+
+    depth: Float32[np.ndarray, "h w"]
+    left: Log
+    unexplained: float
+
+
+def explain(
+    estimator: DepthEstimator,
+    calibration: SensorCalibration,
+    frame: Picture,
+    background: Float32[np.ndarray, "h w 3"],
+) -> Explanation:
+    """Read a frame's depth and compare the frame with the picture that the sensor file draws of it."""
+    depth = estimator.estimate(frame, background)
+    change = frame.astype(np.float32) - background
+    left = change - (shade(calibration, depth) - calibration.background)
+    size = frame.shape[1] // _CELL, frame.shape[0] // _CELL
+    strong, rest = (cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (change, left))
+    where = np.abs(strong).sum(2)
+    where = where >= np.quantile(where, 1 - _STRONGEST)
+    share = float(np.abs(rest[where]).mean() / max(float(np.abs(strong[where]).mean()), 1e-6))
+    return Explanation(depth, left, share)
+
+
+def _compare(picture: Picture, sensor: SensorModel) -> dict[_View | tuple, float]:
+    """Return how much the picture differs from the sensor file's, as it is and under each hypothesis."""
+    reference = _coarse(load(sensor.sensor_file).background, sensor)
+    seen = _coarse(picture, sensor)
+    differences: dict[_View | tuple, float] = {
+        view: _difference(view.undo(seen), reference) for view in _VIEWS
+    }
+    for move in _MOVES:
+        differences[move] = _difference(_moved(seen, *move), reference)
+    return differences
+
+
+def _fault(differences: dict[_View | tuple, float]) -> str:
+    """Name the hypothesis that fits clearly better than none; "" if there is none."""
+    as_is = differences[_AS_IS]
+    best = min(differences, key=lambda hypothesis: differences[hypothesis])
+    if isinstance(best, _View):
+        return str(best) if differences[best] < _CLEARLY * as_is else ""
+    if differences[best] > min(_CLEARLY_MOVED * as_is, _SAME_UNIT):
+        return ""
+    x, y, right, down = best
+    if (x, y) != (1, 1):
+        return (
+            f"it fits when scaled by {x:g} along its rows and {y:g} along its columns: cut and scale it as "
+            "when the sensor file was made"
+        )
+    return (
+        f"it fits when moved by about {_COARSE * right} px to the right and {_COARSE * down} px down: cut it "
+        "as when the sensor file was made, or look whether the gel has slipped"
+    )
+
+
+def _coarse(picture: Picture, sensor: SensorModel) -> Log:
+    """Return the logarithm of light on coarse cells, without printed dots."""
+    rows, columns = sensor.image_shape
+    size = columns // _COARSE, rows // _COARSE
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    if sensor.markers is not None:
+        dot = 2 * round(0.75 * sensor.markers.diameter / sensor.pixel_pitch / _COARSE) + 1
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (dot, dot))
+        small = cv2.morphologyEx(small, cv2.MORPH_CLOSE, disc)
+    return np.log(cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.0) + _DARK)
+
+
+def _difference(one: Log, other: Log) -> float:
+    """Return the mean difference but for a factor on each channel; no spot counts much."""
+    change = one - other
+    change -= np.median(change.reshape(-1, 3), 0)
+    return float(np.minimum(np.abs(change), _MOST).mean())
+
+
+def _moved(image: Log, x: float, y: float, right: float, down: float) -> Log:
+    """Scale an image about its middle, then shift it; the border goes on."""
+    height, width, _ = image.shape
+    affine = np.array(
+        [[x, 0, (1 - x) * width / 2 + right], [0, y, (1 - y) * height / 2 + down]], np.float32
+    )
+    return cv2.warpAffine(image, affine, (width, height), borderMode=cv2.BORDER_REPLICATE)
