@@ -56,6 +56,9 @@ def main(argv: list[str] | None = None) -> None:
     130 and SIGTERM with 143, after a line that says what was kept. Where nobody reads what is
     printed any more (`touchgoal list | head -1`) it ends with 141, as other programs do.
     """
+    if argv is None:  # this process is the command: OpenCV reads the variable when it is imported
+        # s after which a silent V4L2 camera counts as gone; the default, 10, delays its reopening.
+        os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
     with _until_nobody_reads():
         _main(sys.argv[1:] if argv is None else argv)
 

@@ -1,6 +1,9 @@
 """Cameras over a real MJPEG stream and real files: newest frame, rate, stall, freeze, return."""
 
 import itertools
+import os
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -416,3 +419,23 @@ def test_exposure_and_white_balance_are_locked_or_refused(monkeypatch: pytest.Mo
     plugged.keeps = 99.0
     with pytest.raises(UserError, match="keeps exposure 99 instead of 120"):
         VideoCamera(VideoConfig("0", exposure=120.0))
+
+
+def test_opencv_is_quiet_only_while_a_camera_is_open(streamer: Streamer) -> None:
+    """Importing touchgoal changes neither OpenCV's log level nor its environment variables."""
+    program = (
+        "import os, cv2; before = cv2.utils.logging.getLogLevel(), dict(os.environ)\n"
+        "import touchgoal, touchgoal.control.sensors.video\n"
+        "after = {k: v for k, v in os.environ.items() if k != 'MUJOCO_GL'}\n"
+        "before[1].pop('MUJOCO_GL', None)\n"
+        "assert (cv2.utils.logging.getLogLevel(), after) == before"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+    before = cv2.utils.logging.getLogLevel()
+    cameras = [VideoCamera(VideoConfig(streamer.url, rate=50.0)) for _ in range(2)]
+    cameras[0].close()
+    assert cv2.utils.logging.getLogLevel() == cv2.utils.logging.LOG_LEVEL_FATAL
+    cameras[1].close()
+    cameras[1].close()
+    assert cv2.utils.logging.getLogLevel() == before
+    assert "OPENCV_FFMPEG_LOGLEVEL" not in os.environ

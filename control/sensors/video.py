@@ -1,14 +1,16 @@
-"""Cameras, video files and network streams through OpenCV: always the newest frame, never an old one.
+"""Cameras, video files and network streams through OpenCV: always the newest frame.
 
-A thread empties the driver's queue into one slot: a slow reader of a queue sees the past (measured:
-2 s of it after 3 s). Stamps are taken right after the grab; FFmpeg's own are unusable for streams. A
-source that fails is opened again until it comes back, and meanwhile frames keep their old stamps.
+A thread empties the driver's queue into one slot: a slow reader of a queue would lag (measured: by 2 s
+after 3 s). Stamps are taken right after the grab; FFmpeg's own are unusable for streams. A source that
+fails is opened again until it comes back; meanwhile frames keep their old stamps.
 """
 
 import os
+import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,15 +28,12 @@ from touchgoal.control.sensors.picture_integrity import (
 )
 from touchgoal.runtime.errors import UserError
 
-# A lost stream is told in `problem`; what the libraries print about it would tear a live view apart.
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_FATAL)
-
 _OPEN_TIMEOUT = 5.0  # s to open it the first time: the first frame may take longer to come
 _REOPEN_INTERVAL = 0.5  # s between attempts
 _RATE_WINDOW = 2.0  # s that the rate is measured over
 _LATE_PERIODS = 3.0  # periods without a frame that mean a problem
 _MANUAL_EXPOSURE = 1  # V4L2_EXPOSURE_MANUAL
+_FFMPEG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
 _JPEG = b"\xff\xd8"  # what a JPEG begins with
 
 
@@ -45,19 +44,18 @@ class VideoConfig:
     Attributes:
         source: index of a camera (`0`), a device (`/dev/video2`), a file, an image sequence
             (`frame_%04d.png`) or the address of an MJPEG stream (`http://...`).
-        size: (width, height) to ask a camera for; None: its default.
-        rate: Hz; of a camera to ask for, of images to play, and what `problem` compares with.
+        size: (width, height) to request from a camera; None: its default.
+        rate: Hz; requested from a camera, played from images, and expected by `problem`.
         exposure, white_balance: fixed values for a camera, in V4L2's units (`v4l2-ctl --list-ctrls`;
-            usually 0.1 ms, and kelvin); None: as it is set.
-        timeout: s without a frame after which a stream counts as gone and is opened again.
-        frozen_after: s of pixel-for-pixel the same picture, or part of it, after which it counts as
-            old. Sensor noise makes real pictures differ; rendered ones may rightly stand still: then
-            infinity.
-        frozen_pictures: how many in a row must be the same besides: of a lock-step twin, whose time is not
-            the one on the wall.
-        gel: whether it is a fingertip's, whose pictures are smooth but for its dots: broken ones show.
-        dots: diameter of its printed dots as a share of the picture's diagonal; 0: it has none.
-        device: finds the camera's device whenever it is opened, when `source` is a serial number.
+            usually 0.1 ms, and kelvin); None: unchanged.
+        timeout: s without a frame after which a stream counts as lost and is opened again.
+        frozen_after: s after which an identical picture, or part of one, counts as old. Sensor noise
+            makes real pictures differ; for rendered ones, which may stand still, infinity.
+        frozen_pictures: number of identical pictures in a row required besides, for a lock-step twin,
+            whose time is not wall time.
+        gel: whether the pictures are a fingertip's: smooth but for its dots, so broken ones show.
+        dots: diameter of the printed dots as a share of the picture's diagonal; 0: none.
+        device: looks up the camera's device at each opening, when `source` is a serial number.
     """
 
     source: str
@@ -85,8 +83,43 @@ class VideoConfig:
         return not self.is_camera and "://" not in self.source
 
 
+class _Quiet:
+    """OpenCV's messages, switched off while any camera is open: `VideoCamera.problem` has the news."""
+
+    def __init__(self) -> None:
+        self._lock, self._open, self._level = threading.Lock(), 0, 0
+
+    def begin(self) -> None:
+        with self._lock:
+            self._open += 1
+            if self._open == 1:
+                self._level = cv2.utils.logging.getLogLevel()
+                cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_FATAL)
+
+    def end(self) -> None:
+        with self._lock:
+            self._open -= 1
+            if self._open == 0:
+                cv2.utils.logging.setLogLevel(self._level)
+
+
+_quiet = _Quiet()
+
+
+@contextmanager
+def _quiet_ffmpeg() -> Iterator[None]:
+    """Set FFmpeg's log level for the captures opened within; OpenCV reads it with the first one."""
+    before = os.environ.get(_FFMPEG_LEVEL)
+    os.environ.setdefault(_FFMPEG_LEVEL, "-8")
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_FFMPEG_LEVEL]
+
+
 class VideoCamera:
-    """The Camera protocol over any source.
+    """The Camera interface over any source.
 
     Raises:
         UserError: the source cannot be opened now, or a camera refuses the size.
@@ -94,7 +127,12 @@ class VideoCamera:
 
     def __init__(self, config: VideoConfig) -> None:
         self.config = config
-        self._capture = _open(config, _OPEN_TIMEOUT)
+        _quiet.begin()
+        try:
+            self._capture = _open(config, _OPEN_TIMEOUT)
+        except BaseException:
+            _quiet.end()
+            raise
         self._count, self._grab_times = 0, deque[float]()
         self._image: np.ndarray | None = None
         self._gel: GelPicture | None = None
@@ -102,6 +140,7 @@ class VideoCamera:
         self._frozen_parts, self._decoder = FrozenParts(), JpegDecoder()
         self._same, self._frozen = 0, False  # pictures in a row of which some part was as before
         self._lost = self._refused = ""
+        self._closed = False
         self._latest = LatestValue(f"camera {config.source}", self._take)
 
     @property
@@ -131,8 +170,11 @@ class VideoCamera:
 
     def close(self) -> None:
         """See Camera."""
-        self._latest.close()
-        self._capture.release()
+        if not self._closed:
+            self._closed = True
+            self._latest.close()
+            self._capture.release()
+            _quiet.end()
 
     def _take(self) -> Frame | None:
         if self.config.is_file:
@@ -161,7 +203,7 @@ class VideoCamera:
         return Frame(image, self._count, same_since if self._frozen else stamp)
 
     def _checked(self, image: np.ndarray) -> np.ndarray | None:
-        """RGB of what was grabbed, a JPEG or BGR; None if it is not to be believed."""
+        """Return a grabbed JPEG or BGR picture as RGB; None if it is broken or of another size."""
         if image.ndim == 2 and 1 in image.shape:
             decoded = self._decoder.decode(image.tobytes())
         else:
@@ -171,7 +213,7 @@ class VideoCamera:
             self._refused = "sends broken pictures: check its cable"
         elif before is not None and decoded.shape != before.shape:
             was, now = (f"{x.shape[1]}x{x.shape[0]}" for x in (before, decoded))
-            self._refused = f"sends {now} pixels instead of {was}: another camera, or set anew?"
+            self._refused = f"sends {now} pixels instead of {was}: check that it is the same camera"
             return None
         elif self.config.gel and self._is_broken_gel(decoded):
             self._refused = "sends broken pictures: check its cable"
@@ -181,7 +223,7 @@ class VideoCamera:
         return decoded
 
     def _is_broken_gel(self, image: np.ndarray) -> bool:
-        """As against the last good one, whose place it takes if it is whole."""
+        """Compare with the last good picture, and replace that one if this is whole."""
         now, before = gel_picture(image, self.config.dots), self._gel
         if before is not None and is_broken_gel(now, before):
             return True
@@ -208,8 +250,9 @@ class VideoCamera:
             pass  # not back yet
 
 
+@_quiet_ffmpeg()
 def _open(config: VideoConfig, timeout: float) -> Any:
-    """Within `timeout` s if it is a stream."""
+    """Open the source; a stream within `timeout` s."""
     source = int(config.source) if config.source.isdigit() else config.source
     if config.device is not None:
         source = config.device()
@@ -233,7 +276,7 @@ def _open(config: VideoConfig, timeout: float) -> Any:
 
 
 def _configure_camera(capture: Any, config: VideoConfig) -> None:
-    """Format, size and rate of a camera, read back because drivers ignore what they cannot do."""
+    """Set format, size and rate of a camera; read them back, for drivers ignore what they cannot do."""
     capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
     if config.size is not None:
         width, height = config.size
@@ -259,7 +302,7 @@ def _configure_camera(capture: Any, config: VideoConfig) -> None:
 
 
 def _lock(capture: Any, config: VideoConfig, name: str, automatic: int, manual: int) -> None:
-    """Switch an automatism off and set its value, read back; UserError if the camera does not do it."""
+    """Switch an automatic control off and set its value; UserError if the camera does not take it."""
     prop = {"exposure": cv2.CAP_PROP_EXPOSURE, "white_balance": cv2.CAP_PROP_WB_TEMPERATURE}[name]
     wanted = getattr(config, name)
     capture.set(automatic, manual)
@@ -273,7 +316,7 @@ def _lock(capture: Any, config: VideoConfig, name: str, automatic: int, manual: 
 
 
 def _sends_jpeg(capture: Any) -> bool:
-    """Whether a stream gives its JPEGs undecoded, which it then does from now on.
+    """Switch a stream to undecoded JPEGs and return whether it sends them.
 
     OpenCV's own decoder shows a broken one as if it were whole.
     """

@@ -28,7 +28,9 @@ _EDGE = 10  # share of a picture (1/n) at either end where a seam may be the sen
 _SEAM_PARTS = 32  # along a row, half of which must show the step
 _CLEARLY = 0.85  # of the difference that another order or mirror may leave
 _CLEARLY_MOVED = 0.75  # of the difference that another scale or shift may leave
-_SAME_UNIT = 0.035  # difference below which the file is of this very unit: others are cut differently
+_SAME_UNIT = (
+    0.035  # difference below which the file is of this very unit: others are cut differently
+)
 _OPEN = 1.5  # times the difference up to which presses have to decide
 _EXPLAINS = 0.8  # of the unexplained change that another order or mirror may leave
 UNEXPLAINED = 0.65
@@ -117,7 +119,9 @@ def check_untouched(picture: Picture, sensor: SensorModel, name: str) -> None:
         UserError: it is torn or rolled, its channels are exchanged, it is mirrored, stretched or shifted.
     """
     if fault := seam(picture) or _fault(_compare(picture, sensor)):
-        raise UserError(f"{name} is no picture of a {sensor.name} as its sensor file shows it: {fault}")
+        raise UserError(
+            f"{name} is no picture of a {sensor.name} as its sensor file shows it: {fault}"
+        )
 
 
 def check_presses(
@@ -153,7 +157,9 @@ def check_presses(
     share = {view: float(np.median(unexplained(view) / as_is)) for view in others}
     best = min(share, key=lambda view: share[view])
     if share[best] < _EXPLAINS:
-        raise UserError(f"{name} are no presses of a {sensor.name} as its sensor file shows them: {best}")
+        raise UserError(
+            f"{name} are no presses of a {sensor.name} as its sensor file shows them: {best}"
+        )
 
 
 def fingertips_exchanged(

@@ -36,10 +36,6 @@ def _headless_opengl() -> str:
 if sys.platform == "linux" and "DISPLAY" not in os.environ and "MUJOCO_GL" not in os.environ:
     os.environ["MUJOCO_GL"] = _headless_opengl()
 
-# OpenCV reads this when it is imported: s after which a silent V4L2 camera counts as gone; its default, 10,
-# is longer than an arm may go on without news.
-os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
-
 gymnasium.register(
     "touchgoal/PickPlace-v0", "touchgoal.sim_envs.pick_place:PickPlace", max_episode_steps=160
 )
