@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 from PIL import Image
 
 from touchgoal.control.features import TRUTH_PROGRESS
@@ -38,23 +39,20 @@ def write_film(
         pictures: of `record_with_film`, one every `TICKS_PER_PICTURE` ticks.
         episode: the episode, for the caption.
         control_hz: ticks per second.
-        curves: values at each tick; default: the simulator's progress.
+        curves: values at each tick, which may end before the episode; default: the simulator's
+            progress.
         label: axis label of the curves.
     """
     if curves is None:
         curves, label = {"progress": episode.frames[TRUTH_PROGRESS][:, 0]}, "progress"
-    panel, left, right = _draw_panel(pictures.shape[1], curves, control_hz, label)
-    seconds = np.arange(len(pictures)) * TICKS_PER_PICTURE / control_hz
     end = (len(episode) - 1) / control_hz
-    frames = [
-        np.vstack(
-            [
-                np.hstack([picture, _up_to(panel, round(left + t / end * (right - left)))]),
-                _caption(picture.shape[1] + _PANEL, caption_of(episode), f"{t:.1f} s"),
-            ]
-        )
-        for picture, t in zip(pictures, seconds, strict=True)
-    ]
+    panel, box = _draw_panel(pictures.shape[1], curves, control_hz, end, label)
+    frames = []
+    for k, picture in enumerate(pictures):
+        t = k * TICKS_PER_PICTURE / control_hz
+        beside = np.hstack([picture, _up_to(panel, box, t / end)])
+        caption = _caption(beside.shape[1], caption_of(episode), f"{t:.1f} s")
+        frames.append(np.vstack([beside, caption]))
     write_video(path, np.stack(frames), control_hz / TICKS_PER_PICTURE)
 
 
@@ -67,15 +65,14 @@ def caption_of(episode: Episode) -> str:
 
 
 def _draw_panel(
-    height: int, curves: Mapping[str, np.ndarray], control_hz: int, label: str
-) -> tuple[np.ndarray, float, float]:
-    """Return the panel of all curves, and the columns (px) at which its time axis starts and ends."""
+    height: int, curves: Mapping[str, np.ndarray], control_hz: int, end: float, label: str
+) -> tuple[np.ndarray, Bbox]:
+    """Return an image of all curves up to `end` (s), and the box of its axes (px)."""
     figure = Figure(figsize=(_PANEL / _DPI, height / _DPI), dpi=_DPI)
     axes = figure.add_axes((0.16, 0.17, 0.8, 0.66))
     for (name, values), color in zip(curves.items(), COLORS, strict=False):
         axes.plot(np.arange(len(values)) / control_hz, values, color=color, label=name, lw=1.5)
-    length = max(len(values) for values in curves.values())
-    axes.set_xlim(0, (length - 1) / control_hz)
+    axes.set_xlim(0, end)
     axes.set_xlabel("time (s)", fontsize=7, labelpad=1)
     axes.set_ylabel(label, fontsize=7, labelpad=2)
     axes.tick_params(labelsize=7)
@@ -83,15 +80,17 @@ def _draw_panel(
     figure.legend(loc="upper center", ncols=3, fontsize=7, frameon=False, handlelength=1.2)
     png = io.BytesIO()
     FigureCanvasAgg(figure).print_png(png)
-    box = axes.get_window_extent()
-    return np.asarray(Image.open(png).convert("RGB")), box.x0, box.x1
+    return np.asarray(Image.open(png).convert("RGB")), axes.get_window_extent()
 
 
-def _up_to(panel: np.ndarray, column: int) -> np.ndarray:
-    """Return the panel with what lies after the column faded, and a line at it."""
+def _up_to(panel: np.ndarray, box: Bbox, share: float) -> np.ndarray:
+    """Return the panel with the future faded and a line at the present, a share of the time axis."""
     shown = panel.copy()
-    shown[:, column:] = 255 - (255 - shown[:, column:]) // 5
-    shown[:, column - 1 : column + 1] = 90
+    column = round(box.x0 + share * (box.x1 - box.x0))
+    top, bottom = len(panel) - round(box.y1), len(panel) - round(box.y0) - 2
+    future = shown[top:bottom, column:]
+    future[:] = 255 - (255 - future) // 5
+    shown[top:bottom, column : column + 2] = 90
     return shown
 
 

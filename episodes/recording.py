@@ -153,6 +153,10 @@ def record_with_film(
         env: Environment.
         spec: Episode to record.
         policy: Makes the actor for the environment after its reset; None for the expert.
+        meshes: see `SceneRecorder`.
+
+    Returns:
+        The episode, and images for `episodes.film.write_film`.
     """
     observation, info = env.reset(seed=spec.seed, options=spec.options)
     actor = policy(env) if policy else make_expert(env, spec.outcome)
@@ -163,7 +167,7 @@ def record_with_film(
         ticks.append(tick)
         film.capture()
     film.close()
-    return to_episode(env, ticks, spec), np.stack(film.frames)
+    return to_episode(env, ticks, spec), film.pictures
 
 
 def to_episode(

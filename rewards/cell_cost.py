@@ -1,26 +1,30 @@
-"""The online cost that a cell file's `task.rewards` asks for."""
-
-from pathlib import Path
+"""The on-line cost that a cell file's `task.rewards` asks for."""
 
 from touchgoal.control.cell.config import CellConfig
-from touchgoal.encoders import pretrained
-from touchgoal.encoders.towers.towers import load_towers
-from touchgoal.rewards.embedding_distance import check_words
-from touchgoal.rewards.goals import parse_goal
-from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
+from touchgoal.control.features import FRONT, IMAGE_PREFIX, TACTILE
+from touchgoal.rewards.goals import Inputs, parse_goal
+from touchgoal.rewards.normalizer import REAL_SCENE
 from touchgoal.rewards.online import CostMeter, OnlineCost
-from touchgoal.rewards.setup import own_towers
+from touchgoal.rewards.reward_model import load_reward_model
 
 
 def load_cell_cost(cell: CellConfig) -> OnlineCost:
-    """Return the distance to the cell's goals, measured in a thread."""
-    goals = [parse_goal(text) for text in cell.task.rewards]
-    chosen = cell.task.encoder or pretrained.shipped_encoder_for(cell.sensor)
-    encoder = pretrained.load_encoder(chosen, cell.sensor)
-    check_words(goals, encoder)
+    """Return the distance to the cell's goals, measured in a thread; `close` ends it.
+
+    Raises:
+        UserError: a goal, encoder or normalizer that does not fit the cell.
+    """
     simulated = cell.arm == "sim" or bool(cell.task.twin)
-    path = Path(cell.task.normalizer)
-    if not cell.task.normalizer and simulated:
-        path = pretrained.find_encoder(chosen) / NORMALIZER
-    normalizer = DistanceNormalizer.load(path) if path.is_file() or cell.task.normalizer else None
-    return OnlineCost(CostMeter(load_towers(own_towers(encoder)), encoder, normalizer, goals))
+    inputs = Inputs(
+        name="the cell",
+        camera=FRONT if FRONT.removeprefix(IMAGE_PREFIX) in cell.cameras else None,
+        sides=TACTILE if cell.fingertips is not None else (),
+        sensor=cell.sensor,
+        scene=f"simulated {cell.task.name}" if simulated else REAL_SCENE,
+    )
+    goals = [parse_goal(text) for text in cell.task.rewards]
+    task = cell.task
+    model = load_reward_model(
+        inputs, goals, task.encoder or None, normalizer=task.normalizer or None
+    )
+    return OnlineCost(CostMeter(model))

@@ -2,11 +2,11 @@
 
 All distances are cosine distances, 1 - cos, in [0, 2]:
 
-- image: frozen tower's embedding of the camera picture against that of the goal picture, or, with
-  towers that were trained together (a CLIP), against that of a sentence;
-- tactile: touch embedding of each fingertip against the goal's same fingertip, mean over sides;
-- text: touch embedding of each fingertip against the projected goal sentence, mean over sides; of
-  encoders alone that were aligned with texts.
+- image: frozen tower's embedding of the camera image to that of the goal image, or, with towers
+  that were trained together (a CLIP), to that of a sentence;
+- tactile: touch embedding of each fingertip to the goal's same fingertip, mean over the fingertips;
+- text: touch embedding of each fingertip to the projected goal sentence, mean over the fingertips;
+  only for encoders that were aligned with texts.
 
 Raw distances of different modalities are not comparable; `rewards/normalizer.py` makes them so.
 """
@@ -46,18 +46,18 @@ from touchgoal.runtime.errors import UserError
 
 @dataclass(frozen=True)
 class EmbeddedEpisode:
-    """One trajectory, embedded once; measuring it against a goal is then a dot product per frame.
+    """One embedded trajectory; its distance to a goal is then a dot product per frame.
 
     Attributes:
-        source: which trajectory, for people.
+        source: name of the trajectory, for people.
         fps: frames per second.
         contact: first contact.
-        made_with: what made the embeddings; only equal ones can be compared.
-        image: unit picture embeddings; None without a camera.
-        sides: the fingertips that have touch embeddings, as vocabulary keys.
+        made_with: encoders and sensors; only embeddings of equal ones can be compared.
+        image: unit image embeddings; None without a camera.
+        sides: keys of the fingertips that have touch embeddings.
         touch: unit touch embeddings; None without touch.
-        descriptions: unit embeddings of the sentences about the own object; None where there are
-            none or they were not asked for.
+        descriptions: unit embeddings of the sentences about its object; None if there are none or
+            they were not requested.
         object: catalogue id of the object, "" if unknown.
         success: whether the episode reached its goal, None if unknown.
         words: whether its touch embeddings can be compared with sentences.
@@ -81,18 +81,18 @@ class EmbeddedEpisode:
 
     @property
     def modalities(self) -> tuple[Modality, ...]:
-        """The modalities this trajectory can be measured in."""
+        """Modalities that can be measured."""
         image: tuple[Modality, ...] = () if self.image is None else ("image",)
         touch: tuple[Modality, ...] = () if self.touch is None else ("tactile",)
         return (*image, *touch, "text") if touch and self.words else (*image, *touch)
 
     def pictures(self) -> Float32[np.ndarray, "n d"]:
-        """The picture embeddings of a trajectory that has the modality image."""
+        """Return the image embeddings of a trajectory that has the modality image."""
         assert self.image is not None, f"{self.source} has no pictures"
         return self.image
 
     def touches(self) -> Float32[np.ndarray, "sides n k"]:
-        """The touch embeddings of a trajectory that has the modality tactile."""
+        """Return the touch embeddings of a trajectory that has the modality tactile."""
         assert self.touch is not None, f"{self.source} has no touch"
         return self.touch
 
@@ -102,12 +102,12 @@ class EmbeddedGoal:
     """A goal as unit embeddings, one per modality that has a goal.
 
     Attributes:
-        forms: the user's words, by modality.
-        own: modalities whose goal is a frame of the measured trajectory itself.
+        forms: the goals as a user writes them, by modality.
+        same_episode: modalities whose goal is a frame of the measured trajectory itself.
     """
 
     forms: Mapping[str, str]
-    own: frozenset[str]
+    same_episode: frozenset[str]
     image: Float32[np.ndarray, " d"] | None = None
     touch: Float32[np.ndarray, "sides k"] | None = None
     text: Float32[np.ndarray, " k"] | None = None
@@ -123,19 +123,19 @@ class EpisodeEmbedder:
     def __init__(
         self, towers: Towers, encoder: AnyTouchEncoder | None, camera: str = FRONT
     ) -> None:
-        """Keep the encoders and note what they are.
+        """Take the encoders.
 
         Args:
             towers: frozen image and text towers.
-            encoder: touch encoder (put into evaluation mode), which knows sentences if it was aligned with
-                these towers; or None to measure pictures alone.
-            camera: vocabulary key of the camera whose pictures are measured.
+            encoder: touch encoder (put into evaluation mode), which takes sentences if it was aligned
+                with these towers; None to measure images alone.
+            camera: key of the camera whose images are measured; "" for a plain video's.
 
         Raises:
             UserError: the encoder was trained with other towers.
         """
         self._towers = towers
-        self._encoder = encoder
+        self.encoder = encoder
         self._aligned = encoder if encoder is not None and encoder.towers else None
         self._camera = camera
         # A CLIP's name ends in "#" and a hash of its weights; the folder before it may differ.
@@ -153,7 +153,7 @@ class EpisodeEmbedder:
 
     @property
     def made_with(self) -> EmbeddingSource:
-        """What makes the embeddings of episodes with touch."""
+        """Encoders and sensors of the embeddings of episodes with touch."""
         return self._made_with
 
     @property
@@ -169,14 +169,14 @@ class EpisodeEmbedder:
         Args:
             episode: from the simulator, an arm or a set on disk.
             fps: its frames per second.
-            source: which one, for people.
+            source: its name, for people.
             descriptions: whether to embed the sentences about its object too.
 
         Raises:
             UserError: the episode lacks the camera, starts in contact, or has descriptions that are
                 no list of sentences.
         """
-        sides = tuple(k for k in TACTILE if k in episode.frames) if self._encoder else ()
+        sides = tuple(k for k in TACTILE if k in episode.frames) if self.encoder else ()
         success = episode.meta.get("success")
         return EmbeddedEpisode(
             source=source,
@@ -195,7 +195,7 @@ class EpisodeEmbedder:
     def embed_video(
         self, frames: UInt8[np.ndarray, "n h w 3"], fps: float, source: str
     ) -> EmbeddedEpisode:
-        """Embed a plain video or folder of frames: pictures alone, of an unknown camera."""
+        """Embed a plain video or folder of images: images alone, of an unknown camera."""
         return EmbeddedEpisode(
             source=source,
             fps=fps,
@@ -205,7 +205,7 @@ class EpisodeEmbedder:
         )
 
     def embed_goal(self, goal: Goal, own: EmbeddedEpisode) -> EmbeddedGoal:
-        """Embed a goal for one trajectory; its own frames are not embedded again.
+        """Embed a goal for one trajectory; frames of `own` are not embedded again.
 
         Raises:
             UserError: a frame beyond the trajectory, an unreadable picture or episode, or an
@@ -214,28 +214,28 @@ class EpisodeEmbedder:
         image = None if goal.image is None else self._goal_picture(goal.image, own)
         touch = None if goal.tactile is None else self._goal_touch(goal.tactile, own)
         text = None if goal.text is None else self.embed_sentences([goal.text.text])[0]
-        return EmbeddedGoal(goal.as_dict(), goal.own, image, touch, text)
+        return EmbeddedGoal(goal.as_dict(), goal.same_episode, image, touch, text)
 
     def embed_pictures(self, frames: UInt8[np.ndarray, "n h w 3"]) -> Float32[np.ndarray, "n d"]:
-        """Unit embeddings of camera pictures."""
+        """Return unit embeddings of camera images."""
         return _unit(self._towers.embed_images(frames))
 
     def embed_touch(
         self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
     ) -> Float32[np.ndarray, "n k"]:
-        """Embeddings of one fingertip's pictures, given the same fingertip untouched.
+        """Return embeddings of one fingertip's images, given the same fingertip untouched.
 
-        Unit vectors, but for those of a `PooledEncoder`: they are the shorter the less is felt, and so all
-        the farther from a firm touch.
+        They are unit vectors, except those of a `PooledEncoder`, which are shorter for a lighter touch
+        and so farther from a firm one.
         """
-        assert self._encoder is not None  # without it no trajectory has sides
-        embedded = self._encoder.embed_frames(frames, background)
-        if isinstance(self._encoder, TouchBackbone):
+        assert self.encoder is not None  # without it no trajectory has sides
+        embedded = self.encoder.embed_frames(frames, background)
+        if isinstance(self.encoder, TouchBackbone):
             embedded /= np.linalg.norm(embedded, axis=1, keepdims=True)
         return embedded
 
     def embed_sentences(self, sentences: Sequence[str]) -> Float32[np.ndarray, "m k"]:
-        """Unit embeddings of sentences on how touch feels, to be compared with `embed_touch`."""
+        """Return unit embeddings of sentences on how touch feels, comparable with `embed_touch`."""
         assert self._aligned is not None  # without it no modality takes a sentence
         return self._aligned.embed_text_goal(list(sentences), self._towers)
 
@@ -250,7 +250,8 @@ class EpisodeEmbedder:
         if isinstance(spec, PictureFile | PictureArray):
             return self.embed_pictures(spec.read())[0]
         if isinstance(spec, EpisodeEnd):
-            return self.embed_pictures(spec.read([self._camera]).frames[self._camera][-1:])[0]
+            camera = self._camera or FRONT
+            return self.embed_pictures(spec.read([camera]).frames[camera][-1:])[0]
         return own.pictures()[frame_index(spec, len(own), own.source)]
 
     def _goal_touch(
@@ -296,25 +297,25 @@ class EpisodeEmbedder:
 
 
 def check_words(specs: Iterable[GoalSpec], encoder: AnyTouchEncoder | None) -> None:
-    """Raises UserError if a goal is a sentence, and touch is felt by an encoder that knows none."""
+    """Raise UserError if a goal is a sentence and the touch encoder was not aligned with texts."""
     sentences = [spec for spec in specs if isinstance(spec, Sentence)]
     if sentences and encoder is not None and encoder.towers is None:
         raise UserError(
-            f"goal '{sentences[0]}': this touch encoder was not aligned with texts: leave the goal out, or "
-            "take an encoder of train-encoder align"
+            f"goal '{sentences[0]}': this touch encoder was not aligned with texts: leave the goal "
+            "out, or take an encoder of train-encoder align"
         )
 
 
 def missing_camera(source: str, camera: str, cameras: Sequence[str]) -> str:
-    """What to say where a source lacks a camera."""
+    """Return the message for a source that lacks a camera."""
     there = f"choose --camera {' or '.join(cameras)}" if cameras else "it has no camera"
-    return f"{source} has no pictures of {camera}: {there}"
+    return f"{source} has no images of {camera}: {there}"
 
 
 def compute_distances(
     episode: EmbeddedEpisode, goal: EmbeddedGoal
 ) -> dict[str, Float[np.ndarray, " n"]]:
-    """Raw cosine distance per frame, for each modality that has a goal."""
+    """Return the raw cosine distance per frame, for each modality that has a goal."""
     raw = {}
     if goal.image is not None:
         raw["image"] = image_distances(episode.pictures(), goal.image[None])[:, 0]
@@ -328,28 +329,36 @@ def compute_distances(
 def compute_curves(
     episode: EmbeddedEpisode, goal: EmbeddedGoal, normalizer: DistanceNormalizer | None
 ) -> Curves:
-    """Curves of one trajectory to one goal; without a normalizer raw ones alone, and none fused.
+    """Return the curves of one trajectory to one goal; without a normalizer raw, and none fused.
 
     Raises:
         UserError: the normalizer lacks a modality or was fitted for something else.
     """
     raw = compute_distances(episode, goal)
-    normalised = normalizer.normalise(raw, episode.made_with, goal.own) if normalizer else {}
-    own = goal.own.intersection(raw)
-    return Curves(episode.source, goal.forms, episode.fps, episode.contact, raw, normalised, own)
+    same = goal.same_episode
+    normalised = normalizer.normalise(raw, episode.made_with, same) if normalizer else {}
+    return Curves(
+        episode.source,
+        goal.forms,
+        episode.fps,
+        episode.contact,
+        raw,
+        normalised,
+        same.intersection(raw),
+    )
 
 
 def image_distances(
     image: Float32[np.ndarray, "n d"], goals: Float32[np.ndarray, "g d"]
 ) -> Float[np.ndarray, "n g"]:
-    """Cosine distance of each picture to each goal."""
+    """Return the cosine distance of each image to each goal."""
     return 1 - image.astype(np.float64) @ goals.astype(np.float64).T
 
 
 def touch_distances(
     touch: Float32[np.ndarray, "sides n k"], goals: Float32[np.ndarray, "g sides k"]
 ) -> Float[np.ndarray, "n g"]:
-    """Cosine distance of each touch to each goal's same fingertip, mean over the fingertips."""
+    """Return the distance of each touch to each goal's same fingertip, mean over the fingertips."""
     cosine = np.einsum("snk,gsk->ng", touch, goals, dtype=np.float64)
     return 1 - cosine / len(touch)
 
@@ -357,7 +366,7 @@ def touch_distances(
 def text_distances(
     touch: Float32[np.ndarray, "sides n k"], goals: Float32[np.ndarray, "g k"]
 ) -> Float[np.ndarray, "n g"]:
-    """Cosine distance of each touch to each sentence, mean over the fingertips."""
+    """Return the distance of each touch to each sentence, mean over the fingertips."""
     return 1 - np.mean(touch, axis=0, dtype=np.float64) @ goals.astype(np.float64).T
 
 
@@ -366,7 +375,7 @@ def _unit(embeddings: torch.Tensor) -> Float32[np.ndarray, "n d"]:
 
 
 def _weights_hash(encoder: AnyTouchEncoder) -> str:
-    """Short hash of weights and preprocessor, the same wherever the encoder was loaded from.
+    """Return a short hash of weights and preprocessor, equal wherever the encoder was loaded from.
 
     Saving rounds the weights, so a normalizer is fitted with an encoder loaded from disk.
     """

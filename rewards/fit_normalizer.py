@@ -1,4 +1,4 @@
-"""Fits a `DistanceNormalizer` on successful episodes, of any camera and any lab."""
+"""Fitting of a `DistanceNormalizer` on successful episodes, of any camera and any lab."""
 
 from collections.abc import Sequence
 
@@ -32,11 +32,11 @@ def fit_normalizer(
 ) -> DistanceNormalizer:
     """Fit on successful training episodes.
 
-    Each episode is measured against two kinds of goal, because its own end is much nearer than
-    anybody else's: its own last frame; and for image the last frame of every other episode, for
-    tactile that of every other episode with the same object, for text every sentence about its
-    object. The last frame is never measured itself, or an episode's own goal would count as
-    distance 0: the 5 frames before it stand for the end, the first 5 for the start.
+    Two kinds of goal have medians of their own, because an episode's own end is much nearer than
+    another's: its own last frame; and for image the last frame of every other episode, for tactile
+    that of every other episode with the same object, for text every sentence about its object. The
+    5 frames before the last stand for the end (the last one is at distance 0 of itself), the first
+    5 for the start.
 
     Args:
         episodes: at least two that end in the goal state, embedded alike.
@@ -50,9 +50,9 @@ def fit_normalizer(
     _check_training(episodes, modalities)
     start, goal, separated = {}, {}, {}
     for modality in modalities:
-        for own in (False, True) if modality != "text" else (False,):
-            starts, ends = _training_distances(episodes, modality, own)
-            name = median_name(modality, own)
+        for same_episode in (False, True) if modality != "text" else (False,):
+            starts, ends = _training_distances(episodes, modality, same_episode)
+            name = median_name(modality, same_episode)
             separated[name] = _check_separation(name, starts, ends)
             start[name], goal[name] = float(np.median(starts)), float(np.median(ends))
     return DistanceNormalizer(start, goal, separated, episodes[0].made_with, scene, len(episodes))
@@ -61,7 +61,7 @@ def fit_normalizer(
 def _check_separation(
     name: str, starts: Float[np.ndarray, " pairs"], ends: Float[np.ndarray, " pairs"]
 ) -> float:
-    """Share of pairs whose end is nearer than its start; UserError if too few to normalise by."""
+    """Return the share of pairs whose end is nearer than the start; UserError if it is too low."""
     if not len(starts):
         raise UserError(
             f"no two training episodes can be compared in '{name}' (for touch they must share an "
@@ -106,12 +106,12 @@ def _check_training(episodes: Sequence[EmbeddedEpisode], modalities: Sequence[Mo
 
 
 def _training_distances(
-    episodes: Sequence[EmbeddedEpisode], modality: Modality, own: bool
+    episodes: Sequence[EmbeddedEpisode], modality: Modality, same_episode: bool
 ) -> tuple[Float[np.ndarray, " pairs"], Float[np.ndarray, " pairs"]]:
-    """Raw distance of the start and of the end of each training episode to each of its goals."""
+    """Return raw distances of the start and of the end of each episode to each of its goals."""
     starts, ends = [], []
     for e in episodes:
-        goals = [o for o in episodes if (o is e) == own]
+        goals = [o for o in episodes if (o is e) == same_episode]
         if modality == "tactile":
             goals = [o for o in goals if o.object == e.object]
         if not goals and modality != "text":

@@ -1,25 +1,23 @@
-"""Goals: what a trajectory should end near, and which modality each goal speaks for.
+"""Goals of a trajectory, and the modality that each one applies to.
 
 A goal is written in one of five forms:
 
-    last                the last frame of the episode itself (MMWand, Figure 8)
-    frame:K             frame K of the episode itself, counted from 0
-    image:PATH          a picture
+    last                the last frame of the trajectory itself (MMWand, Figure 8)
+    frame:K             frame K of the trajectory itself, counted from 0
+    image:PATH          an image
     episode:ROOT#K      the last frame of episode K of the episode set in ROOT
     text:SENTENCE       how the object feels, in words (MMWand, Figure 9)
 
-There are three modalities, each a distance of its own: "image" (camera against goal picture),
-"tactile" (touch against goal touch), "text" (touch against goal sentence). A frame or an episode
-speaks for image and tactile, a picture for image, a sentence for text. Several goals may be given:
-each modality takes the first goal that speaks for it, and a goal left without a modality is an
-error, so `last` and `text:a hard smooth ball` together give all curves of Figures 8 and 9. A
-sentence is a goal for touch: the camera sees the object from the first frame on, so the distance of
-the picture to how it feels says nothing about how far the task has come. Where there is no touch
-and the towers were trained together (a CLIP), a sentence is a goal for pictures, and says what is
-to be seen; the offline image tower knows no words.
+There are three modalities, each with a distance of its own: "image" (camera image to goal image),
+"tactile" (touch to goal touch) and "text" (touch to goal sentence). A frame or an episode applies
+to image and tactile, an image to image, a sentence to text. Several goals may be given: each
+modality takes the first that applies, and a goal that no modality takes is an error. `last` and
+`text:a hard smooth ball` together give all curves of Figures 8 and 9. Without touch, and with
+towers that were trained together (a CLIP), a sentence is a goal for the camera image and describes
+the scene.
 
-The own last frame flatters: every episode, a failed one too, ends at distance 0 of it. To judge
-episodes, give the end of another, successful one.
+With `last` every trajectory, a failed one too, ends at distance 0. To judge episodes, give the end
+of another, successful one.
 """
 
 import re
@@ -32,7 +30,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
-from touchgoal.control.features import TRUTH_CONTACT
+from touchgoal.control.features import FRONT, TRUTH_CONTACT
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.rewards.metrics import START_FRAMES
@@ -42,53 +40,81 @@ Modality = Literal["image", "tactile", "text"]
 MODALITIES: tuple[Modality, ...] = ("image", "tactile", "text")
 
 FORMS = "last, frame:K, image:PATH, episode:ROOT#K or text:SENTENCE"
+_SMALLEST = 16  # px, the smallest camera image that the environments take
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Everything known about trajectories before they are read.
+
+    Attributes:
+        name: name for messages; of several trajectories the shortest.
+        camera: key of the camera; "" for a plain video, None without images.
+        sides: keys of the fingertips with tactile images.
+        sensor: name of the fingertip sensor; None if unknown.
+        scene: where they were recorded, see `scene_of`.
+        length: number of frames of the shortest; None if unknown.
+    """
+
+    name: str
+    camera: str | None
+    sides: tuple[str, ...] = ()
+    sensor: str | None = None
+    scene: str = "unknown"
+    length: int | None = None
+
+    @property
+    def modalities(self) -> tuple[Modality, ...]:
+        """Modalities that can be measured, given an aligned touch encoder."""
+        image: tuple[Modality, ...] = () if self.camera is None else ("image",)
+        return (*image, "tactile", "text") if self.sides else image
 
 
 @dataclass(frozen=True)
 class LastFrame:
-    """The last frame of the measured episode itself."""
+    """The last frame of the measured trajectory."""
 
     modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
 
     def __str__(self) -> str:
-        """The form a user writes."""
+        """Return the form that a user writes."""
         return "last"
 
 
 @dataclass(frozen=True)
 class FrameNumber:
-    """Frame `index` (from 0) of the measured episode itself."""
+    """Frame `index` (from 0) of the measured trajectory."""
 
     index: int
     modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
 
     def __str__(self) -> str:
-        """The form a user writes."""
+        """Return the form that a user writes."""
         return f"frame:{self.index}"
 
 
 @dataclass(frozen=True)
 class PictureFile:
-    """A picture file of the goal, as the measured camera would see it."""
+    """An image file of the goal, as the measured camera would take it."""
 
     path: Path
     modalities: ClassVar[tuple[Modality, ...]] = ("image",)
 
     def __str__(self) -> str:
-        """The form a user writes."""
+        """Return the form that a user writes."""
         return f"image:{self.path}"
 
     def read(self) -> UInt8[np.ndarray, "1 h w 3"]:
-        """The picture, RGB.
+        """Return the image, RGB.
 
         Raises:
-            UserError: there is no such file, or it is no picture.
+            UserError: there is no such file, it is not an image, or it is too small.
         """
         try:
             with Image.open(self.path) as picture:
-                return np.asarray(picture.convert("RGB"))[None]
+                pixels = np.asarray(picture.convert("RGB"))
         except FileNotFoundError:
-            raise UserError(f"goal picture {self.path} does not exist") from None
+            raise UserError(f"goal image {self.path} does not exist") from None
         except (
             UnidentifiedImageError,
             OSError,
@@ -96,31 +122,32 @@ class PictureFile:
             SyntaxError,
             Image.DecompressionBombError,
         ):
-            raise UserError(f"goal picture {self.path} cannot be read as an image") from None
+            raise UserError(f"goal image {self.path} cannot be read as an image") from None
+        return _not_tiny(pixels, f"goal image {self.path}")
 
 
 @dataclass(frozen=True, eq=False)
 class PictureArray:
-    """A picture of the goal, as the measured camera would see it, from a script."""
+    """An image of the goal, as the measured camera would take it, from a script."""
 
     picture: UInt8[np.ndarray, "h w 3"]
     modalities: ClassVar[tuple[Modality, ...]] = ("image",)
 
     def __str__(self) -> str:
-        """For people; it has no form that a user writes."""
+        """Return a name for messages."""
         return "image: an array"
 
     def read(self) -> UInt8[np.ndarray, "1 h w 3"]:
-        """The picture, RGB."""
-        return self.picture[None]
+        """Return the image, RGB; UserError if it is too small."""
+        return _not_tiny(self.picture, "the goal image")
 
 
 @dataclass(frozen=True, eq=False)
 class TouchArrays:
-    """Fingertip pictures of the goal, from a script.
+    """Tactile images of the goal, from a script.
 
     Attributes:
-        pictures: by vocabulary key of the fingertip, in the goal state.
+        pictures: by key of the fingertip, in the goal state.
         backgrounds: the same fingertips untouched.
     """
 
@@ -129,7 +156,7 @@ class TouchArrays:
     modalities: ClassVar[tuple[Modality, ...]] = ("tactile",)
 
     def __str__(self) -> str:
-        """For people; it has no form that a user writes."""
+        """Return a name for messages."""
         return "touch: arrays"
 
 
@@ -142,14 +169,14 @@ class EpisodeEnd:
     modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
 
     def __str__(self) -> str:
-        """The form a user writes."""
+        """Return the form that a user writes."""
         return f"episode:{self.root}#{self.index}"
 
     def read(self, keys: Sequence[str]) -> Episode:
-        """The first frames (for the background of touch) and, last, the last frame.
+        """Return the first frames (for the background of touch) and, last, the last frame.
 
         Args:
-            keys: the keys to read; the simulator's contact truth comes along where it is recorded.
+            keys: keys to read; the simulator's contact is added where it is recorded.
 
         Raises:
             UserError: no such set, episode or key.
@@ -173,7 +200,7 @@ class Sentence:
     modalities: ClassVar[tuple[Modality, ...]] = ("text",)
 
     def __str__(self) -> str:
-        """The form a user writes."""
+        """Return the form that a user writes."""
         return f"text:{self.text}"
 
 
@@ -184,7 +211,7 @@ GoalSpec = (
 
 @dataclass(frozen=True)
 class Goal:
-    """What to be near, per modality; None where no goal speaks for a modality."""
+    """The goal of each modality; None without one."""
 
     image: LastFrame | FrameNumber | PictureFile | PictureArray | EpisodeEnd | Sentence | None = (
         None
@@ -193,20 +220,20 @@ class Goal:
     text: Sentence | None = None
 
     @property
-    def own(self) -> frozenset[str]:
-        """Modalities whose goal is a frame of the measured episode itself."""
+    def same_episode(self) -> frozenset[str]:
+        """Modalities whose goal is a frame of the measured trajectory itself."""
         return frozenset(
             m for m in MODALITIES if isinstance(getattr(self, m), LastFrame | FrameNumber)
         )
 
     def as_dict(self) -> dict[str, str]:
-        """The goal of each modality that has one, in the form a user writes."""
+        """Return the goal of each modality that has one, in the form that a user writes."""
         specs = {name: getattr(self, name) for name in MODALITIES}
         return {name: str(spec) for name, spec in specs.items() if spec is not None}
 
 
 def parse_goal(text: str) -> GoalSpec:
-    """Read one goal in one of the five forms of this module.
+    """Read a goal in one of the five forms of this module.
 
     Raises:
         UserError: any other text; the message lists the forms.
@@ -230,13 +257,13 @@ def parse_goal(text: str) -> GoalSpec:
 def assign_goals(
     specs: Sequence[GoalSpec], available: Sequence[Modality], picture_words: bool = False
 ) -> Goal:
-    """Give each available modality the first goal that speaks for it.
+    """Give each available modality the first goal that applies to it.
 
     Args:
         specs: goals in the order given.
-        available: modalities of the measured source; a plain video has "image" alone.
-        picture_words: whether the towers can compare pictures with sentences; then a sentence is a
-            goal for pictures where there is no touch.
+        available: modalities of the measured trajectory.
+        picture_words: whether the towers compare images with sentences; then a sentence is a goal
+            for images where there is no touch.
 
     Raises:
         UserError: no goal, or one that no modality takes.
@@ -252,45 +279,38 @@ def assign_goals(
             wanted = ["image"]
         if not wanted:
             raise UserError(
-                f"goal '{spec}' speaks for {' and '.join(spec.modalities)}, but this source has "
+                f"goal '{spec}' applies to {' and '.join(spec.modalities)}, but this source has "
                 f"{' and '.join(available)} only; leave the goal out"
             )
         free = [m for m in wanted if m not in taken]
         if not free:
             raise UserError(
-                f"goal '{spec}' is never used: '{taken[wanted[0]]}' before it already speaks for "
+                f"goal '{spec}' is never used: '{taken[wanted[0]]}' before it already applies to "
                 f"{' and '.join(wanted)}; put it first or leave it out"
             )
         taken |= dict.fromkeys(free, spec)
     return Goal(**taken)  # pyright: ignore[reportArgumentType]  modalities fixes the types
 
 
-def check_goal(goal: Goal, length: int, source: str, camera: str, sides: Sequence[str]) -> None:
-    """Find out before any work whether a goal can be read.
-
-    Args:
-        goal: of one trajectory.
-        length: its number of frames.
-        source: its name, for people.
-        camera: vocabulary key of its camera.
-        sides: vocabulary keys of its fingertips.
+def check_goal(goal: Goal, inputs: Inputs) -> None:
+    """Check before any work that a goal can be read.
 
     Raises:
-        UserError: a frame beyond the trajectory; no such picture, set, episode, camera or fingertip.
+        UserError: a frame beyond the trajectory; no such image, set, episode, camera or fingertip.
     """
     for spec in (goal.image, goal.tactile):
-        if isinstance(spec, LastFrame | FrameNumber):
-            frame_index(spec, length, source)
-    if isinstance(goal.image, PictureFile):
+        if isinstance(spec, LastFrame | FrameNumber) and inputs.length is not None:
+            frame_index(spec, inputs.length, inputs.name)
+    if isinstance(goal.image, PictureFile | PictureArray):
         goal.image.read()
     if isinstance(goal.image, EpisodeEnd):
-        goal.image.read([camera])
+        goal.image.read([inputs.camera or FRONT])
     if isinstance(goal.tactile, EpisodeEnd):
-        goal.tactile.read(sides)
+        goal.tactile.read(inputs.sides)
 
 
 def frame_index(spec: LastFrame | FrameNumber, length: int, source: str) -> int:
-    """The frame that a goal in the episode itself means; UserError if there is none."""
+    """Return the frame of the trajectory that is its goal; UserError if it has no such frame."""
     if isinstance(spec, LastFrame):
         return length - 1
     if spec.index >= length:
@@ -298,9 +318,19 @@ def frame_index(spec: LastFrame | FrameNumber, length: int, source: str) -> int:
     return spec.index
 
 
+def _not_tiny(picture: UInt8[np.ndarray, "h w 3"], name: str) -> UInt8[np.ndarray, "1 h w 3"]:
+    height, width, _ = picture.shape
+    if min(height, width) < _SMALLEST:
+        raise UserError(
+            f"{name} is {width} x {height} pixels: give one as the camera takes it, at least "
+            f"{_SMALLEST} x {_SMALLEST}"
+        )
+    return picture[None]
+
+
 def _no_words(spec: Sentence) -> str:
     return (
         f"goal '{spec}' is a sentence, and there is no touch to compare it with; the offline image "
         "tower knows no words: give --towers with a CLIP (Hugging Face id or folder) to compare it "
-        "with the pictures, or a goal of pictures: last, frame:K, image:PATH or episode:ROOT#K"
+        "with the images, or a goal of images: last, frame:K, image:PATH or episode:ROOT#K"
     )

@@ -1,13 +1,13 @@
-"""What makes distances of different modalities comparable: where successful episodes start and end.
+"""Normalizer that makes the distances of different modalities comparable.
 
-Raw cosine distances of a picture, a touch and a sentence have different ranges (a modality gap keeps
+Raw cosine distances of an image, a touch and a sentence have different ranges (a modality gap keeps
 touch and text far apart even at the goal). A `DistanceNormalizer`, fitted once on successful
 episodes (`rewards/fit_normalizer.py`), maps each to 1 at the usual start and 0 at the usual end.
 Scaling each episode by its own extremes instead would turn the noise of an episode that never
 touches anything into a perfect curve.
 
-It holds for what it was fitted on alone: the same towers, camera, fingertip sensor and touch
-encoder, and the same scene. In commands it is `--normalizer PATH`, a file `normalizer.json`.
+It holds only for the towers, camera, fingertip sensor, touch encoder and scene that it was fitted
+on. In commands it is `--normalizer PATH`, a file `normalizer.json`.
 """
 
 import json
@@ -23,18 +23,18 @@ from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 
 NORMALIZER = "normalizer.json"
-"""The normalizer in an encoder's folder: of the episodes that the encoder was trained on."""
+"""Name of the file in an encoder's folder, fitted on the encoder's training episodes."""
 REMEDY = "fit one with touchgoal fit-normalizer, or give --normalizer none for raw distances"
 REAL_SCENE = "recorded, not simulated"
 
 
 @dataclass(frozen=True)
 class EmbeddingSource:
-    """What embeddings were made with and of; only those of equal sources can be compared.
+    """Encoders, camera and sensor of embeddings; only those of equal ones can be compared.
 
     Attributes:
         towers: "offline", or the hash of a CLIP's weights.
-        camera: vocabulary key of the camera; "" for a plain video, whose camera nobody knows.
+        camera: key of the camera; "" for a plain video, whose camera is unknown.
         encoder: hash of the touch encoder's weights and preprocessor; "" without touch.
         sensor: name of the fingertip sensor; "" without touch.
     """
@@ -46,7 +46,7 @@ class EmbeddingSource:
 
 
 def scene_of(features: Iterable[str]) -> str:
-    """The simulated scene that episodes with these keys come from, or `REAL_SCENE`.
+    """Return the simulated scene that episodes with these keys come from, or `REAL_SCENE`.
 
     Only the simulator records `truth.*`; each of its tasks has a key that the other lacks.
     """
@@ -58,24 +58,26 @@ def scene_of(features: Iterable[str]) -> str:
     return "simulated" if TRUTH_PROGRESS in keys else REAL_SCENE
 
 
-def median_name(modality: str, own: bool) -> str:
-    """Name of a pair of medians: "image", or "own image" for goals from the episode itself."""
-    return f"own {modality}" if own else modality
+def median_name(modality: str, same_episode: bool) -> str:
+    """Return the name of a pair of medians: "image", or "image (same episode)".
+
+    The latter is for goals that are a frame of the measured episode itself.
+    """
+    return f"{modality} (same episode)" if same_episode else modality
 
 
 @dataclass(frozen=True)
 class DistanceNormalizer:
-    """Where successful training episodes start and end, in raw cosine distance.
+    """Raw cosine distances at which successful training episodes start and end.
 
     n(d) = (d - goal) / (start - goal): 1 at the usual start, 0 at the usual end, below 0 nearer than
-    that. There is one pair of medians for each `median_name`: a modality, with goals from elsewhere
-    or from the episode itself.
+    that. There is one pair of medians for each `median_name`.
 
     Attributes:
         start: median raw distance of the start of a training episode to a goal.
         goal: the same for its end.
         separated: share of (episode, goal) pairs whose end is nearer the goal than its start.
-        source: what the embeddings were made with.
+        source: encoders, camera and sensor of the embeddings.
         scene: see `scene_of`.
         episodes: number of training episodes.
     """
@@ -88,22 +90,21 @@ class DistanceNormalizer:
     episodes: int
 
     def mismatch(
-        self, source: EmbeddingSource, modalities: Iterable[str], own: frozenset[str]
+        self, source: EmbeddingSource, modalities: Iterable[str], same_episode: frozenset[str]
     ) -> str | None:
-        """Why such distances cannot be normalised by this; None if they can.
+        """Return why such distances cannot be normalised by this; None if they can.
 
-        A plain video is taken to come from the camera that the normalizer was fitted on: whoever
-        names the normalizer says so.
+        A plain video counts as taken by the camera that the normalizer was fitted on.
 
         Args:
-            source: what the embeddings are made with.
+            source: encoders, camera and sensor of the embeddings.
             modalities: those that have a goal.
-            own: those whose goal is a frame of the measured episode itself.
+            same_episode: those whose goal is a frame of the measured episode itself.
         """
         mine, names = self.source, set(modalities)
         for m in sorted(names):
-            if median_name(m, m in own) not in self.start:
-                return f"it has no '{median_name(m, m in own)}', only {', '.join(self.start)}"
+            if (name := median_name(m, m in same_episode)) not in self.start:
+                return f"it has no '{name}', only {', '.join(self.start)}"
         pairs = []
         if "image" in names:
             pairs.append(("towers", mine.towers, source.towers))
@@ -121,24 +122,24 @@ class DistanceNormalizer:
         self,
         raw: Mapping[str, Float[np.ndarray, " n"]],
         source: EmbeddingSource,
-        own: frozenset[str],
+        same_episode: frozenset[str],
     ) -> dict[str, Float[np.ndarray, " n"]]:
-        """Raw distances by modality -> normalised ones.
+        """Return normalised distances by modality.
 
         Args:
-            raw: distances by modality.
-            source: what the embeddings were made with.
-            own: modalities whose goal is a frame of the measured episode itself.
+            raw: cosine distances by modality.
+            source: encoders, camera and sensor of the embeddings.
+            same_episode: modalities whose goal is a frame of the measured episode itself.
 
         Raises:
             UserError: a modality that was not fitted, or was fitted for something else.
         """
-        reason = self.mismatch(source, raw, own)
+        reason = self.mismatch(source, raw, same_episode)
         if reason:
             raise UserError(f"this normalizer does not apply: {reason}; {REMEDY}")
         normalised = {}
         for m, d in raw.items():
-            name = median_name(m, m in own)
+            name = median_name(m, m in same_episode)
             normalised[m] = (d - self.goal[name]) / (self.start[name] - self.goal[name])
         return normalised
 
@@ -148,7 +149,7 @@ class DistanceNormalizer:
 
     @classmethod
     def load(cls, path: Path) -> "DistanceNormalizer":
-        """Read what `save` wrote.
+        """Read a file that `save` wrote.
 
         Raises:
             UserError: no such file, or not a normalizer.

@@ -1,4 +1,4 @@
-"""The cost of a trajectory while it happens: what `reward-curves` would say of the newest tick."""
+"""The cost of a trajectory while it happens, as `reward-curves` computes it from the recording."""
 
 import time
 from collections.abc import Sequence
@@ -8,73 +8,53 @@ import torch
 
 from touchgoal.control.features import CONTROL_HZ, FRONT, TACTILE, Observation
 from touchgoal.control.sensors.latest_value import LatestValue
-from touchgoal.encoders.pretrained import AnyTouchEncoder
-from touchgoal.encoders.towers.towers import Towers
 from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import Contact
-from touchgoal.rewards.embedding_distance import (
-    EmbeddedEpisode,
-    EmbeddedGoal,
-    EpisodeEmbedder,
-    compute_curves,
-)
-from touchgoal.rewards.goals import GoalSpec, assign_goals
+from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EmbeddedGoal, compute_curves
 from touchgoal.rewards.metrics import START_FRAMES
-from touchgoal.rewards.normalizer import DistanceNormalizer
+from touchgoal.rewards.reward_model import RewardModel
 from touchgoal.runtime.errors import UserError
 
-_FIRST_COST_TIMEOUT = 30.0  # s for the first cost, which warms everything up
+_FIRST_COST_TIMEOUT = 30.0  # s for the first cost, which warms up the networks
 _IDLE_SLEEP = 0.005  # s between looks for a new tick
 
 
 class CostMeter:
-    """The cost of one tick after the other, by the same steps as `reward-curves`.
+    """Measures the cost of one tick after the other, with the numbers of `reward-curves`.
 
-    From the fifth tick on the numbers are the same. Before, the fingertips' background is the median
-    of the ticks there have been, while a recording's is always that of its first five.
+    They are equal from the fifth tick on. Before, the fingertips' background is the median of the
+    ticks so far, while a recording's is always that of its first five.
     """
 
-    def __init__(
-        self,
-        towers: Towers,
-        encoder: AnyTouchEncoder,
-        normalizer: DistanceNormalizer | None,
-        goals: Sequence[GoalSpec],
-    ) -> None:
-        """For one run.
+    def __init__(self, model: RewardModel) -> None:
+        """Prepare for one run.
 
         Args:
-            towers: frozen image and text towers.
-            encoder: touch encoder, aligned with them if a goal is a sentence.
-            normalizer: fitted with these encoders on episodes of this scene; None for the raw
-                cosine distance, of goals that speak for one modality alone.
-            goals: each modality takes the first that speaks for it; what none speaks for is left
-                out. Frames of the episode itself are not known yet and cannot be goals.
+            model: with goals from outside the run; without a normalizer, of one modality.
+
+        Raises:
+            UserError: a goal that is known only at the end, or raw distances of several modalities.
         """
-        self._normalizer, self._goals = normalizer, goals
-        self._embedder = EpisodeEmbedder(towers, encoder)
+        if model.goal.same_episode:
+            raise UserError("task.rewards: last and frame:K are not known before the end")
+        if model.normalizer is None and len(model.goal.as_dict()) > 1:
+            raise UserError(
+                "task.rewards: raw distances of several modalities cannot be averaged: give one "
+                "goal of one modality (image:PATH or text:SENTENCE), or a normalizer"
+            )
+        self._model, self._embedder = model, model.embedder
         self._goal: EmbeddedGoal | None = None
 
     def measure(self, observation: Observation, first: Sequence[Observation]) -> float:
-        """The cost of a tick; `first` are the run's first ticks, in their order, five at most."""
-        episode = self._embed(observation, first)
+        """Return the cost of a tick; `first` are the run's first ticks in order, at most five."""
+        tick = self._embed(observation, first)
         if self._goal is None:
-            goal = assign_goals(self._goals, episode.modalities)
-            if goal.own:
-                raise UserError("task.rewards: last and frame:K are not known before the end")
-            self._goal = self._embedder.embed_goal(goal, episode)
-            if self._normalizer is None and len(goal.as_dict()) > 1:
-                raise UserError(
-                    "task.rewards: raw distances of several modalities cannot be averaged: give "
-                    "one goal of one modality (image:PATH or text:SENTENCE), or a normalizer"
-                )
-        curves = compute_curves(episode, self._goal, self._normalizer)
+            self._goal = self._embedder.embed_goal(self._model.goal, tick)
+        curves = compute_curves(tick, self._goal, self._model.normalizer)
         return float(np.mean([curves.costs[name][0] for name in curves.raw]))
 
     def _embed(self, observation: Observation, first: Sequence[Observation]) -> EmbeddedEpisode:
-        """One tick as an episode."""
-        if FRONT not in observation:
-            raise UserError("task.rewards: the cost looks through the front camera: add it")
+        """Return one tick as an episode."""
         sides = tuple(key for key in TACTILE if key in observation)
         touch = [
             self._embedder.embed_touch(
@@ -82,12 +62,13 @@ class CostMeter:
             )
             for key in sides
         ]
+        front = observation.get(FRONT)
         return EmbeddedEpisode(
             source="this run",
             fps=CONTROL_HZ,
             contact=Contact(None, "not looked for"),
             made_with=self._embedder.made_with,
-            image=self._embedder.embed_pictures(observation[FRONT][None]),
+            image=None if front is None else self._embedder.embed_pictures(front[None]),
             sides=sides,
             touch=np.stack(touch) if touch else None,
             words=self._embedder.knows_words,
@@ -95,21 +76,21 @@ class CostMeter:
 
 
 class OnlineCost:
-    """Measures ticks in a thread: the newest one whenever it is through with the last."""
+    """Measures the newest tick in a thread, whenever the one before is done."""
 
     def __init__(self, meter: CostMeter) -> None:
-        """Starts the thread; `close` ends it."""
+        """Start the thread; `close` ends it."""
         self._meter = meter
-        self._first: tuple[Observation, ...] = ()  # ticks in which nothing is touched
+        self._first: tuple[Observation, ...] = ()  # ticks without contact
         self._newest: tuple[Observation, tuple[Observation, ...]] | None = None
         self._latest = LatestValue("cost", self._measure_newest, _FIRST_COST_TIMEOUT)
 
     def latest_cost(self, observation: Observation) -> float:
-        """Hand every tick over, from the first; the newest cost there is, of this tick or an earlier one.
+        """Hand over a tick; return the newest cost, of this tick or an earlier one.
 
-        The mean over the modalities that have a goal, each 1 at the usual start and 0 at the usual
-        end or nearer; without a normalizer the cosine distance. It waits for the first one alone.
-        DriverError, with the reason, if nothing can be measured.
+        Call it with every tick from the first on. The cost is the mean over the modalities that
+        have a goal: normalised, or the cosine distance without a normalizer. Only the first call
+        waits. DriverError, with the reason, if nothing can be measured.
         """
         if len(self._first) < START_FRAMES:
             self._first = (*self._first, observation)

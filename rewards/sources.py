@@ -1,14 +1,12 @@
-"""What can be measured: episodes of a set, or a plain video or folder of frames.
+"""Sources of trajectories: episodes of a set, or a plain video or folder of images.
 
-Opening a source finds every mistake that can be found without a network, so that it is told before
-the encoders are loaded.
+Opening a source reports every mistake that can be found without a network.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 from jaxtyping import UInt8
@@ -25,8 +23,8 @@ from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.metadata import INFO
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EpisodeEmbedder, missing_camera
-from touchgoal.rewards.goals import Goal, GoalSpec, Modality, assign_goals, check_goal
-from touchgoal.rewards.normalizer import EmbeddingSource, scene_of
+from touchgoal.rewards.goals import Inputs
+from touchgoal.rewards.normalizer import scene_of
 from touchgoal.runtime.errors import UserError
 
 CAMERAS = (FRONT, WRIST)
@@ -34,12 +32,12 @@ CAMERAS = (FRONT, WRIST)
 
 @dataclass(frozen=True)
 class EpisodeSource:
-    """Chosen episodes of a set, measured by one camera and, if it has any, its fingertips.
+    """Chosen episodes of a set, with one camera and, if there are any, the fingertips.
 
     Attributes:
         path: the set's folder.
-        camera: vocabulary key of the camera.
-        indices: of the chosen episodes.
+        camera: key of the camera.
+        indices: the chosen episodes.
         with_touch: whether touch is measured.
     """
 
@@ -54,133 +52,116 @@ class EpisodeSource:
         return EpisodeSet(self.path)
 
     @property
-    def sides(self) -> tuple[str, ...]:
-        """The fingertips that are measured, as vocabulary keys."""
-        return tuple(k for k in TACTILE if self.with_touch and k in self.episodes.features)
-
-    @property
-    def sensor(self) -> str | None:
-        """Of the episodes' fingertips, None if unknown."""
-        metas = [self.episodes.meta(i) for i in self.indices]
-        return next((str(m["sensor"]) for m in metas if m.get("sensor")), None)
-
-    @property
-    def scene(self) -> str:
-        """Where the episodes were recorded, see `scene_of`."""
-        return scene_of(self.episodes.features)
-
-    @property
-    def modalities(self) -> tuple[Modality, ...]:
-        """What the episodes can be measured in."""
-        image: tuple[Modality, ...] = ("image",) if self.camera in self.episodes.features else ()
-        return (*image, "tactile", "text") if self.sides else image
+    def inputs(self) -> Inputs:
+        """Everything known about the episodes before they are embedded."""
+        episodes = self.episodes
+        shortest = min(self.indices, key=lambda i: episodes.lengths[i])
+        return Inputs(
+            name=f"{self.path.name}#{shortest}",
+            camera=self.camera if self.camera in episodes.features else None,
+            sides=tuple(k for k in TACTILE if self.with_touch and k in episodes.features),
+            sensor=next(iter(self._sensors()), None),
+            scene=scene_of(episodes.features),
+            length=episodes.lengths[shortest],
+        )
 
     @property
     def names(self) -> list[str]:
-        """Names for the reports, in the order of `embed`."""
+        """File names of the reports, in the order of `embed`."""
         return [f"episode_{i:03d}" for i in self.indices]
 
+    @property
+    def _keys(self) -> list[str]:
+        wanted = (self.camera, *TACTILE, TRUTH_CONTACT)
+        return [key for key in wanted if key in self.episodes.features]
+
+    def _sensors(self) -> set[str]:
+        metas = [self.episodes.meta(i) for i in self.indices]
+        return {str(meta["sensor"]) for meta in metas if meta.get("sensor")}
+
     def check(self) -> None:
-        """UserError for whatever would stop the work: damage, a missing camera, mixed sensors."""
+        """Raise UserError for a damaged or missing file, a missing camera, or mixed sensors."""
         cameras = [key for key in CAMERAS if key in self.episodes.features]
-        if self.camera not in cameras and (cameras or not self.sides):
+        if self.camera not in cameras and (cameras or not self.inputs.sides):
             raise UserError(missing_camera(str(self.path), self.camera, cameras))
-        for i in self.indices:  # a damaged file is found now, before the work, not after half of it
+        for i in self.indices:
             if self.episodes.lengths[i] < 2:
                 raise UserError(
                     f"episode {i} of {self.path} has one frame: a curve needs at least 2"
                 )
-            self.episodes.read(i, [next(iter(self.episodes.features))], [0])
-        metas = [self.episodes.meta(i) for i in self.indices]
-        sensors = {str(m["sensor"]) for m in metas if m.get("sensor")}
-        if len(sensors) > 1:
+            self.episodes.read(i, self._keys, [0])
+        if len(sensors := self._sensors()) > 1:
             raise UserError(
                 f"{self.path} mixes the sensors {', '.join(sorted(sensors))}: choose --index"
             )
 
-    def check_goals(self, specs: Sequence[GoalSpec], picture_words: bool) -> Goal:
-        """What to be near; UserError if it cannot be read for one of the episodes."""
-        goal = assign_goals(specs, self.modalities, picture_words)
-        shortest = min(self.indices, key=lambda i: self.episodes.lengths[i])
-        name, length = f"{self.path.name}#{shortest}", self.episodes.lengths[shortest]
-        check_goal(goal, length, name, self.camera, self.sides)
-        return goal
-
-    def made_with(self, embedder: EpisodeEmbedder) -> EmbeddingSource:
-        """What the embeddings of these episodes are made with."""
-        return embedder.made_with
-
     def embed(
         self, embedder: EpisodeEmbedder, descriptions: bool = False
     ) -> Iterator[EmbeddedEpisode]:
-        """Each episode in turn."""
-        features = self.episodes.features
-        keys = [k for k in (self.camera, *TACTILE, TRUTH_CONTACT) if k in features]
+        """Embed each episode in turn."""
         for i in self.indices:
-            episode = self.episodes.read(i, keys)
+            episode = self.episodes.read(i, self._keys)
             name = f"{self.path.name}#{i}"
             yield embedder.embed_episode(episode, self.episodes.fps, name, descriptions)
 
 
 @dataclass(frozen=True)
 class VideoSource:
-    """A video file, or a folder of pictures: pictures alone, of a camera that nobody knows."""
+    """A video file, or a folder of images: images alone, of an unknown camera."""
 
     path: Path
     frames: UInt8[np.ndarray, "n h w 3"]
     fps: float
 
-    sensor: ClassVar[None] = None
-    scene: ClassVar[str] = "a plain video"
-    modalities: ClassVar[tuple[Modality, ...]] = ("image",)
-    camera: ClassVar[str] = FRONT
-    sides: ClassVar[tuple[str, ...]] = ()
+    @property
+    def inputs(self) -> Inputs:
+        """Everything known about the video before it is embedded."""
+        return Inputs(self.path.name, camera="", scene="a plain video", length=len(self.frames))
 
     @property
     def names(self) -> list[str]:
-        """Name for the report."""
+        """File name of the report."""
         return [self.path.stem or "video"]
 
     @property
-    def goals_it_takes(self) -> str:
-        """For people: which goals this can be measured against, and why no other."""
+    def summary(self) -> str:
+        """Length, rate, and the goals that images alone can take, for people."""
         return (
-            f"{self.path.name}: {len(self.frames)} frames at {self.fps:g} per second, pictures "
-            "alone. Its goals are pictures: last, frame:K, image:PATH or episode:ROOT#K; a sentence "
-            "(text:...) needs towers that compare pictures with words: --towers CLIP"
+            f"{self.path.name}: {len(self.frames)} frames at {self.fps:g} per second, images "
+            "alone. Its goals are images: last, frame:K, image:PATH or episode:ROOT#K; a sentence "
+            "(text:...) needs towers that compare images with words: --towers CLIP"
         )
-
-    def check_goals(self, specs: Sequence[GoalSpec], picture_words: bool) -> Goal:
-        """What to be near; UserError if it cannot be read, or says words the towers do not know."""
-        goal = assign_goals(specs, self.modalities, picture_words)
-        check_goal(goal, len(self.frames), self.path.name, FRONT, ())
-        return goal
-
-    def made_with(self, embedder: EpisodeEmbedder) -> EmbeddingSource:
-        """What the embeddings of this video are made with: nobody knows its camera."""
-        return replace(embedder.made_with, camera="")
 
     def embed(
         self, embedder: EpisodeEmbedder, descriptions: bool = False
     ) -> Iterator[EmbeddedEpisode]:
-        """The video; it has no descriptions."""
+        """Embed the video; it has no descriptions."""
         yield embedder.embed_video(self.frames, self.fps, self.path.name)
 
 
+Source = EpisodeSource | VideoSource
+
+
 def open_source(
-    path: Path, camera: str, index: Sequence[int] = (), with_touch: bool = True
-) -> EpisodeSource | VideoSource:
-    """Open what is to be measured, and check it.
+    path: Path,
+    camera: str,
+    index: Sequence[int] = (),
+    with_touch: bool = True,
+    fps: float | None = None,
+) -> Source:
+    """Open and check a source.
 
     Args:
         path: a set of episodes, or the folder of a run that holds one as `episodes`; a video file;
-            a folder of pictures.
-        camera: the episodes' camera, by its key or its last word ("front"); no matter for a video.
+            a folder of images.
+        camera: the episodes' camera, by its key or its last word ("front"); unused for a video.
         index: which episodes of the set; none for all.
         with_touch: whether the episodes' touch is measured.
+        fps: frames per second of a folder of images; None for 20.
 
     Raises:
-        UserError: nothing there, damaged, no such camera or episode, fewer than 2 frames.
+        UserError: nothing there, damaged, no such camera or episode, fewer than 2 frames, or an
+            option that the source does not take.
     """
     if not path.exists():
         raise UserError(f"{path} does not exist: give a set of episodes, a video or a folder")
@@ -188,15 +169,17 @@ def open_source(
     if key not in CAMERAS:
         names = " or ".join(name.removeprefix(IMAGE_PREFIX) for name in CAMERAS)
         raise UserError(f"there is no camera '{camera}': choose {names}")
-    for root in (path, path / "episodes"):
-        if (root / INFO).exists():
-            return _open_episodes(root, key, index, with_touch)
+    root = next((r for r in (path, path / "episodes") if (r / INFO).exists()), None)
+    if fps is not None and (root is not None or not path.is_dir()):
+        raise UserError(f"{path} states its own frame rate: leave --fps out")
+    if root is not None:
+        return _open_episodes(root, key, index, with_touch)
     if index:
-        raise UserError(f"{path} is no set of episodes: leave --index out")
-    frames, fps = read_frames(path)
+        raise UserError(f"{path} is not a set of episodes: leave --index out")
+    frames, rate = read_frames(path)
     if len(frames) < 2:
         raise UserError(f"{path} has one frame: a curve needs at least 2")
-    return VideoSource(path, frames, fps or CONTROL_HZ)
+    return VideoSource(path, frames, fps or rate or CONTROL_HZ)
 
 
 def _open_episodes(
@@ -206,6 +189,8 @@ def _open_episodes(
     for i in index:
         if not 0 <= i < len(episodes):
             raise UserError(f"{root} has no episode {i}; it has 0 to {len(episodes) - 1}")
+        if index.count(i) > 1:
+            raise UserError(f"--index names episode {i} {index.count(i)} times: name it once")
     if not len(episodes):
         raise UserError(f"{root} has no episodes")
     source = EpisodeSource(root, camera, tuple(index or range(len(episodes))), with_touch)
@@ -216,21 +201,22 @@ def _open_episodes(
 def open_successes(
     paths: Sequence[Path], camera: str, with_touch: bool, assume_success: bool
 ) -> list[EpisodeSource] | list[VideoSource]:
-    """Open the successful episodes of one set, or plain videos that their owner calls successes.
+    """Open the successful episodes of one set, or plain videos of successes.
 
     Args:
-        paths: one set of episodes, or several videos or folders of pictures.
+        paths: one set of episodes, or several videos or folders of images.
         camera: see `open_source`.
         with_touch: see `open_source`.
-        assume_success: whether episodes whose outcome is unknown count as successes.
+        assume_success: whether episodes without a recorded outcome count as successes.
 
     Raises:
-        UserError: as `open_source`; several sets, or sets and videos; fewer than two successes.
+        UserError: as `open_source`; no source, several sets, or sets and videos; fewer than two
+            successes.
     """
     sources = [open_source(path, camera, with_touch=with_touch) for path in paths]
     videos = [source for source in sources if isinstance(source, VideoSource)]
     sets = [source for source in sources if isinstance(source, EpisodeSource)]
-    if len(sets) > 1 or (sets and videos):
+    if not sources or len(sets) > 1 or (sets and videos):
         raise UserError("give one set of episodes, or several videos")
     if videos:
         if len(videos) < 2:
@@ -241,8 +227,8 @@ def open_successes(
     unknown = [i for i, reached in success.items() if reached is None]
     if unknown and not assume_success:
         raise UserError(
-            f"nobody recorded whether {len(unknown)} of {len(success)} episodes of "
-            f"{sets[0].path} succeeded: give --assume-success if they did"
+            f"{len(unknown)} of {len(success)} episodes of {sets[0].path} have no recorded "
+            "outcome: give --assume-success if they succeeded"
         )
     chosen = tuple(i for i, reached in success.items() if reached is None or reached)
     if len(chosen) < 2:

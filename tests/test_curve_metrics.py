@@ -15,7 +15,6 @@ from touchgoal.rewards.metrics import (
     largest_rebound,
     measure_curve,
     noise,
-    pearson,
     spearman,
 )
 
@@ -61,8 +60,6 @@ def test_correlations_by_hand() -> None:
     assert spearman(x, y) == pytest.approx(0.9**0.5)
     # 5 concordant pairs, 1 tie in x of 6 pairs: 5 / sqrt(5 * 6).
     assert kendall_tau_b(x, y) == pytest.approx(5 / 30**0.5)
-    # Deviations (-1, 0, 0, 1) and (-1.5, .5, -.5, 1.5): 3 / sqrt(2 * 5).
-    assert pearson(x, y) == pytest.approx(3 / 10**0.5)
 
 
 @given(CURVES)
@@ -83,7 +80,6 @@ def test_order_survives_monotone_transforms_and_turns_with_time(d: np.ndarray) -
     assert bent.kendall_tau_b == pytest.approx(straight.kendall_tau_b)
     assert backwards.spearman == pytest.approx(-straight.spearman)
     assert backwards.kendall_tau_b == pytest.approx(-straight.kendall_tau_b)
-    assert backwards.pearson == pytest.approx(-(straight.pearson or 0.0))
     assert backwards.peaks == straight.peaks
 
 
@@ -112,7 +108,7 @@ def test_largest_rebound_is_its_definition(d: np.ndarray) -> None:
 def test_strictly_falling_curve_is_perfect(falls: list[float]) -> None:
     m = measure_curve(-np.cumsum(falls), contact=None)
     assert m.spearman == pytest.approx(1) and m.kendall_tau_b == pytest.approx(1)
-    assert (m.peaks, m.largest_rebound, m.rebound_mass, m.violation_rate) == (0, 0.0, 0.0, 0.0)
+    assert (m.peaks, m.largest_rebound) == (0, 0.0)
     if m.t_drop_50 is not None:
         assert m.t_drop_10 is not None and m.t_drop_25 is not None
         assert m.t_drop_10 <= m.t_drop_25 <= m.t_drop_50
@@ -123,26 +119,22 @@ def test_straight_line_by_hand() -> None:
     # The median of 1, .99, .98, .97, .96 is .98; half of it is reached at 1 - t / 100 <= .49.
     assert m.start == pytest.approx(0.98) and m.end == 0
     assert (m.t_drop_10, m.t_drop_25, m.t_drop_50, m.contact_lag) == (12, 27, 51, 11)
-    assert m.area == pytest.approx(0.5) and m.pearson == pytest.approx(1)
-    assert m.variation_ratio == pytest.approx(1 / 0.98)
-    assert m.sigma == pytest.approx(0, abs=1e-12) and m.noise_frames == 40
+    assert m.area == pytest.approx(0.5) and m.sigma == pytest.approx(0, abs=1e-12)
 
 
 def test_noise_is_measured_before_contact_and_blind_to_a_slope() -> None:
     rng = np.random.default_rng(1)
     d = np.linspace(1, 0, 4000) + rng.normal(0, 0.01, 4000)
     d[2000:] += rng.normal(0, 0.5, 2000)
-    sigma, frames = noise(d, contact=2000)
-    assert frames == 2000 and sigma == pytest.approx(0.01, rel=0.05)
-    assert noise(d, contact=3)[1] == 4000
+    assert noise(d, contact=2000) == pytest.approx(0.01, rel=0.05)
+    assert noise(d, contact=3) > 0.1  # too few frames: the whole curve
 
 
 def test_flat_window_makes_no_peak_of_rounding() -> None:
     d = STEP + 1e-6 * np.cos(np.arange(100))
     d[:50] = 1
     m = measure_curve(d, contact=50)
-    assert (m.sigma, m.eps, m.peaks, m.violation_rate) == (0, EPS_FLOOR, 0, 0)
-    assert m.kendall_tolerant == measure_curve(STEP, contact=50).kendall_tau_b
+    assert (m.sigma, m.eps, m.peaks) == (0, EPS_FLOOR, 0)
 
 
 def test_one_eps_for_several_curves() -> None:
@@ -154,10 +146,8 @@ def test_one_eps_for_several_curves() -> None:
 @pytest.mark.parametrize("wiggle", [0.0, 1e-7])
 def test_constant_curve_is_undefined_not_perfect(wiggle: float) -> None:
     m = measure_curve(0.7 + wiggle * np.sin(np.arange(60)), contact=None)
-    undefined = (m.spearman, m.kendall_tau_b, m.kendall_tolerant, m.pearson)
-    assert undefined == (None, None, None, None)
-    assert (m.t_drop_10, m.t_drop_50, m.relative_rebound, m.variation_ratio) == (None,) * 4
-    assert m.flat_fraction == 1 and m.area == pytest.approx(0.7)
+    assert (m.spearman, m.kendall_tau_b, m.t_drop_10, m.t_drop_50) == (None,) * 4
+    assert m.area == pytest.approx(0.7)
 
 
 def test_never_touching_shows_no_drop() -> None:

@@ -16,8 +16,14 @@ from test_episode_embedder import PaintTowers, recorded
 
 import touchgoal
 from touchgoal.control.cell.cell_file import EXAMPLES, read_cell_file
-from touchgoal.control.features import FRONT, TACTILE_LEFT, TACTILE_RIGHT, TRUTH_CONTACT
-from touchgoal.control.interfaces import DriverError
+from touchgoal.control.features import (
+    FRONT,
+    TACTILE,
+    TACTILE_LEFT,
+    TACTILE_RIGHT,
+    TRUTH_CONTACT,
+    TRUTH_START,
+)
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.episodes.media import write_video
@@ -27,11 +33,11 @@ from touchgoal.launch.__main__ import main
 from touchgoal.rewards.api import reward_curve
 from touchgoal.rewards.cell_cost import load_cell_cost
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
-from touchgoal.rewards.goals import PictureFile, Sentence, assign_goals
+from touchgoal.rewards.goals import GoalSpec, Inputs, LastFrame, PictureFile, Sentence, assign_goals
 from touchgoal.rewards.normalizer import DistanceNormalizer
 from touchgoal.rewards.online import CostMeter, OnlineCost
-from touchgoal.rewards.setup import prepare
-from touchgoal.rewards.sources import open_source
+from touchgoal.rewards.reward_model import RewardModel, load_reward_model
+from touchgoal.rewards.sources import VideoSource, open_source
 from touchgoal.runtime.errors import UserError
 
 EPISODE = recorded()
@@ -66,7 +72,7 @@ def test_curve_of_arrays(encoder: TouchEncoder) -> None:
     for name in ("image", "tactile"):
         assert curves.costs[name][0] > 1e-4 and curves.costs[name][-1] == pytest.approx(0, abs=1e-6)
     third = reward_curve(IMAGES, TOUCH, 3, **both)
-    assert third.costs["image"].argmin() == 3 and third.own_goal == {"image", "tactile"}
+    assert third.costs["image"].argmin() == 3 and third.same_episode == {"image", "tactile"}
 
 
 def test_goals_as_arrays_are_those_of_the_same_frame(encoder: TouchEncoder) -> None:
@@ -76,7 +82,7 @@ def test_goals_as_arrays_are_those_of_the_same_frame(encoder: TouchEncoder) -> N
     given = reward_curve(IMAGES, TOUCH, arrays, **both)
     for name in ("image", "tactile"):
         assert given.costs[name] == pytest.approx(frame.costs[name], abs=1e-6)
-    assert not given.own_goal
+    assert not given.same_episode
     picture = reward_curve(IMAGES, goal=IMAGES[9], towers=PaintTowers())
     assert picture.costs["image"] == pytest.approx(frame.costs["image"], abs=1e-6)
     touch = reward_curve(None, {"left": TOUCH["left"]}, "last", **both)
@@ -99,7 +105,7 @@ def test_a_sentence_is_a_goal_for_pictures_with_towers_that_know_words() -> None
         (lambda: reward_curve(IMAGES[:1]), "at least 2 frames"),
         (lambda: reward_curve(IMAGES, {"thumb": IMAGES}), "tactile has no 'thumb'"),
         (lambda: reward_curve(IMAGES, {"left": IMAGES[:3]}), "images 12, left 3"),
-        (lambda: reward_curve(IMAGES, goal=-1), "goal -1 is no frame"),
+        (lambda: reward_curve(IMAGES, goal=-1), "goal -1 is not a frame"),
         (lambda: reward_curve(IMAGES, goal="frame:99"), "frames are 0 to 11"),
         (lambda: reward_curve(IMAGES, goal=IMAGES), "the goal must be RGB"),
         (lambda: reward_curve(IMAGES, goal={"left": IMAGES[0]}), "must be the trajectory's"),
@@ -148,6 +154,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_video(folder / f"{i}.mp4", _stripes(i), 20)
     write_video(folder / "one.mp4", IMAGES[:1], 20)
     (folder / "goal.png").write_text("no picture")
+    Image.new("RGB", (1, 1)).save(folder / "tiny.png")
     return folder
 
 
@@ -157,10 +164,14 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["0.mp4", "--goal", "text:soft"], "knows no words: give --towers"),
         (["0.mp4", "--goal", "frame:12"], "whose frames are 0 to 11"),
         (["0.mp4", "--goal", "image:goal.png"], "goal.png cannot be read"),
+        (["0.mp4", "--goal", "image:tiny.png"], "is 1 x 1 pixels: give one as the camera takes"),
+        (["0.mp4", "--fps", "10"], "states its own frame rate: leave --fps out"),
+        (["0.mp4", "--device", "warp"], "--device warp cannot be used here"),
+        (["episodes", "--index", "0", "0"], "names episode 0 2 times"),
         (["0.mp4", "--goal", "episode:episodes#3"], "has episodes 0 to 2"),
         (["0.mp4", "--goal", "last", "--goal", "frame:1"], "is never used"),
-        (["0.mp4", "--index", "0"], "is no set of episodes: leave --index out"),
-        (["0.mp4", "--encoder", "gelsight_mini"], "has no touch: leave --encoder out"),
+        (["0.mp4", "--index", "0"], "is not a set of episodes: leave --index out"),
+        (["0.mp4", "--encoder", "gelsight_mini"], "has no touch: leave the encoder out"),
         (["0.mp4", "--gamma", "1.5"], "gamma"),
         (["0.mp4", "--normalizer", "none.json"], "there is no normalizer at none.json"),
         (["one.mp4"], "has one frame: a curve needs at least 2"),
@@ -179,10 +190,27 @@ def test_told_before_any_encoder_is_loaded(
 
     monkeypatch.chdir(run_folder)
     monkeypatch.setattr("touchgoal.encoders.pretrained.load_encoder", loaded)
-    monkeypatch.setattr("touchgoal.rewards.setup.load_towers", loaded)
+    monkeypatch.setattr("touchgoal.rewards.reward_model.load_towers", loaded)
     with pytest.raises(SystemExit, match=message):
         main(["reward-curves", *arguments, "--out", "out"])
     assert not (run_folder / "out").exists()
+
+
+def test_a_missing_video_is_found_before_the_first_episode_is_drawn(tmp_path: Path) -> None:
+    """Of the second episode, in a set whose first feature is not a video."""
+    writer = EpisodeWriter(tmp_path)
+    for _ in range(2):
+        writer.append(replace(EPISODE, frames=dict(reversed(EPISODE.frames.items()))))
+    sorted(tmp_path.rglob("*.mp4"))[-1].unlink()
+    with pytest.raises(UserError, match="observation.images.front.*file-001.mp4"):
+        open_source(tmp_path, "front")
+
+
+def test_frame_rate_of_a_folder_of_images(tmp_path: Path) -> None:
+    for i, image in enumerate(IMAGES):
+        Image.fromarray(image).save(tmp_path / f"{i}.png")
+    fast = open_source(tmp_path, "front", fps=50)
+    assert isinstance(fast, VideoSource) and fast.fps == 50 and len(fast.frames) == 12
 
 
 def test_a_run_folder_stands_for_its_episodes(run_folder: Path) -> None:
@@ -195,8 +223,8 @@ def test_published_weights_bring_no_normalizer(run_folder: Path, tmp_path: Path)
     weights = tmp_path / "mae_vittiny.safetensors"
     save_file(published(), weights)
     source = open_source(run_folder / "episodes", "front")
-    setup = prepare(source, ("last",), str(weights), None, None)
-    assert "for published weights bring no normalizer" in setup.note
+    model = load_reward_model(source.inputs, [LastFrame()], str(weights))
+    assert "published weights and loaded encoders come without a normalizer" in model.note
 
 
 def test_foreign_data_are_drawn_raw_until_a_normalizer_is_fitted(
@@ -220,9 +248,9 @@ def test_foreign_data_are_drawn_raw_until_a_normalizer_is_fitted(
     assert fitted.episodes == 2 and fitted.scene == "recorded, not simulated"
     assert fitted.source.sensor == "gelsight_mini" and set(fitted.start) == {
         "tactile",
-        "own tactile",
+        "tactile (same episode)",
     }
-    with pytest.raises(SystemExit, match="does not apply here: it has no 'own image'"):
+    with pytest.raises(SystemExit, match="does not apply here: it has no 'image .same episode.'"):
         main(["reward-curves", "episodes", "--normalizer", "touch/normalizer.json", "--out", "x"])
 
     main(["fit-normalizer", "0.mp4", "1.mp4", "--out", "videos"])
@@ -232,8 +260,32 @@ def test_foreign_data_are_drawn_raw_until_a_normalizer_is_fitted(
     assert scaled["metrics"]["image"]["start"] == pytest.approx(1, abs=0.2)
 
 
+def test_python_and_command_agree_on_simulated_episodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command normalises by the encoder's normalizer; so does Python when it is named."""
+    pytest.importorskip("transformers")
+    monkeypatch.chdir(tmp_path)
+    truth = {TRUTH_START: np.zeros((12, 7), np.float32)}
+    meta = {"sensor": "gelsight_mini", "success": True, "object": "cup"}
+    episode = replace(EPISODE, frames={**EPISODE.frames, **truth}, meta=meta)
+    EpisodeWriter(tmp_path / "set").append(episode)
+    main(["reward-curves", "set", "--out", "command"])
+    report = json.loads(Path("command/episode_000.json").read_text())
+    curves = reward_curve(IMAGES, TOUCH, normalizer="encoder")
+    assert curves.unit == report["unit"] == "distance to goal (normalised)"
+    for name, cost in curves.costs.items():
+        assert cost == pytest.approx(report["cost"]["values"][name], abs=1e-5)
+    raw = reward_curve(IMAGES, TOUCH)
+    assert "raw cosine distances, for" in repr(raw) and "the scene here is unknown" in raw.note
+    raw.plot().savefig("curves.png")
+    assert Path("curves.png").stat().st_size > 10_000 and "\n" not in repr(curves)
+
+
 def test_fit_normalizer_wants_successes(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(run_folder)
+    with pytest.raises(SystemExit, match="give one set of episodes, or several videos"):
+        main(["fit-normalizer", "--out", "y"])
     with pytest.raises(SystemExit, match="at least two successful videos"):
         main(["fit-normalizer", "0.mp4", "--out", "y"])
     with pytest.raises(SystemExit, match="one set of episodes, or several videos"):
@@ -241,7 +293,7 @@ def test_fit_normalizer_wants_successes(run_folder: Path, monkeypatch: pytest.Mo
     meta = {"sensor": "gelsight_mini"}
     for _ in range(2):
         EpisodeWriter(Path("unknown")).append(replace(EPISODE, meta=meta))
-    with pytest.raises(SystemExit, match="nobody recorded whether 2 of 2 episodes"):
+    with pytest.raises(SystemExit, match="2 of 2 episodes of unknown have no recorded outcome"):
         main(["fit-normalizer", "unknown", "--out", "y"])
 
 
@@ -258,14 +310,21 @@ def test_cost_during_a_run_is_raw_where_no_normalizer_applies(
     Image.fromarray(IMAGES[9]).save(tmp_path / "end.png")
     picture, words = PictureFile(tmp_path / "end.png"), Sentence("soft")
     tick = {FRONT: IMAGES[0], TACTILE_LEFT: TOUCH["left"][0], TACTILE_RIGHT: TOUCH["right"][0]}
-    cost = OnlineCost(CostMeter(PaintTowers(), encoder, None, [picture]))
+    cost = OnlineCost(CostMeter(model_of(encoder, None, picture)))
     expected = reward_curve(IMAGES, goal=IMAGES[9], towers=PaintTowers()).costs["image"][0]
     assert cost.latest_cost(tick) == pytest.approx(expected, abs=1e-6)
     cost.close()
-    both = OnlineCost(CostMeter(PaintTowers(), encoder, None, [picture, words]))
-    with pytest.raises(DriverError, match="raw distances of several modalities"):
-        both.latest_cost(tick)
-    both.close()
+    with pytest.raises(UserError, match="raw distances of several modalities"):
+        CostMeter(model_of(encoder, None, picture, words))
+    with pytest.raises(UserError, match="not known before the end"):
+        CostMeter(model_of(encoder, None, LastFrame()))
+
+
+def model_of(
+    encoder: TouchEncoder, normalizer: DistanceNormalizer | None, *goals: GoalSpec
+) -> RewardModel:
+    inputs = Inputs("this run", FRONT, TACTILE, "gelsight_mini")
+    return load_reward_model(inputs, goals, encoder, PaintTowers(), normalizer)
 
 
 def test_cost_during_a_run_is_that_of_its_recording(encoder: TouchEncoder, tmp_path: Path) -> None:
@@ -282,7 +341,7 @@ def test_cost_during_a_run_is_that_of_its_recording(encoder: TouchEncoder, tmp_p
     goal = embedder.embed_goal(assign_goals(goals, recording.modalities), recording)
     expected = compute_curves(recording, goal, normalizer).costs["image+text"]
     meter, ticks = (
-        CostMeter(PaintTowers(), encoder, normalizer, goals),
+        CostMeter(model_of(encoder, normalizer, *goals)),
         [{key: values[i] for key, values in frames.items()} for i in range(len(IMAGES))],
     )
     during = [meter.measure(tick, ticks[: min(i + 1, 5)]) for i, tick in enumerate(ticks)]

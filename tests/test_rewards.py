@@ -41,6 +41,7 @@ from touchgoal.rewards.goals import (
 )
 from touchgoal.rewards.normalizer import DistanceNormalizer, EmbeddingSource
 from touchgoal.rewards.report.report import write_report
+from touchgoal.rewards.report.summary import metrics_table
 from touchgoal.runtime.errors import UserError
 
 N, CONTACT = 40, 20
@@ -171,10 +172,12 @@ def test_own_ends_and_those_of_others_have_their_own_medians() -> None:
     def median(*degrees: float) -> object:
         return pytest.approx(np.median(1 - np.cos(np.radians(degrees))), abs=1e-6)
 
-    assert normalizer.start == {"image": median(50, 90), "own image": median(90, 50)}
-    assert normalizer.goal == {"image": median(36, 40), "own image": median(4, 0)}
+    assert normalizer.start == {"image": median(50, 90), "image (same episode)": median(90, 50)}
+    assert normalizer.goal == {"image": median(36, 40), "image (same episode)": median(4, 0)}
     assert compute_curves(
-        still, replace(goal_of(still), own=frozenset(ALL), touch=None, text=None), normalizer
+        still,
+        replace(goal_of(still), same_episode=frozenset(ALL), touch=None, text=None),
+        normalizer,
     )
 
 
@@ -209,7 +212,7 @@ def test_scale_refuses_what_would_mislead(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="at least one"):
         fit_scene([], ["image"])
     normalizer = fit_scene([good, replace(good)], ["image"])
-    with pytest.raises(UserError, match="it has no 'tactile', only image, own image"):
+    with pytest.raises(UserError, match="it has no 'tactile', only image, image .same episode."):
         compute_curves(good, goal_of(good), normalizer)
     for change, message in (
         ({"towers": "z"}, "with the towers towers, not z"),
@@ -328,6 +331,19 @@ def test_report_holds_the_curves(tmp_path: Path) -> None:
     ]
     first = paths["png"].read_bytes()
     assert write_report(curves, tmp_path, "ep3", {}, gamma=0.9)["png"].read_bytes() == first
+
+
+def test_the_table_of_many_episodes_is_at_most_100_characters_wide() -> None:
+    """With every cell at its longest: counts of three digits behind each value."""
+    rng = np.random.default_rng(0)
+    curves = []
+    for k in range(300):
+        fall = np.linspace(2, 0, 900) * (k % 5 > 0) + 0.1 * rng.random(900)
+        contact = Contact(500 if k % 3 else None, "truth")
+        normalised = {"image": fall, "tactile": fall}
+        curves.append(Curves("a", {}, 20.0, contact, normalised, normalised))
+    table = metrics_table(curves)
+    assert "(n=" in table and max(len(line) for line in table.splitlines()) <= 100
 
 
 def test_reports_need_no_torch() -> None:

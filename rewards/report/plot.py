@@ -1,0 +1,169 @@
+"""Plots of cost and reward curves, one panel under another."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from touchgoal.episodes.film import COLORS
+
+# Colours that colour-blind readers can tell apart; the dashes distinguish them in grey.
+COLOR = dict(zip(("image", "tactile", "text", "image+tactile", "image+text"), COLORS, strict=True))
+DASHES = {
+    "image": (0, (5, 2)),
+    "tactile": (0, (1.5, 1.5)),
+    "text": (0, (5, 1.5, 1.5, 1.5)),
+    "image+tactile": "-",
+    "image+text": "-",
+}
+_SIZE = (12.0, 10.0)  # inches, at 100 pixels an inch
+_PANELS = ((0.53, 0.345), (0.275, 0.17), (0.06, 0.15))  # bottom and height of each panel
+_LABEL_GAP = 0.06  # least distance between two curve labels, share of the first panel's height
+
+
+@dataclass(frozen=True)
+class PlotText:
+    """Texts of a plot.
+
+    Attributes:
+        heading: name of the trajectory.
+        goal: its goal.
+        axes: label of the vertical axis of each panel.
+        contact: label of the first contact.
+    """
+
+    heading: str
+    goal: str
+    axes: tuple[str, str, str]
+    contact: str
+
+
+def draw(
+    panels: tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray], Mapping[str, np.ndarray]],
+    fps: float,
+    contact: int | None,
+    normalised: bool,
+    text: PlotText,
+) -> Figure:
+    """Return a figure of costs, state rewards and potential-based rewards over time.
+
+    Args:
+        panels: costs, state rewards and potential-based rewards, by name of the curve.
+        fps: frames per second.
+        contact: first frame in contact, which is marked.
+        normalised: whether the costs are; then the usual start and end of successes are marked.
+        text: texts of the plot.
+    """
+    figure = Figure(figsize=_SIZE, dpi=100)
+    length = len(next(iter(panels[0].values())))
+    for k, (curves, (bottom, height), label) in enumerate(
+        zip(panels, _PANELS, text.axes, strict=True)
+    ):
+        axes = figure.add_axes((0.095, bottom, 0.725, height))
+        for name, line in curves.items():
+            width = 2.6 if "+" in name else 1.8
+            style = {"color": COLOR[name], "linestyle": DASHES[name], "linewidth": width}
+            axes.plot(np.arange(length) / fps, line, **style)
+        _frame_axes(axes, label, (length - 1) / fps)
+        if k == 0:
+            _frame_costs(axes, normalised)
+        if contact is not None:
+            _mark_contact(axes, contact / fps, text.contact if k == 0 else "")
+        if k < 2:  # in the last panel all curves end near 0: colours and dashes distinguish them
+            _label_lines(axes, curves, _LABEL_GAP * _PANELS[0][1] / height)
+            axes.tick_params(labelbottom=k == 0)
+    figure.axes[-1].set_xlabel("time (s)", fontsize=12)
+    heading, goal = _elide_middle(text.heading, 85), _elide_middle(f"goal: {text.goal}", 125)
+    figure.text(0.095, 0.95, heading, fontsize=15, fontweight="bold", parse_math=False)
+    figure.text(0.095, 0.915, goal, fontsize=12, color="0.35", parse_math=False)
+    return figure
+
+
+def _frame_axes(axes: Axes, label: str, end: float) -> None:
+    axes.set_ylabel(label, fontsize=12)
+    axes.set_xlim(0, end)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.05 * (high - low))
+    axes.grid(True, color="0.92", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=11, color="0.6")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color("0.6")
+
+
+def _frame_costs(axes: Axes, normalised: bool) -> None:
+    """Start the cost axis at 0; if normalised, mark where successes usually start and end."""
+    high = axes.get_ylim()[1]
+    axes.set_ylim(-0.03 * high, high)
+    if not normalised:
+        return
+    axes.set_ylim(-0.04, max(high, 1.2))
+    # Each name stands where a good curve is not: the start's at the end and the reverse.
+    for level, name, x, side in (
+        (1, "usual start", 0.995, "right"),
+        (0, "usual end, or nearer", 0.005, "left"),
+    ):
+        axes.axhline(level, color="0.6", linewidth=0.9, zorder=1)
+        place = axes.get_yaxis_transform()
+        axes.text(x, level, name, ha=side, va="bottom", color="0.5", transform=place)
+
+
+def _mark_contact(axes: Axes, time: float, name: str) -> None:
+    axes.axvline(time, color="0.35", linewidth=1.2, linestyle=(0, (2, 3)), zorder=1)
+    if not name:
+        return
+    right = time > 0.85 * axes.get_xlim()[1]
+    axes.annotate(
+        name,
+        (time, 1),
+        xycoords=("data", "axes fraction"),
+        xytext=(-6 if right else 6, -2),
+        textcoords="offset points",
+        ha="right" if right else "left",
+        va="top",
+        fontsize=11,
+        color="0.35",
+    )
+
+
+def _label_lines(axes: Axes, values: Mapping[str, np.ndarray], gap: float) -> None:
+    """Name each line at its right end, outside the axes, moved apart where ends meet."""
+    low, high = axes.get_ylim()
+    names = sorted(values, key=lambda name: values[name][-1])
+    ends = np.array([(values[name][-1] - low) / (high - low) for name in names])
+    for name, end, height in zip(names, ends, _spread_labels(ends, gap), strict=True):
+        color = COLOR[name]
+        axes.annotate(
+            name,
+            (1, end),
+            xycoords="axes fraction",
+            xytext=(1.045, height),
+            textcoords="axes fraction",
+            va="center",
+            fontsize=12.5,
+            fontweight="bold" if "+" in name else "normal",
+            color=color,
+            annotation_clip=False,
+            arrowprops={
+                "arrowstyle": "-",
+                "color": color,
+                "linewidth": 0.8,
+                "shrinkA": 1,
+                "relpos": (0, 0.5),
+            },
+        )
+
+
+def _spread_labels(heights: np.ndarray, gap: float) -> np.ndarray:
+    """Return ascending heights moved apart to at least `gap`, about the same mean."""
+    rank = np.arange(len(heights)) * gap
+    spread = np.maximum.accumulate(heights - rank) + rank
+    return spread + np.mean(heights - spread)
+
+
+def _elide_middle(text: str, length: int) -> str:
+    """Return the text without its middle if it is longer than the plot is wide."""
+    half = (length - 3) // 2
+    return text if len(text) <= length else f"{text[:half]} … {text[-half:]}"
