@@ -127,7 +127,7 @@ def test_noise_is_measured_before_contact_and_blind_to_a_slope() -> None:
     d = np.linspace(1, 0, 4000) + rng.normal(0, 0.01, 4000)
     d[2000:] += rng.normal(0, 0.5, 2000)
     assert noise(d, contact=2000) == pytest.approx(0.01, rel=0.05)
-    assert noise(d, contact=3) > 0.1  # too few frames: the whole curve
+    assert noise(d, contact=3) > 0.02  # too few frames: the whole curve
 
 
 def test_flat_window_makes_no_peak_of_rounding() -> None:

@@ -214,11 +214,11 @@ def test_encoders_without_words_measure_touch() -> None:
             check_words([Sentence("hard")], encoder)
 
 
-def test_only_successes_felt_with_the_encoders_sensor_are_goals() -> None:
+def test_only_successes_with_the_encoders_sensor_are_goals() -> None:
     reached: dict[str, MetaValue] = {"sensor": "gelsight_mini", "success": True}
     assert is_goal(reached, "gelsight_mini")
     assert not is_goal(reached | {"success": False}, "gelsight_mini")
-    with pytest.raises(UserError, match="felt with gelsight_mini, the encoder is for digit"):
+    with pytest.raises(UserError, match="recorded with gelsight_mini, the encoder is for digit"):
         is_goal(reached, "digit")
 
 
