@@ -154,7 +154,6 @@ def _deploy(
     if config.execute and not config.yes:
         _confirm(cell)
     terminal = Terminal()
-    print(f"{'MOVING' if config.execute else 'dry run'}: {HELP}", flush=True)
     session = Session(
         cell=cell,
         connection=connection,
@@ -168,6 +167,7 @@ def _deploy(
         camera_size=policy.camera_size if policy else ft.CAMERA_SHAPE[:2],
     )
     with terminal.watching():
+        print(f"{'MOVING' if config.execute else 'dry run'}: {HELP}", flush=True)
         return session.run()
 
 

@@ -5,7 +5,7 @@ The block that is picked up and placed over the wire: test_documented_commands.p
 
 import json
 import os
-import re
+import signal
 import subprocess
 import sys
 import time
@@ -20,26 +20,21 @@ from running_twin import RunningTwin
 
 from touchgoal.control import features as ft
 from touchgoal.control.arms.client_libraries import FRANKY
-from touchgoal.control.cell.cell_file import EXAMPLES, cell_table, find_cell_file, read_cell_file
+from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.config import CellConfig
-from touchgoal.control.cell.limits import cell_limits, cell_watchdogs
+from touchgoal.control.cell.limits import cell_watchdogs
 from touchgoal.control.deployment.control_loop import ControlLoop, Request, RunLog, TickStatus
 from touchgoal.control.deployment.session import RecordEpisode, Session
 from touchgoal.control.interfaces import Actor
 from touchgoal.control.safety.action_filter import ActionFilter
-from touchgoal.control.safety.limits import FR3
-from touchgoal.control.tactile.indentation import require_readable
-from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.repair import validate
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main
-from touchgoal.launch.deploy import NOT_DONE, STOPPED, load_policy
+from touchgoal.launch.deploy import NOT_DONE, STOPPED
 from touchgoal.launch.twin import open_to_network
 from touchgoal.policies import checkpoint
-from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.in_process import simulate_cell
-from touchgoal.sim_envs.config import BeadMazeConfig
 
 _PATIENCE = 600  # s for a loop, on a machine however loaded
 SIM = """
@@ -48,9 +43,6 @@ gripper = { kind = "franka_hand" }
 cameras.front = { source = "simulated" }
 task = { name = "pick-place", policy = "expert", objects = ["wooden_block"], seed = 3 }
 """
-
-
-REAL = (EXAMPLES / "fr3_two_minis.toml").read_text()
 
 
 def run(*arguments: object) -> None:
@@ -239,6 +231,46 @@ def test_a_policy_of_ones_own_moves_the_arm(tmp_path: Path) -> None:
     assert 0.04 < q[-1] - q[0] < 0.1  # 20 ticks, less the lag of the arm that it would learn on
 
 
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        ("np.zeros(7)", "act gave an array of shape (7,); return 7 joint changes (rad)"),
+        ("np.full(8, np.nan)", "return finite numbers"),
+        ("1 / 0", "ZeroDivisionError: division by zero (own.py line 8)"),
+    ],
+)
+def test_a_wrong_policy_of_ones_own_stops_the_arm_with_its_name(
+    answer: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    own = OWN.replace("np.array([0.004, *np.zeros(6), 0.08])", answer)
+    (tmp_path / "own.py").write_text(own)
+    with pytest.raises(SystemExit) as ended:
+        run("deploy", write_cell_file(tmp_path, SIM), "--policy", f"{tmp_path / 'own.py'}:Turns",
+            "--execute", "--yes", "--out", tmp_path / "run")  # fmt: skip
+    said = capsys.readouterr().err
+    assert ended.value.code == STOPPED and message in said and "own.py" in said
+
+
+def test_an_interrupted_pipe_keeps_the_report_and_the_status(tmp_path: Path) -> None:
+    """As `deploy | tee log` and Ctrl-C, which ends tee, too; the keyboard is closed besides."""
+    cell = write_cell_file(tmp_path, SIM)
+    command = f"exec {sys.executable} -m touchgoal.launch deploy {cell} --execute --yes <&-"
+    process = subprocess.Popen(
+        [*"sh -c".split(), f"{command} --out {tmp_path / 'run'}"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout and process.stderr
+    while "MOVING" not in (line := process.stdout.readline()):
+        assert line, process.stderr.read()
+    process.stdout.close()
+    process.send_signal(signal.SIGINT)
+    said = process.stderr.read()
+    assert process.wait(_PATIENCE) == STOPPED
+    assert "STOPPED: stopped by the operator" in said and "at rest after" in said
+
+
 def test_the_policy_is_loaded_once_and_before_anything_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -310,129 +342,6 @@ def test_a_port_that_cannot_be_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="touchgoal twin: --port must be .* 65534, not 99999"):
         run("twin", "--port", 99999, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda p: p.stem)
-def test_example_cell_files_are_read(path: Path) -> None:
-    maze = path.stem == "sim_maze"
-    cell = read_cell_file(path)
-    assert cell.task.name == ("bead-maze" if maze else "pick-place")
-    if maze:  # as it was trained: what ships feels with printed dots, and fingers that hardly press
-        low, high = BeadMazeConfig().grasp_force
-        assert low <= cell.gripper.force <= high
-        assert load_policy(cell) is not None
-
-
-def test_an_example_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name in ("sim", "sim.toml", "control/cell/examples/sim.toml"):
-        assert find_cell_file(Path(name)) == EXAMPLES / "sim.toml"
-    with pytest.raises(
-        UserError, match="no cell file mine.toml.*fr3_two_minis, sim, sim_maze, ur5e"
-    ):
-        find_cell_file(Path("mine.toml"))
-    (tmp_path / "sim.toml").write_text(SIM)
-    assert find_cell_file(Path("sim.toml")) == Path("sim.toml")
-
-
-def test_the_cells_tool_is_the_one_that_is_watched(tmp_path: Path) -> None:
-    """Longer fingers: the TCP and the corners are theirs."""
-    cell = read_cell_file(EXAMPLES / "ur5e.toml")
-    assert cell.tool is not None
-    longer = replace(
-        cell.tool,
-        tcp=0.3,
-        finger_corners=tuple((x, y, 0.32) for x, y, _ in cell.tool.finger_corners),
-    )
-    limits = cell_limits(replace(cell, tool=longer))
-    assert limits.tool.tcp_offset == 0.3 and limits.tool.mass == cell.tool.mass
-    before, after = (
-        ActionFilter(each, 20).monitored_points(limits.arm.home[None])[0, 1:, 2].min()
-        for each in (cell_limits(cell), limits)
-    )
-    assert before - after > 0.1
-
-
-def test_a_touch_ceiling_that_no_picture_can_show_is_refused() -> None:
-    require_readable(find_sensor("digit"), 1.5e-3)
-    require_readable(find_sensor("gelsight_mini"), FR3.indentation)
-    with pytest.raises(UserError, match="deeper than the gelsight_mini's sensor file can read"):
-        require_readable(find_sensor("gelsight_mini"), 5e-3)
-
-
-def test_a_byte_order_mark_is_read_over(tmp_path: Path) -> None:
-    assert read_cell_file(write_cell_file(tmp_path, "\ufeff" + SIM)).arm == "sim"
-
-
-def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
-    """What is written into its JSON by hand counts, or is refused."""
-    cell = read_cell_file(write_cell_file(tmp_path, SIM))
-    path, table = tmp_path / "cell.json", cell_table(cell)
-    path.write_text(json.dumps(table))
-    assert read_cell_file(path) == cell
-    path.write_text(json.dumps(table | {"safety": {"force": 25, "fingertips_lower": [0, 0, 0.1]}}))
-    limits = cell_limits(read_cell_file(path))
-    assert limits.force == 25 and limits.fingertips.lower[2] == 0.1
-    path.write_text(json.dumps(table | {"safty": {"force": 25}}))
-    with pytest.raises(UserError, match="cell.json: safty is unknown: did you mean safety?"):
-        read_cell_file(path)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        (SIM.replace('arm = "sim"', ""), "arm is missing"),
-        (SIM.replace('"sim"', '"fr4"'), "arm must be 'fr3', 'ur5e' or 'sim', not 'fr4'"),
-        (SIM.replace('"sim"', '"fr3"'), "address is missing"),
-        (
-            SIM.replace('"sim"', '"fr3"\naddress = "a"').replace('_hand"', '_hand", address = "a"'),
-            "tool is missing: measure tcp, mass, centre_of_mass and finger_corners",
-        ),
-        (
-            SIM
-            + "tool = { tcp = 0.1, mass = inf, centre_of_mass = [0, 0, 0], finger_corners = [] }",
-            "tool.mass must be a finite number",
-        ),
-        (SIM + "speed = 3", "speed is unknown: There are: arm, "),
-        (SIM.replace("cameras.front", "cameras.back"), "cameras.back must be 'front' or 'wrist'"),
-        (SIM.replace("policy =", "polcy ="), "task.polcy is unknown: did you mean policy?"),
-        (SIM.replace("seed = 3", 'seed = "3"'), "task.seed must be a valid integer, not '3'"),
-        (SIM.replace("seed = 3", "start = [0.0]"), "task.start must be 7 joint positions"),
-        (SIM.replace('_hand"', '_hand", force = 90'), "gripper.force must lie between 0 and 70 N"),
-        (SIM + "safety = { force = true }", "safety.force must be a valid number, not True"),
-        (SIM + "safety = { force = nan }", "safety.force must be a finite number, not nan: Force"),
-        (SIM + "safety = { velocity_share = 20 }", "safety.velocity_share must be less than or eq"),
-        (SIM + "safety = { tip_speed = inf }", "safety.tip_speed must be a finite number, not inf"),
-        (SIM + "safety = { velocity_share = 0 }", "safety.velocity_share must be greater than 0"),
-        (SIM + "safety = { observation_age = inf }", "safety.observation_age must be a finite"),
-        (SIM + "safety = { flange_lower = [0, 0] }", "safety.flange_lower has too few values"),
-        (SIM + "safety = { flange_lower = [0, 0, 0, 0] }", "safety.flange_lower must have 3 val"),
-        (SIM + "safety = 3", "safety must be a section with keys of its own"),
-        (SIM + 'fingertips = { sensor = "digt", left = "", right = "" }', "fingertips.sensor: dig"),
-        ("arm =", "is no TOML"),
-        (
-            SIM.replace("seed = 3", r'instruction = "\u001b[2J"'),
-            "task.instruction has control char",
-        ),
-        (
-            SIM.replace("seed = 3", "grasp = [0.5, 0, -0.2, 0]"),
-            "task.grasp [0.5, 0.0, -0.2] is outs",
-        ),
-        (
-            SIM.replace("seed = 3", "goal = [1.9, 0]"),
-            "task.goal [1.9, 0.0] is outside the fingertips",
-        ),
-        (REAL.replace("-0.01", "3.6"), "tool.centre_of_mass.0 must be less than or equal to 0.5"),
-        (re.sub(r"0\.1(539|209)", "0.0", REAL), "tool.finger_corners span [29.0, 140.0, 0.0] mm"),
-        (REAL.replace("tcp = 0.1374", "tcp = 0.4"), "tool.finger_corners leave out the TCP"),
-        (REAL.replace("2BNKH4TQ", "2BNK9P3X"), "fingertips.left and fingertips.right are both"),
-    ],
-)
-def test_a_bad_cell_file_is_one_line(wrong: str, message: str, tmp_path: Path) -> None:
-    with pytest.raises(UserError) as error:
-        read_cell_file(write_cell_file(tmp_path, wrong))
-    assert "cell.toml" in str(error.value) and message in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def test_a_twin_beyond_loopback_says_that_the_network_can_drive_it() -> None:

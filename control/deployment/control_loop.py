@@ -9,6 +9,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from traceback import extract_tb
 from typing import Literal
 
 import numpy as np
@@ -201,9 +203,10 @@ class ControlLoop:
         except (DriverError, UserError) as error:
             return self._arm_first(self.stop(str(error), "check what it names, then start again"))
         except Exception as error:  # the policy's, most likely; the arm must not go on
-            message = " ".join(str(error).split())
+            message, origin = " ".join(str(error).split()), extract_tb(error.__traceback__)[-1]
+            where = f"{Path(origin.filename).name} line {origin.lineno}"
             return self.stop(
-                f"{type(error).__name__}: {message}", "the program or the policy failed"
+                f"{type(error).__name__}: {message} ({where})", "the program or the policy failed"
             )
 
     def _loop(self, actor: Actor, seconds: float, log: RunLog) -> Ending:

@@ -1,0 +1,155 @@
+"""Cell files: the examples, what they mean for the limits, and every mistake in one line."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from touchgoal.control.cell.cell_file import EXAMPLES, cell_table, find_cell_file, read_cell_file
+from touchgoal.control.cell.limits import cell_limits
+from touchgoal.control.safety.action_filter import ActionFilter
+from touchgoal.control.safety.limits import FR3
+from touchgoal.control.tactile.indentation import require_readable
+from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.launch.deploy import load_policy
+from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.config import BeadMazeConfig
+
+SIM = """
+arm = "sim"
+gripper = { kind = "franka_hand" }
+cameras.front = { source = "simulated" }
+task = { name = "pick-place", policy = "expert", objects = ["wooden_block"], seed = 3 }
+"""
+REAL = (EXAMPLES / "fr3_two_minis.toml").read_text()
+
+
+def write_cell_file(folder: Path, text: str) -> Path:
+    path = folder / "cell.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda p: p.stem)
+def test_example_cell_files_are_read(path: Path) -> None:
+    maze = path.stem == "sim_maze"
+    cell = read_cell_file(path)
+    assert cell.task.name == ("bead-maze" if maze else "pick-place")
+    if maze:  # as it was trained: what ships feels with printed dots, and fingers that hardly press
+        low, high = BeadMazeConfig().grasp_force
+        assert low <= cell.gripper.force <= high
+        assert load_policy(cell) is not None
+
+
+def test_an_example_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("sim", "sim.toml", "control/cell/examples/sim.toml"):
+        assert find_cell_file(Path(name)) == EXAMPLES / "sim.toml"
+    with pytest.raises(
+        UserError, match="no cell file mine.toml.*fr3_two_minis, sim, sim_maze, ur5e"
+    ):
+        find_cell_file(Path("mine.toml"))
+    (tmp_path / "sim.toml").write_text(SIM)
+    assert find_cell_file(Path("sim.toml")) == Path("sim.toml")
+
+
+def test_the_cells_tool_is_the_one_that_is_watched(tmp_path: Path) -> None:
+    """Longer fingers: the TCP and the corners are theirs."""
+    cell = read_cell_file(EXAMPLES / "ur5e.toml")
+    assert cell.tool is not None
+    longer = replace(
+        cell.tool,
+        tcp=0.3,
+        finger_corners=tuple((x, y, 0.32) for x, y, _ in cell.tool.finger_corners),
+    )
+    limits = cell_limits(replace(cell, tool=longer))
+    assert limits.tool.tcp_offset == 0.3 and limits.tool.mass == cell.tool.mass
+    before, after = (
+        ActionFilter(each, 20).monitored_points(limits.arm.home[None])[0, 1:, 2].min()
+        for each in (cell_limits(cell), limits)
+    )
+    assert before - after > 0.1
+
+
+def test_a_touch_ceiling_that_no_picture_can_show_is_refused() -> None:
+    require_readable(find_sensor("digit"), 1.5e-3)
+    require_readable(find_sensor("gelsight_mini"), FR3.indentation)
+    with pytest.raises(UserError, match="deeper than the gelsight_mini's sensor file can read"):
+        require_readable(find_sensor("gelsight_mini"), 5e-3)
+
+
+def test_a_byte_order_mark_is_read_over(tmp_path: Path) -> None:
+    assert read_cell_file(write_cell_file(tmp_path, "\ufeff" + SIM)).arm == "sim"
+
+
+def test_a_twins_cell_file_has_the_keys_of_a_labs(tmp_path: Path) -> None:
+    """What is written into its JSON by hand counts, or is refused."""
+    cell = read_cell_file(write_cell_file(tmp_path, SIM))
+    path, table = tmp_path / "cell.json", cell_table(cell)
+    path.write_text(json.dumps(table))
+    assert read_cell_file(path) == cell
+    path.write_text(json.dumps(table | {"safety": {"force": 25, "fingertips_lower": [0, 0, 0.1]}}))
+    limits = cell_limits(read_cell_file(path))
+    assert limits.force == 25 and limits.fingertips.lower[2] == 0.1
+    path.write_text(json.dumps(table | {"safty": {"force": 25}}))
+    with pytest.raises(UserError, match="cell.json: safty is unknown: did you mean safety?"):
+        read_cell_file(path)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (SIM.replace('arm = "sim"', ""), "arm is missing"),
+        (SIM.replace('"sim"', '"fr4"'), "arm must be 'fr3', 'ur5e' or 'sim', not 'fr4'"),
+        (SIM.replace('"sim"', '"fr3"'), "address is missing"),
+        (
+            SIM.replace('"sim"', '"fr3"\naddress = "a"').replace('_hand"', '_hand", address = "a"'),
+            "tool is missing: measure tcp, mass, centre_of_mass and finger_corners",
+        ),
+        (
+            SIM
+            + "tool = { tcp = 0.1, mass = inf, centre_of_mass = [0, 0, 0], finger_corners = [] }",
+            "tool.mass must be a finite number",
+        ),
+        (SIM + "speed = 3", "speed is unknown: There are: arm, "),
+        (SIM.replace("cameras.front", "cameras.back"), "cameras.back must be 'front' or 'wrist'"),
+        (SIM.replace("policy =", "polcy ="), "task.polcy is unknown: did you mean policy?"),
+        (SIM.replace("seed = 3", 'seed = "3"'), "task.seed must be a valid integer, not '3'"),
+        (SIM.replace("seed = 3", "start = [0.0]"), "task.start must be 7 joint positions"),
+        (SIM.replace('_hand"', '_hand", force = 90'), "gripper.force must lie between 0 and 70 N"),
+        (SIM + "safety = { force = true }", "safety.force must be a valid number, not True"),
+        (SIM + "safety = { force = nan }", "safety.force must be a finite number, not nan: Force"),
+        (SIM + "safety = { velocity_share = 20 }", "safety.velocity_share must be less than or eq"),
+        (SIM + "safety = { tip_speed = inf }", "safety.tip_speed must be a finite number, not inf"),
+        (SIM + "safety = { velocity_share = 0 }", "safety.velocity_share must be greater than 0"),
+        (SIM + "safety = { observation_age = inf }", "safety.observation_age must be a finite"),
+        (SIM + "safety = { flange_lower = [0, 0] }", "safety.flange_lower has too few values"),
+        (SIM + "safety = { flange_lower = [0, 0, 0, 0] }", "safety.flange_lower must have 3 val"),
+        (SIM + "safety = 3", "safety must be a section with keys of its own"),
+        (SIM + 'fingertips = { sensor = "digt", left = "", right = "" }', "fingertips.sensor: dig"),
+        ("arm =", "is no TOML"),
+        (
+            SIM.replace("seed = 3", r'instruction = "\u001b[2J"'),
+            "task.instruction has control char",
+        ),
+        (
+            SIM.replace("seed = 3", "grasp = [0.5, 0, -0.2, 0]"),
+            "task.grasp [0.5, 0.0, -0.2] is outs",
+        ),
+        (
+            SIM.replace("seed = 3", "goal = [1.9, 0]"),
+            "task.goal [1.9, 0.0] is outside the fingertips",
+        ),
+        (REAL.replace("-0.01", "3.6"), "tool.centre_of_mass.0 must be less than or equal to 0.5"),
+        (re.sub(r"0\.1(539|209)", "0.0", REAL), "tool.finger_corners span [29.0, 140.0, 0.0] mm"),
+        (REAL.replace("tcp = 0.1374", "tcp = 0.4"), "tool.finger_corners leave out the TCP"),
+        (REAL.replace("2BNKH4TQ", "2BNK9P3X"), "fingertips.left and fingertips.right are both"),
+    ],
+)
+def test_a_bad_cell_file_is_one_line(wrong: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError) as error:
+        read_cell_file(write_cell_file(tmp_path, wrong))
+    assert "cell.toml" in str(error.value) and message in str(error.value)
+    assert "\n" not in str(error.value)
