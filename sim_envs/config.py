@@ -108,6 +108,18 @@ DelayRange = Annotated[tuple[Delay, Delay], ORDERED]
 TickRange = Annotated[tuple[Annotated[int, Field(ge=0, le=2)], ...], Field(min_length=1)]
 
 
+def _one_or_three(changes: tuple[float, ...]) -> tuple[float, ...]:
+    if len(changes) not in (1, 3):
+        raise ValueError(f"takes one value, or red, green and blue, not {len(changes)} values")
+    return changes
+
+
+LightChange = Annotated[
+    tuple[Annotated[float, Field(ge=-0.95, le=1.0)], ...], AfterValidator(_one_or_three)
+]
+"""Change of each colour channel's brightness as a share; one value for all three."""
+
+
 @checked_dataclass
 class DeploymentConfig:
     """Delays and dynamics of a real arm, drawn anew for each episode.
@@ -192,6 +204,9 @@ class EnvConfig(SceneConfig):
     pick-place and 20 rad/s in bead-maze, whose bead turns with it."""
     randomization: Annotated[SensorRandomization, RARE] = SensorRandomization()
     """How much the two fingertip sensors differ, drawn anew for each episode."""
+    light_change: Annotated[LightChange, RARE] = (0.0,)
+    """Change of the fingertips' light after an episode's first picture, as a share: one value, or
+    red, green and blue. -0.15 dims them by 15 %."""
     as_deployed: bool = False
     """Behave as the arm does when it is deployed: driven, delayed and sensed as over the wire."""
     deployment: DeploymentConfig = DeploymentConfig()

@@ -1,6 +1,7 @@
 """What every task shares: a Gymnasium environment around the simulated cell."""
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -258,7 +259,12 @@ class FrankaTactileEnv(gym.Env[dict[str, Any], np.ndarray], ABC):
 
     def read_tactile(self, side: int) -> TactileFrame:
         """What the left (0) or right (1) sensor shows; `update_contacts` first, keep to the order of time."""
-        return self._pads[side].sense(self.data, self._contacts[side], self.np_random)
+        frame = self._pads[side].sense(self.data, self._contacts[side], self.np_random)
+        change = self.config.light_change
+        if self._ticks == 0 or not any(change):
+            return frame
+        lit = frame.image * (1 + np.array(change, np.float32))
+        return replace(frame, image=np.rint(lit).clip(0, 255).astype(np.uint8))
 
     # Insides.
 
