@@ -24,7 +24,6 @@ COMMANDS = {
     "train-encoder": "train a touch encoder",
     "train-estimators": "train networks that estimate contact from touch and poses from camera pictures",
     "train-policy": "train a policy on recorded episodes",
-    "train-policy-paper": "train-policy with the network, sampler and actions that Sparsh publishes",
     "make-policy": "make a shipped policy anew: recordings, corrections, training, choice",
     "run-policy": "run a policy in a task: success rate, video",
     "reward-curves": "costs and rewards along episodes or plain videos",

@@ -1,8 +1,9 @@
 """Train a policy on recorded episodes; choose among its snapshots by trials in the task."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from touchgoal.encoders.training.options import TrainingOptions
 from touchgoal.policies.config import (
@@ -23,77 +24,198 @@ from touchgoal.runtime.option_types import (
 )
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 
+if TYPE_CHECKING:
+    from touchgoal.episodes.store import EpisodeSet
+    from touchgoal.policies.network import PolicyConfig
+    from touchgoal.policies.perception.frozen_touch import TouchEmbedder
+
 ENVS: dict[TaskName, TaskConfig] = {
     "bead-maze": BeadMazeConfig(split="validation"),
     "pick-place": PickPlaceConfig(),
 }
-"""Options of the environment of each task, unless others are typed."""
+"""Default options of each task's environment."""
+# Sparsh (C.7). It leaves open how many ticks of a plan are done (here all 8), at what rate, and for how
+# long to train (here the 600 epochs of diffusion_policy's real-robot tasks).
+_PAPER = {
+    "head": "published",
+    "representation": "delta",
+    "touch_input": "embedding",
+    "touch_projection_dim": 256,
+    "touch_noise": 0.0,
+    "position_noise": 0.0,
+    "execution_horizon": 8,
+    "train": TrainConfig(epochs=600, lr=1e-4, snapshot_epochs=100),
+    "sampler": SamplerConfig("ddpm", "epsilon", num_train_timesteps=100, num_inference_steps=100),
+}
 
 
 @checked_dataclass
 class Config(TrainingOptions):
     """Options of train-policy."""
 
+    PRESETS: ClassVar = {"paper": _PAPER}
+
     data: Path
-    """Set of episodes to learn from: those that succeeded, and those in which an expert corrected a
-    policy."""
+    """Episode set to train on: its successful episodes, and those in which an expert corrected a policy."""
     validation: Path
-    """Set of other episodes, on which losses are measured."""
+    """Episode set for the validation loss; it must share no recording with --data."""
+    preset: Literal["default", "paper"] = "default"
+    """Default hyperparameters: for two CPU cores, or as published for the bead maze (Sparsh C.7,
+    diffusion_policy): U-Net of 87 M, 100 DDPM steps, joint changes, 600 epochs. Days on a CPU."""
     include_unknown: Annotated[bool, RARE] = False
-    """Also learn from episodes that do not say whether they succeeded."""
+    """Also train on episodes that do not say whether they succeeded."""
+    trim_pauses: bool = False
+    """Leave out the frames of each episode before arm or gripper first move."""
     task: TaskName | None = None
-    """Task of the episodes, in which snapshots are tried; default: what the episodes say."""
+    """Task of the episodes, in which snapshots are tried; default: the one that the episodes name."""
     encoder: Path | None = None
-    """Folder of a frozen touch encoder (train-encoder), or the name of one that ships; without one the
-    policy does not feel."""
+    """Frozen touch encoder: a folder (train-encoder), or the name of one that ships; default: none."""
     end_to_end: bool = False
-    """Feel through a touch ViT that is trained jointly with the policy, instead of a frozen encoder."""
+    """Train a touch ViT jointly with the policy, instead of a frozen encoder."""
     estimator: Path | None = None
-    """Folder of a state estimator (train-estimators): the policy acts on its estimates of contact and
-    of where things lie at the start, and learns on the truth, so its episodes need no pictures."""
+    """Folder of a state estimator (train-estimators). The policy is trained on the simulator's contacts
+    and object poses, so its episodes need no images; when it acts, the estimator supplies both."""
     out: Path | None = None
     """Folder of the run; the policy goes to its `policy/`."""
     share: Annotated[Fraction, RARE] = 1.0
-    """Share of the episodes to learn from, counted from the first; 1 takes all."""
+    """Share of the episodes to train on, counted from the first."""
     head: Head = "small"
     """Size of the U-Net of a diffusion policy, or regression, which predicts plans directly."""
     representation: ActionRepresentation = "body_twist"
-    """How actions are written while learning: delta (joint change of each control tick), relative (since
-    the plan's start), absolute (joint positions), base_twist or body_twist (displacement and turn of
-    the hand along the base's or the hand's own axes). body_twist also sees what moves along the hand's
-    axes; with a state estimator take base_twist."""
+    """Actions as the network predicts them: delta (joint change of each control tick), relative (joint
+    change since the plan's start), absolute (joint positions), base_twist or body_twist (displacement
+    and rotation of the hand along the base's or the hand's axes). body_twist also gives the network the
+    hand's motion along its own axes; with --estimator take base_twist."""
     arm_state: ArmState = "measured"
-    """How the policy knows where the arm is: measured, or commanded (where it has been sent), into which
-    no delay comes; episodes need the column observation.command for that."""
+    """Arm state that the policy reads: measured, or commanded, which no delay affects; commanded needs
+    episodes with the column observation.command."""
     touch_input: TouchInput = "wrench"
-    """What the policy takes from a frozen touch embedding: wrench, the forces and torques on both
-    fingertips, which a small network learns from what the simulator says; or embedding, a projection of it
-    that is learned from the actions alone."""
+    """Input from a frozen touch encoder: wrench (a small network trained on the simulator's pad forces
+    and torques), or embedding (a projection trained on the actions alone)."""
     touch_projection_dim: Annotated[Count, RARE] = 64
-    """Numbers to which a frozen embedding is projected, with --touch-input embedding."""
+    """Width of that projection, with --touch-input embedding."""
     touch_noise: Annotated[NotNegative, RARE] = 0.1
-    """Noise added to touch embeddings while learning, relative to their standard deviation."""
+    """Noise on touch embeddings in training, relative to their standard deviation."""
     position_noise: Annotated[NotNegative, RARE] = 0.3
-    """Noise added to joint and hand positions while learning, where the policy sees them, relative to
-    their standard deviation."""
+    """Noise on joint and hand positions in training, where the policy reads them, relative to their
+    standard deviation."""
     observation_horizon: Annotated[Count, RARE] = 2
-    """Control ticks that the policy sees, the latest included."""
+    """Control ticks that the policy observes, the latest included."""
     execution_horizon: Count = 2
-    """Control ticks of a plan that are done before the next plan."""
+    """Control ticks of a plan that are executed before the next plan."""
     train: TrainConfig = TrainConfig()
-    """How long and how fast to learn."""
+    """Epochs, learning rate, batches."""
     sampler: Annotated[SamplerConfig, RARE] = SamplerConfig()
-    """How the diffusion is trained and sampled."""
+    """Noise schedule and denoising of a diffusion policy."""
     trials: CountOrNone = 24
-    """Number of validation episodes in which every snapshot is tried; 0 keeps the last snapshot."""
+    """Number of validation episodes in which every snapshot is tried; 0 takes the last snapshot."""
     env: PickPlaceConfig | BeadMazeConfig = ENVS["bead-maze"]
     """Options of the task in which snapshots are tried; name it with --task."""
     workers: Count = os.cpu_count() or 1
     """Processes that simulate."""
 
 
-def main(config: Any) -> None:
-    """Embed, train, choose."""
-    from touchgoal.launch.commands.train_policy import run_command
+def main(config: Config) -> None:
+    """Embed touch, train, choose a snapshot."""
+    from touchgoal.encoders.pretrained import find_encoder
+    from touchgoal.encoders.training.run import check_training, open_sets, open_training, recipe
+    from touchgoal.encoders.training.trainer import is_first_process
+    from touchgoal.policies.checkpoint import ESTIMATOR, TOUCH
+    from touchgoal.policies.perception.frozen_touch import load_touch
+    from touchgoal.policies.perception.state_estimation import load_estimator
+    from touchgoal.policies.training import training_data
+    from touchgoal.policies.training.model_selection import add_parts, score, select
+    from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
+    from touchgoal.policies.training.train import POLICY, train
+    from touchgoal.runtime.errors import UserError
+    from touchgoal.runtime.run_folder import write_json
 
-    run_command(config)
+    check_training(config.trainer, config.out)
+    if config.end_to_end and config.encoder:
+        raise UserError("--end-to-end and --encoder exclude each other: leave out one")
+    touch = load_touch(config.encoder) if config.encoder else None
+    parts = {TOUCH: find_encoder(config.encoder, published=False)} if config.encoder else {}
+    if config.estimator:
+        load_estimator(config.estimator)
+        parts[ESTIMATOR] = config.estimator
+    sets = open_sets(config.data, config.validation)
+    found = [training_data.choose_episodes(s, config.include_unknown) for s in sets]
+    rows = [f.rows for f in found]
+    rows[0] = rows[0][: max(1, round(config.share * len(rows[0])))]
+    chosen = list(zip(sets, rows, strict=True))
+    task = training_data.find_task(chosen, config.task)
+    env = _env(config, task)
+    reads_touch = config.encoder or config.end_to_end or config.estimator
+    sensor = training_data.common_sensor(chosen) if reads_touch else ""
+    if config.trials:
+        training_data.check_sensor(sensor, env.sensor)
+    training_data.check_apart(*sets)
+    pauses = [training_data.find_pauses(*one) for one in chosen]
+    policy = replace(_policy_config(config, sets[0], touch), task=task, sensor=sensor)
+    out = open_training(config, "train-policy")
+    print(f"{task}: {found[0]} for training, {found[1]} for validation")
+    training_data.report_pauses(pauses[0], sets[0].fps, config.trim_pauses)
+    windows, validation = (
+        SequenceDataset(
+            load_recordings(
+                s, r, policy, touch, config.workers, skip=skip if config.trim_pauses else None
+            ),
+            policy,
+        )
+        for (s, r), skip in zip(chosen, pauses, strict=True)
+    )
+    print(f"{len(windows)} windows of {len(rows[0])} episodes; {len(validation)} for validation")
+    provenance = recipe(*sets) | {"episodes": len(rows[0])}
+    train(policy, windows, validation, config.train, out, config.trainer, provenance)
+    if not is_first_process():
+        return
+    add_parts(out / POLICY, parts)
+    if config.trials:
+        scores = select(out, parts, lambda d: score(d, env, config.trials, config.workers))
+        write_json(out / "metrics.json", {"snapshots": scores})
+    print(f"policy: {out / POLICY}")
+    print(f"next: touchgoal run-policy --task {task} --policy {out / POLICY}")
+
+
+def _policy_config(
+    config: Config, episodes: "EpisodeSet", touch: "TouchEmbedder | None"
+) -> "PolicyConfig":
+    from touchgoal.control import features as ft
+    from touchgoal.policies.heads.diffusion import DiffusionConfig, RegressionConfig
+    from touchgoal.policies.heads.unet import PRESETS
+    from touchgoal.policies.network import PolicyConfig
+    from touchgoal.policies.perception.end_to_end import EndToEndConfig
+    from touchgoal.policies.perception.state_estimation import ESTIMATED
+
+    columns = ft.STATE, ft.TCP_POSE, *[ft.COMMAND] * (config.arm_state == "commanded")
+    head = RegressionConfig()
+    if config.head != "regression":
+        head = DiffusionConfig(PRESETS[config.head], config.sampler)
+    return PolicyConfig(
+        touch_dim=touch.dim if touch else 0,
+        touch=touch.name if touch else "",
+        touch_input=config.touch_input,
+        touch_projection_dim=config.touch_projection_dim,
+        touch_noise=config.touch_noise,
+        position_noise=config.position_noise,
+        end_to_end=EndToEndConfig() if config.end_to_end else None,
+        proprioception=(*columns, ft.WRENCH, *ESTIMATED) if config.estimator else columns,
+        representation=config.representation,
+        observation_horizon=config.observation_horizon,
+        execution_horizon=config.execution_horizon,
+        control_hz=episodes.fps,
+        head=head,
+    )
+
+
+def _env(config: Config, task: TaskName) -> TaskConfig:
+    """Return the options of the task in which snapshots are tried."""
+    from touchgoal.runtime.errors import UserError
+
+    if type(config.env) is type(ENVS[task]):
+        return config.env
+    if config.env not in ENVS.values():
+        raise UserError(
+            f"the episodes are of {task}: add --task {task}, to which --env.* then belong"
+        )
+    return ENVS[task]

@@ -181,7 +181,7 @@ def test_learning_the_bead_maze(
     run("benchmark", "policy-latency", "--policy", "policy/policy", "--repeats", 3,
         "--large-repeats", 0)  # fmt: skip
     assert "denoising" in capsys.readouterr().out
-    run("train-policy-paper", *both, *one, "--head", "tiny", "--sampler.num-inference-steps", 2, "--trials", 0,
+    run("train-policy", "--preset", "paper", *both, *one, "--head", "tiny", "--sampler.num-inference-steps", 2, "--trials", 0,
         "--encoder", "gelsight_mini_markers_mae", "--train.epochs", 1, "--out", "paper")  # fmt: skip
     paper = checkpoint.load(Path("paper/policy")).config
     assert paper.representation == "delta" and paper.touch_input == "embedding"
@@ -202,7 +202,12 @@ def test_learning_to_pick_and_place(
     """From placements and demonstrations to a policy that is corrected; too little of everything."""
     monkeypatch.chdir(tmp_path)
     one, blind = ("--workers", 1), ("--env.no-tactile", "--env.cameras", "--out", "demos")
-    other = shutil.copytree(episodes, tmp_path / "other")
+    copied = shutil.copytree(episodes, tmp_path / "copied")
+    message = refused(capsys, "train-estimators", "--data", episodes, "--validation", copied)
+    assert "is also in" in message
+    run("collect-demos", "--episodes", 1, "--seed", 77, *one, "--env.max-seconds", 1, "--env.cameras",
+        "--out", "other")  # fmt: skip
+    other = Path("other/episodes")
     run("train-estimators", "--data", episodes, "--validation", other, *one, "--objects", 2,
         "--placements", 2, "--train.epochs", 1, "--train.contact-epochs", 1, "--out", "est")  # fmt: skip
     run("train-estimators", "--data", episodes, "--validation", other, *one, "--objects", 8,

@@ -24,7 +24,7 @@ from touchgoal.policies.evaluation.table import table
 from touchgoal.policies.training.training_data import (
     choose_episodes,
     common_sensor,
-    common_task,
+    find_task,
 )
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
@@ -267,7 +267,7 @@ def test_only_what_is_known_to_be_good_is_learned_from(tmp_path: Path) -> None:
     arm = EpisodeSet(tmp_path / "arm")
     with pytest.raises(UserError, match="1 of unknown success.*add --include-unknown"):
         choose_episodes(arm)
-    assert common_task([(episodes, [0, 1]), (episodes, [2])]) == "bead-maze"
+    assert find_task([(episodes, [0, 1]), (episodes, [2])], None) == "bead-maze"
     with pytest.raises(UserError, match="more than one task"):
-        common_task([(episodes, [0]), (arm, [0])])
+        find_task([(episodes, [0]), (arm, [0])], None)
     assert common_sensor([(arm, [0])]) == "digit"

@@ -38,6 +38,7 @@ from touchgoal.policies.perception.proprioception import network_input
 from touchgoal.policies.training import train as train_module
 from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
 from touchgoal.policies.training.train import ema_decay, train
+from touchgoal.policies.training.training_data import find_pauses, report_pauses
 from touchgoal.runtime.errors import UserError
 
 import mujoco  # isort: skip - after touchgoal, which chooses the OpenGL platform
@@ -336,3 +337,20 @@ def test_two_sets_beside_each_other_share_no_embeddings(tmp_path: Path) -> None:
         fresh = torch.from_numpy(embedder.embed(episodes, 0)).half()
         assert torch.equal(touches[-1], fresh)
     assert not torch.equal(*touches)
+
+
+def test_a_pause_at_the_start_is_reported_and_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    config = replace(TOY, touch_dim=0, touch="")
+    ticks = toy_observations(30)
+    still = [{**ticks[0], ft.ACTION: np.zeros(8, np.float32)} for _ in range(15)]
+    moving = [{**tick, ft.ACTION: np.full(8, 0.1, np.float32)} for tick in ticks[1:16]]
+    frames = {key: np.stack([tick[key] for tick in [*still, *moving]]) for key in still[0]}
+    EpisodeWriter(tmp_path / "set").append(Episode(frames, "feel"))
+    episodes = EpisodeSet(tmp_path / "set")
+    pauses = find_pauses(episodes, [0])
+    report_pauses(pauses, 20, trimmed=False)
+    assert "1 of 1 episodes begin with a pause of 0.8 to 0.8 s" in capsys.readouterr().out
+    trimmed = load_recordings(episodes, [0], config, None, skip=pauses)
+    assert trimmed.lengths == (15,) and trimmed.actions.unique().tolist() == [pytest.approx(0.1)]

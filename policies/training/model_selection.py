@@ -1,10 +1,14 @@
-"""Which snapshot of a training acts best: only trials can tell, a loss cannot."""
+"""Choice of the best snapshot of a training by trials in the task, since a loss cannot tell."""
 
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from touchgoal.policies.checkpoint import SavedPolicy
+from touchgoal.policies.evaluation.evaluate import Evaluation, run_trials, trial_specs
 from touchgoal.policies.training.train import POLICY, SNAPSHOTS
+from touchgoal.runtime import seeds
+from touchgoal.sim_envs.config import TaskConfig
 
 Score = tuple[float, float]
 """Success rate, then mean progress; both in [0, 1]."""
@@ -13,12 +17,12 @@ Score = tuple[float, float]
 def select(
     run: Path, parts: Mapping[str, Path], trial: Callable[[Path], Score]
 ) -> dict[str, Score]:
-    """Tries every snapshot of a run and makes the best one its policy.
+    """Try every snapshot of a run and make the best one its policy.
 
     Args:
-        run: directory of a finished training.
+        run: folder of a finished training.
         parts: what goes beside every policy, see `add_parts`.
-        trial: scores a policy's directory, on validation tasks.
+        trial: scores a policy's folder, on validation tasks.
 
     Returns:
         The score of every snapshot; the best is in `run/policy`. Among equals the later one wins.
@@ -37,7 +41,16 @@ def select(
     return scores
 
 
+def score(policy: Path, env: TaskConfig, trials: int, workers: int) -> Score:
+    """Return how well the policy in a folder does in a number of trials that choose a snapshot."""
+    maker = SavedPolicy(policy)
+    env = maker.env_config(env)
+    start = seeds.MODEL_SELECTION.first(trials, "--trials")
+    result = Evaluation(tuple(run_trials(env, maker, trial_specs(env, trials, start), workers)))
+    return result.rate.successes / trials, result.progress
+
+
 def add_parts(policy: Path, parts: Mapping[str, Path]) -> None:
-    """Copies folders beside a policy's weights: its touch encoder, its senses, by their names."""
+    """Copy folders beside a policy's weights, by name: its touch encoder, its state estimator."""
     for name, folder in parts.items():
         shutil.copytree(folder, policy / name, dirs_exist_ok=True)

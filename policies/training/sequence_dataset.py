@@ -3,7 +3,6 @@
 Touch is embedded once, by a frozen encoder, and kept on disk inside the set that it was made from.
 """
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -37,7 +36,6 @@ class Recordings:
         lengths: ticks of each episode.
         pictures: for the end-to-end encoder; None without.
         wrench: what acted on both pads (N, Nm, pad frames); None unless the policy reads it.
-        checksum: of the episodes, in their order.
     """
 
     touch: Float16[Tensor, "n e"]
@@ -46,7 +44,6 @@ class Recordings:
     lengths: tuple[int, ...]
     pictures: UInt8[Tensor, "n k h w 3"] | None = None
     wrench: Float32[Tensor, "n 12"] | None = None
-    checksum: str = ""
 
 
 def load_recordings(
@@ -55,8 +52,9 @@ def load_recordings(
     config: PolicyConfig,
     embedder: TouchEmbedder | None,
     workers: int = 1,
+    skip: Sequence[int] | None = None,
 ) -> Recordings:
-    """Reads episodes, embedding those that are not yet; a kill loses those in progress.
+    """Read episodes, and embed those that are not yet; a kill loses those in progress.
 
     Args:
         episodes: the set.
@@ -64,6 +62,8 @@ def load_recordings(
         config: says which columns are read.
         embedder: of touch; None for a policy without.
         workers: processes that embed.
+        skip: ticks of each chosen episode to leave out at its start. Images and forces stay relative to
+            its very first tick.
 
     Raises:
         UserError: nothing chosen, a missing column, another rate or embedder than the config's, or
@@ -77,27 +77,22 @@ def load_recordings(
         frames = episodes.read(i, keys).frames
         if ft.WRENCH in frames:
             frames[ft.WRENCH] = tare(frames[ft.WRENCH], frames[ft.WRENCH][0])
-        state.append(np.concatenate([frames[key] for key in config.proprioception], 1))
-        actions.append(frames[ft.ACTION])
+        start = skip[n] if skip else 0
+        state.append(np.concatenate([frames[key][start:] for key in config.proprioception], 1))
+        actions.append(frames[ft.ACTION][start:])
         if config.reads_wrench:
-            wrench.append(frames[ft.TRUTH_PAD_WRENCH])
-        touch.append(embedded[n] if embedded else np.empty((len(actions[-1]), 0), np.float16))
+            wrench.append(frames[ft.TRUTH_PAD_WRENCH][start:])
+        no_touch = np.empty((len(actions[-1]), 0), np.float16)
+        touch.append(embedded[n][start:] if embedded else no_touch)
         if config.end_to_end:
-            pictures.append(_difference_images(episodes, i, config.end_to_end))
+            pictures.append(_difference_images(episodes, i, config.end_to_end)[start:])
     parts = (torch.from_numpy(np.concatenate(rows)) for rows in (touch, state, actions))
     return Recordings(
         *parts,
         lengths=tuple(len(rows) for rows in actions),
         pictures=torch.from_numpy(np.concatenate(pictures)) if config.end_to_end else None,
         wrench=torch.from_numpy(np.concatenate(wrench)) if wrench else None,
-        checksum=checksum_of(episodes, chosen),
     )
-
-
-def checksum_of(episodes: EpisodeSet, chosen: Sequence[int]) -> str:
-    """Tells the chosen episodes, in their order, from any others: SHA-256 in hexadecimal."""
-    each = "".join(episodes.episode_checksum(i) for i in chosen)
-    return hashlib.sha256(each.encode()).hexdigest()
 
 
 def _difference_images(

@@ -1,22 +1,29 @@
-"""Which recorded episodes a policy learns from, and of which task and sensor they are."""
+"""Choice and checks of the episodes that a policy is trained on."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
+from touchgoal.control import features as ft
+from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.episodes.overlap import require_no_shared_frames
+from touchgoal.episodes.pauses import leading_pause
 from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.config import TASKS, TaskName
+
+_PAUSE = 0.5  # s
 
 
 @dataclass(frozen=True)
 class ChosenEpisodes:
-    """Episodes of a set to learn from.
+    """Episodes of a set to train on.
 
     Attributes:
         rows: their indices.
-        failed: how many were left out because they failed.
-        unknown: how many whose success nobody recorded; left out unless they were asked for.
+        failed: number of failed ones, which are left out.
+        unknown: number of those left out because their success is not recorded.
     """
 
     rows: list[int]
@@ -24,19 +31,19 @@ class ChosenEpisodes:
     unknown: int
 
     def __str__(self) -> str:
-        """Such as `12 episodes (3 that failed left out)`."""
+        """Return such as `12 episodes (3 that failed left out)`."""
         left = [f"{self.failed} that failed"] * bool(self.failed)
         left += [f"{self.unknown} of unknown success"] * bool(self.unknown)
         return f"{len(self.rows)} episodes" + (f" ({', '.join(left)} left out)" if left else "")
 
 
 def choose_episodes(episodes: EpisodeSet, include_unknown: bool = False) -> ChosenEpisodes:
-    """The episodes that succeeded, and those in which an expert corrected a policy.
+    """Return the episodes that succeeded, and those in which an expert corrected a policy.
 
     Args:
         episodes: the set.
-        include_unknown: also those that do not say whether they succeeded, such as recordings of an
-            arm that nobody judged.
+        include_unknown: also take those that do not say whether they succeeded, such as recordings of
+            an arm.
 
     Raises:
         UserError: none is left.
@@ -50,27 +57,66 @@ def choose_episodes(episodes: EpisodeSet, include_unknown: bool = False) -> Chos
         if unknown:
             remedy = "say in their meta whether they succeeded, or add --include-unknown"
         raise UserError(
-            f"no episode of {episodes.root} to learn from ({chosen.failed} failed, {unknown} of "
+            f"no episode of {episodes.root} to train on ({chosen.failed} failed, {unknown} of "
             f"unknown success): {remedy}"
         )
     return chosen
 
 
-def check_apart(
-    data: tuple[EpisodeSet, Sequence[int]], validation: tuple[EpisodeSet, Sequence[int]]
-) -> None:
-    """UserError if an episode is both learned from and judged by, in one folder or in two."""
-    known = {data[0].episode_checksum(i) for i in data[1]}
-    for i in validation[1]:
-        if validation[0].episode_checksum(i) in known:
+def check_apart(data: EpisodeSet, validation: EpisodeSet) -> None:
+    """Raise UserError if an episode, or its frames, are in both sets, in one folder or in two."""
+    known = {data.episode_checksum(i) for i in range(len(data))}
+    for i in range(len(validation)):
+        if validation.episode_checksum(i) in known:
             raise UserError(
-                f"episode {i} of {validation[0].root} is also in {data[0].root}: judge by episodes "
-                "that are not learned from"
+                f"episode {i} of {validation.root} is also in {data.root}: validate on episodes that "
+                "are not trained on"
             )
+    require_no_shared_frames(data, validation)
+
+
+def find_pauses(episodes: EpisodeSet, rows: Sequence[int]) -> list[int]:
+    """Return how many frames of each episode pass before arm or gripper first move."""
+    return [leading_pause(episodes.read(i, [ft.STATE, ft.ACTION])) for i in rows]
+
+
+def report_pauses(pauses: Sequence[int], fps: int, trimmed: bool) -> None:
+    """Print how many demonstrations begin with a pause, which a policy imitates by not starting."""
+    long = [n / fps for n in pauses if n / fps >= _PAUSE]
+    if long:
+        what = "left out" if trimmed else "a policy may imitate it by not starting: --trim-pauses"
+        print(
+            f"{len(long)} of {len(pauses)} episodes begin with a pause of {min(long):.1f} to "
+            f"{max(long):.1f} s; {what}"
+        )
+
+
+def find_task(chosen: Sequence[tuple[EpisodeSet, Sequence[int]]], task: str | None) -> TaskName:
+    """Return the task of the chosen episodes, which is to be the one asked for, if one is.
+
+    Raises:
+        UserError: they are of several tasks or of another one, or name none and none is asked for.
+    """
+    root, found = chosen[0][0].root, _common("task", chosen, task_of)
+    if task and found not in ("", task):
+        raise UserError(f"{root} is of {found}, not of {task}: leave out --task")
+    if (found or task) not in TASKS:
+        raise UserError(f"{root} does not name its task: add --task {' or '.join(TASKS)}")
+    return cast(TaskName, found or task)
+
+
+def check_sensor(recorded: str, tried: str) -> None:
+    """Raise UserError if snapshots would be tried with another sensor than was recorded."""
+    tried = find_sensor(tried).name
+    if recorded and tried != recorded:
+        raise UserError(
+            f"the episodes were recorded with {recorded}, snapshots would be tried with {tried}: add "
+            f"--env.sensor {recorded}"
+        )
 
 
 def succeeded(meta: Mapping[str, Any]) -> bool | None:
-    """Whether an episode shows what to do; None if its facts do not tell."""
+    """Return whether an episode is a demonstration of success; None if its meta does not tell."""
     if meta.get("outcome") == CORRECTED:
         return True
     if meta.get("outcome") == "unknown" or meta.get("success") is None:
@@ -78,22 +124,13 @@ def succeeded(meta: Mapping[str, Any]) -> bool | None:
     return bool(meta["success"])
 
 
-def common_task(sets: Sequence[tuple[EpisodeSet, Sequence[int]]]) -> str:
-    """The task that all chosen episodes of some sets are of; "" if none says.
-
-    Raises:
-        UserError: they are of several.
-    """
-    return _common("task", sets, task_of)
-
-
 def common_sensor(sets: Sequence[tuple[EpisodeSet, Sequence[int]]]) -> str:
-    """The fingertip sensor of all chosen episodes; "" if none says; UserError if several."""
+    """Return the fingertip sensor of all chosen episodes; "" if none is named; UserError if several."""
     return _common("sensor", sets, lambda meta: str(meta.get("sensor", "")))
 
 
 def task_of(meta: Mapping[str, Any]) -> str:
-    """An episode's task by its facts; older sets say it by the wire or the object's shape alone."""
+    """Return an episode's task from its meta; other recorders name only the wire or the object's shape."""
     if "task" in meta:
         return str(meta["task"])
     if "wire" in meta:
