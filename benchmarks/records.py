@@ -12,16 +12,45 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
+from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
 from typing import Any
 
-from touchgoal.benchmarks.quoted import QUOTED
+from touchgoal.benchmarks import figures
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import hardware
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "benchmarks" / "results"
+
+
+@dataclass(frozen=True)
+class Quoted:
+    """One entry of records.toml.
+
+    Attributes:
+        topic: heading in docs/results.md.
+        claim: what is measured.
+        command: as a user types it.
+        figure: function of `figures` that gives the headline.
+        of: its further arguments.
+        in_readme: whether README's table shows it.
+    """
+
+    topic: str
+    claim: str
+    command: str
+    figure: str
+    of: dict[str, str] = field(default_factory=dict)
+    in_readme: bool = False
+
+
+QUOTED = {
+    name: Quoted(**entry)
+    for name, entry in tomllib.loads((FOLDER / "records.toml").read_text()).items()
+}
 _BLOCK = re.compile(r"(<!-- (headlines|results) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -63,7 +92,8 @@ def describe(name: str) -> str:
 
 def headline(name: str) -> str:
     """Return the figure of a record in one line."""
-    return QUOTED[name].headline(load_record(name)["metrics"])
+    quoted = QUOTED[name]
+    return getattr(figures, quoted.figure)(load_record(name)["metrics"], **quoted.of)
 
 
 def render(page: str) -> str:

@@ -3,7 +3,7 @@
 import pytest
 
 from touchgoal.benchmarks import records
-from touchgoal.benchmarks.quoted import QUOTED
+from touchgoal.benchmarks.records import QUOTED
 from touchgoal.launch.__main__ import main
 
 

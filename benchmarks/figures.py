@@ -1,0 +1,150 @@
+"""The figure of a record in one line, from what its command wrote to metrics.json."""
+
+from typing import Any
+
+from touchgoal.policies.evaluation.success_rate import SuccessRate
+
+Metrics = dict[str, Any]
+
+
+def successes(metrics: Metrics) -> str:
+    """Success rate of run-policy."""
+    return str(SuccessRate(metrics["successes"], metrics["trials"]))
+
+
+def deployed(metrics: Metrics) -> str:
+    """Success rate by arm."""
+    rows = metrics["deployments"]
+    arms = dict.fromkeys(row["arm"] for row in rows)
+    rates = {arm: [row["success"] for row in rows if row["arm"] == arm] for arm in arms}
+    return "; ".join(f"{arm} {SuccessRate(sum(r), len(r))}" for arm, r in rates.items())
+
+
+def fewest_and_most(metrics: Metrics) -> str:
+    """Success of the worst and the best row."""
+    done = [
+        SuccessRate(sum(t["success"] for t in r["trials"]), len(r["trials"]))
+        for r in metrics["rows"]
+    ]
+    worst, best = (f(done, key=lambda rate: rate.successes) for f in (min, max))
+    return f"{worst} (worst row) to {best} (best row)"
+
+
+def maze(metrics: Metrics, **names: str) -> str:
+    """Success of closed-loop rows, by label and a part of the row's name."""
+    found = []
+    for label, part in names.items():
+        [own] = [trials for key, trials in metrics["closed_loop"].items() if part in key]
+        found.append(f"{label} {SuccessRate(sum(t['success'] for t in own), len(own))}")
+    return "; ".join(found)
+
+
+def auc(metrics: Metrics) -> str:
+    """AUC of the last cost, success against a dropped object."""
+    drop = metrics["auc"]["drop"]
+    return f"{drop['image']:.2f} by image, {drop['image+tactile']:.2f} by image and touch"
+
+
+def median_rate(metrics: Metrics, start: str, unit: str) -> str:
+    """Range of the median rates of rows that start so."""
+    rates = [row["median"] for row in metrics["rows"] if row["what"].startswith(start)]
+    return f"{min(rates):,.0f} to {max(rates):,.0f} {unit}"
+
+
+def plan(metrics: Metrics) -> str:
+    """Time of a whole plan."""
+    stage = next(s for s in metrics["stages"] if s["what"].startswith("a whole plan"))
+    return f"{stage['median']:.1f} ms, 95th percentile {stage['p95']:.1f} ms"
+
+
+def encoder_speed(metrics: Metrics) -> str:
+    """Time and rate of the first encoder."""
+    row = metrics["rows"][0]
+    return (
+        f"{row['encoder']} {row['tick']:.1f} ms a frame, {row['batched']:.0f} frames/s in batches"
+    )
+
+
+def realism(metrics: Metrics) -> str:
+    """Median PSNR, beside Taxim's table."""
+
+    def median(sensor: str, method: str) -> float:
+        psnr = sorted(
+            row["psnr_near"]
+            for row in metrics["rows"]
+            if (row["sensor"], row["method"]) == (sensor, method)
+        )
+        return psnr[len(psnr) // 2]
+
+    ours, taxim = "ours, circles corrected", "taxim table, on our background"
+    return "; ".join(
+        f"{name} {median(sensor, ours):.1f} dB (Taxim's table {median(sensor, taxim):.1f})"
+        for name, sensor in (("GelSight", "gelsight"), ("Mini", "gelsight_mini"))
+    )
+
+
+def real_force(metrics: Metrics) -> str:
+    """Median force error with its interval."""
+    low, high = metrics["median_error_interval"]
+    return f"{metrics['median_error']:.2f} N [{low:.2f}, {high:.2f}]"
+
+
+def markers(metrics: Metrics) -> str:
+    """Share of dots near the other tracker's."""
+    return f"{metrics['near']:.1%} of {metrics['dots']}; {metrics['exchanged']} exchanged"
+
+
+def nearest(metrics: Metrics) -> str:
+    """Nearest-video accuracy of every encoder."""
+    rows = []
+    for row in metrics["rows"]:
+        low, high = row["nearest_interval"]
+        name = row["encoder"].removeprefix("runs/").removesuffix("/encoder")
+        rows.append(f"{name} {row['nearest']:.2f} [{low:.2f}, {high:.2f}]")
+    return "; ".join(rows)
+
+
+def faults(metrics: Metrics) -> str:
+    """Faults that lose no episode, and the longest time to rest."""
+    rows = metrics["rows"]
+    rest = [row["rest"] for row in rows if row["rest"] == row["rest"]]  # NaN: nothing to stop
+    whole = sum(row["episodes_whole"] for row in rows)
+    return f"{whole} of {len(rows)} keep all episodes; at rest within {max(rest):.2f} s"
+
+
+def stream(metrics: Metrics) -> str:
+    """Distances from the box and the limits."""
+    most = {k: max(row[k] for row in metrics["rows"]) for k in ("outside", "speed", "jerk")}
+    return (
+        f"{-1e3 * most['outside']:.1f} mm inside the box; {most['speed']:.0%} of the speed limit, "
+        f"{most['jerk']:.0%} of the jerk limit"
+    )
+
+
+def replay(metrics: Metrics) -> str:
+    """Largest distance of the tools."""
+    return f"{1e3 * max(row['tool'] for row in metrics['rows']):.2f} mm at most"
+
+
+_TACBENCH = {  # task -> metric, unit
+    "force": ("mae_mn", "mN"),
+    "slip": ("f1", "F1"),
+    "pose": ("accuracy", "accuracy"),
+    "grasp": ("accuracy", "accuracy"),
+    "textile": ("accuracy", "accuracy"),
+}
+
+
+def tacbench(metrics: Metrics) -> str:
+    """The first encoder's figures with most labels, on each task's first test set."""
+    found = {}
+    for row in metrics["rows"]:
+        if row["task"] in _TACBENCH and row["encoder"] == metrics["rows"][0]["encoder"]:
+            found.setdefault(row["task"], row)
+    parts = []
+    for task, row in found.items():
+        metric, unit = _TACBENCH[task]
+        low, high = row[f"{metric}_interval"]
+        form = ".0f" if unit == "mN" else ".2f"
+        parts.append(f"{task} {row[metric]:{form}} [{low:{form}}, {high:{form}}] {unit}")
+    return "; ".join(parts)
