@@ -205,7 +205,7 @@ def main(config: Align | Mae | Dino | IJepa | VJepa | Surfaces | Adapt) -> None:
 def _align(config: Align) -> None:
     """Align touch with images and texts, then fit the normalizer of reward curves."""
     from touchgoal.encoders.alignment.align import align
-    from touchgoal.encoders.ssl.unlabelled_touch import sensor_of
+    from touchgoal.encoders.ssl.frames import find_sensor_name
     from touchgoal.encoders.towers.towers import load_towers
     from touchgoal.encoders.training.run import check_training, open_sets, open_training, recipe
     from touchgoal.encoders.training.trainer import is_first_process
@@ -218,7 +218,7 @@ def _align(config: Align) -> None:
 
     check_training(config, config.out)
     data, validation = open_sets(config.data, config.validation)
-    sensor = sensor_of(config.sensor, data, validation)
+    sensor = find_sensor_name(config.sensor, data, validation)
     successes = [i for i in range(len(data)) if data.meta(i).get("success") is True]
     if not successes:
         raise UserError(

@@ -322,7 +322,7 @@ def test_wrong_data_for_an_encoder(
     message = refused(capsys, "train-encoder", "align", *both, *sensor, "--out", out)
     assert "was recorded with gelsight_mini, not" in message and not out.exists()
     same = ("--data", episodes, "--validation", episodes)
-    assert "judge by episodes" in refused(capsys, "train-encoder", "mae", *same, "--out", out)
+    assert "validate on episodes" in refused(capsys, "train-encoder", "mae", *same, "--out", out)
     nothing = refused(capsys, "train-encoder", "mae", *both, "--resume", "--out", out)
     assert "nothing to resume" in nothing and not out.exists()
     meta = EpisodeSet.meta

@@ -22,7 +22,9 @@ def press(brightness: int) -> np.ndarray:
     return pictures
 
 
-def write_videos(folder: Path, splits: tuple[str, ...] = SPLITS) -> Path:
+def write_videos(
+    folder: Path, splits: tuple[str, ...] = SPLITS, brightness: int = 180
+) -> Path:
     """One video of each split: the held-out ones are darker than untouched, the others brighter."""
     (folder / "videos").mkdir(parents=True)
     with (folder / "labels.csv").open("w", newline="") as file:
@@ -31,7 +33,7 @@ def write_videos(folder: Path, splits: tuple[str, ...] = SPLITS) -> Path:
         for split in splits:
             write_video(
                 folder / "videos" / f"{split}.mp4",
-                press(20 if split in ("val", "test") else 180),
+                press(20 if split in ("val", "test") else brightness),
                 10,
             )
             rows.writerow([f"{split}.mp4", split, split, split, "", "", ""])
@@ -62,8 +64,22 @@ def test_several_folders_are_learned_from_together(tmp_path: Path) -> None:
     touch = open_touch([videos, tmp_path / "pickles"], (), "gelsight_mini")
     assert len(touch.train(9, 0, None)) == 18 + 2
     assert len(touch.validation(9, 0, None)) == 18 + 1
-    elsewhere = write_videos(tmp_path / "others", ("train", "val"))
+    elsewhere = write_videos(tmp_path / "others", ("train", "unlabelled"), brightness=150)
     assert len(open_touch([videos], [elsewhere], None).validation(9, 0, None)) == 18 + 18
+
+
+def test_shared_frames_are_refused_whatever_the_folder_and_the_order(tmp_path: Path) -> None:
+    videos = write_videos(tmp_path / "videos", ("train",))
+    copies = write_videos(tmp_path / "copies", ("unlabelled", "test"))
+    with pytest.raises(UserError, match="unlabelled.mp4.* shares .* frames with .*train.mp4"):
+        open_touch([videos], [copies], None)
+    rows = [encoded(gel(i, (240, 320))) for i in range(4)]
+    other = [[encoded(gel(i, (240, 320)))] for i in range(7, 10)]
+    for name, clips in (("a", [rows, *other[:2]]), ("b", [other[2], rows[::-2]])):
+        for i, clip in enumerate(clips):
+            write(tmp_path / name / f"{i:03d}.pkl", clip)
+    with pytest.raises(UserError, match="001.pkl.* shares 2 frames with .*000.pkl"):
+        open_touch([tmp_path / "a"], [tmp_path / "b"], "gelsight_mini")
 
 
 def test_what_cannot_be_learned_from_together_is_one_line(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -51,7 +51,7 @@ def align(
     out_dir: Path,
     options: TrainerOptions,
     recipe: dict[str, Any],
-) -> pretrained.AnyTouchEncoder:
+) -> TouchEncoder:
     """Train a touch encoder.
 
     Writes what `trainer.fit` does, and at the end the epoch with the best retrieval (mean of both
@@ -124,7 +124,7 @@ def align(
         "test_metrics": evaluate_retrieval(encoder, test),
     }
     on_first_process(lambda: pretrained.save(encoder, out_dir / _ENCODER, provenance))
-    return pretrained.load_encoder(out_dir / _ENCODER)
+    return cast(TouchEncoder, pretrained.load_encoder(out_dir / _ENCODER))
 
 
 def _checksum(touches: Touches) -> str:

@@ -1,4 +1,4 @@
-"""What self-supervision trains on: touches drawn from episodes, preprocessed, without labels."""
+"""Training data without labels: touches drawn from episodes and recordings, preprocessed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,12 +6,13 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16, UInt8
+from jaxtyping import Float, Float16, Int, UInt8
 from torch import Tensor
 
 from touchgoal.control.features import TACTILE, TRUTH_PAD_WRENCH
 from touchgoal.encoders.backbones.frame_history import past_rows
 from touchgoal.encoders.preprocess import preprocessor_for
+from touchgoal.episodes.overlap import ChecksummedRecording
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
@@ -19,15 +20,15 @@ from touchgoal.runtime.progress import track
 
 @runtime_checkable  # beartype checks arguments in tests
 class Clip(Protocol):
-    """Pictures in time."""
+    """Images in time."""
 
     def __len__(self) -> int: ...  # noqa: D105
     def frames(self, rows: Sequence[int]) -> UInt8[np.ndarray, "n h w 3"]: ...  # noqa: D102
 
 
 @runtime_checkable
-class Recorded(Protocol):
-    """One fingertip's pictures in a file, and the sensor untouched."""
+class Recording(ChecksummedRecording, Protocol):
+    """One fingertip's images in a file, and the untouched sensor."""
 
     @property
     def sensor(self) -> str: ...  # noqa: D102
@@ -41,12 +42,12 @@ class TouchFrames:
     """n touches.
 
     Attributes:
-        touch: Preprocessed frames; half precision, for they fill the memory. Of an objective that sees
-            several at once a moment's frames, the newest first.
-        wrench: What the simulator says acts on each pad (N, Nm, pad frame), for probes only;
-            None if the episodes do not say.
+        touch: Preprocessed frames in half precision, to save memory. For objectives on several frames,
+            the t frames of a sample, newest first.
+        wrench: Simulated wrench on each pad (N, Nm, pad frame), for probes only; None if the episodes
+            do not record it.
         sensor: Name of the fingertip sensor.
-        stride: Ticks from one of a moment's frames to the one before.
+        stride: Ticks between the frames of a sample.
     """
 
     touch: Float16[Tensor, "n *t 3 h w"]
@@ -55,28 +56,28 @@ class TouchFrames:
     stride: int = 1
 
     @classmethod
-    def of_moments(
+    def from_samples(
         cls,
-        moments: list[Float16[Tensor, "_ t 3 h w"]],
+        samples: list[Float16[Tensor, "_ t 3 h w"]],
         wrench: Float[Tensor, "n 6"] | None,
         sensor: str,
         offsets: tuple[int, ...] | None,
     ) -> "TouchFrames":
-        """Of the frames of drawn moments, newest first; see `sample_frames` for `offsets`."""
-        touch = torch.cat(moments)
+        """Join the frames of samples, newest first; see `sample_frames` for `offsets`."""
+        touch = torch.cat(samples)
         stride = offsets[1] if offsets and len(offsets) > 1 else 1
         return cls(touch if offsets else touch[:, 0], wrench, sensor, stride)
 
     @classmethod
     def joined(cls, parts: list["TouchFrames"]) -> "TouchFrames":
-        """All touches of one sensor and stride; forces are known only if they are of every part."""
+        """Join touches of one sensor and stride; wrenches only if every part has them."""
         wrenches = [part.wrench for part in parts if part.wrench is not None]
         wrench = torch.cat(wrenches) if len(wrenches) == len(parts) else None
         first = parts[0]
         return cls(torch.cat([part.touch for part in parts]), wrench, first.sensor, first.stride)
 
     def __len__(self) -> int:
-        """Number of touches."""
+        """Return the number of touches."""
         return len(self.touch)
 
 
@@ -87,18 +88,18 @@ def sample_frames(
     seed: int,
     offsets: tuple[int, ...] | None = None,
 ) -> TouchFrames:
-    """Draws ticks at random from every episode, and takes every fingertip of each.
+    """Draw ticks at random from every episode, with every fingertip of each.
 
-    The background is a fingertip's first frame: episodes start untouched. For frames before an
-    episode's first, that one stands, as it does when a policy acts: nothing has touched or moved yet.
+    The background is a fingertip's first frame: episodes start untouched. The first frame also stands
+    for frames before it, as it does when a policy acts.
 
     Args:
         episodes: A set with touch.
         sensor: Name of the fingertip sensor.
         per_episode: Ticks drawn from each episode; all of a shorter one.
-        seed: Of the draw; an episode's draw does not depend on the other episodes.
-        offsets: How many ticks before a drawn one each frame lies that is seen with it, the drawn one's
-            0 first; None for single frames.
+        seed: Random seed; an episode's draw does not depend on the other episodes.
+        offsets: Ticks from the drawn frame back to each frame of a sample, 0 first; None for single
+            frames.
 
     Raises:
         UserError: No touch in the set, or another sensor's.
@@ -112,55 +113,78 @@ def sample_frames(
     touch, wrench = [], []
     for i in track(range(len(episodes)), "touches", "episode"):
         check_sensor(episodes, i, sensor)
-        rng = np.random.default_rng([seed, i])
-        ticks = np.sort(rng.permutation(episodes.lengths[i])[:per_episode])
-        seen, where = np.unique(past_rows(ticks, offsets or (0,)), return_inverse=True)
-        frames = episodes.read(i, keys, seen.tolist()).frames
+        ticks, rows, where = _draw_rows(episodes.lengths[i], per_episode, [seed, i], offsets)
+        frames = episodes.read(i, keys, rows).frames
         first = episodes.read(i, keys, [0]).frames
         known = episodes.read(i, truth, ticks.tolist()).frames
         for side, key in sides.items():
-            rows = torch.from_numpy(preprocess(frames[key], first[key][0])).half()
-            touch.append(rows[torch.from_numpy(where.reshape(len(ticks), -1))])
+            touch.append(torch.from_numpy(preprocess(frames[key], first[key][0])).half()[where])
             for name in truth:
                 wrench.append(torch.from_numpy(known[name][:, 6 * side : 6 * side + 6]))
-    return TouchFrames.of_moments(touch, torch.cat(wrench) if truth else None, sensor, offsets)
+    return TouchFrames.from_samples(touch, torch.cat(wrench) if truth else None, sensor, offsets)
 
 
 def sample_recordings(
-    recordings: Sequence[Recorded],
+    recordings: Sequence[Recording],
     per_recording: int,
     seed: int,
     offsets: tuple[int, ...] | None = None,
 ) -> TouchFrames:
-    """Draws pictures at random from every recording.
+    """Draw images at random from every recording, as `sample_frames` does from episodes.
 
     Args:
-        recordings: Of one sensor, one at least.
-        per_recording: Pictures drawn from each; all of a shorter one.
-        seed: Of the draw; a recording's draw does not depend on how many there are after it.
-        offsets: As in `frames.sample_frames`.
+        recordings: Recordings of one sensor, at least one.
+        per_recording: Images drawn from each; all of a shorter one.
+        seed: Random seed; a recording's draw does not depend on later recordings.
+        offsets: As for `sample_frames`.
 
     Raises:
-        UserError: A picture is broken, or not of the sensor's shape.
+        UserError: An image is broken, or not of the sensor's shape.
     """
     sensor = recordings[0].sensor
     preprocess = preprocessor_for(sensor)
     touch = []
     for i, recording in enumerate(track(recordings, "touches", "recording")):
-        rng = np.random.default_rng([seed, i])
         clip, background = recording.open()
-        drawn = np.sort(rng.permutation(len(clip))[:per_recording])
-        seen, where = np.unique(past_rows(drawn, offsets or (0,)), return_inverse=True)
-        rows = preprocess(clip.frames(seen.tolist()), background)
-        touch.append(torch.from_numpy(rows).half()[torch.from_numpy(where.reshape(len(drawn), -1))])
-    return TouchFrames.of_moments(touch, None, sensor, offsets)
+        _, rows, where = _draw_rows(len(clip), per_recording, [seed, i], offsets)
+        touch.append(torch.from_numpy(preprocess(clip.frames(rows), background)).half()[where])
+    return TouchFrames.from_samples(touch, None, sensor, offsets)
+
+
+def _draw_rows(
+    length: int, count: int, seed: list[int], offsets: tuple[int, ...] | None
+) -> tuple[Int[np.ndarray, " k"], list[int], Int[Tensor, "k t"]]:
+    """Return the drawn rows, all rows to read for them, and where among these each frame is."""
+    drawn = np.sort(np.random.default_rng(seed).permutation(length)[:count])
+    rows, where = np.unique(past_rows(drawn, offsets or (0,)), return_inverse=True)
+    return drawn, rows.tolist(), torch.from_numpy(where.reshape(len(drawn), -1))
+
+
+def find_sensor_name(sensor: str | None, *sets: EpisodeSet) -> str:
+    """Return the fingertip sensor of all episodes.
+
+    Args:
+        sensor: Its name, for episodes that do not name theirs.
+        sets: Episode sets.
+
+    Raises:
+        UserError: Unknown, not named, or not the same in all episodes.
+    """
+    sensor = sensor or str(sets[0].meta(0).get("sensor", ""))
+    if not sensor:
+        raise UserError(f"{sets[0].root} does not name its fingertip sensor: name it with --sensor")
+    preprocessor_for(sensor)
+    for episodes in sets:
+        for i in range(len(episodes)):
+            check_sensor(episodes, i, sensor)
+    return sensor
 
 
 def check_sensor(episodes: EpisodeSet, i: int, sensor: str) -> None:
-    """Raises UserError if an episode says that it was recorded with another sensor."""
-    felt = episodes.meta(i).get("sensor", sensor)
-    if felt != sensor:
+    """Raise UserError if an episode names another sensor."""
+    recorded = episodes.meta(i).get("sensor", sensor)
+    if recorded != sensor:
         raise UserError(
-            f"episode {i} of {episodes.root} was recorded with {felt}, not {sensor}: name that sensor, "
-            "or record with this one"
+            f"episode {i} of {episodes.root} was recorded with {recorded}, not {sensor}: name that "
+            "sensor, or record with this one"
         )

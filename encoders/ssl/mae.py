@@ -3,7 +3,7 @@
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float, Float16, Int
@@ -121,7 +121,7 @@ def train_mae(
     out_dir: Path,
     options: TrainerOptions,
     recipe: dict[str, Any],
-) -> pretrained.AnyTouchEncoder:
+) -> TouchBackbone:
     """Trains a backbone.
 
     Writes what `trainer.fit` does and, at the end, the backbone to `encoder/`. Killed and resumed,
@@ -180,7 +180,7 @@ def train_mae(
         "metrics": history[-1],
     }
     on_first_process(lambda: pretrained.save(model.backbone, out_dir / _ENCODER, provenance))
-    return pretrained.load_encoder(out_dir / _ENCODER)
+    return cast(TouchBackbone, pretrained.load_encoder(out_dir / _ENCODER))
 
 
 @torch.no_grad()

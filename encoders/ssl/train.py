@@ -2,13 +2,14 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.sparsh import Method, backbone_for
+from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.ssl.config import (
     DinoConfig,
     IJepaConfig,
@@ -42,7 +43,7 @@ def train_self_distilled(
     out_dir: Path,
     options: TrainerOptions,
     recipe: dict[str, Any],
-) -> pretrained.AnyTouchEncoder:
+) -> TouchBackbone:
     """Train a backbone by the objective of `config`.
 
     Writes what `trainer.fit` does, images reconstructed from the tokens, and at the end the teacher's
@@ -112,4 +113,4 @@ def train_self_distilled(
         "metrics": history[-1],
     }
     on_first_process(lambda: pretrained.save(model.teacher, out_dir / _ENCODER, provenance))
-    return pretrained.load_encoder(out_dir / _ENCODER)
+    return cast(TouchBackbone, pretrained.load_encoder(out_dir / _ENCODER))

@@ -1,38 +1,38 @@
-"""What trainings without labels learn from: episodes, published recordings, videos, or several of these."""
+"""Sources of a training without labels: episode sets, published recordings, videos, or several."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.ssl.frames import (
-    Recorded,
+    Recording,
     TouchFrames,
-    check_sensor,
+    find_sensor_name,
     sample_frames,
     sample_recordings,
 )
 from touchgoal.episodes.importers.labelled_videos import has_labels
 from touchgoal.episodes.importers.pretraining_clips import read_recordings
 from touchgoal.episodes.importers.video_recordings import read_video_recordings
+from touchgoal.episodes.overlap import require_no_shared_frames, require_no_shared_recordings
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import provenance
 
 Offsets = tuple[int, ...] | None
 Draw = Callable[[int, int, Offsets], TouchFrames]
-"""So many touches of each episode or recording, by a seed; offsets as in `sample_frames`."""
+"""Draws a number of samples from each episode or recording by a seed; see `sample_frames`."""
 
 
 @dataclass(frozen=True)
 class UnlabelledTouch:
-    """Where touches are drawn from.
+    """Touches for training and validation.
 
     Attributes:
-        train: to learn from.
-        validation: others, to judge by.
-        recipe: JSON-able; where they come from.
+        train: Draws training touches.
+        validation: Draws validation touches.
+        recipe: JSON-able provenance.
     """
 
     train: Draw
@@ -42,96 +42,108 @@ class UnlabelledTouch:
 
 @dataclass(frozen=True)
 class _Source:
-    """One folder: all of it, and what it asks not to learn from, if it does."""
+    """A folder: an episode set, or recordings."""
 
     folder: Path
     sensor: str
-    whole: Draw
-    learned: Draw
-    held_out: Draw | None
-    facts: dict[str, Any]
+    episodes: EpisodeSet | None
+    recordings: Sequence[Recording] = ()
+
+    @property
+    def training(self) -> list[Recording]:
+        return [recording for recording in self.recordings if not recording.held_out]
+
+    @property
+    def held_out(self) -> list[Recording]:
+        return [recording for recording in self.recordings if recording.held_out]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        path = str(self.folder)
+        if (episodes := self.episodes) is not None:
+            return {"path": path, "episodes": len(episodes), "checksum": episodes.checksum}
+        return {
+            "path": path,
+            "recordings": len(self.training),
+            "held_out": len(self.held_out),
+        }
+
+    def draw(self, recordings: Sequence[Recording]) -> Draw:
+        """Return a function that draws from the episode set, or else from these recordings."""
+        if (episodes := self.episodes) is not None:
+            return lambda count, seed, offsets: sample_frames(
+                episodes, self.sensor, count, seed, offsets
+            )
+        return lambda count, seed, offsets: sample_recordings(recordings, count, seed, offsets)
 
 
 def open_touch(
     data: Sequence[Path], validation: Sequence[Path], sensor: str | None
 ) -> UnlabelledTouch:
-    """Opens what was named, all of one sensor.
+    """Open folders of one sensor.
 
-    What a folder of `data` holds out is judged by, besides `validation`.
+    Recordings that a folder of `data` holds out are added to the validation data.
 
     Raises:
-        UserError: no such folder, an unknown or another sensor, or nothing to judge by.
+        UserError: No such folder, an unknown or another sensor, nothing to validate on, or frames
+            both in the training and in the validation data.
     """
-    learned_from = {folder.resolve() for folder in data}
+    training_folders = {folder.resolve() for folder in data}
     for folder in validation:
-        if folder.resolve() in learned_from:
+        if folder.resolve() in training_folders:
             raise UserError(
-                f"--data and --validation are both {folder}: judge by episodes that are not learned "
-                "from; where a folder holds recordings out, leave --validation out"
+                f"--data and --validation are both {folder}: validate on episodes that are not trained "
+                "on; where a folder holds recordings out, leave --validation out"
             )
     first = _open(data[0], sensor)
-    learned = [first, *(_open(folder, first.sensor) for folder in data[1:])]
-    judged = [_open(folder, first.sensor) for folder in validation]
-    if not judged:
-        for source in learned:
-            if source.held_out is None:
-                raise UserError(
-                    f"{source.folder} holds no recordings out: name other episodes with --validation"
-                )
-    held_out = [source.held_out for source in learned if source.held_out is not None]
-    facts = {
-        "train": [source.facts for source in learned],
-        "validation": [source.facts for source in judged],
-    }
+    train = [first, *(_open(folder, first.sensor) for folder in data[1:])]
+    other = [_open(folder, first.sensor) for folder in validation]
+    for source in train:
+        if not other and not source.held_out:
+            raise UserError(
+                f"{source.folder} holds no recordings out: name other episodes with --validation"
+            )
+    _require_no_overlap(train, other)
     return UnlabelledTouch(
-        _joined([source.learned for source in learned]),
-        _joined([*held_out, *(source.whole for source in judged)]),
-        {**provenance(), "data": facts},
+        _join([source.draw(source.training) for source in train]),
+        _join(
+            [source.draw(source.held_out) for source in train if source.held_out]
+            + [source.draw(source.recordings) for source in other]
+        ),
+        {
+            **provenance(),
+            "data": {
+                "train": [source.record for source in train],
+                "validation": [source.record for source in other],
+            },
+        },
     )
 
 
-def sensor_of(named: str | None, *sets: EpisodeSet) -> str:
-    """The sensor of all episodes; UserError if it is unknown, or not the one that was named."""
-    sensor = named or str(sets[0].meta(0).get("sensor", ""))
-    if not sensor:
-        raise UserError(f"{sets[0].root} does not name its fingertip sensor: name it with --sensor")
-    preprocessor_for(sensor)
-    for episodes in sets:
-        for i in range(len(episodes)):
-            check_sensor(episodes, i, sensor)
-    return sensor
+def _require_no_overlap(train: Sequence[_Source], other: Sequence[_Source]) -> None:
+    for one in train:
+        for two in other:
+            if one.episodes is not None and two.episodes is not None:
+                require_no_shared_frames(one.episodes, two.episodes)
+    require_no_shared_recordings(
+        [recording for source in train for recording in source.training],
+        [recording for source in train for recording in source.held_out]
+        + [recording for source in other for recording in source.recordings],
+    )
 
 
 def _open(folder: Path, sensor: str | None) -> _Source:
     if (folder / "meta").exists():
-        return _episodes(folder, sensor)
+        episodes = EpisodeSet(folder)
+        return _Source(folder, find_sensor_name(sensor, episodes), episodes)
     found = read_video_recordings(folder) if has_labels(folder) else read_recordings(folder, sensor)
     recorded = found[0].sensor
     if sensor not in (None, recorded):
         raise UserError(f"{folder} was recorded with {recorded}, not {sensor}")
-    kept = [recording for recording in found if not recording.held_out]
-    others = [recording for recording in found if recording.held_out]
-    facts = {"path": str(folder), "recordings": len(kept), "held_out": len(others)}
-    draws = _drawn(found), _drawn(kept), _drawn(others) if others else None
-    return _Source(folder, recorded, *draws, facts)
+    return _Source(folder, recorded, None, found)
 
 
-def _episodes(folder: Path, sensor: str | None) -> _Source:
-    episodes = EpisodeSet(folder)
-    named = sensor_of(sensor, episodes)
-
-    def draw(count: int, seed: int, offsets: Offsets) -> TouchFrames:
-        return sample_frames(episodes, named, count, seed, offsets)
-
-    facts = {"path": str(folder), "episodes": len(episodes), "checksum": episodes.checksum}
-    return _Source(folder, named, draw, draw, None, facts)
-
-
-def _drawn(recordings: Sequence[Recorded]) -> Draw:
-    return lambda count, seed, offsets: sample_recordings(recordings, count, seed, offsets)
-
-
-def _joined(draws: list[Draw]) -> Draw:
+def _join(draws: list[Draw]) -> Draw:
     return lambda count, seed, offsets: TouchFrames.joined(
         [draw(count, seed, offsets) for draw in draws]
     )

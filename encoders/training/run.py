@@ -7,6 +7,7 @@ from typing import Any
 from touchgoal.encoders.training.checkpoint import check_run_folder
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import check_device
+from touchgoal.episodes.overlap import require_no_shared_frames
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import provenance
@@ -44,13 +45,15 @@ def open_sets(data: Path, validation: Path) -> tuple[EpisodeSet, EpisodeSet]:
     """Open the training and the validation set.
 
     Raises:
-        UserError: They are the same, or damaged.
+        UserError: They are the same, share frames, or are damaged.
     """
     if data.resolve() == validation.resolve():
         raise UserError(
             f"--data and --validation are both {data}: validate on episodes that are not trained on"
         )
-    return EpisodeSet(data), EpisodeSet(validation)
+    sets = EpisodeSet(data), EpisodeSet(validation)
+    require_no_shared_frames(*sets)
+    return sets
 
 
 def recipe(data: EpisodeSet, validation: EpisodeSet) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from typing import Any, cast
 
 from touchgoal.control import features as ft
 from touchgoal.control.tactile.sensor_models import find_sensor
-from touchgoal.episodes.overlap import require_no_shared_frames
 from touchgoal.episodes.pauses import leading_pause
 from touchgoal.episodes.recording import CORRECTED
 from touchgoal.episodes.store import EpisodeSet
@@ -61,18 +60,6 @@ def choose_episodes(episodes: EpisodeSet, include_unknown: bool = False) -> Chos
             f"unknown success): {remedy}"
         )
     return chosen
-
-
-def check_apart(data: EpisodeSet, validation: EpisodeSet) -> None:
-    """Raise UserError if an episode, or its frames, are in both sets, in one folder or in two."""
-    known = {data.episode_checksum(i) for i in range(len(data))}
-    for i in range(len(validation)):
-        if validation.episode_checksum(i) in known:
-            raise UserError(
-                f"episode {i} of {validation.root} is also in {data.root}: validate on episodes that "
-                "are not trained on"
-            )
-    require_no_shared_frames(data, validation)
 
 
 def find_pauses(episodes: EpisodeSet, rows: Sequence[int]) -> list[int]:
