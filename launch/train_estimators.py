@@ -62,7 +62,6 @@ def main(config: Config) -> None:
         save_estimator,
     )
     from touchgoal.policies.training.model_selection import add_parts
-    from touchgoal.policies.training.training_data import check_apart
     from touchgoal.runtime import seeds
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.run_folder import write_json
@@ -76,7 +75,6 @@ def main(config: Config) -> None:
             f"{encoder} reads several frames; a state estimator needs one of single frames"
         )
     first_seed = seeds.POSE_TRAINING.first(config.objects, "--objects")
-    check_apart(*sets)
     out = open_training(config, "train-estimators")
     reused = load_network(config.pose) if config.pose else None
     pose_config = reused.config.pose_estimator if reused else config.pose_estimator

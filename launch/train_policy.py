@@ -149,7 +149,6 @@ def main(config: Config) -> None:
     sensor = training_data.common_sensor(chosen) if reads_touch else ""
     if config.trials:
         training_data.check_sensor(sensor, env.sensor)
-    training_data.check_apart(*sets)
     pauses = [training_data.find_pauses(*one) for one in chosen]
     policy = replace(_policy_config(config, sets[0], touch), task=task, sensor=sensor)
     out = open_training(config, "train-policy")

@@ -22,9 +22,7 @@ def press(brightness: int) -> np.ndarray:
     return pictures
 
 
-def write_videos(
-    folder: Path, splits: tuple[str, ...] = SPLITS, brightness: int = 180
-) -> Path:
+def write_videos(folder: Path, splits: tuple[str, ...] = SPLITS, brightness: int = 180) -> Path:
     """One video of each split: the held-out ones are darker than untouched, the others brighter."""
     (folder / "videos").mkdir(parents=True)
     with (folder / "labels.csv").open("w", newline="") as file:
