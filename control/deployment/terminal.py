@@ -33,8 +33,8 @@ def say(text: str) -> None:
     try:
         print(text, flush=True)
     except BrokenPipeError:
-        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-        sys.stdout.flush()  # the text is still in the buffer
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # for whatever flushes it later
+        print(text, file=sys.stderr, flush=True)
 
 
 class Terminal:
