@@ -1,13 +1,14 @@
 """Timed moves for the arm itself: joint moves and straight lines inside every limit.
 
-A path is a Chebyshev polynomial per joint over its length, walked along an S-curve: as fast as speed,
-acceleration and jerk let it, which for a single joint is the fastest there is. Where a joint's speed
-limit shrinks near the end of its range, slower cruises and longer braking are tried.
+A path is a Chebyshev polynomial per joint over its length. Ruckig walks it: the fastest profile from rest
+to rest inside limits of speed, acceleration and jerk. Where a joint's speed limit shrinks near the end of
+its range, slower cruises and longer braking are tried.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+import ruckig
 from jaxtyping import Float
 from numpy.polynomial import chebyshev
 
@@ -19,7 +20,6 @@ from touchgoal.control.motion.rotations import (
     rotation_matrix,
     rotation_vector,
 )
-from touchgoal.control.motion.s_curve import SCurve, s_curve
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.runtime.errors import UserError
 
@@ -32,6 +32,63 @@ _SLACK = 1.005
 # Shares of full speed and of full braking that are tried where full ones would break a limit.
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3, 0.2)
 
+Times = Float[np.ndarray, " k"]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Share of a path walked over time, in pieces of constant jerk.
+
+    Attributes:
+        starts: of the pieces, then the end, s.
+        rates: share, speed, acceleration and jerk at these, per s^0 to s^3.
+    """
+
+    starts: Float[np.ndarray, " m"]
+    rates: Float[np.ndarray, "4 m"]
+
+    @classmethod
+    def fastest(
+        cls, speed: float, acceleration: float, deceleration: float, jerk: float
+    ) -> "Timing":
+        """Return the fastest from rest to rest inside these limits of the share, by Ruckig."""
+        unit = jerk ** (-1 / 3)  # s, in which jerk is 1: limits of very short paths are huge
+        wanted, found = ruckig.InputParameter(1), ruckig.Trajectory(1)
+        wanted.current_position, wanted.target_position = [0.0], [1.0]
+        wanted.max_velocity, wanted.max_jerk = [speed * unit], [1.0]
+        wanted.max_acceleration = [acceleration * unit**2]
+        wanted.min_acceleration = [-deceleration * unit**2]
+        result = ruckig.Ruckig(1).calculate(wanted, found)
+        assert result == ruckig.Result.Working, result
+        profile = found.profiles[0][0]
+        rates = np.array([profile.p, profile.v, profile.a, [*profile.j, 0.0]])
+        return cls(np.append(0.0, np.cumsum(profile.t)), rates).slowed(unit)
+
+    @property
+    def duration(self) -> float:
+        """From rest to rest, s."""
+        return float(self.starts[-1])
+
+    @property
+    def corners(self) -> Times:
+        """Times (s) at which the jerk changes, and the moments before."""
+        return np.concatenate([self.starts, self.starts - 1e-9])
+
+    def derivatives(self, t: Times) -> tuple[Times, Times, Times, Times]:
+        """Return the share of the path and its first three derivatives at times `t` (s)."""
+        piece = np.clip(np.searchsorted(self.starts, t, "right") - 1, 0, self.starts.size - 1)
+        s, s1, s2, s3 = self.rates[:, piece]
+        moves = (t >= 0) & (t < self.duration)
+        dt = np.where(moves, t - self.starts[piece], 0.0)
+        share = s + dt * (s1 + dt * (s2 / 2 + dt * s3 / 6))
+        rates = (s1 + dt * (s2 + dt * s3 / 2), s2 + dt * s3, s3)
+        speed, acceleration, jerk = (np.where(moves, rate, 0.0) for rate in rates)
+        return np.where(t < self.duration, share, 1.0), speed, acceleration, jerk
+
+    def slowed(self, factor: float) -> "Timing":
+        """Return the same profile, `factor` times as long."""
+        return Timing(factor * self.starts, self.rates / factor ** np.arange(4)[:, None])
+
 
 @dataclass(frozen=True)
 class Trajectory:
@@ -39,11 +96,11 @@ class Trajectory:
 
     Attributes:
         coefficients: of the Chebyshev polynomials over the path, whose ends are -1 and 1; rad.
-        timing: how the path is walked.
+        timing: of the walk along the path.
     """
 
     coefficients: Float[np.ndarray, "d n"]
-    timing: SCurve
+    timing: Timing
 
     @property
     def duration(self) -> float:
@@ -51,18 +108,18 @@ class Trajectory:
         return self.timing.duration
 
     def at(self, t: Float[np.ndarray, "*k"] | float) -> Float[np.ndarray, "*k n"]:
-        """Joint positions (rad) at times `t` (s); before the start and after the end it rests."""
+        """Return the joint positions (rad) at times `t` (s); at rest before the start and after the end."""
         times = np.asarray(t, dtype=np.float64)
         s = self.timing.derivatives(times.ravel())[0].reshape(times.shape)
         return np.moveaxis(chebyshev.chebval(2 * s - 1, self.coefficients), 0, -1)
 
     def sample(self, hz: float) -> Float[np.ndarray, "k n"]:
-        """Joint positions (rad) at a fixed rate, both ends included."""
+        """Return the joint positions (rad) at a fixed rate, both ends included."""
         return self.at(np.arange(int(np.ceil(self.duration * hz)) + 1) / hz)
 
 
 def joint_move(start: Joints, goal: Joints, limits: JointLimits) -> Trajectory:
-    """Straight in joint space, all joints together, at rest at both ends.
+    """Return the move straight in joint space, all joints together, at rest at both ends.
 
     UserError if an end is outside the limits' range.
     """
@@ -76,7 +133,7 @@ def straight_line(
     rotation: Matrix3,
     limits: JointLimits,
 ) -> Trajectory:
-    """The TCP straight from where `start` has it to a pose in the base frame, turning evenly.
+    """Return the TCP's straight line from `start` to a pose in the base frame, turning evenly.
 
     UserError if the line leaves the arm's reach or the limits' range, or bends at a singularity.
     """
@@ -100,9 +157,7 @@ def straight_line(
             )
         q.append(solution.q)
     trajectory = _timed(chebyshev.chebfit(nodes, np.array(q), _DEGREE), limits)
-    points = np.array(
-        [kinematics.forward(p)[0] for p in trajectory.sample(100 / trajectory.duration)]
-    )
+    points = kinematics.forward_many(trajectory.sample(100 / trajectory.duration))[0]
     line = position - origin
     unit = line / max(float(np.linalg.norm(line)), 1e-9)
     away = points - origin
@@ -115,7 +170,7 @@ def straight_line(
 
 
 def require_inside_workspace(trajectory: Trajectory, safety: ActionFilter) -> None:
-    """UserError if the flange or the fingers leave their boxes on the way (looked at 100 Hz)."""
+    """UserError if flange or fingers leave their boxes on the way (checked at 100 Hz)."""
     inside = safety.inside_workspace(trajectory.sample(100))
     if not inside.all():
         raise UserError(
@@ -125,12 +180,12 @@ def require_inside_workspace(trajectory: Trajectory, safety: ActionFilter) -> No
 
 
 def _timed(coefficients: Float[np.ndarray, "d n"], limits: JointLimits) -> Trajectory:
-    """The path walked as fast as the limits let it."""
+    """Return the path walked as fast as the limits let it."""
     q, slope = (_path(coefficients, np.linspace(0, 1, _SAMPLES), k) for k in (0, 1))
     _require_range(q, limits)
     steepest = np.abs(slope).max(axis=0)
     if not steepest.any():
-        return Trajectory(coefficients, s_curve(1e3, 1e6, 1e6, 1e9))  # it is there already
+        return Trajectory(coefficients, Timing.fastest(1e3, 1e6, 1e6, 1e9))  # it is there already
     full = [
         float((limit / np.maximum(steepest, 1e-12)).min())
         for limit in (limits.velocity, limits.acceleration, limits.jerk)
@@ -138,7 +193,7 @@ def _timed(coefficients: Float[np.ndarray, "d n"], limits: JointLimits) -> Traje
     best = None
     for cruise in _SHARES:
         for braking in _SHARES:
-            timing = s_curve(cruise * full[0], full[1], braking * full[1], full[2])
+            timing = Timing.fastest(cruise * full[0], full[1], braking * full[1], full[2])
             if best is not None and timing.duration >= best.duration:
                 break  # slower braking takes longer still
             timing = timing.slowed(_excess(coefficients, timing, limits))
@@ -151,7 +206,7 @@ def _timed(coefficients: Float[np.ndarray, "d n"], limits: JointLimits) -> Traje
 def _path(
     coefficients: Float[np.ndarray, "d n"], s: Float[np.ndarray, " k"], order: int
 ) -> Float[np.ndarray, "k n"]:
-    """Joint positions at shares `s` of the path, or their derivative of some order by the share."""
+    """Return the joint positions at shares `s` of the path, or their derivative by the share."""
     derived = chebyshev.chebder(coefficients, order)
     return 2**order * chebyshev.chebval(2 * s - 1, derived).T
 
@@ -166,8 +221,8 @@ def _require_range(q: Float[np.ndarray, "k n"], limits: JointLimits) -> None:
         )
 
 
-def _excess(coefficients: Float[np.ndarray, "d n"], timing: SCurve, limits: JointLimits) -> float:
-    """How many times as long the path must take to be inside every limit; at least once.
+def _excess(coefficients: Float[np.ndarray, "d n"], timing: Timing, limits: JointLimits) -> float:
+    """Return how many times as long the path must take to be inside every limit; at least 1.
 
     Speed, acceleration and jerk fall with the duration to the power of -1, -2 and -3.
     """
