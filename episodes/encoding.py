@@ -1,10 +1,10 @@
-"""An episode as the bytes that lie on disk, and back.
+"""Conversion of an episode to the bytes on disk, and back.
 
 Numbers are stored as they are, touch as PNG, cameras as H.264, both lossless. Encoding is the
 slow part of recording and holds no state: worker processes encode, one process appends.
 
-A data file carries a `Description` of its episode as JSON in its Parquet footer (key `touchgoal`),
-so that everything under meta/ can be made again from the data files alone.
+The Parquet footer of a data file carries a `Description` of its episode as JSON (key `touchgoal`) and
+its checksum, so that everything under meta/ can be rebuilt from the data files alone.
 """
 
 import io
@@ -29,6 +29,7 @@ from touchgoal.episodes.schema import (
     Episode,
     MetaValue,
     describe_features,
+    drop_pixel_format,
     is_camera,
     is_image,
 )
@@ -36,7 +37,7 @@ from touchgoal.runtime.errors import UserError
 
 # Frames a row group: reading one window of touch reads a few groups, not the whole episode.
 FRAMES_PER_ROW_GROUP = 32
-_FOOTER_KEY = b"touchgoal"
+_FOOTER_KEY, _CHECKSUM_KEY = b"touchgoal", b"touchgoal.crc32"
 _MOST_PIXELS = 50_000_000
 # Measured on noisy 320 x 240 touch: 3.6 ms and 90 kB a frame; OpenCV's default filter 8.1 ms and
 # 110 kB, PIL at compress_level 1 11.0 ms and 114 kB.
@@ -52,16 +53,16 @@ _PNG = [
 
 @dataclass(frozen=True)
 class Description:
-    """All that is said of an episode beside its frames, free of its place in a set.
+    """Everything about an episode but its frames and its place in a set.
 
     Attributes:
-        fps: frames per second.
-        features: as in LeRobot's meta/info.json.
-        task: the instruction.
-        meta: facts about the episode.
-        length: number of frames.
-        stats: key -> statistics, without the index columns.
-        video_crc32: camera key -> checksum of its MP4 file, which has none of its own.
+        fps: Frames per second.
+        features: As in LeRobot's meta/info.json.
+        task: Instruction.
+        meta: Facts about the episode.
+        length: Number of frames.
+        stats: Key -> statistics, without the index columns.
+        video_crc32: Camera key -> checksum of its MP4 file.
     """
 
     fps: int
@@ -75,12 +76,12 @@ class Description:
 
 @dataclass(frozen=True, eq=False)
 class EncodedEpisode:
-    """An episode ready to be appended; pickles.
+    """An episode ready to be appended; it pickles.
 
     Attributes:
-        description: everything but the frames.
-        columns: key -> PNG bytes per frame for touch, array (T, d) for numbers.
-        videos: camera key -> MP4 bytes.
+        description: Everything but the frames.
+        columns: Key -> PNG bytes per frame for touch, array (T, d) for numbers.
+        videos: Camera key -> MP4 bytes.
     """
 
     description: Description
@@ -89,10 +90,10 @@ class EncodedEpisode:
 
 
 def encode(episode: Episode, fps: int) -> EncodedEpisode:
-    """Compresses an episode recorded at `fps` frames per second.
+    """Compress an episode recorded at `fps` frames per second.
 
     Raises:
-        UserError: the episode does not pass `Episode.check`.
+        UserError: The episode does not pass `Episode.check`.
     """
     episode.check()
     columns, videos, stats = {}, {}, {}
@@ -119,32 +120,32 @@ def encode(episode: Episode, fps: int) -> EncodedEpisode:
 
 
 def encode_png(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """A PNG file of an RGB picture, without loss, tuned for speed."""
+    """Return an RGB image as a PNG file, tuned for speed."""
     return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), _PNG)[1].tobytes()
 
 
 def decode_png(png: bytes) -> UInt8[np.ndarray, "h w 3"]:
-    """The RGB picture of a PNG file."""
+    """Return the RGB image of a PNG file."""
     width, height = struct.unpack(">II", png[16:24].ljust(8, b"\0"))
     image = None
     if 0 < width * height <= _MOST_PIXELS:  # a few bytes may unpack to gigabytes
         image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
-        raise UserError("a picture in the data file is no readable PNG")
+        raise UserError("an image in the data file is no readable PNG")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def index_columns(
     length: int, fps: int, episode_index: int, first_index: int, task_index: int
 ) -> dict[str, Shaped[np.ndarray, " n"]]:
-    """LeRobot's index columns of an episode at its place in a set.
+    """Return LeRobot's index columns of an episode at its place in a set.
 
     Args:
-        length: frames of the episode.
-        fps: frames per second; time stamps are frame_index / fps seconds, exactly.
-        episode_index: position of the episode in the set.
-        first_index: frames in all episodes before it.
-        task_index: row of its task in meta/tasks.parquet.
+        length: Number of frames.
+        fps: Frames per second; time stamps are exactly frame_index / fps seconds.
+        episode_index: Position of the episode in the set.
+        first_index: Number of frames in all episodes before it.
+        task_index: Row of its task in meta/tasks.parquet.
     """
     frame = np.arange(length)
     columns = {
@@ -158,54 +159,55 @@ def index_columns(
 
 
 def data_file(encoded: EncodedEpisode, indices: dict[str, Shaped[np.ndarray, " n"]]) -> bytes:
-    """The Parquet file of an episode's numbers and touch, with its description in the footer."""
+    """Return the Parquet file of an episode's numbers and touch, with its description in the footer."""
     arrays = {key: _to_arrow(key, column) for key, column in encoded.columns.items()}
     arrays |= {key: pa.array(column) for key, column in indices.items()}
     return write_table(pa.table(arrays), encoded.description)
 
 
 def write_table(table: pa.Table, description: Description) -> bytes:
-    """A Parquet file of frames: with a checksum on every page."""
-    footer = {_FOOTER_KEY: json.dumps(vars(description)).encode()}
-    # Read back, the elements of a list have another name: the same content is to make the same bytes.
-    columns = {name: _as_encoded(table[name].combine_chunks()) for name in table.column_names}
-    table = pa.table(columns).replace_schema_metadata(footer)
+    """Return a Parquet file of frames with a checksum on every page and on the description."""
+    text = json.dumps(vars(description)).encode()
+    footer = {_FOOTER_KEY: text, _CHECKSUM_KEY: str(zlib.crc32(text)).encode()}
     file = io.BytesIO()
     pq.write_table(
-        table,
+        table.replace_schema_metadata(footer),
         file,
         row_group_size=FRAMES_PER_ROW_GROUP,
         compression="none",  # PNG is compressed; the numbers are a thousandth of it
         use_dictionary=False,
-        write_statistics=False,  # would repeat whole pictures as a column's least and greatest
+        write_statistics=False,  # would repeat whole images as a column's least and greatest
         write_page_checksum=True,
     )
     return file.getvalue()
 
 
-def _as_encoded(column: pa.Array) -> pa.Array:
-    if not pa.types.is_fixed_size_list(column.type):
-        return column
-    return pa.FixedSizeListArray.from_arrays(column.flatten(), column.type.list_size)
-
-
 def has_description(file: pq.ParquetFile) -> bool:
-    """Whether touchgoal wrote a data file."""
+    """Return whether touchgoal wrote a data file."""
     return _FOOTER_KEY in (file.schema_arrow.metadata or {})
 
 
 def read_description(file: pq.ParquetFile) -> Description:
-    """The description in a data file's footer.
+    """Return the description in a data file's footer.
 
     Raises:
-        UserError: the file was not written by touchgoal.
+        UserError: touchgoal did not write the file, or its footer is damaged.
     """
     if not has_description(file):
         raise UserError("this Parquet file was not written by touchgoal")
+    text, footer = file.schema_arrow.metadata[_FOOTER_KEY], file.schema_arrow.metadata
+    checksum = footer.get(_CHECKSUM_KEY)  # which files of older versions lack
     try:
-        return Description(**json.loads(file.schema_arrow.metadata[_FOOTER_KEY]))
-    except (ValueError, TypeError, RecursionError) as error:
+        if checksum is not None and int(checksum) != zlib.crc32(text):
+            raise ValueError("checksum")
+        description = Description(**json.loads(text))
+        drop_pixel_format(description.features)
+        stored = {k for k, f in description.features.items() if f["dtype"] != "video"}
+        if stored != set(file.schema_arrow.names):
+            raise ValueError("columns")
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise UserError("the description in this Parquet file is damaged") from error
+    return description
 
 
 def _to_arrow(key: str, column: Shaped[np.ndarray, "n d"] | list[bytes]) -> pa.Array:
@@ -222,12 +224,12 @@ def _to_arrow(key: str, column: Shaped[np.ndarray, "n d"] | list[bytes]) -> pa.A
 def read_columns(
     file: pq.ParquetFile, features: dict[str, dict[str, Any]], frames: Int[np.ndarray, " n"]
 ) -> dict[str, Shaped[np.ndarray, "n ..."]]:
-    """Reads some columns of some frames of a data file; nothing else is decoded.
+    """Read some columns of some frames of a data file; nothing else is decoded.
 
     Args:
-        file: an open data file.
-        features: the features to read, as in meta/info.json.
-        frames: frame indices, in any order.
+        file: Open data file.
+        features: Features to read, as in meta/info.json.
+        frames: Frame indices, in any order.
     """
     out = {
         key: np.empty((len(frames), *feature["shape"]), FEATURES[key].dtype)

@@ -1,13 +1,14 @@
-"""The tables under meta/ of a LeRobotDataset v3, and durable writing.
+"""The files under meta/ of a LeRobotDataset v3.
 
-What goes beyond LeRobot are columns of meta/episodes that it ignores: `touchgoal/NAME` for the
-episode's fact NAME (plain scalar or list of strings) and `videos/KEY/crc32` for the checksum of
-its video.
+Columns of meta/episodes beyond LeRobot's, which ignores them: `touchgoal/NAME` for the entry NAME of an
+episode's `meta` (scalar or list of strings), `videos/KEY/crc32` for the checksum of its video.
 """
 
+import io
 import json
 import sys
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from touchgoal.control.features import FEATURES
-from touchgoal.episodes.bytes_on_disk import json_bytes, parquet_bytes
-from touchgoal.episodes.encoding import Description, index_columns
-from touchgoal.episodes.schema import INDEX_DTYPES
+from touchgoal.episodes.encoding import Description, has_description, index_columns
+from touchgoal.episodes.schema import INDEX_DTYPES, drop_pixel_format
 from touchgoal.episodes.statistics import Stats, array_statistics, merge
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.json_file import parse_json
 
 VERSION = "v3.0"
 CHUNK = 1000
@@ -32,54 +33,52 @@ INFO = "meta/info.json"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 TASKS = "meta/tasks.parquet"
 STATS = "meta/stats.json"
+_COUNTS = {"fps": 1, "total_episodes": 0, "total_frames": 0, "total_tasks": 0}  # least values
 
 Row = dict[str, Any]
 
 
 def repair_command(root: Path) -> str:
-    """What an error message tells the user to run."""
+    """Return the advice of an error message to repair a set."""
     return f"run: touchgoal repair --fix {root}"
 
 
 def set_folder(path: Path) -> Path:
-    """The set in `path` or in its subfolder `episodes`, where recording commands write it.
-
-    Says on stderr when it is the subfolder; returns `path` if neither holds a set.
-    """
+    """Return the folder of a set: `path`, or its `episodes/` where it is a run folder (noted on stderr)."""
     inside = path / "episodes"
-    if (path / INFO).exists() or not (inside / INFO).exists():
+    if (path / INFO).exists() or not inside.is_dir():
         return path
     print(f"{path} is a run folder: taking the episodes in {inside}", file=sys.stderr)
     return inside
 
 
 def data_path(file_number: int) -> str:
-    """Path in the set of the data file `file_number`; each holds one episode."""
+    """Return the path in the set of a data file, which holds one episode."""
     return DATA_PATH.format(chunk_index=file_number // CHUNK, file_index=file_number % CHUNK)
 
 
 def video_path(key: str, file_number: int) -> str:
-    """Path in the set of the video of camera `key`, file `file_number`."""
+    """Return the path in the set of a video of camera `key`."""
     return VIDEO_PATH.format(
         video_key=key, chunk_index=file_number // CHUNK, file_index=file_number % CHUNK
     )
 
 
 def file_number_of(row: Row) -> int:
-    """Number of an episode's files; repair leaves gaps, so it may exceed its position."""
+    """Return the number of an episode's files; after a repair it may exceed the episode's index."""
     return row["data/chunk_index"] * CHUNK + row["data/file_index"]
 
 
 @dataclass(frozen=True)
 class SetMetadata:
-    """What meta/ says of a set of episodes.
+    """Content of meta/.
 
     Attributes:
-        fps: frames per second.
-        features: as in info.json.
-        tasks: all instructions; the position is the task_index.
-        stats: statistics over all frames by key.
-        episodes: the table meta/episodes, one row an episode; None before the first.
+        fps: Frames per second.
+        features: As in info.json.
+        tasks: All instructions; the position is the task_index.
+        stats: Statistics over all frames by key.
+        episodes: Table meta/episodes, one row an episode; None before the first.
     """
 
     fps: int
@@ -95,14 +94,14 @@ class SetMetadata:
 
     @property
     def next_file_number(self) -> int:
-        """Number of the files of the episode to come."""
+        """Number of the next episode's files."""
         return file_number_of(last_row(self.episodes)) + 1 if self.episodes is not None else 0
 
     def with_episode(self, description: Description, file_number: int) -> "SetMetadata":
-        """This metadata with one more episode, whose files have number `file_number`.
+        """Return this metadata with one more episode, whose files have number `file_number`.
 
         Raises:
-            UserError: its frame rate, features or facts differ from the set's.
+            UserError: Its frame rate, features or meta keys differ from the set's.
         """
         self._check_same(description)
         tasks = tuple(dict.fromkeys((*self.tasks, description.task)))
@@ -112,9 +111,9 @@ class SetMetadata:
         }
         row = self._row(description, file_number, stats)
         schema = _schema(row) if self.episodes is None else self.episodes.schema
-        if facts := _differing_facts(row, schema):
+        if differing := _differing_meta(row, schema):
             raise UserError(
-                f"the episode's meta differs from the set's in {', '.join(facts)}: give every "
+                f"the episode's meta differs from the set's in {', '.join(differing)}: give every "
                 "episode of a set the same keys with the same types"
             )
         table = pa.Table.from_pylist([row], schema=schema)
@@ -125,7 +124,7 @@ class SetMetadata:
         return replace(self, tasks=tasks, stats=stats, episodes=table)
 
     def index_columns_for(self, description: Description) -> dict[str, Any]:
-        """The index columns of an episode that would come next."""
+        """Return the index columns of an episode that would come next."""
         before = last_row(self.episodes)
         tasks = list(dict.fromkeys((*self.tasks, description.task)))
         return index_columns(
@@ -178,13 +177,14 @@ class SetMetadata:
         return row
 
     def write(self, root: Path) -> None:
-        """Writes all of meta/, each file at once and info.json, which commits, last."""
-        write_file(root / EPISODES, parquet_bytes(self.episodes))
-        write_file(root / STATS, json_bytes(self.stats))
-        write_file(root / TASKS, parquet_bytes(_tasks_table(self.tasks)))
-        write_file(root / INFO, json_bytes(self._info()))
+        """Write all of meta/, each file atomically and info.json, which commits, last."""
+        write_file(root / EPISODES, _parquet(self.episodes))
+        write_file(root / STATS, _json(self.stats))
+        write_file(root / TASKS, _parquet(_tasks_table(self.tasks)))
+        write_file(root / INFO, _json(self.info()))
 
-    def _info(self) -> dict[str, Any]:
+    def info(self) -> dict[str, Any]:
+        """Return the content of info.json."""
         last = last_row(self.episodes)
         videos = any(feature["dtype"] == "video" for feature in self.features.values())
         return {
@@ -205,10 +205,10 @@ class SetMetadata:
 
     @classmethod
     def load(cls, root: Path) -> "SetMetadata":
-        """Reads all of meta/ of a set.
+        """Read all of meta/.
 
         Raises:
-            UserError: no set, an unknown version, or a file that cannot be read.
+            UserError: No set, an unknown version, or a file that cannot be read.
         """
         info = load_info(root)
         return cls(
@@ -220,8 +220,18 @@ class SetMetadata:
         )
 
 
+def _parquet(table: pa.Table | None) -> bytes:
+    file = io.BytesIO()
+    pq.write_table(table, file, write_page_checksum=True)
+    return file.getvalue()
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(value, indent=1, allow_nan=False).encode()
+
+
 def read_video(root: Path, name: str, crc32: int) -> bytes:
-    """The bytes of a video file of a set; UserError names it if it is missing or damaged."""
+    """Return the bytes of a video file of a set; UserError if it is missing or damaged."""
     try:
         video = (root / name).read_bytes()
         if zlib.crc32(video) != crc32:
@@ -231,14 +241,11 @@ def read_video(root: Path, name: str, crc32: int) -> bytes:
     return video
 
 
-_NEEDED = "fps", "features", "total_episodes", "total_frames", "total_tasks"
-
-
 def load_info(root: Path) -> dict[str, Any]:
-    """Reads meta/info.json.
+    """Read meta/info.json.
 
     Raises:
-        UserError: no set, or one of another version.
+        UserError: No set, one of another version, or a value that cannot be.
     """
     if not (root / INFO).exists():
         raise UserError(
@@ -247,15 +254,23 @@ def load_info(root: Path) -> dict[str, Any]:
         )
     info = load_json(root, INFO)
     check_version(root, info)
-    if missing := [key for key in _NEEDED if key not in info]:
-        raise UserError(
-            f"{root / INFO} is corrupt (it has no {missing[0]}): {repair_command(root)}"
-        )
+    features = info.get("features")
+    sound = isinstance(features, dict) and all(
+        isinstance(f, dict) and isinstance(f.get("dtype"), str) and isinstance(f.get("shape"), list)
+        for f in features.values()
+    )
+    wrong = [] if sound else ["features"]
+    for key, least in _COUNTS.items():
+        if type(value := info.get(key)) is not int or value < least:
+            wrong.append(f"{key} = {value!r}")
+    if wrong:
+        raise unreadable(root, INFO, ValueError(f"wrong {', '.join(wrong)}"))
+    drop_pixel_format(info["features"])
     return info
 
 
 def check_version(root: Path, info: dict[str, Any]) -> None:
-    """Raises UserError if info.json says another version than `VERSION`."""
+    """Raise UserError if info.json names another version than `VERSION`."""
     if (version := info.get("codebase_version")) != VERSION:
         raise UserError(
             f"{root} is of LeRobot version {version!r}, touchgoal reads {VERSION}: convert it with "
@@ -264,30 +279,32 @@ def check_version(root: Path, info: dict[str, Any]) -> None:
 
 
 def load_json(root: Path, name: str) -> dict[str, Any]:
-    """Reads a JSON file of a set; UserError names it if it is missing or broken."""
+    """Read a JSON object of a set; UserError if it is missing or broken."""
     try:
-        return json.loads((root / name).read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
+        if not isinstance(value := parse_json((root / name).read_bytes()), dict):
+            raise ValueError("it holds no object")
+        return value
+    except (OSError, ValueError) as error:
         raise unreadable(root, name, error) from error
 
 
 def load_table(root: Path, name: str, leave_out: str | None = None) -> pa.Table:
-    """Reads a Parquet file of a set, without the columns that begin with `leave_out`.
+    """Read a Parquet file of a set, without the columns that begin with `leave_out`.
 
     Raises:
-        UserError: the file is missing or broken.
+        UserError: The file is missing or broken.
     """
     try:
-        with pq.ParquetFile(root / name) as file:
+        with pq.ParquetFile(root / name, page_checksum_verification=True) as file:
             names = file.schema_arrow.names
-            kept = [n for n in names if leave_out is None or not n.startswith(leave_out)]
-            return file.read(kept).combine_chunks()
+            columns = [n for n in names if leave_out is None or not n.startswith(leave_out)]
+            return file.read(columns).combine_chunks()
     except (OSError, pa.ArrowException) as error:
         raise unreadable(root, name, error) from error
 
 
 def unreadable(root: Path, name: str, error: Exception) -> UserError:
-    """The error, in one line, that the file `name` of a set is missing or broken."""
+    """Return the error that the file `name` of a set is missing or broken."""
     if isinstance(error, FileNotFoundError):
         return UserError(f"{root / name} is missing: {repair_command(root)}")
     reason = str(error).splitlines()[0]
@@ -295,32 +312,51 @@ def unreadable(root: Path, name: str, error: Exception) -> UserError:
 
 
 def refuse_other_writers(root: Path, features: dict[str, Any], episodes: pa.Table | None) -> None:
-    """Raises UserError if lerobot wrote the set or added episodes to it.
+    """Raise UserError if lerobot wrote the set or added episodes to it.
 
-    touchgoal writes one file under meta/episodes and one data file an episode, with checksums; lerobot
-    puts several episodes into a file and begins further files.
+    touchgoal writes one file under meta/episodes, and one data file an episode with a description in
+    its footer; lerobot puts several episodes into a file and begins further files.
 
     Args:
-        root: folder of the set.
-        features: as in info.json.
-        episodes: the table meta/episodes; None if it cannot be read.
+        root: Folder of the set.
+        features: As in info.json.
+        episodes: Table meta/episodes; None if it cannot be read.
     """
     listed = (root / "meta/episodes").rglob("*.parquet")
     if others := sorted(path for path in listed if path != root / EPISODES):
         raise written_by_others(root, others[0])
-    if not set(features) <= {*FEATURES, *INDEX_DTYPES}:
-        raise written_by_others(root, root / INFO)
+    if unknown := sorted(set(features) - {*FEATURES, *INDEX_DTYPES}):
+        refuse_foreign_data_files(root, if_none=root / INFO)
+        raise unreadable(root, INFO, ValueError(f"unknown feature {unknown[0]!r}"))
     if episodes is None:
         return
     places = episodes.select(["data/chunk_index", "data/file_index"]).to_pylist()
     cameras = [key for key, feature in features.items() if feature["dtype"] == "video"]
     unchecked = any(f"videos/{key}/crc32" not in episodes.column_names for key in cameras)
     if unchecked or len({file_number_of(row) for row in places}) < len(places):
-        raise written_by_others(root, root / EPISODES)
+        refuse_foreign_data_files(root, if_none=root / EPISODES)
+        raise unreadable(root, EPISODES, ValueError("wrong places of files"))
+
+
+def refuse_foreign_data_files(root: Path, if_none: Path | None = None) -> None:
+    """Raise UserError if touchgoal did not write one of the data files that can be read.
+
+    Args:
+        root: Folder of the set.
+        if_none: File that is blamed where no data file can be read; None to allow that.
+    """
+    own = False
+    for path in sorted((root / "data").rglob("*.parquet")):
+        with suppress(OSError, pa.ArrowException), pq.ParquetFile(path) as file:
+            if not has_description(file):
+                raise written_by_others(root, path)
+            own = True
+    if not own and if_none is not None:
+        raise written_by_others(root, if_none)
 
 
 def written_by_others(root: Path, path: Path) -> UserError:
-    """The error that a set holds a file that touchgoal did not write."""
+    """Return the error that touchgoal did not write a file of a set."""
     return UserError(
         f"{root} holds episodes that lerobot wrote (see {path}); touchgoal reads only its own and "
         "changes nothing here: use the set with lerobot, or append its episodes to a new set with "
@@ -329,7 +365,7 @@ def written_by_others(root: Path, path: Path) -> UserError:
 
 
 def last_row(table: pa.Table | None) -> Row:
-    """The last row of meta/episodes without statistics, or {} of no table."""
+    """Return the last row of meta/episodes without statistics, or {} without a table."""
     if table is None:
         return {}
     names = [name for name in table.column_names if not name.startswith("stats/")]
@@ -340,8 +376,8 @@ def _dtype_and_shape(feature: dict[str, Any] | None) -> Any:
     return feature and (feature["dtype"], feature["shape"])
 
 
-def _differing_facts(row: Row, schema: pa.Schema) -> list[str]:
-    """Facts that only one of the two has, or that have another type."""
+def _differing_meta(row: Row, schema: pa.Schema) -> list[str]:
+    """Return the meta keys that only one of the two has, or that have another type."""
     ours = _schema(row)
     names = {*ours.names, *schema.names}
     same = {
@@ -362,7 +398,7 @@ def _arrow_type(value: Any) -> pa.DataType:
 
 
 def _tasks_table(tasks: tuple[str, ...]) -> pa.Table:
-    """LeRobot reads tasks with pandas and wants `task` as the index, which pandas finds here."""
+    """Return meta/tasks with pandas' metadata: LeRobot reads it with pandas and expects `task` as index."""
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": list(tasks)})
     column = {"metadata": None}
     pandas = {

@@ -1,10 +1,7 @@
-"""Whether a set of episodes is sound, and making it sound again after a crash or damage."""
+"""Check of a set of episodes, and repair after a crash or damage."""
 
-import io
 import itertools
 import os
-import re
-import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -14,12 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from touchgoal.episodes import metadata
-from touchgoal.episodes.encoding import (
-    Description,
-    has_description,
-    read_description,
-    write_table,
-)
+from touchgoal.episodes.encoding import Description, read_description, write_table
 from touchgoal.episodes.metadata import SetMetadata
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
@@ -29,12 +21,11 @@ from touchgoal.runtime.progress import track
 REPAIRED = "repaired"
 _FOLDERS = ("data", "videos", "meta")
 _META = (metadata.INFO, metadata.EPISODES, metadata.TASKS, metadata.STATS)
-_WRITER = re.compile(r"parquet-cpp-arrow version \d+\.\d+\.\d+")
 _DATA_FILES = "chunk-[0-9][0-9][0-9]/file-[0-9][0-9][0-9].parquet"
 
 
 def unlisted_files(root: Path, set_metadata: SetMetadata | None) -> list[str]:
-    """Files that belong to no listed episode, as paths in the set; hidden ones do not count."""
+    """Return the files that belong to no listed episode, as paths in the set, without hidden ones."""
     known = set(_META)
     cameras = _cameras(set_metadata.features) if set_metadata else []
     for file_number in _file_numbers(set_metadata):
@@ -48,7 +39,7 @@ def unlisted_files(root: Path, set_metadata: SetMetadata | None) -> list[str]:
 
 
 def contradictions_in_meta(root: Path, set_metadata: SetMetadata) -> list[str]:
-    """What info.json, stats.json and tasks.parquet contradict in meta/episodes."""
+    """Return how info.json, stats.json and tasks.parquet contradict meta/episodes."""
     info = metadata.load_info(root)
     frames = metadata.last_row(set_metadata.episodes)["dataset_to_index"]
     problems = []
@@ -77,7 +68,7 @@ def _cameras(features: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def _read_episode(root: Path, file_number: int) -> tuple[Description, pa.Table]:
-    """Reads every byte of an episode's files; checksums show any damage."""
+    """Read every byte of an episode's files and compare the checksums."""
     name = metadata.data_path(file_number)
     try:
         with pq.ParquetFile(root / name, page_checksum_verification=True) as file:
@@ -93,33 +84,30 @@ def _wrong_index_columns(table: pa.Table, indices: dict[str, np.ndarray]) -> lis
     return [k for k, values in indices.items() if not np.array_equal(table[k].to_numpy(), values)]
 
 
-def _refuse_sets_of_others(root: Path) -> None:
-    """Repair would move aside what it does not know, so it must be sure the set is touchgoal's."""
-    if not any((root / folder).is_dir() for folder in _FOLDERS):
+def _require_own_set(root: Path) -> None:
+    """Raise UserError unless touchgoal wrote the set: a repair moves unknown files aside."""
+    listed = [path for path in root.iterdir() if path.name != REPAIRED] if root.is_dir() else [root]
+    if listed and not any((root / folder).is_dir() for folder in _FOLDERS):
         raise UserError(f"{root} is not a set of episodes: give the folder of one")
-    info: dict[str, Any] = {"codebase_version": metadata.VERSION}
-    episodes = None
     if (root / metadata.INFO).exists():
-        with suppress(UserError):  # damaged: the data files will tell
+        info: dict[str, Any] = {"codebase_version": metadata.VERSION}
+        with suppress(UserError):  # damaged: it is rebuilt from the data files
             info = metadata.load_json(root, metadata.INFO)
         metadata.check_version(root, info)
-    with suppress(UserError):
-        episodes = metadata.load_table(root, metadata.EPISODES)
-    metadata.refuse_other_writers(root, info.get("features", {}), episodes)
-    for path in sorted((root / "data").rglob("*.parquet")):
-        with suppress(OSError, pa.ArrowException), pq.ParquetFile(path) as file:
-            if not has_description(file):
-                raise metadata.written_by_others(root, path)
+    metadata.refuse_other_writers(root, {}, None)
+    metadata.refuse_foreign_data_files(root)
 
 
 def validate(root: str | os.PathLike[str]) -> list[str]:
-    """Reads every file of a set and returns what is wrong, one line a problem; [] if sound.
+    """Read every file of a set and return what is wrong, one line a problem; [] if it is sound.
 
     Raises:
-        UserError: not a set, one of another version, or one that lerobot wrote or continued.
+        UserError: Not a set, one of another version, or one that lerobot wrote or continued.
     """
     root = metadata.set_folder(Path(root))
-    _refuse_sets_of_others(root)
+    _require_own_set(root)
+    if not any((root / folder).is_dir() for folder in _FOLDERS):
+        return []  # nothing was recorded yet
     try:
         set_metadata = SetMetadata.load(root)
     except UserError as error:
@@ -135,70 +123,44 @@ def validate(root: str | os.PathLike[str]) -> list[str]:
                 problems.append(
                     f"{name} has wrong {', '.join(differing)}: {metadata.repair_command(root)}"
                 )
-            name = root / metadata.data_path(file_number)
-            same_features = description.features == rebuilt.features
-            if not (same_features and _is_as_written(name, table, description)):
-                problems.append(_altered(root, metadata.data_path(file_number)))
             rebuilt = rebuilt.with_episode(description, file_number)
         except UserError as error:
             problems.append(str(error))
     if not problems and rebuilt is not None:
-        problems += _altered_meta(root, rebuilt)
+        problems += _altered_meta(root, set_metadata, rebuilt)
     return problems + [
         f"{root / n} belongs to no episode" for n in unlisted_files(root, set_metadata)
     ]
 
 
-def _altered(root: Path, name: str) -> str:
-    return f"{root / name} is not as it was written: {metadata.repair_command(root)}"
-
-
-def _is_as_written(path: Path, table: pa.Table, description: Description) -> bool:
-    """Whether a data file has the bytes that its content makes: its footer has no checksum."""
-    return _same_parquet(path.read_bytes(), write_table(table, description))
-
-
-def _altered_meta(root: Path, rebuilt: SetMetadata) -> list[str]:
-    """The files under meta/ that are not what the data files make them."""
-    problems = []
-    with tempfile.TemporaryDirectory() as made:
-        rebuilt.write(Path(made))
-        for name in _META:
-            there, expected = (root / name).read_bytes(), (Path(made) / name).read_bytes()
-            same = _same_parquet if name.endswith(".parquet") else bytes.__eq__
-            if not same(there, expected):
-                problems.append(_altered(root, name))
-    return problems
-
-
-def _same_parquet(there: bytes, made: bytes) -> bool:
-    """Whether the bytes agree; of a file that another release of pyarrow wrote, whether the content does."""
-    if there == made:
-        return True
-    try:
-        with (
-            pq.ParquetFile(io.BytesIO(there)) as first,
-            pq.ParquetFile(io.BytesIO(made)) as second,
-        ):
-            writers = first.metadata.created_by, second.metadata.created_by
-            elsewhere = writers[0] != writers[1] and bool(_WRITER.fullmatch(writers[0]))
-            return elsewhere and first.read().equals(second.read(), check_metadata=True)
-    except (OSError, pa.ArrowException):
-        return False
+def _altered_meta(root: Path, found: SetMetadata, rebuilt: SetMetadata) -> list[str]:
+    """Return the files under meta/ whose content is not that of the data files."""
+    assert found.episodes is not None and rebuilt.episodes is not None
+    same = {
+        metadata.INFO: metadata.load_info(root) == rebuilt.info(),
+        metadata.EPISODES: found.episodes.to_pylist() == rebuilt.episodes.to_pylist(),
+        metadata.TASKS: found.tasks == rebuilt.tasks,
+        metadata.STATS: found.stats == rebuilt.stats,
+    }
+    return [
+        f"{root / name} is not as it was written: {metadata.repair_command(root)}"
+        for name, equal in same.items()
+        if not equal
+    ]
 
 
 def repair(root: str | os.PathLike[str]) -> list[str]:
-    """Makes a set sound again after a crash or damage; deletes nothing.
+    """Make a set sound again after a crash or damage; nothing is deleted.
 
-    Every episode whose files are whole is kept, in order; other files move to `repaired/` inside
-    the set, and so does the old meta/, which is made again from the data files. May itself be
-    killed and run again.
+    Every episode whose files are whole stays, in order; other files move to `repaired/` inside the
+    set, and so does the old meta/, which is rebuilt from the data files. A killed repair can be run
+    again.
 
     Returns:
         What was done, one line each; [] if the set was sound.
 
     Raises:
-        UserError: not a set, one of another version, or one that lerobot wrote or continued.
+        UserError: Not a set, one of another version, or one that lerobot wrote or continued.
     """
     root = metadata.set_folder(Path(root))
     if not validate(root):
@@ -243,7 +205,7 @@ def _rewrite_index_columns(
 
 
 def _move_to_repaired(root: Path, name: str) -> str:
-    """Moves a file of the set into `repaired/`, beside what an earlier repair moved there."""
+    """Move a file of the set into `repaired/`, beside what an earlier repair moved there."""
     target = root / REPAIRED / name
     for i in itertools.count(1):
         if not target.exists():

@@ -1,4 +1,4 @@
-"""What an episode is: synchronised frames in the project's vocabulary, a task, facts about it."""
+"""An episode: synchronised frames, a task in words, and facts about the whole."""
 
 import math
 from dataclasses import dataclass, field
@@ -30,12 +30,12 @@ INDEX_DTYPES = {
 
 
 def is_image(key: str) -> bool:
-    """Whether a key holds pictures, of a camera or of a fingertip sensor."""
+    """Return whether a key holds images, of a camera or of a fingertip sensor."""
     return key.startswith(IMAGE_PREFIX)
 
 
 def is_camera(key: str) -> bool:
-    """Whether a key holds context pictures, stored as video; touch is stored picture by picture."""
+    """Return whether a key holds camera images, stored as video; tactile images are stored singly."""
     return is_image(key) and "tactile" not in key
 
 
@@ -44,12 +44,11 @@ class Episode:
     """One recorded attempt at a task.
 
     Attributes:
-        frames: key of `FEATURES` -> array (T, *shape) in the key's dtype, rows in step at the
-            set's frame rate. Pictures are uint8 RGB (T, h, w, 3); h and w may differ from
-            `FEATURES` but not within a set of episodes, nor may the arm's number of joints.
-        task: the instruction, in words.
-        meta: facts about the whole episode, such as the object, the seed and the outcome. All
-            episodes of a set have the same keys with the same types.
+        frames: Key of `FEATURES` -> array (T, *shape) in the key's dtype, one row a frame. Images are
+            uint8 RGB (T, h, w, 3). Within a set, image sizes and the arm's number of joints are equal.
+        task: Instruction in words.
+        meta: Facts about the whole episode, such as object, seed and outcome; the same keys with the
+            same types in every episode of a set.
     """
 
     frames: dict[str, np.ndarray]
@@ -62,14 +61,14 @@ class Episode:
 
     @property
     def features(self) -> dict[str, Feature]:
-        """The vocabulary for this episode's arm, which its state, else its action, tells."""
+        """`FEATURES` for this episode's arm; the length of its state, else its action, gives the joints."""
         for key, joints in ((STATE, lambda n: (n - 1) // 2), (ACTION, lambda n: n - 1)):
             if key in self.frames and self.frames[key].ndim == 2:
                 return features_of(joints(self.frames[key].shape[1]))
         return features_of(N_JOINTS)
 
     def check(self) -> None:
-        """Raises UserError, naming the key, if anything here could not be stored faithfully."""
+        """Raise UserError, naming the key, if a value cannot be stored without loss."""
         if not self.task.strip():
             raise UserError("an episode needs a task in words: its task is empty")
         if len(self) == 0:
@@ -105,7 +104,7 @@ def _check_key(features: dict[str, Feature], key: str, values: np.ndarray) -> No
 def _check_image_shape(key: str, shape: tuple[int, ...]) -> None:
     if len(shape) != 4 or shape[3] != 3 or 0 in shape:
         raise UserError(f"{key} has shape {shape}: pictures are (T, h, w, 3), RGB")
-    # Other writers' H.264 (yuv420p) shares one colour sample between 2 x 2 pixels, as `write_video` does.
+    # H.264 in yuv420p, as `write_video` writes it, shares one colour sample between 2 x 2 pixels.
     if is_camera(key) and (shape[1] % 2 or shape[2] % 2):
         raise UserError(f"{key} is {shape[1]} x {shape[2]}: a camera needs even height and width")
 
@@ -126,7 +125,7 @@ def _check_meta(key: str, value: Any) -> None:
 
 
 def describe_features(episode: Episode, fps: int) -> dict[str, dict[str, Any]]:
-    """The `features` of LeRobot's meta/info.json for an episode, index columns included."""
+    """Return the `features` of LeRobot's meta/info.json for an episode, index columns included."""
     described = {}
     for key, feature in episode.features.items():
         if key not in episode.frames:
@@ -147,9 +146,14 @@ def _video_info(shape: list[int], fps: int) -> dict[str, Any]:
         "video.height": shape[0],
         "video.width": shape[1],
         "video.codec": "h264",
-        "video.pix_fmt": "gbrp",
         "video.fps": fps,
         "video.channels": 3,
         "is_depth_map": False,
         "has_audio": False,
     }
+
+
+def drop_pixel_format(features: dict[str, dict[str, Any]]) -> None:
+    """Remove `video.pix_fmt`, which sets of older versions name and lerobot's own tools reject."""
+    for feature in features.values():
+        (feature.get("info") or {}).pop("video.pix_fmt", None)

@@ -2,8 +2,8 @@
 
 Every episode has its own data file and its own videos, numbered by the same number; an append
 writes them first and then everything under meta/, each file in one atomic step, info.json last.
-So a set holds what its info.json says, and a process killed at any moment leaves at most the files
-of the episode in progress, which `repair` takes in (if complete) or moves aside.
+A set holds what its info.json lists; a process killed at any moment leaves at most the files of the
+episode in progress, which `repair` adds (if complete) or moves aside.
 """
 
 import hashlib
@@ -36,22 +36,22 @@ from touchgoal.runtime.folder_lock import FolderLock
 
 
 class EpisodeWriter:
-    """Appends episodes to a set, new or continued; one writer at a time.
+    """Writer that appends episodes to a new or an existing set; one at a time.
 
-    The first episode fixes the features, picture sizes and meta keys of a new set. Another writer, in
-    this process or another one, is refused until this one is closed, garbage or its process gone.
+    The first episode fixes the features, image sizes and meta keys of a new set. A second writer, in
+    this process or another one, is refused until this one is closed or garbage, or its process ends.
     """
 
     def __init__(self, root: str | os.PathLike[str], fps: int = 20) -> None:
-        """Opens a set for appending; no file is written before the first `append`.
+        """Open a set for appending; no file is written before the first `append`.
 
         Args:
-            root: folder of the set; made if it is not there.
-            fps: frames per second of the episodes to come.
+            root: Folder of the set; made if missing.
+            fps: Frames per second of the episodes to come.
 
         Raises:
-            UserError: a continued set runs at another rate, was interrupted, is damaged or was
-                continued by lerobot; another process is recording into it; the folder cannot be made.
+            UserError: An existing set has another rate, was interrupted, is damaged or was continued
+                by lerobot; another process records into it; the folder cannot be made.
         """
         self._root = Path(root)
         self._fps = fps
@@ -63,7 +63,7 @@ class EpisodeWriter:
             raise
 
     def _load(self) -> SetMetadata | None:
-        """What the set holds so far, checked; None before the first episode."""
+        """Return the checked metadata of the set; None before the first episode."""
         found = None
         if (self._root / metadata.INFO).exists():
             found = SetMetadata.load(self._root)
@@ -86,17 +86,17 @@ class EpisodeWriter:
         return 0 if self._metadata is None else self._metadata.n_episodes
 
     def close(self) -> None:
-        """Lets another writer continue the set."""
+        """Release the set for another writer."""
         self._lock.release()
 
     def append(self, episode: Episode | EncodedEpisode) -> int:
-        """Adds an episode; when this returns, it is on disk for good.
+        """Add an episode; when this returns, it is on disk.
 
         Returns:
             The episode's index in the set.
 
         Raises:
-            UserError: the episode is unsound or does not fit the set, which stays as it was; or
+            UserError: The episode is unsound or does not fit the set, which stays as it was; or
                 another process writes to the set.
         """
         encoded = encode(episode, self._fps) if isinstance(episode, Episode) else episode
@@ -118,17 +118,17 @@ class EpisodeWriter:
 
 
 class EpisodeSet:
-    """A set of episodes for reading: what it held when opened."""
+    """A set of episodes for reading, as it was when opened."""
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
-        """Opens a set.
+        """Open a set.
 
         Args:
-            root: folder of the set, or of the run that recorded it (which holds it as `episodes`).
+            root: Folder of the set, or of the run that recorded it into its `episodes/`.
 
         Raises:
-            UserError: not a set, an unknown version, or written by lerobot in part or whole; a
-                metadata file is missing or corrupt.
+            UserError: Not a set, an unknown version, or written by lerobot in part or whole; a
+                metadata file is corrupt; a file is missing.
         """
         self.root = metadata.set_folder(Path(root))
         info = metadata.load_info(self.root)
@@ -144,6 +144,10 @@ class EpisodeSet:
                 f"{self.root / metadata.EPISODES} lists {len(self._rows)} of "
                 f"{info['total_episodes']} episodes: {metadata.repair_command(self.root)}"
             )
+        for row in self._rows:  # before any work with the others
+            for name in self._files(row):
+                if not (self.root / name).is_file():
+                    raise metadata.unreadable(self.root, name, FileNotFoundError())
 
     def __len__(self) -> int:
         """Number of episodes."""
@@ -151,10 +155,9 @@ class EpisodeSet:
 
     @cached_property
     def checksum(self) -> str:
-        """Tells these episodes from any others, wherever they lie: SHA-256 in hexadecimal.
+        """SHA-256 of the set, independent of its folder.
 
-        Covers what meta/episodes says of each: length, task, facts, statistics of every feature and
-        the checksums of its videos.
+        It covers every episode's length, task, meta, statistics and checksums of videos.
         """
         table = metadata.load_table(self.root, metadata.EPISODES).slice(0, len(self))
         return hashlib.sha256(json.dumps(table.to_pylist(), sort_keys=True).encode()).hexdigest()
@@ -165,14 +168,16 @@ class EpisodeSet:
         return [row["length"] for row in self._rows]
 
     def episode_checksum(self, i: int) -> str:
-        """Tells episode i from any other, wherever its set lies and grows: SHA-256 in hexadecimal.
+        """Return the SHA-256 of episode i's length, meta and checksums of videos.
 
-        Covers its length, its facts and the checksums of its videos.
+        It does not change when the set moves or grows.
         """
-        row = self._row(i)
-        said = {k: v for k, v in row.items() if k == "length" or k.startswith(metadata.META_PREFIX)}
-        said |= {k: v for k, v in row.items() if k.endswith("/crc32")}
-        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+        content = {
+            key: value
+            for key, value in self._row(i).items()
+            if key == "length" or key.startswith(metadata.META_PREFIX) or key.endswith("/crc32")
+        }
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def frame_checksums(self, i: int, key: str) -> frozenset[int]:
         """Return checksums of the frames of a feature of episode i, comparable in this process."""
@@ -187,27 +192,27 @@ class EpisodeSet:
             raise metadata.unreadable(self.root, name, error) from error
 
     def meta(self, i: int) -> dict[str, MetaValue]:
-        """The facts about episode i."""
+        """Return the facts about episode i."""
         prefix = metadata.META_PREFIX
         row = self._row(i)
         return {k.removeprefix(prefix): v for k, v in row.items() if k.startswith(prefix)}
 
     def task(self, i: int) -> str:
-        """The instruction of episode i."""
+        """Return the instruction of episode i."""
         return self._row(i)["tasks"][0]
 
     def read(
         self, i: int, keys: Sequence[str] | None = None, frames: Sequence[int] | None = None
     ) -> Episode:
-        """Reads episode i; only what is asked for is decoded.
+        """Read episode i; only the keys and frames asked for are decoded.
 
         Args:
-            i: index of the episode.
-            keys: the keys to read; None for all.
-            frames: indices of the frames to read, in the order wanted; None for all.
+            i: Index of the episode.
+            keys: Keys to read; None for all.
+            frames: Indices of the frames to read, in any order; None for all.
 
         Raises:
-            UserError: no such episode, key or frame; a file is missing or corrupt.
+            UserError: No such episode, key or frame; a file is missing or corrupt.
         """
         row = self._row(i)
         keys = list(self.features) if keys is None else keys
@@ -223,6 +228,15 @@ class EpisodeSet:
         read = self._read_data(row, columns, wanted) if columns else {}
         read |= {key: self._read_video(row, key, wanted) for key in keys if is_camera(key)}
         return Episode({key: read[key] for key in keys}, self.task(i), self.meta(i))
+
+    def __repr__(self) -> str:
+        """Return folder, size and features."""
+        return f"EpisodeSet({str(self.root)!r}: {len(self)} episodes, {', '.join(self.features)})"
+
+    def _files(self, row: Row) -> list[str]:
+        number = metadata.file_number_of(row)
+        videos = [metadata.video_path(key, number) for key in self.features if is_camera(key)]
+        return [metadata.data_path(number), *videos]
 
     def _row(self, i: int) -> Row:
         if not 0 <= i < len(self):

@@ -9,9 +9,10 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.json_file import write_json
 from touchgoal.runtime.option_types import checked_dataclass
 from touchgoal.runtime.provenance import hardware, provenance
-from touchgoal.runtime.run_folder import open_run, write_json
+from touchgoal.runtime.run_folder import open_run
 
 BENCHMARKS = {
     "bead-maze": ("papers.bead_maze", "bead maze: success on unseen wires (TacBench T5)"),

@@ -58,9 +58,10 @@ def main(config: Config) -> None:
     from touchgoal.control.calibration.press_set import read_presses, split
     from touchgoal.control.tactile.sensor_calibration import save
     from touchgoal.control.tactile.sensor_models import find_model
+    from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.progress import progress_bar
     from touchgoal.runtime.provenance import provenance
-    from touchgoal.runtime.run_folder import open_run, write_json
+    from touchgoal.runtime.run_folder import open_run
 
     find_model(config.sensor)
     pitch = config.mm_per_pixel * 1e-3

@@ -43,7 +43,8 @@ def main(config: Config) -> None:
     from touchgoal.control.calibration.sensor_check import check_sensor
     from touchgoal.control.sensors.fingertip_source import is_recorded, open_frames
     from touchgoal.control.tactile.sensor_models import find_sensor
-    from touchgoal.runtime.run_folder import open_run, write_json
+    from touchgoal.runtime.json_file import write_json
+    from touchgoal.runtime.run_folder import open_run
 
     sensor = find_sensor(config.sensor)
     out = open_run(config.out, "check-sensor", config)

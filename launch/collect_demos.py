@@ -63,7 +63,8 @@ def main(config: Config) -> None:
     from touchgoal.policies.training.dagger import dagger_roles
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.interruption import on_interruption
-    from touchgoal.runtime.run_folder import open_run, write_json
+    from touchgoal.runtime.json_file import write_json
+    from touchgoal.runtime.run_folder import open_run
 
     roles, acts = expert_alone, config.policy not in (None, "expert")
     if config.feedback or config.policy is not None:

@@ -185,7 +185,7 @@ def _report(result: "Result", out: Path) -> None:
     """Write the numbers, print the report, exit with the status."""
     from touchgoal.control.deployment.report import metrics, report
     from touchgoal.control.deployment.terminal import say
-    from touchgoal.runtime.run_folder import write_json
+    from touchgoal.runtime.json_file import write_json
 
     numbers, lost = metrics(result), [result.recording_error] if result.recording_error else []
     try:

@@ -73,7 +73,8 @@ def main(config: Config) -> None:
 
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.provenance import portable
-    from touchgoal.runtime.run_folder import open_run, write_json
+    from touchgoal.runtime.json_file import write_json
+    from touchgoal.runtime.run_folder import open_run
 
     if config.learn_touch and (config.touch or config.task == "pick-place"):
         raise UserError("--learn-touch goes with --task bead-maze and without --touch")

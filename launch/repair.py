@@ -14,10 +14,10 @@ class Config:
     """Options of repair."""
 
     root: Annotated[Path, tyro.conf.Positional]
-    """The set: the folder that holds meta/ and data/, or the run folder around it."""
+    """Folder of the set, which holds meta/ and data/, or the run folder around it."""
     fix: bool = False
-    """Keep every whole episode and move what is damaged into FOLDER/repaired (nothing is deleted).
-    Without --fix, only say what is wrong."""
+    """Rebuild the set from every whole episode and move damaged files to FOLDER/repaired; nothing is
+    deleted. Without it, only print the problems."""
 
 
 def main(config: Config) -> None:
@@ -26,11 +26,10 @@ def main(config: Config) -> None:
 
     if config.fix:
         print("\n".join(repair(config.root)) or f"{config.root} is sound: nothing to do")
-        return
-    problems = validate(config.root)
-    if problems:
+    elif problems := validate(config.root):
         shown = "\n  ".join(problems)
         raise UserError(
-            f"{config.root} has {len(problems)} problem(s); --fix keeps every whole episode:\n  {shown}"
+            f"{config.root} has {len(problems)} problem(s); --fix saves every whole episode:\n  {shown}"
         )
-    print(f"{config.root} is sound")
+    else:
+        print(f"{config.root} is sound")

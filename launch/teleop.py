@@ -48,7 +48,8 @@ def main(config: Config) -> None:
     from touchgoal.episodes.recording import EpisodeSpec
     from touchgoal.episodes.store import EpisodeWriter
     from touchgoal.runtime.errors import UserError
-    from touchgoal.runtime.run_folder import open_run, write_json
+    from touchgoal.runtime.json_file import write_json
+    from touchgoal.runtime.run_folder import open_run
     from touchgoal.sim_envs.bead_maze import BeadMaze
     from touchgoal.sim_envs.experts.teleoperator import HELP
 

@@ -64,7 +64,7 @@ def main(config: Config) -> None:
     from touchgoal.policies.training.model_selection import add_parts
     from touchgoal.runtime import seeds
     from touchgoal.runtime.errors import UserError
-    from touchgoal.runtime.run_folder import write_json
+    from touchgoal.runtime.json_file import write_json
 
     check_training(config.trainer, config.out, _CONTACT)
     sets = open_sets(config.data, config.validation)

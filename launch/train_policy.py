@@ -128,7 +128,7 @@ def main(config: Config) -> None:
     from touchgoal.policies.training.sequence_dataset import SequenceDataset, load_recordings
     from touchgoal.policies.training.train import POLICY, train
     from touchgoal.runtime.errors import UserError
-    from touchgoal.runtime.run_folder import write_json
+    from touchgoal.runtime.json_file import write_json
 
     check_training(config.trainer, config.out)
     if config.end_to_end and config.encoder:

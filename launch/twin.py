@@ -61,7 +61,8 @@ class Config:
 def main(config: Config) -> None:
     """Open the twin, print its addresses, serve until a signal ends it."""
     from touchgoal.control.cell.cell_file import cell_table
-    from touchgoal.runtime.run_folder import open_run, write_json
+    from touchgoal.runtime.json_file import write_json
+    from touchgoal.runtime.run_folder import open_run
     from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 
     out = open_run(config.out, "twin", config, adds=True).resolve()

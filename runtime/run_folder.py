@@ -7,8 +7,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.json_file import write_json
 from touchgoal.runtime.provenance import hardware, provenance, versions
 
 RECORD = "config.json"
@@ -51,7 +51,7 @@ def open_run(out: Path | None, command: str, config: Any, adds: bool = False) ->
     check_writable(folder)
     record = {
         "name": command,
-        "config": json.loads(json.dumps(asdict(config), default=_plain)),
+        "config": json.loads(json.dumps(asdict(config), default=str)),
         **provenance(),
         "versions": versions(),
         "hardware": hardware(),
@@ -89,13 +89,3 @@ def _refuse_other_run(folder: Path, record: dict[str, Any], records: list[Path])
                 f"{folder} holds the results of {other.get('command', 'another run')}; "
                 "choose another --out"
             )
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write atomically, so that a reader never sees half a file."""
-    with atomic_write(path) as unfinished:
-        unfinished.write_text(json.dumps(value, indent=2, default=_plain) + "\n")
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if hasattr(value, "item") else str(value)

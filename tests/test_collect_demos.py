@@ -47,6 +47,8 @@ def test_a_killed_recording_leaves_no_process_and_can_be_continued(tmp_path: Pat
     assert processes_with(mark) == []
     shutil.rmtree(tmp_path / "episodes", ignore_errors=True)
     (tmp_path / "episodes").mkdir()  # as killed before its first episode
+    main(["repair", str(tmp_path)])
+    main(["repair", str(tmp_path), "--fix"])
     main(command)
     assert len(EpisodeSet(tmp_path)) == 2
 

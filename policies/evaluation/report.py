@@ -11,7 +11,7 @@ from touchgoal.episodes.recording import EpisodeSpec, record_with_film
 from touchgoal.policies.by_name import PolicyMaker
 from touchgoal.policies.evaluation.evaluate import Evaluation, Trial
 from touchgoal.policies.evaluation.table import table, worst_first
-from touchgoal.runtime.run_folder import write_json
+from touchgoal.runtime.json_file import write_json
 from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.config import TaskConfig
 from touchgoal.sim_envs.tasks import make_env

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from touchgoal.rewards.curves import GAMMA, Curves
 from touchgoal.rewards.report.summary import metrics_table
 from touchgoal.runtime.atomic_write import write_file
-from touchgoal.runtime.run_folder import write_json
+from touchgoal.runtime.json_file import write_json
 
 
 def write_report(

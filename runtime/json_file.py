@@ -1,0 +1,37 @@
+"""JSON as it is read and written here: no key twice, no NaN, no half file."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from touchgoal.runtime.atomic_write import write_file
+
+
+def parse_json(data: bytes) -> Any:
+    """Parse a JSON document.
+
+    Raises:
+        ValueError: It is no JSON, or a key stands twice in one object.
+    """
+    try:
+        return json.loads(data, object_pairs_hook=_unique)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON file atomically; numpy scalars become numbers, other objects text."""
+    write_file(path, (json.dumps(value, indent=2, default=_plain) + "\n").encode())
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    value = dict(pairs)
+    if len(value) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice!r} stands twice")
+    return value
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if hasattr(value, "item") else str(value)
