@@ -72,8 +72,8 @@ def main(config: Config) -> None:
     import json
 
     from touchgoal.runtime.errors import UserError
-    from touchgoal.runtime.provenance import portable
     from touchgoal.runtime.json_file import write_json
+    from touchgoal.runtime.provenance import portable
     from touchgoal.runtime.run_folder import open_run
 
     if config.learn_touch and (config.touch or config.task == "pick-place"):
