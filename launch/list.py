@@ -1,4 +1,4 @@
-"""List what there is by name: objects, sensors, tasks, policies, encoders or benchmarks."""
+"""List objects, sensors, tasks, policies, encoders or benchmarks by name."""
 
 import json
 from collections.abc import Callable
@@ -12,6 +12,17 @@ from touchgoal.runtime.option_types import checked_dataclass
 
 _WEIGHTS = Path(touchgoal.__file__).parent / "encoders" / "weights"
 Kind = Literal["objects", "sensors", "tasks", "policies", "encoders", "benchmarks"]
+TASKS = {
+    "pick-place": "pick an object up and place it on a disc",
+    "bead-maze": "lead a bead along a bent wire by touch",
+}
+POLICIES = {
+    "expert": "the task's scripted expert, which reads the simulator's state",
+    "follower": "bead-maze: a classical controller on the force at the hand",
+    "shipped": "the learned policy that ships for the task",
+    "FOLDER": "a policy that train-policy made: its folder policy/",
+    "MODULE:CLASS": "a class of your own with reset() and act(observation); or FILE.py:CLASS",
+}
 
 
 @checked_dataclass
@@ -19,62 +30,42 @@ class Config:
     """Options of list."""
 
     kind: Annotated[Kind | None, tyro.conf.Positional] = None
-    """What to list; without it, how many there are of each."""
+    """Kind to list; without it, the number of each."""
 
 
 def main(config: Config) -> None:
     """Print a line for each."""
     if config.kind is None:
-        for kind, entries in KINDS.items():
-            print(f"{len(entries()):>4} {kind:<12}touchgoal list {kind}")
+        for kind, (entries, use) in KINDS.items():
+            print(f"{len(entries()):>4} {kind:<12}touchgoal list {kind:<12}used as: {use}")
         return
-    entries = KINDS[config.kind]()
+    entries = KINDS[config.kind][0]()
     width = max(len(name) for name in entries) + 2
     for name, meaning in entries.items():
         print(f"{name:<{width}}{meaning}")
 
 
 def objects() -> dict[str, str]:
-    """The catalogue that pick-place draws from."""
+    """Return the object catalogue of pick-place."""
     from touchgoal.sim_envs.scene.objects import CATALOGUE
 
     return {name: f"{kind.shape}: {kind.descriptions[0]}" for name, kind in CATALOGUE.items()}
 
 
 def sensors() -> dict[str, str]:
-    """Models of fingertip sensors."""
+    """Return the models of fingertip sensors."""
     from touchgoal.control.tactile.sensor_models import SENSORS
 
-    def describe(name: str) -> str:
-        sensor = SENSORS[name]
-        (rows, columns), pitch = sensor.image_shape, 1e3 * sensor.pixel_pitch
+    found = {}
+    for name, sensor in SENSORS.items():
+        rows, columns = sensor.image_shape
         dots = "gel with printed dots" if sensor.markers else "plain gel"
-        return f"{columns} x {rows} px, {pitch:.3f} mm a pixel, {dots}"
-
-    return {name: describe(name) for name in SENSORS}
-
-
-def tasks() -> dict[str, str]:
-    """What `--task` takes."""
-    return {
-        "pick-place": "pick an object up and place it on a disc",
-        "bead-maze": "lead a bead along a bent wire by feel",
-    }
-
-
-def policies() -> dict[str, str]:
-    """What `--policy` takes."""
-    return {
-        "expert": "the task's expert, which sees the simulator's state",
-        "follower": "bead-maze: the classical one, which feels the force on the hand",
-        "shipped": "the learned policy that ships for the task",
-        "FOLDER": "a policy that train-policy made: its folder policy/",
-        "MODULE:CLASS": "a class of your own with reset() and act(observation); or FILE.py:CLASS",
-    }
+        found[name] = f"{columns} x {rows} px, {1e3 * sensor.pixel_pitch:.3f} mm a pixel, {dots}"
+    return found
 
 
 def encoders() -> dict[str, str]:
-    """The touch encoders that ship."""
+    """Return the shipped touch encoders."""
     found = {}
     for path in sorted(_WEIGHTS.glob("*/encoder.json")):
         made = json.loads(path.read_text())["config"]
@@ -84,17 +75,17 @@ def encoders() -> dict[str, str]:
 
 
 def benchmarks() -> dict[str, str]:
-    """What `touchgoal benchmark` takes."""
+    """Return the benchmarks."""
     from touchgoal.launch.benchmark import BENCHMARKS
 
     return {name: meaning for name, (_, meaning) in BENCHMARKS.items()}
 
 
-KINDS: dict[Kind, Callable[[], dict[str, str]]] = {
-    "objects": objects,
-    "sensors": sensors,
-    "tasks": tasks,
-    "policies": policies,
-    "encoders": encoders,
-    "benchmarks": benchmarks,
+KINDS: dict[Kind, tuple[Callable[[], dict[str, str]], str]] = {
+    "objects": (objects, "--env.objects NAME"),
+    "sensors": (sensors, "--env.sensor NAME"),
+    "tasks": (lambda: TASKS, "--task NAME"),
+    "policies": (lambda: POLICIES, "--policy NAME"),
+    "encoders": (encoders, "--encoder NAME"),
+    "benchmarks": (benchmarks, "touchgoal benchmark NAME"),
 }

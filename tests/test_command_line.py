@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
+import touchgoal
 from touchgoal import __version__
 from touchgoal.launch.__main__ import COMMANDS, main
 from touchgoal.launch.list import KINDS
@@ -90,10 +92,32 @@ def test_version_and_lists(capsys: pytest.CaptureFixture) -> None:
     assert capsys.readouterr().out == f"touchgoal {__version__}\n"
     main(["list"])
     assert all(kind in capsys.readouterr().out.split() for kind in ("objects",))
-    for kind, entries in KINDS.items():
+    for kind, (entries, _) in KINDS.items():
         main(["list", kind])
         printed = capsys.readouterr().out.splitlines()
         assert [line.split()[0] for line in printed] == list(entries()) != []
+
+
+def test_the_interface_alone_is_listed() -> None:
+    names = [name for name in dir(touchgoal) if not name.startswith("_")]
+    assert names == ["evaluate", "load_encoder", "load_policy", "make", "reward_curve"]
+
+
+def test_an_ascii_terminal_takes_any_file_name(tmp_path: Path) -> None:
+    """A folder of images with an umlaut is named, and the mistake after it is one line."""
+    folder = tmp_path / "B\u00e4lle"
+    folder.mkdir()
+    for i in range(2):
+        Image.new("RGB", (32, 32)).save(folder / f"{i}.png")
+    command = [sys.executable, "-m", "touchgoal.launch", "reward-curves", str(folder)]
+    result = subprocess.run(
+        [*command, "--goal", "image:none.png"],
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode == 1 and "B\\xe4lle: 2 frames" in result.stdout
+    assert result.stderr.splitlines()[-1].endswith("none.png does not exist")
 
 
 def test_completion(capsys: pytest.CaptureFixture) -> None:

@@ -37,7 +37,7 @@ from touchgoal.rewards.goals import GoalSpec, Inputs, LastFrame, PictureFile, Se
 from touchgoal.rewards.normalizer import DistanceNormalizer
 from touchgoal.rewards.online import CostMeter, OnlineCost
 from touchgoal.rewards.reward_model import RewardModel, load_reward_model
-from touchgoal.rewards.sources import VideoSource, open_source
+from touchgoal.rewards.sources import EpisodeSource, VideoSource, open_source
 from touchgoal.runtime.errors import UserError
 
 EPISODE = recorded()
@@ -215,6 +215,7 @@ def test_frame_rate_of_a_folder_of_images(tmp_path: Path) -> None:
 
 def test_a_run_folder_stands_for_its_episodes(run_folder: Path) -> None:
     source = open_source(run_folder, "front")
+    assert isinstance(source, EpisodeSource) and "3 episodes, 36 frames" in repr(source.episodes)
     assert source.path == run_folder / "episodes" and len(source.names) == 3
 
 

@@ -19,10 +19,10 @@ __version__ = "0.1.0"
 
 
 def _headless_opengl() -> str:
-    """MuJoCo's platform without a screen: EGL, or none if its libraries are not installed.
+    """Return MuJoCo's platform without a screen: EGL, or none if its libraries are not installed.
 
-    Without this choice `import mujoco` itself fails on such a machine; with it only what draws
-    fails, and says which packages to install (`sim_envs/scene/rendering.py`).
+    Otherwise `import mujoco` itself fails on such a machine. With "disable" only rendering fails,
+    with a message that names the packages to install (`sim_envs/scene/rendering.py`).
     """
     try:
         ctypes.CDLL("libEGL.so.1")
@@ -32,7 +32,7 @@ def _headless_opengl() -> str:
     return "egl"
 
 
-# MuJoCo reads this when it is first imported; a person who sets it keeps their choice.
+# MuJoCo reads this when it is first imported; a value that the user set stays.
 if sys.platform == "linux" and "DISPLAY" not in os.environ and "MUJOCO_GL" not in os.environ:
     os.environ["MUJOCO_GL"] = _headless_opengl()
 
@@ -43,7 +43,7 @@ gymnasium.register(
     "touchgoal/BeadMaze-v0", "touchgoal.sim_envs.bead_maze:BeadMaze", max_episode_steps=800
 )
 
-# One call a job. Each is imported when it is first used: `import touchgoal` stays light.
+# One call a job. Each is imported at its first use, so that `import touchgoal` stays light.
 _INTERFACE = {
     "evaluate": "touchgoal.policies.evaluation.evaluate",
     "load_encoder": "touchgoal.encoders.pretrained",
@@ -60,4 +60,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_INTERFACE})
+    return sorted([*_INTERFACE, "__doc__", "__version__"])
