@@ -153,11 +153,6 @@ class EpisodeSet:
         """Return the number of episodes."""
         return len(self._rows)
 
-    def __repr__(self) -> str:
-        """Return folder, size and features in one line."""
-        frames, keys = sum(self.lengths), ", ".join(self.features)
-        return f"<EpisodeSet {self.root}: {len(self)} episodes, {frames} frames at {self.fps} Hz; {keys}>"
-
     @cached_property
     def checksum(self) -> str:
         """SHA-256 of the set, independent of its folder.
