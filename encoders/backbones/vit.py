@@ -1,4 +1,4 @@
-"""A plain vision transformer (Dosovitskiy et al. 2021) that takes any input size."""
+"""Plain vision transformer (Dosovitskiy et al. 2021) for images and clips of any size."""
 
 import math
 from dataclasses import dataclass
@@ -17,23 +17,21 @@ class ViTConfig:
     """Size of a transformer.
 
     Attributes:
-        image_size: Height and width in pixels that the backbone is meant for; other sizes work too.
-        patch_size: Side of a square patch in pixels.
+        image_size: Height and width of the input, px; other sizes work without learned positions.
+        patch_size: Side of a square patch, px.
         channels: Input channels.
-        width: Size of a token.
+        width: Width of a token.
         depth: Number of blocks.
-        heads: Attention heads; must divide `width`.
-        mlp_ratio: Hidden size of a block's MLP over `width`.
+        heads: Attention heads; they divide `width`.
+        mlp_ratio: Hidden width of a block's MLP over `width`.
         class_token: Prepend a learned token and pool by it; otherwise pool by the mean.
-        registers: Learned tokens without a position that only attention sees; left out of the
-            output (Darcet et al. 2024).
-        layer_scale: Initial value of a learned factor on each channel of both branches of a block
-            (Touvron et al. 2021); none when None.
-        tubelet: Frames a token; 1 takes images, more take clips of any multiple of it.
-        frames: Frames of the clips that the backbone is meant for; 1 for images.
-        learned_positions: Keep the position codes as parameters that training changes. The backbone
-            then takes the configured size only.
-        norm_epsilon: Of every LayerNorm.
+        registers: Learned tokens without position, not part of the output (Darcet et al. 2024).
+        layer_scale: Initial value of learned factors on both branches of a block (Touvron et al.
+            2021); None for none.
+        tubelet: Frames in a token; 1 for images, more for clips of any multiple of it.
+        frames: Frames of a clip; 1 for images.
+        learned_positions: Learn the position codes; the input size is then fixed.
+        norm_epsilon: Epsilon of every LayerNorm.
     """
 
     image_size: tuple[int, int] = (120, 160)
@@ -52,7 +50,7 @@ class ViTConfig:
     norm_epsilon: float = 1e-5
 
     def __post_init__(self) -> None:
-        """Raises UserError for sizes that cannot be built."""
+        """Raise UserError for sizes that cannot be built."""
         if self.width % (4 * self.heads) or self.width % self.heads:
             raise UserError(
                 f"ViT width {self.width} must be divisible by 4 x heads ({self.heads}): "
@@ -82,16 +80,13 @@ PRESETS: dict[str, ViTConfig] = {
 def sinusoidal_positions(
     rows: int, columns: int, width: int, times: int | None = None
 ) -> Float[Tensor, "n {width}"]:
-    """Fixed position codes, as in MAE (He et al. 2022): a half for the row, a half for the column.
+    """Return fixed position codes, one half for the row, one for the column (MAE, He et al. 2022).
 
     Args:
         rows: Patches from top to bottom.
         columns: Patches from left to right.
-        width: Size of a code, a multiple of 4, of 6 for clips.
-        times: Tubelets from the first to the last, which then have the first of three thirds.
-
-    Returns:
-        One code a patch, time by time and row by row (n = times * rows * columns).
+        width: Width of a code, a multiple of 4, or of 6 for clips.
+        times: Tubelets in time; their codes are then the first of three thirds.
     """
     sides = [rows, columns] if times is None else [times, rows, columns]
     bands = width // (2 * len(sides))
@@ -105,7 +100,7 @@ def sinusoidal_positions(
 def _known_positions(
     rows: int, columns: int, width: int, times: int | None = None
 ) -> Float[Tensor, "n {width}"]:
-    """The same, not to be changed: computed once, which shows where single frames are embedded."""
+    """Return the same, computed once; not to be changed."""
     with torch.inference_mode(False):
         return sinusoidal_positions(rows, columns, width, times)
 
@@ -121,7 +116,7 @@ class Block(nn.Module):
         norm_epsilon: float = 1e-5,
         layer_scale: float | None = None,
     ) -> None:
-        """Builds the two residual branches; see `ViTConfig`."""
+        """Build the two residual branches; see `ViTConfig`."""
         super().__init__()
         self.heads = heads
         self.norm1 = nn.LayerNorm(width, norm_epsilon)
@@ -135,14 +130,14 @@ class Block(nn.Module):
         self.scale2 = nn.Parameter(torch.full((width,), layer_scale)) if scaled else None
 
     def attention(self, x: Float[Tensor, "b n d"]) -> Float[Tensor, "b n d"]:
-        """Multi-head self-attention over the tokens."""
+        """Return multi-head self-attention over the tokens."""
         b, n, d = x.shape
         q, k, v = self.qkv(x).view(b, n, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
         y = F.scaled_dot_product_attention(q, k, v)
         return self.out(y.transpose(1, 2).reshape(b, n, d))
 
     def forward(self, x: Float[Tensor, "b n d"]) -> Float[Tensor, "b n d"]:
-        """One transformer block."""
+        """Return the output tokens."""
         attended = self.attention(self.norm1(x))
         x = x + (attended if self.scale1 is None else attended * self.scale1)
         changed = self.mlp_out(F.gelu(self.mlp_in(self.norm2(x))))
@@ -150,14 +145,14 @@ class Block(nn.Module):
 
 
 class ViT(nn.Module):
-    """Images, or clips, to tokens.
+    """Transformer from images or clips to tokens.
 
-    An input whose sides are no multiples of the patch is padded with zeros at the right and the
-    bottom. For background-subtracted touch, zero means an untouched gel.
+    Inputs are padded with zeros at the right and bottom to multiples of the patch; for
+    background-subtracted touch, zero is an untouched gel.
     """
 
     def __init__(self, config: ViTConfig) -> None:
-        """Builds a randomly initialised backbone."""
+        """Build a randomly initialised backbone."""
         super().__init__()
         self.config = config
         c = config
@@ -180,10 +175,10 @@ class ViT(nn.Module):
             nn.init.normal_(self.registers, std=0.02)
 
     def embed_patches(self, images: Float[Tensor, "b c *t h w"]) -> Float[Tensor, "b n d"]:
-        """Patch embeddings with positions, row by row, without class token and registers.
+        """Return patch embeddings with positions, row by row, without class token and registers.
 
         Raises:
-            UserError: Clips of a length that is no multiple of `tubelet`, or a size other than the
+            UserError: Clips of a length that is no multiple of `tubelet`, or another size than the
                 configured one with learned positions.
         """
         size, tubelet = self.config.patch_size, self.config.tubelet
@@ -198,7 +193,7 @@ class ViT(nn.Module):
         return tokens.flatten(2).transpose(1, 2) + positions.to(tokens)
 
     def _positions(self, *grid: int) -> Float[Tensor, "n d"]:
-        """Codes for times (of clips), rows and columns of patches."""
+        """Return codes for times (of clips), rows and columns of patches."""
         if self.positions is None:
             *times, rows, columns = grid
             return _known_positions(rows, columns, self.config.width, *times)
@@ -212,22 +207,16 @@ class ViT(nn.Module):
     def forward(
         self, images: Float[Tensor, "b c *t h w"], ids_keep: Int[Tensor, "b k"] | None = None
     ) -> Float[Tensor, "b n d"]:
-        """Normalised output tokens.
+        """Return normalised output tokens: a class token, if any, then one for each patch.
 
-        Args:
-            images: Preprocessed images, or clips if the tubelet has several frames.
-            ids_keep: Indices (time by time, row by row) of the patches each image keeps; all when None. The dropped
-                ones are never computed, as masked self-supervision wants.
-
-        Returns:
-            One token for each kept patch in the order of `ids_keep`; the class token, if any, first.
+        `ids_keep` are the patches to compute (time by time, row by row); None for all.
         """
         return self.encode(self.embed_patches(images), ids_keep)[:, self.config.registers :]
 
     def encode(
         self, tokens: Float[Tensor, "b n d"], ids_keep: Int[Tensor, "b k"] | None = None
     ) -> Float[Tensor, "b m d"]:
-        """All normalised output tokens of embedded patches: registers, class token, kept patches."""
+        """Return all output tokens of embedded patches: registers, class token, patches in `ids_keep`."""
         if ids_keep is not None:
             tokens = tokens.gather(1, ids_keep[:, :, None].expand(-1, -1, tokens.shape[2]))
         if self.class_token is not None:
@@ -241,19 +230,19 @@ class ViT(nn.Module):
     def features(
         self, images: Float[Tensor, "b c *t h w"], ids_keep: Int[Tensor, "b k"] | None = None
     ) -> Float[Tensor, "b d"]:
-        """One vector an image: the class token if there is one, else the mean of the tokens."""
+        """Return one vector an image: the class token if there is one, else the mean token."""
         tokens = self(images, ids_keep)
         return tokens[:, 0] if self.class_token is not None else tokens.mean(1)
 
 
 def patch_grid(config: ViTConfig) -> tuple[int, int]:
-    """Rows and columns of patches in an image of the configured size."""
+    """Return rows and columns of patches in an image of the configured size."""
     rows, columns = (-(-side // config.patch_size) for side in config.image_size)
     return rows, columns
 
 
 def patchify(images: Float[Tensor, "b c h w"], vit: ViTConfig) -> Float[Tensor, "b n p"]:
-    """The pixels of every patch, row by row, padded with zeros as the backbone does."""
+    """Return the pixels of every patch, row by row, padded with zeros as in the backbone."""
     size = vit.patch_size
     h, w = images.shape[2:]
     padded = F.pad(images, (0, -w % size, 0, -h % size))
@@ -261,7 +250,7 @@ def patchify(images: Float[Tensor, "b c h w"], vit: ViTConfig) -> Float[Tensor, 
 
 
 def _grid(config: ViTConfig) -> tuple[int, ...]:
-    """Tubelets of the configured clips, if they are such; rows; columns."""
+    """Return the configured tubelets in time (for clips), rows and columns."""
     times = () if config.tubelet == 1 else (config.frames // config.tubelet,)
     return (*times, *patch_grid(config))
 
@@ -282,13 +271,10 @@ def _patch_projection(config: ViTConfig) -> nn.Conv2d | nn.Conv3d:
 def random_masking(
     config: ViTConfig, mask_ratio: float, count: int, generator: torch.Generator
 ) -> Int[Tensor, "{count} k"]:
-    """Draw which patches of `count` images of the configured size to keep, for `ViT.forward`.
+    """Draw which patches of `count` images to keep, for `ViT.forward`.
 
-    Args:
-        config: Size of the images and patches.
-        mask_ratio: Share of the patches to drop, in [0, 1); at least one patch stays.
-        count: Number of images.
-        generator: Random generator on the CPU.
+    A share of `mask_ratio` in [0, 1) is dropped; at least one patch stays. `generator` is the
+    CPU's.
     """
     rows, columns = patch_grid(config)
     order = torch.rand(count, rows * columns, generator=generator).argsort(1)

@@ -1,7 +1,7 @@
-"""Attentive probing (Sparsh's appendix C.1, after V-JEPA): a learned query looks at an encoder's tokens.
+"""Attentive probing (Sparsh's appendix C.1, after V-JEPA): a learned query attends to tokens.
 
-One block of cross-attention, then two linear layers. With tokens of width 768, twelve heads and a width
-of 768 the block has 7,088,640 parameters, as published.
+One block of cross-attention, then two linear layers. With tokens of width 768, twelve heads and a
+width of 768 the block has 7,088,640 parameters, as published.
 """
 
 import math
@@ -15,17 +15,10 @@ _NARROWER = 4  # than the block: the hidden layer of the head, 192 of 768 as pub
 
 
 class AttentivePooler(nn.Module):
-    """Tokens to one vector: a learned query attends to them, then an MLP; both with residuals."""
+    """Pooling of tokens to one vector by a learned query and an MLP, both with residuals."""
 
     def __init__(self, features: int, width: int, heads: int, mlp_ratio: float = 4.0) -> None:
-        """Builds a randomly initialised block.
-
-        Args:
-            features: width of the tokens.
-            width: of the query and of what comes out; a multiple of `heads`.
-            heads: of the attention.
-            mlp_ratio: hidden width of the MLP over `width`.
-        """
+        """Build a randomly initialised block; `heads` divides the width of query and output."""
         super().__init__()
         self.heads = heads
         self.query = nn.Parameter(torch.zeros(1, 1, width))
@@ -42,7 +35,7 @@ class AttentivePooler(nn.Module):
         nn.init.trunc_normal_(self.query, std=0.02)
 
     def forward(self, tokens: Float[Tensor, "b t f"]) -> Float[Tensor, "b d"]:
-        """What the query finds in the tokens."""
+        """Return the pooled vector."""
         # There is one query for all tokens: its product with a key is one with the token itself, and values are
         # made of the tokens' weighted sum. The keys' bias is the same for all tokens, so it drops out of the softmax.
         tokens = self.norm1(tokens)
@@ -59,15 +52,15 @@ class AttentivePooler(nn.Module):
 
 
 class AttentiveProbe(nn.Module):
-    """Tokens to the numbers of a task: the pooled vector through a hidden layer of a quarter of its width."""
+    """Probe of an attentive pooler and a hidden layer of a quarter of its width."""
 
     def __init__(self, features: int, outputs: int, width: int = 128, heads: int = 4) -> None:
-        """Builds a randomly initialised probe; see AttentivePooler."""
+        """Build a randomly initialised probe; see AttentivePooler."""
         super().__init__()
         self.pooler = AttentivePooler(features, width, heads)
         self.hidden = nn.Linear(width, width // _NARROWER)
         self.out = nn.Linear(width // _NARROWER, outputs)
 
     def forward(self, tokens: Float[Tensor, "b t f"]) -> Float[Tensor, "b k"]:
-        """The outputs, unbounded."""
+        """Return the outputs, unbounded."""
         return self.out(F.relu(self.hidden(self.pooler(tokens))))

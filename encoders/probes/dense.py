@@ -1,6 +1,6 @@
-"""Tokens back to a picture: what a dense quantity, such as a force field, is read by.
+"""Dense probe: tokens back to an image, for quantities such as a force field.
 
-After DPT (Ranftl et al. 2021), with one stage: tokens go to their places and are refined by
+After DPT (Ranftl et al. 2021), with one stage: tokens are placed on their grid and refined by
 convolutions between doublings of the resolution.
 """
 
@@ -12,20 +12,20 @@ from touchgoal.runtime.errors import UserError
 
 
 class DenseProbe(nn.Module):
-    """Tokens of a grid of patches to planes of values."""
+    """Probe from the tokens of a grid of patches to planes of values."""
 
     def __init__(
         self, features: int, grid: tuple[int, int], planes: int, side: int, width: int = 48
     ) -> None:
-        """Builds a randomly initialised probe.
+        """Build a randomly initialised probe.
 
         Args:
-            features: width of the tokens.
-            grid: rows and columns of the patches. Tokens before theirs (a class token) are left out;
+            features: Width of the tokens.
+            grid: Rows and columns of the patches. Tokens before them (a class token) are dropped;
                 several times as many (clips) are averaged over time.
-            planes: of the output.
-            side: rows and columns of the output.
-            width: channels in between.
+            planes: Planes of the output.
+            side: Rows and columns of the output.
+            width: Channels in between.
         """
         super().__init__()
         self.grid, self.side = grid, side
@@ -35,11 +35,7 @@ class DenseProbe(nn.Module):
         self.out = nn.Conv2d(width, planes, 3, padding=1)
 
     def forward(self, tokens: Float[Tensor, "b t f"]) -> Float[Tensor, "b p s s"]:
-        """The planes, unbounded.
-
-        Raises:
-            UserError: Fewer tokens than patches.
-        """
+        """Return the planes, unbounded; UserError for fewer tokens than patches."""
         patches = self.grid[0] * self.grid[1]
         times = tokens.shape[1] // patches
         if not times:

@@ -1,4 +1,4 @@
-"""What a frozen embedding knows, as a ridge regression can read it."""
+"""Linear probes: ridge regressions from frozen embeddings."""
 
 import numpy as np
 import torch
@@ -13,14 +13,9 @@ def ridge_r2(
     test_targets: Float[Tensor, "m k"],
     strength: float = 1e-3,
 ) -> Float[Tensor, " k"]:
-    """Share of each target's variance that a linear reading of new inputs explains.
+    """Return the share of each target's variance that a ridge explains on other inputs.
 
-    Args:
-        inputs: Embeddings to fit on; columns are brought to variance 1.
-        targets: What to read from them.
-        test_inputs: Other embeddings.
-        test_targets: Their targets.
-        strength: Of the ridge, as a share of the number of samples.
+    Columns are brought to variance 1; `strength` is a share of the number of samples.
     """
     mean, spread = inputs.mean(0), inputs.std(0).clamp(min=1e-6)
     X, Y = ((inputs - mean) / spread).double(), targets.double()
@@ -38,13 +33,9 @@ def ridge_scores(
     test_inputs: Float[np.ndarray, "m d"],
     strength: float,
 ) -> Float[np.ndarray, "m k"]:
-    """Targets of new inputs by a ridge regression in its dual form: fewer samples than columns.
+    """Predict targets by a ridge in its dual form, for fewer samples than columns.
 
-    Args:
-        inputs: Embeddings to fit on; columns are brought to variance 1.
-        targets: What to read from them.
-        test_inputs: Other embeddings.
-        strength: Of the ridge, beside the mean square of an input's columns.
+    Columns are brought to variance 1; `strength` is relative to the mean square of their rows.
     """
     mean, spread = inputs.mean(0), inputs.std(0) + 1e-6
     known = (inputs - mean) / spread

@@ -1,8 +1,8 @@
-"""Self-distillation without labels (DINO: Caron et al. 2021; Sparsh, Higuera et al. 2024) for touch.
+"""Self-distillation without labels (DINO: Caron et al. 2021; Sparsh) for touch.
 
-Views are blocks of patches of the same touch, as in Sparsh's code, so that none is scaled: how large a
-contact is must stay what it is. From each view the student is to guess what classes the teacher gives
-the other, larger ones; classes have no meaning beforehand.
+Views are blocks of patches of the same touch, as in Sparsh's code, and are never scaled: the size
+of a contact must stay as it is. From each view the student predicts the prototypes that the teacher
+gives the other, larger views.
 """
 
 import math
@@ -31,7 +31,7 @@ class DinoHead(nn.Module):
     """Three layers to a unit vector, then its cosine with every prototype."""
 
     def __init__(self, width: int, config: DinoConfig) -> None:
-        """Randomly initialised."""
+        """Build a randomly initialised head."""
         super().__init__()
         hidden = config.head_width
         layers: list[nn.Module] = []
@@ -44,7 +44,7 @@ class DinoHead(nn.Module):
         self.prototypes = nn.Linear(bottleneck, prototypes, bias=False)
 
     def forward(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n p"]:
-        """Scores, -1 to 1."""
+        """Return scores from -1 to 1."""
         unit = F.normalize(self.mlp(x).float(), dim=1)
         with torch.autocast(x.device.type, enabled=False):  # temperatures blow rounding up
             return unit @ F.normalize(self.prototypes.weight, dim=1).T
@@ -60,12 +60,12 @@ class _SharedBatchNorm(nn.BatchNorm1d):
 
 
 class Dino(SelfDistillation):
-    """A student with its head, and the average of both."""
+    """DINO objective: a student with its head, and the average of both."""
 
     center: Float[Tensor, " p"]
 
     def __init__(self, config: DinoConfig, backbone: TouchBackbone, steps: int) -> None:
-        """Randomly initialised; see `SelfDistillation`."""
+        """Build randomly initialised heads; see `SelfDistillation`."""
         super().__init__(config, backbone, steps)
         self.config = config
         self.head = DinoHead(backbone.config.vit.width, config)
@@ -77,7 +77,7 @@ class Dino(SelfDistillation):
         return [*super().averaged(), (self.teacher_head, self.head)]
 
     def draw(self, count: int, generator: torch.Generator) -> dict[str, Any]:
-        """Blocks of the picture's own shape: `global_ids` (count, 2, k), `local_ids` (count, v, j)."""
+        """Draw blocks of the image's shape: `global_ids` (count, 2, k), `local_ids` (count, v, j)."""
         grid, config = patch_grid(self.backbone.config.vit), self.config
         views = {"global_ids": (config.global_scale, _GLOBAL_VIEWS)}
         views["local_ids"] = (config.local_scale, config.local_views)
@@ -91,7 +91,7 @@ class Dino(SelfDistillation):
     def forward(
         self, touch: Tensor, global_ids: Int[Tensor, "b 2 k"], local_ids: Int[Tensor, "b v j"]
     ) -> dict[str, Float[Tensor, ""]]:
-        """The loss, and how many nats the teacher's classes tell of the touch: 0 if all get the same."""
+        """Return the loss, and the mutual information of touch and prototype, nats: 0 at collapse."""
         images = self.stacked(touch)
         with torch.no_grad():
             scores = self._scores(self.teacher, self.teacher_head, images, [global_ids])
@@ -108,7 +108,7 @@ class Dino(SelfDistillation):
     def _scores(
         self, backbone: TouchBackbone, head: DinoHead, images: Tensor, views: list[Tensor]
     ) -> Float[Tensor, "v b p"]:
-        """Of every view of every touch; patches are embedded once."""
+        """Return the scores of every view of every touch; patches are embedded once."""
         vit = backbone.vit
         patches = vit.embed_patches(images)
         outputs = []
@@ -124,7 +124,7 @@ class Dino(SelfDistillation):
         return head(read.flatten(0, 1)).unflatten(0, read.shape[:2])
 
     def _targets(self, scores: Float[Tensor, "2 b p"]) -> Float[Tensor, "2 b p"]:
-        """The teacher's distributions over prototypes."""
+        """Return the teacher's distributions over prototypes."""
         config = self.config
         warm = min(self.done / config.teacher_warmup, 1.0) if config.teacher_warmup else 1.0
         first = config.first_teacher_temperature
@@ -142,7 +142,7 @@ class Dino(SelfDistillation):
 def cross_entropy_of_views(
     targets: Float[Tensor, "g b p"], logits: Float[Tensor, "v b p"]
 ) -> Float[Tensor, ""]:
-    """Mean over all pairs of a teacher's and another student's view (Caron et al. 2021, equation 3).
+    """Return the mean over all pairs of a teacher's and another student's view (DINO's equation 3).
 
     Args:
         targets: The teacher's distributions for the first g views.
@@ -154,13 +154,13 @@ def cross_entropy_of_views(
 
 
 def information(targets: Float[Tensor, "v b p"]) -> Float[Tensor, ""]:
-    """Mutual information of touch and class within a batch, nats; at most the logarithm of its size."""
+    """Return the mutual information of touch and prototype within a batch, nats."""
     common, own = torch.special.entr(targets.mean(1)).sum(1), torch.special.entr(targets).sum(2)
     return common.mean() - own.mean()
 
 
 def sinkhorn(logits: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
-    """Distributions over prototypes that use all prototypes alike (Caron et al. 2020).
+    """Return distributions over prototypes that use all prototypes alike (Caron et al. 2020).
 
     Rows and columns are scaled in turn, over the touches of all processes.
     """

@@ -1,4 +1,4 @@
-"""I-JEPA (Assran et al. 2023; Sparsh, Higuera et al. 2024) for touch: predict blocks, not their pixels."""
+"""I-JEPA (Assran et al. 2023; Sparsh) for touch: predict the tokens of hidden blocks."""
 
 from typing import Any
 
@@ -16,13 +16,14 @@ _SQUARE = 1.0, 1.0
 
 
 class IJepa(JointEmbeddingPrediction):
-    """The backbone sees one large block without the target blocks, each of which is then predicted."""
+    """I-JEPA objective: predict each target block from a large block without the target blocks."""
 
     config: IJepaConfig
 
     def draw(self, count: int, generator: torch.Generator) -> dict[str, Any]:
-        """`seen_ids` (count, k), which all touches have as many of as the one with the fewest; and
-        `wanted_ids` (count, blocks, j)."""
+        """Draw `seen_ids` (count, k), cut to the smallest number in the batch, and `wanted_ids`
+        (count, blocks, j).
+        """
         config, grid = self.config, patch_grid(self.backbone.config.vit)
         size = draw_size(grid, config.context_scale, _SQUARE, generator)
         context = cover(draw_blocks(grid, size, count, 1, generator), grid[0] * grid[1])
@@ -36,7 +37,7 @@ class IJepa(JointEmbeddingPrediction):
     def forward(
         self, touch: Tensor, seen_ids: Int[Tensor, "b k"], wanted_ids: Int[Tensor, "b m j"]
     ) -> dict[str, Float[Tensor, ""]]:
-        """The loss: smooth L1 distance of predicted and actual tokens, as in the released code."""
+        """Return the loss: smooth L1 distance of predicted and actual tokens, as released."""
         images = self.stacked(touch)
         actual = take(self.targets(images), wanted_ids)
         predicted = self.predict(self.backbone.vit.embed_patches(images), seen_ids, wanted_ids)

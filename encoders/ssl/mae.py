@@ -1,4 +1,4 @@
-"""Masked autoencoding of touch (He et al. 2022; Sparsh, Higuera et al. 2024): no labels needed."""
+"""Masked autoencoding of touch (He et al. 2022; Sparsh, Higuera et al. 2024)."""
 
 from dataclasses import asdict
 from functools import partial
@@ -35,15 +35,13 @@ _ENCODER = "encoder"
 
 
 class MaskedAutoencoder(nn.Module):
-    """A backbone, and a decoder that reconstructs what the backbone did not see."""
+    """Backbone, and a decoder that reconstructs hidden patches."""
 
     def __init__(self, config: MaeConfig, sensor: str, stride: int = 1) -> None:
-        """Builds both, randomly initialised; UserError for an unknown sensor or nothing masked.
+        """Build both, randomly initialised; `stride` is the ticks between stacked frames.
 
-        Args:
-            config: Of the training.
-            sensor: Name of the fingertip sensor.
-            stride: Ticks between the frames of a touch, if it has several.
+        Raises:
+            UserError: Unknown sensor, or nothing is masked.
         """
         super().__init__()
         self.config = config
@@ -65,21 +63,22 @@ class MaskedAutoencoder(nn.Module):
     def forward(
         self, touch: Float16[Tensor, "b *t 3 h w"], ids_keep: Int[Tensor, "b k"]
     ) -> dict[str, Float[Tensor, ""]]:
-        """The loss, for the trainer."""
+        """Return the loss, for the trainer."""
         return {"loss": self.loss(self.images(touch), ids_keep)}
 
     def images(self, touch: Float16[Tensor, "b *t 3 h w"]) -> Float[Tensor, "b c h w"]:
-        """Touches as the backbone takes them; of two frames the newer one's channels come first."""
+        """Return the backbone's input; of two frames the newer one's channels come first."""
         touch = touch.float()
         return stack_frames(touch, self.backbone.config.vit) if self.config.stacked else touch
 
     def loss(
         self, touch: Float[Tensor, "b c h w"], ids_keep: Int[Tensor, "b k"]
     ) -> Float[Tensor, ""]:
-        """Mean squared error of the reconstructed patches, in the preprocessor's units.
+        """Return the mean squared error of the reconstructed patches, in the preprocessor's units.
 
-        All patches count with a bottleneck, else the masked ones. Patches are not brought to
-        variance 1, as He et al. do: most of a touch is untouched, and would be noise at full size.
+        With a bottleneck all patches count, otherwise the masked ones. Patches are not normalised
+        to variance 1, as in He et al.: most of a touch is untouched, and would become noise at full
+        size.
         """
         error = (self.reconstruct(touch, ids_keep) - patchify(touch, self.backbone.config.vit)) ** 2
         if self.config.bottleneck:
@@ -90,7 +89,7 @@ class MaskedAutoencoder(nn.Module):
     def reconstruct(
         self, touch: Float[Tensor, "b c h w"], ids_keep: Int[Tensor, "b k"]
     ) -> Float[Tensor, "b n p"]:
-        """All patches of touches, of which the backbone sees those in `ids_keep`."""
+        """Return all patches, decoded from those in `ids_keep`."""
         tokens = self.decoder_embed(self.backbone.vit(touch, ids_keep))
         rows, columns = patch_grid(self.backbone.config.vit)
         b, d = len(tokens), tokens.shape[2]
@@ -122,24 +121,9 @@ def train_mae(
     options: TrainerOptions,
     recipe: dict[str, Any],
 ) -> TouchBackbone:
-    """Trains a backbone.
+    """Train a backbone; see `ssl.train.train_self_distilled`.
 
-    Writes what `trainer.fit` does and, at the end, the backbone to `encoder/`. Killed and resumed,
-    it ends with the same weights as uninterrupted.
-
-    Args:
-        train: Touches to learn from.
-        val: Touches of other episodes.
-        config: How to train.
-        out_dir: A new run's directory, or one to go on with.
-        options: Seed, device, precision, whether to go on.
-        recipe: JSON-able; where the touches come from, kept with the weights.
-
-    Returns:
-        The backbone as saved in `out_dir/encoder`, for inference, on the CPU.
-
-    Raises:
-        UserError: No such device, or a directory that does not fit `options.resume`.
+    Writes what `trainer.fit` does and, at the end, the backbone to `encoder/`.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
@@ -185,11 +169,10 @@ def train_mae(
 
 @torch.no_grad()
 def validate(model: MaskedAutoencoder, train: TouchFrames, val: TouchFrames) -> dict[str, float]:
-    """Losses on other touches, and how well forces can be read from the embedding.
+    """Return losses on other touches, and how well a linear probe reads forces.
 
-    Returns:
-        `validation_loss`; `validation_loss_of_blank`, the loss of drawing an untouched gel; and what
-        `read_forces` finds.
+    `validation_loss`, `validation_loss_of_blank` (the loss of predicting an untouched gel), and the
+    metrics of `read_forces`.
     """
     vit, device = model.backbone.config.vit, model.backbone.device
     generator = torch.Generator().manual_seed(0)

@@ -1,7 +1,7 @@
-"""Which patches a network sees and which it is asked for: blocks of a grid, drawn for a whole batch.
+"""Blocks of patches that a network reads or predicts, drawn for a whole batch.
 
-A block's size is drawn once a batch, so that its patches make a rectangular tensor; its place is drawn
-for every picture. Indices count row by row, as `ViT.forward` wants them; those of one block are sorted.
+A block's size is drawn once a batch, so that its patches make a rectangular tensor; its place is
+drawn for every image. Indices count row by row, as for `ViT.forward`; those of a block are sorted.
 """
 
 import torch
@@ -19,13 +19,13 @@ def draw_size(
     aspect: tuple[float, float],
     generator: torch.Generator,
 ) -> tuple[int, int]:
-    """Rows and columns of a block.
+    """Draw the rows and columns of a block.
 
     Args:
         grid: Rows and columns of patches.
         scale: Least and greatest share of the patches.
         aspect: Least and greatest height over width.
-        generator: Of the draw.
+        generator: Random generator on the CPU.
     """
     share, ratio = (
         low + (high - low) * torch.rand((), generator=generator).item()
@@ -43,7 +43,7 @@ def draw_blocks(
     blocks: int,
     generator: torch.Generator,
 ) -> Int[Tensor, "{count} {blocks} k"]:
-    """Patches of so many blocks of a size in each of `count` pictures, anywhere; they may overlap."""
+    """Draw the patches of `blocks` blocks of a size in each of `count` images; they may overlap."""
     starts = [
         torch.randint(0, whole - part + 1, (count, blocks, 1, 1), generator=generator)
         for whole, part in zip(grid, size, strict=True)
@@ -54,20 +54,14 @@ def draw_blocks(
 
 
 def cover(ids: Int[Tensor, "b m k"], patches: int) -> Bool[Tensor, "b {patches}"]:
-    """Which patches of each picture are in at least one of its blocks."""
+    """Return whether each patch of an image is in one of its blocks."""
     return torch.zeros(len(ids), patches, dtype=torch.bool).scatter(1, ids.flatten(1), True)
 
 
 def cut(
     allowed: Bool[Tensor, "b n"], generator: torch.Generator, at_most: int | None = None
 ) -> Int[Tensor, "b k"]:
-    """As many of the allowed patches as the picture with the fewest has; which ones is drawn.
-
-    Args:
-        allowed: Patches of each picture.
-        generator: Of the draw.
-        at_most: No more than so many.
-    """
+    """Draw as many of the allowed patches of each image as the image with the fewest has."""
     fewest = int(allowed.sum(1).min())
     kept = fewest if at_most is None else min(fewest, at_most)
     chance = torch.rand(allowed.shape, generator=generator).masked_fill(~allowed, -1.0)
@@ -83,12 +77,12 @@ def draw_targets(
     least: int,
     generator: torch.Generator,
 ) -> tuple[Int[Tensor, "b m k"], Bool[Tensor, "b n"]]:
-    """Blocks to ask for, and what of `within` is left to see: at least so many patches.
+    """Draw target blocks; return them, and which patches of `within` they leave.
 
-    A picture with less left has its blocks drawn again.
+    An image with fewer than `least` patches left has its blocks drawn again.
 
     Raises:
-        UserError: That cannot be had on a grid so small.
+        UserError: The grid is too small for that.
     """
     ids = draw_blocks(grid, size, count, blocks, generator)
     for _ in range(_TRIES):

@@ -1,4 +1,4 @@
-"""Prediction of what a teacher makes of the patches that the backbone does not see (JEPA: LeCun 2022)."""
+"""Prediction of the teacher's tokens of hidden patches (JEPA: LeCun 2022)."""
 
 import torch
 import torch.nn.functional as F
@@ -12,12 +12,12 @@ from touchgoal.encoders.ssl.self_distillation import SelfDistillation
 
 
 class Predictor(nn.Module):
-    """A narrow transformer: from the tokens of seen patches to those of others, told by their places."""
+    """Narrow transformer from the tokens of given patches to those of others."""
 
     places: Float[Tensor, "n w"]
 
     def __init__(self, vit: ViTConfig, config: PredictorConfig) -> None:
-        """Randomly initialised, for a backbone."""
+        """Build a randomly initialised predictor for a backbone."""
         super().__init__()
         width = config.predictor_width
         self.embed = nn.Linear(vit.width, width)
@@ -38,7 +38,7 @@ class Predictor(nn.Module):
         seen_ids: Int[Tensor, "b k"],
         wanted_ids: Int[Tensor, "b j"],
     ) -> Float[Tensor, "b j d"]:
-        """Tokens of the wanted patches."""
+        """Return tokens of the wanted patches."""
         x = self.embed(seen)
         asked = (self.mask_token + self.places[wanted_ids]).to(x)
         x = torch.cat([x + self.places[seen_ids].to(x), asked], 1)
@@ -48,23 +48,23 @@ class Predictor(nn.Module):
 
 
 class JointEmbeddingPrediction(SelfDistillation):
-    """A backbone that sees parts, a predictor, and a teacher that sees all; subclasses draw the parts."""
+    """Backbone of partial input, predictor, and teacher of the whole; subclasses draw the parts."""
 
     def __init__(self, config: PredictorConfig, backbone: TouchBackbone, steps: int) -> None:
-        """Randomly initialised; see `SelfDistillation`."""
+        """Build a randomly initialised predictor; see `SelfDistillation`."""
         super().__init__(config, backbone, steps)
         self.config = config
         self.predictor = Predictor(backbone.config.vit, config)
 
     @property
     def least_seen(self) -> int:
-        """Patches that are always left to see in each frame: an eighth."""
+        """Return the least number of patches left as input in each frame: an eighth."""
         rows, columns = patch_grid(self.backbone.config.vit)
         return max(rows * columns // 8, 1)
 
     @torch.no_grad()
     def targets(self, images: Float[Tensor, "b c *t h w"]) -> Float[Tensor, "b n d"]:
-        """The teacher's tokens of everything, each brought to mean 0 and variance 1."""
+        """Return the teacher's tokens of all patches, each with mean 0 and variance 1."""
         tokens = self.teacher.vit(images).float()
         return F.layer_norm(tokens, tokens.shape[2:])
 
@@ -74,12 +74,12 @@ class JointEmbeddingPrediction(SelfDistillation):
         seen_ids: Int[Tensor, "b k"],
         wanted_ids: Int[Tensor, "b m j"],
     ) -> Float[Tensor, "b m j d"]:
-        """Tokens of m sets of patches, each predicted for itself.
+        """Return tokens of m sets of patches, each set predicted by itself.
 
         Args:
-            patches: Embedded patches of everything, of which only those in `seen_ids` are looked at.
-            seen_ids: Patches that the backbone sees.
-            wanted_ids: Patches asked for.
+            patches: All embedded patches.
+            seen_ids: Patches that the backbone reads.
+            wanted_ids: Patches to predict.
         """
         tokens = self.backbone.vit.encode(patches, seen_ids)
         tokens = tokens[:, self.backbone.config.vit.registers :]
@@ -90,6 +90,6 @@ class JointEmbeddingPrediction(SelfDistillation):
 
 
 def take(tokens: Float[Tensor, "b n d"], ids: Int[Tensor, "b m j"]) -> Float[Tensor, "b m j d"]:
-    """The tokens of sets of patches."""
+    """Return the tokens of sets of patches."""
     index = ids.flatten(1)[:, :, None].expand(-1, -1, tokens.shape[2])
     return tokens.gather(1, index).unflatten(1, ids.shape[1:])

@@ -1,6 +1,6 @@
-"""What DINO, I-JEPA and V-JEPA share: a teacher that is a moving average of what is trained, and the run.
+"""Teacher and student of DINO, I-JEPA and V-JEPA.
 
-The teacher is what is kept, measured and saved: it is steadier than its student.
+The teacher, a moving average of the student, is measured and saved: it is steadier.
 """
 
 import copy
@@ -16,56 +16,50 @@ from touchgoal.encoders.ssl.config import SelfDistillationConfig
 
 
 def frozen_copy(module: nn.Module) -> Any:
-    """The same, which no gradient reaches."""
+    """Return a copy without gradients."""
     return copy.deepcopy(module).requires_grad_(False)
 
 
 @torch.no_grad()
 def update_average(average: nn.Module, module: nn.Module, momentum: float) -> None:
-    """Exponential moving average: average <- momentum * average + (1 - momentum) * module."""
+    """Update a moving average: average <- momentum * average + (1 - momentum) * module."""
     for mean, weight in zip(average.parameters(), module.parameters(), strict=True):
         mean.lerp_(weight, 1 - momentum)
 
 
 class SelfDistillation(nn.Module):
-    """A backbone that learns from its own moving average; the objective is the subclass's.
+    """Backbone that learns from its own moving average; subclasses define the objective.
 
     Attributes:
-        backbone: What is trained.
+        backbone: The student.
         teacher: Its average.
-        step: Updates so far; part of the state, so that schedules go on after an interruption.
+        step: Updates so far; part of the state, so that schedules resume.
     """
 
     step: Int[Tensor, ""]
 
     def __init__(self, config: SelfDistillationConfig, backbone: TouchBackbone, steps: int) -> None:
-        """Builds the teacher, equal to the backbone.
-
-        Args:
-            config: For the teacher's momentum.
-            backbone: Randomly initialised.
-            steps: Updates of the whole training.
-        """
+        """Build the teacher, equal to the backbone, for a training of `steps` updates."""
         super().__init__()
         self.backbone, self.teacher = backbone, frozen_copy(backbone)
         self.register_buffer("step", torch.zeros((), dtype=torch.long))
         self._momentum, self._steps = (config.momentum, config.final_momentum), max(steps, 1)
 
     def draw(self, count: int, generator: torch.Generator) -> dict[str, Any]:
-        """What is random about a batch of so many touches: `forward`'s further arguments."""
+        """Draw what is random about a batch of `count` touches: `forward`'s further arguments."""
         raise NotImplementedError
 
     def averaged(self) -> list[tuple[nn.Module, nn.Module]]:
-        """Averages, and what they are of."""
+        """Return pairs of an average and its module."""
         return [(self.teacher, self.backbone)]
 
     @property
     def done(self) -> float:
-        """Share of the training that is done."""
+        """Return the share of the training that is done."""
         return min(self.step.item() / self._steps, 1.0)
 
     def update_teacher(self) -> None:
-        """After every update of the weights."""
+        """Update the averages; to be called after every update of the weights."""
         first, last = self._momentum
         momentum = first + self.done * (last - first)
         for average, module in self.averaged():
@@ -73,5 +67,5 @@ class SelfDistillation(nn.Module):
         self.step += 1
 
     def stacked(self, touch: Tensor) -> Float[Tensor, "b c *t h w"]:
-        """Touches, the frames of each newest first, as the network takes them."""
+        """Return the network's input from touches with the frames of each newest first."""
         return stack_frames(touch.float(), self.backbone.config.vit)

@@ -46,8 +46,9 @@ def train_self_distilled(
 ) -> TouchBackbone:
     """Train a backbone by the objective of `config`.
 
-    Writes what `trainer.fit` does, images reconstructed from the tokens, and at the end the teacher's
-    backbone to `encoder/`. Killed and resumed, it ends with the same weights as uninterrupted.
+    Writes what `trainer.fit` does, images reconstructed from the tokens, and at the end the
+    teacher's backbone to `encoder/`. Killed and resumed, it ends with the same weights as
+    uninterrupted.
 
     Args:
         train: Training touches.
@@ -58,11 +59,11 @@ def train_self_distilled(
         recipe: JSON-able provenance of the touches, stored with the weights.
 
     Returns:
-        The backbone as saved in `out_dir/encoder`, for inference, on the CPU.
+        The backbone as saved, for inference, on the CPU.
 
     Raises:
-        UserError: No such device, a folder that does not fit `options.resume`, or an encoder that
-            gives all touches the same embedding (collapse), which is not saved.
+        UserError: No such device, a folder that does not fit `options.resume`, or a collapsed
+            encoder, which is not saved.
     """
     method, objective = _OBJECTIVES[type(config)]
     optimizer = OptimizerConfig(

@@ -1,7 +1,7 @@
-"""What is measured of a self-supervised backbone after every epoch, for its losses say little.
+"""Validation of a self-supervised backbone after every epoch, for its loss says little.
 
-Whether it has collapsed, what a linear decoder reconstructs from its tokens, and what forces a ridge
-regression reads from its embedding. Nothing here changes the training.
+Collapse, linear reconstruction of the image from the tokens, and forces read by a ridge. Nothing
+here changes the training.
 """
 
 import math
@@ -32,7 +32,7 @@ _CONTRAST = 32.0  # grey levels that 1.0 is drawn as
 
 @runtime_checkable  # beartype checks arguments in tests
 class Distilled(Protocol):
-    """What of an objective is measured; see `SelfDistillation`."""
+    """Part of an objective that validation uses; see `SelfDistillation`."""
 
     teacher: TouchBackbone
 
@@ -41,21 +41,21 @@ class Distilled(Protocol):
 
 
 class Validation:
-    """Measures a training's teacher on touches of other episodes."""
+    """Metrics of a training's teacher on touches of other episodes."""
 
     def __init__(
         self, model: Distilled, train: TouchFrames, val: TouchFrames, out_dir: Path, epochs: int
     ) -> None:
-        """Measures the untrained backbone, which collapse is judged by."""
+        """Measure the untrained backbone, to which collapse is relative."""
         self._model, self._train, self._val = model, train, val
         self._out_dir, self._epochs = out_dir, epochs
         self._untrained = token_statistics(self._tokens(val))
 
     def metrics(self) -> dict[str, float]:
-        """The loss, `token_statistics`, the reconstruction and the forces, where they are known.
+        """Return the loss, `token_statistics`, `reconstruction` and `read_forces`.
 
-        `reconstruction`: share of a picture's change, as mean square, that a linear decoder fitted to
-        the training's tokens gets right of each patch from its own token.
+        `reconstruction` is the share of the image's mean square that a linear decoder, fitted to
+        the training tokens, gets right of each patch from its own token.
         """
         tokens, pixels = self._tokens(self._val), self._pixels(self._val)
         error = (self._decode(tokens) - pixels).square().mean() / pixels.square().mean()
@@ -68,15 +68,14 @@ class Validation:
         }
 
     def has_collapsed(self, metrics: dict[str, float]) -> bool:
-        """Whether all touches have come to look the same to the teacher, differ along one line, or are all
-        given the same class, if it gives any."""
+        """Return whether touches no longer differ, differ along one line, or share one prototype."""
         spread = metrics["token_spread"] / max(self._untrained["token_spread"], 1e-12)
         rank = (metrics["effective_rank"] - 1) / max(self._untrained["effective_rank"] - 1, 1e-12)
         told = metrics.get("teacher_information", 1.0)
         return not (spread >= _LEAST_SPREAD and rank >= _LEAST_RANK and told >= _LEAST_INFORMATION)
 
     def line(self, metrics: dict[str, float]) -> str:
-        """The line printed of an epoch."""
+        """Return the line to print for an epoch."""
         text = (
             f"loss {metrics['loss']:.4f} in training, {metrics['validation_loss']:.4f} in validation; "
             f"spread of tokens {metrics['token_spread']:.3f} ({self._untrained['token_spread']:.3f} "
@@ -87,7 +86,7 @@ class Validation:
         return text + warning if self.has_collapsed(metrics) else text
 
     def draw(self, epoch: int) -> None:
-        """A few times a training: `reconstruction_EPOCH.png`, touches above what is read from tokens."""
+        """Write `reconstruction_EPOCH.png` a few times: touches above their reconstructions."""
         due = {math.ceil(self._epochs * (k + 1) / _PICTURES) for k in range(_PICTURES)}
         if epoch not in due or not is_first_process():
             return
@@ -123,11 +122,11 @@ class Validation:
         return torch.cat([network(images).float().cpu() for images in stacked])
 
     def _pixels(self, data: TouchFrames) -> Float[Tensor, "n p c"]:
-        """Of the newest frame's patches."""
+        """Return the pixels of the newest frame's patches."""
         return patchify(_sample(data)[:, 0].float(), self._model.teacher.config.vit)
 
     def _decode(self, tokens: Float[Tensor, "m p d"]) -> Float[Tensor, "m q c"]:
-        """What tokens say of the newest frame's patches, each of its own: a ridge regression."""
+        """Decode the newest frame's patches, each from its own token, by a ridge."""
         known, pixels = self._tokens(self._train), self._pixels(self._train)
         count = pixels.shape[1]  # of a clip the tokens of the newest tubelet come first
         X, Y = known[:, :count].flatten(0, 1), pixels.flatten(0, 1)
@@ -139,15 +138,15 @@ class Validation:
 
 
 def token_statistics(tokens: Float[Tensor, "n p d"]) -> dict[str, float]:
-    """How touches differ in their tokens.
+    """Measure how touches differ in their tokens.
 
-    The mean over touches is taken from each place first: tokens of one touch always differ, for they
-    carry the codes of their places, and would hide a collapse.
+    The mean over touches is subtracted at each place first: position codes make the tokens of one
+    touch differ even at collapse.
 
     Returns:
-        `token_spread`, the mean square of what is left beside the tokens' own: 0 if all touches look
-        the same; `effective_rank`, the exponential of the entropy of its covariance's spectrum (Roy
-        and Vetterli 2007): in how many dimensions touches differ.
+        `token_spread`, the mean square of what is left over the tokens' own: 0 if all touches are
+        equal; `effective_rank`, the exponential of the entropy of its covariance's spectrum (Roy
+        and Vetterli 2007): the number of dimensions in which touches differ.
     """
     apart = (tokens - tokens.mean(0)).double()
     spread = apart.square().mean() / tokens.double().square().mean()
@@ -163,12 +162,10 @@ def token_statistics(tokens: Float[Tensor, "n p d"]) -> dict[str, float]:
 def read_forces(
     embed: Callable[[Tensor], Tensor], train: TouchFrames, val: TouchFrames
 ) -> dict[str, float]:
-    """How well forces can be read from an embedding.
+    """Return `force_x_r2`, `force_y_r2` (shear along columns and rows), `force_z_r2`.
 
-    Returns:
-        `force_x_r2`, `force_y_r2` (shear along the image's columns and rows), `force_z_r2`: the
-        share of the variance that a linear reading fitted on 2,048 touches of `train` explains;
-        nothing if the episodes do not know the force.
+    Shares of the variance that a linear probe fitted on 2,048 training touches explains; nothing
+    without recorded forces.
     """
     if train.wrench is None or val.wrench is None:
         return {}
@@ -179,7 +176,7 @@ def read_forces(
 
 
 def forces_line(metrics: dict[str, float]) -> str:
-    """What `read_forces` found, for an epoch's line; "" if nothing."""
+    """Return the result of `read_forces` for an epoch's line; "" without forces."""
     if "force_x_r2" not in metrics:
         return ""
     forces = [f"{axis} {metrics[f'force_{axis}_r2']:.2f}" for axis in "xyz"]
@@ -187,7 +184,7 @@ def forces_line(metrics: dict[str, float]) -> str:
 
 
 def _sample(data: TouchFrames) -> Tensor:
-    """Evenly drawn touches."""
+    """Return evenly spaced touches."""
     rows = torch.linspace(0, len(data) - 1, min(_TOKEN_SAMPLES, len(data))).long()
     return data.touch[rows]
 
@@ -197,7 +194,7 @@ def _to(value: Tensor | list[Tensor], device: torch.device) -> Tensor | list[Ten
 
 
 def _picture(patches: Float[Tensor, "p c"], vit: ViTConfig) -> np.ndarray:
-    """The inverse of `patchify`, as RGB about grey."""
+    """Invert `patchify`, as RGB about grey."""
     rows, columns = patch_grid(vit)
     size = vit.patch_size
     image = patches.view(rows, columns, 3, size, size).permute(0, 3, 1, 4, 2)

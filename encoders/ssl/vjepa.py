@@ -1,4 +1,4 @@
-"""V-JEPA (Bardes et al. 2024; Sparsh, Higuera et al. 2024) for touch: predict hidden tubes of a clip."""
+"""V-JEPA (Bardes et al. 2024; Sparsh) for touch: predict the tokens of hidden tubes of a clip."""
 
 from typing import Any
 
@@ -14,16 +14,17 @@ from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, take
 
 
 class VJepa(JointEmbeddingPrediction):
-    """The backbone sees what two masks leave of a clip; what they hide is predicted.
+    """V-JEPA objective: predict what each of two masks hides from what it leaves.
 
-    A mask is the same in all frames: what is hidden cannot be copied from a moment before.
+    A mask is the same in all frames, so that nothing hidden can be copied from an earlier frame.
     """
 
     config: VJepaConfig
 
     def draw(self, count: int, generator: torch.Generator) -> dict[str, Any]:
-        """For each mask `seen_ids` (count, k) and `wanted_ids` (count, 1, j), time by time; all touches
-        have as many of each as the one with the fewest."""
+        """Draw `seen_ids` (count, k) and `wanted_ids` (count, 1, j) for each mask, time by time;
+        cut to the smallest number in the batch.
+        """
         config, vit = self.config, self.backbone.config.vit
         grid, times = patch_grid(vit), vit.frames // vit.tubelet
         everything = torch.ones(count, grid[0] * grid[1], dtype=torch.bool)
@@ -47,7 +48,7 @@ class VJepa(JointEmbeddingPrediction):
         seen_ids: list[Int[Tensor, "b _"]],
         wanted_ids: list[Int[Tensor, "b 1 _"]],
     ) -> dict[str, Float[Tensor, ""]]:
-        """The loss: L1 distance of predicted and actual tokens, the mean over both masks."""
+        """Return the loss: L1 distance of predicted and actual tokens, the mean over both masks."""
         images = self.stacked(touch)
         targets, patches = self.targets(images), self.backbone.vit.embed_patches(images)
         losses = [
@@ -58,5 +59,5 @@ class VJepa(JointEmbeddingPrediction):
 
 
 def tubes(ids: Int[Tensor, "b k"], times: int, patches: int) -> Int[Tensor, "b j"]:
-    """The same patches of all times of a clip, of so many patches each."""
+    """Repeat patches at all times of a clip with `patches` patches a frame."""
     return torch.cat([ids + time * patches for time in range(times)], 1)

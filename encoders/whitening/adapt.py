@@ -1,8 +1,8 @@
-"""A fitted encoder adapted to videos of one's own: what differs between presses of one real thing does not matter.
+"""Adaptation of a whitened encoder to real videos.
 
-`surface_whitening` knows that from simulation. A share of what videos of the same thing show is blended into
-it, and features are centred on what these videos show. Where the things are ranked for how they feel, the
-encoder learns the words for it, too.
+`simulated_surfaces` estimates the within-object covariance in simulation. Here that of real videos
+is blended in, and features are centred on the videos. Where objects have ranks, the encoder also
+learns sentences.
 """
 
 from dataclasses import replace
@@ -26,16 +26,16 @@ from touchgoal.runtime.progress import track
 def adapt(
     encoder: PooledEncoder, videos: list[LabelledVideo], share: float, towers: Towers
 ) -> PooledEncoder:
-    """A new encoder, which knows sentences of these towers if some of the videos are ranked.
+    """Return an adapted encoder, with a text head for these towers if some videos have ranks.
 
     Args:
-        encoder: fitted to simulated surfaces.
-        videos: of things that were pressed, several of each.
-        share: of the videos in the covariance that is whitened; 0 centres alone.
-        towers: whose sentences it shall know.
+        encoder: Encoder fitted to simulated surfaces.
+        videos: Videos of pressed objects, several of each.
+        share: Weight of the videos in the covariance that is whitened; 0 only centres.
+        towers: Towers for the sentences.
 
     Raises:
-        UserError: no thing has two videos.
+        UserError: No object has two videos.
     """
     things = np.array([video.object for video in videos])
     if not videos or np.unique(things, return_counts=True)[1].max() < 2:
@@ -59,7 +59,7 @@ def adapt(
 
 
 def _pooled(encoder: PooledEncoder, video: LabelledVideo) -> Float[Tensor, "k d"]:
-    """Features of a video's firmest frames."""
+    """Return the features of a video's firmest frames."""
     frames = video.frames()
     background = touch_background(frames)
     touch = encoder.preprocess(frames[firmest_frames(frames, background)], background)

@@ -1,4 +1,4 @@
-"""Distances that ignore what differs within a class (Hatch et al. 2006, within-class covariance normalisation)."""
+"""Within-class covariance normalisation (Hatch et al. 2006)."""
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -9,7 +9,7 @@ _LEAST = 1e-12  # variance: samples that do not differ at all
 def inverse_square_root(
     covariance: Float[np.ndarray, "d d"], shrinkage: float
 ) -> Float[np.ndarray, "d d"]:
-    """V of a covariance C, shrunk towards a sphere, such that V.T C V is the identity."""
+    """Return V with V.T C V the identity, C the covariance shrunk towards a sphere."""
     size = len(covariance)
     sphere = max(np.trace(covariance) / size, _LEAST) * np.eye(size)
     values, vectors = np.linalg.eigh((1 - shrinkage) * covariance + shrinkage * sphere)
@@ -19,7 +19,7 @@ def inverse_square_root(
 def within_classes(
     samples: Float[np.ndarray, "n d"], classes: Shaped[np.ndarray, " n"]
 ) -> Float[np.ndarray, "d d"]:
-    """Covariance about the mean of each class."""
+    """Return the covariance about the mean of each class."""
     apart = samples.astype(np.float64)
     names = np.unique(classes)
     for name in names:

@@ -1,9 +1,9 @@
-"""What of a touch does not matter, learned from simulated surfaces pressed again and again.
+"""Within-surface covariance of touch features, estimated on simulated presses.
 
-Every surface is pressed several times, each time at another place, turn and depth, on another unit of
-the sensor, in other light and through other compression. The covariance within surfaces is what does
-not matter; its inverse square root makes distances that ignore it (within-class covariance
-normalisation: Hatch et al. 2006). A closed form: nothing is tuned, the seed hardly matters.
+Each surface is pressed several times, at another place, rotation and depth, on another sensor
+instance, in other light and through other compression. What differs between these presses does not
+matter; the inverse square root of its covariance makes distances that ignore it (Hatch et al.
+2006). The solution is in closed form.
 """
 
 from collections.abc import Iterator
@@ -39,7 +39,7 @@ _COMPRESSED = 0.7
 
 @dataclass(frozen=True)
 class WhiteningConfig:
-    """How much is simulated."""
+    """Amount of simulated data."""
 
     surfaces: int = 5000
     presses: int = 4
@@ -47,13 +47,7 @@ class WhiteningConfig:
 
 
 def train(sensor: SensorModel, name: str, config: WhiteningConfig) -> PooledEncoder:
-    """An encoder fitted to simulated touch.
-
-    Args:
-        sensor: simulated: a measured sensor file says most.
-        name: sensor whose pictures the encoder is for.
-        config: how much is simulated.
-    """
+    """Return an encoder for the sensor called `name`, fitted to simulated touch."""
     encoder = PooledEncoder(PooledEncoderConfig.for_sensor(name))
     total, square = np.zeros(FEATURES), np.zeros((FEATURES, FEATURES))
     within = np.zeros((FEATURES, FEATURES))
@@ -82,7 +76,7 @@ def _surfaces_a_batch(config: WhiteningConfig) -> int:
 def _pooled(
     encoder: PooledEncoder, sensor: SensorModel, config: WhiteningConfig
 ) -> Iterator[Float32[np.ndarray, "surfaces presses d"]]:
-    """Pooled features of some surfaces at a time, each pressed several times."""
+    """Yield the pooled features of a batch of surfaces."""
     rng = np.random.default_rng([config.seed, 0])
     units = [_unit(sensor, rng) for _ in range(_UNITS)]
     step = _surfaces_a_batch(config)
@@ -100,7 +94,7 @@ def _pooled(
 
 
 def _unit(sensor: SensorModel, rng: np.random.Generator) -> SensorInstance:
-    """One unit of the sensor, its response stronger or weaker than the file's."""
+    """Return a sensor instance with a response stronger or weaker than the file's."""
     instance = sample_instance(sensor, rng)
     strength = rng.uniform(0.75, 1.3) * rng.uniform(0.85, 1.15, (3, 1, 1))
     response = (instance.calibration.response * strength).astype(np.float32)
@@ -110,7 +104,7 @@ def _unit(sensor: SensorModel, rng: np.random.Generator) -> SensorInstance:
 def _visible_press(
     surface, unit: SensorInstance, rng: np.random.Generator
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
-    """The unit untouched, and pressed, as its camera sends both."""
+    """Return the camera images of the untouched and of the pressed sensor."""
     rest = untouched(unit, rng)
     frame = rest
     for _ in range(_TRIES):

@@ -1,7 +1,8 @@
-"""Sentences brought to where the touches they tell of lie, by a ridge: for an encoder that stays as it is.
+"""Sentences mapped into a fixed touch embedding by a ridge regression.
 
-Things are ranked for hardness, roughness and bumpiness, 0 to 2 each, as PhysiCLeAR's are. Every rank, and
-every triple of ranks that occurs, is a sentence; its place is the mean of the touches it is true of.
+Objects have ranks 0 to 2 of hardness, roughness and bumpiness, as in PhysiCLeAR. Every rank, and
+every triple of ranks in the data, is a sentence; its target is the mean of the touches it
+describes.
 """
 
 from collections.abc import Callable
@@ -25,35 +26,35 @@ EmbedTexts = Callable[[list[str]], Float[Tensor, "k t"]]
 
 @dataclass(frozen=True, eq=False)
 class TextHead:
-    """From a text tower's embeddings to touch.
+    """Linear map from a text tower's embeddings to touch.
 
     Attributes:
-        mean: of the unit text embeddings.
-        matrix: what is left of them to touch.
+        mean: Mean of the unit text embeddings.
+        matrix: Map from centred text embeddings to touch.
     """
 
     mean: Float[Tensor, " t"]
     matrix: Float[Tensor, "t d"]
 
     def __call__(self, texts: Float[Tensor, "n t"]) -> Float[Tensor, "n d"]:
-        """Unit vectors."""
+        """Return unit vectors among the touch embeddings."""
         return F.normalize((F.normalize(texts, dim=1) - self.mean) @ self.matrix, dim=1)
 
 
 def rank_sentences(property_: int) -> list[str]:
-    """What is said of the three ranks of a property."""
+    """Return the sentences for the three ranks of a property."""
     return [f"a {word} object" for word in RANK_WORDS[property_]]
 
 
 def fit_text_head(
     touches: Float[Tensor, "n d"], ranks: Int[Tensor, "n 3"], embed_texts: EmbedTexts
 ) -> TextHead:
-    """Ridge from sentences to the mean touch that each is true of.
+    """Fit a ridge from sentences to the mean touch that each describes.
 
     Args:
-        touches: centred.
-        ranks: of what was touched.
-        embed_texts: a text tower's.
+        touches: Centred touch embeddings.
+        ranks: Ranks of the touched objects.
+        embed_texts: A text tower's embedding function.
     """
     sentences, places, weights = [], [], []
     for property_ in range(ranks.shape[1]):
