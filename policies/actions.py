@@ -1,8 +1,8 @@
-"""What a policy predicts: chunks of actions, and the scales it learns in.
+"""Chunks of actions: their representations, and normalisation.
 
 An action (8,) is the joint change (7) of one tick, rad, and the gripper width target, m
-(`features.ACTION`). A chunk, or plan, is the actions of h ticks from the latest
-observation on; a network learns and draws it in a representation, each tick of it normalised.
+(`features.ACTION`). A chunk, or plan, is the actions of h ticks from the latest observation on. A network
+predicts it in a representation, each tick normalised by itself.
 """
 
 from functools import cache
@@ -20,13 +20,13 @@ from touchgoal.policies.config import ActionRepresentation
 
 ACTION_DIM = N_JOINTS + 1
 
-_MIN_RANGE = 1e-6  # in SI units: smaller than anything that a policy should learn to vary
+_MIN_RANGE = 1e-6  # SI units; a component that varies less counts as constant
 
 
 def to_representation(
     actions: Float[Tensor, "b h 8"], joints: Float[Tensor, "b 7"], kind: ActionRepresentation
 ) -> Float[Tensor, "b h 8"]:
-    """Actions in a representation; `joints` (rad) are those measured at the chunk's start."""
+    """Return actions in a representation; `joints` (rad) are measured at the chunk's start."""
     if kind == "delta":
         return actions
     targets = actions[..., :N_JOINTS].cumsum(1)
@@ -42,7 +42,7 @@ def to_representation(
 def to_actions(
     represented: Float[Tensor, "b h 8"], joints: Float[Tensor, "b 7"], kind: ActionRepresentation
 ) -> Float[Tensor, "b h 8"]:
-    """The inverse of `to_representation`."""
+    """Invert `to_representation`."""
     if kind == "delta":
         return represented
     targets = represented[..., :N_JOINTS]
@@ -56,27 +56,27 @@ def to_actions(
 
 
 def _base_jacobian_and_elbow(joints: Float[Tensor, "b 7"]) -> Float[Tensor, "b 7 7"]:
-    """From small changes of the joints to the hand's displacement, its turn, the third joint's."""
+    """Return the matrix from joint changes to the hand's displacement, rotation and third joint."""
     rows, _ = _kinematics().jacobians(joints.cpu().numpy().astype(np.float64))
     elbow = torch.eye(N_JOINTS)[2].expand(len(rows), 1, -1)
     return torch.cat([torch.from_numpy(rows).float(), elbow], 1).to(joints)
 
 
 def nearest(widths: Float[Tensor, "b h"], allowed: tuple[float, ...]) -> Float[Tensor, "b h"]:
-    """Of each width (m) the nearest that is allowed."""
+    """Return for each width (m) the nearest allowed one."""
     levels = torch.tensor(allowed).to(widths)
     return levels[(widths[..., None] - levels).abs().argmin(-1)]
 
 
 def body_jacobian(joints: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 6 7"]:
-    """From small changes of the joints to the TCP's displacement and turn along the TCP's axes."""
+    """Return the matrix from joint changes to the TCP's displacement and rotation along its own axes."""
     J, R = _kinematics().jacobians(joints.reshape(-1, N_JOINTS).cpu().numpy().astype(np.float64))
     own = R.mT[:, None] @ J.reshape(-1, 2, 3, N_JOINTS)
     return torch.from_numpy(own).float().to(joints).reshape(*joints.shape[:-1], 6, N_JOINTS)
 
 
 def tcp_poses(joints: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7"]:
-    """Where the TCP is, `features.TCP_POSE`, with the joints there (rad)."""
+    """Return `features.TCP_POSE` at joint positions (rad)."""
     position, R = _kinematics().forward_many(
         joints.reshape(-1, N_JOINTS).cpu().numpy().astype(np.float64)
     )
@@ -86,7 +86,7 @@ def tcp_poses(joints: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7"]:
 
 
 def _damped_pseudoinverse(J: Float[Tensor, "b 6 7"]) -> Float[Tensor, "b 7 6"]:
-    """From a displacement and turn to the least change of the joints, damped where none will do."""
+    """Return the matrix from displacement and rotation to the least joint change, damped if singular."""
     return J.mT @ torch.linalg.inv(J @ J.mT + DAMPING * torch.eye(6).to(J))
 
 
@@ -96,16 +96,16 @@ def _kinematics() -> Fr3Kinematics:
 
 
 class Normalizer(nn.Module):
-    """An affine map of every component to the range that a network likes, and back.
+    """Affine map of every component to a network's range, and back.
 
-    A component that was constant becomes 0, and comes back as the constant.
+    A constant component becomes 0, and comes back as the constant.
     """
 
     offset: Tensor
     scale: Tensor
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        """The identity, until fitted."""
+        """Start as the identity."""
         super().__init__()
         self.register_buffer("offset", torch.zeros(shape))
         self.register_buffer("scale", torch.ones(shape))
@@ -113,9 +113,9 @@ class Normalizer(nn.Module):
     def fit_range(
         self, values: Float[Tensor, "n ..."], valid: Bool[Tensor, "n ..."] | None = None
     ) -> None:
-        """From now on, the least and the greatest of these values become -1 and 1.
+        """Map the least and the greatest of these values to -1 and 1.
 
-        Only values that are `valid` count, if that is given; a component without any becomes 0.
+        Only `valid` values count, if given; a component without any becomes 0.
         """
         if valid is None:
             valid = torch.ones_like(values, dtype=torch.bool)
@@ -126,16 +126,16 @@ class Normalizer(nn.Module):
         self._set((low + high) / 2, (high - low) / 2)
 
     def fit_mean_std(self, values: Float[Tensor, "n ..."]) -> None:
-        """From now on, these values become ones of mean 0 and variance 1."""
+        """Map these values to mean 0 and variance 1."""
         self._set(values.mean(0), values.std(0, correction=0))
 
     def forward(self, values: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
-        """To the network's range."""
+        """Map to the network's range."""
         constant = self.scale == 0
         return (values - self.offset) * ~constant / (self.scale + constant)
 
     def inverse(self, scaled: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
-        """Back from it."""
+        """Map back from it."""
         return scaled * self.scale + self.offset
 
     def _set(self, offset: Tensor, scale: Tensor) -> None:

@@ -1,4 +1,4 @@
-"""The policy: from what both fingertips and the arm have felt to the actions of the next ticks."""
+"""The policy's network: observations of the last ticks to actions of the next ones."""
 
 from dataclasses import dataclass, field
 
@@ -28,45 +28,39 @@ from touchgoal.policies.perception.proprioception import input_widths, is_positi
 from touchgoal.runtime.errors import UserError
 
 WRENCH_DIM = ft.FEATURES[ft.TRUTH_PAD_WRENCH].shape[0]
-_CLIP = 5.0  # standard deviations beyond which an input is as surprising as it gets
+_CLIP = 5.0  # standard deviations
 
 
 @dataclass(frozen=True)
 class PolicyConfig:
-    """What a policy sees and does.
+    """Inputs and outputs of a policy.
 
     Attributes:
-        touch_dim: of the frozen embedding of both fingertips together; 0 for a policy without
-            touch.
+        touch_dim: of the frozen embedding of both fingertips together; 0 without touch.
         touch: names what made the embeddings: encoder, sensor, background.
-        touch_input: what of the embeddings reaches the head. "wrench": a small network reads the wrenches on
-            both pads out of them, which learns from what the simulator says acted there and from
-            nothing else (TacBench's force estimation, T1), and the head sees the 12 numbers.
-            "embedding": a projection that learns from the actions alone, for episodes without that truth.
-        touch_projection_dim: to which an embedding is projected, with "embedding".
-        touch_noise: standard deviation of noise added to the touch while learning, of embeddings
-            scaled to variance 1. Without it a network knows each recorded episode again by its
-            sensors, and learns its wire by heart.
-        position_noise: likewise of the joint and TCP positions, one draw for all ticks seen: where on
-            the table a wire ran shall not tell how it goes on. Velocities and the hand's
-            orientation stay as they are. "body_twist" sees no positions.
-        gripper_widths: m, all that the demonstrations ask for, if those are two: what is predicted in
-            between, where the network is not sure, becomes the nearer one, for a hand that is sent a
-            width on the way goes there. Empty: any width.
-        end_to_end: for fingertips that no frozen encoder reads; None for a policy without.
-        proprioception: columns of `features.FEATURES`, the state first. Where it acts, those that
-            only a simulator knows come from its state estimator, see `state_estimation.py`. The force on
-            the hand is seen less that of the episode's first tick, see `proprioception.tare`.
-        observation_horizon: ticks seen, the latest included.
-        prediction_horizon: ticks planned. The first is the latest observation's, so that all of
-            them can be done; diffusion_policy counts from the oldest observation instead.
-        execution_horizon: ticks of a plan that are done before the next one.
-        representation: of the actions while learning; "body_twist" also sees along the hand's own axes,
-            see `proprioception.py`.
+        touch_input: "wrench": a small network, trained on the simulator's pad forces and on nothing else
+            (TacBench's T1), reads the wrenches on both pads from the embedding, and the head gets those 12
+            numbers. "embedding": a projection that is trained on the actions alone, for episodes without
+            that truth.
+        touch_projection_dim: width of the projection, with "embedding".
+        touch_noise: standard deviation of noise on normalised embeddings in training. Without it the
+            network recognises each recorded episode by its sensors.
+        position_noise: likewise on joint and TCP positions, one draw for all ticks observed, so that the
+            place on the table does not tell how a wire goes on. "body_twist" reads no positions.
+        gripper_widths: m, the only two that the demonstrations command; what is predicted in between
+            becomes the nearer one, for the hand would go to a width on the way. Empty: any width.
+        end_to_end: touch encoder that is trained jointly; None without.
+        proprioception: columns of `features.FEATURES`, the state first. Columns that only a simulator
+            knows come from a state estimator on an arm. The wrench is tared, see `proprioception.tare`.
+        observation_horizon: ticks observed, the latest included.
+        prediction_horizon: ticks planned, from the latest observation on; diffusion_policy counts from the
+            oldest one.
+        execution_horizon: ticks of a plan that are executed before the next one.
+        representation: of the actions in training.
         control_hz: ticks per second.
-        head: what draws the plan.
-        task: of the episodes learned from, such as "bead-maze"; "" if unknown.
-        sensor: of the fingertips in them; "" for a policy without touch.
+        head: predicts the plan.
+        task: of the training episodes, such as "bead-maze"; "" if unknown.
+        sensor: of the fingertips in them; "" without touch.
     """
 
     touch_dim: int
@@ -88,15 +82,15 @@ class PolicyConfig:
     sensor: str = ""
 
     def __post_init__(self) -> None:
-        """Raises UserError for what makes no policy."""
+        """Raise UserError for values that do not go together."""
         if self.proprioception[:1] != (ft.STATE,) or not set(self.proprioception) <= set(
             ft.FEATURES
         ):
             raise UserError(f"proprioception must be known columns, {ft.STATE} first")
-        seen = set(self.proprioception) - {ft.COMMAND}
-        if self.representation == "body_twist" and seen != {ft.STATE, ft.TCP_POSE}:
+        columns = set(self.proprioception) - {ft.COMMAND}
+        if self.representation == "body_twist" and columns != {ft.STATE, ft.TCP_POSE}:
             raise UserError(
-                'representation "body_twist" sees the arm alone, neither force nor object: choose "base_twist"'
+                'representation "body_twist" reads neither force nor object: choose "base_twist"'
             )
         if not 1 <= self.execution_horizon <= self.prediction_horizon:
             raise UserError(
@@ -113,12 +107,12 @@ class PolicyConfig:
 
     @property
     def reads_wrench(self) -> bool:
-        """Whether its training needs `truth.pad_wrench`."""
+        """Whether training needs `truth.pad_wrench`."""
         return self.touch_dim > 0 and self.touch_input == "wrench"
 
     @property
     def estimated(self) -> tuple[str, ...]:
-        """Columns that senses must read where there is no simulator to ask."""
+        """Columns that a state estimator supplies on an arm."""
         return tuple(key for key in self.proprioception if not key.startswith("observation."))
 
     @property
@@ -128,18 +122,18 @@ class PolicyConfig:
 
     @property
     def proprioception_dim(self) -> int:
-        """Width of the proprioception as the network sees it, see `proprioception.network_input`."""
+        """Width of `proprioception.network_input`."""
         return sum(input_widths(self.proprioception, self.representation))
 
 
 @dataclass(frozen=True, eq=False)
 class ObservationBatch:
-    """What a policy has seen on the last ticks, oldest first, as it was measured.
+    """Observations of the last ticks, oldest first.
 
     Attributes:
         touch: frozen embeddings of the left and the right fingertip, side by side.
         state: columns of `PolicyConfig.proprioception`, side by side, SI units.
-        pictures: of the latest tick, for the end-to-end encoder, see `end_to_end.difference_images`; None without.
+        pictures: difference images of the latest tick, for the end-to-end encoder; None without.
     """
 
     touch: Float[Tensor, "b o e"]
@@ -156,7 +150,7 @@ class PolicyNetwork(nn.Module):
     """Network from an observation batch to actions, with its normalizers inside."""
 
     def __init__(self, config: PolicyConfig) -> None:
-        """Randomly initialised; `fit_normalizers` comes before training."""
+        """Initialise at random; call `fit_normalizers` before training."""
         super().__init__()
         self.config = config
         ticks = config.prediction_horizon
@@ -196,11 +190,10 @@ class PolicyNetwork(nn.Module):
         wrench: Float[Tensor, "n 12"] | None = None,
         action_is_pad: Bool[Tensor, "m h"] | None = None,
     ) -> None:
-        """Fits the scales to training data: n ticks, and the chunks of m windows.
+        """Fit the normalizers to training data: n ticks, and the chunks of m windows.
 
-        Inputs get variance 1, actions the range -1 to 1, for each tick of the chunk by itself: the
-        first of a relative plan moves an eighth of what the last does. Padded actions do not
-        count.
+        Inputs get variance 1. Actions get the range -1 to 1, each tick of the chunk by itself: the last of
+        a relative plan moves eight times as far as the first. Padded actions do not count.
         """
         if self.config.touch_dim:
             self.touch_normalizer.fit_mean_std(touch)
@@ -219,20 +212,20 @@ class PolicyNetwork(nn.Module):
         wrench: Float[Tensor, "b o 12"] | None = None,
         action_is_pad: Bool[Tensor, "b h"] | None = None,
     ) -> Float[Tensor, ""]:
-        """Training loss on windows.
+        """Return the training loss on windows.
 
         Args:
-            batch: what was seen.
-            actions: what was done.
-            noise: random numbers of the batch.
-            wrench: what acted on both pads, where touch is read as that.
-            action_is_pad: the ticks that lie after the episode's end, of which nothing is learned.
+            batch: observations.
+            actions: recorded actions.
+            generator: random generator on the CPU.
+            wrench: on both pads, with `reads_wrench`.
+            action_is_pad: ticks after the episode's end, which do not count.
         """
         chunk = to_representation(actions, batch.joints, self.config.representation)
         touch = self._encode_touch(batch, noise)
         wrench_loss = torch.zeros((), device=touch.device)
         if self.config.reads_wrench:
-            assert wrench is not None, "this policy learns to read wrenches"
+            assert wrench is not None, "needs the wrenches on the pads"
             wrench_loss = F.mse_loss(touch, self.wrench_normalizer(wrench))
             touch = touch.detach()
         encoded = self._encode(batch, touch, noise)
@@ -241,7 +234,7 @@ class PolicyNetwork(nn.Module):
 
     @torch.inference_mode()
     def plan(self, batch: ObservationBatch, generator: torch.Generator) -> Float[Tensor, "b h 8"]:
-        """Actions (`features.ACTION`) of the ticks from the latest observation on.
+        """Return actions (`features.ACTION`) of the ticks from the latest observation on.
 
         The same generator state (on the CPU) gives the same plan.
         """
@@ -255,7 +248,7 @@ class PolicyNetwork(nn.Module):
     def _encode_touch(
         self, batch: ObservationBatch, noise: BatchNoise | None = None
     ) -> Float[Tensor, "b o w"]:
-        """What touch tells the head, with the training's noise if there is a generator for it."""
+        """Return the head's touch input, with the training's noise if a generator is given."""
         if self.touch_readout is None:
             return batch.state[..., :0]
         touch = self.touch_normalizer(batch.touch).clamp(-_CLIP, _CLIP)
@@ -270,15 +263,17 @@ class PolicyNetwork(nn.Module):
         touch: Float[Tensor, "b o w"],
         noise: BatchNoise | None = None,
     ) -> Float[Tensor, "b c"]:
-        """What the head sees, with the training's noise if there is a generator for it."""
+        """Return the head's whole input, with the training's noise if a generator is given."""
         columns, kind = self.config.proprioception, self.config.representation
         state = network_input(batch.state, columns, kind)
-        seen = self.state_normalizer(state).clamp(-_CLIP, _CLIP)
+        state = self.state_normalizer(state).clamp(-_CLIP, _CLIP)
         if noise is not None:
-            shift = noise.randn((len(seen), 1, seen.shape[2])).to(seen)
-            seen = seen + self.config.position_noise * shift * is_position(columns, kind).to(seen)
-        seen = torch.cat([touch, seen], -1)
+            shift = torch.randn(len(state), 1, state.shape[2], generator=noise).to(state)
+            state = state + self.config.position_noise * shift * is_position(columns, kind).to(
+                state
+            )
+        encoded = torch.cat([touch, state], -1).flatten(1)
         if self.end_to_end_encoder is None:
-            return seen.flatten(1)
-        assert batch.pictures is not None, "this policy looks at pictures"
-        return torch.cat([seen.flatten(1), self.end_to_end_encoder(batch.pictures)], 1)
+            return encoded
+        assert batch.pictures is not None, "needs tactile images"
+        return torch.cat([encoded, self.end_to_end_encoder(batch.pictures)], 1)

@@ -1,4 +1,4 @@
-"""A policy's own network for the pictures of both fingertips, trained along with it."""
+"""Touch encoder that is trained jointly with the policy."""
 
 from dataclasses import dataclass
 
@@ -9,18 +9,17 @@ from torch import Tensor, nn
 
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 
-_ZERO = 128  # grey level of an unchanged touch
-_SCALE = 16.0  # grey levels that make 1.0 of a touch, as in `encoders/preprocess.py`
+_ZERO = 128  # grey level of an unchanged pixel
+_SCALE = 16.0  # grey levels per 1.0 of the input, as in `encoders/preprocess.py`
 
 
 @dataclass(frozen=True)
 class EndToEndConfig:
-    """An encoder for both fingertips at the latest tick: a ViT, which reads textures.
+    """Size of a ViT for both tactile images of the latest tick.
 
     Attributes:
-        size: rows and columns of the pictures it takes; twice as many of either learn nine times
-            slower.
-        width: of the embedding of one picture.
+        size: rows and columns of its input; twice as many of either train nine times slower.
+        width: of the embedding of one image.
     """
 
     size: tuple[int, int] = (60, 80)
@@ -30,7 +29,7 @@ class EndToEndConfig:
 def difference_images(
     frames: UInt8[np.ndarray, "n H W 3"], first: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]
 ) -> UInt8[np.ndarray, "n h w 3"]:
-    """The change of a fingertip's pictures since the untouched first one, at the encoder's size."""
+    """Return the change of tactile images since the untouched first one, at the encoder's size."""
     h, w = size
     change = frames - first.astype(np.int16) + _ZERO
     frames = np.clip(change, 0, 255).astype(np.uint8)
@@ -38,16 +37,16 @@ def difference_images(
 
 
 class EndToEndEncoder(nn.Module):
-    """Pictures of both fingertips to one vector, through one network."""
+    """Network from both tactile images to one vector; both sides share its weights."""
 
     def __init__(self, config: EndToEndConfig) -> None:
-        """Randomly initialised."""
+        """Initialise at random."""
         super().__init__()
         vit = ViTConfig(image_size=config.size, width=128, depth=4, heads=4)
-        self.vit, self.say = ViT(vit), nn.Linear(vit.width, config.width)
+        self.vit, self.projection = ViT(vit), nn.Linear(vit.width, config.width)
 
     def forward(self, pictures: UInt8[Tensor, "b k h w 3"]) -> Float[Tensor, "b e"]:
-        """The embedding of the latest tick, a picture of each of `features.TACTILE`."""
+        """Return the embedding of a tick with an image of each of `features.TACTILE`."""
         count = pictures.shape[1]
         images = (pictures.flatten(0, 1).permute(0, 3, 1, 2).float() - _ZERO) / _SCALE
-        return self.say(self.vit.features(images)).unflatten(0, (-1, count)).flatten(1)
+        return self.projection(self.vit.features(images)).unflatten(0, (-1, count)).flatten(1)

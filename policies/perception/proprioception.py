@@ -1,12 +1,11 @@
-"""Proprioception as a network understands it at once.
+"""Proprioception as a network reads it.
 
-Two views of the same columns. From the base: joints and hand as they are. Along the hand's own axes
-("body_twist"): how the hand moves and which way is up, and nothing of where on the table it is or which way
-it faces, so that what was learnt on one wire holds for every wire that bends as much.
+In the base frame: joints and TCP pose. Along the hand's own axes ("body_twist"): the hand's velocity and the
+vertical, without place or heading, so that what is learned on one wire holds for every wire that bends as
+much.
 
-With `observation.command` among the columns the arm is seen where it has been sent, not where it was last
-measured: how late a measurement is, and how far the arm lags, then makes no difference to what the
-network sees, and a correction is not made twice.
+With `observation.command` among the columns the commanded arm stands in for the measured one: delays and the
+arm's lag then do not change the input, and no correction is made twice.
 """
 
 import numpy as np
@@ -19,22 +18,22 @@ from touchgoal.policies.actions import body_jacobian, tcp_poses
 from touchgoal.policies.config import ActionRepresentation
 
 _LENGTH_SCALE = 0.02  # m
-# Columns that there are along the hand's axes, and their `input_widths`.
+# Columns along the hand's axes, and their `input_widths`.
 _BODY_FRAME_WIDTHS = {ft.STATE: 7, ft.TCP_POSE: 3, ft.COMMAND: 0}
 
 
 def tare(wrench: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """The force on the hand since an episode's first tick, when nothing touched it: (..., 6).
+    """Return the wrench (..., 6) less that of an episode's first tick, without contact.
 
-    An arm's estimate has a bias of some newtons that stays for a while.
+    An arm's estimate has a bias of some newtons that lasts.
     """
     return (wrench - first).astype(np.float32)
 
 
 def input_widths(columns: tuple[str, ...], kind: ActionRepresentation) -> list[int]:
-    """Of what `network_input` makes of each column; KeyError for one that "body_twist" does not know.
+    """Return the width of each column in `network_input`; KeyError for one unknown to "body_twist".
 
-    The command has no width of its own: it stands in the place of state and pose.
+    The command has no width of its own: it replaces state and pose.
     """
     if kind == "body_twist":
         return [_BODY_FRAME_WIDTHS[key] for key in columns]
@@ -43,7 +42,7 @@ def input_widths(columns: tuple[str, ...], kind: ActionRepresentation) -> list[i
 
 
 def is_position(columns: tuple[str, ...], kind: ActionRepresentation) -> Float[Tensor, " r"]:
-    """1 for joint and TCP positions, 0 for all else that `network_input` gives."""
+    """Return 1 for the joint and TCP positions in `network_input`, 0 for the rest."""
     marks = []
     for key, width in zip(columns, input_widths(columns, kind), strict=True):
         count = 0 if kind == "body_twist" else {ft.STATE: ft.N_JOINTS, ft.TCP_POSE: 3}.get(key, 0)
@@ -54,21 +53,20 @@ def is_position(columns: tuple[str, ...], kind: ActionRepresentation) -> Float[T
 def network_input(
     state: Float[Tensor, "... s"], columns: tuple[str, ...], kind: ActionRepresentation
 ) -> Float[Tensor, "... r"]:
-    """What a network sees of columns of `features.FEATURES`, side by side.
+    """Return the network's input from columns of `features.FEATURES`, side by side.
 
-    From the base: the TCP's quaternion becomes the first two columns of its rotation matrix. A
-    quaternion and its negative are the same turn, and a measured one jumps between the two as the hand
-    turns about the vertical; the matrix does not (Zhou et al. 2019). What `truth.start` says is seen
-    from the hand, in axes parallel to the base's: a centimetre matters there, not where on the table.
+    In the base frame the TCP's quaternion becomes the first two columns of its rotation matrix: a
+    quaternion jumps to its negative as the hand turns, the matrix does not (Zhou et al. 2019).
+    `truth.start` becomes relative to the hand, in axes parallel to the base's.
 
-    Along the hand's axes: the TCP's linear and angular velocity (m/s, rad/s) and the gripper's width
-    for the state, the vertical for the TCP's pose.
+    Along the hand's axes the state becomes the TCP's linear and angular velocity (m/s, rad/s) and the
+    gripper's width, the TCP's pose the vertical.
     """
     parts, start = {}, 0
     for key in columns:
         parts[key] = state[..., start : (start := start + ft.FEATURES[key].shape[0])]
     if ft.COMMAND in parts:
-        _put_where_sent(parts)
+        _replace_by_command(parts)
     if kind == "body_twist":
         parts[ft.STATE] = _body_twist(parts[ft.STATE])
         if ft.TCP_POSE in parts:
@@ -85,8 +83,8 @@ def network_input(
     return torch.cat([parts[key] for key in columns if key in parts], -1)
 
 
-def _put_where_sent(parts: dict[str, Tensor]) -> None:
-    """Joints, velocities and the TCP as commanded, in place of what was measured."""
+def _replace_by_command(parts: dict[str, Tensor]) -> None:
+    """Replace measured joints, velocities and TCP by the commanded ones."""
     command = parts.pop(ft.COMMAND)
     parts[ft.STATE] = torch.cat([command, parts[ft.STATE][..., -1:]], -1)
     if ft.TCP_POSE in parts:
@@ -99,7 +97,7 @@ def _body_twist(state: Float[Tensor, "... 15"]) -> Float[Tensor, "... 7"]:
 
 
 def _vertical_in_body_frame(quaternion: Float[Tensor, "... 4"]) -> Float[Tensor, "... 3"]:
-    """The base's z axis in the frame that the quaternion turns."""
+    """Return the base's z axis in the frame that the quaternion rotates."""
     w, x, y, z = quaternion.unbind(-1)
     return torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1)
 
@@ -110,7 +108,7 @@ def _start_from_hand(
     turned: Float[Tensor, "... 6"],
     held: Float[Tensor, "... 1"],
 ) -> Float[Tensor, "... 12"]:
-    """`features.TRUTH_START` relative to the hand's position and yaw."""
+    """Return `features.TRUTH_START` relative to the hand's position and yaw."""
     cos, sin = turned[..., 0], turned[..., 1]
     cos, sin = cos * cos - sin * sin, 2 * cos * sin  # of twice the hand's yaw
     yaw = torch.stack(
