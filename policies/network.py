@@ -217,7 +217,7 @@ class PolicyNetwork(nn.Module):
         Args:
             batch: observations.
             actions: recorded actions.
-            generator: random generator on the CPU.
+            noise: random numbers of the batch.
             wrench: on both pads, with `reads_wrench`.
             action_is_pad: ticks after the episode's end, which do not count.
         """
@@ -248,7 +248,7 @@ class PolicyNetwork(nn.Module):
     def _encode_touch(
         self, batch: ObservationBatch, noise: BatchNoise | None = None
     ) -> Float[Tensor, "b o w"]:
-        """Return the head's touch input, with the training's noise if a generator is given."""
+        """Return the head's touch input, with the training's noise if given."""
         if self.touch_readout is None:
             return batch.state[..., :0]
         touch = self.touch_normalizer(batch.touch).clamp(-_CLIP, _CLIP)
@@ -263,12 +263,12 @@ class PolicyNetwork(nn.Module):
         touch: Float[Tensor, "b o w"],
         noise: BatchNoise | None = None,
     ) -> Float[Tensor, "b c"]:
-        """Return the head's whole input, with the training's noise if a generator is given."""
+        """Return the head's whole input, with the training's noise if given."""
         columns, kind = self.config.proprioception, self.config.representation
         state = network_input(batch.state, columns, kind)
         state = self.state_normalizer(state).clamp(-_CLIP, _CLIP)
         if noise is not None:
-            shift = torch.randn(len(state), 1, state.shape[2], generator=noise).to(state)
+            shift = noise.randn((len(state), 1, state.shape[2])).to(state)
             state = state + self.config.position_noise * shift * is_position(columns, kind).to(
                 state
             )

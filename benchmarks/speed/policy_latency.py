@@ -23,7 +23,6 @@ from touchgoal.policies.heads.unet import PRESETS
 from touchgoal.policies.network import PolicyConfig
 from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.runtime.option_types import Count, CountOrNone, checked_dataclass
-from touchgoal.sim_envs.config import EnvConfig
 
 
 @checked_dataclass
@@ -77,7 +76,7 @@ def _stages(config: Config) -> list[Stage]:
     folder = config.policy or SHIPPED_POLICIES["bead-maze"]
     maker = SavedPolicy(folder)
     planner, policy = maker(), maker.network()
-    ticks = _observations(policy.config, maker.env_config(EnvConfig()).camera_size)
+    ticks = _observations(policy.config, planner.env_config().camera_size)
     stages = []
     if planner.touch is not None:
         encoder = planner.touch.encoder

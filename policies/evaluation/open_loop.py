@@ -1,13 +1,12 @@
-"""Open-loop error of a policy along recorded demonstrations, as Table 10 of Sparsh may mean it.
+"""Open-loop error of a policy along recorded demonstrations, for Table 10 of Sparsh.
 
-The paper compares "the compounded trajectory from predicted delta joint angles" with a
-demonstration on an unseen maze, and leaves open how. Three readings, in mm at the TCP:
+The paper compares "the compounded trajectory from predicted delta joint angles" with a demonstration on an
+unseen maze, and leaves open how. Three readings, in mm at the TCP:
 
 - chunk: one plan, compounded from the measured joints, after each of its ticks.
-- teacher_forced: the first action of each tick's plan, compounded over the demonstration; every plan sees
-  the recording.
-- free_running: the same, but every plan sees the joints that were compounded so far (and still the
-  recorded touch).
+- teacher_forced: the first action of each tick's plan, compounded over the demonstration; every plan
+  observes the recording.
+- free_running: the same, but every plan observes the joints compounded so far (and the recorded touch).
 """
 
 from collections.abc import Callable
@@ -34,7 +33,7 @@ class OpenLoopErrors:
         chunk: mean over all plans, after each tick of the plan.
         teacher_forced: at each tick.
         free_running: at each tick.
-        path: length of the TCP's way, mm.
+        path: length of the TCP's path, mm.
     """
 
     chunk: Float[np.ndarray, " h"]
@@ -44,7 +43,7 @@ class OpenLoopErrors:
 
 
 def open_loop_errors(plan: Plan, demonstration: SequenceDataset, control_hz: int) -> OpenLoopErrors:
-    """Errors of a planner along one demonstration.
+    """Return the errors of a planner along one demonstration.
 
     Args:
         plan: observation batches to actions, such as `PolicyNetwork.plan` or a baseline.
@@ -69,7 +68,7 @@ def open_loop_errors(plan: Plan, demonstration: SequenceDataset, control_hz: int
 
 
 def _free_running(plan: Plan, batch: ObservationBatch, control_hz: int) -> Float[np.ndarray, "t 7"]:
-    """Joints after each tick, where each plan sees the joints compounded so far."""
+    """Return the joints after each tick, where each plan observes the joints compounded so far."""
     kinematics = Fr3Kinematics()
     joints = batch.joints[0].numpy().astype(np.float64)
     states, velocity, course = [], batch.state[0, -1, 7:14].numpy(), []
@@ -85,8 +84,8 @@ def _free_running(plan: Plan, batch: ObservationBatch, control_hz: int) -> Float
         now[18:22] = torch.from_numpy(quaternion)
         states = [*(states or [now] * horizon)[1:], now]
         pictures = None if batch.pictures is None else batch.pictures[i : i + 1]
-        seen = ObservationBatch(touch[None], torch.stack(states)[None], pictures)
-        action = plan(seen)[0, 0, :7].numpy()
+        observed = ObservationBatch(touch[None], torch.stack(states)[None], pictures)
+        action = plan(observed)[0, 0, :7].numpy()
         velocity = action * control_hz
         joints = joints + action
         course.append(joints)
@@ -106,12 +105,12 @@ def _positions(joints: Float[np.ndarray, "... 7"]) -> Float[np.ndarray, "... 3"]
 
 
 def zero_motion(horizon: int) -> Plan:
-    """The baseline that stands still."""
+    """Return the baseline that stands still."""
     return lambda batch: torch.zeros(len(batch.state), horizon, 8)
 
 
 def repeat_last(control_hz: int, horizon: int) -> Plan:
-    """The baseline that goes on at the measured joint velocity."""
+    """Return the baseline that continues at the measured joint velocity."""
 
     def plan(batch: ObservationBatch) -> Float[Tensor, "b h 8"]:
         change = batch.state[:, -1, 7:14] / control_hz
@@ -121,5 +120,5 @@ def repeat_last(control_hz: int, horizon: int) -> Plan:
 
 
 def constant_action(action: Float[Tensor, "8"], horizon: int) -> Plan:
-    """The baseline that does the same action for ever, such as the mean of demonstrations."""
+    """Return the baseline of one action, such as the mean of demonstrations."""
     return lambda batch: action.expand(len(batch.state), horizon, 8)

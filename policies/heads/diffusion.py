@@ -1,7 +1,4 @@
-"""What draws chunks of actions: diffusion (Chi et al. 2023), and regression as its baseline.
-
-Both work in the policy's scaled representation of actions, see `policy.py`.
-"""
+"""Heads that predict chunks of normalised actions: diffusion (Chi et al. 2023), and regression."""
 
 from dataclasses import dataclass, field
 
@@ -18,14 +15,14 @@ from touchgoal.policies.heads.unet import PRESETS, UNet, UNetConfig
 
 @dataclass(frozen=True)
 class DiffusionConfig:
-    """A network and how it is trained and sampled."""
+    """U-Net and sampler of a diffusion head."""
 
     unet: UNetConfig = field(default_factory=lambda: PRESETS["small"])
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
 
 
 class Diffusion(nn.Module):
-    """Draws a chunk from the distribution that the demonstrations show."""
+    """Sampler of chunks from the distribution of the demonstrations."""
 
     def __init__(self, config: DiffusionConfig, ticks: int, action_dim: int, condition_dim: int):
         super().__init__()
@@ -40,7 +37,7 @@ class Diffusion(nn.Module):
         noise: BatchNoise,
         is_pad: Bool[Tensor, "b h"] | None = None,
     ) -> Float[Tensor, ""]:
-        """Mean squared error of the network's answer at random steps, padded ticks left out."""
+        """Return the mean squared error at random steps, without padded ticks."""
         noisy, step, target = add_noise(self.config.sampler, chunk, noise)
         error = (self.network(noisy, step, condition) - target).square()
         return masked_mean(error, is_pad)
@@ -48,7 +45,7 @@ class Diffusion(nn.Module):
     def sample(
         self, condition: Float[Tensor, "b c"], generator: torch.Generator
     ) -> Float[Tensor, "b h a"]:
-        """A drawn chunk for every condition; the generator is the CPU's."""
+        """Draw a chunk for every condition; the generator is on the CPU."""
         noise = torch.randn(len(condition), *self._shape, generator=generator).to(condition)
         return denoise(
             self.config.sampler, lambda x, t: self.network(x, t, condition), noise, generator
@@ -57,17 +54,16 @@ class Diffusion(nn.Module):
 
 @dataclass(frozen=True)
 class RegressionConfig:
-    """Size of a multilayer perceptron: units of each hidden layer, and how many of these."""
+    """Width and number of the hidden layers of a multilayer perceptron."""
 
     width: int = 512
     depth: int = 3
 
 
 class Regression(nn.Module):
-    """Answers with the median of what the demonstrations show.
+    """Prediction of the median of the demonstrations, by the absolute error as in ACT (Zhao et al. 2023).
 
-    Learned by the absolute error, as ACT (Zhao et al. 2023) is: next to a square it asks for small
-    motions as exactly as for large ones, and where the demonstrations disagree it takes a side.
+    Unlike a squared error it weighs small motions like large ones, and chooses one of several modes.
     """
 
     def __init__(self, config: RegressionConfig, ticks: int, action_dim: int, condition_dim: int):
@@ -87,13 +83,13 @@ class Regression(nn.Module):
         noise: BatchNoise,
         is_pad: Bool[Tensor, "b h"] | None = None,
     ) -> Float[Tensor, ""]:
-        """Mean absolute error, padded ticks left out; nothing is random."""
+        """Return the mean absolute error without padded ticks; nothing is random."""
         return masked_mean((self._predict(condition) - chunk).abs(), is_pad)
 
     def sample(
         self, condition: Float[Tensor, "b c"], generator: torch.Generator
     ) -> Float[Tensor, "b h a"]:
-        """The chunk for every condition; nothing is random."""
+        """Predict the chunk for every condition; nothing is random."""
         return self._predict(condition)
 
     def _predict(self, condition: Float[Tensor, "b c"]) -> Float[Tensor, "b h a"]:

@@ -1,7 +1,6 @@
-"""From noise to samples and back: DDPM, DDIM and flow matching.
+"""Noising and denoising of samples: DDPM, DDIM and flow matching.
 
-Each is a way to add noise to a clean sample for training, and a way to walk from noise to a sample with a
-network that was trained to denoise. The two diffusions are one formula (Song et al. 2021, eq. 12).
+DDPM and DDIM are one formula (Song et al. 2021, eq. 12).
 """
 
 from collections.abc import Callable
@@ -14,45 +13,32 @@ from torch import Tensor
 from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.policies.config import SamplerConfig
 
-FLOW_TIME_SCALE = (
-    100.0  # what flow time 1 is called to the network, so that its embedding resolves it
-)
+FLOW_TIME_SCALE = 100.0  # the network's step at flow time 1, so that its embedding resolves it
 DenoisingNetwork = Callable[[Float[Tensor, "b h a"], Float[Tensor, " b"]], Float[Tensor, "b h a"]]
 
 
 @lru_cache
 def alphas_cumprod(steps: int) -> Float[Tensor, " {steps}"]:
-    """Share of the variance that is signal after each step (alpha-bar), float64."""
+    """Return alpha-bar, the share of signal in the variance after each step, float64."""
     t = torch.arange(steps + 1, dtype=torch.float64) / steps
     power = torch.cos((t + 0.008) / 1.008 * torch.pi / 2) ** 2
     return (1 - (1 - power[1:] / power[:-1]).clamp(max=0.999)).cumprod(0)
 
 
 def inference_timesteps(config: SamplerConfig) -> Int[Tensor, " {config.num_inference_steps}"]:
-    """Steps of the schedule that a plan visits, from pure noise on.
-
-    Spaced backwards from the last one ("trailing", Lin et al. 2024): the first must be noise alone,
-    as that is what a plan starts from.
-    """
-    share = (
-        torch.arange(config.num_inference_steps, 0, -1, dtype=torch.float64)
-        / config.num_inference_steps
-    )
+    """Return the steps that denoising visits, from pure noise on ("trailing", Lin et al. 2024)."""
+    steps = config.num_inference_steps
+    share = torch.arange(steps, 0, -1, dtype=torch.float64) / steps
     return (share * config.num_train_timesteps).round().long() - 1
 
 
 def add_noise(
     config: SamplerConfig, clean: Float[Tensor, "b h a"], noise: BatchNoise
 ) -> tuple[Float[Tensor, "b h a"], Float[Tensor, " b"], Float[Tensor, "b h a"]]:
-    """A training example of every sample, at a random step.
-
-    Args:
-        config: the sampler trained for.
-        clean: samples.
-        noise: random numbers for step and noise.
+    """Make a training example of every sample, at a random step.
 
     Returns:
-        Noisy samples, the step to tell the network, what the network should answer.
+        Noisy samples, their steps, the network's targets.
     """
     b = len(clean)
     added = noise.randn(clean.shape).to(clean)
@@ -73,11 +59,11 @@ def denoise(
     noise: Float[Tensor, "b h a"],
     generator: torch.Generator,
 ) -> Float[Tensor, "b h a"]:
-    """Samples from noise.
+    """Draw samples.
 
     Args:
         config: the sampler that the network was trained for.
-        network: noisy samples and step to its prediction.
+        network: from noisy samples and step to its prediction.
         noise: standard normal.
         generator: of the noise that "ddpm" adds, on the CPU.
     """
@@ -106,7 +92,7 @@ def _denoise_diffusion(
         if config.prediction_type == "epsilon":
             answer = (x - (1 - power) ** 0.5 * answer) / power**0.5
         clean = answer.clamp(-config.clip, config.clip)
-        # of the clipped sample: the step then is DDPM's posterior even where it clips
+        # from the clipped sample, so that the step is DDPM's posterior even where it clips
         noise = (x - power**0.5 * clean) / (1 - power) ** 0.5
         fresh = 0.0
         if config.kind == "ddpm":

@@ -1,4 +1,4 @@
-"""The conditional 1-D U-Net of the diffusion policy (Chi et al. 2023), over the ticks of a chunk."""
+"""Conditional 1-D U-Net of diffusion_policy (Chi et al. 2023), over the ticks of a chunk."""
 
 import math
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ class UNetConfig:
 
     Attributes:
         channels: of each level; every level but the last halves the number of ticks.
-        kernel: ticks a convolution sees, odd.
+        kernel: ticks a convolution covers, odd.
         groups: of the group norms; divides every number of channels.
         step_embedding_dim: of the diffusion step's embedding, even.
     """
@@ -30,7 +30,7 @@ class UNetConfig:
     step_embedding_dim: int = 128
 
     def __post_init__(self) -> None:
-        """Raises UserError for sizes that cannot be built."""
+        """Raise UserError for sizes that do not go together."""
         if not self.channels or any(c % self.groups for c in self.channels):
             raise UserError(
                 f"U-Net channels {self.channels} must be multiples of the {self.groups} groups"
@@ -40,28 +40,28 @@ class UNetConfig:
 
     @property
     def tick_multiple(self) -> int:
-        """What the number of ticks must be a multiple of."""
+        """Number of which the ticks must be a multiple."""
         return 2 ** (len(self.channels) - 1)
 
 
 PRESETS: dict[str, UNetConfig] = {
     "tiny": UNetConfig((16, 32), groups=4, step_embedding_dim=16),
-    # plans on one core within a tick of 20 Hz; two levels, as calls cost more than channels
+    # plans on one core within a tick of 20 Hz; two levels, for calls cost more than channels
     "small": UNetConfig((96, 192), kernel=3, step_embedding_dim=64),
-    # diffusion_policy's config for states; its 512-1024-2048 for pictures differs in width alone
+    # diffusion_policy's config for states; its 512-1024-2048 for images differs in width alone
     "published": UNetConfig((256, 512, 1024), step_embedding_dim=256),
 }
 
 
 class UNet(nn.Module):
-    """Noisy chunk, diffusion step and condition to a chunk of the same shape.
+    """Network from noisy chunk, diffusion step and condition to a chunk of the same shape.
 
-    Layers and wiring are those of `ConditionalUnet1D` in diffusion_policy, including that the first
-    level's skip stays unused.
+    Layers and wiring are those of `ConditionalUnet1D` in diffusion_policy, whose first level's skip is
+    unused, too.
     """
 
     def __init__(self, config: UNetConfig, action_dim: int, condition_dim: int) -> None:
-        """Builds a randomly initialised network."""
+        """Initialise at random."""
         super().__init__()
         self.config = config
         w = config.step_embedding_dim
@@ -95,12 +95,12 @@ class UNet(nn.Module):
         step: Float[Tensor, " b"],
         condition: Float[Tensor, "b c"],
     ) -> Float[Tensor, "b h a"]:
-        """The network's prediction.
+        """Return the network's prediction.
 
         Args:
             noisy: chunks; h is a multiple of `UNetConfig.tick_multiple`.
             step: of the diffusion, 0 to about 100.
-            condition: what the chunk depends on.
+            condition: encoded observations.
         """
         given = torch.cat(
             [self.step(sinusoidal_embedding(step, self.config.step_embedding_dim)), condition], 1
@@ -124,7 +124,7 @@ class UNet(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions with FiLM between them: the condition scales and shifts every channel."""
+    """Two convolutions with FiLM between them, which scales and shifts every channel."""
 
     def __init__(self, in_channels: int, out_channels: int, kernel: int, groups: int):
         super().__init__()
@@ -140,20 +140,20 @@ class ResidualBlock(nn.Module):
     def forward(
         self, x: Float[Tensor, "b i h"], film: Float[Tensor, "b s 1"]
     ) -> Float[Tensor, "b o h"]:
-        """The block's output, of as many ticks, given its scales and shifts."""
+        """Return as many ticks, given the scales and shifts."""
         scale, shift = film.chunk(2, dim=1)
         return self.two(torch.addcmul(shift, scale, self.one(x))) + self.skip(x)
 
 
 class ShortConv1d(nn.Conv1d):
-    """A convolution over few ticks, padded to keep their number, as one matrix product.
+    """Convolution over few ticks, padded to the same number, as one matrix product.
 
-    Torch's own falls to a slow path: with 192 channels and 2 ticks, measured on one core, it takes
-    3.5 times as long at batch 1 and 4 times in training.
+    Torch's own takes a slow path: with 192 channels and 2 ticks, on one core, it takes 3.5 times as long
+    at batch 1 and 4 times in training.
     """
 
     def forward(self, input: Float[Tensor, "b i h"]) -> Float[Tensor, "b o h"]:
-        """As `nn.Conv1d` with zero padding of half the kernel."""
+        """Convolve like `nn.Conv1d` with zero padding of half the kernel."""
         k = self.kernel_size[0]
         ticks = F.pad(input.transpose(1, 2), (0, 0, k // 2, k // 2)).unfold(1, k, 1)
         return F.linear(ticks.flatten(2), self.weight.flatten(1), self.bias).transpose(1, 2)
@@ -168,7 +168,7 @@ def _convolution(in_channels: int, out_channels: int, kernel: int, groups: int) 
 
 
 def sinusoidal_embedding(step: Float[Tensor, " b"], width: int) -> Float[Tensor, "b {width}"]:
-    """The diffusion step as sines and cosines of wavelengths up to 10,000 (Vaswani et al. 2017)."""
+    """Return sines and cosines of wavelengths up to 10,000 (Vaswani et al. 2017)."""
     half = width // 2
     rate = torch.exp(torch.arange(half, device=step.device) * (-math.log(10000.0) / (half - 1)))
     angle = step[:, None] * rate

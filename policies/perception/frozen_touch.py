@@ -1,4 +1,4 @@
-"""What a policy feels: both fingertips through a frozen touch encoder."""
+"""Frozen touch encoder for both fingertips of a policy."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -18,15 +18,15 @@ from touchgoal.runtime.errors import UserError
 
 
 class TouchEmbedder:
-    """Both fingertips as one row: the left embedding, then the right one.
+    """Embedder of both fingertips: the left embedding, then the right one, as one row.
 
     The background of each is its first frame: episodes start untouched.
 
     Attributes:
-        name: changes whenever the embeddings would; becomes `PolicyConfig.touch`.
-        dim: of a row.
-        sensor: name of the fingertip sensor; None if any will do.
-        reach: how many ticks back an embedding sees; 0 of an encoder of single frames.
+        name: identifies the embeddings, see `PolicyConfig.touch`.
+        dim: width of a row.
+        sensor: name of the fingertip sensor; None for any.
+        reach: number of earlier ticks that an embedding depends on; 0 with single frames.
     """
 
     def __init__(self, encoder: pretrained.AnyTouchEncoder, name: str) -> None:
@@ -39,7 +39,7 @@ class TouchEmbedder:
         }
 
     def embed(self, episodes: EpisodeSet, i: int) -> Float32[np.ndarray, "t e"]:
-        """All ticks of an episode; UserError if it was recorded with another sensor."""
+        """Embed all ticks of an episode; UserError if it was recorded with another sensor."""
         if self.sensor is not None:
             check_sensor(episodes, i, self.sensor)
         frames = episodes.read(i, ft.TACTILE).frames
@@ -48,40 +48,39 @@ class TouchEmbedder:
 
     @torch.no_grad()
     def embed_tick(
-        self, seen: Sequence[Mapping[str, np.ndarray]], untouched: Mapping[str, np.ndarray]
+        self, observations: Sequence[Mapping[str, np.ndarray]], untouched: Mapping[str, np.ndarray]
     ) -> Float32[np.ndarray, " e"]:
-        """The newest tick, as `embed` would have it.
+        """Embed the latest tick, with the same result as `embed`.
 
         Args:
-            seen: the last `1 + reach` observations, oldest first; if fewer, the oldest stands for
-                those before. Frames of one that was seen before, the same object, are not
-                preprocessed again.
-            untouched: an observation without touch.
+            observations: the last `1 + reach`, oldest first; if fewer, the oldest is repeated. Frames
+                of an object that was passed before are not preprocessed again.
+            untouched: an observation without contact.
         """
         sides = [
-            self._recent[key].latest([tick[key] for tick in seen], untouched[key])
+            self._recent[key].latest([tick[key] for tick in observations], untouched[key])
             for key in ft.TACTILE
         ]
         return self.encoder.embed_touch(self.encoder.stack(torch.cat(sides))).numpy().ravel()
 
 
 def load_touch(name_or_path: str | Path) -> TouchEmbedder:
-    """The embedder of an encoder, a folder or one that ships; UserError if there is none.
+    """Load the embedder of an encoder, a folder or one that ships; UserError if there is none.
 
     Embeddings are named after the weights, not after the folder, which may move.
     """
     directory = pretrained.find_encoder(name_or_path, published=False)
     encoder = pretrained.load_encoder(directory)
     offsets = encoder.offsets
-    seen = f"/frames{'-'.join(map(str, offsets))}" if len(offsets) > 1 else ""
-    return TouchEmbedder(encoder, f"{encoder.config.preprocessor}/{_digest(directory)}{seen}")
+    frames = f"/frames{'-'.join(map(str, offsets))}" if len(offsets) > 1 else ""
+    return TouchEmbedder(encoder, f"{encoder.config.preprocessor}/{_digest(directory)}{frames}")
 
 
 def load_touch_of(directory: Path, name: str) -> TouchEmbedder:
-    """The embedder with which a policy was trained: in its folder, or else the one that ships by that name.
+    """Load the embedder that a policy was trained with: from its folder, else the shipped one of that name.
 
     Args:
-        directory: `touch/` of the policy's folder, there or not.
+        directory: `touch/` of the policy's folder; it need not exist.
         name: `PolicyConfig.touch`.
 
     Raises:
@@ -95,7 +94,7 @@ def load_touch_of(directory: Path, name: str) -> TouchEmbedder:
 
 
 def shipped_touch(name: str) -> str | None:
-    """Which of the encoders that ship made embeddings of a name (`TouchEmbedder.name`), if one did."""
+    """Return the shipped encoder whose embeddings have a name (`TouchEmbedder.name`), if there is one."""
     names = pretrained.encoder_names()
     return next((n for n in names if _digest(pretrained.find_encoder(n)) in name), None)
 

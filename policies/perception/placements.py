@@ -1,4 +1,4 @@
-"""How pick-and-place begins, seen many times over: what the pose estimator learns from."""
+"""Rendered starts of pick-place, on which the pose estimator is trained."""
 
 from dataclasses import dataclass
 
@@ -16,12 +16,12 @@ from touchgoal.sim_envs.pick_place import PickPlace
 
 @dataclass(frozen=True, eq=False)
 class Placements:
-    """n beginnings of episodes.
+    """Starts of n episodes.
 
     Attributes:
-        pictures: of every camera by its column, as it takes them.
+        pictures: camera images by column.
         tcp: pose of the hand, `features.TCP_POSE`.
-        start: what there is to see, `features.TRUTH_START`.
+        start: true poses, `features.TRUTH_START`.
     """
 
     pictures: dict[str, UInt8[Tensor, "n h w 3"]]
@@ -29,20 +29,20 @@ class Placements:
     start: Float32[Tensor, "n 7"]
 
     def __len__(self) -> int:
-        """Number of beginnings."""
+        """Return the number of starts."""
         return len(self.start)
 
 
 def render_placements(
     config: PickPlaceConfig, objects: int, placements_each: int, seed: int, workers: int
 ) -> Placements:
-    """Lays so many objects on the table, each so many times.
+    """Render objects on the table, each at several places.
 
     Args:
-        config: of the task; cameras are those to look through.
-        objects: objects of random kind and size, one for every seed from `seed` on.
-        placements_each: places of each.
-        seed: of the first thing.
+        config: of the task, with the cameras to render.
+        objects: number of objects of random shape and size, one a seed from `seed` on.
+        placements_each: number of places of each.
+        seed: of the first object.
         workers: processes that render.
     """
     seeds = range(seed, seed + objects)

@@ -1,4 +1,4 @@
-"""Pose estimator: a network that reads in the first pictures of an episode what lies where."""
+"""Pose estimator: a network from an episode's first camera images to object and goal poses."""
 
 import torch
 import torch.nn.functional as F
@@ -14,17 +14,17 @@ _TCP = ft.FEATURES[ft.TCP_POSE].shape[0]
 
 
 class PoseEstimator(nn.Module):
-    """Pictures of the start to `features.TRUTH_START`."""
+    """Network from the first camera images to `features.TRUTH_START`."""
 
     def __init__(self, config: PoseEstimatorConfig) -> None:
-        """Randomly initialised; `fit_normalizers` comes before training."""
+        """Initialise at random; fit the normalizers before training."""
         super().__init__()
         self.config = config
         self.networks = nn.ModuleList(_SpatialSoftmax(config) for _ in config.crops)
-        seen = _TCP + config.keypoints * (2 + config.keypoint_features) * len(config.crops)
+        width = _TCP + config.keypoints * (2 + config.keypoint_features) * len(config.crops)
         self.tcp_normalizer, self.start_normalizer = Normalizer((_TCP,)), Normalizer((_START,))
         self.head = nn.Sequential(
-            nn.Linear(seen, config.width), nn.Mish(),
+            nn.Linear(width, config.width), nn.Mish(),
             nn.Linear(config.width, config.width), nn.Mish(),
             nn.Linear(config.width, _START),
         )  # fmt: skip
@@ -32,10 +32,10 @@ class PoseEstimator(nn.Module):
     def forward(
         self, pictures: dict[str, UInt8[Tensor, "b h w 3"]], tcp: Float[Tensor, "b 7"]
     ) -> Float[Tensor, "b 7"]:
-        """What was read: m, base frame.
+        """Return the estimate: m, base frame.
 
         Args:
-            pictures: by column, as the cameras take them.
+            pictures: camera images by column.
             tcp: pose of the hand, which carries a camera.
         """
         return self.start_normalizer.inverse(self.scaled(pictures, tcp))
@@ -43,7 +43,7 @@ class PoseEstimator(nn.Module):
     def scaled(
         self, pictures: dict[str, UInt8[Tensor, "b h w 3"]], tcp: Float[Tensor, "b 7"]
     ) -> Float[Tensor, "b 7"]:
-        """The same, scaled to variance 1."""
+        """Return the estimate, normalised to variance 1."""
         parts = [self.tcp_normalizer(tcp)]
         for (key, (top, bottom, left, right)), network in zip(
             self.config.crops, self.networks, strict=True
@@ -54,7 +54,7 @@ class PoseEstimator(nn.Module):
 
 
 class _Surroundings(nn.Module):
-    """Adds to each cell what lies so many cells around it."""
+    """Dilated convolution, added to each cell."""
 
     def __init__(self, width: int, dilation: int) -> None:
         super().__init__()
@@ -66,7 +66,7 @@ class _Surroundings(nn.Module):
 
 
 class _SpatialSoftmax(nn.Module):
-    """Looks at several places of a picture: where each is, in [-1, 1], and what is there."""
+    """Keypoints of an image: the place of each, in [-1, 1], and its features."""
 
     def __init__(self, config: PoseEstimatorConfig) -> None:
         super().__init__()

@@ -1,7 +1,7 @@
-"""State estimation: reads in touch and pictures what only a simulator knows for sure.
+"""State estimation from touch and camera images: contact, and the poses at the start.
 
-A policy learns on those truths, and acts on the estimates. So the estimator can learn from far more
-than demonstrations, and the policy from demonstrations without pictures.
+A policy is trained on the simulator's truth and acts on the estimates. So the estimator can be trained on far
+more than demonstrations, and the policy on demonstrations without images.
 """
 
 from collections.abc import Mapping
@@ -31,12 +31,12 @@ ESTIMATED = (ft.TRUTH_CONTACT, ft.TRUTH_START)
 
 @dataclass(frozen=True)
 class StateEstimatorConfig:
-    """What is felt and seen through.
+    """Inputs of a state estimator.
 
     Attributes:
         touch: names the embedder of the fingertips, see `frozen_touch.py`.
-        touch_dim: of its embedding of both fingertips.
-        pose_estimator: of the cameras.
+        touch_dim: width of its embedding of both fingertips.
+        pose_estimator: for the cameras.
     """
 
     touch: str
@@ -45,10 +45,10 @@ class StateEstimatorConfig:
 
 
 class StateEstimatorNetwork(nn.Module):
-    """Tells contact of each fingertip from touch, and poses from pictures of the start."""
+    """Networks for the contact of each fingertip, and for poses from the first camera images."""
 
     def __init__(self, config: StateEstimatorConfig) -> None:
-        """Randomly initialised."""
+        """Initialise at random."""
         super().__init__()
         self.config = config
         side_dim = config.touch_dim // len(ft.TACTILE)
@@ -56,22 +56,22 @@ class StateEstimatorNetwork(nn.Module):
         self.pose_estimator = PoseEstimator(config.pose_estimator)
 
     def contact(self, touch: Float[Tensor, "b e"]) -> Float[Tensor, "b 2"]:
-        """Log-odds that each pad touches something, given embeddings of both."""
+        """Return the log-odds of contact of each pad, given embeddings of both."""
         sides = touch.unflatten(1, (len(ft.TACTILE), -1))
         return self.contact_head(self.touch_normalizer(sides)).squeeze(2)
 
 
 class StateEstimator:
-    """What an observation says of `ESTIMATED`, as columns of those names.
+    """Estimator of the columns `ESTIMATED`.
 
     Attributes:
         touch: the embedder.
-        cameras: columns of pictures looked at.
+        cameras: columns of the camera images that it reads.
         camera_size: rows and columns of these.
     """
 
     def __init__(self, network: StateEstimatorNetwork, touch: TouchEmbedder) -> None:
-        """For inference; UserError if the embedder is not the training's."""
+        """Use a network for inference; UserError if the embedder is not the training's."""
         if touch.name != network.config.touch:
             raise UserError(
                 f"the state estimator was trained with the touch encoder {network.config.touch}, "
@@ -87,27 +87,27 @@ class StateEstimator:
     def estimate(
         self, observation: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray]
     ) -> dict[str, Float32[np.ndarray, " n"]]:
-        """Whether each pad touches something (1 or 0), and how the episode began.
+        """Return the contact of each pad (1 or 0), and the poses at the start.
 
         Args:
             observation: of a tick.
-            first: the episode's first, untouched one, with all of the table in view.
+            first: the episode's first one, untouched and with all of the table in view.
         """
         if self._start[0] is not first:
             pictures = {key: self._picture(key, first[key]) for key in self.cameras}
             tcp = torch.from_numpy(first[ft.TCP_POSE])[None]
             self._start = first, self.network.pose_estimator(pictures, tcp)[0].numpy()
         touch = torch.from_numpy(self.touch.embed_tick([observation], first))[None]
-        # True or false, as in what the policy learned on: acting on a probability it stands still at times.
+        # 0 or 1, as in training: on a probability the policy stands still at times
         contact = (self.network.contact(touch)[0] > 0).numpy().astype(np.float32)
         return {ft.TRUTH_CONTACT: contact, ft.TRUTH_START: self._start[1]}
 
     def _picture(self, key: str, picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[Tensor, "1 h w 3"]:
         size = self.camera_size
         if picture.shape[:2] != size:
-            seen, wanted = (f"{rows} x {columns}" for rows, columns in (picture.shape[:2], size))
+            given, wanted = (f"{rows} x {columns}" for rows, columns in (picture.shape[:2], size))
             raise UserError(
-                f"{key} is {seen}, the policy was trained on {wanted}: make the environment with "
+                f"{key} is {given}, the policy was trained on {wanted}: make the environment with "
                 "load_policy(...).env_config(), or set camera_size"
             )
         return torch.from_numpy(picture)[None]
@@ -116,7 +116,7 @@ class StateEstimator:
 def save_estimator(
     network: StateEstimatorNetwork, directory: Path, provenance: dict[str, Any]
 ) -> None:
-    """Writes the networks; scales as float32, all else as float16."""
+    """Write the networks: normalizers as float32, weights as float16."""
     weights = {name: tensor.detach().cpu() for name, tensor in network.state_dict().items()}
     for name, _ in network.named_parameters():
         weights[name] = weights[name].half()
@@ -124,9 +124,7 @@ def save_estimator(
 
 
 def load_estimator(directory: Path) -> StateEstimator:
-    """Reads what `save_estimator` wrote, and the touch encoder.
-
-    That is in `touch/` beside, or else the shipped one.
+    """Read what `save_estimator` wrote, and the touch encoder: in `touch/` beside it, else the shipped one.
 
     Raises:
         UserError: nothing there, damaged, or another touch encoder than the training's.
@@ -136,7 +134,7 @@ def load_estimator(directory: Path) -> StateEstimator:
 
 
 def load_network(directory: Path) -> StateEstimatorNetwork:
-    """The networks alone; UserError: nothing there, or damaged."""
+    """Read the networks alone; UserError: nothing there, or damaged."""
     network = StateEstimatorNetwork(ESTIMATOR_FORMAT.read_config(directory, _config))
     ESTIMATOR_FORMAT.load_weights(network, directory)
     return network
@@ -146,5 +144,5 @@ def _config(fields: dict[str, Any]) -> StateEstimatorConfig:
     pose_estimator = fields.pop("pose_estimator")
     crops = tuple((key, tuple(box)) for key, box in pose_estimator.pop("crops"))
     size, dilations = (tuple(pose_estimator.pop(name)) for name in ("size", "dilations"))
-    seen = PoseEstimatorConfig(size, crops, dilations=dilations, **pose_estimator)
-    return StateEstimatorConfig(**fields, pose_estimator=seen)
+    pose = PoseEstimatorConfig(size, crops, dilations=dilations, **pose_estimator)
+    return StateEstimatorConfig(**fields, pose_estimator=pose)

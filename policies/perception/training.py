@@ -1,4 +1,4 @@
-"""Training of the state estimator: contact in embeddings of touch, the scene in pictures."""
+"""Training of the state estimator: contact from touch embeddings, poses from camera images."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -29,7 +29,7 @@ _HUBER_BETA = 0.3  # standard deviations beyond which an error of the pose count
 def embed_touch_and_contact(
     episodes: EpisodeSet, touch: TouchEmbedder, workers: int
 ) -> tuple[Float[Tensor, "n e"], Bool[Tensor, "n 2"]]:
-    """All ticks of a set: embeddings, which are kept on disk, and whether each pad touched."""
+    """Return touch embeddings of all ticks of a set, cached on disk, and the contact of each pad."""
     rows = embed_episodes(episodes, range(len(episodes)), touch, workers)
     truth = [episodes.read(i, [ft.TRUTH_CONTACT]).frames for i in range(len(episodes))]
     contact = np.concatenate([frames[ft.TRUTH_CONTACT] for frames in truth])
@@ -45,7 +45,7 @@ def train_contact_estimator(
     options: TrainerOptions,
     recipe: dict[str, Any],
 ) -> None:
-    """Trains the reader of contact; writes what `trainer.fit` does."""
+    """Train the contact head; writes what `trainer.fit` does."""
     sides = touch.unflatten(1, (len(ft.TACTILE), -1)).flatten(0, 1)
     network.touch_normalizer.fit_mean_std(sides)
     noise = config.touch_noise * network.touch_normalizer.scale.repeat(len(ft.TACTILE))
@@ -87,7 +87,7 @@ def train_pose_estimator(
     options: TrainerOptions,
     recipe: dict[str, Any],
 ) -> None:
-    """Trains the pose estimator; writes what `trainer.fit` does."""
+    """Train the pose estimator; writes what `trainer.fit` does."""
     estimator.tcp_normalizer.fit_mean_std(placements.tcp)
     estimator.start_normalizer.fit_mean_std(placements.start)
 
@@ -130,16 +130,16 @@ class _PoseLoss(nn.Module):
 def _add_pixel_noise(
     pictures: UInt8[Tensor, "b h w 3"], box: Box, counts: int, noise: BatchNoise
 ) -> UInt8[Tensor, "b h w 3"]:
-    """Changes, and returns, the pictures; outside the box nobody looks."""
+    """Change the images in the box, and return them."""
     top, bottom, left, right = box
-    seen = pictures[:, top:bottom, left:right]
+    crop = pictures[:, top:bottom, left:right]
     added = noise.draw(
-        len(seen),
+        len(crop),
         lambda n, g: torch.randint(
-            -counts, counts + 1, (n, *seen.shape[1:]), dtype=torch.int16, generator=g
+            -counts, counts + 1, (n, *crop.shape[1:]), dtype=torch.int16, generator=g
         ),
     )
-    seen.copy_((seen + added).clamp(0, 255))
+    crop.copy_((crop + added).clamp(0, 255))
     return pictures
 
 
@@ -147,17 +147,16 @@ def _add_pixel_noise(
 def contact_error_rate(
     network: StateEstimatorNetwork, touch: Float[Tensor, "n e"], contact: Bool[Tensor, "n 2"]
 ) -> float:
-    """Share of ticks and pads read wrongly."""
+    """Return the share of ticks and pads with a wrong contact."""
     return float(((network.contact(touch) > 0) != contact).float().mean())
 
 
 @torch.no_grad()
 def pose_errors(estimator: PoseEstimator, placements: Placements) -> dict[str, list[float]]:
-    """Median and 90th percentile of the errors.
+    """Return median and 90th percentile of the errors.
 
-    Returns:
-        Of the object's and the goal's position on the table (mm), of the object's height (mm), of
-        the grasp's yaw (degrees) where it matters.
+    Errors of the object's and the goal's position on the table (mm), of the object's height (mm), and of
+    the grasp's yaw (degrees) for objects that are not round.
     """
     predicted, true = estimator(placements.pictures, placements.tcp), placements.start
     off = predicted - true
@@ -167,7 +166,7 @@ def pose_errors(estimator: PoseEstimator, placements: Placements) -> dict[str, l
         "object_mm": 1e3 * off[:, :2].norm(dim=1),
         "goal_mm": 1e3 * off[:, 5:].norm(dim=1),
         "height_mm": 1e3 * off[:, 2].abs(),
-        "yaw_degrees": yaw[true[:, 4] != 0],  # round things are grasped at 0 exactly
+        "yaw_degrees": yaw[true[:, 4] != 0],  # round objects are grasped at 0 exactly
     }
     at = torch.tensor([0.5, 0.9])
     return {name: error.quantile(at).tolist() for name, error in errors.items() if len(error)}

@@ -18,27 +18,25 @@ from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.tasks import make_expert
 
-# Standard deviations of what is added to `features.TRUTH_START`: m, and of twice the yaw's cosine and sine.
-# A little more than the shipped pose estimator errs (its errors: `estimator.json`).
+# Standard deviations of the noise on `features.TRUTH_START`: m, and cosine and sine of twice the yaw. A little
+# above the errors of the shipped pose estimator (`estimator.json`).
 _START_ERROR = np.array([0.003, 0.003, 0.0015, 0.03, 0.03, 0.0015, 0.0015])
 
 
 @dataclass(frozen=True)
 class DaggerRoles:
-    """Who acts and whose answers are recorded, see `Roles` in `episodes/recording.py`.
-
-    The expert can be asked what to do in any state.
+    """Actor and expert of a recording, see `Roles` in `episodes/recording.py`.
 
     Attributes:
-        policy: makes the policy that acts while the expert says what it should have done (DAgger,
-            Ross et al. 2011); one with a state estimator acts on nearly the simulator's truth
-            instead. None: the expert itself acts.
+        policy: makes the policy that acts while the expert's actions are recorded (DAgger, Ross et al.
+            2011); one with a state estimator acts on the simulator's truth with noise instead. None: the
+            expert itself acts.
     """
 
     policy: Callable[[Any], Actor] | None = None
 
     def __call__(self, env: FrankaTactileEnv, spec: EpisodeSpec) -> tuple[Actor, Actor]:
-        """Who acts, and whose answers are recorded."""
+        """Return the actor, and the expert whose actions are recorded."""
         expert = FeedbackExpert(env) if isinstance(env, PickPlace) else make_expert(env)
         if self.policy is None:
             return expert, expert
@@ -80,9 +78,9 @@ def dagger_roles(policy: str | None, task: TaskConfig, feedback: bool) -> Dagger
 
 
 class _NearlyTrueState:
-    """A state estimator that asks the simulator, and errs as pose estimators do, an episode long.
+    """The simulator's truth, with an error that stays for an episode as a pose estimator's does.
 
-    Who acts on the exact truth never gets where its estimates will lead it.
+    A policy that acts on the exact truth never reaches the states to which its estimates will lead it.
     """
 
     def __init__(self, env: PickPlace) -> None:

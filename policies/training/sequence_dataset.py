@@ -1,6 +1,6 @@
-"""Training windows over episodes: what was seen on the last ticks, and what was done on the next.
+"""Training windows over episodes: observations of the last ticks, actions of the next ones.
 
-Touch is embedded once, by a frozen encoder, and kept on disk inside the set that it was made from.
+Touch is embedded once, by a frozen encoder, and cached inside the episode set.
 """
 
 from collections.abc import Sequence
@@ -30,12 +30,12 @@ class Recordings:
     """n ticks of several episodes, one after the other.
 
     Attributes:
-        touch: embeddings of both fingertips; float16, as they are many.
+        touch: embeddings of both fingertips.
         state: proprioception.
         actions: `features.ACTION`.
         lengths: ticks of each episode.
-        pictures: for the end-to-end encoder; None without.
-        wrench: what acted on both pads (N, Nm, pad frames); None unless the policy reads it.
+        pictures: difference images for the end-to-end encoder; None without.
+        wrench: on both pads (N, Nm, pad frames); None unless the policy is trained on it.
     """
 
     touch: Float16[Tensor, "n e"]
@@ -111,7 +111,7 @@ def _check(
     embedder: TouchEmbedder | None,
 ) -> None:
     if not chosen:
-        raise UserError(f"no episode of {episodes.root} to learn from: record successful ones")
+        raise UserError(f"no episode of {episodes.root} to train on: record successful ones")
     if episodes.fps != config.control_hz:
         raise UserError(
             f"{episodes.root} runs at {episodes.fps} Hz, the policy at {config.control_hz}: set "
@@ -119,11 +119,10 @@ def _check(
         )
     if tuple(episodes.features[ft.STATE]["shape"]) != ft.FEATURES[ft.STATE].shape:
         raise UserError(
-            f"{episodes.root} is of an arm with another number of joints: policies are for the "
-            f"{ft.N_JOINTS} of an FR3"
+            f"{episodes.root} is of another arm: policies command the {ft.N_JOINTS} joints of an FR3"
         )
     if missing := set(config.proprioception) - set(episodes.features):
-        raise UserError(f"{episodes.root} has no {sorted(missing)[0]}, which the policy acts on")
+        raise UserError(f"{episodes.root} has no {sorted(missing)[0]}, which the policy reads")
     if config.reads_wrench and ft.TRUTH_PAD_WRENCH not in episodes.features:
         raise UserError(
             f"{episodes.root} has no {ft.TRUTH_PAD_WRENCH}, which only simulated episodes have: "
@@ -132,7 +131,7 @@ def _check(
     made = (embedder.name, embedder.dim) if embedder else ("", 0)
     if made != (config.touch, config.touch_dim):
         raise UserError(
-            f"the policy wants touch {config.touch!r} of width {config.touch_dim}, this is "
+            f"the policy needs touch {config.touch!r} of width {config.touch_dim}, this is "
             f"{made[0]!r} of width {made[1]}: make its config for this embedder"
         )
 
@@ -140,7 +139,7 @@ def _check(
 def embed_episodes(
     episodes: EpisodeSet, chosen: Sequence[int], embedder: TouchEmbedder, workers: int = 1
 ) -> list[Float16[np.ndarray, "t e"]]:
-    """The embeddings of episodes, made and kept if they are not yet."""
+    """Return the embeddings of episodes, from the cache or made and cached."""
     _fill_cache(episodes, chosen, embedder, workers)
     return [cached_embeddings(episodes, i, embedder) for i in chosen]
 
@@ -148,7 +147,7 @@ def embed_episodes(
 def cached_embeddings(
     episodes: EpisodeSet, i: int, embedder: TouchEmbedder
 ) -> Float16[np.ndarray, "t e"]:
-    """The embeddings that `embed_episodes` kept of an episode; UserError if they are damaged."""
+    """Return the cached embeddings of an episode; UserError if they are damaged."""
     path = _cache_path(episodes, embedder, i)
     rows = np.load(path)
     if rows.shape != (episodes.lengths[i], embedder.dim):
@@ -157,7 +156,7 @@ def cached_embeddings(
 
 
 def _cache_path(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> Path:
-    """Inside the set, where every training on it finds it; named by episode and encoder weights."""
+    """Return the file inside the set, named by episode and encoder weights."""
     folder = episodes.root / ".cache" / "embeddings" / embedder.name.replace("/", "_")
     return folder / f"{episodes.episode_checksum(i)[:32]}.npy"
 
@@ -188,27 +187,26 @@ def _embed(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> None:
 class SequenceDataset:
     """One window for every recorded tick.
 
-    Before an episode's start its first observation is repeated, as in diffusion_policy. What comes
-    after its end is padding: `action_is_pad`, of which nothing is learned. Nobody knows what was
-    right after a failure or when time was up. The last tick is padding too: its observation is the
-    result of the last action, and what is recorded beside it was never done.
+    Before an episode's start its first observation is repeated, as in diffusion_policy. Ticks after its
+    end are padding (`action_is_pad`), which does not count in training. So is the last tick: its observation
+    is the result of the last action, and the action recorded beside it was never executed.
     """
 
     def __init__(self, recorded: Recordings, config: PolicyConfig) -> None:
-        """Windows of the config's horizons."""
+        """Make windows of the config's horizons."""
         self.recorded = recorded
         ends = np.cumsum(recorded.lengths)
         first = np.repeat(ends - recorded.lengths, recorded.lengths)[:, None]
         last = np.repeat(ends - 1, recorded.lengths)[:, None]
         tick = np.arange(ends[-1])[:, None]
-        seen = tick + np.arange(1 - config.observation_horizon, 1)
-        done = tick + np.arange(config.prediction_horizon)
-        self._observed = torch.from_numpy(np.maximum(seen, first))
-        self._planned = torch.from_numpy(np.minimum(done, last))
-        self.action_is_pad: Bool[Tensor, "n h"] = torch.from_numpy(done >= last)
+        observed = tick + np.arange(1 - config.observation_horizon, 1)
+        planned = tick + np.arange(config.prediction_horizon)
+        self._observed = torch.from_numpy(np.maximum(observed, first))
+        self._planned = torch.from_numpy(np.minimum(planned, last))
+        self.action_is_pad: Bool[Tensor, "n h"] = torch.from_numpy(planned >= last)
 
     def __len__(self) -> int:
-        """Number of windows."""
+        """Return the number of windows."""
         return len(self._observed)
 
     @property
@@ -218,17 +216,19 @@ class SequenceDataset:
 
     @property
     def actions(self) -> Float[Tensor, "n h 8"]:
-        """What was done in every window; after the end of an episode the last recorded action."""
+        """Actions of every window; after the end of an episode the last recorded one."""
         return self.recorded.actions[self._planned]
 
     def take(self, rows: Int[Tensor, " b"]) -> tuple[ObservationBatch, Float[Tensor, "b h 8"]]:
-        """Some windows: what was seen, what was done."""
-        seen, recorded = self._observed[rows], self.recorded
+        """Return observations and actions of some windows."""
+        observed, recorded = self._observed[rows], self.recorded
         pictures = None if recorded.pictures is None else recorded.pictures[rows]
-        batch = ObservationBatch(recorded.touch[seen].float(), recorded.state[seen], pictures)
+        batch = ObservationBatch(
+            recorded.touch[observed].float(), recorded.state[observed], pictures
+        )
         return batch, recorded.actions[self._planned[rows]]
 
     def wrench(self, rows: Int[Tensor, " b"]) -> Float[Tensor, "b o 12"] | None:
-        """What acted on both pads when some windows were seen, if it was read."""
+        """Return the wrenches on both pads in some windows, if they were read."""
         wrench = self.recorded.wrench
         return None if wrench is None else wrench[self._observed[rows]]

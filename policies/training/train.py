@@ -1,4 +1,4 @@
-"""Training a policy on recorded sequences (the recipe of Chi et al. 2023)."""
+"""Training of a policy on recorded sequences (the recipe of Chi et al. 2023)."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -33,26 +33,25 @@ def train(
     options: TrainerOptions,
     recipe: dict[str, Any],
 ) -> PolicyNetwork:
-    """Trains a policy; the moving average of its weights is what is kept.
+    """Train a policy; the moving average of its weights is the result.
 
-    Writes what `trainer.fit` does, a policy to `snapshots/epoch-<n>/` every so often and at the end,
-    and the last one to `policy/`. Which snapshot acts best, only closed-loop trials can tell. Killed
-    and resumed, it ends with the same weights as uninterrupted.
+    Beside the files of `trainer.fit` it writes snapshots to `snapshots/epoch-<n>/`, and the last one to
+    `policy/`. A run that is killed and resumed ends with the same weights as an uninterrupted one.
 
     Args:
-        policy: what to train.
-        windows: to learn from.
-        validation: of other episodes.
-        config: how to train.
-        out_dir: a new run's directory, or one to go on with.
-        options: seed, device, precision, whether to go on.
-        recipe: JSON-able; where the episodes come from, kept with the weights.
+        policy: inputs and outputs.
+        windows: training data.
+        validation: windows of other episodes.
+        config: epochs, learning rate, batches.
+        out_dir: folder of a new run, or of the one to resume.
+        options: seed, device, precision, resumption.
+        recipe: JSON-able provenance of the episodes, written beside the weights.
 
     Returns:
         The policy as saved in `out_dir/policy`.
 
     Raises:
-        UserError: no such device, or a directory that does not fit `options.resume`.
+        UserError: no such device, or a folder that does not fit `options.resume`.
     """
     recorded = windows.recorded
     widths = recorded.actions[:, -1].unique().tolist()
@@ -67,7 +66,7 @@ def train(
     average = AveragedModel(network, multi_avg_fn=_update_average).eval().requires_grad_(False)
     averaged = cast(PolicyNetwork, average.module)
 
-    def keep_snapshot(history: list[dict[str, float]], provenance: dict[str, Any]) -> None:
+    def save_snapshot(history: list[dict[str, float]], provenance: dict[str, Any]) -> None:
         known = {"train": asdict(config), "windows": len(windows), "metrics": history[-1]}
         last = len(history) == config.epochs
         folders = [out_dir / POLICY] if last else []
@@ -96,7 +95,7 @@ def train(
         evaluate=lambda: _validate(averaged, validation, config, options.seed),
         progress=_progress,
         after_step=lambda: average.update_parameters(network),
-        after_epoch=keep_snapshot,
+        after_epoch=save_snapshot,
         extra_state={"average": average},
     )
     fit(training, out_dir, options, recipe)
@@ -104,7 +103,7 @@ def train(
 
 
 def ema_decay(step: int, power: float = 0.75, greatest: float = 0.9999) -> float:
-    """Weight of the past after `step` updates; diffusion_policy's schedule and constants."""
+    """Return the decay after `step` updates, by diffusion_policy's schedule and constants."""
     return min(greatest, 1 - (1 + step) ** -power)
 
 
@@ -115,7 +114,7 @@ def _update_average(average: Sequence[Tensor], weights: Sequence[Tensor], n_aver
 
 
 class _PolicyLoss(nn.Module):
-    """A policy's training loss, for the trainer."""
+    """Training loss of a policy, for the trainer."""
 
     def __init__(self, policy: PolicyNetwork) -> None:
         super().__init__()
@@ -136,11 +135,11 @@ class _PolicyLoss(nn.Module):
 
 
 def _make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, Any]:
-    seen, actions = windows.take(rows)
+    observed, actions = windows.take(rows)
     return {
-        "touch": seen.touch,
-        "state": seen.state,
-        "pictures": seen.pictures,
+        "touch": observed.touch,
+        "state": observed.state,
+        "pictures": observed.pictures,
         "wrench": windows.wrench(rows),
         "actions": actions,
         "action_is_pad": windows.action_is_pad[rows],
@@ -151,18 +150,18 @@ def _make_batch(windows: SequenceDataset, rows: Int[Tensor, " b"]) -> dict[str, 
 def _validate(
     policy: PolicyNetwork, windows: SequenceDataset, config: TrainConfig, seed: int
 ) -> dict[str, float]:
-    """The average's loss, and the error of the joint change (rad) it plans over the chunk."""
+    """Return the loss, and the error of the joint change (rad) planned over the chunk."""
     n = min(config.validation_windows, len(windows))
     rows = torch.linspace(0, len(windows) - 1, n).long()
     device = policy.action_normalizer.scale.device
     batch = send_to_device(_make_batch(windows, rows), device)
     generator = torch.Generator().manual_seed(seed)
-    seen = ObservationBatch(batch["touch"], batch["state"], batch["pictures"])
-    planned = policy.plan(seen, generator)
+    observed = ObservationBatch(batch["touch"], batch["state"], batch["pictures"])
+    planned = policy.plan(observed, generator)
     is_pad = batch["action_is_pad"]
     off = (planned - batch["actions"])[..., :7].masked_fill(is_pad[..., None], 0.0)
     error = off.sum(1).norm(dim=1).mean()
-    loss = policy.loss(seen, batch["actions"], BatchNoise(generator), batch["wrench"], is_pad)
+    loss = policy.loss(observed, batch["actions"], BatchNoise(generator), batch["wrench"], is_pad)
     return {"validation_loss": loss.item(), "validation_error": error.item()}
 
 
