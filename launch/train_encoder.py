@@ -250,8 +250,7 @@ def _train_unlabelled(config: Mae | Dino | IJepa | VJepa) -> None:
     """Draw touches, train, save the encoder."""
     from touchgoal.encoders.backbones.frame_history import frame_offsets
     from touchgoal.encoders.backbones.sparsh import SPARSH_BASE
-    from touchgoal.encoders.ssl.mae import train_mae
-    from touchgoal.encoders.ssl.train import train_self_distilled
+    from touchgoal.encoders.ssl.train import train_unlabelled
     from touchgoal.encoders.ssl.unlabelled_touch import open_touch
     from touchgoal.encoders.training.run import check_training, open_training
 
@@ -264,15 +263,8 @@ def _train_unlabelled(config: Mae | Dino | IJepa | VJepa) -> None:
     train, val = (
         draw(config.frames, config.seed, offsets) for draw in (touch.train, touch.validation)
     )
-    match config:
-        case Mae():
-            train_mae(train, val, config.mae, out, config, touch.recipe)
-        case Dino():
-            train_self_distilled(train, val, config.dino, out, config, touch.recipe)
-        case IJepa():
-            train_self_distilled(train, val, config.ijepa, out, config, touch.recipe)
-        case VJepa():
-            train_self_distilled(train, val, config.vjepa, out, config, touch.recipe)
+    settings = getattr(config, method)
+    train_unlabelled(train, val, settings, out, config, touch.recipe)
     print(f"encoder: {out / 'encoder'}")
 
 

@@ -25,7 +25,7 @@ from touchgoal.encoders.ssl.config import (
 from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.ijepa import IJepa
 from touchgoal.encoders.ssl.predictor import JointEmbeddingPrediction, Predictor, take
-from touchgoal.encoders.ssl.train import train_self_distilled
+from touchgoal.encoders.ssl.train import train_unlabelled
 from touchgoal.encoders.ssl.vjepa import VJepa
 from touchgoal.encoders.training.options import TrainerOptions
 
@@ -34,8 +34,8 @@ PREDICTOR: dict[str, Any] = {"predictor_width": 24, "predictor_depth": 1, "predi
 ITOY = IJepaConfig(vit="tiny", **SMALL, **PREDICTOR)
 VTOY = VJepaConfig(vit="tiny", small_blocks=3, **SMALL, **PREDICTOR)
 CASES: dict[Any, Any] = {
-    "ijepa": (IJepa, train_self_distilled, ITOY, moving_blobs(24)),
-    "vjepa": (VJepa, train_self_distilled, VTOY, moving_blobs(24, frames=4)),
+    "ijepa": (IJepa, train_unlabelled, ITOY, moving_blobs(24)),
+    "vjepa": (VJepa, train_unlabelled, VTOY, moving_blobs(24, frames=4)),
 }
 
 

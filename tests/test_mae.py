@@ -13,7 +13,8 @@ from touchgoal.encoders.backbones.vit import patchify, random_masking
 from touchgoal.encoders.probes.ridge import ridge_r2
 from touchgoal.encoders.ssl.config import MAE_PRESETS, MaeConfig
 from touchgoal.encoders.ssl.frames import TouchFrames
-from touchgoal.encoders.ssl.mae import MaskedAutoencoder, train_mae
+from touchgoal.encoders.ssl.mae import MaskedAutoencoder
+from touchgoal.encoders.ssl.train import train_unlabelled
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.runtime.errors import UserError
 
@@ -37,7 +38,7 @@ def blobs(count: int, seed: int) -> TouchFrames:
 def test_the_mean_of_the_tokens_learns_where_and_how_strong(tmp_path: Path) -> None:
     train, val = blobs(256, 0), blobs(64, 1)
     config = replace(TOY, epochs=8)
-    backbone = train_mae(train, val, config, tmp_path, TrainerOptions(), {"data": "toy"})
+    backbone = train_unlabelled(train, val, config, tmp_path, TrainerOptions(), {"data": "toy"})
     metrics = pretrained.ENCODER_FORMAT.provenance(tmp_path / "encoder")["metrics"]
     assert metrics["validation_loss"] < metrics["validation_loss_of_blank"]
     assert min(metrics[f"force_{axis}_r2"] for axis in "xyz") > 0.8
@@ -64,13 +65,13 @@ def sliding(count: int, seed: int) -> TouchFrames:
 def test_two_frames_on_top_of_each_other_tell_motion(tmp_path: Path) -> None:
     train, val = sliding(256, 0), sliding(64, 1)
     config = replace(TOY, stacked=True, epochs=8, mask_ratio=0.25)
-    backbone = train_mae(train, val, config, tmp_path, TrainerOptions(), {"data": "toy"})
+    backbone = train_unlabelled(train, val, config, tmp_path, TrainerOptions(), {"data": "toy"})
     metrics = pretrained.ENCODER_FORMAT.provenance(tmp_path / "encoder")["metrics"]
     assert metrics["force_x_r2"] > 0.5
     assert backbone.offsets == (0, 2) and backbone.config.vit.channels == 6
     newest_alone = replace(train, touch=train.touch[:, 0]), replace(val, touch=val.touch[:, 0])
     single = replace(config, stacked=False)
-    train_mae(*newest_alone, single, tmp_path / "single", TrainerOptions(), {})
+    train_unlabelled(*newest_alone, single, tmp_path / "single", TrainerOptions(), {})
     blind = pretrained.ENCODER_FORMAT.provenance(tmp_path / "single/encoder")["metrics"]
     assert blind["force_x_r2"] < 0.1
 
@@ -88,19 +89,19 @@ def test_the_paper_preset_is_table_2() -> None:
 @pytest.mark.parametrize("bottleneck", [True, False])
 def test_a_killed_training_ends_with_the_same_weights(tmp_path: Path, bottleneck: bool) -> None:
     data, config = blobs(32, 0), replace(TOY, bottleneck=bottleneck)
-    whole = train_mae(data, data, config, tmp_path / "whole", TrainerOptions(), {})
+    whole = train_unlabelled(data, data, config, tmp_path / "whole", TrainerOptions(), {})
     with killed_in_epoch(2):
-        train_mae(data, data, config, tmp_path / "killed", TrainerOptions(), {})
+        train_unlabelled(data, data, config, tmp_path / "killed", TrainerOptions(), {})
     go_on = TrainerOptions(resume=True)
-    resumed = train_mae(data, data, config, tmp_path / "killed", go_on, {})
+    resumed = train_unlabelled(data, data, config, tmp_path / "killed", go_on, {})
     for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(a, b)
     with pytest.raises(UserError, match="holds a run already"):
-        train_mae(data, data, config, tmp_path / "killed", TrainerOptions(), {})
+        train_unlabelled(data, data, config, tmp_path / "killed", TrainerOptions(), {})
     with pytest.raises(UserError, match=r"of another data set.*mae.lr was 0.003, is 0.001"):
-        train_mae(data, data, replace(config, lr=1e-3), tmp_path / "killed", go_on, {})
+        train_unlabelled(data, data, replace(config, lr=1e-3), tmp_path / "killed", go_on, {})
     with pytest.raises(UserError, match=r"of another data set.*\(data was"):
-        train_mae(blobs(32, 1), data, config, tmp_path / "killed", go_on, {})
+        train_unlabelled(blobs(32, 1), data, config, tmp_path / "killed", go_on, {})
 
 
 def test_one_visible_patch_is_enough(tmp_path: Path) -> None:
@@ -114,7 +115,7 @@ def test_one_visible_patch_is_enough(tmp_path: Path) -> None:
         assert model.loss(data.touch.float(), ids_keep).isfinite()
     nothing_masked = replace(TOY, mask_ratio=0.01, bottleneck=False)
     with pytest.raises(UserError, match="masks none of 12 patches"):
-        train_mae(data, data, nothing_masked, tmp_path, TrainerOptions(), {})
+        train_unlabelled(data, data, nothing_masked, tmp_path, TrainerOptions(), {})
 
 
 def test_only_masked_patches_count_where_tokens_are_seen() -> None:

@@ -103,8 +103,7 @@ from pathlib import Path
 import torch
 sys.path.insert(0, {tests!r})
 import test_align, test_mae, test_self_distillation, toy_policies
-from touchgoal.encoders.ssl.mae import train_mae
-from touchgoal.encoders.ssl.train import train_self_distilled
+from touchgoal.encoders.ssl.train import train_unlabelled
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import OptimizerConfig
 from touchgoal.policies.config import TrainConfig
@@ -114,12 +113,12 @@ from touchgoal.policies.training.train import train
 OptimizerConfig.build = lambda self, module: torch.optim.SGD(module.parameters(), self.lr)
 out, options = Path(sys.argv[1]), TrainerOptions()
 data = test_mae.blobs(32, 0)
-train_mae(data, data, replace(test_mae.TOY, epochs=2, lr=0.1), out / "mae", options, {{}})
+train_unlabelled(data, data, replace(test_mae.TOY, epochs=2, lr=0.1), out / "mae", options, {{}})
 config = replace(test_align.CONFIG, lr=0.1)
 test_align.run_align(test_align.TRAIN, test_align.VAL, test_align.FakeTowers(), config, out / "align", {{}})
 data = test_self_distillation.moving_blobs(32)
-config = replace(test_self_distillation.TOY, epochs=2, lr=0.1, targets="sinkhorn", batch_norm=True)
-train_self_distilled(data, data, config, out / "dino", options, {{}})
+config = replace(test_self_distillation.TOY, epochs=2, lr=0.1, batch_norm=True)
+train_unlabelled(data, data, config, out / "dino", options, {{}})
 windows, config = toy_policies.toy_dataset(toy_policies.TOY), TrainConfig(epochs=2, batch_size=8)
 train(toy_policies.TOY, windows, windows, config, out / "policy", options, {{}})
 """

@@ -47,7 +47,7 @@ _THEIRS = {
 _SHOWN = 20  # keys in a message
 
 
-def load_sparsh(path: Path, image_size: tuple[int, int] | None = None) -> ViT:
+def load_sparsh(path: Path) -> ViT:
     """Load a published Sparsh encoder of any method, for inference, as float32 on the CPU.
 
     The architecture is read off the weights' shapes.
@@ -63,7 +63,7 @@ def load_sparsh(path: Path, image_size: tuple[int, int] | None = None) -> ViT:
     """
     tensors = _encoder_tensors(path, _read(path))
     with torch.device("meta"):
-        vit = ViT(_config(path, tensors, image_size))
+        vit = ViT(_config(path, tensors))
     names = {_their_name(name): name for name in vit.state_dict()}
     expected = {theirs: tuple(vit.state_dict()[ours].shape) for theirs, ours in names.items()}
     if not vit.config.learned_positions:
@@ -164,9 +164,7 @@ def _encoder_tensors(path: Path, found: Mapping[str, Any]) -> dict[str, Tensor]:
     )
 
 
-def _config(
-    path: Path, tensors: Mapping[str, Tensor], image_size: tuple[int, int] | None
-) -> ViTConfig:
+def _config(path: Path, tensors: Mapping[str, Tensor]) -> ViTConfig:
     """Return the config that the shapes imply; `_check_fit` finds what is wrong with them."""
     projection = tensors[_PATCH]
     if projection.ndim not in (4, 5) or projection.shape[0] % _HEAD_WIDTH:
@@ -178,10 +176,9 @@ def _config(
     blocks = [int(match[1]) for name in tensors if (match := re.match(r"blocks\.(\d+)\.", name))]
     hidden = tensors.get("blocks.0.mlp.fc1.bias")
     registers = tensors.get("register_tokens")
-    size, times = image_size or UPRIGHT, 2
+    size, times = UPRIGHT, 2
     if _POSITIONS in tensors:
-        sizes = [image_size] if image_size else [SQUARE, UPRIGHT]
-        size, times = _grid_of(path, tensors[_POSITIONS], sizes, patch_size, tubelet)
+        size, times = _grid_of(path, tensors[_POSITIONS], patch_size, tubelet)
     return ViTConfig(
         image_size=size,
         patch_size=patch_size,
@@ -200,18 +197,17 @@ def _config(
 
 
 def _grid_of(
-    path: Path, positions: Tensor, sizes: list[tuple[int, int]], patch_size: int, tubelet: int
+    path: Path, positions: Tensor, patch_size: int, tubelet: int
 ) -> tuple[tuple[int, int], int]:
     """Return the image size that the number of positions fits, and the number of tubelets."""
     count = positions.shape[-2] if positions.ndim > 1 else 0
-    for height, width in sizes:
+    for height, width in (SQUARE, UPRIGHT):
         times, left = divmod(count, math.ceil(height / patch_size) * math.ceil(width / patch_size))
         if left == 0 and times >= 1 and (times == 1 or tubelet > 1):
             return (height, width), times
-    tried = " or ".join(f"{height} x {width}" for height, width in sizes)
     raise UserError(
-        f"{path} has {tuple(positions.shape)} positions, which do not fit pictures of {tried}: say "
-        "for which size of picture it is"
+        f"{path} has {tuple(positions.shape)} positions, which fit neither images of {SQUARE} nor of "
+        f"{UPRIGHT}: give an encoder for one of these sizes"
     )
 
 

@@ -142,11 +142,8 @@ class DinoConfig(SelfDistillationConfig):
     """Teacher's temperature at the start; it rises linearly."""
     teacher_warmup: Annotated[Fraction, RARE] = 0.07
     """Share of the steps in which the teacher's temperature rises."""
-    targets: Literal["centering", "sinkhorn"] = "centering"
-    """How the teacher avoids giving every touch the same prototype: subtract its mean output, or spread
-    every batch evenly over the prototypes (Sinkhorn-Knopp, as in DINOv2)."""
     center_momentum: Annotated[Fraction, RARE] = 0.9
-    """Momentum of the teacher's mean output."""
+    """Momentum of the teacher's mean output, which is subtracted against collapse."""
     global_scale: Scales = (0.48, 1.0)
     """Size of the two large views, the teacher's input, as a share of the patches."""
     local_scale: Scales = (0.1, 0.48)

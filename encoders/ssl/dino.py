@@ -24,7 +24,6 @@ from touchgoal.encoders.ssl.self_distillation import (
 from touchgoal.encoders.training.trainer import gather_batch, own_rows
 
 _GLOBAL_VIEWS = 2
-_SINKHORN_ROUNDS = 3
 
 
 class DinoHead(nn.Module):
@@ -129,9 +128,7 @@ class Dino(SelfDistillation):
         warm = min(self.done / config.teacher_warmup, 1.0) if config.teacher_warmup else 1.0
         first = config.first_teacher_temperature
         temperature = first + warm * (config.teacher_temperature - first)
-        if config.targets == "centering":
-            return ((scores - self.center) / temperature).softmax(2)
-        return torch.stack([sinkhorn(view / temperature) for view in scores])
+        return ((scores - self.center) / temperature).softmax(2)
 
     @torch.no_grad()
     def _move_center(self, scores: Float[Tensor, "2 b p"]) -> None:
@@ -157,16 +154,3 @@ def information(targets: Float[Tensor, "v b p"]) -> Float[Tensor, ""]:
     """Return the mutual information of touch and prototype within a batch, nats."""
     common, own = torch.special.entr(targets.mean(1)).sum(1), torch.special.entr(targets).sum(2)
     return common.mean() - own.mean()
-
-
-def sinkhorn(logits: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
-    """Return distributions over prototypes that use all prototypes alike (Caron et al. 2020).
-
-    Rows and columns are scaled in turn, over the touches of all processes.
-    """
-    every = gather_batch(logits)
-    Q = (every - every.max()).exp()
-    for _ in range(_SINKHORN_ROUNDS):
-        Q = Q / Q.sum(0) / Q.shape[1]
-        Q = Q / Q.sum(1, keepdim=True) / len(Q)
-    return own_rows(Q, len(logits)) * len(Q)

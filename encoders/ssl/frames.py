@@ -2,39 +2,23 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16, Int, UInt8
+from jaxtyping import Float, Float16, Int
 from torch import Tensor
 
 from touchgoal.control.features import TACTILE, TRUTH_PAD_WRENCH
 from touchgoal.encoders.backbones.frame_history import past_rows
 from touchgoal.encoders.preprocess import preprocessor_for
-from touchgoal.episodes.overlap import ChecksummedRecording
+from touchgoal.episodes.importers.pretraining_clips import Recording as ClipRecording
+from touchgoal.episodes.importers.video_recordings import VideoRecording
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
-
-@runtime_checkable  # beartype checks arguments in tests
-class Clip(Protocol):
-    """Images in time."""
-
-    def __len__(self) -> int: ...  # noqa: D105
-    def frames(self, rows: Sequence[int]) -> UInt8[np.ndarray, "n h w 3"]: ...  # noqa: D102
-
-
-@runtime_checkable
-class Recording(ChecksummedRecording, Protocol):
-    """One fingertip's images in a file, and the untouched sensor."""
-
-    @property
-    def sensor(self) -> str: ...  # noqa: D102
-    @property
-    def held_out(self) -> bool: ...  # noqa: D102
-    def open(self) -> tuple["Clip", UInt8[np.ndarray, "h w 3"]]: ...  # noqa: D102
+Recording = ClipRecording | VideoRecording
+"""One fingertip's images in a file, and the untouched sensor."""
 
 
 @dataclass(frozen=True, eq=False)

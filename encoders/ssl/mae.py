@@ -1,15 +1,9 @@
 """Masked autoencoding of touch (He et al. 2022; Sparsh, Higuera et al. 2024)."""
 
-from dataclasses import asdict
-from functools import partial
-from pathlib import Path
-from typing import Any, cast
-
 import torch
 from jaxtyping import Float, Float16, Int
 from torch import Tensor, nn
 
-from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.frame_history import stack_frames
 from touchgoal.encoders.backbones.sparsh import backbone_for
 from touchgoal.encoders.backbones.touch_backbone import BATCH, TouchBackbone, TouchBackboneConfig
@@ -25,10 +19,6 @@ from touchgoal.encoders.backbones.vit import (
 from touchgoal.encoders.ssl.config import MaeConfig
 from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.validation import forces_line, read_forces
-from touchgoal.encoders.training.batch_noise import BatchNoise
-from touchgoal.encoders.training.checkpoint import checksum
-from touchgoal.encoders.training.options import TrainerOptions
-from touchgoal.encoders.training.trainer import OptimizerConfig, Training, fit, on_first_process
 from touchgoal.runtime.errors import UserError
 
 _ENCODER = "encoder"
@@ -65,6 +55,11 @@ class MaskedAutoencoder(nn.Module):
     ) -> dict[str, Float[Tensor, ""]]:
         """Return the loss, for the trainer."""
         return {"loss": self.loss(self.images(touch), ids_keep)}
+
+    def draw(self, count: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Draw the patches that the backbone reads: `ids_keep` (count, k)."""
+        vit = self.backbone.config.vit
+        return {"ids_keep": random_masking(vit, self.config.mask_ratio, count, generator)}
 
     def images(self, touch: Float16[Tensor, "b *t 3 h w"]) -> Float[Tensor, "b c h w"]:
         """Return the backbone's input; of two frames the newer one's channels come first."""
@@ -113,60 +108,6 @@ class MaskedAutoencoder(nn.Module):
             )
 
 
-def train_mae(
-    train: TouchFrames,
-    val: TouchFrames,
-    config: MaeConfig,
-    out_dir: Path,
-    options: TrainerOptions,
-    recipe: dict[str, Any],
-) -> TouchBackbone:
-    """Train a backbone; see `ssl.train.train_self_distilled`.
-
-    Writes what `trainer.fit` does and, at the end, the backbone to `encoder/`.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(options.seed)
-        model = MaskedAutoencoder(config, train.sensor, train.stride)
-
-    masking = partial(random_masking, model.backbone.config.vit, config.mask_ratio)
-
-    def batch(rows: Tensor, noise: BatchNoise) -> dict[str, Tensor]:
-        return {"touch": train.touch[rows], "ids_keep": noise.draw(len(rows), masking)}
-
-    training = Training(
-        loss=model,
-        n_samples=len(train),
-        batch=batch,
-        optimizer=OptimizerConfig(
-            config.epochs,
-            config.batch_size,
-            config.lr,
-            config.weight_decay,
-            betas=(0.9, config.second_moment),
-            warmup=config.warmup,
-            max_grad_norm=1.0,
-            final_weight_decay=config.final_weight_decay,
-        ),
-        identity={
-            "mae": asdict(config),
-            "sensor": train.sensor,
-            "stride": train.stride,
-            "data": checksum(train.touch, val.touch),
-        },
-        evaluate=lambda: validate(model, train, val),
-        progress=_progress,
-    )
-    history, provenance = fit(training, out_dir, options, recipe)
-    provenance |= {
-        "mae": asdict(config),
-        "touches": {"train": len(train), "val": len(val)},
-        "metrics": history[-1],
-    }
-    on_first_process(lambda: pretrained.save(model.backbone, out_dir / _ENCODER, provenance))
-    return cast(TouchBackbone, pretrained.load_encoder(out_dir / _ENCODER))
-
-
 @torch.no_grad()
 def validate(model: MaskedAutoencoder, train: TouchFrames, val: TouchFrames) -> dict[str, float]:
     """Return losses on other touches, and how well a linear probe reads forces.
@@ -179,7 +120,7 @@ def validate(model: MaskedAutoencoder, train: TouchFrames, val: TouchFrames) -> 
     total, blank = 0.0, 0.0
     for batch in val.touch.split(BATCH):
         touch = model.images(batch.to(device))
-        ids_keep = random_masking(vit, model.config.mask_ratio, len(touch), generator).to(device)
+        ids_keep = model.draw(len(touch), generator)["ids_keep"].to(device)
         total += model.loss(touch, ids_keep).item() * len(touch)
         blank += patchify(touch, vit).square().mean().item() * len(touch)
     return {
@@ -195,7 +136,8 @@ def _embed(model: MaskedAutoencoder, touch: Tensor) -> Tensor:
     return torch.cat([model.backbone.embed_touch(batch) for batch in batches]).cpu()
 
 
-def _progress(metrics: dict[str, float]) -> str:
+def progress_line(metrics: dict[str, float]) -> str:
+    """Return the line to print for an epoch."""
     return (
         f"loss {metrics['loss']:.4f} in training, {metrics['validation_loss']:.4f} in validation "
         f"({metrics['validation_loss_of_blank']:.4f} for drawing an untouched gel){forces_line(metrics)}"

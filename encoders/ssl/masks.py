@@ -58,14 +58,11 @@ def cover(ids: Int[Tensor, "b m k"], patches: int) -> Bool[Tensor, "b {patches}"
     return torch.zeros(len(ids), patches, dtype=torch.bool).scatter(1, ids.flatten(1), True)
 
 
-def cut(
-    allowed: Bool[Tensor, "b n"], generator: torch.Generator, at_most: int | None = None
-) -> Int[Tensor, "b k"]:
+def cut(allowed: Bool[Tensor, "b n"], generator: torch.Generator) -> Int[Tensor, "b k"]:
     """Draw as many of the allowed patches of each image as the image with the fewest has."""
     fewest = int(allowed.sum(1).min())
-    kept = fewest if at_most is None else min(fewest, at_most)
     chance = torch.rand(allowed.shape, generator=generator).masked_fill(~allowed, -1.0)
-    return chance.topk(kept, 1).indices.sort(1).values
+    return chance.topk(fewest, 1).indices.sort(1).values
 
 
 def draw_targets(

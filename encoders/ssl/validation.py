@@ -7,7 +7,6 @@ here changes the training.
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -16,10 +15,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from touchgoal.encoders.backbones.frame_history import stack_frames
-from touchgoal.encoders.backbones.touch_backbone import BATCH, TouchBackbone
+from touchgoal.encoders.backbones.touch_backbone import BATCH
 from touchgoal.encoders.backbones.vit import ViTConfig, patch_grid, patchify
 from touchgoal.encoders.probes.ridge import ridge_r2
 from touchgoal.encoders.ssl.frames import TouchFrames
+from touchgoal.encoders.ssl.self_distillation import SelfDistillation
 from touchgoal.encoders.training.trainer import is_first_process
 
 _PROBE_SAMPLES, _TOKEN_SAMPLES = 2048, 128
@@ -30,21 +30,16 @@ _PICTURES, _SHOWN = 4, 6
 _CONTRAST = 32.0  # grey levels that 1.0 is drawn as
 
 
-@runtime_checkable  # beartype checks arguments in tests
-class Distilled(Protocol):
-    """Part of an objective that validation uses; see `SelfDistillation`."""
-
-    teacher: TouchBackbone
-
-    def draw(self, count: int, generator: torch.Generator) -> dict: ...  # noqa: D102
-    def __call__(self, touch: Tensor, **drawn: Any) -> dict[str, Tensor]: ...  # noqa: D102
-
-
 class Validation:
     """Metrics of a training's teacher on touches of other episodes."""
 
     def __init__(
-        self, model: Distilled, train: TouchFrames, val: TouchFrames, out_dir: Path, epochs: int
+        self,
+        model: SelfDistillation,
+        train: TouchFrames,
+        val: TouchFrames,
+        out_dir: Path,
+        epochs: int,
     ) -> None:
         """Measure the untrained backbone, to which collapse is relative."""
         self._model, self._train, self._val = model, train, val
@@ -71,8 +66,10 @@ class Validation:
         """Return whether touches no longer differ, differ along one line, or share one prototype."""
         spread = metrics["token_spread"] / max(self._untrained["token_spread"], 1e-12)
         rank = (metrics["effective_rank"] - 1) / max(self._untrained["effective_rank"] - 1, 1e-12)
-        told = metrics.get("teacher_information", 1.0)
-        return not (spread >= _LEAST_SPREAD and rank >= _LEAST_RANK and told >= _LEAST_INFORMATION)
+        information = metrics.get("teacher_information", 1.0)
+        return not (
+            spread >= _LEAST_SPREAD and rank >= _LEAST_RANK and information >= _LEAST_INFORMATION
+        )
 
     def line(self, metrics: dict[str, float]) -> str:
         """Return the line to print for an epoch."""
