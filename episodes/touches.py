@@ -1,18 +1,27 @@
 """Touches: single tactile frames with the object they feel, cut from episodes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
 from touchgoal.control.features import TACTILE, TRUTH_CONTACT, WRIST
+from touchgoal.control.sensors.exchanged import Picture, fingertips_exchanged
+from touchgoal.control.tactile.background import local_change
 from touchgoal.control.tactile.contact import detect_contact, threshold_for
+from touchgoal.control.tactile.picture_guard import check_untouched
+from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
 _BACKGROUND_FRAMES = 5
 _VIEW_FRAMES_BEFORE_CONTACT = 5
+_SAME_SENSOR = (
+    1.0  # counts of local change between two days of one sensor; noise of 1 count gives 0.3
+)
+_LOOKED_AT = 8  # episodes of a set whose first frames are checked
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +124,40 @@ def _check(episodes: EpisodeSet) -> list[int]:
         raise UserError(f"{episodes.root} has no touch or no wrist pictures: record {WRIST} too")
     if missing := {"object", "descriptions"} - set(episodes.meta(0)):
         raise UserError(f"{episodes.root} lacks meta {', '.join(sorted(missing))}: record them")
+    check_fingertips(episodes, range(len(episodes)))
     return sides
+
+
+def check_fingertips(episodes: EpisodeSet, chosen: Sequence[int]) -> None:
+    """Refuse a set whose fingertip pictures are not its sensor's, or in which left and right change places.
+
+    The first frames of some episodes are compared with the sensor file, and with each other.
+
+    Raises:
+        UserError: see `picture_guard.check_untouched`; or two episodes have them exchanged.
+    """
+    keys = [key for key in TACTILE if key in episodes.features]
+    looked_at = [chosen[i] for i in np.linspace(0, len(chosen) - 1, _LOOKED_AT).astype(int)]
+    first: list[UInt8[np.ndarray, "h w 3"]] = []
+    for i in sorted(set(looked_at)) if keys else ():
+        read = episodes.read(i, keys, [0]).frames
+        frames = [read[key][0] for key in keys]
+        sensor = SENSORS.get(str(episodes.meta(i).get("sensor")))
+        for key, frame in zip(keys, frames, strict=True):
+            if sensor is not None:
+                check_untouched(frame, sensor, f"{key} of episode {i} of {episodes.root}")
+        first = first or frames
+        if len(keys) == 2 and _exchanged((frames[0], frames[1]), (first[0], first[1])):
+            raise UserError(
+                f"{episodes.root}: left and right fingertip of episode {i} look exchanged against episode "
+                f"{looked_at[0]}: exchange {keys[0]} and {keys[1]} in one of them, or leave it out"
+            )
+
+
+def _exchanged(frames: tuple[Picture, Picture], first: tuple[Picture, Picture]) -> bool:
+    """Whether the same two sensors changed sides; other sensors, as simulation draws them, do not count."""
+    crossed = max(float(local_change(frames[k], first[1 - k]).mean()) for k in (0, 1))
+    return crossed < _SAME_SENSOR and fingertips_exchanged(frames, first)
 
 
 def touch_background(frames: UInt8[np.ndarray, "n h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

@@ -1,9 +1,9 @@
 """Fit a sensor's light, gel and noise to ball presses, and write its sensor file.
 
-PRESSES holds background.png (the untouched sensor), the pictures of the presses, and presses.csv
-with the columns file and ball_mm (the ball's radius). Where ball and gel touch is found in the
-pictures, or taken from the columns x_px, y_px, radius_px (circles; the first pixel is 0, 0). Presses
-of two balls of different size tell most about depth.
+PRESSES holds background.png (the untouched sensor), the pictures of the presses, and presses.csv with the
+columns file and ball_mm (the ball's radius). Contact circles are found in the pictures unless the columns
+x_px, y_px and radius_px give them (the first pixel is 0, 0). Use two balls of different size.
+`touchgoal record-presses` makes such a folder.
 """
 
 import math
@@ -28,22 +28,25 @@ class Config:
     sensor: str = "gelsight_mini"
     """Model of the sensor (`touchgoal list sensors`)."""
     ball_mm: Positive | None = None
-    """Radius of the ball, mm, of presses for which presses.csv gives none."""
+    """Radius of the ball, mm, for presses without ball_mm in presses.csv."""
+    check_lamps: bool = True
+    """Refuse pictures with channels exchanged, mirrored or turned against the model's sensor file; switch
+    it off for a sensor whose lamps are placed otherwise."""
     illumination_exponent: Positive | None = None
     """Power of the background's brightness by which the response varies over the image; default: the
-    one with which the balls come out at their size (four fits, a few minutes)."""
+    one that reads the balls at their size (four fits, a few minutes)."""
     out: Path | None = None
     """Folder of the run; the sensor file goes to its `sensor_file/`."""
     held_out: Annotated[float, Field(ge=0.1, le=0.5)] = 0.25
-    """Share of the presses that are not fitted, on which the reported errors are measured."""
+    """Share of the presses that is held out to measure the reported errors."""
     seed: Seed = 0
-    """Random seed of the choice of those presses."""
+    """Random seed of the held-out choice."""
     source: str = ""
-    """Where the presses come from, for the record; default: their folder."""
+    """Origin of the presses, for the record; default: their folder."""
 
 
 def main(config: Config) -> None:
-    """Fit without the held-out presses and judge on them, then fit all; UserError for bad input."""
+    """Fit without the held-out presses and measure errors on them, then fit all."""
     import numpy as np
 
     from touchgoal.control.calibration import report
@@ -56,6 +59,7 @@ def main(config: Config) -> None:
     from touchgoal.control.calibration.held_out_depth import depth_errors, median_by_ball
     from touchgoal.control.calibration.pictures import light_compass
     from touchgoal.control.calibration.press_set import read_presses, split
+    from touchgoal.control.tactile.picture_guard import check_presses, check_untouched
     from touchgoal.control.tactile.sensor_calibration import save
     from touchgoal.control.tactile.sensor_models import find_model
     from touchgoal.runtime.json_file import write_json
@@ -63,13 +67,18 @@ def main(config: Config) -> None:
     from touchgoal.runtime.provenance import provenance
     from touchgoal.runtime.run_folder import open_run
 
-    find_model(config.sensor)
+    model = find_model(config.sensor)
     pitch = config.mm_per_pixel * 1e-3
     presses = read_presses(config.presses, pitch, config.ball_mm or math.nan)
     if np.isnan(presses.ball_radius).any():
         raise UserError(
-            "no picture tells the ball's radius, and every depth in mm hangs on it: measure the ball "
+            "the ball's radius is missing, and every depth in mm depends on it: measure the ball "
             "and give --ball-mm, or ball_mm in presses.csv (two balls of different size are best)"
+        )
+    if config.check_lamps:
+        check_untouched(presses.background, model, f"{config.presses}/background.png")
+        check_presses(
+            presses.background, presses.images, model, f"the pictures in {config.presses}"
         )
     out = open_run(config.out, "calibrate", config)
     train, test = split(presses, round(config.held_out * len(presses)), config.seed)

@@ -20,6 +20,8 @@ import torch
 from jaxtyping import Float, Float32, UInt8
 
 from touchgoal.control.features import FRONT, TACTILE, TRUTH_CONTACT
+from touchgoal.control.tactile.picture_guard import check_untouched
+from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.pretrained import AnyTouchEncoder
 from touchgoal.encoders.towers.towers import Towers
@@ -285,7 +287,13 @@ class EpisodeEmbedder:
                 f"with {START_FRAMES} frames before the first touch"
             )
         pictures = [episode.frames[side] for side in sides]
-        return np.stack([self.embed_touch(p, touch_background(p)) for p in pictures])
+        backgrounds = [touch_background(p) for p in pictures]
+        if (sensor := SENSORS.get(self._made_with.sensor)) is not None:
+            for side, background in zip(sides, backgrounds, strict=True):
+                check_untouched(background, sensor, f"{side} of {source}")
+        return np.stack(
+            [self.embed_touch(p, b) for p, b in zip(pictures, backgrounds, strict=True)]
+        )
 
     def _embed_descriptions(
         self, episode: Episode, source: str

@@ -22,6 +22,7 @@ from touchgoal.control.features import (
 from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.metadata import INFO
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.episodes.touches import check_fingertips
 from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EpisodeEmbedder, missing_camera
 from touchgoal.rewards.goals import Inputs
 from touchgoal.rewards.normalizer import scene_of
@@ -94,6 +95,8 @@ class EpisodeSource:
             raise UserError(
                 f"{self.path} mixes the sensors {', '.join(sorted(sensors))}: choose --index"
             )
+        if self.with_touch:
+            check_fingertips(self.episodes, self.indices)
 
     def embed(
         self, embedder: EpisodeEmbedder, descriptions: bool = False

@@ -180,9 +180,9 @@ def test_check_sensor_says_what_is_off(
         cv2.imwrite(str(pictures / f"{i:03d}.png"), lit.astype(np.uint8)[..., ::-1])
     main(["check-sensor", str(pictures), "--sensor", "gelsight_mini", "--ball-mm", "6",
           "--weight-g", "2000", "--out", str(tmp_path / "out")])  # fmt: skip
-    said = capsys.readouterr().out
-    assert "lock the exposure" in said and "record-presses" in said
-    assert "of a weight of 19.6 N: multiply" in said
+    printed = capsys.readouterr().out
+    assert "lock the exposure" in printed and "record-presses" in printed
+    assert "under a weight of 19.6 N: multiply" in printed
     drawn = cv2.imread(str(tmp_path / "out" / "check.png"))
     assert drawn is not None and drawn.shape == (3 * 240, 5 * 320, 3)
 

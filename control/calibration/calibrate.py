@@ -16,6 +16,7 @@ from touchgoal.control.calibration.press_fit import (
     WIDEST,
     FitState,
     PressFit,
+    move_circles,
 )
 from touchgoal.control.calibration.press_set import PressSet
 from touchgoal.control.tactile.sensor_calibration import (
@@ -89,17 +90,8 @@ class FittedCalibration:
         That looks at the pictures: an error at these circles is the model's alone, an error at
         `correct_labels` the labels' as well.
         """
-        p = self.calibration
-        steps = PressFit(
-            presses,
-            p.background,
-            self.varies_over_image,
-            illumination_exponent=p.illumination_exponent,
-        )
-        state = FitState(self.calibration, self.correct_labels(presses), self.ball_radii(presses))
-        for _ in range(8):
-            state = steps.fit_circles(state)
-        return state.circles
+        known = replace(presses, ball_radius=self.ball_radii(presses))
+        return move_circles(self.calibration, known, self.correct_labels(presses))
 
     def simulate(self, circle: Circle, ball_radius: float) -> Float32[np.ndarray, "h w 3"]:
         """Picture of a press, RGB counts without noise; px and m."""

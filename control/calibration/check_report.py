@@ -1,4 +1,4 @@
-"""What `check-sensor` prints and draws."""
+"""Printed lines, metrics and picture of `check-sensor`."""
 
 from typing import Any
 
@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.control.calibration.sensor_check import PressRead, SensorCheck
+from touchgoal.control.calibration.sensor_check import PressReading, SensorCheck
 from touchgoal.control.tactile.background import Drift
+from touchgoal.control.tactile.picture_guard import UNEXPLAINED
 
 _SHOWN = 4  # presses in the picture
 _CONTRAST = 4  # of the change column
@@ -18,7 +19,7 @@ _DEPTH_OFF, _FORCE_OFF = 0.1, 0.2
 
 
 def figures(check: SensorCheck, ball_mm: float | None, weight_g: float | None) -> dict[str, Any]:
-    """What metrics.json holds; lengths in mm, forces in N, light in counts."""
+    """Return the content of metrics.json; lengths in mm, forces in N, light in counts."""
     balls = [press.ball for press in check.presses if press.ball is not None]
     read: dict[str, Any] = {}
     if ball_mm is not None and balls:
@@ -34,6 +35,7 @@ def figures(check: SensorCheck, ball_mm: float | None, weight_g: float | None) -
     return {
         "frames": check.frames,
         "touching": check.touching,
+        "torn": check.torn,
         "noise": check.noise,
         "drift": _drift(check.drift),
         "drift_from_file": _drift(check.drift_from_file),
@@ -44,70 +46,84 @@ def figures(check: SensorCheck, ball_mm: float | None, weight_g: float | None) -
         "markers": check.markers,
         "largest_shift_px": check.largest_shift,
         "presses": len(check.presses),
+        "presses_unexplained": check.unexplained,
         **read,
     }
 
 
 def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
-    """The same as people read it, with what to do where something is off."""
-    said = [f"frames       {check.frames}, {check.touching} of them touched"]
+    """Return the printed lines, with the remedy where a figure is off."""
+    printed = [f"frames       {check.frames}, {check.touching} of them touched"]
+    if check.torn:
+        printed.append(
+            f"             {check.torn} are torn or rolled and left out: check the cable and the decoder"
+        )
     if check.noise is not None:
-        said.append(f"noise        {check.noise:.2f} counts a pixel")
-    said += [
+        printed.append(f"noise        {check.noise:.2f} counts a pixel")
+    printed += [
         _light("drift", check.drift, "lock the exposure, and let the sensor warm up"),
-        _light("sensor file", check.drift_from_file, "calibrate this sensor anew"),
+        _light("sensor file", check.drift_from_file, "calibrate this sensor"),
     ]
     if check.unlike_file > _UNLIKE:
-        said.append(
-            f"             the untouched gel is not the sensor file's ({check.unlike_file:.1f} counts in "
-            "one spot): lengths and forces are not this sensor's until it is calibrated"
+        printed.append(
+            f"             the untouched gel differs from the sensor file's by {check.unlike_file:.1f} counts "
+            "in one spot: depths and forces are nominal until this sensor is calibrated"
         )
-    said.append(_contact(check))
+    printed.append(_contact(check))
     if check.markers is not None:
-        said.append(
-            f"markers      {100 * check.markers:.0f} % seen, moved by up to {check.largest_shift:.1f} px"
+        printed.append(
+            f"markers      {100 * check.markers:.0f} % found, moved by up to {check.largest_shift:.1f} px"
+        )
+    if check.unexplained:
+        printed.append(
+            f"refused      {check.unexplained} of {check.unexplained + len(check.presses)} presses: the sensor "
+            f"file leaves more than {100 * UNEXPLAINED:.0f} % of their change unexplained; calibrate this "
+            "sensor (touchgoal record-presses)"
         )
     if "radius_mm" in figures:
-        low, middle, high = figures["radius_mm"]
-        off = middle / figures["ball_mm"] - 1
-        said.append(
-            f"ball         {figures['ball_mm']:g} mm reads {middle:.2f} mm (quartiles {low:.2f} to "
-            f"{high:.2f}), {1e3 * figures['residual_mm']:.0f} um from a sphere"
-            + (
-                ""
-                if abs(off) <= _DEPTH_OFF
-                else ": calibrate this sensor (touchgoal record-presses)"
-            )
-        )
+        printed.append(_ball(figures))
     elif "depth_mm" in figures:
-        said.append(
+        printed.append(
             "deepest      {1:.2f} mm (quartiles {0:.2f} to {2:.2f})".format(*figures["depth_mm"])
         )
     if "unexplained" in figures:
-        said.append(
-            f"simulation   leaves {100 * figures['unexplained'][1]:.0f} % of the change unexplained, of the depth "
-            "that it reads itself"
+        printed.append(
+            f"simulation   leaves {100 * figures['unexplained'][1]:.0f} % of the change unexplained"
         )
     if "force" in figures:
-        low, middle, high = figures["force"]
-        line = f"force        {middle:.1f} N (quartiles {low:.1f} to {high:.1f})"
-        if "weight" in figures:
-            weight = figures["weight"]
-            line += f" of a weight of {weight:.1f} N"
-            if abs(middle / weight - 1) > _FORCE_OFF:
-                line += f": multiply the model's foundation_modulus by {weight / middle:.2f}"
-        said.append(line)
-    return said
+        printed.append(_force(figures))
+    return printed
 
 
 def picture(check: SensorCheck) -> UInt8[np.ndarray, "H W 3"]:
-    """Rows of press, the simulator's picture of its depth, changes of both times 4 about grey, depth."""
+    """Draw a row a press: frame, simulated frame, change of each times 4 about grey, depth."""
     rows = [_row(press, check.background) for press in check.presses[:_SHOWN]]
     empty = np.hstack([check.background] * 2)
     return np.vstack(rows or [empty])
 
 
-def _row(press: PressRead, background: UInt8[np.ndarray, "h w 3"]) -> np.ndarray:
+def _ball(figures: dict[str, Any]) -> str:
+    low, middle, high = figures["radius_mm"]
+    line = (
+        f"ball         {figures['ball_mm']:g} mm reads {middle:.2f} mm (quartiles {low:.2f} to {high:.2f}), "
+        f"{1e3 * figures['residual_mm']:.0f} um from a sphere"
+    )
+    off = abs(middle / figures["ball_mm"] - 1) > _DEPTH_OFF
+    return line + ": calibrate this sensor (touchgoal record-presses)" * off
+
+
+def _force(figures: dict[str, Any]) -> str:
+    low, middle, high = figures["force"]
+    line = f"force        {middle:.1f} N (quartiles {low:.1f} to {high:.1f})"
+    if "weight" in figures:
+        weight = figures["weight"]
+        line += f" under a weight of {weight:.1f} N"
+        if abs(middle / weight - 1) > _FORCE_OFF:
+            line += f": multiply the model's foundation_modulus by {weight / middle:.2f}"
+    return line
+
+
+def _row(press: PressReading, background: UInt8[np.ndarray, "h w 3"]) -> np.ndarray:
     drawn, simulated = (
         np.clip(128 + _CONTRAST * (frame.astype(np.float32) - background), 0, 255).astype(np.uint8)
         for frame in (press.frame, press.drawn)
@@ -127,11 +143,11 @@ def _row(press: PressRead, background: UInt8[np.ndarray, "h w 3"]) -> np.ndarray
 
 def _contact(check: SensorCheck) -> str:
     line = (
-        f"contact      told from {check.threshold:.1f} counts on; untouched frames reach "
+        f"contact      from {check.threshold:.1f} counts on; untouched frames reach "
         f"{check.untouched:.1f}"
     )
     if not check.touched:
-        return line + ", nothing touched"
+        return line + "; nothing touched"
     line += f", touches {check.touched:.1f}"
     if check.touched < _MARGIN * check.threshold:
         line += ": a narrow margin; send pictures with less compression, or press harder"
@@ -140,8 +156,8 @@ def _contact(check: SensorCheck) -> str:
 
 def _light(name: str, drift: Drift, remedy: str) -> str:
     gain = 100 * (drift.gain - 1)
-    said = f"{name:<13}light {gain.min():+.1f} to {gain.max():+.1f} %, {drift.pattern.max():.1f} counts of pattern"
-    return said + (f": {remedy}" if drift.large else "")
+    line = f"{name:<13}light {gain.min():+.1f} to {gain.max():+.1f} %, {drift.pattern.max():.1f} counts of pattern"
+    return line + (f": {remedy}" if drift.large else "")
 
 
 def _drift(drift: Drift) -> dict[str, list[float]]:

@@ -32,6 +32,7 @@ BLUR_PYRAMID = (3.0e-3, 1.5e-3, 0.75e-3, 0.35e-3)
 
 _PIXELS = 5000  # of a press that take part in the fit
 _FOLDS = 4
+_MOVES = 8  # Gauss-Newton steps of a circle
 _RIDGE = 1e-3  # of each term's own energy; between 1e-4 and 1e-2 the held-out error hardly moves
 # What cross-validation chooses from.
 BLUR_SCALES = (0.15, 0.25, 0.35, 0.5, 0.7, 1.0)
@@ -257,6 +258,33 @@ class PressFit:
             if (residual(there) ** 2).sum() < (here**2).sum():
                 return there
         return circle
+
+
+def move_circles(
+    calibration: SensorCalibration,
+    presses: PressSet,
+    start: Float64[np.ndarray, "n 3"] | None = None,
+) -> Float64[np.ndarray, "n 3"]:
+    """Move the circles (px) of presses of known balls to where a sensor file says their pictures show them.
+
+    Args:
+        calibration: the sensor file.
+        presses: in the light of the file's background; their circles bound the search.
+        start: circles to start from; None: the presses' own.
+    """
+    widest = WIDEST * presses.ball_radius / calibration.pixel_pitch
+    circles = np.array(presses.circles if start is None else start, np.float64)
+    circles[:, 2] = circles[:, 2].clip(NARROWEST, widest)
+    steps = PressFit(
+        presses,
+        calibration.background,
+        varies_over_image=True,
+        illumination_exponent=calibration.illumination_exponent,
+    )
+    state = FitState(calibration, circles, presses.ball_radius)
+    for _ in range(_MOVES):
+        state = steps.fit_circles(state)
+    return state.circles
 
 
 def _sample(

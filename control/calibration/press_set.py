@@ -1,4 +1,4 @@
-"""A folder of labelled ball presses, from which a sensor's light is calibrated."""
+"""A folder of ball presses, from which a sensor is calibrated."""
 
 import csv
 import math
@@ -14,7 +14,6 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.picture_file import read_picture
 
 COLUMNS = ("file", "x_px", "y_px", "radius_px", "ball_mm")
-_NEEDED = ("file",)
 # Twelve are fitted and four held out: with fewer, the 30 response terms of a channel follow single
 # presses, and the held-out error of the GelSight presses is a tenth above that of 36.
 MINIMUM = 16
@@ -32,10 +31,11 @@ class PressSet:
     Attributes:
         background: the untouched sensor, RGB.
         images: the presses, RGB.
-        circles: where the ball touches the gel as labelled: centre x (column), centre y (row) and
-            radius, px; the centre of the first pixel is (0, 0).
+        circles: contact circles as given or found: centre x (column), centre y (row) and radius, px;
+            the centre of the first pixel is (0, 0).
         ball_radius: m, one a press; all NaN if not known.
         files: name of each picture.
+        labelled: whether the circles were given, not found in the pictures.
     """
 
     background: UInt8[np.ndarray, "h w 3"]
@@ -43,26 +43,27 @@ class PressSet:
     circles: Float[np.ndarray, "n 3"]
     ball_radius: Float[np.ndarray, " n"]
     files: tuple[str, ...]
+    labelled: bool = True
 
     def __len__(self) -> int:
         """Number of presses."""
         return len(self.images)
 
     def take(self, chosen: Int[np.ndarray, " m"]) -> "PressSet":
-        """Some of the presses, by index."""
+        """Return some of the presses, by index."""
         circles, balls = self.circles[chosen], self.ball_radius[chosen]
         files = tuple(self.files[i] for i in chosen)
-        return PressSet(self.background, self.images[chosen], circles, balls, files)
+        return PressSet(self.background, self.images[chosen], circles, balls, files, self.labelled)
 
 
 def split(presses: PressSet, n_held_out: int, seed: int) -> tuple[PressSet, PressSet]:
-    """Presses to fit, and presses to judge the fit on."""
+    """Draw presses to fit and presses to judge the fit on."""
     order = np.random.default_rng(seed).permutation(len(presses))
     return presses.take(np.sort(order[n_held_out:])), presses.take(np.sort(order[:n_held_out]))
 
 
 def write_presses(presses: PressSet, folder: Path, adds: bool = False) -> None:
-    """Make the folder that `read_presses` reads, or add to its presses; the background is the new one."""
+    """Write the folder that `read_presses` reads, or add presses to it with a new background."""
     folder.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(folder / "background.png"), presses.background[..., ::-1])
     with (folder / "presses.csv").open("a" if adds else "w", newline="") as file:
@@ -80,82 +81,111 @@ def write_presses(presses: PressSet, folder: Path, adds: bool = False) -> None:
 def read_presses(folder: Path, pitch: float, ball_mm: float = math.nan) -> PressSet:
     """Read `background.png`, `presses.csv` and the pictures it names, in the background's light.
 
-    Circles that the table leaves open are found in the pictures.
+    Without `presses.csv` every other picture is a press. Circles that the table lacks are found.
 
     Args:
-        folder: what to read.
+        folder: of the pictures.
         pitch: m per pixel.
         ball_mm: radius of the ball of presses for which the table gives none, mm.
 
     Raises:
-        UserError: something is missing, does not fit together, or cannot be calibrated from.
+        UserError: something is missing, does not fit together, or is too little to calibrate from.
     """
     background = _read_image(folder / "background.png")
-    rows = _read_rows(folder / "presses.csv")
+    rows = _read_rows(folder, ball_mm)
     if len(rows) < MINIMUM:
         raise UserError(
             f"{folder} has {len(rows)} presses, calibration needs at least {MINIMUM} (12 to fit the "
             "30 response terms of a colour, 4 to check them): add presses at other places"
         )
-    names = tuple(row[0] for row in rows)
-    ball = np.array([row[4] for row in rows])
-    ball = np.where(np.isnan(ball), ball_mm, ball) * 1e-3
+    ball = np.array([row.ball_mm for row in rows]) * 1e-3
     images, circles = [], []
-    for name, given, radius in zip(names, (row[1:4] for row in rows), ball, strict=True):
-        image = _read_image(folder / name)
+    for row, radius in zip(rows, ball, strict=True):
+        image = _read_image(folder / row.file)
         if image.shape != background.shape:
             raise UserError(
-                f"{folder / name} has {image.shape[1]} x {image.shape[0]} pixels, background.png "
+                f"{folder / row.file} has {image.shape[1]} x {image.shape[0]} pixels, background.png "
                 f"{background.shape[1]} x {background.shape[0]}: record them at the same size"
             )
-        circle = _found(name, image, background) if np.isnan(given).any() else np.array(given)
-        _check_circle(name, circle, radius, background.shape, pitch)
-        _check_visible(name, circle, image, background)
+        circle = row.circle if row.labelled else _find(row.file, image, background)
+        _check_circle(row.file, circle, radius, background.shape, pitch)
+        _check_visible(row.file, circle, image, background)
         circles.append(circle)
         images.append(without_drift(image, background, circle))
     if np.isnan(ball).any() and not np.isnan(ball).all():
         raise UserError("presses.csv gives ball_mm for some presses only: fill in all, or none")
-    return PressSet(background, np.stack(images), np.stack(circles), ball, names)
+    return PressSet(
+        background,
+        np.stack(images),
+        np.stack(circles),
+        ball,
+        tuple(row.file for row in rows),
+        labelled=any(row.labelled for row in rows),
+    )
 
 
-def _found(name: str, image: np.ndarray, background: np.ndarray) -> np.ndarray:
+@dataclass(frozen=True)
+class _Row:
+    """A line of presses.csv; NaN where it says nothing."""
+
+    file: str
+    circle: Float[np.ndarray, "3"]
+    ball_mm: float
+
+    @property
+    def labelled(self) -> bool:
+        return not np.isnan(self.circle).any()
+
+
+def _find(name: str, image: np.ndarray, background: np.ndarray) -> Float[np.ndarray, "3"]:
     try:
         return find_circle(image, background)
     except UserError as error:
         raise UserError(f"{name}: {error}") from error
 
 
-def _read_rows(path: Path) -> list[tuple[str, float, float, float, float]]:
+def _read_rows(folder: Path, ball_mm: float) -> list[_Row]:
+    path = folder / "presses.csv"
     if not path.is_file():
-        raise UserError(f"{path} is missing: write one line a press: {','.join(COLUMNS)}")
+        if math.isnan(ball_mm):
+            raise UserError(
+                f"{path} is missing: give --ball-mm if one ball made all presses, or write one line a press "
+                "with the columns file,ball_mm (docs/own_sensor.md)"
+            )
+        pictures = {p.name for p in folder.iterdir() if p.suffix.lower() in (".png", ".jpg")}
+        unknown = np.full(3, math.nan)
+        return [_Row(name, unknown, ball_mm) for name in sorted(pictures - {"background.png"})]
     with path.open(newline="") as file:
         reader = csv.DictReader(file)
-        missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
-        if missing:
-            raise UserError(f"{path} lacks the column {missing[0]}: its first line must be file,ball_mm "
-                            f"or {','.join(COLUMNS)}")  # fmt: skip
-        return [_read_row(path, line, row) for line, row in enumerate(reader, 2)]
+        if "file" not in (reader.fieldnames or ()):
+            raise UserError(
+                f"{path} lacks the column file: its first line must be file,ball_mm or "
+                f"{','.join(COLUMNS)} (docs/own_sensor.md)"
+            )
+        return [_read_row(path, line, row, ball_mm) for line, row in enumerate(reader, 2)]
 
 
-def _read_row(path: Path, line: int, row: dict[str, str]) -> tuple[str, float, float, float, float]:
+def _read_row(path: Path, line: int, row: dict[str, str], ball_mm: float) -> _Row:
     try:
         x, y, radius, ball = (_number(row.get(name)) for name in COLUMNS[1:])
     except (TypeError, ValueError) as error:
         raise UserError(
             f"{path}, line {line}: {error}; write numbers, or leave them out"
         ) from error
-    return row["file"], x, y, radius, ball
+    return _Row(row["file"], np.array([x, y, radius]), ball_mm if math.isnan(ball) else ball)
 
 
 def _number(text: str | None) -> float:
-    return float(text) if (text or "").strip() and text is not None else math.nan
+    return float(text) if text and text.strip() else math.nan
 
 
 def _read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     image = read_picture(path)
     if image is None:
-        raise UserError(f"{path} is missing or no picture: a folder of presses needs "
-                        "background.png, presses.csv and the pictures it names")  # fmt: skip
+        raise UserError(
+            f"{path} is missing or no picture: a folder of presses needs background.png and the pictures "
+            "of the presses"
+        )
     return image
 
 
@@ -164,11 +194,15 @@ def _check_circle(
 ) -> None:
     x, y, radius = circle
     if not (np.isfinite(circle).all() and radius >= 3):
-        raise UserError(f"presses.csv, {name}: a contact radius of {radius:g} px is too small to "
-                        "show slopes; press harder or record at full resolution")  # fmt: skip
+        raise UserError(
+            f"presses.csv, {name}: a contact radius of {radius:g} px is too small to show slopes; press "
+            "harder or record at full resolution"
+        )
     if not (0 <= x < shape[1] and 0 <= y < shape[0]):
-        raise UserError(f"presses.csv, {name}: the circle's centre ({x:g}, {y:g}) px lies outside "
-                        f"the {shape[1]} x {shape[0]} picture")  # fmt: skip
+        raise UserError(
+            f"presses.csv, {name}: the circle's centre ({x:g}, {y:g}) px lies outside the {shape[1]} x "
+            f"{shape[0]} picture"
+        )
     if radius * pitch >= ball:
         raise UserError(
             f"presses.csv, {name}: a contact radius of {radius * pitch * 1e3:.2f} mm ({radius:g} px "
@@ -184,8 +218,10 @@ def _check_visible(
     inside = (columns - circle[0]) ** 2 + (rows - circle[1]) ** 2 < circle[2] ** 2
     change = image[inside].astype(np.float32) - background[inside]
     if np.percentile(np.abs(change), 90) < _VISIBLE:
-        raise UserError(f"{name} shows no contact in its circle (less than {_VISIBLE:g} counts from "
-                        "background.png): drop it, or record the background again")  # fmt: skip
+        raise UserError(
+            f"{name} shows no contact in its circle (less than {_VISIBLE:g} counts from background.png): "
+            "drop it, or record the background again"
+        )
 
 
 def without_drift(
@@ -193,9 +229,9 @@ def without_drift(
     background: UInt8[np.ndarray, "h w 3"],
     circle: Float[np.ndarray, "3"],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A press as it would look in the background's light.
+    """Return a press as it would look in the background's light.
 
-    Gain and offset of each channel, by a robust line through the pixels far from the contact.
+    Each channel loses gain and offset of a robust line through the pixels far from the contact.
 
     Args:
         image: RGB picture of a press.
@@ -215,7 +251,7 @@ def without_drift(
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Gain and offset with the least absolute error."""
+    """Fit gain and offset by least absolute error."""
     terms = np.stack([x, np.ones(len(x))], 1).astype(np.float64)
     weight, solved = np.ones(len(x)), np.array([1.0, 0.0])
     for _ in range(_LINE_ROUNDS):

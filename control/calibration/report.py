@@ -30,12 +30,13 @@ _MAX_SHOWN = 6  # held-out presses in the picture
 
 
 def held_out_errors(judged: FittedCalibration, test: PressSet) -> dict[str, PictureErrors]:
-    """Mean errors of the held-out pictures, by what predicts them."""
+    """Return mean errors of the held-out pictures by the predictor."""
+    given = "labelled" if test.labelled else "found"
     background = judged.calibration.background.astype(np.float32)
     balls = judged.ball_radii(test)
     simulated = {
         "background alone": [background] * len(test),
-        "fit, circles as labelled": [*map(judged.simulate, judged.correct_labels(test), balls)],
+        f"fit, circles as {given}": [*map(judged.simulate, judged.correct_labels(test), balls)],
         "fit, circles moved to the picture": [
             *map(judged.simulate, judged.fit_circles(test), balls)
         ],

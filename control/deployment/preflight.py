@@ -19,6 +19,7 @@ from touchgoal.control.sensors.exchanged import Picture, fingertips_exchanged
 from touchgoal.control.tactile.contact import contact_strength
 from touchgoal.control.tactile.indentation import require_readable
 from touchgoal.control.tactile.markers import find_markers, without_markers
+from touchgoal.control.tactile.picture_guard import check_untouched
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.runtime.checks import CheckResult
@@ -169,6 +170,7 @@ def _camera(camera: Camera, rate: float, nominal: float, gripper: Gripper) -> st
         raise UserError(camera.problem)
     untouched = ""
     if isinstance(camera, TactileSensor):
+        check_untouched(camera.read().image, camera.model, "it")
         frame, background = _fingertip(camera)
         # A unit differs from the sensor file's; a contact is told by far more than that.
         strength = float(contact_strength(frame[None], background)[0])

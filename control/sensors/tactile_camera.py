@@ -1,4 +1,4 @@
-"""A fingertip sensor: a camera whose pictures are cut and scaled to its model's image."""
+"""Fingertip sensors as cameras: pictures cut and scaled to the sensor model's image."""
 
 from dataclasses import dataclass, replace
 
@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from touchgoal.control.interfaces import Camera, Frame
+from touchgoal.control.interfaces import Camera, DriverError, Frame
 from touchgoal.control.sensors.gel_corners import rectify
+from touchgoal.control.tactile.picture_guard import seam
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Corners
@@ -15,13 +16,13 @@ from touchgoal.runtime.option_types import Corners
 
 @dataclass(frozen=True)
 class Crop:
-    """How a sensor's picture lies in its camera's.
+    """Position of the gel in its camera's picture.
 
     Attributes:
-        border: share cut off at each of the four sides; 0 of a stream that is cut already.
+        border: share cut off at each side; 0 for a stream that is already cut.
         quarter_turns: counter-clockwise, before cutting; a DIGIT's camera lies on its side.
-        corners: of the gel, in place of a border, of a camera that sees it at an angle (a GelSight Wedge's);
-            after the turns.
+        corners: of the gel after the turns, px, in place of a border; for a camera that sees the gel
+            at an angle (GelSight Wedge).
     """
 
     border: float = 0.0
@@ -29,19 +30,23 @@ class Crop:
     corners: Corners | None = None
 
 
-# Of a whole GelSight Mini picture its SDK cuts a seventh off each side, the case's edge, and scales
-# the rest; digit-interface turns the pictures upright.
+# The GelSight Mini's SDK cuts a seventh off each side, the case's edge; digit-interface turns upright.
 GELSIGHT_MINI_CROP = Crop(border=1 / 7)
 DIGIT_CROP = Crop(quarter_turns=1)
 NO_CROP = Crop()
 
 
 class TactileCamera:
-    """The TactileSensor protocol over a Camera; it closes the camera with it."""
+    """The TactileSensor interface over a Camera; it closes the camera with it.
+
+    A torn or rolled picture is left out: the frame before it stays, with its stamp.
+    """
 
     def __init__(self, camera: Camera, model: SensorModel, crop: Crop) -> None:
         self._camera, self._model, self._crop = camera, model, crop
-        self._last: tuple[Frame, Frame] | None = None
+        self._raw: Frame | None = None
+        self._whole: Frame | None = None
+        self._torn = ""
 
     @property
     def model(self) -> SensorModel:
@@ -56,17 +61,19 @@ class TactileCamera:
     @property
     def problem(self) -> str:
         """See Camera."""
-        return self._camera.problem
+        return self._camera.problem or self._torn
 
     def read(self) -> Frame:
         """See Camera; UserError if the picture's proportions are not the sensor's."""
-        frame = self._camera.read()
-        if self._last is None or self._last[0] is not frame:
-            self._last = (
-                frame,
-                replace(frame, image=crop_to_sensor(frame.image, self._model, self._crop)),
-            )
-        return self._last[1]
+        raw = self._camera.read()
+        if self._raw is not raw:
+            frame = replace(raw, image=crop_to_sensor(raw.image, self._model, self._crop))
+            self._raw, self._torn = raw, seam(frame.image)
+            if not self._torn:
+                self._whole = frame
+        if self._whole is None:
+            raise DriverError(f"the picture of the {self._model.name}: {self._torn}")
+        return self._whole
 
     def close(self) -> None:
         """See Camera."""
@@ -76,10 +83,10 @@ class TactileCamera:
 def crop_to_sensor(
     image: UInt8[np.ndarray, "h w 3"], model: SensorModel, crop: Crop
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The sensor's picture in its camera's, at the model's shape.
+    """Cut the sensor's picture out of its camera's and scale it to the model's shape.
 
     Raises:
-        UserError: the picture's proportions are not the sensor's, or the corners are none of a gel in it.
+        UserError: the picture has other proportions, or the corners are no quadrangle in it.
     """
     image = np.rot90(image, crop.quarter_turns)
     if crop.corners is not None:

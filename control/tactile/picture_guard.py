@@ -23,7 +23,7 @@ from touchgoal.runtime.errors import UserError
 
 # Thresholds lie between what whole pictures and faulty ones reach, on the real frames of three Minis and two
 # DIGITs (tests/measure_picture_guard.py prints the table).
-_SEAM = 3.5  # times the usual step from row to row
+_SEAM, _STEP = 3.5, 6.0  # times the usual step from row to row; counts, the channels' sum
 _EDGE = 10  # share of a picture (1/n) at either end where a seam may be the sensor's case
 _SEAM_PARTS = 32  # along a row, half of which must show the step
 _CLEARLY = 0.85  # of the difference that another order or mirror may leave
@@ -40,11 +40,10 @@ _STRONGEST = 0.1  # share of the picture over which the explanation is judged
 _COARSE = 4  # px of the sensor's picture to a cell of the comparison
 _DARK = 8.0  # counts added before the logarithm: noise in the dark is no difference
 _MOST = 0.5  # logarithm of light: a spot counts no more
-_EXCHANGED = 1.5  # times that both fingertips must be more like the other's sensor file
 _COLOURS = "red", "green", "blue"
 
 Picture = UInt8[np.ndarray, "h w 3"]
-Log = Float32[np.ndarray, "h w 3"]
+Cells = Float32[np.ndarray, "rows columns 3"]
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,7 @@ def seam(picture: Picture) -> str:
         step = np.diff(light, axis=0)
         jump = np.abs(step[1:-1] - (step[:-2] + step[2:]) / 2).sum(2)
         usual = np.median(jump, 1)[margin:-margin]
-        if usual.max() > _SEAM * (np.quantile(usual, 0.95) + 0.3):
+        if usual.max() > max(_SEAM * np.quantile(usual, 0.95), _STEP):
             at = int(usual.argmax()) + margin + 2
             return f"it is torn or rolled at {name} {at}: check the cable and how it is decoded"
     return ""
@@ -162,24 +161,6 @@ def check_presses(
         )
 
 
-def fingertips_exchanged(
-    frames: tuple[Picture, Picture], backgrounds: tuple[Picture, Picture]
-) -> bool:
-    """Whether each of two untouched fingertips looks clearly more like the other one's sensor file.
-
-    Both must: light drifts, and a file may be old.
-
-    Args:
-        frames: of the left and of the right finger.
-        backgrounds: of the left one's and of the right one's sensor file.
-    """
-    unlike = [
-        [float(local_change(frame, background).mean()) for background in backgrounds]
-        for frame in frames
-    ]
-    return all(_EXCHANGED * unlike[side][1 - side] < unlike[side][side] for side in (0, 1))
-
-
 @dataclass(frozen=True, eq=False)
 class Explanation:
     """A frame as its sensor file explains it.
@@ -191,7 +172,7 @@ class Explanation:
     """
 
     depth: Float32[np.ndarray, "h w"]
-    left: Log
+    left: Float32[np.ndarray, "h w 3"]
     unexplained: float
 
 
@@ -245,7 +226,7 @@ def _fault(differences: dict[_View | tuple, float]) -> str:
     )
 
 
-def _coarse(picture: Picture, sensor: SensorModel) -> Log:
+def _coarse(picture: Picture, sensor: SensorModel) -> Cells:
     """Return the logarithm of light on coarse cells, without printed dots."""
     rows, columns = sensor.image_shape
     size = columns // _COARSE, rows // _COARSE
@@ -257,14 +238,14 @@ def _coarse(picture: Picture, sensor: SensorModel) -> Log:
     return np.log(cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.0) + _DARK)
 
 
-def _difference(one: Log, other: Log) -> float:
+def _difference(one: Cells, other: Cells) -> float:
     """Return the mean difference but for a factor on each channel; no spot counts much."""
     change = one - other
     change -= np.median(change.reshape(-1, 3), 0)
     return float(np.minimum(np.abs(change), _MOST).mean())
 
 
-def _moved(image: Log, x: float, y: float, right: float, down: float) -> Log:
+def _moved(image: Cells, x: float, y: float, right: float, down: float) -> Cells:
     """Scale an image about its middle, then shift it; the border goes on."""
     height, width, _ = image.shape
     affine = np.array(

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from touchgoal.control import features as ft
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.episodes.touches import check_fingertips
 from touchgoal.policies.network import ObservationBatch, PolicyConfig
 from touchgoal.policies.perception.end_to_end import EndToEndConfig, difference_images
 from touchgoal.policies.perception.frozen_touch import TouchEmbedder
@@ -134,6 +135,8 @@ def _check(
             f"the policy needs touch {config.touch!r} of width {config.touch_dim}, this is "
             f"{made[0]!r} of width {made[1]}: make its config for this embedder"
         )
+    if embedder or config.end_to_end:
+        check_fingertips(episodes, chosen)
 
 
 def embed_episodes(
