@@ -1,5 +1,6 @@
 """The `touchgoal` command: `touchgoal COMMAND --help`."""
 
+import errno
 import importlib
 import io
 import os
@@ -14,6 +15,7 @@ from typing import Any
 from touchgoal import __version__
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import Terminated, terminable
+from touchgoal.runtime.run_folder import check_writable, release_runs
 
 COMMANDS = {
     "demo": "pick an object up and place it in simulation, and draw its distance to the goal",
@@ -39,9 +41,23 @@ COMMANDS = {
     "completion": "print a script that completes commands and options in a shell",
 }
 
+_FREE_SPACE = ": free some space and run the command again"
+_WRITE_ERRORS = {  # errno -> advice
+    errno.ENOSPC: _FREE_SPACE,
+    errno.EDQUOT: _FREE_SPACE,
+    errno.EFBIG: "",
+    errno.EIO: "",
+    errno.EROFS: "",
+    errno.EACCES: "",
+    errno.EPERM: "",
+    errno.ENAMETOOLONG: "",
+    errno.ELOOP: "",
+    errno.EMFILE: ": raise the limit with ulimit -n",
+}
+
 
 def usage() -> str:
-    """What `touchgoal --help` prints."""
+    """Return the text of `touchgoal --help`."""
     lines = [f"  {name:<20}{meaning}" for name, meaning in COMMANDS.items()]
     return (
         "usage: touchgoal COMMAND [options]\n       touchgoal COMMAND --help\n"
@@ -52,16 +68,15 @@ def usage() -> str:
 def main(argv: list[str] | None = None) -> None:
     """Run one command.
 
-    A user's mistake is one line on stderr and exit code 1 (2 if tyro finds it); Ctrl-C exits with
-    130 and SIGTERM with 143, after a line that says what was kept. Where nobody reads what is
-    printed any more (`touchgoal list | head -1`) it ends with 141, as other programs do.
+    Exit status: 1 after a user's mistake or a failed write, in one line on stderr (2 if tyro finds
+    it), 130 after Ctrl-C and 143 after SIGTERM, 141 where the reader of stdout has gone
+    (`touchgoal list | head -1`).
     """
     if argv is None:  # this process is the command: OpenCV reads the variable when it is imported
-        # s after which a silent V4L2 camera counts as gone; the default, 10, delays its reopening.
+        # s until a silent V4L2 camera is given up; the default, 10, delays its reopening.
         os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
-    if isinstance(sys.stdout, io.TextIOWrapper):  # an ASCII terminal prints other letters escaped
-        sys.stdout.reconfigure(errors="backslashreplace")
-    with _until_nobody_reads():
+    _prepare_streams()
+    with _until_reader_leaves():
         _main(sys.argv[1:] if argv is None else argv)
 
 
@@ -80,21 +95,45 @@ def _main(arguments: list[str]) -> None:
 def _run(name: str, *options: str) -> None:
     prog = f"touchgoal {name}"
     try:
+        _require_working_directory()
         module, config = read_options(name, list(options))
         module.main(config)
     except UserError as error:
         sys.exit(f"{prog}: {error}")
+    except OSError as error:
+        if error.errno not in _WRITE_ERRORS:
+            raise
+        where = f"{error.filename}: " if error.filename else ""
+        sys.exit(f"{prog}: {where}{os.strerror(error.errno)}{_WRITE_ERRORS[error.errno]}")
     except KeyboardInterrupt as interruption:
         stopped = "; ".join(["stopped", *getattr(interruption, "__notes__", [])])
         print(f"\n{prog}: {stopped}", file=sys.stderr)
         stopped_by = signal.SIGTERM if isinstance(interruption, Terminated) else signal.SIGINT
         sys.exit(128 + stopped_by)
+    finally:
+        release_runs()
+
+
+def _require_working_directory() -> None:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise UserError("the working directory is gone: change to one that exists") from None
+
+
+def _prepare_streams() -> None:
+    """Open streams that were closed at the start; escape what a terminal's encoding lacks."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def read_options(name: str, options: list[str]) -> tuple[Any, Any]:
-    """A command's module and its Config. What can be checked before any work is checked here."""
+    """Return a command's module and its checked Config."""
     from touchgoal.launch.support.command_line import parse
-    from touchgoal.runtime.run_folder import check_writable
 
     module = importlib.import_module(f"touchgoal.launch.{name.replace('-', '_')}")
     chosen, prog = module, f"touchgoal {name}"
@@ -122,7 +161,7 @@ def _unknown(name: str) -> str:
 
 
 @contextmanager
-def _until_nobody_reads() -> Iterator[None]:
+def _until_reader_leaves() -> Iterator[None]:
     try:
         try:
             yield
@@ -133,14 +172,14 @@ def _until_nobody_reads() -> Iterator[None]:
         stdout.register(sys.stdout.fileno(), 0)
         if not any(event & select.POLLERR for _, event in stdout.poll(0)):
             raise  # another pipe's
-        # What is still to be written would fail again at the interpreter's end.
+        # The rest of the buffer would fail again at the interpreter's end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(128 + signal.SIGPIPE)
 
 
 @contextmanager
 def _recorded_as(arguments: list[str]) -> Iterator[None]:
-    """Makes `arguments` the command that records of the run name."""
+    """Make `arguments` the command that the run's record names."""
     before = sys.argv
     sys.argv = ["touchgoal", *arguments]
     try:

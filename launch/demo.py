@@ -23,7 +23,7 @@ class Config:
     """Options of demo."""
 
     out: Path | None = None
-    """Folder of the run. Default: runs/<date>_demo."""
+    """Folder of the run."""
     words: str = "a hard smooth round object"
     """Sentence that says how the object feels: the goal in words."""
     seed: Seed = seeds.DEMO.start

@@ -35,7 +35,7 @@ class Config:
     device: str = "cpu"
     """Torch device of the encoders: cpu, cuda or cuda:1."""
     out: Path | None = None
-    """Folder of the run, for normalizer.json. Default: runs/<date>_fit-normalizer."""
+    """Folder of the run, for normalizer.json."""
 
 
 def main(config: Config) -> None:

@@ -44,7 +44,7 @@ class Config:
     device: str = "cpu"
     """Torch device of the encoders: cpu, cuda or cuda:1."""
     out: Path | None = None
-    """Folder of the run. Default: runs/<date>_reward-curves."""
+    """Folder of the run."""
 
 
 def main(config: Config) -> None:

@@ -1,36 +1,52 @@
-"""Files that are there in full or not at all: a reader, a kill or a power cut never leaves a half one."""
+"""Files that are complete or absent: a kill or a power cut never leaves half a file."""
 
+import errno
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+_FULL = 1_000_000  # bytes free, below which a failed write is blamed on the disk
+
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Gives the name under which to write; the file takes its place once it is whole and on the disk.
+    """Yield a temporary name to write to; move the file to `path` once it is on disk.
 
-    Of two that are to change together, open the one that is to be replaced last first. A block that
-    fails leaves the older file as it was, and what it wrote as PATH.tmp.
+    To change two files together, open first the one that is to be replaced last. A block that fails
+    leaves the older file as it was.
 
     Args:
-        path: of the file; its folder is made if needed.
+        path: Path of the file; its folder is made if needed.
+
+    Raises:
+        OSError: It cannot be written; with the path, also where a library reports a full disk in
+            its own way.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(path.name + ".tmp")
-    yield unfinished
-    _to_disk(unfinished)
+    try:
+        yield unfinished
+        _sync(unfinished)
+    except Exception as error:
+        full = shutil.disk_usage(path.parent).free < _FULL
+        number = getattr(error, "errno", None) or (errno.ENOSPC if full else None)
+        unfinished.unlink(missing_ok=True)
+        if number is None:
+            raise
+        raise OSError(number, os.strerror(number), str(path)) from error
     os.replace(unfinished, path)
-    _to_disk(path.parent)
+    _sync(path.parent)
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Writes all of a file, as `atomic_write` does."""
+    """Write a file as `atomic_write` does."""
     with atomic_write(path) as unfinished:
         unfinished.write_bytes(data)
 
 
-def _to_disk(path: Path) -> None:
+def _sync(path: Path) -> None:
     file = os.open(path, os.O_RDONLY)
     try:
         os.fsync(file)

@@ -1,4 +1,4 @@
-"""One recorder a folder at a time."""
+"""Lock that lets one process at a time write into a folder."""
 
 import fcntl
 import os
@@ -10,17 +10,25 @@ from touchgoal.runtime.errors import UserError
 
 
 class FolderLock:
-    """Holds a folder, made if need be, until released, garbage or the process is gone.
+    """Lock on a folder, made if need be, until released, garbage or the process ends.
 
-    The kernel keeps the lock, so nothing stale is ever left on disk. A network file system without
-    locks is let through: there an `EpisodeWriter` sees another one by its files, later.
+    The kernel holds it, so that a killed process leaves no stale lock. File systems without locks
+    (some network ones) are let through.
     """
 
-    def __init__(self, folder: Path) -> None:
-        """Takes the folder.
+    def __init__(
+        self,
+        folder: Path,
+        refusal: str = "something else is recording into {}: wait for it or give another folder",
+    ) -> None:
+        """Take the lock.
+
+        Args:
+            folder: Folder to lock.
+            refusal: Message where another one holds it; {} stands for the folder.
 
         Raises:
-            UserError: somebody holds it, or it cannot be made.
+            UserError: Another one holds it, or the folder cannot be made.
         """
         made = not folder.exists()
         try:
@@ -35,9 +43,7 @@ class FolderLock:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             self.release()
-            raise UserError(
-                f"something else is recording into {folder}: wait for it or give another folder"
-            ) from error
+            raise UserError(refusal.format(folder)) from error
         except OSError:
             pass
 

@@ -1,4 +1,4 @@
-"""Where a command leaves its results: one folder with the record of the run beside them."""
+"""Folder of a run: the results of a command and the record of how they were made."""
 
 import json
 import tempfile
@@ -8,47 +8,52 @@ from pathlib import Path
 from typing import Any
 
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.folder_lock import FolderLock
 from touchgoal.runtime.json_file import write_json
 from touchgoal.runtime.provenance import hardware, provenance, versions
 
 RECORD = "config.json"
+_held: dict[Path, FolderLock] = {}
 
 
 def check_writable(out: Path | None) -> None:
-    """Leave nothing, but try to write where the folder of a run is to be.
+    """Try to write where the folder of a run is to be, and leave nothing.
 
     Raises:
-        UserError: it is a file, or cannot be written to.
+        UserError: It is a file or a broken link, its name is too long, or it cannot be written to.
     """
     folder = out if out is not None else Path("runs")
-    while not folder.exists():
-        folder = folder.parent
-    if not folder.is_dir():
-        raise UserError(f"--out: {folder} is a file; name a folder")
     try:
+        while not folder.exists():
+            if folder.is_symlink():
+                raise UserError(f"--out: {folder} is a link that leads nowhere; name a folder")
+            folder = folder.parent
+        if not folder.is_dir():
+            raise UserError(f"--out: {folder} is a file; name a folder")
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise UserError(f"--out: cannot write in {folder.resolve()}: {error.strerror}") from error
+        raise UserError(f"--out: cannot write in {folder}: {error.strerror}") from error
 
 
 def open_run(out: Path | None, command: str, config: Any, adds: bool = False) -> Path:
-    """Make the folder, default `runs/<date>_<command>`, and write the run's record into it.
+    """Make the folder of a run, hold it until `release_runs`, and write the run's record into it.
 
-    The record of the first run is `config.json`; later ones add `config_2.json` and so on.
+    The first run's record is `config.json`; later ones add `config_2.json` and so on.
 
     Args:
-        out: the folder the user asked for.
-        command: name of the command.
-        config: its frozen dataclass.
-        adds: whether this run goes on with what an earlier one left there: it adds episodes, or
-            was resumed.
+        out: Folder that the user named; None for `runs/<date>_<command>`.
+        command: Name of the command.
+        config: Its frozen dataclass.
+        adds: Whether the run continues what the folder holds: it appends episodes, or resumes.
 
     Raises:
-        UserError: the folder holds results of another run, or cannot be written to.
+        UserError: Another process writes into the folder, it holds the results of another run, or
+            it cannot be written to.
     """
     folder = out or _dated_folder(command)
     check_writable(folder)
+    _hold(folder)
     record = {
         "name": command,
         "config": json.loads(json.dumps(asdict(config), default=str)),
@@ -59,14 +64,27 @@ def open_run(out: Path | None, command: str, config: Any, adds: bool = False) ->
     records = sorted(folder.glob("config*.json"))
     if not adds:
         _refuse_other_run(folder, record, records)
-    folder.mkdir(parents=True, exist_ok=True)
     name = RECORD if not records else f"config_{len(records) + 1}.json"
     write_json(folder / name, record)
     return folder
 
 
+def release_runs() -> None:
+    """Release the folders of this process's runs."""
+    while _held:
+        _held.popitem()[1].release()
+
+
+def _hold(folder: Path) -> None:
+    """Lock the folder against other processes; commands of this one may share it."""
+    if (key := folder.resolve()) not in _held or not key.exists():
+        _held[key] = FolderLock(
+            folder, "another command is writing into {}: wait for it or name another --out"
+        )
+
+
 def _dated_folder(command: str) -> Path:
-    """A folder of `runs/` that is not there yet: two runs may begin in the same second."""
+    """Return an unused folder of `runs/`: two runs may begin in the same second."""
     dated = Path("runs") / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{command}"
     folder, number = dated, 1
     while folder.exists():
@@ -76,7 +94,7 @@ def _dated_folder(command: str) -> Path:
 
 
 def _refuse_other_run(folder: Path, record: dict[str, Any], records: list[Path]) -> None:
-    """UserError if the folder holds more than records of runs, and one with other options."""
+    """Raise UserError if the folder holds results, and the record of a run with other options."""
     if not folder.exists() or not set(folder.iterdir()) - set(records):
         return
     for path in records:

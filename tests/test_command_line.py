@@ -2,12 +2,14 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,6 +20,7 @@ from touchgoal import __version__
 from touchgoal.launch.__main__ import COMMANDS, main
 from touchgoal.launch.list import KINDS
 from touchgoal.launch.support.command_line import SHOWN, _all_options, _members, docstrings, parse
+from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import Terminated, on_interruption, terminable
 from touchgoal.runtime.option_types import checked_dataclass
@@ -232,3 +235,64 @@ def test_every_option_is_described(name: str) -> None:
     for _, member in _members(module.Config):
         for (owner, field), _ in _all_options(member, None):
             assert docstrings(owner).get(field), f"{owner.__name__}.{field}"
+
+
+@pytest.mark.parametrize(
+    ("shell", "message"),
+    [
+        ('{python} twin --out ""', "--out is empty: give a value or leave the option out"),
+        ("{python} twin --out=", "--out is empty"),
+        ("{python} twin --out " + 300 * "x", "--out: cannot write in .*: File name too long"),
+        (
+            "ln -s a b; ln -s b a; {python} twin --out a/run",
+            "--out: a is a link that leads nowhere",
+        ),
+        ("mkdir gone; cd gone; rmdir ../gone; {python} twin", "the working directory is gone"),
+        ("{python} repair Käfer <&- >&-", r"K(ä|\\xe4)fer is not a set of episodes"),
+    ],
+)
+def test_an_unfit_surrounding_is_one_line(tmp_path: Path, shell: str, message: str) -> None:
+    line = shell.format(python=f"{sys.executable} -m touchgoal.launch")
+    environment = os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    done = subprocess.run(
+        ["bash", "-c", line], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 1 and re.search(message, done.stderr), done.stderr
+    assert len(done.stderr.splitlines()) == 1 and done.stderr.startswith("touchgoal ")
+
+
+def test_closed_streams_are_no_mistake(tmp_path: Path) -> None:
+    line = f"{sys.executable} -m touchgoal.launch list objects <&- >&-"
+    assert subprocess.run(["bash", "-c", line], capture_output=True).stderr == b""
+
+
+def test_a_full_disk_is_one_line_with_the_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from touchgoal.launch import list as command
+
+    def fail(_: object) -> None:
+        raise RuntimeError("PytorchStreamWriter failed writing file")
+
+    def save(_: object) -> None:
+        with atomic_write(tmp_path / "weights") as unfinished:
+            unfinished.write_bytes(b"half")
+            fail(unfinished)
+
+    monkeypatch.setattr(command, "main", save)
+    with pytest.raises(RuntimeError, match="Pytorch"):
+        main(["list"])
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=0))
+    with pytest.raises(SystemExit, match="weights: No space left on device: free some space"):
+        main(["list"])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_process_at_a_time_writes_into_a_folder(tmp_path: Path) -> None:
+    open_run(tmp_path, "toy", Toy(out=tmp_path))
+    line = [sys.executable, "-m", "touchgoal.launch", "twin", "--out", str(tmp_path)]
+    done = subprocess.run(line, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr == (
+        f"touchgoal twin: another command is writing into {tmp_path}: wait for it or name another --out\n"
+    )

@@ -7,6 +7,7 @@ import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from itertools import pairwise
 from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
@@ -50,6 +51,7 @@ def parse(
         UserError: a value is out of range.
         SystemExit: help was asked for (0), or something typed was not understood (2).
     """
+    _refuse_empty_values(arguments)
     short = not {"--help", "-h"}.isdisjoint(arguments)  # what tyro hides it does not take either
     typed = ["--help" if a == "--help-all" else a for a in arguments]
     env = envs[_task(typed, envs)] if envs else None
@@ -101,8 +103,9 @@ def _as_options(
             offered = type(default)  # options of the other task are refused
         if (info.type, field.name) in hidden:
             offered = Annotated[offered, tyro.conf.Suppress]
-        if default is None or default == ():  # the text says what that stands for
-            offered = Annotated[offered, tyro.conf.arg(help_behavior_hint="")]
+        if default is None or default == ():  # the text describes what that means
+            hint = "(default: runs/<date>_<command>)" if field.name == "out" else ""
+            offered = Annotated[offered, tyro.conf.arg(help_behavior_hint=hint)]
         fields.append(StructFieldSpec(field.name, offered, default, text))
     return StructConstructorSpec(partial(_make, info.type), tuple(fields))
 
@@ -227,6 +230,14 @@ def _values(arguments: Sequence[str], option: str) -> Iterator[str]:
             yield arguments[i + 1]
         elif argument.startswith(f"{option}="):
             yield argument.removeprefix(f"{option}=")
+
+
+def _refuse_empty_values(arguments: Sequence[str]) -> None:
+    """Raise UserError for `--out ""`, which would mean the working directory."""
+    for option, value in pairwise(["", *arguments]):
+        if (option.startswith("--") and not value) or re.fullmatch(r"--[\w.-]+=", value):
+            name = value.removesuffix("=") or option
+            raise UserError(f"{name} is empty: give a value or leave the option out")
 
 
 def _one_line(error: UserError, arguments: Sequence[str]) -> str:
