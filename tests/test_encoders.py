@@ -336,7 +336,7 @@ def test_encoder_for_another_use_is_refused(tmp_path: Path) -> None:
         (lambda x: x[0, 0], r"not of shape \(320, 3\)"),
         (lambda x: x[:0], "at least one"),
         (lambda x: x[:, :, :120], "1.33 times as wide as high"),
-        (lambda x: x[0], "one picture needs its background"),
+        (lambda x: x[0], "one image needs its background"),
     ],
 )
 def test_embed_refuses_what_is_no_picture(wrong: Callable, message: str) -> None:

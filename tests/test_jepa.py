@@ -53,7 +53,7 @@ def test_ijepa_sees_one_block_without_its_targets() -> None:
     model = build("ijepa", "compact")
     for seed in range(20):
         drawn = model.draw(16, rng(seed))
-        seen, wanted = drawn["seen_ids"], drawn["wanted_ids"]
+        seen, wanted = drawn["context_ids"], drawn["target_ids"]
         assert wanted.shape[:2] == (16, 4) and 8 <= wanted.shape[2] <= 20
         assert seen.shape[1] >= 10
         for own, blocks in zip(seen, wanted, strict=True):
@@ -68,9 +68,9 @@ def test_vjepa_hides_tubes() -> None:
     model = build("vjepa", "compact")
     for seed in range(20):
         drawn = model.draw(16, rng(seed))
-        few, many = (len(ids[0, 0]) for ids in drawn["wanted_ids"])
+        few, many = (len(ids[0, 0]) for ids in drawn["target_ids"])
         assert few >= 2 * 8 and many >= 2 * 0.5 * 80
-        for seen, wanted in zip(drawn["seen_ids"], drawn["wanted_ids"], strict=True):
+        for seen, wanted in zip(drawn["context_ids"], drawn["target_ids"], strict=True):
             for ids in (seen, wanted[:, 0]):
                 first, second = ids.chunk(2, 1)
                 assert torch.equal(first + 80, second) and first.max() < 80
@@ -88,10 +88,10 @@ def test_the_loss_of_ijepa_is_the_smooth_distance_of_normed_tokens() -> None:
             tokens = model.teacher.vit(image)[0]
             spread = (tokens.var(1, correction=0, keepdim=True) + 1e-5).sqrt()
             normed = (tokens - tokens.mean(1, keepdim=True)) / spread
-            seen_ids = drawn["seen_ids"][b : b + 1]
-            seen = model.backbone.vit(image, seen_ids)
-            for block in drawn["wanted_ids"][b]:
-                error = (model.predictor(seen, seen_ids, block[None])[0] - normed[block]).abs()
+            context_ids = drawn["context_ids"][b : b + 1]
+            seen = model.backbone.vit(image, context_ids)
+            for block in drawn["target_ids"][b]:
+                error = (model.predictor(seen, context_ids, block[None])[0] - normed[block]).abs()
                 total += torch.where(error < 1, error**2 / 2, error - 0.5).sum().item()
                 count += error.numel()
     assert model(touch=touch, **drawn)["loss"].item() == pytest.approx(total / count, rel=1e-4)
@@ -106,9 +106,9 @@ def test_the_loss_of_vjepa_is_the_distance_of_normed_tokens() -> None:
         tokens = model.teacher.vit(clip)
         spread = (tokens.var(2, correction=0, keepdim=True) + 1e-5).sqrt()
         normed = (tokens - tokens.mean(2, keepdim=True)) / spread
-        for seen_ids, wanted in zip(drawn["seen_ids"], drawn["wanted_ids"], strict=True):
-            seen = model.backbone.vit(clip, seen_ids)
-            predicted = model.predictor(seen, seen_ids, wanted[:, 0])
+        for context_ids, wanted in zip(drawn["context_ids"], drawn["target_ids"], strict=True):
+            seen = model.backbone.vit(clip, context_ids)
+            predicted = model.predictor(seen, context_ids, wanted[:, 0])
             rows = [normed[b, wanted[b, 0]] for b in range(2)]
             losses.append((predicted - torch.stack(rows)).abs().mean())
     torch.testing.assert_close(model(touch=touch, **drawn)["loss"], sum(losses) / 2)
@@ -121,18 +121,18 @@ def test_what_is_hidden_reaches_the_targets_alone(method: Method) -> None:
     model(touch=touch, **drawn)["loss"].backward()
     assert all(p.grad is None for p in model.teacher.parameters())
     assert all(p.grad is not None for p in model.backbone.parameters())
-    seen_ids, wanted = (x[0] if isinstance(x, list) else x for x in drawn.values())
+    context_ids, wanted = (x[0] if isinstance(x, list) else x for x in drawn.values())
     with torch.no_grad():
         before = model.predict(
-            model.backbone.vit.embed_patches(model.stacked(touch)), seen_ids, wanted
+            model.backbone.vit.embed_patches(model.stacked(touch)), context_ids, wanted
         )
         for b in range(2):
-            for patch in set(range(12)) - set((seen_ids[b] % 12).tolist()):
+            for patch in set(range(12)) - set((context_ids[b] % 12).tolist()):
                 y, x = 40 * (patch // 4), 40 * (patch % 4)
                 touch[b, ..., y : y + 40, x : x + 40] += 3
         images = model.stacked(touch)
         assert not torch.allclose(model.targets(images)[0, wanted[0, 0]], before[0, 0])
-        after = model.predict(model.backbone.vit.embed_patches(images), seen_ids, wanted)
+        after = model.predict(model.backbone.vit.embed_patches(images), context_ids, wanted)
     torch.testing.assert_close(after, before)
 
 

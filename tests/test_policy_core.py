@@ -207,7 +207,7 @@ def test_a_killed_training_ends_as_an_uninterrupted_one(
         patch.setattr(train_module, "_validate", killed)
         train(TOY, windows, other, CONFIG, killed_run, SEED, {})
     (note,) = stop.value.__notes__
-    assert "kept 2 of 3 epochs" in note and "--resume" in note
+    assert "2 of 3 epochs are saved" in note and "--resume" in note
     with pytest.raises(UserError, match="resume it"):
         train(TOY, windows, other, CONFIG, killed_run, SEED, {})
     go_on = replace(SEED, resume=True)

@@ -116,7 +116,7 @@ def test_adapting_says_what_it_needs(clips: Path, tmp_path: Path) -> None:
         main(["train-encoder", "adapt", "--data", str(clips), "--encoder", "gelsight_mini",
               "--out", str(tmp_path / "a")])  # fmt: skip
     one = [video for video in read_labelled_videos(clips) if video.path.stem.endswith("_0")]
-    with pytest.raises(UserError, match="no thing has two videos"):
+    with pytest.raises(UserError, match="no object has two videos"):
         adapt(load_encoder("gelsight_mini_surfaces"), one, 0.1, OfflineTowers())
 
 

@@ -195,8 +195,10 @@ class AlignmentLoss(nn.Module):
         self.encoder, self.config = encoder, config
 
     def forward(self, **batch: Tensor | None) -> dict[str, Float[Tensor, ""]]:
-        """Return the losses of what `make_batch` returns, for the trainer."""
-        return self.losses(self.embed(batch, gather_batch))
+        """Return `batch_losses` of what `make_batch` returns, in float32 whatever the precision."""
+        embedded = self.embed(batch, gather_batch)
+        with torch.autocast(embedded.touch.device.type, enabled=False):
+            return batch_losses(embedded, self.encoder.config.pretrained_together, self.config)
 
     def embed(
         self, batch: Mapping[str, Any], gather: Callable[[Tensor], Tensor] = lambda rows: rows
@@ -216,11 +218,6 @@ class AlignmentLoss(nn.Module):
             contact=contact > 0,
             same=(label[:, None] == label) | (sentence[:, None] == sentence),
         )
-
-    def losses(self, batch: AlignedBatch) -> dict[str, Float[Tensor, ""]]:
-        """Return `batch_losses`, in float32 whatever the precision."""
-        with torch.autocast(batch.touch.device.type, enabled=False):
-            return batch_losses(batch, self.encoder.config.pretrained_together, self.config)
 
 
 def batch_losses(

@@ -62,13 +62,13 @@ def loss_floor(
     target = target.double()
     n = len(target)
     right = torch.eye(n, dtype=torch.bool) if positives is None else positives
-    wanted = (right / right.sum(1, keepdim=True)).to(target)
-    anchor = torch.nn.functional.normalize(wanted @ target, dim=1)
+    goal = (right / right.sum(1, keepdim=True)).to(target)
+    anchor = torch.nn.functional.normalize(goal @ target, dim=1)
     best = torch.full((n,), -torch.inf, dtype=torch.float64, device=target.device)
     for step in range(steps):
         logits = anchor @ target.T / temperature
-        loss = logits.logsumexp(1) - (wanted * logits).sum(1)
-        gradient = (logits.softmax(1) - wanted) @ target / temperature
+        loss = logits.logsumexp(1) - (goal * logits).sum(1)
+        gradient = (logits.softmax(1) - goal) @ target / temperature
         length = gradient.norm(dim=1, keepdim=True)
         gap = (gradient * anchor).sum(1) + length[:, 0]
         best = torch.maximum(best, loss - gap)

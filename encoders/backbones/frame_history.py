@@ -48,19 +48,19 @@ class RecentFrames:
         self._untouched: Frame | None = None
         self._known: list[tuple[Frame, Float[Tensor, "1 3 H W"]]] = []
 
-    def latest(self, seen: Sequence[Frame], untouched: Frame) -> Float[Tensor, "1 t 3 H W"]:
+    def latest(self, history: Sequence[Frame], untouched: Frame) -> Float[Tensor, "1 t 3 H W"]:
         """Return the newest frame and those at the offsets before it, for an encoder's `stack`.
 
         Args:
-            seen: Frames of the last ticks, oldest first; the same objects from tick to tick. The
+            history: Frames of the last ticks, oldest first; the same objects from tick to tick. The
                 oldest stands for frames before it.
             untouched: Frame of the untouched sensor.
         """
         if untouched is not self._untouched:
             self._untouched, self._known = untouched, []
-        newest = len(seen) - 1
-        chosen = [self._preprocessed(seen[max(newest - back, 0)]) for back in self._offsets]
-        held = {id(frame) for frame in seen}
+        newest = len(history) - 1
+        chosen = [self._preprocessed(history[max(newest - back, 0)]) for back in self._offsets]
+        held = {id(frame) for frame in history}
         self._known = [entry for entry in self._known if id(entry[0]) in held]
         return torch.stack(chosen, 1)
 

@@ -22,14 +22,14 @@ from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_normalised
 from touchgoal.encoders.whitening.text_head import TextHead
 
-# Blocks after which the picture is pooled, and channels there: edges, textures, parts. The last
-# stages know ImageNet's classes and tell touches apart less well.
+# Blocks after which the image is pooled, and channels there: edges, textures, parts. The last stages
+# are specific to ImageNet's classes and separate touches less well.
 STAGES = ((4, 40), (7, 80), (10, 112), (14, 192))
 FEATURES = 2 * sum(channels for _, channels in STAGES)
-_CONTRAST = 4.0  # counts of a drawn picture per count of change
-# Strength of a spot: root mean square change, counts, of 2 x 2 pixels each, in cells of a twelfth of the
-# picture's height. On PhysiCLeAR's training videos untouched frames have 1.0 to 2.8 (in 95 of 100), also in a
-# tenth more or less light, and the lightest twentieth of the touches 9.2.
+_CONTRAST = 4.0  # counts of the network's input per count of change
+# Strength of contact in a cell of a twelfth of the image's height: root mean square change of 2 x 2 px
+# means, counts. On PhysiCLeAR's training videos 95 % of untouched frames have 1.0 to 2.8, also in a tenth
+# more or less light, and the lightest twentieth of the touches 9.2.
 _CELLS = 12, 16
 _HALF_LENGTH = 4.0  # counts at which an embedding has half of its length
 
@@ -139,10 +139,10 @@ class PooledEncoder(BaseTouchEncoder):
         network = self._network[0].to(touch.device)
         drawn = (128 + _CONTRAST * self._scale * touch).clamp(0, 255) / 255
         x = network.stem(imagenet_normalised(drawn).contiguous(memory_format=torch.channels_last))
-        stages, wanted = [], {block for block, _ in STAGES}
+        stages, pooled = [], {block for block, _ in STAGES}
         for i in range(STAGES[-1][0] + 1):
             x = network.blocks[i](x)
-            if i in wanted:
+            if i in pooled:
                 stages.append(x)
         return stages
 

@@ -10,9 +10,9 @@ from PIL import Image
 from touchgoal.runtime.errors import UserError
 
 SPARSH, SPARSH_PLAIN = "sparsh/v1", "sparsh-plain/v1"
-"""With the background subtracted, as Sparsh has it for the DIGIT and the GelSight Mini; without, as for the
-GelSight of 2017."""
-_HEIGHT, _WIDTH = 4, 3  # of an upright picture
+"""With background subtraction, as Sparsh for DIGIT and GelSight Mini, and without, as for the GelSight
+of 2017."""
+_HEIGHT, _WIDTH = 4, 3  # of an upright image
 _GREY = 127  # of an unchanged pixel: 255 * 0.5, rounded down
 
 
@@ -57,18 +57,18 @@ class SparshPreprocessor:
         shifted = background.astype(np.int16) - _GREY
         for i, frame in enumerate(frames):
             # cv2 cuts to 0 and 255
-            seen = cv2.subtract(frame, shifted, dtype=cv2.CV_8U) if self.subtract else frame
-            picture = Image.fromarray(_upright(seen))
-            small = picture.resize((columns, rows), Image.Resampling.BILINEAR)
+            change = cv2.subtract(frame, shifted, dtype=cv2.CV_8U) if self.subtract else frame
+            image = Image.fromarray(_upright(change))
+            small = image.resize((columns, rows), Image.Resampling.BILINEAR)
             np.divide(np.asarray(small).transpose(2, 0, 1), np.float32(255), out=out[i])
         return out
 
 
-def _upright(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "H W 3"]:
+def _upright(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "H W 3"]:
     """Return the image in portrait format, cropped to 4:3 about the centre."""
-    if picture.shape[0] < picture.shape[1]:
-        picture = np.rot90(picture, -1)
-    h, w, _ = picture.shape
+    if image.shape[0] < image.shape[1]:
+        image = np.rot90(image, -1)
+    h, w, _ = image.shape
     height, width = min(h, w * _HEIGHT // _WIDTH), min(w, h * _WIDTH // _HEIGHT)
     top, left = (h - height) // 2, (w - width) // 2
-    return np.ascontiguousarray(picture[top : top + height, left : left + width])
+    return np.ascontiguousarray(image[top : top + height, left : left + width])

@@ -22,8 +22,8 @@ from touchgoal.encoders.backbones.sparsh import NORM_EPSILON, SQUARE, UPRIGHT
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.runtime.errors import UserError
 
-# Where the averaged ("teacher", "target") encoder lies, which is the one that Sparsh probes: DINO, V-JEPA,
-# I-JEPA, MAE, and a file with the encoder alone.
+# Prefixes of the averaged ("teacher", "target") encoder, which Sparsh probes: DINO, V-JEPA, I-JEPA, MAE,
+# and files with the encoder alone.
 _PREFIXES = (
     "teacher_encoder.backbone.",
     "target_encoder.backbone.",
@@ -32,7 +32,7 @@ _PREFIXES = (
     "",
 )
 _PATCH, _BANDS, _POSITIONS = "patch_embed.proj.weight", "pos_embed.frequency_bands", "pos_embed"
-_HEAD_WIDTH = 64  # of every ViT from tiny to large: the number of heads is in no shape
+_HEAD_WIDTH = 64  # of ViTs from tiny to large; no shape tells the number of heads
 _THEIRS = {
     "patch": "patch_embed.proj",
     "registers": "register_tokens",
@@ -50,13 +50,9 @@ _SHOWN = 20  # keys in a message
 def load_sparsh(path: Path) -> ViT:
     """Load a published Sparsh encoder of any method, for inference, as float32 on the CPU.
 
-    The architecture is read off the weights' shapes.
-
-    Args:
-        path: A `.safetensors` file, or a training's `.ckpt`, of which the encoder that Sparsh
-            probes is taken; other pickled objects are dropped, their code never runs.
-        image_size: Height and width in px. Default: 224 x 224 or 320 x 240, whichever its learned
-            positions fit; 320 x 240 without learned positions.
+    The architecture is read off the weights' shapes; images are 224 x 224 or 320 x 240 px,
+    whichever the learned positions fit, else 320 x 240. Other objects pickled in a training's
+    `.ckpt` are dropped, their code never runs.
 
     Raises:
         UserError: Not such a file, or tensors that do not fit, which are listed.

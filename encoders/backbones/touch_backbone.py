@@ -136,8 +136,8 @@ class BaseTouchEncoder(nn.Module):
         frames = images[None] if single else images
         if background is None and single:
             raise UserError(
-                "one picture needs its background: embed(image, background=untouched), where "
-                "untouched is a picture of the same sensor with nothing on it"
+                "one image needs its background: embed(image, background=untouched), with untouched an "
+                "image of the same sensor without contact"
             )
         untouched = frames[0] if background is None else background
         check_pictures("background", untouched, ndim=(3,))
@@ -169,10 +169,10 @@ class BaseTouchEncoder(nn.Module):
         rows = np.arange(len(frames)) if rows is None else rows
         embedded = np.empty((len(rows), self._width), np.float32)
         for i in range(0, len(rows), BATCH):
-            seen = past_rows(rows[i : i + BATCH], self.offsets)
-            once, where = np.unique(seen, return_inverse=True)
+            inputs = past_rows(rows[i : i + BATCH], self.offsets)
+            once, where = np.unique(inputs, return_inverse=True)
             touch = torch.from_numpy(self.preprocess(frames[once], background))
-            stacked = self.stack(touch[torch.from_numpy(where.reshape(seen.shape))])
+            stacked = self.stack(touch[torch.from_numpy(where.reshape(inputs.shape))])
             embedded[i : i + BATCH] = self.embed_touch(stacked.to(self.device)).cpu().numpy()
         return embedded
 

@@ -43,9 +43,10 @@ class AttentivePooler(nn.Module):
         q = self.q(self.query).view(self.heads, -1)
         asked = torch.einsum("hd,hdf->fh", q, key) / math.sqrt(q.shape[1])
         weights = (tokens @ asked).softmax(1)
-        seen = torch.einsum("bhf,hdf->bhd", weights.transpose(1, 2) @ tokens, value)
+        attended = torch.einsum("bhf,hdf->bhd", weights.transpose(1, 2) @ tokens, value)
         pooled = (
-            self.query + self.proj(seen.flatten(1) + self.kv.bias[self.proj.in_features :])[:, None]
+            self.query
+            + self.proj(attended.flatten(1) + self.kv.bias[self.proj.in_features :])[:, None]
         )
         pooled = pooled + self.mlp_out(F.gelu(self.mlp_in(self.norm2(pooled))))
         return pooled[:, 0]

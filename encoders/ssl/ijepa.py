@@ -21,7 +21,7 @@ class IJepa(JointEmbeddingPrediction):
     config: IJepaConfig
 
     def draw(self, count: int, generator: torch.Generator) -> dict[str, Any]:
-        """Draw `seen_ids` (count, k), cut to the smallest number in the batch, and `wanted_ids`
+        """Draw `context_ids` (count, k), cut to the smallest number in the batch, and `target_ids`
         (count, blocks, j).
         """
         config, grid = self.config, patch_grid(self.backbone.config.vit)
@@ -29,16 +29,16 @@ class IJepa(JointEmbeddingPrediction):
         context = cover(draw_blocks(grid, size, count, 1, generator), grid[0] * grid[1])
         aspect = config.shortest, config.tallest
         size = draw_size(grid, config.target_scale, aspect, generator)
-        wanted, left = draw_targets(
-            grid, size, count, config.target_blocks, context, self.least_seen, generator
+        target, left = draw_targets(
+            grid, size, count, config.target_blocks, context, self.min_context, generator
         )
-        return {"seen_ids": cut(left, generator), "wanted_ids": wanted}
+        return {"context_ids": cut(left, generator), "target_ids": target}
 
     def forward(
-        self, touch: Tensor, seen_ids: Int[Tensor, "b k"], wanted_ids: Int[Tensor, "b m j"]
+        self, touch: Tensor, context_ids: Int[Tensor, "b k"], target_ids: Int[Tensor, "b m j"]
     ) -> dict[str, Float[Tensor, ""]]:
         """Return the loss: smooth L1 distance of predicted and actual tokens, as released."""
         images = self.stacked(touch)
-        actual = take(self.targets(images), wanted_ids)
-        predicted = self.predict(self.backbone.vit.embed_patches(images), seen_ids, wanted_ids)
+        actual = take(self.targets(images), target_ids)
+        predicted = self.predict(self.backbone.vit.embed_patches(images), context_ids, target_ids)
         return {"loss": F.smooth_l1_loss(predicted, actual)}

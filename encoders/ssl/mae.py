@@ -100,10 +100,10 @@ class MaskedAutoencoder(nn.Module):
 
     def _check_mask(self, vit: ViTConfig) -> None:
         rows, columns = patch_grid(vit)
-        seen = random_masking(vit, self.config.mask_ratio, 1, torch.Generator()).shape[1]
-        if seen == rows * columns and not self.config.bottleneck:
+        unmasked = random_masking(vit, self.config.mask_ratio, 1, torch.Generator()).shape[1]
+        if unmasked == rows * columns and not self.config.bottleneck:
             raise UserError(
-                f"mask_ratio {self.config.mask_ratio} masks none of {seen} patches, and without "
+                f"mask_ratio {self.config.mask_ratio} masks none of {unmasked} patches, and without "
                 "bottleneck there is nothing to learn: raise it"
             )
 
@@ -140,5 +140,5 @@ def progress_line(metrics: dict[str, float]) -> str:
     """Return the line to print for an epoch."""
     return (
         f"loss {metrics['loss']:.4f} in training, {metrics['validation_loss']:.4f} in validation "
-        f"({metrics['validation_loss_of_blank']:.4f} for drawing an untouched gel){forces_line(metrics)}"
+        f"({metrics['validation_loss_of_blank']:.4f} for an untouched gel){forces_line(metrics)}"
     )

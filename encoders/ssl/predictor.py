@@ -34,17 +34,17 @@ class Predictor(nn.Module):
 
     def forward(
         self,
-        seen: Float[Tensor, "b k d"],
-        seen_ids: Int[Tensor, "b k"],
-        wanted_ids: Int[Tensor, "b j"],
+        context: Float[Tensor, "b k d"],
+        context_ids: Int[Tensor, "b k"],
+        target_ids: Int[Tensor, "b j"],
     ) -> Float[Tensor, "b j d"]:
-        """Return tokens of the wanted patches."""
-        x = self.embed(seen)
-        asked = (self.mask_token + self.places[wanted_ids]).to(x)
-        x = torch.cat([x + self.places[seen_ids].to(x), asked], 1)
+        """Return tokens of the target patches."""
+        x = self.embed(context)
+        asked = (self.mask_token + self.places[target_ids]).to(x)
+        x = torch.cat([x + self.places[context_ids].to(x), asked], 1)
         for block in self.blocks:
             x = block(x)
-        return self.out(self.norm(x[:, seen.shape[1] :]))
+        return self.out(self.norm(x[:, context.shape[1] :]))
 
 
 class JointEmbeddingPrediction(SelfDistillation):
@@ -57,7 +57,7 @@ class JointEmbeddingPrediction(SelfDistillation):
         self.predictor = Predictor(backbone.config.vit, config)
 
     @property
-    def least_seen(self) -> int:
+    def min_context(self) -> int:
         """Return the least number of patches left as input in each frame: an eighth."""
         rows, columns = patch_grid(self.backbone.config.vit)
         return max(rows * columns // 8, 1)
@@ -71,22 +71,22 @@ class JointEmbeddingPrediction(SelfDistillation):
     def predict(
         self,
         patches: Float[Tensor, "b n d"],
-        seen_ids: Int[Tensor, "b k"],
-        wanted_ids: Int[Tensor, "b m j"],
+        context_ids: Int[Tensor, "b k"],
+        target_ids: Int[Tensor, "b m j"],
     ) -> Float[Tensor, "b m j d"]:
         """Return tokens of m sets of patches, each set predicted by itself.
 
         Args:
             patches: All embedded patches.
-            seen_ids: Patches that the backbone reads.
-            wanted_ids: Patches to predict.
+            context_ids: Patches that the backbone reads.
+            target_ids: Patches to predict.
         """
-        tokens = self.backbone.vit.encode(patches, seen_ids)
+        tokens = self.backbone.vit.encode(patches, context_ids)
         tokens = tokens[:, self.backbone.config.vit.registers :]
-        sets = wanted_ids.shape[1]
-        tokens, places = (x.repeat_interleave(sets, 0) for x in (tokens, seen_ids))
-        predicted = self.predictor(tokens, places, wanted_ids.flatten(0, 1))
-        return predicted.unflatten(0, wanted_ids.shape[:2]).float()
+        sets = target_ids.shape[1]
+        tokens, places = (x.repeat_interleave(sets, 0) for x in (tokens, context_ids))
+        predicted = self.predictor(tokens, places, target_ids.flatten(0, 1))
+        return predicted.unflatten(0, target_ids.shape[:2]).float()
 
 
 def take(tokens: Float[Tensor, "b n d"], ids: Int[Tensor, "b m j"]) -> Float[Tensor, "b m j d"]:

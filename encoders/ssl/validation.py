@@ -75,11 +75,11 @@ class Validation:
         """Return the line to print for an epoch."""
         text = (
             f"loss {metrics['loss']:.4f} in training, {metrics['validation_loss']:.4f} in validation; "
-            f"spread of tokens {metrics['token_spread']:.3f} ({self._untrained['token_spread']:.3f} "
+            f"token spread {metrics['token_spread']:.3f} ({self._untrained['token_spread']:.3f} "
             f"untrained) in {metrics['effective_rank']:.1f} dimensions; "
-            f"{metrics['reconstruction']:.2f} of the picture reconstructed{forces_line(metrics)}"
+            f"{metrics['reconstruction']:.2f} of the image reconstructed{forces_line(metrics)}"
         )
-        warning = "  WARNING: the embeddings have collapsed, all touches look the same"
+        warning = "  WARNING: the embeddings have collapsed, all touches have the same one"
         return text + warning if self.has_collapsed(metrics) else text
 
     def draw(self, epoch: int) -> None:

@@ -22,13 +22,13 @@ class VJepa(JointEmbeddingPrediction):
     config: VJepaConfig
 
     def draw(self, count: int, generator: torch.Generator) -> dict[str, Any]:
-        """Draw `seen_ids` (count, k) and `wanted_ids` (count, 1, j) for each mask, time by time;
+        """Draw `context_ids` (count, k) and `target_ids` (count, 1, j) for each mask, time by time;
         cut to the smallest number in the batch.
         """
         config, vit = self.config, self.backbone.config.vit
         grid, times = patch_grid(vit), vit.frames // vit.tubelet
         everything = torch.ones(count, grid[0] * grid[1], dtype=torch.bool)
-        drawn: dict[str, list[Tensor]] = {"seen_ids": [], "wanted_ids": []}
+        drawn: dict[str, list[Tensor]] = {"context_ids": [], "target_ids": []}
         for scale, blocks in (
             (config.small_scale, config.small_blocks),
             (config.large_scale, config.large_blocks),
@@ -36,24 +36,24 @@ class VJepa(JointEmbeddingPrediction):
             aspect = config.shortest, config.tallest
             size = draw_size(grid, (scale, scale), aspect, generator)
             hidden, left = draw_targets(grid, size, count, blocks, everything, 1, generator)
-            wanted = cut(cover(hidden, everything.shape[1]), generator)
-            seen = cut(left, generator)
-            drawn["seen_ids"].append(tubes(seen, times, everything.shape[1]))
-            drawn["wanted_ids"].append(tubes(wanted, times, everything.shape[1])[:, None])
+            target = cut(cover(hidden, everything.shape[1]), generator)
+            context = cut(left, generator)
+            drawn["context_ids"].append(tubes(context, times, everything.shape[1]))
+            drawn["target_ids"].append(tubes(target, times, everything.shape[1])[:, None])
         return drawn
 
     def forward(
         self,
         touch: Tensor,
-        seen_ids: list[Int[Tensor, "b _"]],
-        wanted_ids: list[Int[Tensor, "b 1 _"]],
+        context_ids: list[Int[Tensor, "b _"]],
+        target_ids: list[Int[Tensor, "b 1 _"]],
     ) -> dict[str, Float[Tensor, ""]]:
         """Return the loss: L1 distance of predicted and actual tokens, the mean over both masks."""
         images = self.stacked(touch)
         targets, patches = self.targets(images), self.backbone.vit.embed_patches(images)
         losses = [
-            F.l1_loss(self.predict(patches, seen, wanted), take(targets, wanted))
-            for seen, wanted in zip(seen_ids, wanted_ids, strict=True)
+            F.l1_loss(self.predict(patches, context, target), take(targets, target))
+            for context, target in zip(context_ids, target_ids, strict=True)
         ]
         return {"loss": torch.stack(losses).mean()}
 

@@ -108,7 +108,7 @@ def load(
     path = out_dir / _CHECKPOINT
     try:
         found = torch.load(path, "cpu", weights_only=True)
-        old, history, kept = found["identity"], found["history"], found["provenance"]
+        old, history, recorded = found["identity"], found["history"], found["provenance"]
     except Exception as error:  # torch.load raises whatever its parts raise
         raise UserError(f"{path} cannot be read: start again in another directory") from error
     if difference := _difference(old, _json(identity)):
@@ -117,9 +117,9 @@ def load(
         )
     for name, part in state.items():
         part.load_state_dict(found[name])
-    if provenance != kept and provenance not in (resumed := kept.get("resumed", [])):
-        kept = {**kept, "resumed": [*resumed, dict(provenance)]}
-    return history, kept
+    if provenance != recorded and provenance not in (resumed := recorded.get("resumed", [])):
+        recorded = {**recorded, "resumed": [*resumed, dict(provenance)]}
+    return history, recorded
 
 
 def _json(value: Mapping[str, Any]) -> dict[str, Any]:

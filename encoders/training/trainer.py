@@ -153,7 +153,7 @@ class Training:
 def fit(
     training: Training, out_dir: Path, options: TrainerOptions, recipe: Mapping[str, Any]
 ) -> tuple[list[Metrics], dict[str, Any]]:
-    """Train; Ctrl-C keeps the finished epochs.
+    """Train; after Ctrl-C the finished epochs can be resumed.
 
     Writes `metrics.jsonl` (a line an epoch), TensorBoard's event files and `checkpoint.pt` (after
     every epoch).
@@ -268,13 +268,13 @@ def _mean_over_steps(losses: list[dict[str, Tensor]], accelerator: Accelerator) 
 
 def _how_to_resume(out_dir: Path, done: int, epochs: int) -> str:
     if not done:
-        return f"no epoch was finished, nothing is kept in {out_dir}"
+        return f"no epoch was finished, nothing is saved in {out_dir}"
     command = command_line()
     if "--out" not in command:
         command += f" --out {shlex.quote(str(out_dir))}"
     if "--resume" not in command:
         command += " --resume"
-    return f"kept {done} of {epochs} epochs in {out_dir}; go on with: {command}"
+    return f"{done} of {epochs} epochs are saved in {out_dir}; resume with: {command}"
 
 
 def epoch_batches(

@@ -37,12 +37,12 @@ def adapt(
     Raises:
         UserError: No object has two videos.
     """
-    things = np.array([video.object for video in videos])
-    if not videos or np.unique(things, return_counts=True)[1].max() < 2:
-        raise UserError("no thing has two videos, which would show what does not matter about it")
+    objects = np.array([video.object for video in videos])
+    if not videos or np.unique(objects, return_counts=True)[1].max() < 2:
+        raise UserError("no object has two videos: film each object at least twice")
     pooled = [_pooled(encoder, video) for video in track(videos, "videos", "video")]
     every = torch.cat(pooled).double().numpy()
-    names = np.repeat(things, [len(rows) for rows in pooled])
+    names = np.repeat(objects, [len(rows) for rows in pooled])
     covariance = (1 - share) * encoder.covariance + share * within_classes(every, names)
     adapted = PooledEncoder(encoder.config).fit(every.mean(0), inverse_square_root(covariance, 0.0))
     ranked = [i for i, video in enumerate(videos) if video.ranks is not None]

@@ -28,7 +28,7 @@ from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_in
 
 _UNITS = 48
 _BATCH = 32
-_SHRINKAGE = 0.1  # of the covariance towards a sphere; 0.01 to 0.3 tell real things apart alike
+_SHRINKAGE = 0.1  # towards a sphere; 0.01 to 0.3 separate real objects equally well
 _VISIBLE = 4.0  # counts of change that a press makes somewhere, or another is drawn
 _TRIES = 3
 # Brightness between two moments, common and by channel; JPEG quality; share of streams compressed.

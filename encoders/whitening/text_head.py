@@ -19,7 +19,7 @@ RANK_WORDS = (
     ("flat", "slightly bumpy", "bumpy"),
 )
 """What a rank of hardness, roughness and bumpiness is called."""
-_STRENGTH = 0.003  # of the ridge; a hundred times more or less says the same of real things
+_STRENGTH = 0.003  # of the ridge; on real objects, 100 times more or less makes no difference
 
 EmbedTexts = Callable[[list[str]], Float[Tensor, "k t"]]
 
