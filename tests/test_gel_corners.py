@@ -100,7 +100,7 @@ def test_a_cell_file_has_the_corners_of_either_gel(tmp_path: Path) -> None:
     picture, corners = seen_at_an_angle(1.0)
     y, x = np.mgrid[:480, :640] // 4
     picture = np.stack([x, 255 - x, y], -1).astype(np.uint8)  # as smooth as a gel
-    cv2.imwrite(str(tmp_path / "0.png"), picture)
+    cv2.imwrite(str(tmp_path / "0.png"), picture[..., ::-1])
     a, b, c, d = ((639 - x, y) for x, y in corners)
     mirrored = b, a, d, c
     path = tmp_path / "cell.toml"

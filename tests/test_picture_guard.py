@@ -1,0 +1,190 @@
+"""Pictures that are not their sensor's are refused by a line that names the fault; whole ones pass."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from a_cell import MadeUpCamera, MadeUpClock
+from toy_episodes import FPS, make_episode
+
+import touchgoal
+from touchgoal.control.calibration.ball import press_surface
+from touchgoal.control.features import TACTILE_LEFT, TACTILE_RIGHT
+from touchgoal.control.interfaces import DriverError
+from touchgoal.control.sensors.tactile_camera import NO_CROP, TactileCamera
+from touchgoal.control.tactile.picture_guard import check_presses, check_untouched
+from touchgoal.control.tactile.sensor_calibration import load, save, shade
+from touchgoal.control.tactile.sensor_models import (
+    DIGIT,
+    GELSIGHT_MINI,
+    GELSIGHT_MINI_MARKERS,
+    SensorModel,
+)
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.episodes.touches import check_fingertips
+from touchgoal.launch.__main__ import main
+from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.tactile.optics import render_untouched
+from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
+
+REAL = Path("/work/shared/data")
+MINI = load(GELSIGHT_MINI.sensor_file)
+
+
+def stretched(picture: np.ndarray) -> np.ndarray:
+    """By 8 % along the rows, the sides cut off."""
+    height, width, _ = picture.shape
+    wide = cv2.resize(np.ascontiguousarray(picture), (round(1.08 * width), height))
+    left = (wide.shape[1] - width) // 2
+    return wide[:, left : left + width]
+
+
+def torn(picture: np.ndarray) -> np.ndarray:
+    middle = len(picture) // 2
+    return np.concatenate([picture[:middle], np.roll(picture[middle:], 40, 1)])
+
+
+def half_grey(picture: np.ndarray) -> np.ndarray:
+    middle = len(picture) // 2
+    return np.concatenate([picture[:middle], np.full_like(picture[middle:], 128)])
+
+
+Fault = Callable[[np.ndarray], np.ndarray]
+FAULTS: dict[str, tuple[Fault, str]] = {
+    "exchanged": (lambda p: p[..., ::-1], "red and blue are exchanged"),
+    "left to right": (lambda p: p[:, ::-1], "it is mirrored left to right"),
+    "top to bottom": (lambda p: p[::-1], "it is mirrored top to bottom"),
+    "turned": (lambda p: p[::-1, ::-1], "it is turned by 180 degrees"),
+    "stretched": (stretched, "it fits when scaled by 0.926 along its rows"),
+    "scrolled": (lambda p: np.roll(p, 80, 0), "torn or rolled at row 80"),
+    "rolled": (lambda p: np.roll(p, 100, 1), "torn or rolled at column 100"),
+    "torn": (torn, "torn or rolled at row"),
+    "half grey": (half_grey, "torn or rolled at row"),
+}
+
+
+def other_light(picture: np.ndarray) -> np.ndarray:
+    return (picture * np.array([0.85, 1.0, 1.15])).clip(0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("model", [GELSIGHT_MINI, DIGIT], ids=lambda model: model.name)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_every_fault_is_named(fault: str, model: SensorModel) -> None:
+    change, says = FAULTS[fault]
+    rng = np.random.default_rng(0)
+    picture = load(model.sensor_file).background + rng.normal(size=(*model.image_shape, 3))
+    picture = np.ascontiguousarray(change(other_light(picture)))
+    with pytest.raises(UserError) as refused:
+        check_untouched(picture, model, "the picture")
+    assert says in str(refused.value)
+
+
+def test_other_sensors_of_the_model_pass() -> None:
+    """In other light, with dust on the gel, with printed dots."""
+    rng = np.random.default_rng(0)
+    for model in (GELSIGHT_MINI, GELSIGHT_MINI_MARKERS, DIGIT):
+        for _ in range(8):
+            picture = other_light(render_untouched(sample_instance(model, rng), rng))
+            for x, y in rng.integers(20, 220, (6, 2)):
+                cv2.circle(picture, (int(x), int(y)), 3, (30, 25, 30), -1)
+            check_untouched(picture, model, "the picture")
+
+
+def balls(model: SensorModel) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The untouched gel and four presses, with noise."""
+    calibration, rng = load(model.sensor_file), np.random.default_rng(0)
+    rows, columns = model.image_shape
+    surfaces = [np.zeros(model.image_shape, np.float32)] + [
+        press_surface(calibration, np.array([x * columns, y * rows, 20.0]), 4e-3)
+        for x in (0.3, 0.7)
+        for y in (0.3, 0.7)
+    ]
+    pictures = [shade(calibration, surface) for surface in surfaces]
+    noisy = [(p + rng.normal(size=p.shape)).round().clip(0, 255).astype(np.uint8) for p in pictures]
+    return noisy[0], noisy[1:]
+
+
+def test_presses_tell_a_mirror_that_the_untouched_gel_does_not_show(tmp_path: Path) -> None:
+    both = (MINI.background.astype(float) + MINI.background[:, ::-1]) / 2
+    save(replace(MINI, background=both.astype(np.uint8)), tmp_path, {})
+    model = replace(GELSIGHT_MINI, sensor_file=tmp_path)
+    untouched, presses = balls(model)
+    check_presses(untouched, presses, model, "the presses")
+    untouched, presses = untouched[:, ::-1].copy(), [p[:, ::-1].copy() for p in presses]
+    check_untouched(untouched, model, "the picture")
+    with pytest.raises(UserError, match="mirrored left to right"):
+        check_presses(untouched, presses, model, "the presses")
+
+
+def test_a_fingertip_leaves_out_torn_pictures() -> None:
+    clock = MadeUpClock()
+    camera = MadeUpCamera(clock, MINI.background)
+    fingertip = TactileCamera(camera, GELSIGHT_MINI, NO_CROP)
+    clock.time = 1.0
+    whole = fingertip.read()
+    clock.time, camera.image = 2.0, torn(MINI.background)
+    assert fingertip.read() is whole and "torn" in fingertip.problem
+    clock.time, camera.image = 3.0, MINI.background
+    assert fingertip.read().stamp == 3.0 and not fingertip.problem
+    camera.image = torn(MINI.background)
+    with pytest.raises(DriverError, match="torn or rolled"):
+        TactileCamera(camera, GELSIGHT_MINI, NO_CROP).read()
+
+
+def test_commands_and_curves_refuse_exchanged_colours(tmp_path: Path) -> None:
+    untouched, presses = balls(GELSIGHT_MINI)
+    swapped = [picture[..., ::-1] for picture in (*[untouched] * 3, *presses * 4)]
+    cv2.imwrite(str(tmp_path / "background.png"), swapped[0][..., ::-1])
+    for i, picture in enumerate(swapped[3:]):
+        cv2.imwrite(str(tmp_path / f"{i:02d}.png"), picture[..., ::-1])
+    options = ["--out", str(tmp_path / "out")]
+    commands = [
+        ["check-sensor", str(tmp_path), *options],
+        ["calibrate", str(tmp_path), "--mm-per-pixel", "0.0634", "--ball-mm", "4", *options],
+    ]
+    for command in commands:
+        with pytest.raises(SystemExit, match="red and blue are exchanged"):
+            main(command)
+    with pytest.raises(UserError, match="red and blue are exchanged"):
+        touchgoal.reward_curve(tactile={"left": np.stack(swapped)})
+
+
+def test_a_set_in_which_the_fingertips_change_places_is_refused(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    units = [sample_instance(GELSIGHT_MINI, rng) for _ in range(2)]
+
+    def tips(sides: tuple[int, ...]) -> dict[str, np.ndarray]:
+        pictures = [np.stack([render_untouched(units[s], rng) for _ in range(3)]) for s in sides]
+        return dict(zip((TACTILE_LEFT, TACTILE_RIGHT), pictures, strict=True))
+
+    for name, second in (("right", (0, 1)), ("wrong", (1, 0))):
+        root = tmp_path / name
+        writer = EpisodeWriter(root, FPS)
+        for sides in ((0, 1), second):
+            episode = make_episode(0, 3)
+            episode.frames.update(tips(sides))
+            episode.meta["sensor"] = "gelsight_mini"
+            writer.append(episode)
+        if name == "right":
+            check_fingertips(EpisodeSet(root), range(2))
+        else:
+            with pytest.raises(UserError, match="episode 1 look exchanged"):
+                check_fingertips(EpisodeSet(root), range(2))
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="real frames are not part of the repository")
+@pytest.mark.parametrize(("folder", "model"), [("mini", GELSIGHT_MINI), ("digit", DIGIT)])
+def test_real_presses_pass_and_their_faults_do_not(folder: str, model: SensorModel) -> None:
+    files = sorted((REAL / f"{folder}_presses").glob("*.png"))
+    pictures = {file.name: cv2.imread(str(file))[..., ::-1].copy() for file in files}  # pyright: ignore
+    untouched = pictures.pop("background.png")
+    for picture in (untouched, *pictures.values()):
+        check_untouched(picture, model, "the picture")
+    for change, says in FAULTS.values():
+        with pytest.raises(UserError, match=says):
+            check_untouched(np.ascontiguousarray(change(untouched)), model, "the picture")
+    presses = list(pictures.values())[::4]
+    check_presses(untouched, presses, model, "the presses")
