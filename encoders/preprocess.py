@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.runtime.errors import UserError
 
-_BRIGHTNESS_CELL = 4  # px
 _ASPECT_TOLERANCE = 0.02  # a GelSight Mini's own 3280 x 2464 differs from 4:3 by 0.2 %
 
 
@@ -43,22 +43,22 @@ class Preprocessor(Protocol):
 class TactilePreprocessor:
     """Resizes, subtracts the untouched sensor and divides by a constant.
 
-    Any change of the numbers that come out needs a new version: encoders refuse to load under
-    another preprocessor than they were trained with.
+    A change of the light since the untouched picture is taken out first (`light_gain`).
+
+    Any change of the numbers that come out in steady light needs a new version: encoders refuse to
+    load under another preprocessor than they were trained with.
 
     Attributes:
         sensor: `control.sensors.SensorModel.name`.
         version: Counts changes.
         size: Height and width of the output in pixels.
         scale: Grey levels (of 255) that make 1.0; about the contrast of a firm contact.
-        steady_light: Take out what brighter or dimmer light changes, before the subtraction.
     """
 
     sensor: str
     version: int
     size: tuple[int, int]
     scale: float
-    steady_light: bool = False
 
     @property
     def id(self) -> str:
@@ -87,8 +87,7 @@ class TactilePreprocessor:
         interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
         untouched = background.astype(np.float32)
         for i, frame in enumerate(frames):
-            lit = frame / _brightness(frame, untouched) if self.steady_light else frame
-            change = (lit - untouched) / np.float32(self.scale)
+            change = (remove_gain(frame, untouched) - untouched) / np.float32(self.scale)
             out[i] = cv2.resize(change, (w, h), interpolation=interpolation).transpose(2, 0, 1)
         return out
 
@@ -99,19 +98,6 @@ class TactilePreprocessor:
                 f"a {self.sensor} frame is {expected:.2f} times as wide as high, these are "
                 f"{shape[1]}x{shape[0]}: crop them, or choose the right sensor"
             )
-
-
-def _brightness(
-    frame: UInt8[np.ndarray, "h w 3"], untouched: Float32[np.ndarray, "h w 3"]
-) -> Float32[np.ndarray, "3"]:
-    """Of each channel, relative to the untouched sensor: the median, which most contacts leave."""
-    h, w, _ = frame.shape
-    size = max(w // _BRIGHTNESS_CELL, 1), max(h // _BRIGHTNESS_CELL, 1)
-    now, before = (
-        cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) + 1
-        for image in (frame, untouched)
-    )
-    return np.median(now / before, (0, 1)).astype(np.float32)
 
 
 def check_pictures(name: str, pictures: object, ndim: tuple[int, ...]) -> None:
@@ -166,8 +152,8 @@ def preprocessor_for(sensor: str) -> TactilePreprocessor:
     return PREPROCESSORS[sensor]
 
 
-def steady_preprocessor_for(sensor: str) -> TactilePreprocessor:
-    """Version 3: twice as high and wide, and changes of the light taken out; UserError for an unknown sensor."""
+def fine_preprocessor_for(sensor: str) -> TactilePreprocessor:
+    """Return version 3, twice as high and wide; UserError for an unknown sensor."""
     plain = preprocessor_for(sensor)
     h, w = plain.size
-    return replace(plain, version=3, size=(2 * h, 2 * w), steady_light=True)
+    return replace(plain, version=3, size=(2 * h, 2 * w))

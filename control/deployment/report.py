@@ -7,13 +7,18 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.control_loop import SLOW_ARM, slow_arm
 from touchgoal.control.deployment.session import Result
+from touchgoal.control.tactile.light_gain import LightWatch, light_advice
 
+_LIGHT_TICKS = 10  # from one look at the fingertips' light to the next
 _VERDICTS = {True: "done", False: "not done", None: "nobody can tell whether it is done"}
 
 
 def metrics(result: Result) -> dict[str, Any]:
     """Return the numbers of a run, for metrics.json."""
     ending, log = result.ending, result.log
+    light = LightWatch()
+    for row in log.rows[::_LIGHT_TICKS]:
+        light.update(row)
     forces = [np.linalg.norm(row[ft.WRENCH][:3]) for row in log.rows]
     return {
         "reason": ending.reason,
@@ -31,6 +36,7 @@ def metrics(result: Result) -> dict[str, Any]:
         "force_max_newtons": float(max(forces, default=0.0)),
         "clamped": log.limit_counts,
         "arm_pace": log.arm_pace,
+        "light_change": light.change,
     }
 
 
@@ -45,6 +51,8 @@ def report(result: Result, numbers: dict[str, Any], episodes: str) -> str:
     ]
     if log.arm_pace < SLOW_ARM:
         lines.append(slow_arm(log.arm_pace))
+    if advice := light_advice([numbers["light_change"]]):
+        lines.append(advice)
     if result.held_width is not None:
         lines.append(f"the hand still holds something, {1e3 * result.held_width:.0f} mm wide")
     if result.episode is not None:

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from touchgoal.control.tactile.light_gain import GAIN_SPREAD, LARGE_CHANGE, divide_gain, light_gain
 from touchgoal.runtime.errors import UserError
 
 # Pictures are averaged over _CELL x _CELL pixels and then blurred. Measured on 320 x 240 frames:
@@ -20,7 +21,7 @@ _WAVES = 4, 5
 # Share of a frame that enters the background: 2 s of a 25 Hz sensor, slower than any contact.
 _RATE = 0.02
 # Standard deviations between 150,000 real touches of Minis (Tactile-MNIST), counts.
-_GAIN_SPREAD, _OFFSET_SPREAD, _PATTERN_SPREAD = 0.047, 2.4, 2.4
+_OFFSET_SPREAD, _PATTERN_SPREAD = 2.4, 2.4
 _MOVED = 1.5  # counts of local change among the first frames that are no noise
 _ANOTHER_SENSOR = 5.0  # counts of local change to a reference; drift of the full spread gives 3
 
@@ -45,7 +46,7 @@ class Drift:
 
         The pattern's largest value over an image is twice its standard deviation already.
         """
-        gain = np.abs(self.gain - 1) > 2 * _GAIN_SPREAD
+        gain = np.abs(self.gain - 1) > LARGE_CHANGE
         offset = np.abs(self.offset) > 2 * _OFFSET_SPREAD
         return bool((gain | offset | (self.pattern > 4 * _PATTERN_SPREAD)).any())
 
@@ -58,6 +59,10 @@ class Background:
             is the first background.
         reference: what drift is measured against, such as the sensor file's background; None: the
             first background.
+
+    Attributes:
+        steady: the untouched frame without what a changed light multiplies since the first frames,
+            counts; `light_gain.remove_gain` brings a frame into the same light.
 
     Raises:
         UserError: something moved on the sensor while the frames were taken, or they differ from
@@ -75,7 +80,8 @@ class Background:
                 "the touch sensor's picture changes while its background is taken: "
                 "keep it still and untouched, and start again"
             )
-        self._current, self._frames = first.copy(), len(frames)
+        self.steady, self._frames = first.copy(), len(frames)
+        self._first, self._gain = first, np.ones(3, np.float32)
         self.reference = first if reference is None else reference.astype(np.float32)
         if float(local_change(first, self.reference).max()) > _ANOTHER_SENSOR:
             raise UserError(
@@ -86,7 +92,7 @@ class Background:
     @property
     def image(self) -> Float32[np.ndarray, "h w 3"]:
         """The untouched frame as it would look now, counts."""
-        return self._current
+        return self.steady * self._gain
 
     def update(self, frame: UInt8[np.ndarray, "h w 3"]) -> None:
         """Follow the drift by one frame; only for frames in which nothing touches.
@@ -94,18 +100,21 @@ class Background:
         The first 50 count alike: of a single first frame its noise must not stay.
         """
         self._frames += 1
-        cv2.accumulateWeighted(frame, self._current, max(_RATE, 1 / self._frames))
+        rate = max(_RATE, 1 / self._frames)
+        gain = light_gain(frame, self._first)
+        self._gain += rate * (gain - self._gain)
+        cv2.accumulateWeighted(divide_gain(frame, gain), self.steady, rate)
 
     def drift(self) -> Drift:
         """How far the background went from the reference; see `Drift.large`."""
         reference = _blurred(self.reference).reshape(-1, 3)
-        change = _blurred(self._current).reshape(-1, 3) - reference
+        change = _blurred(self.image).reshape(-1, 3) - reference
         gain, offset = np.empty(3), np.empty(3)
         for c in range(3):
             explain = np.stack([reference[:, c], np.ones(len(reference))], axis=1)
             # Gain and offset of a smooth background look alike: the spread decides between them.
             seen = len(explain) * _PATTERN_SPREAD**2 / (_WAVES[0] * _WAVES[1])
-            normal = explain.T @ explain / seen + np.diag([_GAIN_SPREAD**-2, _OFFSET_SPREAD**-2])
+            normal = explain.T @ explain / seen + np.diag([GAIN_SPREAD**-2, _OFFSET_SPREAD**-2])
             gain[c], offset[c] = np.linalg.solve(normal, explain.T @ change[:, c] / seen)
         pattern = np.abs(change - gain * reference - offset).max(0)
         return Drift(1 + gain, offset, pattern.astype(np.float64))

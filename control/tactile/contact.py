@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from touchgoal.control.tactile.background import Background, local_change
+from touchgoal.control.tactile.light_gain import remove_gain
 
 THRESHOLD = 1.2  # counts; noise of 1 count has a strength of 0.3, at most 0.45
 # Threshold of a noisy sensor per usual strength of its untouched frames. On 409 clips of a real Mini
@@ -44,7 +45,8 @@ class ContactDetector:
 
     def update(self, frame: UInt8[np.ndarray, "h w 3"]) -> bool:
         """Judge the next frame."""
-        self.strength = float(local_change(frame, self.background.image).max())
+        rest = self.background.steady
+        self.strength = float(local_change(remove_gain(frame, rest), rest).max())
         self._peak = max(self._peak, self.strength) if self.touching else self.strength
         least = max(self.threshold / 2, _OVER_NOISE * self._noise)
         ends_at = np.clip(_RELEASE * self._peak, least, self.threshold)
@@ -78,7 +80,8 @@ def contact_strength(
         frames: RGB pictures of one fingertip sensor.
         background: the same sensor untouched.
     """
-    return np.array([local_change(frame, background).max() for frame in frames], np.float32)
+    changes = (local_change(remove_gain(frame, background), background) for frame in frames)
+    return np.array([change.max() for change in changes], np.float32)
 
 
 def threshold_for(

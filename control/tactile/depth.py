@@ -22,6 +22,7 @@ from touchgoal.control.tactile.depth_steps import (
     shading,
     slopes,
 )
+from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.control.tactile.sensor_calibration import (
     SensorCalibration,
     illumination,
@@ -76,12 +77,12 @@ class DepthEstimator:
 
         Args:
             image: RGB frame; paint markers over first (`markers.without_markers`).
-            background: the untouched sensor as it is now (`background.Background.image`), markers
-                painted over as well; None: the sensor file's.
+            background: the untouched sensor (`background.Background.steady`), markers painted over
+                as well; None: the sensor file's. The image is brought into its light.
         """
         if background is None:
             background = self._calibration.background.astype(np.float32)
-        change = image - background
+        change = remove_gain(image, background) - background
         surface = np.zeros((1, 1), np.float32)
         for level, (_, steps, searched, inner) in zip(self._levels, self._schedule, strict=True):
             surface = level.refine(surface, change, steps, searched, inner)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from touchgoal.control.tactile.background import local_change
+from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.runtime.errors import UserError
 
@@ -124,7 +125,7 @@ def change_statistics(
 
     Each statistic appears as it is, as its root and as its logarithm.
     """
-    small = resized(frame)
+    small = remove_gain(resized(frame), background)
     local, change = local_change(small, background), small - background
     plain = np.array(
         [

@@ -38,7 +38,7 @@ class IndentationMeter:
         """The deepest point in the next frame, m; 0 while nothing touches."""
         if not self._detector.update(frame):
             return 0.0
-        return float(self._depth.estimate(frame, self._detector.background.image).max())
+        return float(self._depth.estimate(frame, self._detector.background.steady).max())
 
 
 def deepest_readable(sensor: SensorModel, wanted: float) -> float:

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
-from touchgoal.encoders.preprocess import steady_preprocessor_for
+from touchgoal.encoders.preprocess import fine_preprocessor_for
 from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_normalised
 from touchgoal.encoders.whitening.text_head import TextHead
@@ -55,7 +55,7 @@ class PooledEncoderConfig:
     @classmethod
     def for_sensor(cls, sensor: str) -> "PooledEncoderConfig":
         """Return the config for a sensor; UserError for an unknown one."""
-        return cls(FEATURES, sensor, steady_preprocessor_for(sensor).id)
+        return cls(FEATURES, sensor, fine_preprocessor_for(sensor).id)
 
     @property
     def embedding_dim(self) -> int:
@@ -76,7 +76,7 @@ class PooledEncoder(BaseTouchEncoder):
     text_matrix: Float[Tensor, "t d"]
 
     def __init__(self, config: PooledEncoderConfig) -> None:
-        preprocess = steady_preprocessor_for(config.sensor)
+        preprocess = fine_preprocessor_for(config.sensor)
         super().__init__(preprocess, config.features)
         self.config, self._scale = config, preprocess.scale
         self.register_buffer("mean", torch.zeros(config.features))

@@ -22,7 +22,7 @@ class SparshPreprocessor:
 
     Each channel is the change in grey levels plus 127, clipped to 0 to 255. Landscape images are
     rotated clockwise, others than 4:3 cropped about the centre, and resized bilinearly as PIL does.
-    Mean and variance are not normalised.
+    Mean and variance are not normalised, and a change of the light stays in, as published.
 
     Attributes:
         size: Height and width of the output, px: 320 x 240 as trained, 224 x 224 for learned

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from touchgoal.control import features as ft
+from touchgoal.control.tactile.light_gain import LightWatch
 from touchgoal.episodes.recording import EpisodeSpec, run
 from touchgoal.policies.by_name import AnyPolicy, PolicyMaker, prepare_policy
 from touchgoal.policies.evaluation.success_rate import SuccessRate
@@ -27,6 +28,7 @@ from touchgoal.sim_envs.scene.objects import CATALOGUE
 from touchgoal.sim_envs.tasks import make_env
 
 _TOLERANCE = 1e-3  # rad or m by which an action may exceed a limit before it counts as clamped
+_LIGHT_TICKS = 10  # from one look at the fingertips' light to the next
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ class Trial:
             position.
         seconds: length.
         clamped: share of the ticks whose action was beyond the arm's or the gripper's limits.
+        light_change: largest change of a fingertip's light since the first picture, as a share.
         episode: what distinguishes it: the object, its mass, or the wire.
     """
 
@@ -58,6 +61,7 @@ class Trial:
     goal_distance: float | None
     seconds: float
     clamped: float
+    light_change: float
     episode: dict[str, Any]
 
 
@@ -147,8 +151,10 @@ def run_trial(config: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec) -> Tri
     try:
         observation, info = env.reset(seed=spec.seed, options=spec.options)
         keys = (ft.WRENCH, ft.TRUTH_PAD_WRENCH, ft.TRUTH_PROGRESS, ft.ACTION)
-        rows, last = [], info
+        rows, last, light = [], info, LightWatch()
         for last in run(env, policy(env), observation, info):
+            if len(rows) % _LIGHT_TICKS == 0:
+                light.update(last)
             rows.append([last[key] for key in keys])  # images would fill the memory
         wrench, pads, progress, actions = (np.stack(column) for column in zip(*rows, strict=True))
         force = np.linalg.norm(wrench[:, :3], axis=1)
@@ -166,6 +172,7 @@ def run_trial(config: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec) -> Tri
             goal_distance=None if away is None else float(away),
             seconds=(len(rows) - 1) / config.control_hz,
             clamped=float(((actions < low) | (actions > high)).any(1)[:-1].mean()),
+            light_change=light.change,
             episode=env.episode_info(),
         )
     finally:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from touchgoal.control.tactile.light_gain import light_advice
 from touchgoal.policies.evaluation.evaluate import Evaluation, Trial
 from touchgoal.sim_envs.scene.objects import SHAPES
 from touchgoal.sim_envs.scene.wires import FAMILIES
@@ -39,6 +40,8 @@ def table(trials: Sequence[Trial]) -> str:
             f"clamped: {clamped:.0%} of the actions are beyond the arm's limits; an action is the "
             "joint changes of one tick (rad) and the gripper's width (m)"
         )
+    if advice := light_advice([t.light_change for t in trials]):
+        lines.append(f"light: {advice}")
     return "\n".join(lines)
 
 

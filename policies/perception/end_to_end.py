@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
+from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 
 _ZERO = 128  # grey level of an unchanged pixel
@@ -31,9 +32,12 @@ def difference_images(
 ) -> UInt8[np.ndarray, "n h w 3"]:
     """Return the change of tactile images since the untouched first one, at the encoder's size."""
     h, w = size
-    change = frames - first.astype(np.int16) + _ZERO
-    frames = np.clip(change, 0, 255).astype(np.uint8)
-    return np.stack([cv2.resize(f, (w, h), interpolation=cv2.INTER_AREA) for f in frames])
+    small = []
+    for frame in frames:
+        change = np.rint(remove_gain(frame, first)) - first + _ZERO
+        picture = np.clip(change, 0, 255).astype(np.uint8)
+        small.append(cv2.resize(picture, (w, h), interpolation=cv2.INTER_AREA))
+    return np.stack(small)
 
 
 class EndToEndEncoder(nn.Module):

@@ -1,0 +1,103 @@
+"""Light of a fingertip: its change since the untouched picture, measured and taken out.
+
+An LED that warms up, or a camera's exposure, multiplies each colour channel by a factor. Whatever
+compares a picture with an untouched one divides by that factor first, with `remove_gain`.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from touchgoal.control.features import TACTILE, Observation
+
+Picture = UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"]
+
+GAIN_SPREAD = 0.047
+"""Standard deviation of a channel's brightness between 150,000 real touches of Minis (Tactile-MNIST)."""
+LARGE_CHANGE = 2 * GAIN_SPREAD
+"""Change of a channel's brightness beyond what training has shown, as a share."""
+_ROWS = 32  # of cells that a picture is compared in; 30 x 40 at 240 x 320
+_DARK, _BRIGHT = 16.0, 250.0  # counts below which noise counts, and above which pixels clip
+_LEAST_CELLS = 0.05  # share of the cells from which a channel's gain can be told
+_LEAST_GAIN = 0.04  # of a picture that is all but black
+
+
+def light_gain(picture: Picture, untouched: Picture) -> Float32[np.ndarray, "3"]:
+    """Return the factor of each channel's brightness between two pictures of a fingertip.
+
+    It is the median ratio over a grid of cells, which a contact of less than half the gel leaves
+    alone. Cells that are dark or clipped do not count; a channel without others keeps 1.
+
+    Args:
+        picture: RGB, touched or not.
+        untouched: the same sensor untouched, RGB, of the same size.
+    """
+    now, before = _cells(picture), _cells(untouched)
+    usable = (before > _DARK) & (before < _BRIGHT) & (now < _BRIGHT)
+    ratios = now / np.maximum(before, 1)
+    gain = np.ones(3, np.float32)
+    for channel in range(3):
+        ratio = ratios[channel, usable[channel]]
+        if ratio.size >= _LEAST_CELLS * now.shape[1]:
+            middle = ratio.size // 2
+            gain[channel] = np.partition(ratio, middle)[middle]
+    return np.maximum(gain, _LEAST_GAIN)
+
+
+def remove_gain(picture: Picture, untouched: Picture) -> Float32[np.ndarray, "h w 3"]:
+    """Return a picture as it would look in the light of the untouched one, counts."""
+    return divide_gain(picture, light_gain(picture, untouched))
+
+
+def divide_gain(picture: Picture, gain: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "h w 3"]:
+    """Return a picture without a known gain."""
+    rows, columns, _ = picture.shape
+    factors = np.tile(1 / gain, columns)  # whole rows at once: three times faster
+    return (picture.reshape(rows, -1) * factors).reshape(picture.shape)
+
+
+def _cells(picture: Picture) -> Float32[np.ndarray, "3 n"]:
+    """Return the means of each channel over parts of every n-th row: a grid of cells, as a list."""
+    step = max(picture.shape[0] // _ROWS, 1)
+    rows = picture[::step].astype(np.float32)
+    size = max(picture.shape[1] // step, 1), len(rows)
+    return cv2.resize(rows, size, interpolation=cv2.INTER_AREA).reshape(-1, 3).T
+
+
+class LightWatch:
+    """Largest change of the fingertips' light since the first picture of an episode.
+
+    Attributes:
+        change: of the channel that changed most, as a share; -0.15 is 15 % dimmer.
+    """
+
+    def __init__(self) -> None:
+        self.change = 0.0
+        self._first: dict[str, Picture] = {}
+
+    def update(self, observation: Observation) -> None:
+        """Take the fingertips' pictures of an observation into account; the first are untouched."""
+        for key in TACTILE:
+            if key in observation:
+                first = self._first.setdefault(key, observation[key])
+                changes = light_gain(observation[key], first) - 1
+                self.change = float(max(self.change, *changes, key=abs))
+
+
+def light_advice(changes: Sequence[float]) -> str:
+    """Say what a large change of the light means and what to do; empty if there is none.
+
+    Args:
+        changes: largest one of each episode (`LightWatch.change`).
+    """
+    large = [change for change in changes if abs(change) > LARGE_CHANGE]
+    if not large:
+        return ""
+    where = f" in {len(large)} of {len(changes)} episodes" if len(changes) > 1 else ""
+    return (
+        f"the fingertips' light changed by up to {max(large, key=abs):+.0%} after the first "
+        f"picture{where}; it is corrected, but sensors in training differ by {LARGE_CHANGE:.0%} at "
+        "most: let the lamps warm up, fix exposure and white balance, and start again"
+    )
