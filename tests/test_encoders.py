@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file, save_file
 
+from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.infonce import info_nce, loss_floor, symmetric_info_nce
@@ -68,19 +69,21 @@ def test_preprocessor_is_named_after_the_sensor() -> None:
 def test_untouched_is_zero_and_change_is_in_units_of_the_scale(rng: np.random.Generator) -> None:
     background = rng.integers(50, 200, (240, 320, 3)).astype(np.uint8)
     pressed = background.copy()
-    pressed[:120, :, 1] += 16
+    pressed[:80, :, 1] += 16
     out = MINI(np.stack([background, pressed]), background)
     assert out.shape == (2, 3, 120, 160)
     np.testing.assert_array_equal(out[0], 0)
     expected = np.zeros((3, 120, 160))
-    expected[1, :60] = 16 / MINI.scale
+    expected[1, :40] = 16 / MINI.scale
     np.testing.assert_allclose(out[1], expected, atol=1e-6)
 
 
 def test_pixels_are_averaged_over_their_area(rng: np.random.Generator) -> None:
     frame = rng.integers(0, 256, (1, 240, 320, 3)).astype(np.uint8)
-    out = MINI(frame, np.full((240, 320, 3), 100, np.uint8))
-    blocks = frame[0].reshape(120, 2, 160, 2, 3).mean((1, 3)).transpose(2, 0, 1)
+    background = np.full((240, 320, 3), 100, np.uint8)
+    out = MINI(frame, background)
+    steady = remove_gain(frame[0], background)
+    blocks = steady.reshape(120, 2, 160, 2, 3).mean((1, 3)).transpose(2, 0, 1)
     np.testing.assert_allclose(out[0] * MINI.scale + 100, blocks, atol=1e-3)
 
 
