@@ -1,6 +1,7 @@
 """What trainings without labels learn from: several folders of several kinds, none of it held out."""
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 import torch
 from published_files import encoded, gel, write, write_slides
 
+from touchgoal.encoders.ssl.config import DINO_PRESETS
 from touchgoal.encoders.ssl.unlabelled_touch import open_touch
 from touchgoal.episodes.media import write_video
+from touchgoal.launch.__main__ import read_options
 from touchgoal.runtime.errors import UserError
 
 SPLITS = "train", "unlabelled", "val", "test"
@@ -93,3 +96,11 @@ def test_what_cannot_be_learned_from_together_is_one_line(tmp_path: Path) -> Non
         open_touch([write_videos(tmp_path / "held", ("val",))], (), None)
     with pytest.raises(UserError, match="leave --validation out"):
         open_touch([videos], [tmp_path / "slides" / ".." / "videos"], None)
+
+
+def test_a_preset_sets_defaults_that_options_override() -> None:
+    words = "dino --data x --preset paper --dino.epochs 3".split()
+    _, config = read_options("train-encoder", words)
+    assert config.dino == replace(DINO_PRESETS["paper"], epochs=3)
+    _, config = read_options("train-encoder", ["dino", "--data", "x"])
+    assert config.dino == DINO_PRESETS["default"]

@@ -4,7 +4,7 @@ The `paper` presets are Sparsh's Table 2 (Higuera et al. 2024); what it leaves o
 released code, see each objective. The predictors' sizes are those of the released code.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -30,13 +30,33 @@ def _check_heads(network: str, width: int, heads: int) -> None:
 
 
 @checked_dataclass
-class MaeConfig:
-    """Hyperparameters of masked autoencoding (MAE)."""
+class _UnlabelledConfig:
+    """Hyperparameters that all objectives share."""
 
     vit: Literal["tiny", "compact", "small", "base"] = "compact"
-    """Size of the backbone, a ViT; base is the paper's and needs --mae.stacked."""
+    """Size of the backbone, a ViT; base is the paper's."""
+    epochs: Count = 30
+    """Passes over the touches."""
+    batch_size: Count = 64
+    """Touches in each step; all of them if there are fewer."""
+    lr: Positive = 1e-3
+    """Highest learning rate of AdamW; it rises from 0 during `warmup`, then falls by a cosine."""
+    warmup: Annotated[Fraction, RARE] = 0.1
+    """Share of the steps in which the learning rate rises from 0."""
+    weight_decay: NotNegative = 0.04
+    """Weight decay of weight matrices and convolutions at the start."""
+
+
+@checked_dataclass
+class MaeConfig(_UnlabelledConfig):
+    """Hyperparameters of masked autoencoding (MAE)."""
+
+    batch_size: Count = 128
+    weight_decay: NotNegative = 0.05
+    final_weight_decay: Annotated[NotNegative | None, RARE] = None
+    """Weight decay at the end, reached by a cosine; default: as at the start."""
     stacked: bool = False
-    """Stack an earlier frame as further input channels, as Sparsh does."""
+    """Stack an earlier frame as further input channels, as Sparsh does; `base` needs it."""
     mask_ratio: Annotated[float, Field(ge=0, lt=1)] = 0.5
     """Share of the patches hidden from the backbone."""
     bottleneck: bool = True
@@ -48,20 +68,8 @@ class MaeConfig:
     """Number of the decoder's blocks."""
     decoder_heads: Annotated[Count, RARE] = 4
     """Attention heads of each decoder block; they divide the decoder's width."""
-    epochs: Count = 30
-    """Passes over the touches."""
-    batch_size: Count = 128
-    """Touches in each step; all of them if there are fewer."""
-    lr: Positive = 1e-3
-    """Highest learning rate of AdamW; it rises from 0 during `warmup`, then falls to 0 by a cosine."""
-    warmup: Annotated[Fraction, RARE] = 0.1
-    """Share of the steps in which the learning rate rises from 0."""
     second_moment: Annotated[Fraction, RARE] = 0.999
     """AdamW's beta 2: decay of its running mean of squared gradients."""
-    weight_decay: NotNegative = 0.05
-    """Weight decay of weight matrices and convolutions at the start."""
-    final_weight_decay: Annotated[NotNegative | None, RARE] = None
-    """Weight decay at the end, reached by a cosine; default: as at the start."""
 
     def __post_init__(self) -> None:
         """Raise OptionError for a network that cannot be built."""
@@ -93,23 +101,11 @@ MAE_PRESETS: dict[str, MaeConfig] = {
 
 
 @checked_dataclass
-class SelfDistillationConfig:
-    """Hyperparameters that DINO, I-JEPA and V-JEPA share: sizes and schedules."""
+class SelfDistillationConfig(_UnlabelledConfig):
+    """Hyperparameters that DINO, I-JEPA and V-JEPA share: the teacher and schedules."""
 
-    vit: Literal["tiny", "compact", "small", "base"] = "compact"
-    """Size of the backbone, a ViT; base is the paper's."""
-    epochs: Count = 30
-    """Passes over the touches."""
-    batch_size: Count = 64
-    """Touches in each step; all of them if there are fewer."""
-    lr: Positive = 1e-3
-    """Highest learning rate of AdamW; it rises from 0 during `warmup`, then falls by a cosine."""
     final_lr: Annotated[Fraction, RARE] = 1e-3
     """Learning rate at the end as a share of `lr`."""
-    warmup: Annotated[Fraction, RARE] = 0.1
-    """Share of the steps in which the learning rate rises from 0."""
-    weight_decay: NotNegative = 0.04
-    """Weight decay of weight matrices and convolutions at the start."""
     final_weight_decay: NotNegative = 0.4
     """Weight decay at the end, reached by a cosine."""
     momentum: Fraction = 0.99
@@ -220,33 +216,21 @@ class VJepaConfig(PredictorConfig):
     """Hidden blocks of the second mask."""
 
 
+_JEPA_PAPER: dict[str, Any] = {
+    "vit": "base",
+    "epochs": 150,
+    "batch_size": 150,
+    "lr": 6.25e-4,
+    "final_lr": 1.6e-3,
+    "warmup": 0.2,
+    "momentum": 0.996,
+    "predictor_heads": 12,
+}
 IJEPA_PRESETS: dict[str, IJepaConfig] = {
     "default": IJepaConfig(),
-    "paper": IJepaConfig(
-        vit="base",
-        epochs=150,
-        batch_size=150,
-        lr=6.25e-4,
-        final_lr=1.6e-3,
-        warmup=0.2,
-        momentum=0.996,
-        predictor_width=192,
-        predictor_depth=6,
-        predictor_heads=12,
-    ),
+    "paper": IJepaConfig(**_JEPA_PAPER, predictor_width=192, predictor_depth=6),
 }
 VJEPA_PRESETS: dict[str, VJepaConfig] = {
     "default": VJepaConfig(),
-    "paper": VJepaConfig(
-        vit="base",
-        epochs=150,
-        batch_size=150,
-        lr=6.25e-4,
-        final_lr=1.6e-3,
-        warmup=0.2,
-        momentum=0.996,
-        predictor_width=384,
-        predictor_depth=12,
-        predictor_heads=12,
-    ),
+    "paper": VJepaConfig(**_JEPA_PAPER, predictor_width=384, predictor_depth=12),
 }
