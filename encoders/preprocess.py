@@ -1,4 +1,4 @@
-"""Raw fingertip frames to network input: the same numbers in training, tests and deployment."""
+"""Preprocessing of raw fingertip frames: the same numbers in training, tests and deployment."""
 
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
@@ -15,44 +15,42 @@ _ASPECT_TOLERANCE = 0.02  # a GelSight Mini's own 3280 x 2464 differs from 4:3 b
 
 @runtime_checkable  # beartype checks arguments in tests
 class Preprocessor(Protocol):
-    """What makes a network's numbers of raw frames, whatever they are."""
+    """Preprocessor of raw frames to network input."""
 
     @property
     def id(self) -> str:
-        """Changes whenever the numbers do."""
+        """Return an identity that changes whenever the numbers do."""
         ...
 
     @property
     def sensor(self) -> str | None:
-        """The only sensor that it is for, if there is but one."""
+        """Return the only sensor that it is for, or None for any."""
         ...
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width of the output, px."""
+        """Return height and width of the output, px."""
         ...
 
     def __call__(
         self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
     ) -> Float32[np.ndarray, "n 3 H W"]:
-        """Frames of one sensor, given the same sensor untouched; UserError for another's."""
+        """Preprocess frames, given the untouched sensor; UserError for another sensor's."""
         ...
 
 
 @dataclass(frozen=True)
 class TactilePreprocessor:
-    """Resizes, subtracts the untouched sensor and divides by a constant.
+    """Removal of light changes, subtraction of the untouched sensor, resizing and scaling.
 
-    A change of the light since the untouched picture is taken out first (`light_gain`).
-
-    Any change of the numbers that come out in steady light needs a new version: encoders refuse to
-    load under another preprocessor than they were trained with.
+    Any change of the output in steady light needs a new version: encoders refuse to load under
+    another preprocessor than they were trained with.
 
     Attributes:
-        sensor: `control.sensors.SensorModel.name`.
-        version: Counts changes.
-        size: Height and width of the output in pixels.
-        scale: Grey levels (of 255) that make 1.0; about the contrast of a firm contact.
+        sensor: `SensorModel.name`.
+        version: Version of the numbers.
+        size: Height and width of the output, px.
+        scale: Grey levels (of 255) that become 1.0; about the contrast of a firm contact.
     """
 
     sensor: str
@@ -62,23 +60,20 @@ class TactilePreprocessor:
 
     @property
     def id(self) -> str:
-        """Names sensor and version, e.g. "gelsight_mini/v1"."""
+        """Return sensor and version, e.g. "gelsight_mini/v1"."""
         return f"{self.sensor}/v{self.version}"
 
     def __call__(
         self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
     ) -> Float32[np.ndarray, "n 3 H W"]:
-        """Signed change against the untouched sensor; zero where nothing touches.
+        """Return the signed change against the untouched sensor; zero without contact.
 
-        Pixels are averaged over the area they cover (interpolated if the frames are smaller than
-        the output), after the subtraction, so that rounding does not eat faint contacts.
-
-        Args:
-            frames: Raw RGB frames of one sensor.
-            background: The same sensor untouched.
+        A gain of the light is removed first (`light_gain`). Pixels are averaged over their area
+        (interpolated if the frames are smaller than the output) after the subtraction, so that
+        rounding keeps faint contacts.
 
         Raises:
-            UserError: The pictures have another shape (aspect ratio) than the sensor's.
+            UserError: The frames have another aspect ratio than the sensor's.
         """
         self._check(frames.shape[1:3])
         h, w = self.size
@@ -100,30 +95,30 @@ class TactilePreprocessor:
             )
 
 
-def check_pictures(name: str, pictures: object, ndim: tuple[int, ...]) -> None:
-    """Raises UserError, in one line, unless these are RGB pictures as cameras give them.
+def check_images(name: str, images: object, ndim: tuple[int, ...]) -> None:
+    """Raise UserError, in one line, unless these are RGB images.
 
     Args:
-        name: what they are called in the message.
-        pictures: to be uint8 numpy arrays, (height, width, 3) or (n, height, width, 3).
-        ndim: the numbers of axes allowed: 3, 4 or both.
+        name: Their name in the message.
+        images: Expected are uint8 numpy arrays, (height, width, 3) or (n, height, width, 3).
+        ndim: Allowed numbers of axes: 3, 4 or both.
     """
     shapes = " or ".join({3: "(height, width, 3)", 4: "(n, height, width, 3)"}[n] for n in ndim)
-    wanted = f"{name} must be RGB pictures as a numpy array of uint8 (0 to 255), {shapes}"
-    if not isinstance(pictures, np.ndarray):
-        kind = type(pictures)
+    expected = f"{name} must be RGB images as a numpy array of uint8 (0 to 255), {shapes}"
+    if not isinstance(images, np.ndarray):
+        kind = type(images)
         hint = ": tensor.cpu().numpy()" if kind.__module__ == "torch" else ""
-        raise UserError(f"{wanted}, not a {kind.__module__}.{kind.__qualname__}{hint}")
-    if pictures.dtype != np.uint8:
-        unit = np.issubdtype(pictures.dtype, np.floating)
+        raise UserError(f"{expected}, not a {kind.__module__}.{kind.__qualname__}{hint}")
+    if images.dtype != np.uint8:
+        unit = np.issubdtype(images.dtype, np.floating)
         hint = ": values of 0 to 1 become (255 * images).round().astype(np.uint8)" if unit else ""
-        raise UserError(f"{wanted}, not of {pictures.dtype}{hint}")
-    if pictures.ndim not in ndim or pictures.shape[-1] != 3:
-        first = pictures.ndim in (3, 4) and pictures.shape[-3] == 3
+        raise UserError(f"{expected}, not of {images.dtype}{hint}")
+    if images.ndim not in ndim or images.shape[-1] != 3:
+        first = images.ndim in (3, 4) and images.shape[-3] == 3
         hint = ": put the colours last, np.moveaxis(images, -3, -1)" if first else ""
-        raise UserError(f"{wanted}, not of shape {pictures.shape}{hint}")
-    if 0 in pictures.shape:
-        raise UserError(f"{wanted}, and at least one: these have shape {pictures.shape}")
+        raise UserError(f"{expected}, not of shape {images.shape}{hint}")
+    if 0 in images.shape:
+        raise UserError(f"{expected}, and at least one: these have shape {images.shape}")
 
 
 PREPROCESSORS: dict[str, TactilePreprocessor] = {
@@ -146,7 +141,7 @@ PREPROCESSORS: dict[str, TactilePreprocessor] = {
 
 
 def preprocessor_for(sensor: str) -> TactilePreprocessor:
-    """The preprocessor of a sensor; UserError for an unknown one."""
+    """Return the preprocessor of a sensor; UserError for an unknown one."""
     if sensor not in PREPROCESSORS:
         raise UserError(f"unknown sensor '{sensor}': choose from {', '.join(PREPROCESSORS)}")
     return PREPROCESSORS[sensor]

@@ -66,7 +66,7 @@ def main(config: Config) -> None:
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.json_file import write_json
 
-    check_training(config.trainer, config.out, _CONTACT)
+    check_training(config, config.out, _CONTACT)
     sets = open_sets(config.data, config.validation)
     encoder = config.encoder or pretrained.DEFAULT_ENCODER
     touch = load_touch(encoder)
@@ -83,7 +83,7 @@ def main(config: Config) -> None:
     provenance = recipe(*sets)
     rows, validation = (training.embed_touch_and_contact(s, touch, config.workers) for s in sets)
     training.train_contact_estimator(
-        network, *rows, config.train, out / _CONTACT, config.trainer, provenance
+        network, *rows, config.train, out / _CONTACT, config, provenance
     )
     errors: dict = {"contact": training.contact_error_rate(network, *validation)}
     cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key, _ in pose_config.crops)
@@ -96,7 +96,7 @@ def main(config: Config) -> None:
             render_placements(env, config.objects, config.placements, first_seed, config.workers),
             config.train,
             out / _POSE,
-            replace(config.trainer, resume=config.resume and has_checkpoint(out / _POSE)),
+            replace(config, resume=config.resume and has_checkpoint(out / _POSE)),
             provenance,
         )
     if not is_first_process():

@@ -130,7 +130,7 @@ def main(config: Config) -> None:
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.json_file import write_json
 
-    check_training(config.trainer, config.out)
+    check_training(config, config.out)
     if config.end_to_end and config.encoder:
         raise UserError("--end-to-end and --encoder exclude each other: leave out one")
     touch = load_touch(config.encoder) if config.encoder else None
@@ -165,7 +165,7 @@ def main(config: Config) -> None:
     )
     print(f"{len(windows)} windows of {len(rows[0])} episodes; {len(validation)} for validation")
     provenance = recipe(*sets) | {"episodes": len(rows[0])}
-    train(policy, windows, validation, config.train, out, config.trainer, provenance)
+    train(policy, windows, validation, config.train, out, config, provenance)
     if not is_first_process():
         return
     add_parts(out / POLICY, parts)

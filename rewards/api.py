@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from touchgoal.control.features import CONTROL_HZ, FRONT, TACTILE, TACTILE_LEFT, TACTILE_RIGHT
-from touchgoal.encoders.preprocess import check_pictures
+from touchgoal.encoders.preprocess import check_images
 from touchgoal.encoders.pretrained import DEFAULT_ENCODER, AnyTouchEncoder
 from touchgoal.encoders.towers.towers import Towers
 from touchgoal.episodes.schema import Episode
@@ -111,7 +111,7 @@ def _as_episode(
         raise UserError("nothing to measure: give images, tactile or both")
     names = {key: side for side, key in _SIDES.items()} | {camera: "images"}
     for key, pictures in frames.items():
-        check_pictures(names[key], pictures, ndim=(4,))
+        check_images(names[key], pictures, ndim=(4,))
     lengths = {names[key]: len(pictures) for key, pictures in frames.items()}
     if len(set(lengths.values())) > 1:
         counts = ", ".join(f"{name} {n}" for name, n in lengths.items())
@@ -124,7 +124,7 @@ def _as_episode(
 def _as_specs(goal: GoalLike, episode: Episode) -> list[GoalSpec]:
     """Return a script's goal in the forms of rewards/goals.py."""
     if isinstance(goal, np.ndarray):
-        check_pictures("the goal", goal, ndim=(3,))
+        check_images("the goal", goal, ndim=(3,))
         return [PictureArray(goal)]
     if isinstance(goal, Mapping):
         return _array_specs(goal, episode)
@@ -140,7 +140,7 @@ def _array_specs(goal: Mapping[str, np.ndarray], episode: Episode) -> list[GoalS
     for name, picture in goal.items():
         if name != "image" and name not in _SIDES:
             raise UserError(f"a goal has no '{name}': give image, left, right or several of them")
-        check_pictures(f"the goal's {name}", picture, ndim=(3,))
+        check_images(f"the goal's {name}", picture, ndim=(3,))
     touch = {_SIDES[name]: picture for name, picture in goal.items() if name in _SIDES}
     sides = {key for key in TACTILE if key in episode.frames}
     if touch and touch.keys() != sides:

@@ -18,7 +18,7 @@ from touchgoal.encoders import pretrained
 from touchgoal.encoders.alignment.infonce import info_nce, loss_floor, symmetric_info_nce
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS, ViT, ViTConfig, random_masking
-from touchgoal.encoders.preprocess import PREPROCESSORS, check_pictures
+from touchgoal.encoders.preprocess import PREPROCESSORS, check_images
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import portable
 
@@ -348,9 +348,9 @@ def test_embed_refuses_what_is_no_picture(wrong: Callable, message: str) -> None
         make_encoder().embed(wrong(images))
     assert "\n" not in str(error.value)
     with pytest.raises(UserError, match=r"not a torch.Tensor: tensor.cpu\(\).numpy\(\)"):
-        check_pictures("images", torch.from_numpy(images), ndim=(3, 4))
+        check_images("images", torch.from_numpy(images), ndim=(3, 4))
     with pytest.raises(UserError, match=r"not a builtins\.list"):
-        check_pictures("images", list(images), ndim=(3, 4))
+        check_images("images", list(images), ndim=(3, 4))
 
 
 def test_embed_takes_one_picture_or_many() -> None:

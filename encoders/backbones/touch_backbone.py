@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from touchgoal.encoders.backbones.frame_history import frame_offsets, past_rows, stack_frames
 from touchgoal.encoders.backbones.sparsh_input import SparshPreprocessor
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
-from touchgoal.encoders.preprocess import Preprocessor, check_pictures, preprocessor_for
+from touchgoal.encoders.preprocess import Preprocessor, check_images, preprocessor_for
 from touchgoal.encoders.towers.towers import Towers, same_towers
 from touchgoal.runtime.errors import UserError
 
@@ -131,7 +131,7 @@ class BaseTouchEncoder(nn.Module):
         Raises:
             UserError: Other images, or one image without its background.
         """
-        check_pictures("images", images, ndim=(3, 4))
+        check_images("images", images, ndim=(3, 4))
         single = images.ndim == 3
         frames = images[None] if single else images
         if background is None and single:
@@ -140,7 +140,7 @@ class BaseTouchEncoder(nn.Module):
                 "image of the same sensor without contact"
             )
         untouched = frames[0] if background is None else background
-        check_pictures("background", untouched, ndim=(3,))
+        check_images("background", untouched, ndim=(3,))
         if untouched.shape != frames.shape[1:]:
             raise UserError(
                 f"the background is {untouched.shape[1]}x{untouched.shape[0]} pixels, the images "

@@ -39,8 +39,3 @@ class DataOptions:
 @checked_dataclass
 class TrainingOptions(TrainerOptions, DataOptions):
     """Options of every training on episodes; `--help` lists those of the last base first."""
-
-    @property
-    def trainer(self) -> TrainerOptions:
-        """The trainer's part of the options."""
-        return TrainerOptions(self.seed, self.device, self.precision, self.resume)
