@@ -64,7 +64,7 @@ def test_a_batch_that_is_not_whole_is_one_line(tmp_path: Path) -> None:
         next(read_strokes(tmp_path))
     write_force_batch(batch)
     (batch / "dataset_digit_01.pkl").unlink()
-    with pytest.raises(UserError, match="10 pictures, .* labels 16: get all its files"):
+    with pytest.raises(UserError, match="10 images, .* labels 16: get all its files"):
         next(read_strokes(tmp_path))
     write_force_batch(batch)
     (batch / "dataset_slip_forces.pkl").unlink()
@@ -77,7 +77,7 @@ def test_a_batch_that_is_not_whole_is_one_line(tmp_path: Path) -> None:
     [
         (lambda v: v.pop("trajectories"), "has no 'trajectories'"),
         (lambda v: v.update(trajectories={}), "has no stroke"),
-        (lambda v: v.update(in_contact=np.ones(16)), "labelled as untouched"),
+        (lambda v: v.update(in_contact=np.ones(16)), "labelled as without contact"),
         (lambda v: v.update(in_contact=["yes"] * 16), "no plain numbers"),
         (lambda v: v["trajectories"][0].pop("forces"), "stroke 0 in .* has no 'forces'"),
         (lambda v: v["trajectories"][0].update(forces=np.full((6, 3), np.nan)), "not all between"),
@@ -94,7 +94,7 @@ def test_a_batch_that_is_not_whole_is_one_line(tmp_path: Path) -> None:
             lambda v: v["trajectories"][0].update(indexes=np.arange(16, 22)),
             "whole numbers from 0 to 15",
         ),
-        (lambda v: v["trajectories"][0].update(indexes=np.arange(3)), "3 pictures, 6 forces"),
+        (lambda v: v["trajectories"][0].update(indexes=np.arange(3)), "3 images, 6 forces"),
         (lambda v: v["trajectories"][0].update(slip_label=np.full(6, 2)), "from 0 to 1"),
     ],
 )

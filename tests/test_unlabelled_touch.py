@@ -92,7 +92,7 @@ def test_what_cannot_be_learned_from_together_is_one_line(tmp_path: Path) -> Non
         open_touch([videos], (), "digit")
     with pytest.raises(UserError, match="videos holds no recordings out: .* --validation"):
         open_touch([write_videos(tmp_path / "a" / "videos", ("train",))], (), None)
-    with pytest.raises(UserError, match="has no video to learn from: .* train or unlabelled"):
+    with pytest.raises(UserError, match="has no video to train on: .* train or unlabelled"):
         open_touch([write_videos(tmp_path / "held", ("val",))], (), None)
     with pytest.raises(UserError, match="leave --validation out"):
         open_touch([videos], [tmp_path / "slides" / ".." / "videos"], None)

@@ -94,7 +94,7 @@ def _follow(
     rows = []
     for picture in others:
         now = tracker.update(picture.frame())
-        found = picture.seen & first.seen
+        found = picture.found & first.found
         theirs = picture.positions - first.positions
         off = np.linalg.norm(tracker.displacement - theirs, axis=-1)
         ours = (now.positions - middle).reshape(-1, 2)

@@ -1,6 +1,6 @@
-"""Grasps with a known force: the layout of EstimateModulus (MIT, arXiv 2407.15304).
+"""Grasps with a measured force: the layout of EstimateModulus (MIT, arXiv 2407.15304).
 
-A folder holds `grasps.csv` (trial, object), and of each trial `TRIAL.avi` (a fingertip's raw pictures)
+A folder holds `grasps.csv` (trial, object), and for each trial `TRIAL.avi` (a fingertip's raw images)
 and `TRIAL.csv` (force_newtons, gripper_width_m; one row a frame).
 """
 
@@ -25,12 +25,12 @@ class ForceGrasp:
     """One grasp, from the open hand and back.
 
     Attributes:
-        trial: its name.
-        object: id of the thing.
-        video: its file.
-        force: of the grasp, N, one a frame, as its load cell says: spikes and drift included.
-        width: of the gripper, m, one a frame.
-        corners: of the gel in the pictures, px, if they are to be rectified.
+        trial: Name of the grasp.
+        object: Id of the object.
+        video: Video file.
+        force: Grasp force of each frame, N, as the load cell gives it, with spikes and drift.
+        width: Gripper width of each frame, m.
+        corners: Corners of the gel in the images, px, if they are to be rectified.
     """
 
     trial: str
@@ -41,7 +41,7 @@ class ForceGrasp:
     corners: Corners | None = None
 
     def frames(self) -> UInt8[np.ndarray, "m h w 3"]:
-        """RGB frames, as many as `force` has: raw, or the gel as a GelSight Wedge shows it."""
+        """Return as many RGB frames as `force` has: raw, or rectified to a GelSight Wedge's gel."""
         frames = read_frames(self.video)[0][: len(self.force)]
         if self.corners is None:
             return frames
@@ -49,10 +49,10 @@ class ForceGrasp:
 
 
 def read_force_grasps(folder: Path, corners: Corners | None = None) -> list[ForceGrasp]:
-    """The grasps of a folder; with corners of the gel in its pictures, they are rectified.
+    """Read the grasps of a folder; with corners of the gel, their images are rectified.
 
     Raises:
-        UserError: a table, a column or a video is missing.
+        UserError: A table, a column or a video is missing.
     """
     index = folder / "grasps.csv"
     if not index.is_file():

@@ -1,4 +1,4 @@
-"""Touch videos with ranks of what they feel like: PhysiCLeAR (Octopi, RSS 2024, arXiv 2405.02794).
+"""Touch videos with ranked object properties: PhysiCLeAR (Octopi, RSS 2024, arXiv 2405.02794).
 
 A folder holds `videos/` and `labels.csv` with the columns file, object, name, split (train, val, test or
 unlabelled), hardness, roughness and bumpiness (0, 1 or 2 each; empty where not ranked).
@@ -17,23 +17,23 @@ from touchgoal.runtime.errors import UserError
 
 PROPERTIES = ("hardness", "roughness", "bumpiness")
 FIRMEST = 5
-"""Frames of a video that count, those of the largest change, as published for PhysiCLeAR."""
+"""Number of frames of the largest change that represent a video, as published for PhysiCLeAR."""
 
-_SMALL = 80, 60  # px at which the change is looked for
+_SMALL = 80, 60  # px at which the change is measured
 _TABLE = "labels.csv"
 _COLUMNS = ("file", "object", "name", "split", *PROPERTIES)
 
 
 @dataclass(frozen=True)
 class LabelledVideo:
-    """One press of one thing.
+    """One press of an object.
 
     Attributes:
-        path: of the video.
-        object: id of the thing.
-        name: what people call it.
+        path: Video file.
+        object: Id of the object.
+        name: Name of the object.
         split: train, val, test or unlabelled.
-        ranks: hardness, roughness, bumpiness, 0 to 2; None where not ranked.
+        ranks: Hardness, roughness and bumpiness, 0 to 2; None where not ranked.
     """
 
     path: Path
@@ -43,20 +43,20 @@ class LabelledVideo:
     ranks: tuple[int, int, int] | None
 
     def frames(self) -> UInt8[np.ndarray, "n h w 3"]:
-        """RGB frames; the first few are untouched."""
+        """Return the RGB frames; the first few are without contact."""
         return read_frames(self.path)[0]
 
 
 def has_labels(folder: Path) -> bool:
-    """Whether a folder has the table of such videos."""
+    """Return whether a folder has the table of such videos."""
     return (folder / _TABLE).is_file()
 
 
 def read_labelled_videos(folder: Path) -> list[LabelledVideo]:
-    """The videos of a folder, in the order of `labels.csv`.
+    """List the videos of a folder, in the order of `labels.csv`.
 
     Raises:
-        UserError: no such table, a column or a video is missing, or a rank is none.
+        UserError: No such table, a column or a video is missing, or a rank is not 0, 1 or 2.
     """
     table = folder / _TABLE
     if not has_labels(folder):
@@ -74,7 +74,7 @@ def read_labelled_videos(folder: Path) -> list[LabelledVideo]:
 def firmest_frames(
     frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
 ) -> Int[np.ndarray, " k"]:
-    """Rows of the frames that differ most from the untouched sensor, in the order of time."""
+    """Return the indices of the frames that differ most from the untouched sensor, in time."""
     change = np.abs(_shrunk(frames) - _shrunk(background[None])).mean((1, 2, 3))
     return np.sort(np.argsort(-change, kind="stable")[:FIRMEST])
 

@@ -1,4 +1,4 @@
-"""Labels in the pickles of published files: arrays as they must be, or one line."""
+"""Checks of the labels in published pickles: arrays of the expected shape and range, or a UserError."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -10,7 +10,7 @@ from touchgoal.runtime.errors import UserError
 
 
 def entry(value: Any, key: str, name: str) -> Any:
-    """What a dictionary holds under a key; UserError if it is none, or has no such key."""
+    """Return the value of a key; UserError if `value` is no dictionary or lacks the key."""
     if not isinstance(value, dict) or key not in value:
         raise UserError(f"{name} has no '{key}': get it again, as published")
     return value[key]
@@ -19,13 +19,13 @@ def entry(value: Any, key: str, name: str) -> Any:
 def numbers(
     value: Any, shape: tuple[int | None, ...], most: float, name: str
 ) -> Float64[np.ndarray, "..."]:
-    """An array of finite numbers.
+    """Return an array of finite numbers.
 
     Args:
-        value: an array, or a list of numbers or of arrays.
-        shape: None where any length will do.
-        most: the largest size that a number may have.
-        name: for the message.
+        value: Array, or list of numbers or of arrays.
+        shape: Expected shape, None for any length.
+        most: Largest magnitude.
+        name: Name for the message.
     """
     array = np.asarray(_array(value, name), np.float64)
     fits = array.ndim == len(shape) and all(
@@ -33,13 +33,13 @@ def numbers(
     )
     if not fits:
         raise UserError(f"{name} are of shape {array.shape}, not {shape}".replace("None", "n"))
-    if not (np.abs(array) <= most).all():  # which NaN is not, either
+    if not (np.abs(array) <= most).all():  # False for NaN
         raise UserError(f"{name} are not all between -{most:g} and {most:g}")
     return array
 
 
 def whole_numbers(value: Any, most: int, name: str) -> Int64[np.ndarray, " n"]:
-    """A row of whole numbers from 0 to `most`."""
+    """Return a row of whole numbers from 0 to `most`."""
     array = numbers(value, (None,), 2.0**53, name)
     if (array != np.floor(array)).any() or (array < 0).any() or (array > most).any():
         raise UserError(f"{name} are not all whole numbers from 0 to {most}")
@@ -47,7 +47,7 @@ def whole_numbers(value: Any, most: int, name: str) -> Int64[np.ndarray, " n"]:
 
 
 def truths(value: Any, name: str) -> Bool[np.ndarray, " n"]:
-    """A row of noughts and ones, or of truth values."""
+    """Return a row of booleans, also from zeros and ones."""
     return whole_numbers(value, 1, name).astype(bool)
 
 
@@ -67,7 +67,7 @@ def _array(value: Any, name: str) -> np.ndarray:
 
 
 def _is_number_or_row(item: Any) -> bool:
-    """Of one step of nesting at most: whatever else is in a file, this comes to an end."""
+    """Return whether an item is a number or a flat row of numbers."""
     if isinstance(item, np.ndarray):
         return item.dtype.kind in "biuf"
     row: Iterable[Any] = item if isinstance(item, list | tuple) else [item]

@@ -1,19 +1,17 @@
 """Strokes of a probe with force and slip labels: T1 and T2 of TacBench (Sparsh, arXiv 2410.24090, C.2, C.4).
 
-The sets `digit-force-estimation` and `gelsight-force-estimation`: folders PROBE/BATCH (sphere/batch_1)
-with `dataset_digit_NN.pkl` or `dataset_gelsight_NN.pkl`, lists of encoded pictures that follow each other,
-and `dataset_slip_forces.pkl`: `in_contact`, one a picture, and `trajectories`, by number: `indexes` of
-the pictures, `forces` (n, 3) and `slip_label`. In the sets' flat and sharp batches `indexes` has five more,
-which the last ones are.
+The sets `digit-force-estimation` and `gelsight-force-estimation` hold folders PROBE/BATCH (sphere/batch_1)
+with `dataset_digit_NN.pkl` or `dataset_gelsight_NN.pkl`, consecutive lists of encoded images, and
+`dataset_slip_forces.pkl`: `in_contact`, one per image, and numbered `trajectories` with `indexes` of the
+images, `forces` (n, 3) and `slip_label`. In the flat and sharp batches `indexes` has five more at its end.
 
-Forces are in newtons: Sparsh divides them by 4, 4 and 5 N. The third is normal to the gel; its sign is
-not stated, and is taken as that which makes pressing positive (Sparsh's head for it knows no other). Which
-way the first two lie in the picture is not stated.
+Forces are in newtons: Sparsh divides them by 4, 4 and 5 N. The third is normal to the gel; its sign is not
+stated and is taken so that pressing is positive. The image directions of the first two are not stated.
 
-GelSight pictures stand, 320 high; a Mini's lie, and are turned back counter-clockwise here. One batch of
-them (sharp/batch_2) has red and blue exchanged, as people who have the files say: its untouched gel is
-bluer than red, the others' redder. So it is read whatever batch it is. Nothing of the kind is known of the
-DIGIT's. Neither is whether the Mini's gel has dots (name `gelsight_mini_markers` if so).
+GelSight images are stored upright, 320 high, and are turned back counter-clockwise here. One batch
+(sharp/batch_2) has red and blue exchanged: its untouched gel is bluer than red, the others' redder, by
+which any such batch is recognised. Whether the Mini's gel has dots is unknown (name
+`gelsight_mini_markers` if so).
 """
 
 import re
@@ -27,11 +25,11 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 
 from touchgoal.episodes.importers.labels import entry, numbers, truths, whole_numbers
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
-from touchgoal.episodes.importers.touch_clip import TouchClip, check_kind, read_pictures
+from touchgoal.episodes.importers.touch_clip import TouchClip, check_sensor, read_pictures
 from touchgoal.runtime.errors import UserError
 
 STRIDE = 5
-"""Pictures between the two of a pair: 83 ms at a DIGIT's 60 Hz."""
+"""Number of images between the two of a pair: 83 ms at a DIGIT's 60 Hz."""
 _LABELS = "dataset_slip_forces.pkl"
 _PICTURES = re.compile(r"dataset_(digit|gelsight)_\d+\.pkl")
 _KINDS = {"digit": ("digit",), "gelsight": ("gelsight_mini", "gelsight_mini_markers")}
@@ -44,13 +42,13 @@ class ForceStroke:
     """A probe pressed on the gel and drawn over it.
 
     Attributes:
-        name: probe, batch and number.
+        name: Probe, batch and number.
         probe: sphere, sharp or flat.
-        clip: all pictures of the batch.
-        rows: this stroke's pictures among them, in time.
-        force: N; two along the gel, the third into it, positive where pressed.
-        slip: whether the probe slides.
-        untouched: row of the picture without contact that is the last before the stroke.
+        clip: All images of the batch.
+        rows: Indices of the stroke's images among them, in time.
+        force: Force, N; two components along the gel, the third into it, positive under pressure.
+        slip: Whether the probe slides.
+        untouched: Index of the last image without contact before the stroke.
     """
 
     name: str
@@ -62,23 +60,23 @@ class ForceStroke:
     untouched: int
 
     def frames(self) -> UInt8[np.ndarray, "n h w 3"]:
-        """Its pictures, RGB."""
+        """Decode the stroke's RGB images."""
         return self.clip.frames(self.rows)
 
     def background(self) -> UInt8[np.ndarray, "h w 3"]:
-        """The sensor untouched."""
+        """Decode the image of the sensor without contact."""
         return self.clip.frames([self.untouched])[0]
 
 
 def read_strokes(folder: Path, sensor: str | None = None) -> Iterator[ForceStroke]:
-    """The strokes of a published folder, batch after batch; of a batch at a time the labels are held.
+    """Read the strokes of a published folder, one batch at a time.
 
     Args:
-        folder: of a set, of one probe or of one batch.
-        sensor: what recorded it, where the files leave a choice.
+        folder: Folder of a set, of one probe or of one batch.
+        sensor: Sensor model, where the files leave a choice.
 
     Raises:
-        UserError: no such files, another sensor's, or what they hold is not as published.
+        UserError: No such files, another sensor's, or a content that is not as published.
     """
     depths = ("", "*/", "*/*/")
     found = {p.parent for depth in depths for p in folder.glob(f"{depth}dataset_*.pkl")}
@@ -93,7 +91,7 @@ def read_strokes(folder: Path, sensor: str | None = None) -> Iterator[ForceStrok
 
 
 def is_force_set(folder: Path) -> bool:
-    """Whether a folder holds batches of these files."""
+    """Return whether a folder holds batches of these files."""
     return any(any(folder.glob(f"{depth}{_LABELS}")) for depth in ("", "*/", "*/*/"))
 
 
@@ -105,23 +103,23 @@ def _read_batch(batch: Path, sensor: str | None) -> Iterator[ForceStroke]:
     shards = _shards(batch)
     kinds = {match[1] for path in shards if (match := _PICTURES.fullmatch(path.name))}
     if len(kinds) != 1:
-        what = "pictures of two sensors" if kinds else "no pictures (dataset_digit_00.pkl)"
+        what = "images of two sensors" if kinds else "no images (dataset_digit_00.pkl)"
         raise UserError(f"{batch} holds {what}: get it again, as published")
     if not (batch / _LABELS).is_file():
-        raise UserError(f"{batch / _LABELS} is missing, which labels the pictures beside it")
-    named = check_kind(sensor, _KINDS[kinds.pop()], batch)
+        raise UserError(f"{batch / _LABELS} is missing, which labels the images beside it")
+    named = check_sensor(sensor, _KINDS[kinds.pop()], batch)
     pictures = [picture for path in shards for picture in read_pictures(path)]
     labels = read_plain_pickle(batch / _LABELS)
     name = str(batch / _LABELS)
     touched = truths(entry(labels, "in_contact", name), f"'in_contact' of {name}")
     if len(touched) != len(pictures):
         raise UserError(
-            f"{batch} holds {len(pictures)} pictures, {_LABELS} labels {len(touched)}: get all its files"
+            f"{batch} holds {len(pictures)} images, {_LABELS} labels {len(touched)}: get all its files"
         )
     if touched.all():
-        raise UserError(f"no picture in {batch} is labelled as untouched: get it again")
+        raise UserError(f"no image in {batch} is labelled as without contact: get it again")
     untouched = np.flatnonzero(~touched)
-    clip = _colours_mended(TouchClip(str(batch), named, pictures), int(untouched[0]))
+    clip = _with_true_colours(TouchClip(str(batch), named, pictures), int(untouched[0]))
     strokes = list(_trajectories(labels, name, len(pictures)))
     pressed = np.concatenate([force[:, 2] for _, _, force, _ in strokes] or [np.zeros(0)])
     into_gel = np.array([1.0, 1.0, -1.0 if pressed.sum() < 0 else 1.0])
@@ -152,15 +150,15 @@ def _trajectories(labels: Any, name: str, pictures: int) -> Iterator[tuple[str, 
         slip = truths(entry(stroke, "slip_label", own), f"slip labels {own}")
         if len(rows) not in (n, n + STRIDE) or len(slip) < n:
             raise UserError(
-                f"stroke {key} in {name} has {len(rows)} pictures, {n} forces and {len(slip)} slip "
+                f"stroke {key} in {name} has {len(rows)} images, {n} forces and {len(slip)} slip "
                 "labels: get it again, as published"
             )
         if n:
             yield key, rows[:n], force, slip[:n]
 
 
-def _colours_mended(clip: TouchClip, untouched: int) -> TouchClip:
-    """See the top of the page."""
+def _with_true_colours(clip: TouchClip, untouched: int) -> TouchClip:
+    """Exchange red and blue where the untouched gel is bluer than red; see the module."""
     if clip.sensor == "digit":
         return clip
     red, _, blue = clip.frames([untouched])[0].mean((0, 1))

@@ -1,13 +1,13 @@
-"""How an object moves under a finger: T3 of TacBench (Sparsh, arXiv 2410.24090, C.5).
+"""Relative object pose under a finger: T3 of TacBench (Sparsh, arXiv 2410.24090, C.5).
 
-The set `digit-pose-estimation`: `train/OBJECT/bag_NN.pkl` and `test/OBJECT/bag_NN.pkl`, each a dictionary
-with `digit_FINGER`, a list of encoded pictures (index, middle, ring), and `object_FINGER_rel_pose_n5`,
-(n, 4, 4), the object's motion relative to that finger within the last five of them; `bgs/digit_FINGER.png` is
-each finger untouched.
+The set `digit-pose-estimation` holds `train/OBJECT/bag_NN.pkl` and `test/OBJECT/bag_NN.pkl`, each a
+dictionary with `digit_FINGER`, a list of encoded images (index, middle, ring), and
+`object_FINGER_rel_pose_n5`, (n, 4, 4), the object's motion relative to that finger over the last five
+images; `bgs/digit_FINGER.png` shows each finger without contact.
 
-Shifts are taken for millimetres: Sparsh sorts them by 0.1 to 5 without converting, and so the paper draws
-them, but no page states the unit. Along "x", as Sparsh and the paper call it, is the matrix's second row,
-along "y" its first; the turn is that about its third axis.
+Translations are taken for millimetres: Sparsh bins them from 0.1 to 5 without conversion, as the paper plots
+them; no source states the unit. Sparsh's "x" is the matrix's second row, "y" its first; the rotation is that
+about the third axis.
 """
 
 import re
@@ -23,14 +23,14 @@ from touchgoal.episodes.importers.labels import entry, numbers
 from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
 from touchgoal.episodes.importers.touch_clip import (
     TouchClip,
-    check_kind,
+    check_sensor,
+    encoded_pictures,
     read_picture_file,
-    stored_pictures,
 )
 from touchgoal.runtime.errors import UserError
 
 STRIDE = 5
-"""Pictures over which a motion is measured."""
+"""Number of images over which a motion is measured."""
 Finger = Literal["index", "middle", "ring"]
 _MILLIMETRE = 1e-3
 _MOST_SHIFT = 1000.0  # in the file's unit
@@ -42,13 +42,13 @@ class PoseBag:
     """One recording of an object moved by hand under a finger.
 
     Attributes:
-        name: for messages.
+        name: Name for messages.
         object: sugar or pringles.
-        held_out: of the published test set.
-        clip: its pictures.
-        change: of the object's pose since `STRIDE` pictures before (m along x and y, rad), one a picture;
-            the first `STRIDE` have no such past.
-        untouched: file of the finger untouched.
+        held_out: Whether it belongs to the published test set.
+        clip: Images.
+        change: Change of the object's pose over the last `STRIDE` images (m along x and y, rad), one row
+            an image; the first `STRIDE` rows have no such past.
+        untouched: Image file of the finger without contact.
     """
 
     name: str
@@ -59,36 +59,36 @@ class PoseBag:
     untouched: Path
 
     def background(self) -> UInt8[np.ndarray, "h w 3"]:
-        """The finger untouched."""
+        """Read the image of the finger without contact."""
         return read_picture_file(self.untouched, self.clip.sensor)
 
 
 def read_bags(
     folder: Path, finger: Finger = "ring", sensor: str | None = None
 ) -> Iterator[PoseBag]:
-    """The recordings of a published folder, one at a time.
+    """Read the recordings of a published folder, one at a time.
 
     Args:
-        folder: with train/ and test/.
-        finger: which; the paper's is the ring finger.
-        sensor: what recorded it: a DIGIT.
+        folder: Folder with train/ and test/.
+        finger: Finger; the paper uses the ring finger.
+        sensor: Sensor model, which must be a DIGIT.
 
     Raises:
-        UserError: no such files, another sensor's, or what they hold is not as published.
+        UserError: No such files, another sensor's, or a content that is not as published.
     """
     paths = _bags(folder)
     if not paths:
         raise UserError(
             f"{folder} holds no train/OBJECT/bag_00.pkl: give the folder of TacBench's pose estimation"
         )
-    named = check_kind(sensor, ("digit",), folder)
+    named = check_sensor(sensor, ("digit",), folder)
     untouched = folder / "bgs" / f"digit_{finger}.png"
     if not untouched.is_file():
-        raise UserError(f"{untouched} is missing, which shows the {finger} finger untouched")
+        raise UserError(f"{untouched} is missing, which shows the {finger} finger without contact")
     for path in paths:
         bag = read_plain_pickle(path)
         key = f"digit_{finger}"
-        pictures = stored_pictures(entry(bag, key, str(path)), f"'{key}' of {path}")
+        pictures = encoded_pictures(entry(bag, key, str(path)), f"'{key}' of {path}")
         change = _planar(entry(bag, f"object_{finger}_rel_pose_n{STRIDE}", str(path)), str(path))
         count = min(len(pictures), len(change))
         clip = TouchClip(f"{path} ({finger})", named, pictures[:count])
@@ -97,7 +97,7 @@ def read_bags(
 
 
 def is_pose_set(folder: Path) -> bool:
-    """Whether a folder holds these files."""
+    """Return whether a folder holds these files."""
     return bool(_bags(folder))
 
 

@@ -1,10 +1,9 @@
-"""Cloth held by a GelSight, by kind: T6 of TacBench (Sparsh), from active clothing (Yuan et al., ICRA 2018).
+"""Textile classes with a GelSight: T6 of TacBench (Sparsh), from active clothing (Yuan et al., ICRA 2018).
 
-Folders `train/CLASS/CLIP/` and `test/CLASS/CLIP/` with `dataset_gelsight.pkl`, a list of encoded pictures, and
-`metadata.txt` with lines `label: NUMBER` and `class_name: NAME`. No converter from the original videos was
-published: the layout is that of Sparsh's reader. Not known: the pictures' order of colours (taken for RGB),
-whether the gel has dots (`gelsight_markers` if so), and whether a clip begins untouched; Sparsh subtracts
-nothing there.
+Folders `train/CLASS/CLIP/` and `test/CLASS/CLIP/` hold `dataset_gelsight.pkl`, a list of encoded images, and
+`metadata.txt` with lines `label: NUMBER` and `class_name: NAME`: the layout of Sparsh's reader, for no
+converter from the original videos was published. Unknown: the channel order (taken for RGB), whether the gel
+has dots (`gelsight_markers` if so), and whether a clip begins without contact; Sparsh subtracts nothing.
 """
 
 import re
@@ -12,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from touchgoal.episodes.importers.touch_clip import TouchClip, check_kind, read_pictures
+from touchgoal.episodes.importers.touch_clip import TouchClip, check_sensor, read_pictures
 from touchgoal.runtime.errors import UserError
 
 _CLASSES = 20
@@ -21,13 +20,13 @@ _MOST_BYTES = 65_536
 
 @dataclass(frozen=True, eq=False)
 class TextileClip:
-    """One grasp of a piece of cloth.
+    """One grasp of a textile.
 
     Attributes:
-        clip: its pictures.
-        label: number of its class, 0 to 19.
-        name: of its class.
-        held_out: of the published test set.
+        clip: Images.
+        label: Class, 0 to 19.
+        name: Name of the class.
+        held_out: Whether it belongs to the published test set.
     """
 
     clip: TouchClip
@@ -37,10 +36,10 @@ class TextileClip:
 
 
 def read_textiles(folder: Path, sensor: str | None = None) -> Iterator[TextileClip]:
-    """The clips of a folder with train/ and test/, one at a time.
+    """Read the clips of a folder with train/ and test/, one at a time.
 
     Raises:
-        UserError: no such files, another sensor's, or what they hold is not as published.
+        UserError: No such files, another sensor's, or a content that is not as published.
     """
     layout = "*/*/dataset_gelsight.pkl"
     paths = [p for use in ("train", "test") for p in sorted(folder.glob(f"{use}/{layout}"))]
@@ -48,7 +47,7 @@ def read_textiles(folder: Path, sensor: str | None = None) -> Iterator[TextileCl
         raise UserError(
             f"{folder} holds no train/CLASS/CLIP/dataset_gelsight.pkl: give a folder of textiles"
         )
-    named = check_kind(sensor, ("gelsight", "gelsight_markers"), folder)
+    named = check_sensor(sensor, ("gelsight", "gelsight_markers"), folder)
     for path in paths:
         label, name = _read_metadata(path.with_name("metadata.txt"))
         clip = TouchClip(str(path), named, read_pictures(path))

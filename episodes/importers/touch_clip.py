@@ -1,4 +1,4 @@
-"""Pictures of one fingertip as published files hold them: encoded, and left there until asked for."""
+"""Images of one fingertip as published files hold them: encoded, and decoded when asked for."""
 
 import struct
 import zlib
@@ -11,77 +11,76 @@ from jaxtyping import Int, UInt8
 
 from touchgoal.control.sensors.picture_integrity import JpegDecoder
 from touchgoal.control.tactile.sensor_models import SENSORS
-from touchgoal.episodes.importers.plain_pickle import StoredBytes, read_plain_pickle
+from touchgoal.episodes.importers.plain_pickle import read_plain_pickle
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.picture_file import decode_picture
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
-_LOOKS = 25  # pictures from all over a clip by which its untouched gel is found
+_MEDIAN_IMAGES = 25  # spread over a clip, for its untouched gel
 
 Picture = UInt8[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True, eq=False)
 class TouchClip:
-    """Pictures of one fingertip, in time.
+    """Images of one fingertip, in time.
 
     Attributes:
-        name: for messages.
+        name: Name for messages.
         sensor: `control.tactile.sensor_models.SensorModel.name`.
         pictures: JPEG or PNG files.
-        red_and_blue_exchanged: whoever wrote them took RGB for BGR.
+        red_and_blue_exchanged: Whether the writer took RGB for BGR.
     """
 
     name: str
     sensor: str
-    pictures: Sequence[StoredBytes]
+    pictures: Sequence[bytes]
     red_and_blue_exchanged: bool = False
 
     def __len__(self) -> int:
-        """Number of pictures."""
+        """Return the number of images."""
         return len(self.pictures)
 
     def frames(self, rows: Sequence[int] | Int[np.ndarray, " n"]) -> UInt8[np.ndarray, "n h w 3"]:
-        """RGB pictures, as the sensor's model has them: a DIGIT's upright, a GelSight's lying.
+        """Return RGB images, turned as the sensor's model: a DIGIT's upright, a GelSight's lying.
 
         Raises:
-            UserError: one of them is broken, or of another size than the others.
+            UserError: One of them is broken, or of another size than the others.
         """
         pictures = [self._frame(int(row)) for row in rows]
         if len({picture.shape for picture in pictures}) > 1:
-            raise UserError(f"{self.name} holds pictures of different sizes: make them equal")
+            raise UserError(f"{self.name} holds images of different sizes: make them equal")
         return np.stack(pictures)
 
-    def usual(self) -> Picture:
-        """The median of pictures from all over the clip: untouched, where touch comes and goes."""
-        rows = np.linspace(0, len(self) - 1, min(_LOOKS, len(self))).astype(int)
+    def median_image(self) -> Picture:
+        """Return the median of images spread over the clip: the untouched gel where contact moves."""
+        rows = np.linspace(0, len(self) - 1, min(_MEDIAN_IMAGES, len(self))).astype(int)
         return np.median(self.frames(rows), 0).astype(np.uint8)
 
     def _frame(self, row: int) -> Picture:
-        name = f"picture {row} of {self.name}"
-        picture = decode(self.pictures[row].read(), name)
+        picture = decode(self.pictures[row], f"image {row} of {self.name}")
         if self.red_and_blue_exchanged:
             picture = picture[:, :, ::-1]
         return turned(picture, self.sensor)
 
 
 def decode(data: bytes, name: str) -> Picture:
-    """The picture in a JPEG or PNG file.
+    """Decode a JPEG or PNG file; `name` is for the message.
 
     Raises:
-        UserError: it is neither, too large, or broken as far as its kind shows: every byte of a PNG
-            is checked, of a JPEG what makes its decoder stumble.
+        UserError: It is neither, too large, or damaged: a PNG is compared with its checksums, a JPEG
+            must decode without a warning.
     """
     whole = data[:8] == _PNG and _is_whole_png(data)
     if whole or data[:2] == _JPEG:
-        picture = decode_picture(data, name)  # first, for it refuses what is too large
+        picture = decode_picture(data, name)  # first, because it refuses what is too large
         if picture is not None and (whole or JpegDecoder().decode(data) is not None):
             return picture
     raise UserError(f"{name} is broken, or no JPEG or PNG: get the file again")
 
 
 def _is_whole_png(data: bytes) -> bool:
-    """Whether every chunk's checksum is right, up to the last."""
+    """Return whether every chunk's checksum is right, up to the last."""
     at = len(_PNG)
     while at + 12 <= len(data):
         (size,) = struct.unpack_from(">I", data, at)
@@ -97,10 +96,10 @@ def _is_whole_png(data: bytes) -> bool:
 
 
 def turned(picture: Picture, sensor: str) -> UInt8[np.ndarray, "height width 3"]:
-    """A picture as the sensor's model has it.
+    """Return an image in the orientation of the sensor's model.
 
-    A DIGIT's that lies is turned clockwise, as Sparsh's reader does; a GelSight's that stands is turned
-    back, counter-clockwise. Nobody says whether that is right or half a turn off.
+    A lying DIGIT image is turned clockwise, as Sparsh's reader does; an upright GelSight image is
+    turned back, counter-clockwise. No source states whether that is right or half a turn off.
     """
     height, width = SENSORS[sensor].image_shape
     if (picture.shape[0] > picture.shape[1]) == (height > width):
@@ -108,29 +107,29 @@ def turned(picture: Picture, sensor: str) -> UInt8[np.ndarray, "height width 3"]
     return np.ascontiguousarray(np.rot90(picture, -1 if height > width else 1))
 
 
-def read_pictures(path: Path) -> list[StoredBytes]:
-    """The list of encoded pictures that a pickle holds.
+def read_pictures(path: Path) -> list[bytes]:
+    """Return the list of encoded images that a pickle holds.
 
     Raises:
-        UserError: it is no such list, or an empty one.
+        UserError: It is no such list, or an empty one.
     """
-    return stored_pictures(read_plain_pickle(path), str(path))
+    return encoded_pictures(read_plain_pickle(path), str(path))
 
 
-def stored_pictures(value: object, name: str) -> list[StoredBytes]:
-    """A value that is to be a list of encoded pictures; `name` is for the message."""
-    if not isinstance(value, list) or not all(isinstance(item, StoredBytes) for item in value):
-        raise UserError(f"{name} holds something else than a list of encoded pictures")
+def encoded_pictures(value: object, name: str) -> list[bytes]:
+    """Return a value that is to be a list of encoded images; `name` is for the message."""
+    if not isinstance(value, list) or not all(isinstance(item, bytes) for item in value):
+        raise UserError(f"{name} is not a list of encoded images: get it again, as published")
     if not value:
-        raise UserError(f"{name} holds no picture")
+        raise UserError(f"{name} holds no image")
     return value
 
 
 def read_picture_file(path: Path, sensor: str) -> Picture:
-    """A picture in a file of its own, as the sensor's model has it.
+    """Read an image file, in the orientation of the sensor's model.
 
     Raises:
-        UserError: there is none, or it is broken.
+        UserError: It is missing or broken.
     """
     try:
         return turned(decode(path.read_bytes(), str(path)), sensor)
@@ -138,14 +137,14 @@ def read_picture_file(path: Path, sensor: str) -> Picture:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
 
 
-def check_kind(sensor: str | None, kinds: tuple[str, ...], folder: Path) -> str:
-    """The sensor of a layout's pictures: the one named, if it can be, else the first that can.
+def check_sensor(sensor: str | None, possible: tuple[str, ...], folder: Path) -> str:
+    """Return the sensor of a layout: the one named, if it is possible, else the first possible one.
 
     Raises:
-        UserError: they are another sensor's.
+        UserError: The layout is another sensor's.
     """
     if sensor is None:
-        return kinds[0]
-    if sensor not in kinds:
-        raise UserError(f"{folder} was recorded with {' or '.join(kinds)}, not {sensor}")
+        return possible[0]
+    if sensor not in possible:
+        raise UserError(f"{folder} was recorded with {' or '.join(possible)}, not {sensor}")
     return sensor
