@@ -20,7 +20,7 @@ from touchgoal.control.features import (
     TRUTH_SLIP,
     TRUTH_SUCCESS,
 )
-from touchgoal.episodes.encoding import EncodedEpisode, encode
+from touchgoal.episodes.format.encoding import EncodedEpisode, encode
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError

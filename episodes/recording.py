@@ -12,8 +12,8 @@ from jaxtyping import UInt8
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
-from touchgoal.episodes import metadata
-from touchgoal.episodes.encoding import Description, EncodedEpisode, encode
+from touchgoal.episodes.format import set_files
+from touchgoal.episodes.format.encoding import Description, EncodedEpisode, encode
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
@@ -94,7 +94,7 @@ def missing_specs(
         corrected: Whether they are recorded while a policy acts: such an episode does not replace
             the expert's with the same seed.
     """
-    if not (root / metadata.INFO).exists():
+    if not (root / set_files.INFO).exists():
         return list(specs)
     metas = [episodes.meta(i) for episodes in [EpisodeSet(root)] for i in range(len(episodes))]
     recorded = {meta.get("seed") for meta in metas if (meta["outcome"] == CORRECTED) == corrected}

@@ -19,16 +19,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import UInt8
 
-from touchgoal.episodes import metadata
-from touchgoal.episodes.encoding import (
+from touchgoal.episodes.format import set_files
+from touchgoal.episodes.format.encoding import (
     EncodedEpisode,
     data_file,
     encode,
     read_columns,
 )
+from touchgoal.episodes.format.metadata import SetMetadata
+from touchgoal.episodes.format.repair import contradictions_in_meta, unlisted_files
+from touchgoal.episodes.format.set_files import Row
 from touchgoal.episodes.media import decode_video
-from touchgoal.episodes.metadata import Row, SetMetadata
-from touchgoal.episodes.repair import contradictions_in_meta, unlisted_files
 from touchgoal.episodes.schema import INDEX_DTYPES, Episode, MetaValue, is_camera, is_image
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
@@ -65,9 +66,9 @@ class EpisodeWriter:
     def _load(self) -> SetMetadata | None:
         """Return the checked metadata of the set; None before the first episode."""
         found = None
-        if (self._root / metadata.INFO).exists():
+        if (self._root / set_files.INFO).exists():
             found = SetMetadata.load(self._root)
-            metadata.refuse_other_writers(self._root, found.features, found.episodes)
+            set_files.refuse_other_writers(self._root, found.features, found.episodes)
             if found.fps != self._fps:
                 raise UserError(
                     f"{self._root} runs at {found.fps} frames per second, not {self._fps}: "
@@ -77,7 +78,7 @@ class EpisodeWriter:
         if problems := problems or unlisted_files(self._root, found):
             raise UserError(
                 f"{self._root} was interrupted (see {problems[0]}): "
-                f"{metadata.repair_command(self._root)}"
+                f"{set_files.repair_command(self._root)}"
             )
         return found
 
@@ -104,13 +105,13 @@ class EpisodeWriter:
         current = self._metadata or SetMetadata(self._fps, description.features)
         file_number = current.next_file_number
         updated = current.with_episode(description, file_number)
-        if (path := self._root / metadata.data_path(file_number)).exists():
+        if (path := self._root / set_files.data_path(file_number)).exists():
             raise UserError(
                 f"{path} appeared while recording: let only one process write to a set, then "
-                f"{metadata.repair_command(self._root)}"
+                f"{set_files.repair_command(self._root)}"
             )
         for key, video in encoded.videos.items():
-            write_file(self._root / metadata.video_path(key, file_number), video)
+            write_file(self._root / set_files.video_path(key, file_number), video)
         write_file(path, data_file(encoded, current.index_columns_for(description)))
         updated.write(self._root)
         self._metadata = updated
@@ -130,24 +131,24 @@ class EpisodeSet:
             UserError: Not a set, an unknown version, or written by lerobot in part or whole; a
                 metadata file is corrupt; a file is missing.
         """
-        self.root = metadata.set_folder(Path(root))
-        info = metadata.load_info(self.root)
+        self.root = set_files.set_folder(Path(root))
+        info = set_files.load_info(self.root)
         self.fps: int = info["fps"]
         self.features: dict[str, dict[str, Any]] = {
             key: feature for key, feature in info["features"].items() if key not in INDEX_DTYPES
         }
-        table = metadata.load_table(self.root, metadata.EPISODES, leave_out="stats/")
-        metadata.refuse_other_writers(self.root, info["features"], table)
+        table = set_files.load_table(self.root, set_files.EPISODES, leave_out="stats/")
+        set_files.refuse_other_writers(self.root, info["features"], table)
         self._rows: list[Row] = table.slice(0, info["total_episodes"]).to_pylist()
         if len(self._rows) < info["total_episodes"]:
             raise UserError(
-                f"{self.root / metadata.EPISODES} lists {len(self._rows)} of "
-                f"{info['total_episodes']} episodes: {metadata.repair_command(self.root)}"
+                f"{self.root / set_files.EPISODES} lists {len(self._rows)} of "
+                f"{info['total_episodes']} episodes: {set_files.repair_command(self.root)}"
             )
         for row in self._rows:  # before any work with the others
             for name in self._files(row):
                 if not (self.root / name).is_file():
-                    raise metadata.unreadable(self.root, name, FileNotFoundError())
+                    raise set_files.unreadable(self.root, name, FileNotFoundError())
 
     def __len__(self) -> int:
         """Return the number of episodes."""
@@ -159,7 +160,7 @@ class EpisodeSet:
 
         It covers every episode's length, task, meta, statistics and checksums of videos.
         """
-        table = metadata.load_table(self.root, metadata.EPISODES).slice(0, len(self))
+        table = set_files.load_table(self.root, set_files.EPISODES).slice(0, len(self))
         return hashlib.sha256(json.dumps(table.to_pylist(), sort_keys=True).encode()).hexdigest()
 
     @property
@@ -175,7 +176,7 @@ class EpisodeSet:
         content = {
             key: value
             for key, value in self._row(i).items()
-            if key == "length" or key.startswith(metadata.META_PREFIX) or key.endswith("/crc32")
+            if key == "length" or key.startswith(set_files.META_PREFIX) or key.endswith("/crc32")
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
@@ -183,17 +184,17 @@ class EpisodeSet:
         """Return checksums of the frames of a feature of episode i, comparable in this process."""
         if not is_image(key):
             return frozenset(hash(values.tobytes()) for values in self.read(i, [key]).frames[key])
-        name = metadata.data_path(metadata.file_number_of(self._row(i)))
+        name = set_files.data_path(set_files.file_number_of(self._row(i)))
         try:
             with pq.ParquetFile(self.root / name, page_checksum_verification=True) as file:
                 images = file.read([f"{key}.bytes"])[key].combine_chunks().field("bytes")
                 return frozenset(hash(image.as_py()) for image in images)
         except (OSError, pa.ArrowException) as error:
-            raise metadata.unreadable(self.root, name, error) from error
+            raise set_files.unreadable(self.root, name, error) from error
 
     def meta(self, i: int) -> dict[str, MetaValue]:
         """Return the facts about episode i."""
-        prefix = metadata.META_PREFIX
+        prefix = set_files.META_PREFIX
         row = self._row(i)
         return {k.removeprefix(prefix): v for k, v in row.items() if k.startswith(prefix)}
 
@@ -234,9 +235,9 @@ class EpisodeSet:
         return f"EpisodeSet({str(self.root)!r}: {len(self)} episodes, {', '.join(self.features)})"
 
     def _files(self, row: Row) -> list[str]:
-        number = metadata.file_number_of(row)
-        videos = [metadata.video_path(key, number) for key in self.features if is_camera(key)]
-        return [metadata.data_path(number), *videos]
+        number = set_files.file_number_of(row)
+        videos = [set_files.video_path(key, number) for key in self.features if is_camera(key)]
+        return [set_files.data_path(number), *videos]
 
     def _row(self, i: int) -> Row:
         if not 0 <= i < len(self):
@@ -246,16 +247,16 @@ class EpisodeSet:
     def _read_data(
         self, row: Row, features: dict[str, dict[str, Any]], frames: np.ndarray
     ) -> dict[str, np.ndarray]:
-        name = metadata.data_path(metadata.file_number_of(row))
+        name = set_files.data_path(set_files.file_number_of(row))
         try:
             with pq.ParquetFile(self.root / name, page_checksum_verification=True) as file:
                 if file.metadata.num_rows != row["length"]:
                     raise OSError(f"{file.metadata.num_rows} frames instead of {row['length']}")
                 return read_columns(file, features, frames)
         except (OSError, pa.ArrowException) as error:
-            raise metadata.unreadable(self.root, name, error) from error
+            raise set_files.unreadable(self.root, name, error) from error
 
     def _read_video(self, row: Row, key: str, frames: np.ndarray) -> UInt8[np.ndarray, "n h w 3"]:
-        name = metadata.video_path(key, metadata.file_number_of(row))
-        video = metadata.read_video(self.root, name, row[f"videos/{key}/crc32"])
+        name = set_files.video_path(key, set_files.file_number_of(row))
+        video = set_files.read_video(self.root, name, row[f"videos/{key}/crc32"])
         return decode_video(video, self.fps, frames.tolist())

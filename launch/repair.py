@@ -22,7 +22,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Print the problems, or what was done about them."""
-    from touchgoal.episodes.repair import repair, validate
+    from touchgoal.episodes.format.repair import repair, validate
 
     if config.fix:
         print("\n".join(repair(config.root)) or f"{config.root} is sound: nothing to do")

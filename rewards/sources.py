@@ -19,8 +19,8 @@ from touchgoal.control.features import (
     TRUTH_CONTACT,
     WRIST,
 )
+from touchgoal.episodes.format.set_files import INFO
 from touchgoal.episodes.media import read_frames
-from touchgoal.episodes.metadata import INFO
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
 from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EpisodeEmbedder, missing_camera

@@ -20,10 +20,10 @@ from toy_episodes import FPS, PNG_START, assert_holds, flip_byte, make_episode, 
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
-from touchgoal.episodes import metadata
-from touchgoal.episodes.encoding import decode_png
+from touchgoal.episodes.format import metadata, set_files
+from touchgoal.episodes.format.encoding import decode_png
+from touchgoal.episodes.format.repair import repair, validate
 from touchgoal.episodes.media import read_frames
-from touchgoal.episodes.repair import repair, validate
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
 
@@ -34,17 +34,17 @@ def cut_in_half(path: Path) -> None:
 
 DAMAGE = {
     "flipped byte in touch": (
-        metadata.data_path(1),
+        set_files.data_path(1),
         lambda path: flip_byte(path, path.read_bytes().index(PNG_START) + 100),
     ),
-    "half a data file": (metadata.data_path(1), cut_in_half),
+    "half a data file": (set_files.data_path(1), cut_in_half),
     "flipped byte in a video": (
-        metadata.video_path(ft.WRIST, 1),
+        set_files.video_path(ft.WRIST, 1),
         lambda path: flip_byte(path, 400),
     ),
-    "half a video": (metadata.video_path(ft.WRIST, 1), cut_in_half),
-    "no data file": (metadata.data_path(1), Path.unlink),
-    "no video": (metadata.video_path(ft.WRIST, 1), Path.unlink),
+    "half a video": (set_files.video_path(ft.WRIST, 1), cut_in_half),
+    "no data file": (set_files.data_path(1), Path.unlink),
+    "no video": (set_files.video_path(ft.WRIST, 1), Path.unlink),
 }
 
 
@@ -64,7 +64,9 @@ def test_a_damaged_episode_is_named_and_moved_aside(small: Path, case: str) -> N
     assert validate(small) == [] and repair(small) == []
 
 
-@pytest.mark.parametrize("name", [metadata.INFO, metadata.EPISODES, metadata.TASKS, metadata.STATS])
+@pytest.mark.parametrize(
+    "name", [set_files.INFO, set_files.EPISODES, set_files.TASKS, set_files.STATS]
+)
 @pytest.mark.parametrize("harm", [cut_in_half, Path.unlink])
 def test_damaged_metadata_is_made_again(small: Path, name: str, harm) -> None:
     before = metadata.SetMetadata.load(small)
@@ -78,12 +80,12 @@ def test_damaged_metadata_is_made_again(small: Path, name: str, harm) -> None:
 
 
 FILES = (
-    metadata.INFO,
-    metadata.EPISODES,
-    metadata.TASKS,
-    metadata.STATS,
-    metadata.data_path(1),
-    metadata.video_path(ft.WRIST, 1),
+    set_files.INFO,
+    set_files.EPISODES,
+    set_files.TASKS,
+    set_files.STATS,
+    set_files.data_path(1),
+    set_files.video_path(ft.WRIST, 1),
 )
 
 
@@ -102,8 +104,8 @@ def test_a_flipped_byte_is_noticed_or_without_effect(small: Path, name: str) -> 
 
 
 def test_a_flipped_letter_in_the_name_of_a_feature_is_repaired(small: Path) -> None:
-    text = (small / metadata.INFO).read_text()
-    (small / metadata.INFO).write_text(text.replace(ft.WRIST, ft.WRIST.replace("wrist", "wrast")))
+    text = (small / set_files.INFO).read_text()
+    (small / set_files.INFO).write_text(text.replace(ft.WRIST, ft.WRIST.replace("wrist", "wrast")))
     for use in (EpisodeSet, EpisodeWriter):
         with pytest.raises(UserError, match="unknown feature .*wrast.* touchgoal repair --fix"):
             use(small)
@@ -123,44 +125,44 @@ def test_a_flipped_letter_in_the_name_of_a_feature_is_repaired(small: Path) -> N
 def test_values_that_cannot_be_are_named_with_the_repair(
     small: Path, old: str, new: str, message: str
 ) -> None:
-    text = (small / metadata.INFO).read_text()
+    text = (small / set_files.INFO).read_text()
     assert old in text
-    (small / metadata.INFO).write_text(text.replace(old, new, 1))
+    (small / set_files.INFO).write_text(text.replace(old, new, 1))
     with pytest.raises(UserError, match=f"info.json is corrupt .*{message}.* repair --fix"):
         EpisodeSet(small)
     assert validate(small) and repair(small) and validate(small) == []
 
 
 def test_a_missing_video_is_found_before_any_work(small: Path) -> None:
-    (small / metadata.video_path(ft.WRIST, 2)).unlink()
+    (small / set_files.video_path(ft.WRIST, 2)).unlink()
     with pytest.raises(UserError, match="file-002.mp4 is missing: run: touchgoal repair"):
         EpisodeSet(small)
 
 
 def test_a_set_of_an_older_version_is_read_and_continued(small: Path) -> None:
     """It names the pixel format, which lerobot's tools reject, and has no checksum of descriptions."""
-    assert "pix_fmt" not in (small / metadata.INFO).read_text()
-    for path in (small / metadata.data_path(i) for i in range(3)):
+    assert "pix_fmt" not in (small / set_files.INFO).read_text()
+    for path in (small / set_files.data_path(i) for i in range(3)):
         table = pq.read_table(path)
         old = json.loads(table.schema.metadata[b"touchgoal"])
         old["features"][ft.WRIST]["info"]["video.pix_fmt"] = "gbrp"
         footer = {b"touchgoal": json.dumps(old).encode()}
         pq.write_table(table.replace_schema_metadata(footer), path, write_page_checksum=True)
-    info = json.loads((small / metadata.INFO).read_text())
+    info = json.loads((small / set_files.INFO).read_text())
     info["features"][ft.WRIST]["info"]["video.pix_fmt"] = "gbrp"
-    (small / metadata.INFO).write_text(json.dumps(info))
+    (small / set_files.INFO).write_text(json.dumps(info))
     assert validate(small) == []
     EpisodeWriter(small, FPS).append(make_episode(3))
     assert_holds(small, [0, 1, 2, 3])
-    assert validate(small) == [] and "pix_fmt" not in (small / metadata.INFO).read_text()
+    assert validate(small) == [] and "pix_fmt" not in (small / set_files.INFO).read_text()
 
 
 def test_statistics_that_are_none_of_the_frames_are_noticed(small: Path) -> None:
-    stats = json.loads((small / metadata.STATS).read_text())
+    stats = json.loads((small / set_files.STATS).read_text())
     stats[ft.STATE]["mean"] = [999.0] * 15
     stats[ft.STATE]["std"] = [0.0] * 15
-    (small / metadata.STATS).write_text(json.dumps(stats))
-    assert any(metadata.STATS in problem for problem in validate(small))
+    (small / set_files.STATS).write_text(json.dumps(stats))
+    assert any(set_files.STATS in problem for problem in validate(small))
     assert repair(small) and validate(small) == []
 
 
@@ -177,7 +179,7 @@ def test_pictures_and_json_that_are_traps_are_one_line(tmp_path: Path, small: Pa
     for rubbish in (b"", b"\x89PNG", bomb[:20]):
         with pytest.raises(UserError):
             decode_png(rubbish)
-    (small / metadata.INFO).write_text("[" * 100_000)
+    (small / set_files.INFO).write_text("[" * 100_000)
     with pytest.raises(UserError, match="corrupt"):
         EpisodeSet(small)
     deep = tmp_path / "cell.json"

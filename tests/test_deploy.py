@@ -27,7 +27,7 @@ from touchgoal.control.deployment.control_loop import ControlLoop, Request, RunL
 from touchgoal.control.deployment.session import RecordEpisode, Session
 from touchgoal.control.interfaces import Actor
 from touchgoal.control.safety.action_filter import ActionFilter
-from touchgoal.episodes.repair import validate
+from touchgoal.episodes.format.repair import validate
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import main

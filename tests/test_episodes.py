@@ -14,10 +14,10 @@ from PIL import Image
 from toy_episodes import FPS, PNG_START, assert_holds, flip_byte, make_episode, moving_blob, record
 
 from touchgoal.control import features as ft
-from touchgoal.episodes import metadata, statistics
-from touchgoal.episodes.encoding import encode
+from touchgoal.episodes.format import set_files, statistics
+from touchgoal.episodes.format.encoding import encode
+from touchgoal.episodes.format.repair import repair, validate
 from touchgoal.episodes.media import write_video
-from touchgoal.episodes.repair import repair, validate
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.atomic_write import write_file
@@ -51,24 +51,24 @@ def test_part_of_an_episode_is_that_part_of_the_whole(recorded: Path) -> None:
 def test_only_what_is_asked_for_is_decoded(small: Path) -> None:
     for path in (small / "videos").rglob("*.mp4"):
         path.write_bytes(b"not a video")
-    data = small / metadata.data_path(0)
+    data = small / set_files.data_path(0)
     flip_byte(data, data.read_bytes().index(PNG_START) + 100)
     episode = EpisodeSet(small).read(0, [ft.STATE])
     np.testing.assert_array_equal(episode.frames[ft.STATE], make_episode(0).frames[ft.STATE])
 
 
 def test_files_are_what_lerobot_reads(recorded: Path) -> None:
-    info = json.loads((recorded / metadata.INFO).read_text())
+    info = json.loads((recorded / set_files.INFO).read_text())
     assert info["codebase_version"] == "v3.0" and info["total_frames"] == 210
     dtypes = {key: feature["dtype"] for key, feature in info["features"].items()}
     assert (dtypes[ft.WRIST], dtypes[ft.TACTILE_LEFT]) == ("video", "image")
     assert (dtypes[ft.TRUTH_CONTACT], dtypes[ft.STATE]) == ("bool", "float32")
-    pandas = pq.read_table(recorded / metadata.TASKS).schema.pandas_metadata
+    pandas = pq.read_table(recorded / set_files.TASKS).schema.pandas_metadata
     assert pandas["index_columns"] == ["task"]
-    rows = pq.read_table(recorded / metadata.EPISODES).to_pylist()
+    rows = pq.read_table(recorded / set_files.EPISODES).to_pylist()
     assert [row["dataset_from_index"] for row in rows] == [0, 70, 140]
     assert rows[2][f"videos/{ft.WRIST}/to_timestamp"] == 3.5
-    table = pq.read_table(recorded / metadata.data_path(2))
+    table = pq.read_table(recorded / set_files.data_path(2))
     assert set(table.column_names) == {key for key, dtype in dtypes.items() if dtype != "video"}
     assert table["index"].to_pylist() == list(range(140, 210))
     assert table["task_index"].to_pylist() == [0] * 70
@@ -80,7 +80,7 @@ def test_files_are_what_lerobot_reads(recorded: Path) -> None:
 
 
 def test_statistics_of_the_set_are_of_all_frames(recorded: Path) -> None:
-    stats = json.loads((recorded / metadata.STATS).read_text())
+    stats = json.loads((recorded / set_files.STATS).read_text())
     episodes = [make_episode(seed, 70) for seed in range(3)]
     for key, axes, scale in ((ft.ACTION, 0, 1), (ft.TACTILE_LEFT, (0, 1, 2), 255)):
         values = np.concatenate([episode.frames[key] for episode in episodes]).astype(float) / scale
@@ -164,8 +164,8 @@ def test_refusals_say_what_to_do(small: Path, tmp_path: Path) -> None:
         EpisodeSet(tmp_path)
     with pytest.raises(UserError, match="20 frames per second, not 30"):
         EpisodeWriter(small, fps=30)
-    info = json.loads((small / metadata.INFO).read_text())
-    (small / metadata.INFO).write_text(json.dumps({**info, "codebase_version": "v2.1"}))
+    info = json.loads((small / set_files.INFO).read_text())
+    (small / set_files.INFO).write_text(json.dumps({**info, "codebase_version": "v2.1"}))
     for refuse in (EpisodeSet, EpisodeWriter, validate, repair):
         with pytest.raises(UserError, match="version 'v2.1'"):
             refuse(small)
@@ -180,11 +180,11 @@ def add_episodes_like_lerobot(root: Path, extend: bool) -> None:
     """
     extra = root.with_name("extra")
     record(extra, range(3, 5))
-    tables = [pq.read_table(extra / metadata.data_path(i)) for i in range(2)]
+    tables = [pq.read_table(extra / set_files.data_path(i)) for i in range(2)]
     wrist = [EpisodeSet(extra).read(i, [ft.WRIST]).frames[ft.WRIST] for i in range(2)]
     file = 2 if extend else 3
     if extend:
-        tables.insert(0, pq.read_table(root / metadata.data_path(2)))
+        tables.insert(0, pq.read_table(root / set_files.data_path(2)))
         wrist.insert(0, EpisodeSet(root).read(2, [ft.WRIST]).frames[ft.WRIST])
     table = pa.concat_tables([t.replace_schema_metadata(None) for t in tables])
     first = 35 - len(table)
@@ -193,9 +193,9 @@ def add_episodes_like_lerobot(root: Path, extend: bool) -> None:
         ("episode_index", np.arange(first, 35) // 7),
     ):
         table = table.set_column(table.column_names.index(key), key, pa.array(values))
-    pq.write_table(table, root / metadata.data_path(file), compression="snappy")
-    write_video(root / metadata.video_path(ft.WRIST, file), np.concatenate(wrist), FPS)
-    own = pq.read_table(root / metadata.EPISODES).to_pylist()
+    pq.write_table(table, root / set_files.data_path(file), compression="snappy")
+    write_video(root / set_files.video_path(ft.WRIST, file), np.concatenate(wrist), FPS)
+    own = pq.read_table(root / set_files.EPISODES).to_pylist()
     added = [
         {
             **{key: value for key, value in own[2].items() if not key.startswith("touchgoal/")},
@@ -211,11 +211,11 @@ def add_episodes_like_lerobot(root: Path, extend: bool) -> None:
         }
         for i in (3, 4)
     ]
-    name = metadata.EPISODES if extend else metadata.EPISODES.replace("file-000", "file-001")
+    name = set_files.EPISODES if extend else set_files.EPISODES.replace("file-000", "file-001")
     pq.write_table(pa.Table.from_pylist([*own, *added] if extend else added), root / name)
-    info = json.loads((root / metadata.INFO).read_text())
+    info = json.loads((root / set_files.INFO).read_text())
     info |= {"total_episodes": 5, "total_frames": 35, "splits": {"train": "0:5"}}
-    (root / metadata.INFO).write_text(json.dumps(info))
+    (root / set_files.INFO).write_text(json.dumps(info))
 
 
 @pytest.mark.parametrize("extend", [False, True])
@@ -227,15 +227,15 @@ def test_a_set_that_lerobot_continued_is_left_as_it_is(small: Path, extend: bool
         with pytest.raises(UserError, match="lerobot wrote .* changes nothing here") as error:
             use(small)
         assert "touchgoal repair" not in str(error.value) and "\n" not in str(error.value)
-    (small / metadata.INFO).unlink()
+    (small / set_files.INFO).unlink()
     with pytest.raises(UserError, match="lerobot wrote"):
         repair(small)
-    del before[small / metadata.INFO]
+    del before[small / set_files.INFO]
     assert {path: path.read_bytes() for path in small.rglob("*") if path.is_file()} == before
 
 
 def test_a_data_file_without_our_description_is_not_moved(small: Path) -> None:
-    path = small / metadata.data_path(1)
+    path = small / set_files.data_path(1)
     pq.write_table(pq.read_table(path).replace_schema_metadata(None), path)
     before = sorted(small.rglob("*"))
     with pytest.raises(UserError, match="reads only its own"):

@@ -26,7 +26,7 @@ from touchgoal.control.motion.arm_models import FR3_ARM
 from touchgoal.control.motion.kinematics import Fr3Kinematics
 from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.options import TrainerOptions
-from touchgoal.episodes.repair import validate
+from touchgoal.episodes.format.repair import validate
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies import checkpoint

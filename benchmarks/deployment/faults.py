@@ -36,7 +36,7 @@ from touchgoal.control.deployment.session import Session
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor, DriverError
 from touchgoal.control.safety.action_filter import ActionFilter
-from touchgoal.episodes.repair import validate
+from touchgoal.episodes.format.repair import validate
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.policies.network import PolicyConfig

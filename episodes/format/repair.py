@@ -10,9 +10,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from touchgoal.episodes import metadata
-from touchgoal.episodes.encoding import Description, read_description, write_table
-from touchgoal.episodes.metadata import SetMetadata
+from touchgoal.episodes.format import set_files
+from touchgoal.episodes.format.encoding import Description, read_description, write_table
+from touchgoal.episodes.format.metadata import SetMetadata
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.folder_lock import FolderLock
@@ -20,7 +20,7 @@ from touchgoal.runtime.progress import track
 
 REPAIRED = "repaired"
 _FOLDERS = ("data", "videos", "meta")
-_META = (metadata.INFO, metadata.EPISODES, metadata.TASKS, metadata.STATS)
+_META = (set_files.INFO, set_files.EPISODES, set_files.TASKS, set_files.STATS)
 _DATA_FILES = "chunk-[0-9][0-9][0-9]/file-[0-9][0-9][0-9].parquet"
 
 
@@ -29,8 +29,8 @@ def unlisted_files(root: Path, set_metadata: SetMetadata | None) -> list[str]:
     known = set(_META)
     cameras = _cameras(set_metadata.features) if set_metadata else []
     for file_number in _file_numbers(set_metadata):
-        known |= {metadata.data_path(file_number)} | {
-            metadata.video_path(k, file_number) for k in cameras
+        known |= {set_files.data_path(file_number)} | {
+            set_files.video_path(k, file_number) for k in cameras
         }
     files = [path for tree in _FOLDERS for path in (root / tree).rglob("*") if path.is_file()]
     names = {path.relative_to(root) for path in files}
@@ -40,19 +40,19 @@ def unlisted_files(root: Path, set_metadata: SetMetadata | None) -> list[str]:
 
 def contradictions_in_meta(root: Path, set_metadata: SetMetadata) -> list[str]:
     """Return how info.json, stats.json and tasks.parquet contradict meta/episodes."""
-    info = metadata.load_info(root)
-    frames = metadata.last_row(set_metadata.episodes)["dataset_to_index"]
+    info = set_files.load_info(root)
+    frames = set_files.last_row(set_metadata.episodes)["dataset_to_index"]
     problems = []
     if (info["total_episodes"], info["total_frames"]) != (set_metadata.n_episodes, frames):
         problems.append(
-            f"{root / metadata.INFO} counts {info['total_episodes']} episodes, "
-            f"{root / metadata.EPISODES} {set_metadata.n_episodes}"
+            f"{root / set_files.INFO} counts {info['total_episodes']} episodes, "
+            f"{root / set_files.EPISODES} {set_metadata.n_episodes}"
         )
     if info["total_tasks"] != len(set_metadata.tasks):
-        problems.append(f"{root / metadata.TASKS} has not the tasks of {root / metadata.INFO}")
+        problems.append(f"{root / set_files.TASKS} has not the tasks of {root / set_files.INFO}")
     counts = {key: stats["count"] for key, stats in (set_metadata.stats or {}).items()}
     if counts != {key: [frames] for key in set_metadata.features}:
-        problems.append(f"{root / metadata.STATS} is not of all {frames} frames")
+        problems.append(f"{root / set_files.STATS} is not of all {frames} frames")
     return problems
 
 
@@ -60,7 +60,9 @@ def _file_numbers(set_metadata: SetMetadata | None) -> list[int]:
     if set_metadata is None or set_metadata.episodes is None:
         return []
     names = ["data/chunk_index", "data/file_index"]
-    return [metadata.file_number_of(row) for row in set_metadata.episodes.select(names).to_pylist()]
+    return [
+        set_files.file_number_of(row) for row in set_metadata.episodes.select(names).to_pylist()
+    ]
 
 
 def _cameras(features: dict[str, dict[str, Any]]) -> list[str]:
@@ -69,14 +71,14 @@ def _cameras(features: dict[str, dict[str, Any]]) -> list[str]:
 
 def _read_episode(root: Path, file_number: int) -> tuple[Description, pa.Table]:
     """Read every byte of an episode's files and compare the checksums."""
-    name = metadata.data_path(file_number)
+    name = set_files.data_path(file_number)
     try:
         with pq.ParquetFile(root / name, page_checksum_verification=True) as file:
             description, table = read_description(file), file.read()
     except (OSError, pa.ArrowException, UserError) as error:
-        raise metadata.unreadable(root, name, error) from error
+        raise set_files.unreadable(root, name, error) from error
     for key, crc32 in description.video_crc32.items():
-        metadata.read_video(root, metadata.video_path(key, file_number), crc32)
+        set_files.read_video(root, set_files.video_path(key, file_number), crc32)
     return description, table
 
 
@@ -89,13 +91,13 @@ def _require_own_set(root: Path) -> None:
     listed = [path for path in root.iterdir() if path.name != REPAIRED] if root.is_dir() else [root]
     if listed and not any((root / folder).is_dir() for folder in _FOLDERS):
         raise UserError(f"{root} is not a set of episodes: give the folder of one")
-    if (root / metadata.INFO).exists():
-        info: dict[str, Any] = {"codebase_version": metadata.VERSION}
+    if (root / set_files.INFO).exists():
+        info: dict[str, Any] = {"codebase_version": set_files.VERSION}
         with suppress(UserError):  # damaged: it is rebuilt from the data files
-            info = metadata.load_json(root, metadata.INFO)
-        metadata.check_version(root, info)
-    metadata.refuse_other_writers(root, {}, None)
-    metadata.refuse_foreign_data_files(root)
+            info = set_files.load_json(root, set_files.INFO)
+        set_files.check_version(root, info)
+    set_files.refuse_other_writers(root, {}, None)
+    set_files.refuse_foreign_data_files(root)
 
 
 def validate(root: str | os.PathLike[str]) -> list[str]:
@@ -104,7 +106,7 @@ def validate(root: str | os.PathLike[str]) -> list[str]:
     Raises:
         UserError: Not a set, one of another version, or one that lerobot wrote or continued.
     """
-    root = metadata.set_folder(Path(root))
+    root = set_files.set_folder(Path(root))
     _require_own_set(root)
     if not any((root / folder).is_dir() for folder in _FOLDERS):
         return []  # nothing was recorded yet
@@ -119,9 +121,9 @@ def validate(root: str | os.PathLike[str]) -> list[str]:
             description, table = _read_episode(root, file_number)
             rebuilt = rebuilt or SetMetadata(description.fps, description.features)
             if differing := _wrong_index_columns(table, rebuilt.index_columns_for(description)):
-                name = root / metadata.data_path(file_number)
+                name = root / set_files.data_path(file_number)
                 problems.append(
-                    f"{name} has wrong {', '.join(differing)}: {metadata.repair_command(root)}"
+                    f"{name} has wrong {', '.join(differing)}: {set_files.repair_command(root)}"
                 )
             rebuilt = rebuilt.with_episode(description, file_number)
         except UserError as error:
@@ -137,13 +139,13 @@ def _altered_meta(root: Path, found: SetMetadata, rebuilt: SetMetadata) -> list[
     """Return the files under meta/ whose content is not that of the data files."""
     assert found.episodes is not None and rebuilt.episodes is not None
     same = {
-        metadata.INFO: metadata.load_info(root) == rebuilt.info(),
-        metadata.EPISODES: found.episodes.to_pylist() == rebuilt.episodes.to_pylist(),
-        metadata.TASKS: found.tasks == rebuilt.tasks,
-        metadata.STATS: found.stats == rebuilt.stats,
+        set_files.INFO: set_files.load_info(root) == rebuilt.info(),
+        set_files.EPISODES: found.episodes.to_pylist() == rebuilt.episodes.to_pylist(),
+        set_files.TASKS: found.tasks == rebuilt.tasks,
+        set_files.STATS: found.stats == rebuilt.stats,
     }
     return [
-        f"{root / name} is not as it was written: {metadata.repair_command(root)}"
+        f"{root / name} is not as it was written: {set_files.repair_command(root)}"
         for name, equal in same.items()
         if not equal
     ]
@@ -162,7 +164,7 @@ def repair(root: str | os.PathLike[str]) -> list[str]:
     Raises:
         UserError: Not a set, one of another version, or one that lerobot wrote or continued.
     """
-    root = metadata.set_folder(Path(root))
+    root = set_files.set_folder(Path(root))
     if not validate(root):
         return []
     lock = FolderLock(root)
@@ -176,13 +178,13 @@ def _repair(root: Path) -> list[str]:
     done: list[str] = []
     set_metadata: SetMetadata | None = None
     for path in track(sorted((root / "data").glob(_DATA_FILES)), "reading", "file"):
-        file_number = int(path.parent.name[-3:]) * metadata.CHUNK + int(path.stem[-3:])
+        file_number = int(path.parent.name[-3:]) * set_files.CHUNK + int(path.stem[-3:])
         try:
             description, table = _read_episode(root, file_number)
             before = set_metadata or SetMetadata(description.fps, description.features)
             set_metadata = before.with_episode(description, file_number)
         except UserError as error:
-            reason = str(error).removesuffix(": " + metadata.repair_command(root))
+            reason = str(error).removesuffix(": " + set_files.repair_command(root))
             done.append(f"left out the episode of {path}: {reason}")
             continue
         if _wrong_index_columns(table, before.index_columns_for(description)):

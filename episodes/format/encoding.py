@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Int, Shaped, UInt8
 
 from touchgoal.control.features import FEATURES
-from touchgoal.episodes import statistics
+from touchgoal.episodes.format import statistics
 from touchgoal.episodes.media import encode_video
 from touchgoal.episodes.schema import (
     INDEX_DTYPES,
