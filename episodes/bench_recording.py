@@ -1,7 +1,7 @@
-"""What the simulated bench makes, as sets of episodes, made on all cores.
+"""Recording of the simulated touch bench as sets of episodes, on all cores.
 
-Strokes of the indenter rig, slides of held objects, grasp attempts, presses of cloth. Where there is one
-sensor it is the left fingertip; of the right one the truth is zeros, and there are no pictures.
+Indenter strokes, slides of objects, grasp attempts and presses of cloth. A single sensor is the left
+fingertip; the right one then has no images, and its ground truth is zero.
 """
 
 from collections.abc import Callable
@@ -37,51 +37,49 @@ from touchgoal.sim_envs.object_slides import (
     simulate_slide,
 )
 
-_RIG = "rig"  # meta: what tells one rig's recordings from another's
+_RIG = "rig"  # meta: options of the rig
 
 
 def record_strokes(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
-    """The first so many strokes of a rig, of which those that a folder lacks are simulated.
-
-    Interrupted, it keeps the strokes that were finished, and goes on with the next one.
+    """Record the first `count` strokes of a rig; those that the folder holds are not simulated again.
 
     Raises:
-        UserError: the folder holds strokes of another rig, or cannot be written to.
+        UserError: The folder holds recordings of another rig, or cannot be written to.
     """
     rig = _description(config, config.indenters)
     return _record_missing(root, rig, partial(_stroke, config, rig), count, workers)
 
 
 def record_slides(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
-    """The first so many slides of held objects; as `record_strokes`."""
+    """Record slides of held shapes, as `record_strokes`."""
     rig = _description(config, HELD)
     return _record_missing(root, rig, partial(_slide, config, rig), count, workers)
 
 
 def record_catalogue_slides(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
-    """The first so many slides of pick-and-place's objects, each on a unit of its own; as `record_strokes`."""
+    """Record slides of pick-and-place's objects, each on another sensor instance, as `record_strokes`."""
     rig = _description(config, ("objects",))
     record = partial(_slide, config, rig, simulate=simulate_catalogue_slide)
     return _record_missing(root, rig, record, count, workers)
 
 
 def record_grasps(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
-    """The first so many grasp attempts, three frames each; as `record_strokes`."""
+    """Record grasp attempts of three frames each, as `record_strokes`."""
     rig = _description(config, ("grasps",))
     return _record_missing(root, rig, partial(_grasp, config, rig), count, workers)
 
 
 def record_cloths(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
-    """The first so many presses of cloth; as `record_strokes`."""
+    """Record presses of cloth, as `record_strokes`."""
     rig = _description(config, ("cloths",))
     return _record_missing(root, rig, partial(_cloth, config, rig), count, workers)
 
 
-def _description(config: RigConfig, things: tuple[str, ...]) -> str:
-    """Of all that strokes depend on: another rig's are not to be mixed in."""
+def _description(config: RigConfig, shapes: tuple[str, ...]) -> str:
+    """Return all options that the recordings depend on, so that two rigs are not mixed."""
     low, high = config.load
     loads = f"{low:g} to {high:g} N{', no relief' * (not config.shear_relief)}"
-    return f"{config.sensor}, {'+'.join(things)}, {loads}, seed {config.seed}"
+    return f"{config.sensor}, {'+'.join(shapes)}, {loads}, seed {config.seed}"
 
 
 def _record_missing(
@@ -89,9 +87,9 @@ def _record_missing(
 ) -> EpisodeSet:
     writer = EpisodeWriter(root, fps=FPS)
     try:
-        if len(writer) and (said := EpisodeSet(root).meta(0).get(_RIG)) != rig:
+        if len(writer) and (other := EpisodeSet(root).meta(0).get(_RIG)) != rig:
             raise UserError(
-                f"{root} holds recordings of another rig ({said}), not {rig}: give another folder"
+                f"{root} holds recordings of another rig ({other}), not {rig}: give another folder"
             )
         if len(writer) < count:
             with one_core_workers(workers) as pool:
@@ -175,7 +173,7 @@ def _frames(
     wrench: Float32[np.ndarray, "t 6"],
     slip: Bool[np.ndarray, " t"],
 ) -> dict[str, np.ndarray]:
-    """Columns of the left fingertip, and of a right one that nothing touches."""
+    """Return the columns of the left fingertip, and of a right one without contact."""
     n = len(pictures)
     nothing = np.zeros(n, bool)
     return {

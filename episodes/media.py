@@ -1,4 +1,4 @@
-"""Video in and out through PyAV, and folders of pictures through OpenCV. Frames are RGB."""
+"""Video through PyAV, folders of images through OpenCV. Frames are RGB."""
 
 import io
 import re
@@ -12,6 +12,7 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 from jaxtyping import UInt8
 
+from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.picture_file import read_picture
 
@@ -23,16 +24,15 @@ _PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
 
 
 def encode_video(frames: UInt8[np.ndarray, "n h w 3"], fps: float | int) -> bytes:
-    """An MP4 of lossless H.264 in RGB, whose frame i is shown at i / fps seconds.
+    """Return an MP4 of lossless H.264 in RGB, whose frame i is shown at i / fps seconds.
 
-    Image towers see what an eye does not: at crf 18 the image cost of a stored episode differed by 9 to
-    15 % from the raw frames', in lossless yuv444p, whose colours are rounded, still by 5 %. It takes 5.5
-    kB for a simulated picture of 128 x 128 (crf 18: 1.0), 26 kB with noise of 3 counts (1.8); touch takes
-    90 kB a finger.
+    Lossy video changes image embeddings: at crf 18 the image cost of a stored episode differed by 9 to
+    15 % from the raw frames', in lossless yuv444p still by 5 %. A simulated image of 128 x 128 takes
+    5.5 kB (crf 18: 1.0 kB).
 
     Args:
-        frames: RGB pictures.
-        fps: frames per second.
+        frames: RGB images.
+        fps: Frames per second.
     """
     return _encode(frames, fps, "libx264rgb", "rgb24", {"qp": "0"})
 
@@ -69,12 +69,12 @@ def _encode(
 def decode_video(
     video: bytes, fps: float | int, frames: Sequence[int]
 ) -> UInt8[np.ndarray, "n h w 3"]:
-    """The given frames of a video made by `encode_video`, in the given order.
+    """Decode the given frames of a video made by `encode_video`, in the given order.
 
-    Seeks: only the frames asked for, and the key frames before them, are decoded.
+    Only these frames and the key frames before them are decoded.
 
     Raises:
-        UserError: the video has no such frame.
+        UserError: The video has no such frame.
     """
     wanted = sorted(set(frames))
     with av.open(io.BytesIO(video), "r") as container:
@@ -98,29 +98,28 @@ def decode_video(
 
 
 def write_video(path: Path, frames: UInt8[np.ndarray, "n h w 3"], fps: float | int) -> None:
-    """Writes an MP4 (H.264, yuv420p, crf 18) that any browser plays; makes its folder.
+    """Write an MP4 (H.264, yuv420p, crf 18) that any browser plays, and make its folder.
 
     Raises:
-        UserError: no frame, or odd height or width.
+        UserError: No frame, or odd height or width.
     """
     data = _encode(frames, fps, "libx264", "yuv420p", {"crf": "18"})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
+    write_file(path, data)
 
 
 def read_frames(path: Path) -> tuple[UInt8[np.ndarray, "n h w 3"], float | None]:
-    """All frames of a video file, or of a folder of pictures in natural order (2 before 10).
+    """Read all frames of a video file, or of a folder of images in natural order (2 before 10).
 
     Returns:
-        The RGB frames, and frames per second (None if the source does not say: a folder).
+        RGB frames, and frames per second (None for a folder).
 
     Raises:
-        UserError: nothing there, nothing readable, or pictures of different sizes.
+        UserError: Nothing there, nothing readable, or images of different sizes.
     """
     if path.is_dir():
         return _read_folder(path), None
     if not path.exists():
-        raise UserError(f"{path} does not exist: give a video file or a folder of pictures")
+        raise UserError(f"{path} does not exist: give a video file or a folder of images")
     try:
         with av.open(str(path), "r") as container:
             if not container.streams.video:
@@ -140,13 +139,18 @@ def read_frames(path: Path) -> tuple[UInt8[np.ndarray, "n h w 3"], float | None]
 
 def _read_folder(folder: Path) -> UInt8[np.ndarray, "n h w 3"]:
     paths = [path for path in folder.iterdir() if path.suffix.lower() in _PICTURES]
+    if not paths and (folder / "data").is_dir():
+        raise UserError(
+            f"{folder} holds data/ but no meta/info.json; if it is a set of episodes, run: "
+            f"touchgoal repair --fix {folder}"
+        )
     if not paths:
-        raise UserError(f"{folder} holds no picture ({', '.join(sorted(_PICTURES))})")
+        raise UserError(f"{folder} holds no image ({', '.join(sorted(_PICTURES))})")
     frames = []
     for path in sorted(paths, key=lambda path: _natural_order(path.name)):
         picture = read_picture(path)
         if picture is None:
-            raise UserError(f"{path} is no readable picture: remove or replace it")
+            raise UserError(f"{path} is no readable image: remove or replace it")
         frames.append(picture)
     return _stack_equal_sizes(folder, frames)
 
@@ -158,5 +162,5 @@ def _natural_order(name: str) -> list[tuple[str, int]]:
 def _stack_equal_sizes(path: Path, frames: list[np.ndarray]) -> UInt8[np.ndarray, "n h w 3"]:
     sizes = {frame.shape for frame in frames}
     if len(sizes) > 1:
-        raise UserError(f"{path} holds pictures of {len(sizes)} different sizes: make them equal")
+        raise UserError(f"{path} holds images of {len(sizes)} different sizes: make them equal")
     return np.stack(frames)

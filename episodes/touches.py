@@ -1,4 +1,4 @@
-"""Touches: single tactile frames with the object they feel, cut from episodes."""
+"""Touches: single tactile frames with the object in contact, drawn from episodes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,15 +29,15 @@ class Touches:
     """n tactile frames of e episodes, with b backgrounds: one per episode and side.
 
     Attributes:
-        frames: raw sensor RGB, one side each.
-        background: the same sensors untouched, per episode and side.
-        background_index: row of `background` that belongs to each frame.
-        view: the wrist camera's unoccluded picture of the object, one per episode.
-        view_index: row of `view` that belongs to each frame.
-        object: catalogue id of what each frame feels; "" for no contact.
-        descriptions: catalogue id -> sentences on how the object feels.
-        side: index into `vocabulary.TACTILE` of each frame: 0 left, 1 right.
-        episode_index: index in the set of each frame's episode.
+        frames: Raw sensor RGB, one side each.
+        background: The same sensors without contact, per episode and side.
+        background_index: Row of `background` for each frame.
+        view: The wrist camera's unoccluded image of the object, one per episode.
+        view_index: Row of `view` for each frame.
+        object: Catalogue id of the object that each frame touches; "" without contact.
+        descriptions: Catalogue id -> sentences on how the object feels.
+        side: Index into `features.TACTILE` of each frame: 0 left, 1 right.
+        episode_index: Index in the set of each frame's episode.
     """
 
     frames: UInt8[np.ndarray, "n h w 3"]
@@ -51,7 +51,7 @@ class Touches:
     episode_index: Int[np.ndarray, " n"]
 
     def __len__(self) -> int:
-        """Number of touches, n."""
+        """Return the number of touches, n."""
         return len(self.frames)
 
 
@@ -61,27 +61,27 @@ def collect_touches(
     no_contact_frames_per_episode: int,
     seed: int,
 ) -> Touches:
-    """Draws frames in contact, and without contact, evenly from both fingertips of every episode.
+    """Draw frames with and without contact from both fingertips of every episode.
 
     Contact is the simulator's if the set has it, else `detect_contact`'s. The background is the
-    median of a side's first 5 frames. The view is the wrist picture 5 frames before the last one
-    without contact on either side (the first, if that is earlier or nothing is touched), when the
-    hand does not yet hide the object. An episode with fewer frames of a kind gives what it has.
+    median of a side's first 5 frames. The view is the wrist image 5 frames before the last one
+    without contact on either side (the first, if that is earlier or there is no contact), when the
+    hand does not yet hide the object. An episode with fewer frames of a kind gives all it has.
 
     Args:
-        episodes: a set whose meta has `object` and `descriptions`.
-        contact_frames_per_episode: frames in contact to draw, both sides together.
-        no_contact_frames_per_episode: frames without contact on their side to draw.
-        seed: of the draw; an episode's draw does not depend on the other episodes.
+        episodes: Set whose meta has `object` and `descriptions`.
+        contact_frames_per_episode: Number of frames in contact, both sides together.
+        no_contact_frames_per_episode: Number of frames without contact on their side.
+        seed: Random seed; an episode's draw does not depend on the other episodes.
 
     Raises:
-        UserError: the set lacks the pictures or the meta, or no episode touches anything.
+        UserError: The set lacks the images or the meta, or has no contact.
     """
     sides = _check(episodes)
     most = len(episodes) * (contact_frames_per_episode + no_contact_frames_per_episode)
     frames = np.empty((most, *episodes.features[TACTILE[sides[0]]]["shape"]), np.uint8)
     sampled, backgrounds, views, filled = [], [], [], 0
-    for i in track(range(len(episodes)), "taking touches from", "episode"):
+    for i in track(range(len(episodes)), "drawing touches", "episode"):
         background = [_background(episodes, i, side) for side in sides]
         contact = _contact(episodes, i, sides)
         rng = np.random.default_rng([seed, i])
@@ -102,7 +102,7 @@ def collect_touches(
         views.append(_view(episodes, i, contact))
     episode_index, column, in_contact = np.concatenate(sampled).T
     if not in_contact.any():
-        raise UserError(f"nothing is touched in {episodes.root}: give episodes with contact")
+        raise UserError(f"{episodes.root} has no contact: give episodes with contact")
     names = [str(episodes.meta(i)["object"]) for i in range(len(episodes))]
     return Touches(
         frames=frames[:filled],
@@ -118,10 +118,10 @@ def collect_touches(
 
 
 def _check(episodes: EpisodeSet) -> list[int]:
-    """Raises UserError for a set without touch or without names; returns the sides it has."""
+    """Return the sides of a set; UserError if it lacks touch, wrist images or descriptions."""
     sides = [side for side, key in enumerate(TACTILE) if key in episodes.features]
     if not sides or WRIST not in episodes.features:
-        raise UserError(f"{episodes.root} has no touch or no wrist pictures: record {WRIST} too")
+        raise UserError(f"{episodes.root} has no touch or no wrist images: record {WRIST} too")
     if missing := {"object", "descriptions"} - set(episodes.meta(0)):
         raise UserError(f"{episodes.root} lacks meta {', '.join(sorted(missing))}: record them")
     check_fingertips(episodes, range(len(episodes)))
@@ -161,12 +161,12 @@ def _exchanged(frames: tuple[Picture, Picture], first: tuple[Picture, Picture]) 
 
 
 def touch_background(frames: UInt8[np.ndarray, "n h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """A fingertip untouched: the median of its first 5 frames, in training and in rewards alike."""
+    """Return a fingertip's background: the median of its first 5 frames, in training and rewards."""
     return np.median(frames[:_BACKGROUND_FRAMES], axis=0).astype(np.uint8)
 
 
 def contact_per_frame(frames: UInt8[np.ndarray, "t h w 3"]) -> Bool[np.ndarray, " t"]:
-    """Whether a fingertip touches something, frame by frame; in the first 5 it must not."""
+    """Detect contact in each frame of a fingertip; the first 5 must be without."""
     untouched, background = frames[:_BACKGROUND_FRAMES], touch_background(frames)
     return detect_contact(frames, background, threshold_for(untouched, background))
 
@@ -188,7 +188,7 @@ def _contact(episodes: EpisodeSet, i: int, sides: list[int]) -> Bool[np.ndarray,
 def _sample_frames(
     mask: Bool[np.ndarray, "t s"], count: int, rng: np.random.Generator
 ) -> Int[np.ndarray, "k 2"]:
-    """At most `count` places (frame, column) where the mask is true, in order of time."""
+    """Draw at most `count` (frame, column) pairs where the mask is true, in order of time."""
     places = np.argwhere(mask)
     return places[np.sort(rng.permutation(len(places))[:count])]
 
@@ -202,7 +202,7 @@ def _view(
 
 
 def _descriptions(episodes: EpisodeSet) -> dict[str, list[str]]:
-    """All sentences said of each object, each once, in the order in which they appear."""
+    """Return the distinct sentences on each object, in the order in which they appear."""
     sentences_of: dict[str, dict[str, None]] = {}
     for i in range(len(episodes)):
         meta = episodes.meta(i)

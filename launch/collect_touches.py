@@ -1,4 +1,4 @@
-"""Record objects slid over a simulated sensor, to learn from without labels."""
+"""Record objects slid over a simulated sensor, to train on without labels."""
 
 import os
 from pathlib import Path
@@ -12,21 +12,21 @@ class Config:
     """Options of collect-touches."""
 
     out: Path | None = None
-    """Folder of the run; the episodes go to its `episodes/`. A folder that holds some already gets
-    those that are missing."""
+    """Folder of the run; the episodes go to its `episodes/`. Only missing ones are recorded, so the same
+    line continues an interrupted recording."""
     episodes: Count = 300
-    """Number of episodes: one object each, slid and turned for a second, 66 pictures at 60 Hz, on a unit
-    of its own of the sensor. Sparsh learned from 460,000 pictures: 7000."""
+    """Number of episodes: one object each, slid and turned for a second, 66 images at 60 Hz, on another
+    sensor instance. Sparsh trained on 460,000 images, which 7000 episodes give."""
     sensor: str = "gelsight_mini_markers"
     """Fingertip sensor, by name or folder of a sensor file."""
     seed: Seed = 0
-    """Random seed of all episodes."""
+    """Random seed."""
     workers: Count = os.cpu_count() or 1
-    """Processes that simulate."""
+    """Number of simulating processes."""
 
 
 def main(config: Any) -> None:
-    """Record what is missing."""
+    """Record the missing episodes."""
     from touchgoal.control.tactile.sensor_models import find_sensor
     from touchgoal.episodes.bench_recording import record_catalogue_slides
     from touchgoal.runtime.interruption import on_interruption
@@ -38,8 +38,7 @@ def main(config: Any) -> None:
     root = out / "episodes"
     rig = RigConfig(sensor=config.sensor, seed=config.seed)
     with on_interruption(
-        lambda: f"what was recorded is kept in {root}; the same line with --out {out} goes on"
+        lambda: f"finished episodes are in {root}; the same line with --out {out} continues"
     ):
         episodes = record_catalogue_slides(root, rig, config.episodes, config.workers)
-    pictures = sum(episodes.lengths)
-    print(f"{len(episodes)} episodes, {pictures} pictures in {root}")
+    print(f"{len(episodes)} episodes, {sum(episodes.lengths)} images in {root}")

@@ -15,7 +15,7 @@ class Config:
     """Options of completion."""
 
     shell: Annotated[Literal["bash", "zsh", "fish"], tyro.conf.Positional]
-    """Shell to print it for. Put the line in ~/.bashrc or ~/.zshrc; for fish:
+    """Shell. Put the line in ~/.bashrc or ~/.zshrc; for fish:
     touchgoal completion fish > ~/.config/fish/completions/touchgoal.fish"""
 
 

@@ -1,4 +1,4 @@
-"""What a check found: one line of a table, and what to do about it."""
+"""Result of a check: one line of a table, with its remedy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,8 +13,10 @@ class CheckResult:
     """One line of the report.
 
     Attributes:
-        ok: whether it works; None for something optional that is not there.
-        remedy: what to do if it does not.
+        name: What was checked.
+        ok: Whether it works; None for something optional that is absent.
+        detail: What was found.
+        remedy: What to do if it does not work.
     """
 
     name: str
@@ -23,13 +25,13 @@ class CheckResult:
     remedy: str = ""
 
     def __str__(self) -> str:
-        """The line."""
+        """Return the line."""
         remedy = f"  ->  {self.remedy}" if self.remedy else ""
         return f"{_MARKS[self.ok]:<9}{self.name:<18}{self.detail}{remedy}"
 
 
 def require_all_ok(results: Sequence[CheckResult]) -> None:
-    """UserError, so exit code 1, if something that is needed is missing."""
+    """Raise UserError if a check failed."""
     broken = [f for f in results if f.ok is False]
     if broken:
         raise UserError("; ".join(f"{f.name}: {f.remedy or f.detail}" for f in broken))

@@ -1,20 +1,20 @@
-"""The one exception a user's mistake raises, and what its messages advise."""
+"""Exception for a user's mistake."""
 
 from pathlib import Path
 
 
 class UserError(ValueError):
-    """A mistake that the person at the keyboard can mend; its message is one line saying how.
+    """A mistake that the user can correct; the message is one line that says how.
 
-    Commands print the message and exit with 1; anything else is a bug and keeps its traceback.
+    Commands print the message and exit with 1; any other exception is a bug and shows its traceback.
     """
 
 
 def install_extra(extra: str) -> str:
-    """The command that installs one of our optional parts, for messages.
+    """Return the command that installs an extra, for messages.
 
-    touchgoal is on no package index, so it names the clone that this code runs from; an installed
-    wheel does not know its clone.
+    touchgoal is on no package index: the command names the clone that this code runs from, which an
+    installed wheel does not know.
     """
     root = Path(__file__).resolve().parents[1]
     if (root / "pyproject.toml").is_file():

@@ -1,4 +1,4 @@
-"""Options with ranges: `Config` classes that are checked whenever one is made, by whomever."""
+"""Options with ranges: frozen dataclasses that are checked when they are made."""
 
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
@@ -14,21 +14,21 @@ Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 """Between 0 and 1, both included."""
 Count = Annotated[int, Field(ge=1)]
 CountOrNone = Annotated[int, Field(ge=0)]
-"""A count that may be 0, for nothing of it."""
+"""Count that may be 0."""
 Seed = Annotated[int, Field(ge=0)]
 Port = Annotated[int, Field(ge=0, le=65535)]
 
 Point = tuple[float, float]
-"""x and y in a picture, px; the middle of its first pixel is 0, 0."""
+"""x and y in an image, px; the centre of its first pixel is (0, 0)."""
 Corners = tuple[Point, Point, Point, Point]
-"""Of a gel in its camera's picture: top left, top right, bottom left, bottom right; the order in which GelSight
-Wedges' config.csv has them."""
+"""Corners of a gel in its camera's image: top left, top right, bottom left, bottom right, the order of a
+GelSight Wedge's config.csv."""
 
 STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
-"""Of pydantic dataclasses that are read from a file: nothing is converted, every key is known."""
+"""Config of pydantic dataclasses read from a file: no conversion, no unknown key."""
 
 RARE = "rarely needed"
-"""Stands in the annotation of an option that only `--help-all` shows."""
+"""Marks the annotation of an option that only `--help-all` shows."""
 
 Number = TypeVar("Number", bound=float)
 
@@ -41,14 +41,14 @@ def _ordered(bounds: tuple[Number, Number]) -> tuple[Number, Number]:
 
 ORDERED = AfterValidator(_ordered)
 PositiveRange = Annotated[tuple[Positive, Positive], ORDERED]
-"""Lower and upper bound; two equal ones fix the value."""
+"""Lower and upper bound; equal bounds fix the value."""
 
 
 class OptionError(UserError):
     """Values out of range.
 
     Attributes:
-        problems: name of each field at fault ("" for several together), and what is wrong.
+        problems: Name of each wrong field ("" for several together), and what is wrong.
     """
 
     def __init__(self, config: str, problems: list[tuple[str, str]]) -> None:
@@ -62,10 +62,9 @@ Class = TypeVar("Class", bound=type)
 
 @dataclass_transform(frozen_default=True)
 def checked_dataclass(cls: Class) -> Class:
-    """A frozen dataclass whose fields are checked by pydantic against their annotations.
+    """Turn a class into a frozen dataclass whose fields pydantic checks against their annotations.
 
-    Raises (when an instance is made):
-        OptionError: a value does not fit, or `__post_init__` raised a ValueError.
+    Making an instance raises OptionError if a value does not fit or `__post_init__` raises ValueError.
     """
     made: Any = pydantic.dataclasses.dataclass(frozen=True, config={"extra": "forbid"})(cls)
     initialise = made.__init__
@@ -83,6 +82,6 @@ def checked_dataclass(cls: Class) -> Class:
 
 def _problem(error: Any) -> tuple[str, str]:
     field = str(error["loc"][0]) if error["loc"] else ""
-    if error["type"] == "value_error":  # raised by a check of ours, in words of ours
+    if error["type"] == "value_error":  # raised by one of our checks
         return field, error["msg"].removeprefix("Value error, ")
     return field, f"{error['msg'].replace('Input should be', 'must be')}, not {error['input']}"

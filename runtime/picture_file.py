@@ -1,4 +1,4 @@
-"""Pictures from files that somebody else made: whatever is in them, a picture or one line."""
+"""Image files of unknown origin: an image, None, or a UserError, whatever the file holds."""
 
 import io
 import warnings
@@ -15,10 +15,10 @@ _MOST_PIXELS = 50_000_000  # a small file may unpack to gigabytes
 
 
 def read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"] | None:
-    """The RGB picture of a file; None if there is none or it cannot be read.
+    """Read the RGB image of a file; None if it is missing or unreadable.
 
     Raises:
-        UserError: it has more than 50 million pixels.
+        UserError: It has more than 50 million pixels.
     """
     try:
         return decode_picture(path.read_bytes(), str(path))
@@ -27,7 +27,7 @@ def read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"] | None:
 
 
 def decode_picture(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"] | None:
-    """As `read_picture`, from bytes; `name` is for the message."""
+    """Decode an image file's bytes, as `read_picture`; `name` is for the message."""
     if not data:
         return None
     try:

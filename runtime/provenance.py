@@ -1,4 +1,4 @@
-"""Where results come from: the command, the code's commit, versions, hardware."""
+"""Provenance of results: command, commit, versions, hardware."""
 
 import importlib.metadata
 import platform
@@ -75,7 +75,7 @@ def provenance() -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Of Python and of the packages that results depend on most."""
+    """Return the versions of Python and of the packages that results depend on most."""
     found = {"python": platform.python_version()}
     for name in _PACKAGES:
         try:
@@ -86,7 +86,7 @@ def versions() -> dict[str, str]:
 
 
 def hardware() -> str:
-    """Processor of this machine, and its GPU if torch is in use and has one."""
+    """Return the processor of this machine, and its GPU if torch is imported and has one."""
     torch = sys.modules.get("torch")
     gpu = torch.cuda.get_device_name() if torch is not None and torch.cuda.is_available() else ""
     return ", ".join(filter(None, (_processor(), gpu)))
@@ -104,16 +104,16 @@ def _processor() -> str:
 
 @cache
 def _commit() -> tuple[str | None, bool | None]:
-    """Commit of a checkout and whether its files differ from it; None twice for an installed one."""
+    """Return a checkout's commit and whether its files differ; (None, None) for an installed package."""
     here = Path(__file__).resolve()
-    # An installed package may lie in somebody else's repository: only a file of ours counts.
+    # An installed package may lie in another repository, which does not track this file.
     if _git("ls-files", "--error-unmatch", here.name) is None:
         return None, None
     return _git("rev-parse", "HEAD"), bool(_git("status", "--porcelain", "--untracked-files=no"))
 
 
 def _git(*arguments: str) -> str | None:
-    """What git answers, or None if it fails or is missing."""
+    """Return git's output; None if it fails or is missing."""
     folder = Path(__file__).resolve().parent
     try:
         answer = subprocess.run(

@@ -55,7 +55,7 @@ def test_touches(tmp_path: Path, truth: bool) -> None:
 def test_touches_need_touch_and_names(tmp_path: Path) -> None:
     episode = touch_episode(2, truth=True)
     EpisodeWriter(tmp_path / "untouched").append(episode)
-    with pytest.raises(UserError, match="nothing is touched"):
+    with pytest.raises(UserError, match="has no contact"):
         collect_touches(EpisodeSet(tmp_path / "untouched"), 8, 3, seed=0)
     EpisodeWriter(tmp_path / "unnamed").append(Episode(episode.frames, "touch", {}))
     with pytest.raises(UserError, match="lacks meta descriptions, object"):

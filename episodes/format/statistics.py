@@ -1,8 +1,8 @@
-"""Statistics of a feature as LeRobot keeps them, per episode and merged over a set.
+"""Statistics of a feature in LeRobot's format, per episode and merged over a set.
 
 A `Stats` maps min, max, mean, std, count, q01, q10, q50, q90, q99 to nested lists (they go into
-JSON and Parquet as they are). Vectors give one number per component; pictures give one per
-channel, in shape (3, 1, 1), with pixel values scaled to [0, 1]. `count` is the number of frames.
+JSON and Parquet as they are). Vectors have one number per component; images have one per channel, in
+shape (3, 1, 1), with pixel values scaled to [0, 1]. `count` is the number of frames.
 """
 
 import cv2
@@ -15,7 +15,7 @@ QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
 
 def array_statistics(values: Shaped[np.ndarray, "n d"]) -> Stats:
-    """Statistics over the n frames of a numeric or boolean feature of d components."""
+    """Return statistics over the n frames of a numeric or boolean feature of d components."""
     x = values.astype(np.float64)
     stats = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0)}
     stats |= dict(zip(QUANTILES, np.quantile(x, list(QUANTILES.values()), axis=0), strict=True))
@@ -23,7 +23,7 @@ def array_statistics(values: Shaped[np.ndarray, "n d"]) -> Stats:
 
 
 def image_statistics(images: UInt8[np.ndarray, "n h w 3"]) -> Stats:
-    """Statistics over every pixel of n pictures: exact, through one histogram per channel."""
+    """Return exact statistics over every pixel of n images, from one histogram per channel."""
     histogram = np.zeros((3, 256))
     for image in images:
         for channel in range(3):
@@ -50,7 +50,7 @@ def _histogram_statistics(counts: Float[np.ndarray, " 256"]) -> dict[str, float]
 
 
 def merge(a: Stats, b: Stats) -> Stats:
-    """Statistics of two sets of frames together.
+    """Return the statistics of two sets of frames together.
 
     Exact for min, max, mean, std and count. Quantiles are the count-weighted mean of the two,
     LeRobot's own approximation (`aggregate_stats` in lerobot's datasets/compute_stats.py).

@@ -1,4 +1,4 @@
-"""From what was typed to a command's `Config`: tyro parses, and a bad value is one line."""
+"""Parsing of a command line into a command's `Config` with tyro; a bad value is one line."""
 
 import ast
 import dataclasses
@@ -52,7 +52,7 @@ def parse(
         SystemExit: help was asked for (0), or something typed was not understood (2).
     """
     _refuse_empty_values(arguments)
-    short = not {"--help", "-h"}.isdisjoint(arguments)  # what tyro hides it does not take either
+    short = not {"--help", "-h"}.isdisjoint(arguments)  # tyro does not accept what it hides
     typed = ["--help" if a == "--help-all" else a for a in arguments]
     env = envs[_task(typed, envs)] if envs else None
     hidden_of = {name: _hidden(kind, env) for name, kind in _members(config_type)}
@@ -74,14 +74,14 @@ def parse(
         name = next((a for a in typed if a in hidden_of), "")
         if stop.code == 0 and hidden & hidden_of.get(name, set()):
             command = f"{prog} {name}".strip()
-            print(f"{len(hidden_of[name])} rarely needed options more: {command} --help-all")
+            print(f"{len(hidden_of[name])} more options, rarely needed: {command} --help-all")
         if stop.code == 2 and env is not None and envs is not None:
             _point_to_other_task(typed, env, envs)
         raise
 
 
 class _OutOfRange(Exception):
-    """Takes an OptionError past tyro, which would print a ValueError in its own way."""
+    """Carries an OptionError past tyro, which formats a ValueError in its own way."""
 
     def __init__(self, error: UserError) -> None:
         self.error = error
@@ -90,7 +90,7 @@ class _OutOfRange(Exception):
 def _as_options(
     info: StructTypeInfo, env: EnvConfig | None, hidden: set[tuple[type, str]], preset: str = ""
 ) -> StructConstructorSpec | None:
-    """A dataclass as tyro is to offer it: with our help texts, without what is hidden."""
+    """Return tyro's description of a dataclass, with our help texts and without hidden options."""
     if not dataclasses.is_dataclass(info.type) or info.type.__module__.startswith("tyro"):
         return None
     fields = []
@@ -128,7 +128,7 @@ def _default(field: dataclasses.Field, parent: Any) -> Any:
 
 
 def _options(config_type: type) -> list[tuple[dataclasses.Field, Any, str]]:
-    """Fields of a dataclass with their annotations and help texts, which say the ranges."""
+    """Return the fields of a dataclass with annotations and help texts, ranges included."""
     hints, texts = (
         get_type_hints(config_type, include_extras=True),
         docstrings(config_type),
@@ -140,7 +140,7 @@ def _options(config_type: type) -> list[tuple[dataclasses.Field, Any, str]]:
 
 
 def docstrings(config_type: type) -> dict[str, str]:
-    """The string below each field of a dataclass and of those it extends."""
+    """Return the string below each field of a dataclass and of its bases."""
     texts = {}
     for cls in reversed(config_type.__mro__):
         if not dataclasses.is_dataclass(cls):
@@ -164,7 +164,7 @@ def _with_range(text: str, annotation: Any) -> str:
 
 
 def _bounds(annotation: Any) -> Iterator[str]:
-    """What the annotation demands, in words."""
+    """Yield the bounds of an annotation in words."""
     for extra in getattr(annotation, "__metadata__", ()):
         for rule in extra.metadata if isinstance(extra, FieldInfo) else (extra,):
             match rule:
@@ -181,7 +181,7 @@ def _bounds(annotation: Any) -> Iterator[str]:
 
 
 def _hidden(config_type: type, env: EnvConfig | None) -> set[tuple[type, str]]:
-    """Options that --help leaves out: those marked RARE, and what comes after the first SHOWN."""
+    """Return the options that --help hides: those marked RARE, and those after the first SHOWN."""
     options = list(_all_options(config_type, env))
     common = [key for key, is_rare in options if not is_rare]
     return {key for key, is_rare in options if is_rare} | set(common[SHOWN:])
@@ -190,7 +190,7 @@ def _hidden(config_type: type, env: EnvConfig | None) -> set[tuple[type, str]]:
 def _all_options(
     config_type: type, env: EnvConfig | None, rare: bool = False
 ) -> Iterator[tuple[tuple[type, str], bool]]:
-    """Every option and whether it is marked RARE, or in a group that is; groups come last."""
+    """Yield every option and whether it or its group is marked RARE; groups come last."""
     groups = []
     for field, annotation, _ in _options(config_type):
         is_rare = rare or RARE in getattr(annotation, "__metadata__", ())
@@ -206,7 +206,7 @@ def _all_options(
 
 
 def _members(config_type: Any) -> Iterator[tuple[str, type]]:
-    """Names and dataclasses of a union of subcommands; without a name the one that it is."""
+    """Yield names and dataclasses of subcommands; a single dataclass has the name ""."""
     if get_origin(config_type) in (Union, UnionType):
         for member in get_args(config_type):
             yield member.__metadata__[0].name, _bare(member)
@@ -219,7 +219,7 @@ def _bare(annotation: Any) -> Any:
 
 
 def _task(arguments: Sequence[str], envs: Mapping[str, EnvConfig]) -> str:
-    """The task that was typed, the first if none was; tyro refuses one that does not exist."""
+    """Return the typed task, else the first; tyro refuses an unknown one."""
     typed = [value for value in _values(arguments, "--task") if value in envs]
     return typed[-1] if typed else next(iter(envs))
 
@@ -241,7 +241,7 @@ def _refuse_empty_values(arguments: Sequence[str]) -> None:
 
 
 def _one_line(error: UserError, arguments: Sequence[str]) -> str:
-    """The error with the options as they were typed in place of the fields."""
+    """Return the message with the options as typed in place of the fields."""
     if not isinstance(error, OptionError):
         return str(error)
     return "; ".join(f"{_typed(field, arguments)} {what}".strip() for field, what in error.problems)
@@ -259,7 +259,7 @@ def _typed(field: str, arguments: Sequence[str]) -> str:
 def _point_to_other_task(
     arguments: Sequence[str], env: EnvConfig, envs: Mapping[str, EnvConfig]
 ) -> None:
-    """Say to which task an option belongs that this one does not have."""
+    """Raise UserError for an option of another task."""
     for argument in arguments:
         field = argument.removeprefix("--env.").split("=")[0].replace("-", "_")
         owners = [task for task, other in envs.items() if hasattr(other, field)]
@@ -268,7 +268,7 @@ def _point_to_other_task(
 
 
 def print_completion(config_type: Any, shell: str) -> None:
-    """A script for a shell that completes what is typed after `touchgoal`."""
+    """Print a script that completes the arguments of `touchgoal` in a shell."""
     registry = ConstructorRegistry()
     registry.struct_rule(partial(_as_options, env=None, hidden=set()))
     try:
