@@ -1,42 +1,16 @@
 """Preprocessing of raw fingertip frames: the same numbers in training, tests and deployment."""
 
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from touchgoal.control.tactile.light_gain import remove_gain
+from touchgoal.encoders.backbones.sparsh_input import SparshPreprocessor
 from touchgoal.runtime.errors import UserError
 
 _ASPECT_TOLERANCE = 0.02  # a GelSight Mini's own 3280 x 2464 differs from 4:3 by 0.2 %
-
-
-@runtime_checkable  # beartype checks arguments in tests
-class Preprocessor(Protocol):
-    """Preprocessor of raw frames to network input."""
-
-    @property
-    def id(self) -> str:
-        """Return an identity that changes whenever the numbers do."""
-        ...
-
-    @property
-    def sensor(self) -> str | None:
-        """Return the only sensor that it is for, or None for any."""
-        ...
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Return height and width of the output, px."""
-        ...
-
-    def __call__(
-        self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
-    ) -> Float32[np.ndarray, "n 3 H W"]:
-        """Preprocess frames, given the untouched sensor; UserError for another sensor's."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -121,21 +95,14 @@ def check_images(name: str, images: object, ndim: tuple[int, ...]) -> None:
         raise UserError(f"{expected}, and at least one: these have shape {images.shape}")
 
 
-PREPROCESSORS: dict[str, TactilePreprocessor] = {
+Preprocessor = TactilePreprocessor | SparshPreprocessor
+
+_LANDSCAPE = (
+    "gelsight_mini", "gelsight_mini_markers", "gelsight", "gelsight_markers", "gelsight_wedge"
+)  # fmt: skip
+PREPROCESSORS = {
     sensor: TactilePreprocessor(sensor, version=1, size=size, scale=16.0)
-    for size, sensors in (
-        (
-            (120, 160),
-            (
-                "gelsight_mini",
-                "gelsight_mini_markers",
-                "gelsight",
-                "gelsight_markers",
-                "gelsight_wedge",
-            ),
-        ),
-        ((160, 120), ("digit",)),  # upright
-    )
+    for size, sensors in (((120, 160), _LANDSCAPE), ((160, 120), ("digit",)))
     for sensor in sensors
 }
 

@@ -51,7 +51,7 @@ class SparshPreprocessor:
     def __call__(
         self, frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
     ) -> Float32[np.ndarray, "n 3 H W"]:
-        """See Preprocessor."""
+        """Preprocess frames, given the untouched sensor."""
         rows, columns = self.size
         out = np.empty((len(frames), 3, rows, columns), np.float32)
         shifted = background.astype(np.int16) - _GREY

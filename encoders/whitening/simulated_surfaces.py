@@ -51,8 +51,9 @@ def train(sensor: SensorModel, name: str, config: WhiteningConfig) -> PooledEnco
     encoder = PooledEncoder(PooledEncoderConfig.for_sensor(name))
     total, square = np.zeros(FEATURES), np.zeros((FEATURES, FEATURES))
     within = np.zeros((FEATURES, FEATURES))
-    count = config.surfaces * config.presses
-    for rows in track(_pooled(encoder, sensor, config), "surfaces", "batch", _batches(config)):
+    count, step = config.surfaces * config.presses, max(1, _BATCH // config.presses)
+    batches = _pooled(encoder, sensor, config, step)
+    for rows in track(batches, "surfaces", "batch", -(-config.surfaces // step)):
         total += rows.sum((0, 1))
         flat = rows.reshape(-1, FEATURES)
         square += flat.T @ flat
@@ -65,21 +66,12 @@ def train(sensor: SensorModel, name: str, config: WhiteningConfig) -> PooledEnco
     return encoder.fit(mean, whitening)
 
 
-def _batches(config: WhiteningConfig) -> int:
-    return -(-config.surfaces // _surfaces_a_batch(config))
-
-
-def _surfaces_a_batch(config: WhiteningConfig) -> int:
-    return max(1, _BATCH // config.presses)
-
-
 def _pooled(
-    encoder: PooledEncoder, sensor: SensorModel, config: WhiteningConfig
+    encoder: PooledEncoder, sensor: SensorModel, config: WhiteningConfig, step: int
 ) -> Iterator[Float32[np.ndarray, "surfaces presses d"]]:
-    """Yield the pooled features of a batch of surfaces."""
+    """Yield the pooled features of `step` surfaces at a time."""
     rng = np.random.default_rng([config.seed, 0])
     units = [_unit(sensor, rng) for _ in range(_UNITS)]
-    step = _surfaces_a_batch(config)
     for first in range(0, config.surfaces, step):
         touches = []
         for i in range(first, min(first + step, config.surfaces)):
