@@ -296,13 +296,3 @@ def test_a_background_is_filled_in_without_a_seam() -> None:
     presses = replace(made, images=np.stack([settled] * 8), circles=circles)
     change = median_background(presses).astype(int) - made.background
     assert change.min() >= 5 and change.max() <= 7
-
-
-def test_sensor_files_of_older_formats_are_read(tmp_path: Path) -> None:
-    sensor_calibration.save(known_sensor(), tmp_path, {})
-    old = json.loads((tmp_path / "sensor.json").read_text())
-    del old["illumination_exponent"]
-    (tmp_path / "sensor.json").write_text(json.dumps(old | {"format": 1}))
-    assert sensor_calibration.load(tmp_path).illumination_exponent == 1
-    (tmp_path / "sensor.json").write_text(json.dumps(old | {"light_power": 2}))
-    assert sensor_calibration.load(tmp_path).illumination_exponent == 2

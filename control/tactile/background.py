@@ -1,4 +1,4 @@
-"""The untouched picture of a sensor: taken, followed as its light drifts, and judged."""
+"""Background of a sensor: its untouched picture, followed as the light drifts."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -28,7 +28,7 @@ _ANOTHER_SENSOR = 5.0  # counts of local change to a reference; drift of the ful
 
 @dataclass(frozen=True)
 class Drift:
-    """How the light changed since the reference, by channel (R, G, B).
+    """Change of the light since the reference, by channel (R, G, B).
 
     Attributes:
         gain: factor of the brightness, 1 for none.
@@ -44,7 +44,7 @@ class Drift:
     def large(self) -> bool:
         """Whether to take a new reference: more than twice the spread between real touches.
 
-        The pattern's largest value over an image is twice its standard deviation already.
+        The pattern's maximum over an image is already twice its standard deviation.
         """
         gain = np.abs(self.gain - 1) > LARGE_CHANGE
         offset = np.abs(self.offset) > 2 * _OFFSET_SPREAD
@@ -52,21 +52,16 @@ class Drift:
 
 
 class Background:
-    """The untouched frame of one sensor as it is now; `update` follows its drift.
+    """Untouched frame of one sensor as it is now; `update` follows its drift.
 
     Args:
-        frames: at least one RGB picture of the untouched sensor, better five or more: their median
-            is the first background.
-        reference: what drift is measured against, such as the sensor file's background; None: the
-            first background.
-
-    Attributes:
-        steady: the untouched frame without what a changed light multiplies since the first frames,
-            counts; `light_gain.remove_gain` brings a frame into the same light.
+        frames: at least one RGB picture of the untouched sensor, better five or more; their median is
+            the first background.
+        reference: picture that drift is measured against, such as the sensor file's background;
+            None: the first background.
 
     Raises:
-        UserError: something moved on the sensor while the frames were taken, or they differ from
-            the reference as by a contact.
+        UserError: the picture changes between the frames, or differs from the reference as by a contact.
     """
 
     def __init__(
@@ -91,13 +86,13 @@ class Background:
 
     @property
     def image(self) -> Float32[np.ndarray, "h w 3"]:
-        """The untouched frame as it would look now, counts."""
+        """Current background, counts."""
         return self.steady * self._gain
 
     def update(self, frame: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Follow the drift by one frame; only for frames in which nothing touches.
+        """Follow the drift by one frame in which nothing touches.
 
-        The first 50 count alike: of a single first frame its noise must not stay.
+        The first 50 frames have equal weight, so that the noise of a single first one fades.
         """
         self._frames += 1
         rate = max(_RATE, 1 / self._frames)
@@ -106,7 +101,7 @@ class Background:
         cv2.accumulateWeighted(divide_gain(frame, gain), self.steady, rate)
 
     def drift(self) -> Drift:
-        """How far the background went from the reference; see `Drift.large`."""
+        """Return the drift from the reference."""
         reference = _blurred(self.reference).reshape(-1, 3)
         change = _blurred(self.image).reshape(-1, 3) - reference
         gain, offset = np.empty(3), np.empty(3)
@@ -124,11 +119,10 @@ def local_change(
     frame: UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"],
     background: UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"],
 ) -> Float32[np.ndarray, "H W"]:
-    """How much a frame differs from the background beyond any drift of the light, counts.
+    """Return the change from the background that no drift of the light explains, counts.
 
-    Of the blurred difference, each channel loses what low spatial frequencies and a factor on the
-    background explain (least squares); the norm over the channels of the rest is returned, at a
-    quarter of the resolution.
+    Low spatial frequencies and a factor on the background are fitted to each channel of the blurred
+    difference and subtracted. The result is the norm over the channels, at a quarter of the resolution.
     """
     reference = _blurred(background)
     change = _high_pass(_blurred(frame) - reference)
@@ -146,7 +140,7 @@ def _blurred(image: np.ndarray) -> Float32[np.ndarray, "H W 3"]:
 
 
 def _high_pass(image: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
-    """The image without its lowest cosines."""
+    """Subtract the lowest cosines of an image."""
     height, width, channels = image.shape
     down, across = cosines(height, _WAVES[0]), cosines(width, _WAVES[1])
     waves = across @ (down @ image.reshape(height, -1)).reshape(-1, width, channels)
@@ -156,7 +150,7 @@ def _high_pass(image: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 
 
 @lru_cache
 def cosines(size: int, count: int) -> Float32[np.ndarray, "k size"]:
-    """The lowest waves of the cosine transform (type II): orthonormal rows, at most `size`."""
+    """Return the lowest waves of the cosine transform (type II): orthonormal rows, at most `size`."""
     k, n = np.arange(min(count, size))[:, None], np.arange(size) + 0.5
     rows = np.cos(np.pi * k * n / size)
     rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""When a fingertip touches something, from its pictures alone."""
+"""Contact of a fingertip, from its pictures alone."""
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
@@ -18,21 +18,20 @@ _RELEASE = 0.1  # of a contact's peak strength
 
 
 class ContactDetector:
-    """Tells frame by frame whether a sensor touches something, and lets its background follow.
+    """Contact detector that updates its background while nothing touches.
 
-    Contact begins when `strength` exceeds the threshold and ends when it falls below half of it,
-    so that strength about the threshold does not make contact flicker; or below a tenth of the
-    contact's peak, for during a long contact the light drifts on and the background cannot follow.
+    Contact begins when `strength` exceeds the threshold. It ends below half the threshold, so that it does
+    not flicker, or below a tenth of the contact's peak, because the light drifts on during a long contact.
 
     Args:
         background: of the sensor; updated in place.
-        threshold: counts; None: from the noise of the first 10 frames, during which only a strong
-            contact (5 counts) is told.
+        threshold: counts; None: from the noise of the first 10 frames, during which only a strong contact
+            (5 counts) counts.
 
     Attributes:
         touching: whether the last frame was in contact.
         strength: of the last frame, see `contact_strength`.
-        threshold: counts, in use.
+        threshold: in use, counts.
     """
 
     def __init__(self, background: Background, threshold: float | int | None = None) -> None:
@@ -44,7 +43,7 @@ class ContactDetector:
         self._peak = 0.0  # strength
 
     def update(self, frame: UInt8[np.ndarray, "h w 3"]) -> bool:
-        """Judge the next frame."""
+        """Process the next frame and return whether it is in contact."""
         rest = self.background.steady
         self.strength = float(local_change(remove_gain(frame, rest), rest).max())
         self._peak = max(self._peak, self.strength) if self.touching else self.strength
@@ -57,7 +56,7 @@ class ContactDetector:
         return self.touching
 
     def _learn(self) -> None:
-        """Take the sensor's noise from its first untouched frames."""
+        """Estimate the sensor's noise from its first untouched frames."""
         if self._untouched is None:
             return
         self._untouched.append(self.strength)
@@ -71,10 +70,7 @@ class ContactDetector:
 def contact_strength(
     frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
 ) -> Float32[np.ndarray, " n"]:
-    """How much the strongest spot of each frame differs from the untouched gel, in counts.
-
-    The largest `background.local_change`: what brighter or dimmer light, or a smooth change of it,
-    explains does not count.
+    """Return the largest `background.local_change` of each frame, counts.
 
     Args:
         frames: RGB pictures of one fingertip sensor.
@@ -87,10 +83,9 @@ def contact_strength(
 def threshold_for(
     untouched: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
 ) -> float:
-    """Threshold (counts) for a sensor with the noise of these frames.
+    """Return the contact threshold (counts) for a sensor with the noise of these frames.
 
-    Compressed streams have a strength of 1 to 2; see `THRESHOLD`, the least. Fewer than half of the
-    frames may be in contact after all.
+    Compressed streams have a strength of 1 to 2. Fewer than half of the frames may be in contact.
     """
     return max(THRESHOLD, _SPARE * float(np.median(contact_strength(untouched, background))))
 
@@ -100,7 +95,7 @@ def detect_contact(
     background: UInt8[np.ndarray, "h w 3"],
     threshold: float | int = THRESHOLD,
 ) -> Bool[np.ndarray, " n"]:
-    """Whether the sensor touches something, frame by frame: a `ContactDetector` over a recording.
+    """Run a `ContactDetector` over a recording and return whether each frame is in contact.
 
     Args:
         frames: consecutive RGB pictures of one fingertip sensor.

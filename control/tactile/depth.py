@@ -1,10 +1,9 @@
-"""From a sensor's picture to the depth of its gel: the sensor file's model, turned round.
+"""Depth of a gel from a picture, by inverting the sensor file's model.
 
-One colour may belong to two slopes, to a shadow or to a depth, so pixels are not inverted one by
-one. The surface is sought as a whole whose picture (`sensor_calibration.shade`) is the frame, by Gauss-Newton
-steps on the squared error: every pixel is read in the light of its neighbours, and what comes out is
-a surface. A step is a Poisson-like equation with free (Neumann) borders, solved by conjugate
-gradients that the cosine transform preconditions. Coarse grids come first: they cost little.
+One colour may belong to two slopes, to a shadow or to a depth, so pixels are not inverted one by one.
+Gauss-Newton steps find the surface whose picture (`sensor_calibration.shade`) fits the frame. A step is a
+Poisson-like equation with free (Neumann) borders, solved by conjugate gradients that the cosine transform
+preconditions. Coarse grids come first: they cost little.
 """
 
 from dataclasses import dataclass
@@ -50,17 +49,16 @@ _TILTED = 0.05  # slope below which the direction is noise
 
 
 class DepthEstimator:
-    """Reconstructs the gel's surface from single frames of one sensor.
+    """Reconstruction of the gel's surface from single frames of one sensor.
 
-    What the sensor file does not tell apart, no frame shows. Walls steeper than its `max_slope` come
-    out too low, except where the depth's own colour (up to `max_depth`) says how deep they go. Without
-    such a colour, depth counts from the lowest tenth of what is seen: too shallow where a contact
-    fills the view.
+    Walls steeper than the file's `max_slope` read too low, unless the depth's own colour (up to `max_depth`)
+    shows how deep they go. Otherwise depth counts from the lowest tenth of the surface: too shallow where a
+    contact fills the view.
 
     Args:
         calibration: the sensor file.
-        finest: side of the smallest cells, px. 8 takes a third of the time of 2 and finds the
-            deepest point of most contacts as well.
+        finest: side of the smallest cells, px. 8 takes a third of the time of 2 and finds the deepest
+            point of most contacts as well.
     """
 
     def __init__(self, calibration: SensorCalibration, finest: int = 2) -> None:
@@ -73,12 +71,12 @@ class DepthEstimator:
         image: UInt8[np.ndarray, "h w 3"],
         background: Float32[np.ndarray, "h w 3"] | None = None,
     ) -> Map:
-        """Depth of the gel's surface below its rest plane, m, positive where pressed in.
+        """Return the depth of the gel's surface below its rest plane, m, positive where pressed in.
 
         Args:
             image: RGB frame; paint markers over first (`markers.without_markers`).
-            background: the untouched sensor (`background.Background.steady`), markers painted over
-                as well; None: the sensor file's. The image is brought into its light.
+            background: the untouched sensor now (`background.Background.image`), markers painted over as
+                well; None: the sensor file's.
         """
         if background is None:
             background = self._calibration.background.astype(np.float32)
@@ -92,7 +90,7 @@ class DepthEstimator:
 
 @dataclass(frozen=True)
 class _Linear:
-    """The picture near a surface: error (counts), its derivatives by slopes and depth, weights."""
+    """Linearised picture: error (counts), its derivatives by slopes and depth, weights."""
 
     error: Colours
     by_gx: Colours
@@ -102,7 +100,7 @@ class _Linear:
 
 
 class _Level:
-    """The model of the picture and its inverse on cells of some pixels."""
+    """Picture model and its inverse at one cell size."""
 
     def __init__(self, calibration: SensorCalibration, cell: int) -> None:
         p = self._calibration = calibration
@@ -137,13 +135,13 @@ class _Level:
         searched: int,
         inner: int,
     ) -> Map:
-        """From a start (of any resolution) towards the surface that makes the change.
+        """Improve a surface towards the one that causes the change.
 
         Args:
-            start: m.
-            change: of the picture to the untouched one, counts.
+            start: of any resolution, m.
+            change: of the picture against the untouched one, counts.
             steps: of Gauss-Newton.
-            searched: the last how many of them may jump to other slopes.
+            searched: number of last steps that may jump to other slopes.
             inner: conjugate gradient steps in each.
         """
         h, w = self._shape
@@ -176,12 +174,12 @@ class _Level:
         return _Linear(error, by_gx, by_gy, self._per_depth * (surface < p.max_depth), weight)
 
     def _shading(self, gx: Map, gy: Map) -> tuple[Colours, Colours, Colours]:
-        """What slopes add to the picture, and the derivatives of that by gx and gy."""
+        """Return the colour change by slopes, and its derivatives by gx and gy."""
         steepest = np.float32(self._calibration.max_slope)
         return shading(gx, gy, self._gain, self._places, self._coefficients, steepest)
 
     def _search(self, left: Colours, error: Colours, gx: Map, gy: Map) -> tuple[Map, Map] | None:
-        """Slopes, where some others in their direction fit the colours much better; else None."""
+        """Return slopes of another length where they fit much better; None if nowhere."""
         outlier = np.float32((_OUTLIER * self._noise) ** 2)
         new_x, new_y, found = best_slopes(
             *(left, error, gx, gy, self._gain, self._places, self._coefficients, self._lengths),
@@ -190,7 +188,7 @@ class _Level:
         return (new_x, new_y) if found else None
 
     def _solve(self, linear: _Linear, surface: Map, inner: int) -> Map:
-        """The step that Gauss and Newton would take: preconditioned conjugate gradients."""
+        """Return the Gauss-Newton step, by preconditioned conjugate gradients."""
         curvature, slope = normal_equations(
             linear.error, linear.by_gx, linear.by_gy, linear.by_depth, linear.weight
         )
@@ -210,7 +208,7 @@ class _Level:
 
 
 def _coefficients(response: Float32[np.ndarray, "3 10 waves"]) -> Float32[np.ndarray, "rows 10"]:
-    """What 1 and `monomials` of the normal (x, y) are multiplied by.
+    """Return the coefficients of 1 and the normal's `monomials`.
 
     Rows: the colour, its derivative by x, by y; each for R, G, B; each for 1, u, v.
     """

@@ -1,4 +1,4 @@
-"""One Gauss-Newton step from a gel's picture towards its surface, compiled: see `depth`.
+"""Compiled parts of one Gauss-Newton step from a gel's picture towards its surface (see `depth`).
 
 Shapes: maps are (rows, columns), colours (3, rows, columns), all float32.
 """
@@ -12,17 +12,14 @@ from numba import njit
 @njit(cache=True, nogil=True)
 @no_type_check
 def shading(gx, gy, gain, places, coefficients, max_slope):
-    """What slopes add to the picture (counts), and the derivatives of that by them.
+    """Return the colour change by slopes (counts) and its derivatives by them: three of colours.
 
     Args:
         gx, gy: slopes of the surface along columns and rows, maps.
         gain: of the light, colours.
         places: 1, or 1, u and v, of each cell (waves, rows, columns).
-        coefficients: as `depth` orders those of the sensor file.
+        coefficients: the sensor file's, ordered as by `depth`.
         max_slope: beyond it only the direction counts.
-
-    Returns:
-        Three of colours.
     """
     h, w = gx.shape
     waves = len(places)
@@ -59,16 +56,16 @@ def shading(gx, gy, gain, places, coefficients, max_slope):
 @njit(cache=True, nogil=True)
 @no_type_check
 def best_slopes(left, error, gx, gy, gain, places, coefficients, lengths, outlier, tilted, better):
-    """Slopes where others in their direction fit the colours much better, and whether there are any.
+    """Return slopes of other lengths where they fit the colours much better, and whether there are any.
 
     Args:
-        left: what slopes are to explain, colours.
-        error: what these leave, colours.
+        left: colour change to explain, colours.
+        error: rest with the present slopes, colours.
         gx, gy: slopes, maps.
         gain, places, coefficients: see `shading`.
         lengths: of the normal's part in the image plane to try.
-        outlier: square of the error that is tried again, counts^2.
-        tilted: square of the slope below which the direction is noise.
+        outlier: squared error that starts a search, counts^2.
+        tilted: squared slope below which the direction is noise.
         better: share of the squared error that another may leave.
     """
     h, w = gx.shape
@@ -103,11 +100,10 @@ def best_slopes(left, error, gx, gy, gain, places, coefficients, lengths, outlie
 @njit(cache=True, nogil=True)
 @no_type_check
 def normal_equations(error, by_gx, by_gy, by_depth, weight):
-    """Sums over the colours of the weighted products of errors and derivatives.
+    """Sum weighted products of errors and derivatives over the colours.
 
     Returns:
-        gx gx, gx gy, gy gy, gx depth, gy depth, depth depth (6 maps), and of gx, gy, depth with
-        the error (3 maps).
+        gx gx, gx gy, gy gy, gx depth, gy depth, depth depth (6 maps); gx, gy, depth times error (3 maps).
     """
     h, w = weight.shape
     curvature, slope = np.empty((6, h, w), np.float32), np.empty((3, h, w), np.float32)
@@ -130,14 +126,14 @@ def normal_equations(error, by_gx, by_gy, by_depth, weight):
 @njit(cache=True, nogil=True)
 @no_type_check
 def conjugate_gradients(curvature, residual, smooth, down, across, half, count):
-    """The surface's change (m) that explains the residual, after so many steps.
+    """Return the surface's change (m) that explains the residual, after `count` steps.
 
     Args:
         curvature: of `normal_equations`.
-        residual: to be explained, map; it is changed.
+        residual: map; overwritten.
         smooth: eigenvalues of the preconditioner under the cosine transform, map.
         down, across: cosine transform of columns and of rows, as matrices.
-        half: central differences to slopes, 1/m.
+        half: factor of central differences, 1/m.
         count: of steps.
     """
     step, direction = np.zeros_like(residual), np.zeros_like(residual)
@@ -169,7 +165,7 @@ def conjugate_gradients(curvature, residual, smooth, down, across, half, count):
 @njit(cache=True, nogil=True)
 @no_type_check
 def slopes(surface, half, x, y):
-    """Central differences along columns and rows into x and y, the edge replicated."""
+    """Write central differences along columns and rows into x and y, the edge replicated."""
     h, w = surface.shape
     for i in range(h):
         above, below = max(i - 1, 0), min(i + 1, h - 1)
@@ -198,7 +194,7 @@ def add_against_slopes(x, y, half, out):
 @njit(inline="always")
 @no_type_check
 def _fill_terms(terms, x, y):
-    """1 and `sensor_calibration.monomials`."""
+    """Write 1 and `sensor_calibration.monomials` into `terms`."""
     xx, xy, yy = x * x, x * y, y * y
     terms[1], terms[2], terms[3], terms[4], terms[5] = x, y, xx, xy, yy
     terms[6], terms[7], terms[8], terms[9] = xx * x, xx * y, x * yy, yy * y

@@ -1,4 +1,4 @@
-"""How a gel's surface follows what presses into it, and where its walls throw shadows.
+"""Surface of a gel under an object, and the shadows of its walls.
 
 Heights are metres into the gel; x runs along the columns of an image, y down its rows.
 """
@@ -26,20 +26,19 @@ NEARBY_CELLS = (
 
 
 def pixels_per_cell(pitch: float) -> int:
-    """How many pixels of a pitch (m) make one side of a coarse cell: a power of two."""
+    """Return how many pixels of a pitch (m) make one side of a coarse cell: a power of two."""
     return 2 ** max(round(math.log2(CELL / pitch)), 0)
 
 
 def deform(overlap: HeightField, pitch: float, blur_sigmas: tuple[float, ...]) -> HeightField:
-    """Surface of the gel under an object's `overlap` (m, 0 where there is none).
+    """Return the gel's surface under an object's `overlap` (m, 0 where there is none).
 
-    The gel follows the object where they touch and bulges smoothly around it: Taxim's
-    contact-constrained pyramid, on coarse cells. (Box blurs would be faster, but
-    their corners show as a cross around a small contact.) The full-resolution detail, the texture,
-    is added back inside the contact.
+    The gel follows the object in contact and bulges smoothly around it: Taxim's contact-constrained pyramid,
+    on coarse cells. (Box blurs would be faster, but their corners show as a cross around a small contact.)
+    Full-resolution detail is added back inside the contact.
 
     Args:
-        overlap: overlap with the undeformed gel.
+        overlap: with the undeformed gel.
         pitch: m per pixel.
         blur_sigmas: standard deviations of the pyramid, coarse to fine, m.
     """
@@ -63,15 +62,15 @@ def deform(overlap: HeightField, pitch: float, blur_sigmas: tuple[float, ...]) -
 def shadow_depth(
     surface: HeightField, pitch: float, azimuths: tuple[float, ...], slope: float
 ) -> Float32[np.ndarray, "lights h w"]:
-    """How far (m) each point lies below the shadow line of each light.
+    """Return how far (m) each point lies below the shadow line of each light.
 
-    Camera and lights look from inside the gel, so what presses in is a hill to them. A point is in
-    shadow if, going towards the light, the surface rises above the light's slope.
+    Camera and lights look from inside the gel, so an indentation is a hill to them. A point is in shadow if
+    the surface towards the light rises above the light's slope.
 
     Args:
         surface: of the gel, m.
         pitch: m per pixel.
-        azimuths: where in the image each light stands, degrees from x towards y.
+        azimuths: of the lights in the image, degrees from x towards y.
         slope: tangent of the lights' height above the gel plane.
     """
     h, w = surface.shape
@@ -91,7 +90,7 @@ def shadow_depth(
 
 @lru_cache(maxsize=256)  # a calibration asks for thousands
 def _plane(azimuth: float, rise: float, shape: tuple[int, int]) -> HeightField:
-    """A plane that climbs by `rise` each cell in a direction, degrees."""
+    """Return a plane that climbs by `rise` each cell in a direction, degrees."""
     y, x = (rise * np.arange(n) for n in shape)
     angle = math.radians(azimuth)
     return np.add.outer(math.sin(angle) * y, math.cos(angle) * x).astype(np.float32)
@@ -99,7 +98,7 @@ def _plane(azimuth: float, rise: float, shape: tuple[int, int]) -> HeightField:
 
 @lru_cache(maxsize=256)
 def _ray_mask(azimuth: float, reach: int) -> UInt8[np.ndarray, "k k"]:
-    """Mask of the cells within reach of the middle one in a direction, degrees."""
+    """Return a mask of the cells within reach of the middle one in a direction, degrees."""
     steps, angle = np.arange(reach + 1), math.radians(azimuth)
     y, x = (reach + np.rint(steps * f(angle)).astype(int) for f in (math.sin, math.cos))
     line = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)

@@ -1,4 +1,4 @@
-"""How deep a gel is pressed in, fast enough for every tick of a control loop."""
+"""Indentation depth of a gel, fast enough for a control loop."""
 
 from functools import cache
 
@@ -22,7 +22,7 @@ _READABLE = 0.8  # share of a depth that must be read
 
 
 class IndentationMeter:
-    """Follows one fingertip sensor from its untouched picture on.
+    """Indentation of one fingertip sensor, from its untouched picture on.
 
     Args:
         sensor: its model.
@@ -35,17 +35,17 @@ class IndentationMeter:
         self._depth.estimate(untouched)  # compiled code is loaded now, not in a control loop
 
     def measure(self, frame: UInt8[np.ndarray, "h w 3"]) -> float:
-        """The deepest point in the next frame, m; 0 while nothing touches."""
+        """Return the deepest point of the next frame, m; 0 without contact."""
         if not self._detector.update(frame):
             return 0.0
         return float(self._depth.estimate(frame, self._detector.background.steady).max())
 
 
 def deepest_readable(sensor: SensorModel, wanted: float) -> float:
-    """The wanted depth (m), or the next one below it, in steps of 0.1 mm, that the sensor file can read.
+    """Return the largest depth up to `wanted` that the sensor file can read, m, in steps of 0.1 mm.
 
-    A ball is drawn by the sensor file's own model and read back: with the walls that its presses never
-    showed, a deep one reads too shallow, and a ceiling above that would never be met.
+    A ball is drawn by the sensor file's model and read back. With walls steeper than the calibration presses
+    a deep one reads too shallow, and a ceiling above that would never be reached.
     """
     depth = wanted
     while depth > 0 and _read_ball(sensor, depth) < _READABLE * depth:
@@ -54,7 +54,7 @@ def deepest_readable(sensor: SensorModel, wanted: float) -> float:
 
 
 def require_readable(sensor: SensorModel, ceiling: float) -> None:
-    """UserError unless the sensor file can read a ball pressed in by a ceiling (m)."""
+    """Raise UserError unless the sensor file can read a ball pressed in by `ceiling` (m)."""
     deepest = deepest_readable(sensor, ceiling)
     if deepest < ceiling:
         raise UserError(
@@ -65,7 +65,7 @@ def require_readable(sensor: SensorModel, ceiling: float) -> None:
 
 @cache
 def _read_ball(sensor: SensorModel, depth: float) -> float:
-    """What is read (m) of a ball pressed into the middle of the gel by `depth` (m)."""
+    """Return the depth (m) read from a ball pressed into the middle of the gel by `depth` (m)."""
     calibration = load(sensor.sensor_file)
     rows, columns = calibration.background.shape[:2]
     y, x = np.mgrid[:rows, :columns].astype(np.float32)

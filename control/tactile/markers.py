@@ -1,4 +1,4 @@
-"""Dots printed on a gel: found in a picture, followed through the next ones, and painted out."""
+"""Dots printed on a gel: detection, tracking, and removal from a picture."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -19,40 +19,39 @@ _LARGER = 1.1  # times a dot's nominal radius: how large those of another gel ma
 
 @dataclass(frozen=True)
 class Markers:
-    """A grid of dots in one frame.
+    """Grid of dots in one frame.
 
     Attributes:
-        positions: (x, y) of the centres in px, pixel centres at integers; expected ones where a
-            dot was not found.
-        found: whether each dot was seen.
+        positions: (x, y) of the centres in px, pixel centres at integers; expected ones where a dot was
+            not found.
+        found: whether each dot was found.
     """
 
     positions: Float32[np.ndarray, "rows columns 2"]
     found: Bool[np.ndarray, "rows columns"]
 
     def largest_radius(self, grid: MarkerGrid) -> float:
-        """Radius (px) within which such dots end, on an untouched gel: by how far apart they lie in the picture."""
+        """Return the radius (px) that covers such dots on an untouched gel, from their spacing."""
         spacing = np.median(np.linalg.norm(np.diff(self.positions, axis=1), axis=-1))
         return float(_LARGER * spacing * grid.diameter / grid.pitch / 2)
 
 
 class MarkerTracker:
-    """Follows the dots of one gel from frame to frame.
+    """Tracker of one gel's dots from frame to frame.
 
-    A dot takes the spot nearest to where it is expected, if it is that spot's nearest dot as well and
-    lies within half the pitch: dots can get lost, which is flagged, but not swapped. They are expected
-    to go on as they moved, or to stay: whichever explains the frame better, for a grid that jumped and
-    stopped would overshoot onto its neighbours. A lost dot is expected where its neighbours'
-    displacement would carry it.
+    A dot takes the spot nearest to its expected place if it is that spot's nearest dot as well and lies within
+    half the pitch: dots can get lost, which is flagged, but not swapped. Dots are expected either to keep
+    moving or to stay, whichever explains the frame better: a grid that jumps and stops would overshoot onto
+    its neighbours. A lost dot is expected where its neighbours' displacement carries it.
 
     Args:
         untouched: RGB frame of the untouched gel.
-        grid: what is printed on the gel; sizes may be off by a fifth.
+        grid: printed on the gel; sizes may be off by a fifth.
         pixel_pitch: m per px.
 
     Attributes:
-        rest: where the dots lie on the untouched gel.
-        now: where they lie in the last frame.
+        rest: dots on the untouched gel.
+        now: dots in the last frame.
 
     Raises:
         UserError: the frame does not show the grid.
@@ -71,7 +70,7 @@ class MarkerTracker:
 
     @property
     def displacement(self) -> Float32[np.ndarray, "rows columns 2"]:
-        """How far each dot lies from its rest, px."""
+        """Displacement of each dot from its rest, px."""
         return self.now.positions - self.rest.positions
 
     def update(self, frame: UInt8[np.ndarray, "h w 3"]) -> Markers:
@@ -97,9 +96,9 @@ class MarkerTracker:
 def _match(
     expected: Float32[np.ndarray, "rows columns 2"], spots: Float32[np.ndarray, "n 2"], reach: float
 ) -> tuple[Float32[np.ndarray, "rows columns 2"], Bool[np.ndarray, "rows columns"], float]:
-    """Each dot's spot where it has one, whether it has, and how far they are off, px.
+    """Match dots with spots: positions, whether each was found, and the mean distance, px.
 
-    Every dot that finds none counts as `reach` px.
+    Every dot without a spot counts as `reach` px.
     """
     positions, found = expected.copy(), np.zeros(expected.shape[:2], bool)
     if not len(spots):
@@ -116,17 +115,17 @@ def _match(
 def find_markers(
     image: UInt8[np.ndarray, "h w 3"], grid: MarkerGrid, pixel_pitch: float
 ) -> Markers:
-    """The dots of an untouched gel, ordered by rows (downwards) and columns (rightwards).
+    """Find the dots of an untouched gel, ordered by rows (downwards) and columns (rightwards).
 
     The grid may be rotated by up to 30 degrees, shifted, and scaled by a fifth.
 
     Args:
         image: RGB frame.
-        grid: what to look for.
+        grid: to look for.
         pixel_pitch: m per px.
 
     Raises:
-        UserError: less than 70 % of the dots can be seen.
+        UserError: less than 70 % of the dots are visible.
     """
     grey, size = _grey(image), grid.diameter / pixel_pitch
     spots, darkness = _spots(grey, size)
@@ -157,7 +156,7 @@ Image = UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"]
 
 
 def without_markers(image: Image, centres: Float32[np.ndarray, "*n 2"], radius: float) -> Image:
-    """The image with its dots painted over by the membrane stretched between their rims.
+    """Paint the dots over with a membrane stretched between their rims.
 
     Args:
         image: RGB frame or background.
@@ -178,7 +177,7 @@ def _grey(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 1"]:
 
 
 def _usual(darkness: Float32[np.ndarray, " n"], grid: MarkerGrid) -> float:
-    """Median darkness of as many of the darkest spots as the grid has dots."""
+    """Return the median darkness of the darkest spots, as many as the grid has dots."""
     darkest = np.sort(darkness)[-grid.rows * grid.columns :]
     return float(np.median(darkest)) if len(darkest) else 0.0
 
@@ -186,10 +185,10 @@ def _usual(darkness: Float32[np.ndarray, " n"], grid: MarkerGrid) -> float:
 def _spots(
     grey: Float32[np.ndarray, "h w 1"], size: float
 ) -> tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, " n"]]:
-    """Dark spots of about `size` px: (x, y) of their centres and their darkness, 0 to 1.
+    """Find dark spots of about `size` px: (x, y) of their centres and their darkness, 0 to 1.
 
-    Darkness is the share of light missing with respect to the spot's surroundings, blurred to the
-    size of a spot; a parabola through its peak gives the centre.
+    Darkness is the share of light missing against the surroundings, blurred to the size of a spot; a parabola
+    through its peak gives the centre.
     """
     scale = max(int(size / 7), 1)  # dots of 7 px are found as well as larger ones, and faster
     h, w, _ = grey.shape
@@ -213,7 +212,7 @@ def _spots(
 def _refined(
     grey: Float32[np.ndarray, "h w 1"], spots: Float32[np.ndarray, "n 2"], radius: float
 ) -> Float32[np.ndarray, "n 2"]:
-    """Centroids of what is darker than the membrane over each spot: shading does not shift them."""
+    """Return centroids of the darkness below the membrane over each spot: shading does not shift them."""
     padded, margin = _padded(grey, radius)
     (y, x), membrane = _under_dots(padded, spots + margin, radius)
     dark = np.maximum(1 - padded[y, x, 0] / np.maximum(membrane[..., 0], 1), 0)
@@ -222,7 +221,7 @@ def _refined(
 
 
 def _ordered(spots: Float32[np.ndarray, "n 2"], pitch: float) -> Int[np.ndarray, "n 2"]:
-    """(column, row) of each spot in the lattice that grows from the middlemost one.
+    """Return (column, row) of each spot in the lattice that grows from the middlemost one.
 
     Spots that no chain of steps reaches get a cell far outside.
     """
@@ -252,7 +251,7 @@ def _ordered(spots: Float32[np.ndarray, "n 2"], pitch: float) -> Int[np.ndarray,
 
 
 def _fullest(cells: Int[np.ndarray, "n 2"], grid: MarkerGrid) -> Int[np.ndarray, "2"]:
-    """First (column, row) of the window of the grid's size that holds most cells."""
+    """Return the first (column, row) of the grid-sized window with most cells."""
     real = cells[cells[:, 0] > -(10**6)]
     corners = [
         np.array([column, row])
@@ -266,7 +265,7 @@ def _fullest(cells: Int[np.ndarray, "n 2"], grid: MarkerGrid) -> Int[np.ndarray,
 def _spread(
     field: Float32[np.ndarray, "rows columns 2"], known: Bool[np.ndarray, "rows columns"]
 ) -> Float32[np.ndarray, "rows columns 2"]:
-    """The field averaged over known neighbours, those of the next cells counting most."""
+    """Average a field over known neighbours, the nearest counting most."""
     weight = known.astype(np.float32)
     total = cv2.GaussianBlur(field * weight[..., None], (0, 0), 1.0, borderType=cv2.BORDER_CONSTANT)
     share = cv2.GaussianBlur(weight, (0, 0), 1.0, borderType=cv2.BORDER_CONSTANT)
@@ -274,7 +273,7 @@ def _spread(
 
 
 def _padded(image: np.ndarray, radius: float) -> tuple[np.ndarray, int]:
-    """The image with a margin that holds any dot touching it, and the margin's width."""
+    """Return the image with a margin that holds any dot touching it, and the margin."""
     m = int(2 * radius + _RIM) + 3
     padded = cv2.copyMakeBorder(image, m, m, m, m, cv2.BORDER_REPLICATE)
     return padded.reshape(*padded.shape[:2], image.shape[2]), m
@@ -286,7 +285,7 @@ def _under_dots(
     tuple[Int[np.ndarray, "n inner"], Int[np.ndarray, "n inner"]],
     Float32[np.ndarray, "n inner channels"],
 ]:
-    """(rows, columns) of the pixels that dots may cover, and the membrane from their rims there."""
+    """Return (rows, columns) of the pixels under dots, and the membrane there."""
     inner, ring, weights = _membrane(radius + _RIM)
     at = np.rint(centres).astype(int)[:, None]
     x, y = np.moveaxis(at + inner, -1, 0)
@@ -300,7 +299,7 @@ def _membrane(
 ) -> tuple[
     Int[np.ndarray, "inner 2"], Int[np.ndarray, "ring 2"], Float32[np.ndarray, "inner ring"]
 ]:
-    """Offsets (x, y) of the pixels in a disc, of those around it, and the harmonic weights."""
+    """Return offsets (x, y) of a disc and of the ring around it, and the harmonic weights."""
     reach = int(radius) + 2
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     disc = (x * x + y * y <= radius * radius).astype(np.uint8)

@@ -1,19 +1,18 @@
-"""What the coloured lights inside a sensor make of the shape of its gel: the sensor file.
+"""Sensor file: colours that the lights inside a sensor give to the shape of its gel.
 
-The model. A gel surface h(x, y), m into the gel (`gel.deform`), has slopes gx = dh/dx, gy = dh/dy
-by central differences and the unit normal's image-plane part (nx, ny) = -(gx, gy) / sqrt(1 + gx^2
-+ gy^2). With the ten features f_k of `shape_features`, position p = (1, u, v), u and v from -1 to 1
-across columns and rows, and the shadow depths s_l of `gel.shadow_depth`, channel c shows
+A gel surface h(x, y), m into the gel (`gel.deform`), has slopes gx = dh/dx, gy = dh/dy by central differences
+and the unit normal's image-plane part (nx, ny) = -(gx, gy) / sqrt(1 + gx^2 + gy^2). With the ten features f_k
+of `shape_features`, position p = (1, u, v), u and v from -1 to 1 across columns and rows, and the shadow depths
+s_l of `gel.shadow_depth`, channel c shows
 
     I_c = background_c + noise + gain_c (
         sum over k, m of response[c,k,m] f_k p_m  +  sum over l of shadow[c,l] s_l / (s_l + penumbra)
     )
 
 The gain is the blurred background divided by its mean, to the power `illumination_exponent`: where little light
-falls, slopes change the picture little. (Of a real Mini 2 fits, not 1: the gel's scattered light fills
-the background where the lamps themselves no longer reach. With 1 its balls read up to 40 % too flat
-in the corners.) The polynomial holds for what the presses showed and no further: a normal steeper
-than `max_slope` is shortened to it, a depth beyond `max_depth` counts as `max_depth`, for shadows too.
+falls, slopes change the picture little. (A real Mini fits 2, not 1: scattered light fills the background where
+the lamps do not reach; with 1 its balls read up to 40 % too flat in the corners.) The polynomial holds only within
+the presses: a normal steeper than `max_slope` is shortened to it, a depth beyond `max_depth` counts as `max_depth`.
 """
 
 import json
@@ -34,14 +33,13 @@ from touchgoal.runtime.picture_file import read_picture
 
 N_FEATURES = 10
 FORMAT = 2
-_WITHOUT_EXPONENT = 1  # the format before `illumination_exponent`, which was 1
 _JSON, _BACKGROUND = "sensor.json", "background.png"
 _MAKE = "make one with: touchgoal calibrate PRESSES"
 
 
 @dataclass(frozen=True)
 class SensorCalibration:
-    """One sensor's colours, as `touchgoal calibrate` fits them to presses.
+    """Colours of one sensor, as `touchgoal calibrate` fits them to presses: the sensor file.
 
     Attributes:
         sensor: name of the sensor model.
@@ -49,12 +47,10 @@ class SensorCalibration:
         pixel_pitch: m per pixel.
         response: counts per channel and feature (`shape_features`); the last axis multiplies (1, u, v),
             where u and v run from -1 to 1 across columns and rows.
-        light_azimuths: where in the image each light stands, degrees from x (right) towards y
-            (down).
+        light_azimuths: of the lights in the image, degrees from x (right) towards y (down).
         shadow_slope: tangent of the lights' height above the gel plane.
         shadow: counts per channel in the deepest shadow of each light.
-        penumbra: how soft the shadows' edges are, as a half-shadow is called in optics: the shadow depth
-            (`gel.shadow_depth`) at which half of that is reached, m.
+        penumbra: shadow depth (`gel.shadow_depth`) of a half-shadow, m.
         max_slope, max_depth: largest length of (nx, ny), and depth in m, in the presses.
         blur_sigmas: standard deviations of the gel's bulge, coarse to fine, m (`gel.deform`).
         noise: standard deviation of the camera's noise, counts.
@@ -80,7 +76,7 @@ class SensorCalibration:
 def illumination(
     background: UInt8[np.ndarray, "h w 3"], illumination_exponent: float = 1.0
 ) -> Float32[np.ndarray, "h w 3"]:
-    """How strongly slopes change the picture over the image, per channel relative to the mean."""
+    """Return the strength of the response over the image, per channel relative to the mean."""
     light = cv2.GaussianBlur(background.astype(np.float32), (0, 0), background.shape[1] / 40)
     light = (light / light.mean((0, 1))) ** np.float32(illumination_exponent)
     return light / light.mean((0, 1))
@@ -89,7 +85,7 @@ def illumination(
 def shape_features(
     surface: Float32[np.ndarray, "h w"], pitch: float, max_slope: float, max_depth: float
 ) -> Float32[np.ndarray, "10 h w"]:
-    """What the colours are linear in.
+    """Return the ten features that the colours are linear in.
 
     Args:
         surface: of the gel, m into the gel.
@@ -97,8 +93,8 @@ def shape_features(
         max_slope, max_depth: see `SensorCalibration`.
 
     Returns:
-        nx, ny, nx^2, nx ny, ny^2, nx^3, nx^2 ny, nx ny^2, ny^3 of the unit normal's components in
-        the image plane, and the depth in m.
+        nx, ny, nx^2, nx ny, ny^2, nx^3, nx^2 ny, nx ny^2, ny^3 of the unit normal's components in the
+        image plane, and the depth in m.
     """
     padded = np.pad(surface, 1, mode="edge")
     gx = (padded[1:-1, 2:] - padded[1:-1, :-2]) * np.float32(0.5 / pitch)
@@ -113,7 +109,7 @@ def shape_features(
 def monomials(
     x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]
 ) -> Float[np.ndarray, "9 ..."]:
-    """Of a normal's part in the image plane: x, y, x^2, xy, y^2, x^3, x^2 y, x y^2, y^3."""
+    """Return x, y, x^2, xy, y^2, x^3, x^2 y, x y^2, y^3 of a normal in the image plane."""
     xx, xy, yy = x * x, x * y, y * y
     return np.stack([x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y])
 
@@ -121,10 +117,10 @@ def monomials(
 def shadows(
     calibration: SensorCalibration, surface: Float32[np.ndarray, "h w"], pitch: float
 ) -> Float32[np.ndarray, "lights h w"]:
-    """Share of each light's full shadow, 0 to 1, on a gel surface of any resolution.
+    """Return the share of each light's full shadow, 0 to 1, at any resolution.
 
     Args:
-        calibration: where the lights stand and how their shadows begin.
+        calibration: the sensor file.
         surface: of the gel, m; a depth beyond `max_depth` counts as `max_depth`.
         pitch: of the surface, m per pixel.
     """
@@ -139,10 +135,10 @@ def design_matrix(
     surface: Float32[np.ndarray, "h w"],
     pixels: Int[np.ndarray, " n"],
 ) -> Float32[np.ndarray, "terms n"]:
-    """What the change of colour is linear in: the features, times 1, u and v, then the shadows.
+    """Return the terms of the colour change: the features times 1, u and v, then the shadows.
 
     Args:
-        calibration: only its numbers that are not linear are used.
+        calibration: only its non-linear parameters are used.
         surface: of the gel, m.
         pixels: flat indices of the pixels wanted.
     """
@@ -158,7 +154,7 @@ def design_matrix(
 
 
 def coefficients(calibration: SensorCalibration) -> Float32[np.ndarray, "3 terms"]:
-    """What each of `design_matrix` counts for, per channel."""
+    """Return the weight of each term of `design_matrix`, per channel."""
     response = calibration.response.transpose(0, 2, 1).reshape(3, -1)
     return np.concatenate([response, calibration.shadow], 1)
 
@@ -166,9 +162,9 @@ def coefficients(calibration: SensorCalibration) -> Float32[np.ndarray, "3 terms
 def shade(
     calibration: SensorCalibration, surface: Float32[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w 3"]:
-    """RGB picture of a gel surface without noise, in counts, neither rounded nor clipped.
+    """Render a gel surface without noise: RGB counts, neither rounded nor clipped.
 
-    The reference: short and slow. The simulator's fused kernels must agree with it.
+    This is the reference; the simulator's fused kernels must agree with it.
     """
     terms = design_matrix(calibration, surface, np.arange(surface.size))
     change = (coefficients(calibration) @ terms).T.reshape(*surface.shape, 3)
@@ -177,12 +173,12 @@ def shade(
 
 
 def save(calibration: SensorCalibration, folder: Path, provenance: dict[str, Any]) -> None:
-    """Write `sensor.json` and `background.png`; an older sensor file there is replaced.
+    """Write `sensor.json` and `background.png`, replacing an older sensor file there.
 
     Args:
-        calibration: what to keep.
+        calibration: to write.
         folder: made if needed.
-        provenance: where it comes from, JSON-able: source, command, presses, held-out errors.
+        provenance: source, command, presses, held-out errors; JSON-able.
     """
     folder.mkdir(parents=True, exist_ok=True)
     rows, columns, _ = calibration.background.shape
@@ -194,13 +190,12 @@ def save(calibration: SensorCalibration, folder: Path, provenance: dict[str, Any
 
 
 def load(folder: Path) -> SensorCalibration:
-    """Read what `save` wrote.
+    """Read the sensor file of a folder.
 
     Raises:
-        UserError: nothing there, damaged, another format, or numbers that do not fit together.
+        UserError: missing, damaged, of another format, or with inconsistent numbers.
     """
-    description = _read_description(folder)
-    path = folder / _JSON
+    description, path = _read_description(folder), folder / _JSON
     image = read_picture(folder / _BACKGROUND)
     if image is None:
         raise UserError(f"{folder / _BACKGROUND} is missing or no picture: {_MAKE}")
@@ -216,25 +211,17 @@ def load(folder: Path) -> SensorCalibration:
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"{path} has no usable {name}: {_MAKE}") from error
     lights = len(values["light_azimuths"])
-    shapes = {"response": (3, N_FEATURES, 3), "shadow": (3, lights)}
-    for name, shape in shapes.items():
+    for name, shape in {"response": (3, N_FEATURES, 3), "shadow": (3, lights)}.items():
         if values[name].shape != shape:
             raise UserError(f"{path}: {name} is {values[name].shape}, not {shape}: {_MAKE}")
-    for name in (
-        "pixel_pitch",
-        "shadow_slope",
-        "penumbra",
-        "max_slope",
-        "max_depth",
-        "illumination_exponent",
-    ):
+    for name in _POSITIVE:
         if not values[name] > 0:
             raise UserError(f"{path}: {name} must be positive, not {values[name]}: {_MAKE}")
     return SensorCalibration(background=image, **values)
 
 
 def read_provenance(folder: Path) -> dict[str, Any]:
-    """What `save` was told about where the numbers come from; UserError as for `load`."""
+    """Return the provenance of a sensor file; UserError as for `load`."""
     return _read_description(folder)["provenance"]
 
 
@@ -247,12 +234,8 @@ def _read_description(folder: Path) -> dict[str, Any]:
         version, _ = description["format"], description["provenance"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise UserError(f"{path} is no sensor file: {_MAKE}") from error
-    if version == _WITHOUT_EXPONENT:
-        description.setdefault("illumination_exponent", 1.0)
-    elif version != FORMAT:
+    if version != FORMAT:
         raise UserError(f"{path} has format {version}, this touchgoal reads {FORMAT}: {_MAKE}")
-    elif "light_power" in description:  # its older name
-        description["illumination_exponent"] = description.pop("light_power")
     return description
 
 
@@ -272,13 +255,21 @@ def _number(value: Any) -> float:
 
 
 def _plain(value: Any) -> Any:
-    """JSON-able, seven digits."""
+    """Return a JSON-able value with seven digits."""
     if isinstance(value, np.ndarray | tuple):
         return [_plain(v) for v in value]
     return value if isinstance(value, str) else float(f"{value:.7g}")
 
 
-# What sensor.json holds besides the shape of the background, and how each is read.
+_POSITIVE = (
+    "pixel_pitch",
+    "shadow_slope",
+    "penumbra",
+    "max_slope",
+    "max_depth",
+    "illumination_exponent",
+)
+# Values of sensor.json besides the shape of the background, and how each is read.
 _NUMBERS: dict[str, Callable[[Any], Any]] = {
     "sensor": str,
     "pixel_pitch": _number,

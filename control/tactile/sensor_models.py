@@ -1,4 +1,4 @@
-"""Fingertip sensors as data: what a GelSight or a DIGIT is, in numbers with unit and source."""
+"""Fingertip sensors as data: dimensions, stiffness and optics with unit and source."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +9,7 @@ from touchgoal.runtime.errors import UserError
 
 @dataclass(frozen=True)
 class MarkerGrid:
-    """Dots printed on a gel.
+    """Grid of dots printed on a gel.
 
     Attributes:
         rows, columns: of the grid, which is centred on the image.
@@ -25,26 +25,25 @@ class MarkerGrid:
 
 @dataclass(frozen=True)
 class SensorModel:
-    """A camera-based fingertip sensor.
+    """Camera-based fingertip sensor.
 
-    The sensor frame sits on the undeformed gel, in the middle of the image: x along the image's
-    columns, y along its rows (downwards), z out of the gel. The gel is taken to be flat.
+    The sensor frame sits on the undeformed gel, in the middle of the image: x along the image's columns, y along
+    its rows (downwards), z out of the gel. The gel is modelled as flat.
 
     Attributes:
-        name: the id under which encoders and preprocessors know the sensor.
+        name: id that encoders and preprocessors use.
         image_shape: (rows, columns) of a frame.
         pixel_pitch: m of gel per pixel; square pixels.
-        pitch_range: m of gel per pixel, (least, most) among sensors of this model.
+        pitch_range: (smallest, largest) pixel pitch among sensors of this model, m.
         gel_size: (along x, along y) of the gel, m.
         gel_thickness: m.
         case_size: (along x, along y, depth) of the housing, m.
-        foundation_modulus: gel pressure per indentation, Pa/m: how the gel's surface gives way
-            under a contact, as the camera sees it.
+        foundation_modulus: gel pressure per indentation, Pa/m, as the camera shows it.
         shear_modulus: of the gel's material, Pa.
-        normal_stiffness: of the gel as a whole under a typical curved contact, N/m.
-        shear_stiffness: of the gel as a whole, N/m.
+        normal_stiffness: of the whole gel under a typical curved contact, N/m.
+        shear_stiffness: of the whole gel, N/m.
         frame_rate: Hz.
-        sensor_file: folder with the calibration of a typical sensor (`control.tactile.sensor_calibration`).
+        sensor_file: folder with the calibration of a typical sensor (`sensor_calibration`).
         markers: dots printed on the gel, if any.
     """
 
@@ -176,7 +175,7 @@ def find_model(name: str) -> SensorModel:
 
 
 def find_sensor(name: str) -> SensorModel:
-    """A sensor model by name, or one sensor of it by the folder that `touchgoal calibrate` wrote.
+    """Return a sensor model by name, or one sensor by the folder of its sensor file.
 
     Raises:
         UserError: it is neither.

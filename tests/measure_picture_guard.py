@@ -1,0 +1,90 @@
+"""Print how often the picture guard refuses real frames, whole and with each fault.
+
+    python tests/measure_picture_guard.py DATA
+
+DATA holds mini_presses, digit_presses, digit_parts, physiclear and franka_mini_slip (published real touch).
+"""
+
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from test_picture_guard import FAULTS, other_light
+
+from touchgoal.control.tactile.background import local_change
+from touchgoal.control.tactile.picture_guard import check_presses, check_untouched
+from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
+from touchgoal.runtime.errors import UserError
+
+CHANGES = {"none": lambda p: p, "other light": other_light} | {k: f for k, (f, _) in FAULTS.items()}
+PRESSES = "none", "left to right", "exchanged", "turned"
+
+
+def read(files: Iterable[Path]) -> list[np.ndarray]:
+    return [cv2.imread(str(file))[..., ::-1].copy() for file in sorted(files)]  # pyright: ignore
+
+
+def clips(files: Iterable[Path], step: int) -> Iterator[tuple[np.ndarray, list[np.ndarray]]]:
+    """The untouched picture of each clip (median of 5 frames) and its three firmest frames, apart."""
+    for file in sorted(files)[::step]:
+        capture, frames = cv2.VideoCapture(str(file)), []
+        while (got := capture.read())[0]:
+            frames.append(got[1][..., ::-1].copy())
+        if len(frames) < 20:
+            continue
+        untouched = np.median(frames[:5], axis=0).astype(np.uint8)
+        parts = np.array_split(np.arange(5, len(frames)), 3)
+        strength = [float(local_change(frame, untouched).max()) for frame in frames]
+        yield untouched, [frames[max(part, key=lambda i: strength[i])] for part in parts]
+
+
+def refused(check: Callable[[], None]) -> bool:
+    try:
+        check()
+    except UserError:
+        return True
+    return False
+
+
+def main(data: Path) -> None:
+    mini, digit = (read((data / f"{k}_presses").glob("*.png")) for k in ("mini", "digit"))
+    minis = list(clips((data / "physiclear" / "videos").iterdir(), 6))
+    dotted = list(clips((data / "franka_mini_slip").glob("*.mp4"), 6))
+    groups = {  # the first picture of the presses is background.png
+        "Mini, the file's unit": (GELSIGHT_MINI, mini),
+        "DIGIT, the file's unit": (DIGIT, digit),
+        "DIGIT, another, touched": (DIGIT, read((data / "digit_parts").rglob("*.jpg"))[::4]),
+        "Mini, another": (GELSIGHT_MINI, [untouched for untouched, _ in minis]),
+        "Mini, another, touched": (GELSIGHT_MINI, [press for _, p in minis for press in p]),
+        "Minis with dots": (GELSIGHT_MINI_MARKERS, [untouched for untouched, _ in dotted]),
+    }
+    print(f"{'refused pictures':<28}{'n':>5}" + "".join(f"{name[:12]:>14}" for name in CHANGES))
+    for name, (model, pictures) in groups.items():
+        counts = [
+            sum(
+                refused(lambda: check_untouched(np.ascontiguousarray(change(p)), model, "it"))  # noqa: B023
+                for p in pictures
+            )
+            for change in CHANGES.values()
+        ]
+        print(f"{name:<28}{len(pictures):>5}" + "".join(f"{c:>14}" for c in counts), flush=True)
+    sets = {
+        "Mini, the file's unit": (GELSIGHT_MINI, [(mini[0], mini[1 + i :: 8]) for i in range(8)]),
+        "DIGIT, the file's unit": (DIGIT, [(digit[0], digit[1 + i :: 4]) for i in range(4)]),
+        "Mini, another, by clip": (GELSIGHT_MINI, minis[::3]),
+    }
+    print(f"\n{'refused sets of presses':<28}{'n':>5}" + "".join(f"{n:>14}" for n in PRESSES))
+    for name, (model, pairs) in sets.items():
+        counts = []
+        for change in (CHANGES[key] for key in PRESSES):
+            turned = [[np.ascontiguousarray(change(p)) for p in (u, *ps)] for u, ps in pairs]
+            counts.append(
+                sum(refused(lambda: check_presses(t[0], t[1:], model, "it")) for t in turned)  # noqa: B023
+            )
+        print(f"{name:<28}{len(pairs):>5}" + "".join(f"{c:>14}" for c in counts), flush=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
