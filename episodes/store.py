@@ -27,7 +27,7 @@ from touchgoal.episodes.format.encoding import (
     read_columns,
 )
 from touchgoal.episodes.format.metadata import SetMetadata
-from touchgoal.episodes.format.repair import contradictions_in_meta, unlisted_files
+from touchgoal.episodes.format.repair import unlisted_files
 from touchgoal.episodes.format.set_files import Row
 from touchgoal.episodes.media import decode_video
 from touchgoal.episodes.schema import INDEX_DTYPES, Episode, MetaValue, is_camera, is_image
@@ -74,10 +74,14 @@ class EpisodeWriter:
                     f"{self._root} runs at {found.fps} frames per second, not {self._fps}: "
                     "continue it at its own rate or record into another folder"
                 )
-        problems = contradictions_in_meta(self._root, found) if found else []
-        if problems := problems or unlisted_files(self._root, found):
+        doubtful = unlisted_files(self._root, found)
+        if found is not None:
+            info, counted = set_files.load_info(self._root), found.info()
+            if any(info[key] != counted[key] for key in info if key.startswith("total_")):
+                doubtful.append(set_files.INFO)
+        if doubtful:
             raise UserError(
-                f"{self._root} was interrupted (see {problems[0]}): "
+                f"{self._root} was interrupted (see {doubtful[0]}): "
                 f"{set_files.repair_command(self._root)}"
             )
         return found

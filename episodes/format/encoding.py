@@ -9,7 +9,6 @@ its checksum, so that everything under meta/ can be rebuilt from the data files 
 
 import io
 import json
-import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,11 +33,11 @@ from touchgoal.episodes.schema import (
     is_image,
 )
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.picture_file import decode_picture
 
 # Frames a row group: reading one window of touch reads a few groups, not the whole episode.
 FRAMES_PER_ROW_GROUP = 32
 _FOOTER_KEY, _CHECKSUM_KEY = b"touchgoal", b"touchgoal.crc32"
-_MOST_PIXELS = 50_000_000
 # Measured on noisy 320 x 240 touch: 3.6 ms and 90 kB a frame; OpenCV's default filter 8.1 ms and
 # 110 kB, PIL at compress_level 1 11.0 ms and 114 kB.
 _PNG = [
@@ -126,13 +125,10 @@ def encode_png(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
 
 def decode_png(png: bytes) -> UInt8[np.ndarray, "h w 3"]:
     """Return the RGB image of a PNG file."""
-    width, height = struct.unpack(">II", png[16:24].ljust(8, b"\0"))
-    image = None
-    if 0 < width * height <= _MOST_PIXELS:  # a few bytes may unpack to gigabytes
-        image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    image = decode_picture(png, "an image in the data file")
     if image is None:
         raise UserError("an image in the data file is no readable PNG")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return image
 
 
 def index_columns(

@@ -38,24 +38,6 @@ def unlisted_files(root: Path, set_metadata: SetMetadata | None) -> list[str]:
     return sorted(shown - known)
 
 
-def contradictions_in_meta(root: Path, set_metadata: SetMetadata) -> list[str]:
-    """Return how info.json, stats.json and tasks.parquet contradict meta/episodes."""
-    info = set_files.load_info(root)
-    frames = set_files.last_row(set_metadata.episodes)["dataset_to_index"]
-    problems = []
-    if (info["total_episodes"], info["total_frames"]) != (set_metadata.n_episodes, frames):
-        problems.append(
-            f"{root / set_files.INFO} counts {info['total_episodes']} episodes, "
-            f"{root / set_files.EPISODES} {set_metadata.n_episodes}"
-        )
-    if info["total_tasks"] != len(set_metadata.tasks):
-        problems.append(f"{root / set_files.TASKS} has not the tasks of {root / set_files.INFO}")
-    counts = {key: stats["count"] for key, stats in (set_metadata.stats or {}).items()}
-    if counts != {key: [frames] for key in set_metadata.features}:
-        problems.append(f"{root / set_files.STATS} is not of all {frames} frames")
-    return problems
-
-
 def _file_numbers(set_metadata: SetMetadata | None) -> list[int]:
     if set_metadata is None or set_metadata.episodes is None:
         return []
@@ -114,7 +96,7 @@ def validate(root: str | os.PathLike[str]) -> list[str]:
         set_metadata = SetMetadata.load(root)
     except UserError as error:
         return [str(error)]
-    problems = contradictions_in_meta(root, set_metadata)
+    problems: list[str] = []
     rebuilt: SetMetadata | None = None
     for file_number in track(_file_numbers(set_metadata), "checking", "file"):
         try:
