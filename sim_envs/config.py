@@ -114,9 +114,9 @@ def _one_or_three(changes: tuple[float, ...]) -> tuple[float, ...]:
     return changes
 
 
-LightChange = Annotated[
-    tuple[Annotated[float, Field(ge=-0.95, le=1.0)], ...], AfterValidator(_one_or_three)
-]
+BrightnessChange = Annotated[float, Field(ge=-0.95, le=1.0)]
+"""As a share of the brightness; -0.15 is 15 % dimmer."""
+LightChange = Annotated[tuple[BrightnessChange, ...], AfterValidator(_one_or_three)]
 """Change of each colour channel's brightness as a share; one value for all three."""
 
 

@@ -13,7 +13,7 @@ from touchgoal.benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.policies.evaluation.evaluate import evaluate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
-from touchgoal.sim_envs.config import TASKS, BeadMazeConfig, LightChange, TaskConfig, TaskName
+from touchgoal.sim_envs.config import TASKS, BeadMazeConfig, BrightnessChange, TaskConfig, TaskName
 
 
 @checked_dataclass
@@ -24,7 +24,7 @@ class Config(BenchmarkOptions):
     """Tasks; the maze is on validation wires."""
     policy: str = "shipped"
     """Policy, named as for run-policy."""
-    light: LightChange = (-0.15, -0.05, 0.0, 0.1, -0.8)
+    light: tuple[BrightnessChange, ...] = (-0.15, -0.05, 0.0, 0.1, -0.8)
     """Changes of the fingertips' light after the first picture, as shares; a row each."""
     as_deployed: bool = False
     """Let the arm behave as deployed."""
