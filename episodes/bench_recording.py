@@ -7,6 +7,7 @@ fingertip; the right one then has no images, and its ground truth is zero.
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
@@ -37,54 +38,25 @@ from touchgoal.sim_envs.object_slides import (
     simulate_slide,
 )
 
+Recording = Literal["strokes", "slides", "catalogue slides", "grasps", "cloths"]
+"""Content of a set: indenter strokes; slides of held shapes, or of pick-and-place's objects, each on another
+sensor instance; grasp attempts of three frames; presses of cloth."""
 _RIG = "rig"  # meta: options of the rig
+Recorded = tuple[dict[str, np.ndarray], str, dict[str, Any]]  # frames, task, meta
 
 
-def record_strokes(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
-    """Record the first `count` strokes of a rig; those that the folder holds are not simulated again.
+def record_bench(
+    what: Recording, root: Path, config: RigConfig, count: int, workers: int
+) -> EpisodeSet:
+    """Record the first `count` episodes of a rig; those that the folder holds are not simulated again.
 
     Raises:
         UserError: The folder holds recordings of another rig, or cannot be written to.
     """
-    rig = _description(config, config.indenters)
-    return _record_missing(root, rig, partial(_stroke, config, rig), count, workers)
-
-
-def record_slides(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
-    """Record slides of held shapes, as `record_strokes`."""
-    rig = _description(config, HELD)
-    return _record_missing(root, rig, partial(_slide, config, rig), count, workers)
-
-
-def record_catalogue_slides(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
-    """Record slides of pick-and-place's objects, each on another sensor instance, as `record_strokes`."""
-    rig = _description(config, ("objects",))
-    record = partial(_slide, config, rig, simulate=simulate_catalogue_slide)
-    return _record_missing(root, rig, record, count, workers)
-
-
-def record_grasps(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
-    """Record grasp attempts of three frames each, as `record_strokes`."""
-    rig = _description(config, ("grasps",))
-    return _record_missing(root, rig, partial(_grasp, config, rig), count, workers)
-
-
-def record_cloths(root: Path, config: RigConfig, count: int, workers: int) -> EpisodeSet:
-    """Record presses of cloth, as `record_strokes`."""
-    rig = _description(config, ("cloths",))
-    return _record_missing(root, rig, partial(_cloth, config, rig), count, workers)
-
-
-def _description(config: RigConfig, shapes: tuple[str, ...]) -> str:
-    """Return all options that the recordings depend on, so that two rigs are not mixed."""
+    shapes = {"strokes": config.indenters, "slides": HELD, "catalogue slides": ("objects",)}
     low, high = config.load
     loads = f"{low:g} to {high:g} N{', no relief' * (not config.shear_relief)}"
-    return f"{config.sensor}, {'+'.join(shapes)}, {loads}, seed {config.seed}"
-
-
-def _record_missing(
-    root: Path, rig: str, record: Callable[[int], EncodedEpisode], count: int, workers: int
-) -> EpisodeSet:
+    rig = f"{config.sensor}, {'+'.join(shapes.get(what, (what,)))}, {loads}, seed {config.seed}"
     writer = EpisodeWriter(root, fps=FPS)
     try:
         if len(writer) and (other := EpisodeSet(root).meta(0).get(_RIG)) != rig:
@@ -92,9 +64,9 @@ def _record_missing(
                 f"{root} holds recordings of another rig ({other}), not {rig}: give another folder"
             )
         if len(writer) < count:
+            missing = range(len(writer), count)
             with one_core_workers(workers) as pool:
-                missing = range(len(writer), count)
-                made = pool.map(record, missing)
+                made = pool.map(partial(_encoded, what, config, rig), missing)
                 for episode in track(made, root.name, "recording", total=len(missing)):
                     writer.append(episode)
     finally:
@@ -102,70 +74,57 @@ def _record_missing(
     return EpisodeSet(root)
 
 
-def _stroke(config: RigConfig, rig: str, index: int) -> EncodedEpisode:
-    stroke = simulate(config, index)
-    frames = _frames(stroke.frames, stroke.wrench, stroke.slip)
-    meta = {
-        _RIG: rig,
-        "sensor": config.sensor,
-        "object": stroke.indenter,
-        "load": float(stroke.load),
-        "friction": float(stroke.friction),
-        "stroke": index,
+def _encoded(what: Recording, config: RigConfig, rig: str, index: int) -> EncodedEpisode:
+    simulators = {
+        "strokes": _stroke,
+        "slides": partial(_slide, simulate_slide),
+        "catalogue slides": partial(_slide, simulate_catalogue_slide),
+        "grasps": _grasp,
+        "cloths": _cloth,
     }
-    task = f"press a {stroke.indenter} probe into the sensor and slide it"
+    frames, task, meta = simulators[what](config, index)
+    meta = {_RIG: rig, "sensor": config.sensor, **meta, "stroke": index}
     return encode(Episode(frames, task, meta), FPS)
 
 
-def _slide(
-    config: RigConfig,
-    rig: str,
-    index: int,
-    simulate: Callable[[RigConfig, int], Slide] = simulate_slide,
-) -> EncodedEpisode:
+def _stroke(config: RigConfig, index: int) -> Recorded:
+    stroke = simulate(config, index)
+    load, friction = float(stroke.load), float(stroke.friction)
+    return (
+        _frames(stroke.frames, stroke.wrench, stroke.slip),
+        f"press a {stroke.indenter} probe into the sensor and slide it",
+        {"object": stroke.indenter, "load": load, "friction": friction},
+    )
+
+
+def _slide(simulate: Callable[[RigConfig, int], Slide], config: RigConfig, index: int) -> Recorded:
     slide = simulate(config, index)
     half, zero = slide.pose[:, 2] / 2, np.zeros(len(slide.pose), np.float32)
     turned = np.column_stack([np.cos(half), zero, zero, np.sin(half)])
     frames = _frames(slide.frames, slide.wrench, slide.slip)
     frames[TRUTH_OBJECT_POSE] = np.column_stack([slide.pose[:, :2], zero, turned]).astype("f4")
-    meta = {
-        _RIG: rig,
-        "sensor": config.sensor,
-        "object": slide.held,
-        "load": slide.load,
-        "stroke": index,
-    }
-    return encode(Episode(frames, f"slide and turn a {slide.held} on the sensor", meta), FPS)
+    task = f"slide and turn a {slide.held} on the sensor"
+    return frames, task, {"object": slide.held, "load": slide.load}
 
 
-def _grasp(config: RigConfig, rig: str, index: int) -> EncodedEpisode:
+def _grasp(config: RigConfig, index: int) -> Recorded:
     attempt = attempt_grasp(config, index)
-    pressed = attempt.wrench[:, [2, 8]] < 0
+    name, held = attempt.body.kind.name, attempt.held
     frames = {
         TACTILE_LEFT: attempt.left,
         TACTILE_RIGHT: attempt.right,
         TRUTH_PAD_WRENCH: attempt.wrench,
-        TRUTH_CONTACT: pressed,
-        TRUTH_SUCCESS: np.array([[False], [False], [attempt.held]]),
+        TRUTH_CONTACT: attempt.wrench[:, [2, 8]] < 0,
+        TRUTH_SUCCESS: np.array([[False], [False], [held]]),
     }
-    name = attempt.body.kind.name
-    meta = {
-        _RIG: rig,
-        "sensor": config.sensor,
-        "object": name,
-        "grip": attempt.grip,
-        "mass": attempt.body.mass,
-        "success": attempt.held,
-        "stroke": index,
-    }
-    return encode(Episode(frames, f"grasp the {name.replace('_', ' ')} and lift it", meta), FPS)
+    meta = {"object": name, "grip": attempt.grip, "mass": attempt.body.mass, "success": held}
+    return frames, f"grasp the {name.replace('_', ' ')} and lift it", meta
 
 
-def _cloth(config: RigConfig, rig: str, index: int) -> EncodedEpisode:
+def _cloth(config: RigConfig, index: int) -> Recorded:
     clip = press_cloth(config, index)
     name = CLOTHS[clip.cloth].name
-    meta = {_RIG: rig, "sensor": config.sensor, "object": name, "stroke": index}
-    return encode(Episode({TACTILE_LEFT: clip.frames}, f"press on {name}", meta), FPS)
+    return {TACTILE_LEFT: clip.frames}, f"press on {name}", {"object": name}
 
 
 def _frames(

@@ -28,7 +28,9 @@ class Config:
 def main(config: Any) -> None:
     """Record the missing episodes."""
     from touchgoal.control.tactile.sensor_models import find_sensor
-    from touchgoal.episodes.bench_recording import record_catalogue_slides
+    from touchgoal.episodes.bench_recording import record_bench
+    from touchgoal.episodes.format.set_files import INFO
+    from touchgoal.episodes.store import EpisodeSet
     from touchgoal.runtime.interruption import on_interruption
     from touchgoal.runtime.run_folder import open_run
     from touchgoal.sim_envs.config import RigConfig
@@ -36,9 +38,13 @@ def main(config: Any) -> None:
     find_sensor(config.sensor)  # a wrong one is refused before anything is written
     out = open_run(config.out, "collect-touches", config, adds=True)
     root = out / "episodes"
+    recorded = (root / INFO).exists() and len(EpisodeSet(root)) >= config.episodes
     rig = RigConfig(sensor=config.sensor, seed=config.seed)
     with on_interruption(
         lambda: f"finished episodes are in {root}; the same line with --out {out} continues"
     ):
-        episodes = record_catalogue_slides(root, rig, config.episodes, config.workers)
+        count, workers = config.episodes, config.workers
+        episodes = record_bench("catalogue slides", root, rig, count, workers)
+    if recorded:
+        print("nothing left to record:", end=" ")
     print(f"{len(episodes)} episodes, {sum(episodes.lengths)} images in {root}")

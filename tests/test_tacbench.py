@@ -24,7 +24,7 @@ from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.pretrained import save
 from touchgoal.encoders.probes.attentive import AttentivePooler, AttentiveProbe
 from touchgoal.encoders.ssl.frames import sample_frames
-from touchgoal.episodes.bench_recording import record_strokes
+from touchgoal.episodes.bench_recording import record_bench
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import RigConfig
@@ -47,8 +47,8 @@ STROKES = 15
 def strokes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five strokes of each probe, the last two of them after an interruption."""
     folder = tmp_path_factory.mktemp("rig") / "strokes"
-    record_strokes(folder, RIG, STROKES - 2, workers=1)
-    record_strokes(folder, RIG, STROKES, workers=1)
+    record_bench("strokes", folder, RIG, STROKES - 2, workers=1)
+    record_bench("strokes", folder, RIG, STROKES, workers=1)
     return folder
 
 
@@ -115,7 +115,7 @@ def test_strokes_go_on_where_they_stopped(strokes: Path) -> None:
     assert np.array_equal(read[TRUTH_PAD_WRENCH][:, :6], whole.wrench)
     assert np.array_equal(read[TRUTH_SLIP][:, 0], whole.slip)
     with pytest.raises(UserError, match="of another rig"):
-        record_strokes(strokes, RigConfig(seed=4), STROKES, workers=1)
+        record_bench("strokes", strokes, RigConfig(seed=4), STROKES, workers=1)
 
 
 def test_the_pooler_is_the_published_one() -> None:

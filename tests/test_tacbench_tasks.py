@@ -14,7 +14,7 @@ from touchgoal.benchmarks.papers.tacbench_report.published import published
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.probes.dense import DenseProbe
-from touchgoal.episodes.bench_recording import record_cloths, record_grasps
+from touchgoal.episodes.bench_recording import record_bench
 from touchgoal.sim_envs.cloths import CLOTHS, FRAMES, press_cloth
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.grasp_rig import GraspAttempt, attempt_grasp
@@ -27,7 +27,7 @@ GRASPS = 5
 @pytest.fixture(scope="session")
 def grasps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("grasps")
-    record_grasps(folder, RIG, GRASPS, workers=1)
+    record_bench("grasps", folder, RIG, GRASPS, workers=1)
     return folder
 
 
@@ -64,7 +64,7 @@ def test_a_grasp_holds_as_friction_says() -> None:
 
 
 def test_grasps_are_pairs_of_moments_of_each_finger(grasps: Path) -> None:
-    episodes = record_grasps(grasps, RIG, GRASPS, workers=1)
+    episodes = record_bench("grasps", grasps, RIG, GRASPS, workers=1)
     frames = read_grasps(episodes, GRASPS, preprocessor_for(RIG.sensor))
     assert len(frames.stroke) == GRASPS * 2 * 3
     assert frames.before[:6].tolist() == [0, 0, 1, 3, 3, 4]
@@ -89,7 +89,7 @@ def test_a_cloths_yarns_are_as_many_as_it_says(tmp_path: Path) -> None:
     over, under = (CLOTHS[0].pattern(np.full((256, 256), u, np.float32), 0 * x) for u in (0.5, 1.5))
     # plain weave: between two wefts a warp is up on every other yarn
     assert sorted([float(over[0, 0]), float(under[0, 0])]) == pytest.approx([0.5, 1.0])
-    episodes = record_cloths(tmp_path, RIG, 21, workers=1)
+    episodes = record_bench("cloths", tmp_path, RIG, 21, workers=1)
     clip = press_cloth(RIG, 20)
     assert clip.cloth == 0 and episodes.meta(20)["object"] == "poplin"
     change = np.abs(clip.frames.astype(int) - clip.frames[0]).mean((1, 2, 3))

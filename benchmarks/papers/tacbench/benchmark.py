@@ -38,12 +38,7 @@ from touchgoal.benchmarks.papers.tacbench_report.tables import table
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.preprocess import Preprocessor
-from touchgoal.episodes.bench_recording import (
-    record_cloths,
-    record_grasps,
-    record_slides,
-    record_strokes,
-)
+from touchgoal.episodes.bench_recording import record_bench
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import on_interruption
@@ -51,12 +46,6 @@ from touchgoal.runtime.progress import progress_bar
 from touchgoal.runtime.worker_pool import one_core_workers
 
 _LOG = "training.log"
-_RECORDERS: dict[Recording, Callable[..., EpisodeSet]] = {
-    "strokes": record_strokes,
-    "slides": record_slides,
-    "grasps": record_grasps,
-    "cloths": record_cloths,
-}
 _READERS: dict[Recording, Callable[[EpisodeSet, int, Preprocessor], RigFrames]] = {
     "strokes": read_strokes,
     "slides": read_strokes,
@@ -119,7 +108,7 @@ def _recordings(config: Config) -> list[Recording]:
 def _record(what: Recording, folder: Path, config: Config) -> Reading:
     """Record what is missing and return its reader."""
     count = getattr(config, what)
-    episodes = _RECORDERS[what](folder / what, config.rig, count, config.workers)
+    episodes = record_bench(what, folder / what, config.rig, count, config.workers)
     return partial(_READERS[what], episodes, count)
 
 
