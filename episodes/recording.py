@@ -97,7 +97,8 @@ def missing_specs(
     if not (root / set_files.INFO).exists():
         return list(specs)
     metas = [episodes.meta(i) for episodes in [EpisodeSet(root)] for i in range(len(episodes))]
-    recorded = {meta.get("seed") for meta in metas if (meta["outcome"] == CORRECTED) == corrected}
+    alike = [meta for meta in metas if (meta.get("outcome") == CORRECTED) == corrected]
+    recorded = {seed for meta in alike if isinstance(seed := meta.get("seed"), int)}
     return [spec for spec in specs if spec.seed not in recorded]
 
 

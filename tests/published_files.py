@@ -93,14 +93,14 @@ def write_pose_set(
 ) -> None:
     """TacBench's pose estimation, of the ring finger alone: motions grow by 0.3 mm and 0.2 degrees."""
     for use in ("train", "test"):
-        for k, thing in enumerate(("pringles", "sugar")):
+        for k, name in enumerate(("pringles", "sugar")):
             for bag in range(bags):
                 seed = 1000 * k + 100 * bag + (50 if use == "test" else 0)
                 frames = [encoded(gel(seed + t, shape)) for t in range(pictures)]
                 steps = np.arange(pictures + 1) - pictures // 2
                 poses = [pose_change(0.3 * s, -0.6 * s, np.radians(0.2 * s)) for s in steps]
                 value = {"digit_ring": frames, "object_ring_rel_pose_n5": np.stack(poses)}
-                write(folder / use / thing / f"bag_{bag:02d}.pkl", value)
+                write(folder / use / name / f"bag_{bag:02d}.pkl", value)
     (folder / "bgs").mkdir()
     plain = np.full((*shape, 3), UNTOUCHED["red"], np.uint8)
     (folder / "bgs" / "digit_ring.png").write_bytes(encoded(plain, "PNG"))

@@ -174,7 +174,7 @@ def test_an_interrupted_command_says_what_was_kept(
     from touchgoal.launch import list as command
 
     def work(_: object) -> None:
-        with on_interruption(lambda: "kept 1 of 2"):
+        with on_interruption(lambda: "saved 1 of 2"):
             os.kill(os.getpid(), number)
             time.sleep(5)
 
@@ -182,7 +182,7 @@ def test_an_interrupted_command_says_what_was_kept(
     with pytest.raises(SystemExit) as stopped:
         main(["list"])
     assert stopped.value.code == code
-    assert capsys.readouterr().err == "\ntouchgoal list: stopped; kept 1 of 2\n"
+    assert capsys.readouterr().err == "\ntouchgoal list: stopped; saved 1 of 2\n"
 
 
 @pytest.mark.parametrize("buffered", [True, False])

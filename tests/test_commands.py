@@ -110,8 +110,8 @@ def test_train_encoder_then_use_it(episodes: Path, validation: Path, tmp_path: P
     out = tmp_path / "run"
     run("train-encoder", "align", "--data", episodes, "--validation", validation, "--out", out,
         "--align.vit", "tiny", "--align.epochs", 12, "--align.batch-size", 32)  # fmt: skip
-    kept = pretrained.ENCODER_FORMAT.provenance(out / "encoder")
-    assert kept["data"]["train"]["episodes"] == 2 and kept["command"].startswith("touchgoal")
+    recipe = pretrained.ENCODER_FORMAT.provenance(out / "encoder")
+    assert recipe["data"]["train"]["episodes"] == 2 and recipe["command"].startswith("touchgoal")
     run("reward-curves", episodes, "--encoder", out / "encoder", "--out", tmp_path / "curves")
     report = json.loads((tmp_path / "curves" / "episode_001.json").read_text())
     assert report["metrics"]["tactile"]["contact_lag"] is not None

@@ -221,9 +221,9 @@ def test_killed_at_every_write(small: Path, monkeypatch: pytest.MonkeyPatch) -> 
         with pytest.raises(UserError, match="interrupted.*repair"):
             EpisodeWriter(root, FPS)
         assert repair(root)
-        kept = len(EpisodeSet(root))
-        EpisodeWriter(root, FPS).append(make_episode(kept))
-        assert_holds(root, list(range(kept + 1)))
+        left = len(EpisodeSet(root))
+        EpisodeWriter(root, FPS).append(make_episode(left))
+        assert_holds(root, list(range(left + 1)))
         assert validate(root) == []
     assert steps == 2 * 6, "a video, a data file and four files of metadata"
 

@@ -220,7 +220,7 @@ def add_episodes_like_lerobot(root: Path, extend: bool) -> None:
 
 @pytest.mark.parametrize("extend", [False, True])
 def test_a_set_that_lerobot_continued_is_left_as_it_is(small: Path, extend: bool) -> None:
-    """Its episodes are sound, if not ours: nothing moves, and nobody is sent to `repair`."""
+    """Its episodes are sound, if not ours: nothing moves, and no message advises `repair`."""
     add_episodes_like_lerobot(small, extend)
     before = {path: path.read_bytes() for path in small.rglob("*") if path.is_file()}
     for use in (EpisodeSet, lambda root: EpisodeWriter(root, FPS), validate, repair):

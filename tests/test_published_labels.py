@@ -73,7 +73,7 @@ def test_a_batch_that_is_not_whole_is_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (lambda v: v.pop("trajectories"), "has no 'trajectories'"),
         (lambda v: v.update(trajectories={}), "has no stroke"),
@@ -99,14 +99,14 @@ def test_a_batch_that_is_not_whole_is_one_line(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_labels_are_one_line(
-    tmp_path: Path, change: Callable[[dict[str, Any]], object], told: str
+    tmp_path: Path, change: Callable[[dict[str, Any]], object], message: str
 ) -> None:
     batch = tmp_path / "sphere" / "batch_1"
     write_force_batch(batch)
     value = pickle.loads((batch / "dataset_slip_forces.pkl").read_bytes())
     change(value)
     write(batch / "dataset_slip_forces.pkl", value)
-    with pytest.raises(UserError, match=told) as refused:
+    with pytest.raises(UserError, match=message) as refused:
         list(read_strokes(tmp_path))
     assert "\n" not in str(refused.value)
 
@@ -115,9 +115,9 @@ def test_bags_have_motions_in_metres_and_radians(tmp_path: Path) -> None:
     write_pose_set(tmp_path)
     bags = list(read_bags(tmp_path))
     assert [(b.object, b.held_out) for b in bags] == [
-        (thing, held_out)
+        (name, held_out)
         for held_out in (False, True)
-        for thing in ("pringles", "sugar")
+        for name in ("pringles", "sugar")
         for _ in "ab"
     ]
     bag = bags[0]

@@ -95,9 +95,9 @@ def test_an_encoder_learns_from_a_published_folder(
     main(["train-encoder", "mae", "--data", str(data), "--out", str(out), *toy])
     encoder = load_encoder(str(out / "encoder"))
     assert encoder.embed(np.stack([gel(1), gel(2)])).shape[0] == 2  # upright, as a DIGIT's
-    kept = ENCODER_FORMAT.provenance(out / "encoder")
-    assert kept["data"]["train"] == [{"path": data.name, "recordings": 8, "held_out": 2}]
-    for words, told in (
+    recipe = ENCODER_FORMAT.provenance(out / "encoder")
+    assert recipe["data"]["train"] == [{"path": data.name, "recordings": 8, "held_out": 2}]
+    for words, message in (
         (["--data", str(data), "--sensor", "gelsight_mini"], "with digit, not gelsight_mini"),
         (["--data", str(tmp_path / "none")], "is no folder"),
         (["--data", str(tmp_path)], "none of the published layouts"),
@@ -105,7 +105,7 @@ def test_an_encoder_learns_from_a_published_folder(
     ):
         with pytest.raises(SystemExit) as refused:
             main(["train-encoder", "mae", *words, "--out", str(tmp_path / "other"), *toy])
-        assert told in f"{refused.value.code}{capsys.readouterr().err}"
+        assert message in f"{refused.value.code}{capsys.readouterr().err}"
 
 
 def test_what_is_no_such_folder_is_one_line(tmp_path: Path) -> None:

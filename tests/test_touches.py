@@ -41,9 +41,9 @@ def test_touches(tmp_path: Path, truth: bool) -> None:
     assert set(touches.side) == {0, 1}
     assert touches.descriptions["thing_1"] == ["feels like 1", "hard"]
     bumped = touches.frames.astype(int) - touches.background[touches.background_index]
-    felt = bumped[:, 50, 60, 0] > 15
-    assert felt.tolist() == [name != "" for name in touches.object]
-    assert np.abs(bumped[~felt].mean(axis=(1, 2, 3))).max() < 2, "the background is its own"
+    touched = bumped[:, 50, 60, 0] > 15
+    assert touched.tolist() == [name != "" for name in touches.object]
+    assert np.abs(bumped[~touched].mean(axis=(1, 2, 3))).max() < 2, "the background is its own"
     # the last frame before contact is 19; five frames earlier the wrist picture is 14 * 6 bright
     assert touches.view[:2].mean(axis=(1, 2, 3)) == pytest.approx(14 * 6, abs=3)
     np.testing.assert_array_equal(touches.view_index, touches.episode_index)

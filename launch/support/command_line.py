@@ -35,21 +35,21 @@ def parse(
     description: str,
     envs: Mapping[str, EnvConfig] | None = None,
 ) -> Any:
-    """A command's Config.
+    """Parse a command's arguments into its Config.
 
     A Config with an option `--preset` has the defaults of each of its values in `PRESETS`.
 
     Args:
-        config_type: the dataclass, or a union of those that subcommands take.
-        arguments: what was typed after the command's name.
-        prog: the command, as it is called in messages.
-        description: what it does.
-        envs: for a command with `--task`, the default options of each task: `--env.*` are those
-            of the task that was typed.
+        config_type: Dataclass, or a union of the subcommands' dataclasses.
+        arguments: Arguments after the command's name.
+        prog: Name of the command for messages.
+        description: Description of the command for its help.
+        envs: For a command with `--task`, each task's default environment options; `--env.*` are
+            those of the typed task.
 
     Raises:
-        UserError: a value is out of range.
-        SystemExit: help was asked for (0), or something typed was not understood (2).
+        UserError: A value is out of range.
+        SystemExit: Help was asked for (0), or an argument was not understood (2).
     """
     _refuse_empty_values(arguments)
     short = not {"--help", "-h"}.isdisjoint(arguments)  # tyro does not accept what it hides

@@ -57,8 +57,8 @@ def expected(
 ) -> np.ndarray:
     _, size, offsets = METHODS[method]
     background = frames[0] if subtract else None
-    seen = [prepared(frames[max(i - back, 0)], background, size) for back in offsets]
-    touch = np.stack(seen, 1) if method == "vjepa" else np.concatenate(seen)
+    embedded = [prepared(frames[max(i - back, 0)], background, size) for back in offsets]
+    touch = np.stack(embedded, 1) if method == "vjepa" else np.concatenate(embedded)
     return plain_forward(weights, torch.from_numpy(touch)).mean(0).numpy()
 
 
@@ -140,10 +140,10 @@ def test_real_touch_takes_them(tmp_path: Path) -> None:
     weights, frames = published(), video()
     save_file(weights, tmp_path / "mae_vittiny.safetensors")
     for name in (tmp_path, tmp_path / "mae_vittiny.safetensors"):
-        (seen,) = find_embedder(str(name), 0)(frames, frames[0], np.array([7]))
-        np.testing.assert_allclose(seen, expected(weights, frames, 7, "mae"), atol=2e-5)
+        (embedded,) = find_embedder(str(name), 0)(frames, frames[0], np.array([7]))
+        np.testing.assert_allclose(embedded, expected(weights, frames, 7, "mae"), atol=2e-5)
     random = find_embedder(f"random:{tmp_path}", 0)(frames, frames[0], np.array([7]))
-    assert np.abs(random[0] - seen).max() > 0.1
+    assert np.abs(random[0] - embedded).max() > 0.1
 
 
 @pytest.mark.parametrize("method", ["mae", "vjepa"])
