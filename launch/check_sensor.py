@@ -1,8 +1,8 @@
 """Check a sensor, or a sensor file, on your own frames: noise, drift, contact, depth, force, markers.
 
 SOURCE is a USB serial number, a device (/dev/video2), a stream's address, a video, or a folder of
-pictures. Leave the gel untouched for the first second, then press any object, press a ball (--ball-mm),
-or lay a weight on the gel (--weight-g).
+pictures. Leave the gel untouched for the first second, then press any object, press a ball
+(--ball-mm), or lay a weight on the gel (--weight-g).
 """
 
 from pathlib import Path

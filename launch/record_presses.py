@@ -1,8 +1,9 @@
 """Record presses of a ball all over a sensor's gel, and fit its sensor file to them.
 
-SOURCE is a USB serial number, a device (/dev/video2), a stream's address, or a recording: a video or a
-folder of pictures. Leave the gel untouched for a second. Then press the ball where the live picture
-shows, hold still until the press is recorded, and lift. Ctrl-C ends; recorded presses are written.
+SOURCE is a USB serial number, a device (/dev/video2), a stream's address, or a recording: a video
+or a folder of pictures. Leave the gel untouched for a second. Then press the ball where the live
+picture shows, hold still until the press is recorded, and lift. Ctrl-C ends; recorded presses are
+written.
 """
 
 from pathlib import Path
@@ -21,7 +22,7 @@ class Config:
     source: Annotated[str, tyro.conf.Positional]
     """USB serial number, device, or stream's address of the sensor; or a recording of it."""
     ball_mm: Positive
-    """Radius of the ball, mm: measure it, for no picture tells it."""
+    """Radius of the ball, mm: measure it, because pictures do not show it."""
     mm_per_pixel: Positive
     """Length on the gel that a pixel shows, mm."""
     sensor: str = "gelsight_mini"
@@ -42,7 +43,7 @@ class Config:
     calibrate: bool = True
     """Fit the sensor file when enough presses are recorded."""
     out: Path | None = None
-    """Folder of the run; the presses go to its `presses/`, the sensor file to `calibration_N/` (N presses)."""
+    """Folder of the run, with the presses in `presses/` and the sensor file in `calibration_N/`."""
 
 
 def main(config: Config) -> None:
@@ -63,8 +64,8 @@ def main(config: Config) -> None:
         raise UserError("--resume: name the folder of the recording with --out")
     if config.exposure is None and not recorded and "://" not in config.source:
         raise UserError(
-            "give --exposure (v4l2-ctl --list-ctrls shows its range): automatic exposure changes the "
-            "light with every press"
+            "give --exposure (v4l2-ctl --list-ctrls shows its range): automatic exposure changes "
+            "the light with every press"
         )
     frames = open_frames(
         config.source, model, config.corners, config.exposure, config.white_balance

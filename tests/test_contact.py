@@ -88,8 +88,8 @@ def test_a_jpeg_streams_noise_is_no_contact() -> None:
     frames = np.stack([through_jpeg(f) for f in sensed(np.ones(40), height)])
     untouched, background = frames[:5], background_of(frames)
     assert contact_strength(frames[:20], background).max() > THRESHOLD
-    felt = detect_contact(frames, background, threshold_for(untouched, background))
-    np.testing.assert_array_equal(felt, height > 0)
+    touching = detect_contact(frames, background, threshold_for(untouched, background))
+    np.testing.assert_array_equal(touching, height > 0)
 
 
 def test_a_stream_that_starts_with_one_frame_learns_its_noise() -> None:
@@ -99,8 +99,8 @@ def test_a_stream_that_starts_with_one_frame_learns_its_noise() -> None:
     height[50:70] = 25
     frames = np.stack([through_jpeg(f) for f in sensed(light, height)])
     detector = ContactDetector(Background(frames[:1]))
-    felt = [detector.update(frame) for frame in frames[1:]]
-    np.testing.assert_array_equal(felt, height[1:] > 0)
+    touching = [detector.update(frame) for frame in frames[1:]]
+    np.testing.assert_array_equal(touching, height[1:] > 0)
     assert contact_strength(frames[1:50], frames[0]).max() > THRESHOLD, (
         "must fool a fixed threshold"
     )

@@ -1,4 +1,4 @@
-"""A sensor of one's own: its frames from any source, presses recorded from them, the sensor checked."""
+"""Frames of a sensor from any source, presses recorded from them, and the sensor checked."""
 
 import threading
 from collections.abc import Iterator

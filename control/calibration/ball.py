@@ -24,10 +24,10 @@ _CONTACT_PER_DISC = 0.7
 def ball_overlap(
     shape: tuple[int, int], pitch: float, circle: Circle, ball_radius: float
 ) -> Float32[np.ndarray, "h w"]:
-    """Overlap (m) of a ball with the flat gel such that it touches the deformed gel in a circle.
+    """Return the overlap (m) of ball and flat gel with which the deformed gel touches in a circle.
 
-    The gel touches what overlaps by more than `gel.CONTACT_SHARE` of the deepest overlap, so the
-    ball's cap over the circle has the remaining share of its depth.
+    The gel touches where the overlap exceeds `gel.CONTACT_SHARE` of its maximum, so the ball's cap
+    over the circle has the remaining share of its depth.
 
     Args:
         shape: rows and columns of the picture.
@@ -47,7 +47,7 @@ def ball_overlap(
 def press_surface(
     calibration: SensorCalibration, circle: Circle, ball_radius: float
 ) -> Float32[np.ndarray, "h w"]:
-    """Surface of the gel (m) under a ball; the sensor file gives the gel's bulge."""
+    """Return the gel's surface (m) under a ball, with the sensor file's bulge."""
     rows, cols, _ = calibration.background.shape
     raw = ball_overlap((rows, cols), calibration.pixel_pitch, circle, ball_radius)
     return gel.deform(raw, calibration.pixel_pitch, calibration.blur_sigmas)
@@ -56,14 +56,14 @@ def press_surface(
 def find_circle(
     image: UInt8[np.ndarray, "h w 3"], background: UInt8[np.ndarray, "h w 3"]
 ) -> Float[np.ndarray, "3"]:
-    """The contact of one ball: centre x, centre y and radius, px; the fit moves it further.
+    """Find the contact of one ball: centre x, centre y and radius, px, to be moved by the fit.
 
     Args:
         image: RGB picture of the press.
         background: the sensor untouched.
 
     Raises:
-        UserError: nothing that changes stands out.
+        UserError: no change stands out.
     """
     change = image.astype(np.float32) - background
     change -= np.median(change, (0, 1))

@@ -1,4 +1,4 @@
-"""From labelled ball presses to a sensor file."""
+"""Fit of a sensor file to ball presses."""
 
 import math
 from collections.abc import Callable
@@ -41,7 +41,7 @@ _FAR = 4.0  # contact radii from which on a press leaves the gel as it was
 
 @dataclass(frozen=True)
 class LabelCorrection:
-    """How circles were labelled, learnt where pictures were fitted: per coordinate, a line.
+    """Line from labelled to fitted circles, per coordinate.
 
     Attributes:
         offset, slope: true centre x, centre y and radius (px) are about offset + slope x label.
@@ -53,16 +53,17 @@ class LabelCorrection:
 
 @dataclass(frozen=True)
 class FittedCalibration:
-    """A fitted sensor and what was learnt on the way.
+    """Fitted sensor, with the circles and balls of its presses.
 
     Attributes:
-        calibration: the sensor file to be.
-        circles: of the fitted presses, where their pictures say they are, px.
+        calibration: the sensor file.
+        circles: of the fitted presses, moved to their pictures, px.
         ball_radius: of the fitted presses, m.
-        ball_fitted: whether the presses left the ball's radius open. Slopes and depths are then no
-            better known than that radius, which pictures tell poorly.
-        varies_over_image: whether the response may vary over the image; not if all presses lie in one place.
-        label_correction: how the labels were off.
+        ball_fitted: whether the ball's radius was unknown and fitted; slopes and depths are no
+            better known than that radius, which pictures determine poorly.
+        varies_over_image: whether the response varies over the image; not if all presses lie in one
+            place.
+        label_correction: from labels to fitted circles.
     """
 
     calibration: SensorCalibration
@@ -73,28 +74,28 @@ class FittedCalibration:
     label_correction: LabelCorrection
 
     def ball_radii(self, presses: PressSet) -> Float[np.ndarray, " n"]:
-        """Ball radii (m) of other presses: theirs, or the fitted one."""
+        """Return ball radii (m) of other presses: theirs, or the fitted one."""
         known = presses.ball_radius
         return np.where(np.isnan(known), self.ball_radius.mean(), known)
 
     def correct_labels(self, presses: PressSet) -> Float[np.ndarray, "n 3"]:
-        """Where the labels of other presses are to be believed to lie (px), the pictures unseen."""
+        """Predict the circles of other presses (px) from their labels alone."""
         circles = self.label_correction.offset + self.label_correction.slope * presses.circles
         widest = WIDEST * self.ball_radii(presses) / self.calibration.pixel_pitch
         circles[:, 2] = circles[:, 2].clip(NARROWEST, widest)
         return circles
 
     def fit_circles(self, presses: PressSet) -> Float[np.ndarray, "n 3"]:
-        """Circles (px) of other presses, moved from their labels to where their pictures say.
+        """Move the circles (px) of other presses from their labels to their pictures.
 
-        That looks at the pictures: an error at these circles is the model's alone, an error at
-        `correct_labels` the labels' as well.
+        An error at these circles is the model's alone; an error at `correct_labels` includes the
+        labels'.
         """
         known = replace(presses, ball_radius=self.ball_radii(presses))
         return move_circles(self.calibration, known, self.correct_labels(presses))
 
     def simulate(self, circle: Circle, ball_radius: float) -> Float32[np.ndarray, "h w 3"]:
-        """Picture of a press, RGB counts without noise; px and m."""
+        """Render a press (circle in px, radius in m): RGB counts without noise."""
         return shade(self.calibration, press_surface(self.calibration, circle, ball_radius))
 
 
@@ -106,15 +107,15 @@ def fit(
     trust_labels: bool = False,
     illumination_exponent: float = 1.0,
 ) -> FittedCalibration:
-    """Calibrate a sensor.
+    """Fit a sensor file.
 
     Args:
         presses: see `read_presses`.
         pitch: m per pixel.
         sensor: name of the sensor model.
-        on_progress: called STEPS times as the work proceeds.
+        on_progress: called STEPS times.
         trust_labels: leave the circles as they are, but for one common scale of their radii.
-        illumination_exponent: see `SensorCalibration.illumination_exponent` and `select_illumination_exponent`.
+        illumination_exponent: see `SensorCalibration` and `select_illumination_exponent`.
     """
     background, varies_over_image = median_background(presses), _spread_out(presses)
     steps = PressFit(presses, background, varies_over_image, trust_labels, illumination_exponent)
@@ -145,15 +146,15 @@ def fit(
 def select_illumination_exponent(
     presses: PressSet, pitch: float, sensor: str, on_progress: Callable[[], object] = lambda: None
 ) -> float:
-    """The power of light with which the balls of these presses come out at their size.
+    """Return the illumination exponent that reads the balls of these presses at their size.
 
-    The error of pictures cannot tell: it is the same within a hundredth of a count.
+    The error of pictures cannot decide: it is the same within a hundredth of a count.
 
     Args:
         presses: with known balls.
         pitch: m per pixel.
         sensor: name of the sensor model.
-        on_progress: called once a power tried.
+        on_progress: called once an exponent tried.
     """
     wrong = {}
     chosen = np.arange(0, len(presses), max(1, len(presses) // _DEPTH_PRESSES))
@@ -166,18 +167,18 @@ def select_illumination_exponent(
             fitted.ball_radius[chosen],
             finest=4,
         )
-        # The median: balls that the picture's border cuts tell little.
+        # The median: balls cut by the border are unreliable.
         wrong[power] = float(np.median([abs(math.log(error.radius)) for error in errors]))
         on_progress()
     return min(wrong, key=lambda power: wrong[power])
 
 
 def median_background(presses: PressSet) -> UInt8[np.ndarray, "h w 3"]:
-    """The background as the presses show it away from their contacts.
+    """Return the background as the presses show it away from their contacts.
 
-    A gel settles under the first presses: bands of several counts against the picture taken before
-    them. Where fewer than three presses lie far away, the given background takes on the change of
-    its surroundings, so that no seam is left.
+    A gel settles under the first presses: bands of several counts against the picture before them.
+    Where fewer than three presses lie far away, the given background takes the change of its
+    surroundings, so that no seam is left.
     """
     rows, cols = np.ogrid[: presses.background.shape[0], : presses.background.shape[1]]
     x, y, radius = presses.circles.T[:, :, None, None]
@@ -185,8 +186,8 @@ def median_background(presses: PressSet) -> UInt8[np.ndarray, "h w 3"]:
     settled = presses.background.copy()
     enough = far.sum(0) >= 3
     for channel in range(3):
-        seen = np.ma.MaskedArray(presses.images[..., channel], ~far)
-        median = np.ma.median(seen, 0).filled(0)
+        masked = np.ma.MaskedArray(presses.images[..., channel], ~far)
+        median = np.ma.median(masked, 0).filled(0)
         change = np.where(enough, median - presses.background[..., channel], 0)
         around = _spread(change.astype(np.float32), enough)
         filled = np.where(enough, median, presses.background[..., channel] + around)
@@ -197,7 +198,7 @@ def median_background(presses: PressSet) -> UInt8[np.ndarray, "h w 3"]:
 def _spread(
     change: Float32[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
-    """A change continued smoothly to where it is not known: averages over ever wider windows."""
+    """Continue a change smoothly to unknown pixels: averages over ever wider windows."""
     spread, covered = np.zeros_like(change), np.zeros(change.shape, bool)
     weight = known.astype(np.float32)
     for sigma in _WINDOWS:
@@ -210,7 +211,7 @@ def _spread(
 
 
 def noise(presses: PressSet) -> float:
-    """Standard deviation (counts) of what changes from one picture to the next, pixel by pixel."""
+    """Return the standard deviation (counts) of a pixel from one picture to the next."""
     spreads = []
     for one, other in zip(presses.images[:-1], presses.images[1:], strict=True):
         change = (one.astype(np.float32) - other) / math.sqrt(2)
@@ -222,7 +223,7 @@ def noise(presses: PressSet) -> float:
 def _initial_calibration(
     background: UInt8[np.ndarray, "h w 3"], pitch: float, sensor: str, noise: float
 ) -> SensorCalibration:
-    """A sensor file to start from: no response, no limits, a typical gel."""
+    """Return a sensor file without response and limits, with a typical gel."""
     return SensorCalibration(
         sensor=sensor,
         background=background,
@@ -245,7 +246,7 @@ def _spread_out(presses: PressSet) -> bool:
 
 
 def _with_limits(state: FitState) -> SensorCalibration:
-    """With the steepest slope and the largest depth of the presses as the model's limits."""
+    """Set the model's limits to the steepest slope and the largest depth of the presses."""
     calibration, max_slope, max_depth = state.calibration, 0.0, 0.0
     for circle, ball in zip(state.circles, state.ball_radius, strict=True):
         surface = press_surface(calibration, circle, ball)

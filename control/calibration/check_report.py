@@ -56,7 +56,8 @@ def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
     printed = [f"frames       {check.frames}, {check.touching} of them touched"]
     if check.torn:
         printed.append(
-            f"             {check.torn} are torn or rolled and left out: check the cable and the decoder"
+            f"             {check.torn} are torn or rolled and left out: check the cable and the "
+            "decoder"
         )
     if check.noise is not None:
         printed.append(f"noise        {check.noise:.2f} counts a pixel")
@@ -66,18 +67,22 @@ def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
     ]
     if check.unlike_file > _UNLIKE:
         printed.append(
-            f"             the untouched gel differs from the sensor file's by {check.unlike_file:.1f} counts "
+            "             the untouched gel differs from the sensor file's by "
+            f"{check.unlike_file:.1f} counts "
             "in one spot: depths and forces are nominal until this sensor is calibrated"
         )
     printed.append(_contact(check))
     if check.markers is not None:
         printed.append(
-            f"markers      {100 * check.markers:.0f} % found, moved by up to {check.largest_shift:.1f} px"
+            f"markers      {100 * check.markers:.0f} % found, moved by up to "
+            f"{check.largest_shift:.1f} px"
         )
     if check.unexplained:
         printed.append(
-            f"refused      {check.unexplained} of {check.unexplained + len(check.presses)} presses: the sensor "
-            f"file leaves more than {100 * UNEXPLAINED:.0f} % of their change unexplained; calibrate this "
+            f"refused      {check.unexplained} of {check.unexplained + len(check.presses)} "
+            "presses: the sensor "
+            f"file leaves more than {100 * UNEXPLAINED:.0f} % of their change unexplained; "
+            "calibrate this "
             "sensor (touchgoal record-presses)"
         )
     if "radius_mm" in figures:
@@ -105,7 +110,8 @@ def picture(check: SensorCheck) -> UInt8[np.ndarray, "H W 3"]:
 def _ball(figures: dict[str, Any]) -> str:
     low, middle, high = figures["radius_mm"]
     line = (
-        f"ball         {figures['ball_mm']:g} mm reads {middle:.2f} mm (quartiles {low:.2f} to {high:.2f}), "
+        f"ball         {figures['ball_mm']:g} mm reads {middle:.2f} mm (quartiles {low:.2f} to "
+        f"{high:.2f}), "
         f"{1e3 * figures['residual_mm']:.0f} um from a sphere"
     )
     off = abs(middle / figures["ball_mm"] - 1) > _DEPTH_OFF
@@ -156,7 +162,8 @@ def _contact(check: SensorCheck) -> str:
 
 def _light(name: str, drift: Drift, remedy: str) -> str:
     gain = 100 * (drift.gain - 1)
-    line = f"{name:<13}light {gain.min():+.1f} to {gain.max():+.1f} %, {drift.pattern.max():.1f} counts of pattern"
+    line = f"{name:<13}light {gain.min():+.1f} to {gain.max():+.1f} %, "
+    line += f"{drift.pattern.max():.1f} counts of pattern"
     return line + (f": {remedy}" if drift.large else "")
 
 

@@ -1,4 +1,4 @@
-"""Depth of held-out presses: the ball that the depth map shows, beside the ball that pressed."""
+"""Depth of held-out presses: the sphere in the depth map against the ball."""
 
 from dataclasses import asdict, dataclass
 
@@ -17,7 +17,7 @@ _OUTLIER = 20e-6  # m
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """How well a ball is seen in one press, or the median over several.
+    """Errors of one press, or the median over several.
 
     Attributes:
         radius: of the sphere in the depth map, over the ball's.
@@ -33,7 +33,7 @@ class DepthErrors:
 def sphere_in(
     depth: Float32[np.ndarray, "h w"], pitch: float, circle: Circle, ball_radius: float
 ) -> DepthErrors:
-    """The sphere that a depth map shows within a contact.
+    """Fit a sphere to a depth map within a contact.
 
     Args:
         depth: of the gel, m.
@@ -69,7 +69,7 @@ def depth_errors(
     balls: Float[np.ndarray, " n"],
     finest: int = 2,
 ) -> list[DepthErrors]:
-    """Of every press, with the depth that `DepthEstimator` reads.
+    """Return the errors of every press, with depth from `DepthEstimator`.
 
     Args:
         calibration: the sensor file.
@@ -90,7 +90,7 @@ def depth_errors(
 def median_by_ball(
     errors: list[DepthErrors], balls: Float[np.ndarray, " n"]
 ) -> dict[str, dict[str, float]]:
-    """Medians over the presses of each ball, by its radius in mm."""
+    """Return medians over the presses of each ball, by its radius in mm."""
     sizes = np.round(balls * 1e3, 3)
     table = {}
     for size in np.unique(sizes):

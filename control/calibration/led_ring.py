@@ -1,6 +1,6 @@
-"""A sensor file from a drawing: colours of a matt gel under a ring of three lamps, not fitted.
+"""Sensor file of a drawn lamp ring: a matt gel under three lamps, for sensors without presses.
 
-For sensors of which nobody has presses at hand. `touchgoal calibrate` gives the real thing.
+`touchgoal calibrate` fits a real one.
 """
 
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ from touchgoal.control.tactile.sensor_models import SensorModel
 
 @dataclass(frozen=True)
 class LedRing:
-    """Three lamps, red, green and blue, around the camera's view.
+    """Ring of three lamps, red, green and blue, around the camera's view.
 
     Attributes:
         azimuths: of the lamps, degrees from x (right) towards y (down).
         radius: of the ring, m.
         distance: of its plane from the gel's surface, m.
         brightness: mean of the untouched picture, counts.
-        shadowed: share of a lamp's light that is missing in its full shadow; scattered light
-            fills the rest.
+        shadowed: share of a lamp's light that is missing in its full shadow; scattered light fills
+            the rest.
     """
 
     azimuths: tuple[float, float, float]
@@ -32,19 +32,20 @@ class LedRing:
     shadowed: float = 0.5
 
 
-# As real Wedges light their gel (EstimateModulus' pictures, rectified): red from below, green from the left, blue
-# from above, each flank of a ball's imprint in the colour of the side that it faces. Distances: chosen of a few by a grasp of a
-# golf ball, 26 % of whose change they leave unexplained (`touchgoal check-sensor`); of the same sensor's other grasp of it 34 %,
-# of another session's two 51 and 61 %.
+# As real Wedges light their gel (EstimateModulus' pictures, rectified): red from below, green from
+# the left, blue from above, each flank of a ball's imprint in the colour of the side that it faces.
+# Distances: chosen of a few by a grasp of a golf ball, 26 % of whose change they leave unexplained
+# (`touchgoal check-sensor`); of the same sensor's other grasp of it 34 %, of another session's two
+# 51 and 61 %.
 WEDGE_RING = LedRing(azimuths=(90.0, 180.0, -90.0), radius=30e-3, distance=50e-3)
 
 
 def from_led_ring(sensor: SensorModel, ring: LedRing) -> SensorCalibration:
-    """Colours by Lambert's law with the inverse square of the distance.
+    """Return a sensor file by Lambert's law with the inverse square of the distance.
 
-    A lamp in direction l lights a surface of normal n by n.l: linear in the normal's part in the
-    image plane, and falling with its square, n_z = sqrt(1 - nx^2 - ny^2). How the direction changes
-    over the image goes into the terms in u and v.
+    A lamp in direction l lights a surface of normal n by n.l: linear in the normal's image-plane
+    part, and falling with its square, n_z = sqrt(1 - nx^2 - ny^2). How l changes over the image
+    enters the terms in u and v.
     """
     rows, columns = sensor.image_shape
     u, v = np.meshgrid(np.linspace(-1, 1, columns), np.linspace(-1, 1, rows))
@@ -78,5 +79,5 @@ def from_led_ring(sensor: SensorModel, ring: LedRing) -> SensorCalibration:
 
 
 def _fit(place: Float[np.ndarray, "n 3"], slopes: Float[np.ndarray, "n 2"]) -> np.ndarray:
-    """Coefficients of (1, u, v), one row per slope."""
+    """Fit coefficients of (1, u, v), one row per slope."""
     return np.linalg.lstsq(place, slopes, rcond=None)[0].T

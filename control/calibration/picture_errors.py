@@ -1,4 +1,4 @@
-"""How far a simulated picture of a press is from the measured one."""
+"""Errors of a simulated picture of a press against the measured one."""
 
 from dataclasses import astuple, dataclass
 
@@ -31,12 +31,12 @@ def picture_errors(
     simulated: Float32[np.ndarray, "h w 3"],
     circle: Float[np.ndarray, " 3"],
 ) -> PictureErrors:
-    """Errors of a simulated picture.
+    """Return the errors of a simulated picture.
 
     Args:
         measured: RGB.
-        simulated: RGB counts without noise; cut off at 0 and 255.
-        circle: the contact as labelled: centre x, centre y and radius, px.
+        simulated: RGB counts without noise; clipped to 0 and 255.
+        circle: of the contact: centre x, centre y and radius, px.
     """
     x, y, radius = circle
     rows, columns = np.ogrid[: measured.shape[0], : measured.shape[1]]
@@ -52,14 +52,14 @@ def picture_errors(
 
 
 def mean_errors(errors: list[PictureErrors]) -> PictureErrors:
-    """Mean of each error over several pictures."""
+    """Return the mean of each error over several pictures."""
     return PictureErrors(*(float(v) for v in np.mean([astuple(e) for e in errors], 0)))
 
 
 def _structural_similarity(
     a: Float32[np.ndarray, "h w 3"], b: Float32[np.ndarray, "h w 3"]
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Wang et al. 2004: Gaussian window of 1.5 px, K1 = 0.01, K2 = 0.03, each channel alone."""
+    """Return SSIM (Wang et al. 2004): Gaussian window of 1.5 px, K1 = 0.01, K2 = 0.03."""
 
     def mean(image: np.ndarray) -> np.ndarray:
         return cv2.GaussianBlur(image, (11, 11), 1.5)

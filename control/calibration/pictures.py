@@ -1,4 +1,4 @@
-"""Pictures that let a person judge a calibration: presses side by side, and where the lights are."""
+"""Pictures of a calibration: presses side by side, and the lights."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ def side_by_side(
     simulated: Sequence[Float32[np.ndarray, "h w 3"]],
     pairs_a_row: int = 2,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Rows of measured | simulated | difference times CONTRAST about grey, RGB, with a heading.
+    """Draw measured | simulated | difference times CONTRAST about grey, RGB, with a heading.
 
     Args:
         measured: RGB counts.
@@ -38,7 +38,7 @@ def side_by_side(
 
 
 def light_compass(calibration: SensorCalibration, size: int = 320) -> UInt8[np.ndarray, "s s 3"]:
-    """Where in the image the lights stand, by channel, RGB: x to the right, y down.
+    """Draw where in the image the lights stand, by channel: x to the right, y down.
 
     A line's length is the channel's response to slope in the middle of the image, relative to the
     strongest.
@@ -72,7 +72,7 @@ def _heading(width: int, repeats: int) -> UInt8[np.ndarray, "h w 3"]:
 def _write(
     picture: UInt8[np.ndarray, "h w 3"], text: str, x: float, y: float, colour: tuple[int, int, int]
 ) -> None:
-    """Text centred at (x, y)."""
+    """Write text centred at (x, y)."""
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
     at = round(x - width / 2), round(y + height / 2)
     cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)

@@ -1,8 +1,8 @@
-"""The steps by which a sensor's light and gel are fitted to ball presses.
+"""Steps of the fit of a sensor's light and gel to ball presses.
 
-Given the surface under each press, the change of colour is linear in the unknown response
-(`sensor_calibration.design_matrix`): least squares. Around that alternate where exactly each ball lies (hand-made
-circles are off by pixels) and the few numbers that are not linear, chosen by cross-validation.
+With the surface under each press known, the change of colour is linear in the response
+(`sensor_calibration.design_matrix`): least squares. Steps that move the balls (hand-made circles
+are off by pixels) and that select the non-linear parameters by cross-validation alternate with it.
 """
 
 import math
@@ -47,7 +47,7 @@ Weights = Float64[np.ndarray, "3 terms"]
 
 @dataclass(frozen=True)
 class FitState:
-    """Where the fit stands.
+    """State of the fit.
 
     Attributes:
         calibration: the sensor file so far.
@@ -62,7 +62,7 @@ class FitState:
 
 @dataclass(frozen=True)
 class _Sample:
-    """The pixels of one press that take part: flat indices, and change of colour there."""
+    """Fitted pixels of one press: flat indices, and change of colour."""
 
     pixels: Int[np.ndarray, " n"]
     change: Float32[np.ndarray, "n 3"]
@@ -77,20 +77,20 @@ class _NormalEquations:
     energy: float
 
     def loss(self, solved: Weights) -> float:
-        """Squared error (counts^2) of these weights, summed."""
+        """Return the summed squared error (counts^2) of these weights."""
         fitted = np.einsum("ci,cij,cj->", solved, self.square, solved)
         return self.energy - 2 * float((self.product * solved).sum()) + float(fitted)
 
 
 class PressFit:
-    """The steps of the fit; each takes a state and returns a better one.
+    """Steps of the fit; each takes a state and returns a better one.
 
     Args:
-        presses: what to fit.
+        presses: to fit.
         background: the untouched sensor (RGB) that changes are taken against.
         varies_over_image: whether the response may vary over the image.
         trust_labels: whether circles stay as they are.
-        illumination_exponent: of the background's brightness (`SensorCalibration.illumination_exponent`).
+        illumination_exponent: see `SensorCalibration`.
     """
 
     def __init__(
@@ -114,11 +114,11 @@ class PressFit:
     def initialise(
         self, initial: SensorCalibration, ball_radius: Float64[np.ndarray, " n"]
     ) -> FitState:
-        """With the common scale of the labelled radii that explains the pictures best.
+        """Start with the common scale of the labelled radii that explains the pictures best.
 
         Args:
             initial: a sensor file without response.
-            ball_radius: m, one a press; NaN if open, then twice the largest contact's.
+            ball_radius: m, one a press; NaN if unknown, then twice the largest contact's.
         """
         starts = []
         for scale in _LABEL_SCALES:
@@ -130,13 +130,13 @@ class PressFit:
         return self._best(starts)
 
     def select_hyperparameters(self, state: FitState) -> FitState:
-        """With the gel and the shadows that cross-validation prefers, one after the other."""
+        """Select gel and shadow parameters by cross-validation, one after the other."""
         state = self._select_blur(state)
         state = self._select_value(state, "shadow_slope", _SHADOW_SLOPES)
         return self._select_value(state, "penumbra", _PENUMBRAS)
 
     def alternate(self, state: FitState, rounds: int) -> FitState:
-        """Response and circles in turn."""
+        """Fit response and circles in turn."""
         for _ in range(rounds):
             state = self.fit_response(state)
             if not self._trust_labels:
@@ -144,7 +144,7 @@ class PressFit:
         return state
 
     def fit_common_scale(self, state: FitState) -> FitState:
-        """With all contacts and balls larger or smaller, if that explains the pictures better.
+        """Scale all contacts and balls together if that explains the pictures better.
 
         A weaker response to steeper slopes, or a wider bulge around a smaller contact, looks nearly
         the same: single steps would take long.
@@ -157,20 +157,20 @@ class PressFit:
         return self._best(candidates)
 
     def fit_ball_radius(self, state: FitState) -> FitState:
-        """With the ball radius (one for all presses) that explains the pictures best."""
+        """Select the ball radius (one for all presses) that explains the pictures best."""
         widest = state.circles[:, 2].max() * state.calibration.pixel_pitch
         balls = [np.full(len(state.circles), ratio * widest) for ratio in _BALLS_PER_CONTACT]
         return self._best([self.alternate(replace(state, ball_radius=ball), 2) for ball in balls])
 
     def fit_response(self, state: FitState) -> FitState:
-        """With the response that fits best, and the lights where it says they stand."""
+        """Fit the response, and set the lights to its directions."""
         for _ in range(2):  # where the lights stand decides where shadows fall
             solved = self._solve(self._normal_equations(state))
             state = replace(state, calibration=_with_response(state.calibration, solved))
         return state
 
     def fit_circles(self, state: FitState) -> FitState:
-        """With every circle moved towards where its picture says it is."""
+        """Move every circle towards its picture."""
         everything = zip(state.circles, state.ball_radius, self._samples, self._labels, strict=True)
         moved = [self._refine_circle(state.calibration, *press) for press in everything]
         return replace(state, circles=np.stack(moved))
@@ -180,7 +180,7 @@ class PressFit:
         return self._select_value(state, "blur_sigmas", pyramids)
 
     def _select_value(self, state: FitState, name: str, values: Sequence[Any]) -> FitState:
-        """With the value of one number of the sensor file that cross-validation prefers."""
+        """Select the value of one parameter by cross-validation."""
         calibrations = [replace(state.calibration, **{name: value}) for value in values]
         return self._best([replace(state, calibration=p) for p in calibrations])
 
@@ -188,7 +188,7 @@ class PressFit:
         return min(candidates, key=self._held_out_loss)
 
     def _held_out_loss(self, state: FitState) -> float:
-        """Squared error (counts^2) summed over the presses, each predicted without its fold."""
+        """Return the summed squared error (counts^2) of presses predicted without their fold."""
         normals = self._normal_equations(state)
         loss = 0.0
         for fold in range(_FOLDS):
@@ -233,7 +233,7 @@ class PressFit:
         sample: _Sample,
         label: Circle,
     ) -> Circle:
-        """One damped Gauss-Newton step of centre and radius."""
+        """Take one damped Gauss-Newton step of centre and radius."""
         model, step = coefficients(calibration), 0.25
         light = self._light[sample.pixels]
         widest = WIDEST * ball / calibration.pixel_pitch
@@ -265,7 +265,7 @@ def move_circles(
     presses: PressSet,
     start: Float64[np.ndarray, "n 3"] | None = None,
 ) -> Float64[np.ndarray, "n 3"]:
-    """Move the circles (px) of presses of known balls to where a sensor file says their pictures show them.
+    """Move the circles (px) of presses of known balls to their pictures, by a sensor file.
 
     Args:
         calibration: the sensor file.

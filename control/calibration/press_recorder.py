@@ -1,4 +1,4 @@
-"""Presses of one ball, picked from a sensor's frames as a person presses all over its gel."""
+"""Recording of ball presses all over a gel, picked from a sensor's frames."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -29,15 +29,15 @@ Frame = UInt8[np.ndarray, "h w 3"]
 
 
 class PressRecorder:
-    """Keeps one picture of every press: the first in which it stands still.
+    """Recorder of one picture of every press: the first in which it stands still.
 
     Args:
         shape: rows and columns of a frame.
         a_cell: presses wanted in each cell of the map.
 
     Attributes:
-        images, circles: of the presses kept; circles as `find_circle` finds them, px.
-        hint: what the person is to do now.
+        images, circles: of the recorded presses; circles as `find_circle` finds them, px.
+        hint: instruction for the person who presses.
     """
 
     def __init__(self, shape: tuple[int, int], a_cell: int = 2) -> None:
@@ -52,7 +52,7 @@ class PressRecorder:
 
     @property
     def background(self) -> Frame:
-        """The untouched gel as it is now; UserError before it has settled."""
+        """Current untouched gel; UserError before it has settled."""
         if self._detector is None:
             raise UserError(
                 "the gel never stood still and untouched: begin with a second without touch"
@@ -61,7 +61,7 @@ class PressRecorder:
 
     @property
     def counts(self) -> Int[np.ndarray, "rows columns"]:
-        """Presses kept in each cell of the map."""
+        """Number of presses in each cell of the map."""
         counts = np.zeros(self.grid, int)
         for circle in self.circles:
             counts[self._cell(circle)] += 1
@@ -73,7 +73,7 @@ class PressRecorder:
         return bool((self.counts >= self._a_cell).all())
 
     def presses(self, ball_radius: float, first: int = 0) -> PressSet:
-        """What was kept.
+        """Return the recorded presses.
 
         Args:
             ball_radius: m.
@@ -86,7 +86,7 @@ class PressRecorder:
         )
 
     def update(self, frame: Frame) -> bool:
-        """Judge the next frame; whether it was kept."""
+        """Process the next frame and return whether it is recorded."""
         self._recent.append(frame)
         if self._detector is None:
             self._settle()
@@ -103,11 +103,10 @@ class PressRecorder:
             self.hint = "hold still"
             return False
         self._taken = True
-        self.hint = self._keep(frame)
-        return self.hint.startswith("kept")
+        return self._record(frame)
 
     def draw_map(self, frame: Frame) -> Frame:
-        """The frame with the circles kept and how many presses each cell has and wants."""
+        """Draw the recorded circles and the count of each cell on a frame."""
         scale = max(1, round(640 / frame.shape[1]))
         size = frame.shape[1] * scale, frame.shape[0] * scale
         picture = cv2.resize(frame, size, interpolation=cv2.INTER_NEAREST)
@@ -139,20 +138,24 @@ class PressRecorder:
         self._detector = ContactDetector(Background(middle[None]))
         self.hint = f"press {self._where_next()}"
 
-    def _keep(self, frame: Frame) -> str:
-        """Take a press, or say why not."""
+    def _record(self, frame: Frame) -> bool:
+        """Record a press and return whether it is fit; the hint says why not."""
         try:
             x, y, radius = find_circle(frame, self.background)
         except UserError as error:
-            return f"not kept: {str(error).split(':')[0]}"
+            self.hint = f"not recorded: {str(error).split(':')[0]}"
+            return False
         h, w = self._shape
         if radius < _SMALLEST:
-            return "not kept, too light: press harder"
-        if not (0 <= x < w and 0 <= y < h):
-            return "not kept: the ball presses outside the picture"
-        self.images.append(frame)
-        self.circles.append(np.array([x, y, radius]))
-        return f"kept {len(self.images)}: lift the ball"
+            self.hint = "not recorded, too light: press harder"
+        elif not (0 <= x < w and 0 <= y < h):
+            self.hint = "not recorded: the ball presses outside the picture"
+        else:
+            self.images.append(frame)
+            self.circles.append(np.array([x, y, radius]))
+            self.hint = f"recorded {len(self.images)}: lift the ball"
+            return True
+        return False
 
     def _cell(self, circle: np.ndarray) -> tuple[int, int]:
         (h, w), (rows, columns) = self._shape, self.grid

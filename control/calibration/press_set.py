@@ -31,8 +31,8 @@ class PressSet:
     Attributes:
         background: the untouched sensor, RGB.
         images: the presses, RGB.
-        circles: contact circles as given or found: centre x (column), centre y (row) and radius, px;
-            the centre of the first pixel is (0, 0).
+        circles: contact circles as given or found: centre x (column), centre y (row) and radius,
+            px; the centre of the first pixel is (0, 0).
         ball_radius: m, one a press; all NaN if not known.
         files: name of each picture.
         labelled: whether the circles were given, not found in the pictures.
@@ -95,7 +95,8 @@ def read_presses(folder: Path, pitch: float, ball_mm: float = math.nan) -> Press
     rows = _read_rows(folder, ball_mm)
     if len(rows) < MINIMUM:
         raise UserError(
-            f"{folder} has {len(rows)} presses, calibration needs at least {MINIMUM} (12 to fit the "
+            f"{folder} has {len(rows)} presses, calibration needs at least {MINIMUM} (12 to fit "
+            "the "
             "30 response terms of a colour, 4 to check them): add presses at other places"
         )
     ball = np.array([row.ball_mm for row in rows]) * 1e-3
@@ -104,7 +105,8 @@ def read_presses(folder: Path, pitch: float, ball_mm: float = math.nan) -> Press
         image = _read_image(folder / row.file)
         if image.shape != background.shape:
             raise UserError(
-                f"{folder / row.file} has {image.shape[1]} x {image.shape[0]} pixels, background.png "
+                f"{folder / row.file} has {image.shape[1]} x {image.shape[0]} pixels, "
+                "background.png "
                 f"{background.shape[1]} x {background.shape[0]}: record them at the same size"
             )
         circle = row.circle if row.labelled else _find(row.file, image, background)
@@ -149,7 +151,8 @@ def _read_rows(folder: Path, ball_mm: float) -> list[_Row]:
     if not path.is_file():
         if math.isnan(ball_mm):
             raise UserError(
-                f"{path} is missing: give --ball-mm if one ball made all presses, or write one line a press "
+                f"{path} is missing: give --ball-mm if one ball made all presses, or write one "
+                "line a press "
                 "with the columns file,ball_mm (docs/own_sensor.md)"
             )
         pictures = {p.name for p in folder.iterdir() if p.suffix.lower() in (".png", ".jpg")}
@@ -183,7 +186,8 @@ def _read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     image = read_picture(path)
     if image is None:
         raise UserError(
-            f"{path} is missing or no picture: a folder of presses needs background.png and the pictures "
+            f"{path} is missing or no picture: a folder of presses needs background.png and the "
+            "pictures "
             "of the presses"
         )
     return image
@@ -195,17 +199,20 @@ def _check_circle(
     x, y, radius = circle
     if not (np.isfinite(circle).all() and radius >= 3):
         raise UserError(
-            f"presses.csv, {name}: a contact radius of {radius:g} px is too small to show slopes; press "
+            f"presses.csv, {name}: a contact radius of {radius:g} px is too small to show slopes; "
+            "press "
             "harder or record at full resolution"
         )
     if not (0 <= x < shape[1] and 0 <= y < shape[0]):
         raise UserError(
-            f"presses.csv, {name}: the circle's centre ({x:g}, {y:g}) px lies outside the {shape[1]} x "
+            f"presses.csv, {name}: the circle's centre ({x:g}, {y:g}) px lies outside the "
+            f"{shape[1]} x "
             f"{shape[0]} picture"
         )
     if radius * pitch >= ball:
         raise UserError(
-            f"presses.csv, {name}: a contact radius of {radius * pitch * 1e3:.2f} mm ({radius:g} px "
+            f"presses.csv, {name}: a contact radius of {radius * pitch * 1e3:.2f} mm ({radius:g} "
+            "px "
             f"at {pitch * 1e3:g} mm/px) does not fit a ball of radius {ball * 1e3:g} mm: check "
             "ball_mm (a radius, not a diameter) and the scale"
         )
@@ -219,7 +226,8 @@ def _check_visible(
     change = image[inside].astype(np.float32) - background[inside]
     if np.percentile(np.abs(change), 90) < _VISIBLE:
         raise UserError(
-            f"{name} shows no contact in its circle (less than {_VISIBLE:g} counts from background.png): "
+            f"{name} shows no contact in its circle (less than {_VISIBLE:g} counts from "
+            "background.png): "
             "drop it, or record the background again"
         )
 

@@ -1,4 +1,4 @@
-"""What a calibration says of itself: errors on held-out presses, warnings, record and pictures."""
+"""Report of a calibration: held-out errors, warnings, record and pictures."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -48,7 +48,7 @@ def held_out_errors(judged: FittedCalibration, test: PressSet) -> dict[str, Pict
 
 
 def errors_table(errors: dict[str, PictureErrors], n: int) -> str:
-    """The errors as people read them."""
+    """Format the held-out errors."""
     head = f"{f'{n} held-out presses, around the contact':<42}{'L1':>8}{'PSNR':>10}{'SSIM':>8}"
     rows = [
         f"{name:<42}{e.l1_near:>8.2f}{e.psnr_near:>7.1f} dB{e.ssim_near:>8.3f}"
@@ -58,28 +58,31 @@ def errors_table(errors: dict[str, PictureErrors], n: int) -> str:
 
 
 def depth_table(depths: dict[str, dict[str, float]]) -> str:
-    """The depth of held-out presses as people read it."""
+    """Format the depth of held-out presses."""
     return "\n".join(
-        f"depth: a ball of {size} mm reads {d['radius_mm']:.2f} mm (median of {d['presses']:.0f} held-out "
-        f"presses), {d['residual_um']:.0f} um from a sphere, its peak {d['peak_offset_mm']:.2f} mm off"
+        f"depth: a ball of {size} mm reads {d['radius_mm']:.2f} mm (median of {d['presses']:.0f} "
+        "held-out "
+        f"presses), {d['residual_um']:.0f} um from a sphere, its peak {d['peak_offset_mm']:.2f} "
+        "mm off"
         for size, d in depths.items()
     )
 
 
 def refuse_useless(errors: dict[str, PictureErrors]) -> None:
-    """UserError unless the fit predicts held-out pictures better than the background does."""
+    """Raise UserError unless the fit beats the background on held-out pictures."""
     alone = errors["background alone"].l1_near
     best = min(e.l1_near for name, e in errors.items() if name != "background alone")
     if best > _USELESS * alone:
         raise UserError(
             f"the fit predicts held-out presses no better ({best:.1f} counts) than the background "
-            f"alone ({alone:.1f}): check that background.png is of this sensor and that the circles lie "
+            f"alone ({alone:.1f}): check that background.png is of this sensor and that the "
+            "circles lie "
             "on the contacts, or leave them out of presses.csv to have them found"
         )
 
 
 def at_limits(fitted: FittedCalibration, presses: PressSet) -> list[str]:
-    """What stands at a limit of its search, so that the best may lie beyond."""
+    """Return warnings about parameters at a limit of their search."""
     calibration, circles = fitted.calibration, fitted.circles
     moved = np.abs(circles[:, :2] - presses.circles[:, :2]).max(1) > 0.98 * presses.circles[:, 2]
     widest = WIDEST * fitted.ball_radius / calibration.pixel_pitch
@@ -89,7 +92,8 @@ def at_limits(fitted: FittedCalibration, presses: PressSet) -> list[str]:
     if (stuck := moved | size).mean() > _AT_LIMIT:
         names = ", ".join(np.array(presses.files)[stuck][:4])
         lines.append(
-            f"{stuck.sum()} of {len(stuck)} circles stand at their search limit ({names}): check ball_mm, "
+            f"{stuck.sum()} of {len(stuck)} circles stand at their search limit ({names}): check "
+            "ball_mm, "
             "the scale, and that one ball alone touches"
         )
     narrowest, softest = (BLUR_SCALES[i] * BLUR_PYRAMID[0] for i in (0, -1))
@@ -101,11 +105,12 @@ def at_limits(fitted: FittedCalibration, presses: PressSet) -> list[str]:
 
 
 def warnings(fitted: FittedCalibration) -> list[str]:
-    """What the user should know about the presses."""
+    """Return lines on the lights and on what the presses leave open."""
     calibration = fitted.calibration
     azimuths = ", ".join(f"{a:.0f}" for a in calibration.light_azimuths)
     lines = [
-        f"lights (red, green, blue) stand at {azimuths} degrees; noise {calibration.noise:.2f} counts"
+        f"lights (red, green, blue) stand at {azimuths} degrees; noise {calibration.noise:.2f} "
+        "counts"
     ]
     if not fitted.varies_over_image:
         lines.append(
@@ -127,7 +132,7 @@ def record(
     depths: dict[str, dict[str, float]],
     n_test: int,
 ) -> dict[str, Any]:
-    """What metrics.json holds, and the sensor file beside its values."""
+    """Return metrics.json, which is also the provenance in the sensor file."""
     return {
         "presses": len(presses),
         "held_out_presses": n_test,

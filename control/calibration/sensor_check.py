@@ -113,8 +113,8 @@ def check_sensor(
         ball_radius: m, if a ball presses.
 
     Raises:
-        UserError: there are no frames, they are not this sensor's pictures (`picture_guard`), or they
-            show no marker grid where one should be.
+        UserError: there are no frames, they are not this sensor's pictures (`picture_guard`), or
+            they show no marker grid where one should be.
     """
     frames = iter(frames)
     first = next(frames, None)
@@ -229,7 +229,7 @@ def _read(
 def _contact_circles(
     touches: list[_Touch], calibration: SensorCalibration, ball_radius: float
 ) -> list[Circle | None]:
-    """Find each ball's contact circle and move it by the fit, as `calibrate` does; None if too faint."""
+    """Find each ball's contact circle and fit it as `calibrate` does; None if too faint."""
     background = calibration.background
     images, found, at = [], [], []
     for i, touch in enumerate(touches):

@@ -1,4 +1,4 @@
-"""Whether two cameras, or the two fingertips, are each where the other should be, told by what they show."""
+"""Exchanged cameras and fingertips, found by their pictures."""
 
 import cv2
 import numpy as np
@@ -19,9 +19,9 @@ Picture = UInt8[np.ndarray, "h w 3"]
 def fingertips_exchanged(
     frames: tuple[Picture, Picture], backgrounds: tuple[Picture, Picture]
 ) -> bool:
-    """Whether each of two untouched fingertips looks clearly more like the other one's sensor file.
+    """Return whether two untouched fingertips each look more like the other's sensor file.
 
-    Both must: light drifts, and a file may be old.
+    Both must, because light drifts and a file may be old.
 
     Args:
         frames: of the left and of the right finger.
@@ -35,9 +35,9 @@ def fingertips_exchanged(
 
 
 def cameras_exchanged(front: tuple[Picture, Picture], wrist: tuple[Picture, Picture]) -> bool:
-    """Whether the front camera has moved with the arm and the wrist camera has not.
+    """Return whether the front camera has moved with the arm and the wrist camera has not.
 
-    A view without structure tells nothing, and then nothing is said.
+    False for a view without structure.
 
     Args:
         front, wrist: pictures before and after a move of the arm.
@@ -47,7 +47,7 @@ def cameras_exchanged(front: tuple[Picture, Picture], wrist: tuple[Picture, Pict
 
 
 def usual_change(before: Picture, after: Picture) -> float:
-    """By how many counts half of the pixels change at least, beyond a factor on all, as of exposure."""
+    """Return the median change of the pixels, counts, beyond a factor on all (exposure)."""
     size = _SMALL, _SMALL
     small = [cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (before, after)]
     first, second = (x.astype(np.float32) for x in small)

@@ -1,4 +1,4 @@
-"""One fingertip sensor's frames, from wherever they come: plugged in, streamed, or recorded."""
+"""Frames of one fingertip sensor: plugged in, streamed, or recorded."""
 
 import math
 import time
@@ -36,7 +36,7 @@ Frame = UInt8[np.ndarray, "h w 3"]
 
 
 def is_recorded(source: str) -> bool:
-    """Whether it is a video file or a folder of pictures, which end."""
+    """Return whether a source is a video file or a folder of pictures."""
     return not source.startswith("/dev/") and Path(source).exists()
 
 
@@ -77,9 +77,10 @@ def open_frames(
 
 
 def fingertip_video(source: str, model: SensorModel, corners: Corners | None = None) -> VideoConfig:
-    """How to open a live source: a USB serial number, a device (/dev/video2) or a stream's address.
+    """Describe a live source: a USB serial number, a device (/dev/video2) or a stream's address.
 
-    A serial number is looked up again whenever it is opened: after a replug it is another device.
+    A serial number is looked up at each opening, because its device changes when it is plugged in
+    again.
     """
     return VideoConfig(
         source,
@@ -93,16 +94,17 @@ def fingertip_video(source: str, model: SensorModel, corners: Corners | None = N
 def fingertip_view(
     model: SensorModel, source: str, border: float | None = None, corners: Corners | None = None
 ) -> Crop:
-    """How the sensor's picture lies in its camera's: without corners, a stream is cut and turned already.
+    """Return the crop of a source; a stream without corners is already cut and turned.
 
     Raises:
-        UserError: of a sensor that its camera sees at an angle, the corners are missing.
+        UserError: the camera sees the gel at an angle and the corners are missing.
     """
     if corners is not None:
         return Crop(corners=corners)
     if model.name == GELSIGHT_WEDGE.name and "://" not in source:
         raise UserError(
-            f"the camera of a {model.name} sees its gel at an angle: give the corners of the gel in its picture"
+            f"the camera of a {model.name} sees its gel at an angle: give the corners of the gel "
+            "in its picture"
         )
     if "://" in source:
         view = NO_CROP
@@ -114,12 +116,12 @@ def fingertip_view(
 def recorded_frames(
     source: Path, model: SensorModel, corners: Corners | None = None
 ) -> Generator[Frame, None, None]:
-    """Every frame of a video, or of a folder's pictures by name (background.png first).
+    """Yield the frames of a video, or of a folder's pictures by name (background.png first).
 
-    Without corners of the gel they are taken to be cut already.
+    Without corners of the gel the pictures count as already cut.
 
     Raises:
-        UserError: no pictures in it, or of other proportions than the sensor's.
+        UserError: there are no pictures, or they have other proportions than the sensor's.
     """
     empty, view = True, Crop(corners=corners)
     for frame in _folder(source) if source.is_dir() else _video(source):
@@ -134,11 +136,11 @@ def recorded_frames(
 def live_frames(
     config: VideoConfig, model: SensorModel, corners: Corners | None = None
 ) -> Generator[Frame, None, None]:
-    """Frames of a live sensor as they come, without end; close the iterator to release it.
+    """Yield frames of a live sensor without end; close the iterator to release it.
 
     Raises:
-        UserError: it cannot be opened.
-        DriverError: for 5 s nothing came.
+        UserError: the source cannot be opened.
+        DriverError: no frame came for 5 s.
     """
     view = fingertip_view(model, config.source, corners=corners)
     camera = TactileCamera(VideoCamera(config), model, view)
@@ -157,7 +159,7 @@ def live_frames(
 
 
 def _dots(model: SensorModel, view: Crop) -> float:
-    """Diameter of its markers as a share of the diagonal of its camera's picture; 0 without any."""
+    """Return the diameter of printed dots over the camera picture's diagonal; 0 without."""
     if model.markers is None:
         return 0.0
     diagonal = model.pixel_pitch * float(np.hypot(*model.image_shape))  # m, of what is cut out

@@ -1,4 +1,4 @@
-"""Keys typed at a terminal, one by one, without waiting for Enter."""
+"""Single key presses at a terminal, without Enter."""
 
 import contextlib
 import os
@@ -13,19 +13,19 @@ _CTRL_C = "\x03"
 
 
 class Keyboard:
-    """A terminal's keys while the context lasts; the terminal is then as it was before.
+    """Keys of a terminal while the context lasts; its settings are restored afterwards.
 
-    Ctrl-C waits to be read like any key, so that it interrupts nothing half done.
+    Ctrl-C is read like any key, so that it interrupts nothing half done.
     """
 
     def __init__(self, terminal: TextIO) -> None:
-        """Takes the terminal, such as sys.stdin; UserError if it is none."""
+        """Take a terminal, such as sys.stdin; UserError if it is none."""
         if not terminal.isatty():
             raise UserError("there is no keyboard to read: start it in a terminal, without a pipe")
         self._terminal = terminal.fileno()
 
     def __enter__(self) -> "Keyboard":
-        """Keys come at once, and are not shown."""
+        """Deliver keys at once, without echo."""
         self._before = termios.tcgetattr(self._terminal)
         tty.setcbreak(self._terminal)
         modes = termios.tcgetattr(self._terminal)
@@ -34,12 +34,12 @@ class Keyboard:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """What was typed and not read is dropped: it is not meant for the shell."""
+        """Restore the terminal and drop unread keys, so that the shell does not get them."""
         with contextlib.suppress(termios.error):  # it has gone
             termios.tcsetattr(self._terminal, termios.TCSAFLUSH, self._before)
 
     def read_keys(self) -> str:
-        """The keys since the last call, in their order; "" if there are none.
+        """Return the keys since the last call, in order; "" if there are none.
 
         Raises:
             KeyboardInterrupt: Ctrl-C is among them.

@@ -1,4 +1,4 @@
-"""A thread that takes readings from a device and keeps only the newest."""
+"""A thread that reads a device and holds its latest reading."""
 
 import threading
 from collections.abc import Callable
@@ -10,10 +10,10 @@ T = TypeVar("T")
 
 
 class LatestValue(Generic[T]):
-    """Calls `poll` over and over; what it returns, unless None, is the newest reading.
+    """Latest reading of `poll`, which is called over and over; None is no reading.
 
-    `poll` must return within about a second, if only with None. An exception ends the thread, and
-    `read` then raises DriverError with its words.
+    `poll` must return within about a second. Its exception ends the thread, and `read` then raises
+    a DriverError with the same text.
     """
 
     def __init__(self, name: str, poll: Callable[[], T | None], first_timeout: float = 5.0) -> None:
@@ -25,7 +25,7 @@ class LatestValue(Generic[T]):
         self._thread.start()
 
     def read(self) -> T:
-        """The newest reading; it waits `first_timeout` s for the first one."""
+        """Return the latest reading; wait up to `first_timeout` s for the first one."""
         self._updated.wait(self._first_timeout)
         if self._error is not None:
             raise DriverError(f"{self._name}: {self._error}") from self._error
@@ -34,7 +34,7 @@ class LatestValue(Generic[T]):
         return self._value
 
     def close(self) -> None:
-        """End the thread; what `poll` uses may be released afterwards."""
+        """End the thread; afterwards the device may be released."""
         self._stop.set()
         self._thread.join()
 

@@ -1,4 +1,4 @@
-"""A picture that changes, shown in any browser: for machines with and without a screen."""
+"""A live picture in any browser, for machines with and without a screen."""
 
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -14,7 +14,7 @@ _PATIENCE = 1.0  # s without a new picture after which the last one is sent agai
 
 
 class LivePicture:
-    """Serves the newest picture at http://127.0.0.1:port/ as an MJPEG stream.
+    """Server of the latest picture at http://127.0.0.1:port/ as an MJPEG stream.
 
     Args:
         port: 0 for any free one.
@@ -35,7 +35,7 @@ class LivePicture:
 
     @property
     def address(self) -> str:
-        """What to open in a browser."""
+        """Address for a browser."""
         return f"http://127.0.0.1:{self._server.server_address[1]}/"
 
     def show(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
@@ -45,13 +45,13 @@ class LivePicture:
             self._changed.notify_all()
 
     def next_jpeg(self) -> bytes | None:
-        """The next picture, or the last one again; None when closed."""
+        """Wait for the next picture, or return the last one again; None when closed."""
         with self._changed:
             self._changed.wait(_PATIENCE)
             return None if self._closed else self._jpeg
 
     def close(self) -> None:
-        """Hang up."""
+        """Stop serving."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -60,7 +60,7 @@ class LivePicture:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Sends pictures to one browser until either is gone."""
+    """Stream of pictures to one browser."""
 
     live: LivePicture
 
@@ -78,4 +78,4 @@ class _Handler(BaseHTTPRequestHandler):
             pass  # the browser was closed
 
     def log_message(self, format: str, *args: object) -> None:
-        """Nothing on the terminal."""
+        """Print nothing."""

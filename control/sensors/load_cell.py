@@ -1,8 +1,8 @@
-"""Load cell behind a microcontroller that prints lines of text, with a checksum if it can.
+"""Load cell behind a microcontroller that prints lines of text, with an optional checksum.
 
-There is no standard for such lines, so the format is a setting. What a poor cable garbles (bytes or
-line ends lost, bits flipped) passes for a wrong reading in 21 % of the lines without a checksum, in
-0.45 % with an exclusive or, in which like changes cancel, and in none of 32,000 with a CRC
+Such lines have no standard, so the format is a setting. Garbled lines (bytes or line ends lost,
+bits flipped) pass as wrong readings in 21 % of the cases without a checksum, in 0.45 % with an
+exclusive or, in which like changes cancel, and in none of 32,000 with a CRC
 (`tests/test_serial.py`).
 """
 
@@ -51,14 +51,14 @@ class LoadCellConfig:
 
 @dataclass(frozen=True)
 class Sample:
-    """What a line says: force (N), and the device's clock in its own unit if the line has it."""
+    """One line: force (N), and the device's clock in its own unit, None without one."""
 
     force: float
     clock: float | None
 
 
 def parse(line: bytes, config: LoadCellConfig) -> Sample | None:
-    """What a line without its line ending says; None if anything about it is wrong."""
+    """Return the sample of a line without its line ending; None if anything is wrong with it."""
     text = line
     if config.checksum != "none":
         text = line.rpartition(b"*")[0]
@@ -76,10 +76,10 @@ def parse(line: bytes, config: LoadCellConfig) -> Sample | None:
 
 
 def with_checksum(text: bytes, checksum: Checksum) -> bytes:
-    """A line with its checksum, as firmware prints it.
+    """Append a checksum to a line, as firmware prints it.
 
-    `*` and the exclusive or of all bytes as two hexadecimal digits (as NMEA has it), or `*` and
-    Modbus' CRC-16 as four, the high ones first: `printf("*%04X", crc)`, 4B37 for 123456789.
+    `*` and the exclusive or of all bytes as two hexadecimal digits (NMEA), or `*` and Modbus'
+    CRC-16 as four, high byte first: `printf("*%04X", crc)`, 4B37 for 123456789.
     """
     if checksum == "xor":
         return text + b"*%02X" % reduce(xor, text, 0)
@@ -89,7 +89,7 @@ def with_checksum(text: bytes, checksum: Checksum) -> bytes:
 
 
 class SerialLoadCell:
-    """The LoadCell protocol over a serial port. A wrong line is counted and otherwise ignored."""
+    """The LoadCell interface over a serial port; wrong lines are counted and skipped."""
 
     def __init__(self, config: LoadCellConfig) -> None:
         self.config = config
@@ -105,7 +105,7 @@ class SerialLoadCell:
 
     @property
     def clock(self) -> float:
-        """The device's own, of the newest line; minus infinity before the first, or without one."""
+        """Device clock of the latest line; minus infinity without one."""
         return self._clock
 
     def close(self) -> None:
@@ -114,7 +114,7 @@ class SerialLoadCell:
         self._port.close()
 
     def _take(self) -> LoadReading | None:
-        """The last good one of the lines that came in, if any."""
+        """Return the last good line that came in, if any."""
         self._buffer += self._port.read(max(1, self._port.in_waiting))
         stamp, newest = time.monotonic(), None
         *lines, self._buffer = self._buffer.split(b"\n")
@@ -131,7 +131,7 @@ class SerialLoadCell:
         return newest
 
     def _clock_advances(self, sample: Sample) -> bool:
-        """Whether the device's clock has advanced, if it has one."""
+        """Return whether the device's clock has advanced, if it has one."""
         if sample.clock is None:
             return True
         before, last, self._last = self._clock, self._last, sample.clock

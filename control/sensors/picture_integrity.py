@@ -1,4 +1,4 @@
-"""Whether a picture is what the camera saw: decoded without errors, whole, and new in all its parts."""
+"""Integrity of a picture: decoded without errors, whole, and new in all its parts."""
 
 from dataclasses import dataclass
 
@@ -24,12 +24,12 @@ _DARKER = 0.12  # of the usual brightness by which a dot is darker
 _ALL_CHANNELS = np.ones((1, 3))  # their sum
 _BANDS = 8  # that a picture is cut into to look for frozen parts
 _STRIDE = 4  # pixels; every so many are compared
-_LEARNING = 20  # pictures that tell which bands change all the time, as sensor noise makes them
+_LEARNING = 20  # pictures that show which bands change all the time, by sensor noise
 _LIVELY = 0.8  # share of those in which they must
 
 
 class JpegDecoder:
-    """FFmpeg's, told to refuse what it would otherwise patch up."""
+    """FFmpeg's decoder, set to refuse broken pictures instead of patching them."""
 
     def __init__(self) -> None:
         self._codec = av.CodecContext.create("mjpeg", "r")
@@ -38,7 +38,7 @@ class JpegDecoder:
         self._reformatter = VideoReformatter()  # a new one starts and ends a thread per core
 
     def decode(self, data: bytes) -> Picture | None:
-        """RGB picture; None if anything about it is broken, such as a cut end."""
+        """Return the RGB picture; None if it is broken, for example cut off."""
         try:
             frames = self._codec.decode(av.Packet(data))
         except FFmpegError:
@@ -50,11 +50,11 @@ class JpegDecoder:
 
 @dataclass(frozen=True)
 class GelPicture:
-    """A gel's picture.
+    """Picture of a gel.
 
     Attributes:
         image: RGB.
-        spots: where printed dots may be, and their rims; None: there are none.
+        spots: where printed dots and their rims may be; None without dots.
     """
 
     image: Picture
@@ -62,21 +62,21 @@ class GelPicture:
 
 
 def gel_picture(image: Picture, dots: float = 0.0) -> GelPicture:
-    """A picture to be judged, or to judge the next one by.
+    """Prepare a picture for `is_broken_gel`.
 
     Args:
         image: RGB.
-        dots: diameter of printed dots as a share of the picture's diagonal; 0: there are none.
+        dots: diameter of printed dots as a share of the picture's diagonal; 0: none.
     """
     return GelPicture(image, _dark_spots(image, dots) if dots > 0 else None)
 
 
 def jumps_at_blocks(now: GelPicture, before: GelPicture) -> float:
-    """By how many counts the change since `before` jumps more between JPEG's blocks than inside them.
+    """Return the extra jump of the change since `before` between JPEG blocks, counts.
 
-    A decoder cannot see every wrong byte. It shows as blocks of another brightness, which a smooth
-    gel never has: its real changes do not know where blocks end. Dots that move do look like such
-    blocks: the change is looked at where neither picture has one.
+    A decoder cannot detect every wrong byte. It shows as blocks of another brightness, which a
+    smooth gel never has: real changes ignore block borders. Moving dots do look like such blocks,
+    so pixels near dots do not count.
     """
     difference = cv2.subtract(now.image, before.image, dtype=cv2.CV_16S)
     change = cv2.transform(difference, _ALL_CHANNELS)
@@ -96,15 +96,15 @@ def jumps_at_blocks(now: GelPicture, before: GelPicture) -> float:
 
 
 def is_broken_gel(now: GelPicture, before: GelPicture) -> bool:
-    """Whether a gel's picture came through a broken JPEG, judged by the last good one."""
+    """Return whether a gel's picture came through a broken JPEG, judged by the last good one."""
     return jumps_at_blocks(now, before) > _SMOOTH
 
 
 class FrozenParts:
-    """Looks band by band for pictures, or parts of them, that stand still.
+    """Detector of pictures, or bands of them, that stand still.
 
-    Sensor noise makes every part of a real picture differ from the last; a band that does not do so
-    from the start (black, overexposed) tells nothing and is not watched.
+    Sensor noise changes every part of a real picture; a band that never changes from the start
+    (black, overexposed) is not watched.
     """
 
     def __init__(self) -> None:
@@ -113,7 +113,7 @@ class FrozenParts:
         self._changed_at = np.zeros(_BANDS)
 
     def update(self, image: Picture, now: float) -> float:
-        """Time (s) since when some watched part shows the same; `now` if none does."""
+        """Return the time (s) since which a watched band is unchanged; `now` if none is."""
         before, self._before = self._before, image
         if before is None or before.shape != image.shape:
             self._changed_at[:] = now
@@ -136,7 +136,7 @@ def _differs(image: Picture, before: Picture) -> Bool[np.ndarray, " bands"]:
 
 
 def _dark_spots(image: Picture, dots: float) -> Bool[np.ndarray, "h w"]:
-    """Spots that are darker than around them and no larger than a dot, and their rims."""
+    """Return spots darker than their surroundings and no larger than a dot, with rims."""
     height, width = image.shape[:2]
     diameter = dots * float(np.hypot(height, width))
     scale = min(1.0, _DOT / diameter)
@@ -155,9 +155,9 @@ def _dark_spots(image: Picture, dots: float) -> Bool[np.ndarray, "h w"]:
 def _steps(
     grey: Int16[np.ndarray, "h w"], counts: Bool[np.ndarray, "h w"] | None, row: int
 ) -> Float[np.ndarray, " n"]:
-    """From each block's row before `row` to that row, summed over the block's width.
+    """Return the steps to row `row` of each block from the row above, summed over its width.
 
-    Of blocks that count in part only, what counts stands for the rest, unless it is too little.
+    Partly covered blocks are scaled up, or left out if too little of them counts.
     """
     before, after = grey[row - 1 : -1 : _BLOCK], grey[row::_BLOCK]
     steps = cv2.absdiff(np.ascontiguousarray(after), np.ascontiguousarray(before[: len(after)]))
@@ -165,10 +165,10 @@ def _steps(
     sides = steps[:, :whole].reshape(-1, _BLOCK)
     if counts is None:
         return sides.sum(1, dtype=np.float32)
-    kept = (counts[row - 1 : -1 : _BLOCK] & counts[row::_BLOCK])[:, :whole].reshape(-1, _BLOCK)
-    measured = kept.sum(1)
+    covered = (counts[row - 1 : -1 : _BLOCK] & counts[row::_BLOCK])[:, :whole].reshape(-1, _BLOCK)
+    measured = covered.sum(1)
     enough = measured >= _MEASURED
-    return (sides * kept).sum(1, dtype=np.float32)[enough] * _BLOCK / measured[enough]
+    return (sides * covered).sum(1, dtype=np.float32)[enough] * _BLOCK / measured[enough]
 
 
 def _largest(values: Float[np.ndarray, " n"], count: int) -> float:

@@ -1,4 +1,4 @@
-"""Serial ports, opened with one message for what usually goes wrong; the checksum of Modbus."""
+"""Serial ports and Modbus' checksum."""
 
 import struct
 
@@ -8,7 +8,7 @@ from touchgoal.runtime.errors import UserError
 
 
 def open_port(device: str, baud: int, timeout: float) -> serial.Serial:
-    """Opens a device such as /dev/ttyUSB0 for this program alone; reads wait `timeout` s.
+    """Open a device such as /dev/ttyUSB0 exclusively; reads wait `timeout` s.
 
     Raises:
         UserError: it is missing, in use or not permitted.
@@ -17,13 +17,14 @@ def open_port(device: str, baud: int, timeout: float) -> serial.Serial:
         return serial.Serial(device, baud, timeout=timeout, write_timeout=timeout, exclusive=True)
     except serial.SerialException as error:
         raise UserError(
-            f"cannot open {device}: check the cable and that nothing else uses it, and that you are "
+            f"cannot open {device}: check the cable and that nothing else uses it, and that you "
+            "are "
             f"in the group dialout ({error})"
         ) from error
 
 
 def modbus_crc(message: bytes) -> bytes:
-    """CRC-16 of a message, low byte first: polynomial 0xA001 (reflected 0x8005), from 0xFFFF."""
+    """Return the CRC-16 of a message, low byte first (polynomial 0xA001, start 0xFFFF)."""
     value = 0xFFFF
     for byte in message:
         value ^= byte

@@ -21,8 +21,8 @@ class Crop:
     Attributes:
         border: share cut off at each side; 0 for a stream that is already cut.
         quarter_turns: counter-clockwise, before cutting; a DIGIT's camera lies on its side.
-        corners: of the gel after the turns, px, in place of a border; for a camera that sees the gel
-            at an angle (GelSight Wedge).
+        corners: of the gel after the turns, px, in place of a border; for a camera that sees the
+            gel at an angle (GelSight Wedge).
     """
 
     border: float = 0.0
@@ -30,7 +30,8 @@ class Crop:
     corners: Corners | None = None
 
 
-# The GelSight Mini's SDK cuts a seventh off each side, the case's edge; digit-interface turns upright.
+# The GelSight Mini's SDK cuts a seventh off each side, the case's edge; digit-interface turns
+# upright.
 GELSIGHT_MINI_CROP = Crop(border=1 / 7)
 DIGIT_CROP = Crop(quarter_turns=1)
 NO_CROP = Crop()

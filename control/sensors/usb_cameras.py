@@ -1,7 +1,7 @@
-"""USB cameras by what they are: the name and serial number in Linux's device tree, not an index.
+"""USB cameras by product name and serial number in Linux's device tree.
 
-Indices of `/dev/video*` change from boot to boot, and two fingertips look alike; a serial number does
-not change.
+Indices of `/dev/video*` change from boot to boot, and two fingertips look alike; a serial number
+does not change.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,8 @@ from touchgoal.control.tactile.sensor_models import (
 from touchgoal.runtime.errors import UserError
 
 _ROOT = Path("/sys/class/video4linux")
-# What the USB product names contain: gsrobotics looks for the first, digit-interface for the second.
+# What the USB product names contain: gsrobotics looks for the first, digit-interface for the
+# second.
 _PRODUCTS = {
     GELSIGHT_MINI.name: "GelSight Mini",
     GELSIGHT_MINI_MARKERS.name: "GelSight Mini",
@@ -26,7 +27,7 @@ _PRODUCTS = {
 
 @dataclass(frozen=True)
 class UsbCamera:
-    """A camera that is plugged in: `device` such as /dev/video2, product name, serial number."""
+    """Camera that is plugged in: device such as /dev/video2, product name, serial number."""
 
     device: str
     product: str
@@ -34,7 +35,7 @@ class UsbCamera:
 
 
 def list_cameras(root: Path = _ROOT) -> list[UsbCamera]:
-    """All USB cameras; of a camera's several nodes the one with pictures (index 0)."""
+    """List all USB cameras; of a camera's several nodes the one with pictures (index 0)."""
     found = []
     for node in sorted(root.glob("video*"), key=lambda n: (len(n.name), n.name)):
         if _read_text(node / "index") != "0":
@@ -47,7 +48,7 @@ def list_cameras(root: Path = _ROOT) -> list[UsbCamera]:
 
 
 def find_camera(product: str, serial: str = "", root: Path = _ROOT) -> UsbCamera:
-    """The camera with `product` in its name and, if given, this serial number.
+    """Return the camera with `product` in its name and, if given, this serial number.
 
     Raises:
         UserError: there is none, or several.
@@ -67,14 +68,14 @@ def find_camera(product: str, serial: str = "", root: Path = _ROOT) -> UsbCamera
 
 
 def find_sensor_camera(model: SensorModel, serial: str = "", root: Path = _ROOT) -> UsbCamera:
-    """The fingertip sensor of a kind, as `find_camera`."""
+    """Return the camera of a fingertip sensor, as `find_camera`."""
     if model.name not in _PRODUCTS:
         raise UserError(f"a {model.name} has no USB name known here: give its device instead")
     return find_camera(_PRODUCTS[model.name], serial, root)
 
 
 def _usb_device(node: Path) -> Path | None:
-    """The folder of the USB device above a video node: the first that has a product id."""
+    """Return the folder of the USB device above a video node: the first with a product id."""
     device = (node / "device").resolve()
     return next((p for p in (device, *device.parents) if (p / "idProduct").exists()), None)
 

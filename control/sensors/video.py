@@ -1,8 +1,8 @@
 """Cameras, video files and network streams through OpenCV: always the newest frame.
 
-A thread empties the driver's queue into one slot: a slow reader of a queue would lag (measured: by 2 s
-after 3 s). Stamps are taken right after the grab; FFmpeg's own are unusable for streams. A source that
-fails is opened again until it comes back; meanwhile frames keep their old stamps.
+A thread empties the driver's queue into one slot: a slow reader of a queue would lag (measured: by
+2 s after 3 s). Stamps are taken right after the grab; FFmpeg's own are unusable for streams. A
+source that fails is opened again until it comes back; meanwhile frames keep their old stamps.
 """
 
 import os
@@ -39,20 +39,20 @@ _JPEG = b"\xff\xd8"  # what a JPEG begins with
 
 @dataclass(frozen=True)
 class VideoConfig:
-    """One source of pictures.
+    """Source of pictures and how to read it.
 
     Attributes:
         source: index of a camera (`0`), a device (`/dev/video2`), a file, an image sequence
             (`frame_%04d.png`) or the address of an MJPEG stream (`http://...`).
         size: (width, height) to request from a camera; None: its default.
         rate: Hz; requested from a camera, played from images, and expected by `problem`.
-        exposure, white_balance: fixed values for a camera, in V4L2's units (`v4l2-ctl --list-ctrls`;
-            usually 0.1 ms, and kelvin); None: unchanged.
+        exposure, white_balance: fixed values for a camera, in V4L2's units (`v4l2-ctl
+            --list-ctrls`; usually 0.1 ms, and kelvin); None: unchanged.
         timeout: s without a frame after which a stream counts as lost and is opened again.
-        frozen_after: s after which an identical picture, or part of one, counts as old. Sensor noise
-            makes real pictures differ; for rendered ones, which may stand still, infinity.
-        frozen_pictures: number of identical pictures in a row required besides, for a lock-step twin,
-            whose time is not wall time.
+        frozen_after: s after which an identical picture, or part of one, counts as old; infinity
+            for rendered pictures, which lack the noise of real ones.
+        frozen_pictures: identical pictures in a row required besides, for a lock-step twin, whose
+            time is not wall time.
         gel: whether the pictures are a fingertip's: smooth but for its dots, so broken ones show.
         dots: diameter of the printed dots as a share of the picture's diagonal; 0: none.
         device: looks up the camera's device at each opening, when `source` is a serial number.
@@ -84,7 +84,7 @@ class VideoConfig:
 
 
 class _Quiet:
-    """OpenCV's messages, switched off while any camera is open: `VideoCamera.problem` has the news."""
+    """Switch for OpenCV's messages, off while any camera is open; `problem` replaces them."""
 
     def __init__(self) -> None:
         self._lock, self._open, self._level = threading.Lock(), 0, 0
@@ -159,7 +159,8 @@ class VideoCamera:
         if self._refused:
             return f"{self.config.source} {self._refused}"
         if self._frozen:
-            return f"{self.config.source} or a part of it shows one picture for {now - frame.stamp:.1f} s"
+            still = now - frame.stamp
+            return f"{self.config.source} or a part of it shows one picture for {still:.1f} s"
         if now - frame.stamp > _LATE_PERIODS / self.config.rate:
             return f"{self.config.source} gave its last frame {now - frame.stamp:.2f} s ago"
         return ""
@@ -276,7 +277,7 @@ def _open(config: VideoConfig, timeout: float) -> Any:
 
 
 def _configure_camera(capture: Any, config: VideoConfig) -> None:
-    """Set format, size and rate of a camera; read them back, for drivers ignore what they cannot do."""
+    """Set a camera's format, size and rate, and read them back: drivers ignore what they lack."""
     capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
     if config.size is not None:
         width, height = config.size
@@ -302,7 +303,7 @@ def _configure_camera(capture: Any, config: VideoConfig) -> None:
 
 
 def _lock(capture: Any, config: VideoConfig, name: str, automatic: int, manual: int) -> None:
-    """Switch an automatic control off and set its value; UserError if the camera does not take it."""
+    """Switch an automatic control off and set its value; UserError if it does not take."""
     prop = {"exposure": cv2.CAP_PROP_EXPOSURE, "white_balance": cv2.CAP_PROP_WB_TEMPERATURE}[name]
     wanted = getattr(config, name)
     capture.set(automatic, manual)

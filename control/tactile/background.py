@@ -55,13 +55,14 @@ class Background:
     """Untouched frame of one sensor as it is now; `update` follows its drift.
 
     Args:
-        frames: at least one RGB picture of the untouched sensor, better five or more; their median is
-            the first background.
+        frames: at least one RGB picture of the untouched sensor, better five or more; their median
+            is the first background.
         reference: picture that drift is measured against, such as the sensor file's background;
             None: the first background.
 
     Raises:
-        UserError: the picture changes between the frames, or differs from the reference as by a contact.
+        UserError: the picture changes between the frames, or differs from the reference as by a
+            contact.
     """
 
     def __init__(
@@ -108,9 +109,9 @@ class Background:
         for c in range(3):
             explain = np.stack([reference[:, c], np.ones(len(reference))], axis=1)
             # Gain and offset of a smooth background look alike: the spread decides between them.
-            seen = len(explain) * _PATTERN_SPREAD**2 / (_WAVES[0] * _WAVES[1])
-            normal = explain.T @ explain / seen + np.diag([GAIN_SPREAD**-2, _OFFSET_SPREAD**-2])
-            gain[c], offset[c] = np.linalg.solve(normal, explain.T @ change[:, c] / seen)
+            variance = len(explain) * _PATTERN_SPREAD**2 / (_WAVES[0] * _WAVES[1])
+            normal = explain.T @ explain / variance + np.diag([GAIN_SPREAD**-2, _OFFSET_SPREAD**-2])
+            gain[c], offset[c] = np.linalg.solve(normal, explain.T @ change[:, c] / variance)
         pattern = np.abs(change - gain * reference - offset).max(0)
         return Drift(1 + gain, offset, pattern.astype(np.float64))
 
@@ -122,7 +123,8 @@ def local_change(
     """Return the change from the background that no drift of the light explains, counts.
 
     Low spatial frequencies and a factor on the background are fitted to each channel of the blurred
-    difference and subtracted. The result is the norm over the channels, at a quarter of the resolution.
+    difference and subtracted. The result is the norm over the channels, at a quarter of the
+    resolution.
     """
     reference = _blurred(background)
     change = _high_pass(_blurred(frame) - reference)
@@ -150,7 +152,7 @@ def _high_pass(image: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 
 
 @lru_cache
 def cosines(size: int, count: int) -> Float32[np.ndarray, "k size"]:
-    """Return the lowest waves of the cosine transform (type II): orthonormal rows, at most `size`."""
+    """Return the lowest waves of the cosine transform (type II), as orthonormal rows."""
     k, n = np.arange(min(count, size))[:, None], np.arange(size) + 0.5
     rows = np.cos(np.pi * k * n / size)
     rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)

@@ -7,26 +7,27 @@ from touchgoal.control.tactile.background import Background, local_change
 from touchgoal.control.tactile.light_gain import remove_gain
 
 THRESHOLD = 1.2  # counts; noise of 1 count has a strength of 0.3, at most 0.45
-# Threshold of a noisy sensor per usual strength of its untouched frames. On 409 clips of a real Mini
-# (PhysiCLeAR) 2.5 finds every touch; from 2 on down, frames without any are taken for touches.
+# Threshold of a noisy sensor per usual strength of its untouched frames. On 409 clips of a real
+# Mini (PhysiCLeAR) 2.5 finds every touch; from 2 on down, frames without any are taken for touches.
 _SPARE = 2.5
 _LEARNING_FRAMES = 10  # 0.4 s of a 25 Hz sensor
 _LEARNING_QUANTILE = 0.3
 _OVER_NOISE = 1.8  # times the usual strength of noise, where a contact ends at the latest
-_LEARNING_THRESHOLD = 5.0  # counts; the strongest compression noise seen had a strength of 2.5
+_LEARNING_THRESHOLD = 5.0  # counts; the strongest compression noise measured had a strength of 2.5
 _RELEASE = 0.1  # of a contact's peak strength
 
 
 class ContactDetector:
     """Contact detector that updates its background while nothing touches.
 
-    Contact begins when `strength` exceeds the threshold. It ends below half the threshold, so that it does
-    not flicker, or below a tenth of the contact's peak, because the light drifts on during a long contact.
+    Contact begins when `strength` exceeds the threshold. It ends below half the threshold, so that
+    it does not flicker, or below a tenth of the contact's peak, because the light drifts on during
+    a long contact.
 
     Args:
         background: of the sensor; updated in place.
-        threshold: counts; None: from the noise of the first 10 frames, during which only a strong contact
-            (5 counts) counts.
+        threshold: counts; None: from the noise of the first 10 frames, during which only a strong
+            contact (5 counts) counts.
 
     Attributes:
         touching: whether the last frame was in contact.
@@ -38,7 +39,7 @@ class ContactDetector:
         self.background = background
         self.threshold = _LEARNING_THRESHOLD if threshold is None else float(threshold)
         self._untouched: list[float] | None = [] if threshold is None else None  # strengths
-        self._noise = 0.0  # usual strength of untouched frames, as far as learnt
+        self._noise = 0.0  # usual strength of untouched frames, estimated so far
         self.touching, self.strength = False, 0.0
         self._peak = 0.0  # strength
 
@@ -61,7 +62,7 @@ class ContactDetector:
             return
         self._untouched.append(self.strength)
         if len(self._untouched) == _LEARNING_FRAMES:
-            # Not the mean: a contact may begin, too weak to be told yet.
+            # Not the mean: a contact may begin, too weak to detect yet.
             self._noise = float(np.quantile(self._untouched, _LEARNING_QUANTILE))
             self.threshold = max(THRESHOLD, _SPARE * self._noise)
             self._untouched = None

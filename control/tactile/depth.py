@@ -1,9 +1,9 @@
 """Depth of a gel from a picture, by inverting the sensor file's model.
 
-One colour may belong to two slopes, to a shadow or to a depth, so pixels are not inverted one by one.
-Gauss-Newton steps find the surface whose picture (`sensor_calibration.shade`) fits the frame. A step is a
-Poisson-like equation with free (Neumann) borders, solved by conjugate gradients that the cosine transform
-preconditions. Coarse grids come first: they cost little.
+One colour may belong to two slopes, to a shadow or to a depth, so pixels are not inverted one by
+one. Gauss-Newton steps find the surface whose picture (`sensor_calibration.shade`) fits the frame.
+A step is a Poisson-like equation with free (Neumann) borders, solved by conjugate gradients that
+the cosine transform preconditions. Coarse grids come first: they cost little.
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ _MODEL_ERROR = 0.5  # counts by which a perfect calibration still differs from t
 _OUTLIER = 4.0  # standard deviations beyond which a pixel counts less
 _DAMPING = 0.01  # of the usual curvature
 # The lowest tenth of the surface is believed to be gel at rest: to lie within _REST, once for each
-# patch of _PATCH pixels. It decides where the colours themselves do not tell the depth.
+# patch of _PATCH pixels. It decides where the colours leave the depth open.
 _FLAT = 4e-6  # m around its upper end
 _REST = 40e-6  # m
 _PATCH = 400
@@ -51,14 +51,14 @@ _TILTED = 0.05  # slope below which the direction is noise
 class DepthEstimator:
     """Reconstruction of the gel's surface from single frames of one sensor.
 
-    Walls steeper than the file's `max_slope` read too low, unless the depth's own colour (up to `max_depth`)
-    shows how deep they go. Otherwise depth counts from the lowest tenth of the surface: too shallow where a
-    contact fills the view.
+    Walls steeper than the file's `max_slope` read too low, unless the depth's own colour (up to
+    `max_depth`) shows how deep they go. Otherwise depth counts from the lowest tenth of the
+    surface: too shallow where a contact fills the view.
 
     Args:
         calibration: the sensor file.
-        finest: side of the smallest cells, px. 8 takes a third of the time of 2 and finds the deepest
-            point of most contacts as well.
+        finest: side of the smallest cells, px. 8 takes a third of the time of 2 and finds the
+            deepest point of most contacts as well.
     """
 
     def __init__(self, calibration: SensorCalibration, finest: int = 2) -> None:
@@ -75,8 +75,8 @@ class DepthEstimator:
 
         Args:
             image: RGB frame; paint markers over first (`markers.without_markers`).
-            background: the untouched sensor now (`background.Background.image`), markers painted over as
-                well; None: the sensor file's.
+            background: the untouched sensor now (`background.Background.image`), markers painted
+                over as well; None: the sensor file's.
         """
         if background is None:
             background = self._calibration.background.astype(np.float32)
@@ -145,21 +145,21 @@ class _Level:
             inner: conjugate gradient steps in each.
         """
         h, w = self._shape
-        seen = cv2.resize(change, (w, h), interpolation=cv2.INTER_AREA)
-        seen = np.ascontiguousarray(np.moveaxis(seen, 2, 0))
+        target = cv2.resize(change, (w, h), interpolation=cv2.INTER_AREA)
+        target = np.ascontiguousarray(np.moveaxis(target, 2, 0))
         surface = cv2.resize(start, (w, h), interpolation=cv2.INTER_LINEAR)
         for step in range(steps):
-            linear = self._linearise(seen, surface, search=step >= steps - searched)
+            linear = self._linearise(target, surface, search=step >= steps - searched)
             surface = surface + self._solve(linear, surface, inner)
         return surface
 
-    def _linearise(self, seen: Colours, surface: Map, search: bool) -> _Linear:
+    def _linearise(self, target: Colours, surface: Map, search: bool) -> _Linear:
         p = self._calibration
         gx, gy = np.empty_like(surface), np.empty_like(surface)
         slopes(surface, self._half, gx, gy)
         dark = shadows(p, surface, self._pitch)
         # What shadows and depth leave for the slopes to explain.
-        left = seen - self._per_depth * np.minimum(surface, np.float32(p.max_depth))
+        left = target - self._per_depth * np.minimum(surface, np.float32(p.max_depth))
         left -= self._gain * np.tensordot(p.shadow, dark, 1)
         shading, by_gx, by_gy = self._shading(gx, gy)
         error = left - shading

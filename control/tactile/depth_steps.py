@@ -56,7 +56,7 @@ def shading(gx, gy, gain, places, coefficients, max_slope):
 @njit(cache=True, nogil=True)
 @no_type_check
 def best_slopes(left, error, gx, gy, gain, places, coefficients, lengths, outlier, tilted, better):
-    """Return slopes of other lengths where they fit the colours much better, and whether there are any.
+    """Return better slopes along the present directions, and whether any pixel was searched.
 
     Args:
         left: colour change to explain, colours.
@@ -103,7 +103,8 @@ def normal_equations(error, by_gx, by_gy, by_depth, weight):
     """Sum weighted products of errors and derivatives over the colours.
 
     Returns:
-        gx gx, gx gy, gy gy, gx depth, gy depth, depth depth (6 maps); gx, gy, depth times error (3 maps).
+        gx gx, gx gy, gy gy, gx depth, gy depth, depth depth (6 maps); gx, gy, depth times error (3
+        maps).
     """
     h, w = weight.shape
     curvature, slope = np.empty((6, h, w), np.float32), np.empty((3, h, w), np.float32)

@@ -1,4 +1,4 @@
-"""Contact force on a fingertip: from its gel's depth and markers, or from how much its picture changes."""
+"""Contact force on a fingertip: from depth and markers, or from the change of its picture."""
 
 from dataclasses import dataclass
 
@@ -45,8 +45,8 @@ def estimate_force(
     """Estimate the resultant force from one frame's depth and its markers' displacement.
 
     Normal: the gel as an elastic foundation, `foundation_modulus` times the volume in contact. Flat
-    faces and edges read too strong because the gel bulges beside them; only the part in view counts.
-    The modulus is nominal: compare a real sensor with one known weight.
+    faces and edges read too strong because the gel bulges beside them; only the part in view
+    counts. The modulus is nominal: compare a real sensor with one known weight.
 
     Shear: `shear_stiffness` times the mean displacement of the markers, weighted by depth. Edges
     cover few markers and are the least certain.
@@ -102,8 +102,8 @@ def calibrate_force(rows: Float[np.ndarray, "n k"], force: Float[np.ndarray, " n
     """
     if len(rows) < _MIN_FRAMES or np.ptp(force) < 1:
         raise UserError(
-            f"{len(rows)} frames with forces of up to {np.ptp(force):.1f} N are too few: record grasps of "
-            f"several objects, {_MIN_FRAMES} frames or more, from open to firm"
+            f"{len(rows)} frames with forces of up to {np.ptp(force):.1f} N are too few: record "
+            f"grasps of several objects, {_MIN_FRAMES} frames or more, from open to firm"
         )
     mean, spread = rows.mean(0), rows.std(0) + 1e-6
     known, offset = (rows - mean) / spread, float(force.mean())

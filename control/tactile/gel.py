@@ -33,9 +33,9 @@ def pixels_per_cell(pitch: float) -> int:
 def deform(overlap: HeightField, pitch: float, blur_sigmas: tuple[float, ...]) -> HeightField:
     """Return the gel's surface under an object's `overlap` (m, 0 where there is none).
 
-    The gel follows the object in contact and bulges smoothly around it: Taxim's contact-constrained pyramid,
-    on coarse cells. (Box blurs would be faster, but their corners show as a cross around a small contact.)
-    Full-resolution detail is added back inside the contact.
+    The gel follows the object in contact and bulges smoothly around it: Taxim's contact-constrained
+    pyramid, on coarse cells. (Box blurs would be faster, but their corners show as a cross around a
+    small contact.) Full-resolution detail is added back inside the contact.
 
     Args:
         overlap: with the undeformed gel.
@@ -64,8 +64,8 @@ def shadow_depth(
 ) -> Float32[np.ndarray, "lights h w"]:
     """Return how far (m) each point lies below the shadow line of each light.
 
-    Camera and lights look from inside the gel, so an indentation is a hill to them. A point is in shadow if
-    the surface towards the light rises above the light's slope.
+    Camera and lights look from inside the gel, so an indentation is a hill to them. A point is in
+    shadow if the surface towards the light rises above the light's slope.
 
     Args:
         surface: of the gel, m.

@@ -13,9 +13,9 @@ from touchgoal.control.tactile.sensor_calibration import load, shade
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.runtime.errors import UserError
 
-# Cells of half a millimetre on a Mini. On simulated grasps at 10 and 30 N the deepest point came out
-# within a tenth for blocks and balls; a pebble's edges, steeper than any calibration press, at 60 %.
-# Printed dots are left in: they change it by less than a tenth.
+# Cells of half a millimetre on a Mini. On simulated grasps at 10 and 30 N the deepest point came
+# out within a tenth for blocks and balls; a pebble's edges, steeper than any calibration press, at
+# 60 %. Printed dots are left in: they change it by less than a tenth.
 _CELL = 8  # px
 _BALL = 4e-3  # m, radius of the ball that a ceiling is tried with
 _READABLE = 0.8  # share of a depth that must be read
@@ -44,8 +44,9 @@ class IndentationMeter:
 def deepest_readable(sensor: SensorModel, wanted: float) -> float:
     """Return the largest depth up to `wanted` that the sensor file can read, m, in steps of 0.1 mm.
 
-    A ball is drawn by the sensor file's model and read back. With walls steeper than the calibration presses
-    a deep one reads too shallow, and a ceiling above that would never be reached.
+    A ball is drawn by the sensor file's model and read back. With walls steeper than the
+    calibration presses a deep one reads too shallow, and a ceiling above that would never be
+    reached.
     """
     depth = wanted
     while depth > 0 and _read_ball(sensor, depth) < _READABLE * depth:
@@ -58,8 +59,9 @@ def require_readable(sensor: SensorModel, ceiling: float) -> None:
     deepest = deepest_readable(sensor, ceiling)
     if deepest < ceiling:
         raise UserError(
-            f"safety.indentation is {1e3 * ceiling:g} mm, deeper than the {sensor.name}'s sensor file "
-            f"can read ({1e3 * deepest:.1f} mm): lower it, or calibrate with deeper presses"
+            f"safety.indentation is {1e3 * ceiling:g} mm, deeper than the sensor file of the "
+            f"{sensor.name} can read ({1e3 * deepest:.1f} mm): lower it, or calibrate with deeper "
+            "presses"
         )
 
 

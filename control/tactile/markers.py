@@ -22,8 +22,8 @@ class Markers:
     """Grid of dots in one frame.
 
     Attributes:
-        positions: (x, y) of the centres in px, pixel centres at integers; expected ones where a dot was
-            not found.
+        positions: (x, y) of the centres in px, pixel centres at integers; expected ones where a dot
+            was not found.
         found: whether each dot was found.
     """
 
@@ -39,10 +39,11 @@ class Markers:
 class MarkerTracker:
     """Tracker of one gel's dots from frame to frame.
 
-    A dot takes the spot nearest to its expected place if it is that spot's nearest dot as well and lies within
-    half the pitch: dots can get lost, which is flagged, but not swapped. Dots are expected either to keep
-    moving or to stay, whichever explains the frame better: a grid that jumps and stops would overshoot onto
-    its neighbours. A lost dot is expected where its neighbours' displacement carries it.
+    A dot takes the spot nearest to its expected place if it is that spot's nearest dot as well and
+    lies within half the pitch: dots can get lost, which is flagged, but not swapped. Dots are
+    expected either to keep moving or to stay, whichever explains the frame better: a grid that
+    jumps and stops would overshoot onto its neighbours. A lost dot is expected where its
+    neighbours' displacement carries it.
 
     Args:
         untouched: RGB frame of the untouched gel.
@@ -187,8 +188,8 @@ def _spots(
 ) -> tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, " n"]]:
     """Find dark spots of about `size` px: (x, y) of their centres and their darkness, 0 to 1.
 
-    Darkness is the share of light missing against the surroundings, blurred to the size of a spot; a parabola
-    through its peak gives the centre.
+    Darkness is the share of light missing against the surroundings, blurred to the size of a spot;
+    a parabola through its peak gives the centre.
     """
     scale = max(int(size / 7), 1)  # dots of 7 px are found as well as larger ones, and faster
     h, w, _ = grey.shape
@@ -212,7 +213,7 @@ def _spots(
 def _refined(
     grey: Float32[np.ndarray, "h w 1"], spots: Float32[np.ndarray, "n 2"], radius: float
 ) -> Float32[np.ndarray, "n 2"]:
-    """Return centroids of the darkness below the membrane over each spot: shading does not shift them."""
+    """Return each spot's centroid of darkness below its membrane: shading does not shift it."""
     padded, margin = _padded(grey, radius)
     (y, x), membrane = _under_dots(padded, spots + margin, radius)
     dark = np.maximum(1 - padded[y, x, 0] / np.maximum(membrane[..., 0], 1), 0)

@@ -1,10 +1,11 @@
-"""Check that the pictures of a fingertip are its sensor's: whole, in RGB order, and the right way round.
+"""Check that fingertip pictures are the sensor's: whole, in RGB order, the right way round.
 
-The untouched picture is compared with the sensor file's under other orders of the channels, mirrors,
-scales and shifts; each channel may be brighter or darker as a whole. A hypothesis that fits clearly better
-is the fault. A gel's picture changes smoothly, so a step across half of it is the seam of a torn or rolled
-one. Presses decide what the untouched picture leaves open: a Mini's is nearly the same mirrored left to
-right, but the sensor file then explains no press. Printed dots and dust do not count.
+The untouched picture is compared with the sensor file's under other orders of the channels,
+mirrors, scales and shifts; each channel may be brighter or darker as a whole. A hypothesis that
+fits clearly better is the fault. A gel's picture changes smoothly, so a step across half of it is
+the seam of a torn or rolled one. Presses decide what the untouched picture leaves open: a Mini's is
+nearly the same mirrored left to right, but the sensor file then explains no press. Printed dots and
+dust do not count.
 """
 
 from collections.abc import Sequence
@@ -21,8 +22,8 @@ from touchgoal.control.tactile.sensor_calibration import SensorCalibration, load
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.runtime.errors import UserError
 
-# Thresholds lie between what whole pictures and faulty ones reach, on the real frames of three Minis and two
-# DIGITs (tests/measure_picture_guard.py prints the table).
+# Thresholds lie between what whole pictures and faulty ones reach, on the real frames of three
+# Minis and two DIGITs (tests/measure_picture_guard.py prints the table).
 _SEAM, _STEP = 3.5, 6.0  # times the usual step from row to row; counts, the channels' sum
 _EDGE = 10  # share of a picture (1/n) at either end where a seam may be the sensor's case
 _SEAM_PARTS = 32  # along a row, half of which must show the step
@@ -48,7 +49,7 @@ Cells = Float32[np.ndarray, "rows columns 3"]
 
 @dataclass(frozen=True)
 class _View:
-    """One way in which a picture may have been changed on its way: channels in an order, mirrored."""
+    """Hypothesis on a picture: its channels in another order, mirrored, or both."""
 
     order: tuple[int, int, int]
     rows: bool  # mirrored top to bottom
@@ -93,7 +94,7 @@ def seam(picture: Picture) -> str:
     for name, lines in (("row", picture), ("column", np.swapaxes(picture, 0, 1))):
         count = lines.shape[0]
         margin = count // _EDGE
-        if margin < 3:  # too small to tell
+        if margin < 3:  # too small to check
             return ""
         size = (_SEAM_PARTS, count)
         light = cv2.resize(lines.astype(np.float32), size, interpolation=cv2.INTER_AREA)
@@ -115,7 +116,8 @@ def check_untouched(picture: Picture, sensor: SensorModel, name: str) -> None:
         name: of the picture, for the message.
 
     Raises:
-        UserError: it is torn or rolled, its channels are exchanged, it is mirrored, stretched or shifted.
+        UserError: it is torn or rolled, its channels are exchanged, it is mirrored, stretched or
+            shifted.
     """
     if fault := seam(picture) or _fault(_compare(picture, sensor)):
         raise UserError(
@@ -126,7 +128,7 @@ def check_untouched(picture: Picture, sensor: SensorModel, name: str) -> None:
 def check_presses(
     untouched: Picture, presses: Sequence[Picture], sensor: SensorModel, name: str
 ) -> None:
-    """Refuse pictures of presses that the sensor file explains clearly better when turned or reordered.
+    """Refuse presses that the sensor file explains clearly better mirrored or with other channels.
 
     Args:
         untouched: RGB, the same gel untouched; `check_untouched` has passed it.
@@ -182,7 +184,7 @@ def explain(
     frame: Picture,
     background: Float32[np.ndarray, "h w 3"],
 ) -> Explanation:
-    """Read a frame's depth and compare the frame with the picture that the sensor file draws of it."""
+    """Read a frame's depth and compare the frame with the rendering of that depth."""
     depth = estimator.estimate(frame, background)
     change = frame.astype(np.float32) - background
     left = change - (shade(calibration, depth) - calibration.background)
@@ -195,14 +197,14 @@ def explain(
 
 
 def _compare(picture: Picture, sensor: SensorModel) -> dict[_View | tuple, float]:
-    """Return how much the picture differs from the sensor file's, as it is and under each hypothesis."""
+    """Return the difference from the sensor file's picture under each hypothesis."""
     reference = _coarse(load(sensor.sensor_file).background, sensor)
-    seen = _coarse(picture, sensor)
+    given = _coarse(picture, sensor)
     differences: dict[_View | tuple, float] = {
-        view: _difference(view.undo(seen), reference) for view in _VIEWS
+        view: _difference(view.undo(given), reference) for view in _VIEWS
     }
     for move in _MOVES:
-        differences[move] = _difference(_moved(seen, *move), reference)
+        differences[move] = _difference(_moved(given, *move), reference)
     return differences
 
 
@@ -217,12 +219,13 @@ def _fault(differences: dict[_View | tuple, float]) -> str:
     x, y, right, down = best
     if (x, y) != (1, 1):
         return (
-            f"it fits when scaled by {x:g} along its rows and {y:g} along its columns: cut and scale it as "
-            "when the sensor file was made"
+            f"it fits when scaled by {x:g} along its rows and {y:g} along its columns: cut and "
+            "scale "
+            "it as when the sensor file was made"
         )
     return (
-        f"it fits when moved by about {_COARSE * right} px to the right and {_COARSE * down} px down: cut it "
-        "as when the sensor file was made, or look whether the gel has slipped"
+        f"it fits when moved by about {_COARSE * right} px to the right and {_COARSE * down} px "
+        "down: cut it as when the sensor file was made, or check whether the gel has slipped"
     )
 
 

@@ -1,18 +1,20 @@
 """Sensor file: colours that the lights inside a sensor give to the shape of its gel.
 
-A gel surface h(x, y), m into the gel (`gel.deform`), has slopes gx = dh/dx, gy = dh/dy by central differences
-and the unit normal's image-plane part (nx, ny) = -(gx, gy) / sqrt(1 + gx^2 + gy^2). With the ten features f_k
-of `shape_features`, position p = (1, u, v), u and v from -1 to 1 across columns and rows, and the shadow depths
-s_l of `gel.shadow_depth`, channel c shows
+A gel surface h(x, y), m into the gel (`gel.deform`), has slopes gx = dh/dx, gy = dh/dy by central
+differences and the unit normal's image-plane part (nx, ny) = -(gx, gy) / sqrt(1 + gx^2 + gy^2).
+With the ten features f_k of `shape_features`, position p = (1, u, v), u and v from -1 to 1 across
+columns and rows, and the shadow depths s_l of `gel.shadow_depth`, channel c shows
 
     I_c = background_c + noise + gain_c (
-        sum over k, m of response[c,k,m] f_k p_m  +  sum over l of shadow[c,l] s_l / (s_l + penumbra)
+        sum over k, m of response[c,k,m] f_k p_m  +  sum over l of shadow[c,l] s_l / (s_l +
+        penumbra)
     )
 
-The gain is the blurred background divided by its mean, to the power `illumination_exponent`: where little light
-falls, slopes change the picture little. (A real Mini fits 2, not 1: scattered light fills the background where
-the lamps do not reach; with 1 its balls read up to 40 % too flat in the corners.) The polynomial holds only within
-the presses: a normal steeper than `max_slope` is shortened to it, a depth beyond `max_depth` counts as `max_depth`.
+The gain is the blurred background divided by its mean, to the power `illumination_exponent`: where
+little light falls, slopes change the picture little. (A real Mini fits 2, not 1: scattered light
+fills the background where the lamps do not reach; with 1 its balls read up to 40 % too flat in the
+corners.) The polynomial holds only within the presses: a normal steeper than `max_slope` is
+shortened to it, a depth beyond `max_depth` counts as `max_depth`.
 """
 
 import json
@@ -45,8 +47,8 @@ class SensorCalibration:
         sensor: name of the sensor model.
         background: the untouched sensor, RGB.
         pixel_pitch: m per pixel.
-        response: counts per channel and feature (`shape_features`); the last axis multiplies (1, u, v),
-            where u and v run from -1 to 1 across columns and rows.
+        response: counts per channel and feature (`shape_features`); the last axis multiplies (1, u,
+            v), where u and v run from -1 to 1 across columns and rows.
         light_azimuths: of the lights in the image, degrees from x (right) towards y (down).
         shadow_slope: tangent of the lights' height above the gel plane.
         shadow: counts per channel in the deepest shadow of each light.
@@ -54,8 +56,8 @@ class SensorCalibration:
         max_slope, max_depth: largest length of (nx, ny), and depth in m, in the presses.
         blur_sigmas: standard deviations of the gel's bulge, coarse to fine, m (`gel.deform`).
         noise: standard deviation of the camera's noise, counts.
-        illumination_exponent: power of the background's brightness by which the response varies over
-            the image (`illumination`).
+        illumination_exponent: power of the background's brightness by which the response varies
+            over the image (`illumination`).
     """
 
     sensor: str
@@ -93,8 +95,8 @@ def shape_features(
         max_slope, max_depth: see `SensorCalibration`.
 
     Returns:
-        nx, ny, nx^2, nx ny, ny^2, nx^3, nx^2 ny, nx ny^2, ny^3 of the unit normal's components in the
-        image plane, and the depth in m.
+        nx, ny, nx^2, nx ny, ny^2, nx^3, nx^2 ny, nx ny^2, ny^3 of the unit normal's components in
+        the image plane, and the depth in m.
     """
     padded = np.pad(surface, 1, mode="edge")
     gx = (padded[1:-1, 2:] - padded[1:-1, :-2]) * np.float32(0.5 / pitch)

@@ -27,8 +27,8 @@ class MarkerGrid:
 class SensorModel:
     """Camera-based fingertip sensor.
 
-    The sensor frame sits on the undeformed gel, in the middle of the image: x along the image's columns, y along
-    its rows (downwards), z out of the gel. The gel is modelled as flat.
+    The sensor frame sits on the undeformed gel, in the middle of the image: x along the image's
+    columns, y along its rows (downwards), z out of the gel. The gel is modelled as flat.
 
     Attributes:
         name: id that encoders and preprocessors use.
@@ -65,15 +65,14 @@ class SensorModel:
 
 _FILES = Path(__file__).parent / "sensor_files"
 
-# Image: the SDK's 320x240 crop. Sensor file and 0.0634 mm/px: one unit fitted to 46 presses of two balls
-# of known radius (GelSLAM), so depths in millimetres hold on it. Other sources range from 0.058 (the
-# datasheet's 18.6 x 14.3 mm) to 0.071 (22.9 x 17.1): calibrate your own.
-# Gel 25.4 x 20.9 x 4.0 mm: FEATS STEP file. Case 32.5 x 28.5 x 28.3 mm: GelSight STEP file.
-# Shear modulus: FEATS' Neo-Hooke fit, 2 C10 = 0.145 MPa.
-# Foundation modulus: a bonded, nearly incompressible 4 mm layer of E = 0.44 MPa (the same fit) is
-# about three times stiffer than E/t; 3e8 Pa/m gives 0.8 mm under a 25 mm ball at 15 N, within
-# FEATS' measured range (up to 0.86 mm).
-# Whole-gel stiffness: the same modulus over the patch of such a ball, and G A / t of the gel.
+# Image: the SDK's 320x240 crop. Sensor file and 0.0634 mm/px: one unit fitted to 46 presses of two
+# balls of known radius (GelSLAM), so depths in millimetres hold on it. Other sources range from
+# 0.058 (the datasheet's 18.6 x 14.3 mm) to 0.071 (22.9 x 17.1): calibrate your own. Gel 25.4 x 20.9
+# x 4.0 mm: FEATS STEP file. Case 32.5 x 28.5 x 28.3 mm: GelSight STEP file. Shear modulus: FEATS'
+# Neo-Hooke fit, 2 C10 = 0.145 MPa. Foundation modulus: a bonded, nearly incompressible 4 mm layer
+# of E = 0.44 MPa (the same fit) is about three times stiffer than E/t; 3e8 Pa/m gives 0.8 mm under
+# a 25 mm ball at 15 N, within FEATS' measured range (up to 0.86 mm). Whole-gel stiffness: the same
+# modulus over the patch of such a ball, and G A / t of the gel.
 GELSIGHT_MINI = SensorModel(
     name="gelsight_mini",
     image_shape=(240, 320),
@@ -116,11 +115,12 @@ GELSIGHT_MARKERS = replace(
     markers=MarkerGrid(rows=9, columns=11, pitch=1.4e-3, diameter=0.7e-3),
 )
 
-# Image: QVGA at 60 Hz, upright as digit-interface returns it. Sensor file: one unit fitted to 20 presses
-# of one ball (FOTS); ball (3 mm) and scale are assumed, neither is stated and pictures do not tell. Sources
-# range from 0.0405 (gs_sdk, at VGA) over 0.0511 (FOTS) to 0.0667 (a 16 x 19 mm sensing field). Case 32.3 x 27 x 34 mm:
-# its STL. Gel 20 x 30 mm: TACTO, which also bends it by 5 mm (R 100 mm); flat here.
-# Thickness and moduli are not published: a third thinner than the Mini's, of the same silicone.
+# Image: QVGA at 60 Hz, upright as digit-interface returns it. Sensor file: one unit fitted to 20
+# presses of one ball (FOTS); ball (3 mm) and scale are assumed, neither is stated and pictures do
+# not tell. Sources range from 0.0405 (gs_sdk, at VGA) over 0.0511 (FOTS) to 0.0667 (a 16 x 19 mm
+# sensing field). Case 32.3 x 27 x 34 mm: its STL. Gel 20 x 30 mm: TACTO, which also bends it by 5
+# mm (R 100 mm); flat here. Thickness and moduli are not published: a third thinner than the Mini's,
+# of the same silicone.
 DIGIT = SensorModel(
     name="digit",
     image_shape=(320, 240),
@@ -137,12 +137,13 @@ DIGIT = SensorModel(
     sensor_file=_FILES / "digit",
 )
 
-# A finger whose camera sees the gel at an angle (Wang et al. 2021, arXiv 2106.08851); its picture is that between
-# the gel's corners, which differ from unit to unit. Scale: a round number; taken for 33 x 24 mm, EstimateModulus' pictures
-# show the dimples of golf balls 3.9 mm apart, where 400 to 300 of them spread evenly over a ball lie 4.1 to 4.7 mm
-# apart: it may be a tenth larger. 30 pictures a second there, too. Gel: as large as the picture; its case is drawn around it.
-# Thickness and moduli are not published in what was at hand: the Mini's.
-# Sensor file: a drawing of its lamps (`led_ring.py`), fitted to nothing, for no pictures of rigid balls may ship.
+# A finger whose camera sees the gel at an angle (Wang et al. 2021, arXiv 2106.08851); its picture
+# is that between the gel's corners, which differ from unit to unit. Scale: a round number; taken
+# for 33 x 24 mm, EstimateModulus' pictures show the dimples of golf balls 3.9 mm apart, where 400
+# to 300 of them spread evenly over a ball lie 4.1 to 4.7 mm apart: it may be a tenth larger. 30
+# pictures a second there, too. Gel: as large as the picture; its case is drawn around it. Thickness
+# and moduli are not published in what was at hand: the Mini's. Sensor file: a drawing of its lamps
+# (`led_ring.py`), fitted to nothing, for no pictures of rigid balls may ship.
 GELSIGHT_WEDGE = replace(
     GELSIGHT_MINI,
     name="gelsight_wedge",
