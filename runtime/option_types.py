@@ -66,7 +66,9 @@ def checked_dataclass(cls: Class) -> Class:
 
     Making an instance raises OptionError if a value does not fit or `__post_init__` raises ValueError.
     """
-    made: Any = pydantic.dataclasses.dataclass(frozen=True, config={"extra": "forbid"})(cls)
+    made: Any = pydantic.dataclasses.dataclass(
+        frozen=True, config={"extra": "forbid", "use_attribute_docstrings": True}
+    )(cls)
     initialise = made.__init__
 
     def checked(self: Any, *args: Any, **kwargs: Any) -> None:

@@ -82,6 +82,21 @@ def test_help_shows_the_first_options_and_help_all_shows_all(
     assert "--env.timestep" in capsys.readouterr().out
 
 
+def test_arguments_and_the_folder_have_names_and_defaults(
+    capsys: pytest.CaptureFixture,
+) -> None:
+    for name, usage in {
+        "check-sensor": "[OPTIONS] SOURCE",
+        "reward-curves": "[OPTIONS] SOURCE",
+        "completion": "{bash,zsh,fish}",
+    }.items():
+        with pytest.raises(SystemExit):
+            main([name, "--help"])
+        assert usage in (printed := capsys.readouterr().out)
+        if name != "completion":
+            assert "runs/<date>_<command>" in printed
+
+
 def test_a_mistyped_option_or_command_is_guessed(capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(SystemExit):
         options("--env.mas", "1", "2")

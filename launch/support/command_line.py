@@ -1,15 +1,12 @@
 """Parsing of a command line into a command's `Config` with tyro; a bad value is one line."""
 
-import ast
 import dataclasses
-import inspect
 import re
-import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from types import UnionType
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import annotated_types
 import tyro
@@ -103,6 +100,9 @@ def _as_options(
             offered = type(default)  # options of the other task are refused
         if (info.type, field.name) in hidden:
             offered = Annotated[offered, tyro.conf.Suppress]
+        kinds = [get_origin(kind) for kind in (_bare(annotation), *get_args(_bare(annotation)))]
+        if tyro.conf.Positional in getattr(annotation, "__metadata__", ()) and Literal not in kinds:
+            offered = Annotated[offered, tyro.conf.arg(metavar=field.name.upper())]
         if default is None or default == ():  # the text describes what that means
             hint = "(default: runs/<date>_<command>)" if field.name == "out" else ""
             offered = Annotated[offered, tyro.conf.arg(help_behavior_hint=hint)]
@@ -141,21 +141,12 @@ def _options(config_type: type) -> list[tuple[dataclasses.Field, Any, str]]:
 
 def docstrings(config_type: type) -> dict[str, str]:
     """Return the string below each field of a dataclass and of its bases."""
-    texts = {}
-    for cls in reversed(config_type.__mro__):
-        if not dataclasses.is_dataclass(cls):
-            continue
-        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
-        assert isinstance(definition, ast.ClassDef)
-        for field, text in zip(definition.body, definition.body[1:], strict=False):
-            if (
-                isinstance(field, ast.AnnAssign)
-                and isinstance(field.target, ast.Name)
-                and isinstance(text, ast.Expr)
-                and isinstance(text.value, ast.Constant)
-            ):
-                texts[field.target.id] = " ".join(str(text.value.value).split())
-    return texts
+    return {
+        name: " ".join(field.description.split())
+        for cls in reversed(config_type.__mro__)
+        for name, field in getattr(cls, "__pydantic_fields__", {}).items()
+        if field.description
+    }
 
 
 def _with_range(text: str, annotation: Any) -> str:
