@@ -78,7 +78,7 @@ def main(config: Config) -> None:
     if config.check_lamps:
         check_untouched(presses.background, model, f"{config.presses}/background.png")
         check_presses(
-            presses.background, presses.images, model, f"the pictures in {config.presses}"
+            presses.background, list(presses.images), model, f"the pictures in {config.presses}"
         )
     out = open_run(config.out, "calibrate", config)
     train, test = split(presses, round(config.held_out * len(presses)), config.seed)

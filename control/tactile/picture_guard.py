@@ -51,7 +51,7 @@ Cells = Float32[np.ndarray, "rows columns 3"]
 class _View:
     """Hypothesis on a picture: its channels in another order, mirrored, or both."""
 
-    order: tuple[int, int, int]
+    order: tuple[int, ...]
     rows: bool  # mirrored top to bottom
     columns: bool  # mirrored left to right
 
