@@ -1,12 +1,9 @@
 """Demonstrations that begin with a pause, which a policy imitates by not starting."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from touchgoal.control.features import ACTION, STATE
 from touchgoal.episodes.schema import Episode
-from touchgoal.episodes.store import EpisodeSet
 
 _JOINT_MOTION = 2e-3  # rad since the first frame, or commanded since then
 _WIDTH_MOTION = 5e-4  # m of gripper width, measured or commanded
@@ -25,13 +22,3 @@ def leading_pause(episode: Episode) -> int:
     moved |= np.abs(state[:, -1] - state[0, -1]) > _WIDTH_MOTION
     moving = np.flatnonzero(commanded | moved)
     return int(moving[0]) if len(moving) else 0
-
-
-def leading_pauses(episodes: EpisodeSet) -> list[int]:
-    """Return `leading_pause` of every episode of a set, frames."""
-    return [leading_pause(episodes.read(i, [STATE, ACTION])) for i in range(len(episodes))]
-
-
-def trim_leading_pause(episode: Episode, pause: int) -> Episode:
-    """Return an episode without its first `pause` frames."""
-    return replace(episode, frames={key: values[pause:] for key, values in episode.frames.items()})
