@@ -22,13 +22,13 @@ WRIST = "observation.images.wrist"
 TACTILE_LEFT = "observation.images.tactile_left"
 TACTILE_RIGHT = "observation.images.tactile_right"
 ACTION = "action"
-COST = "cost"  # of deployed episodes whose cell file names a goal
+COST = "cost"  # in deployed episodes whose cell file names a goal
 
 TACTILE = (TACTILE_LEFT, TACTILE_RIGHT)
 CAMERAS = (FRONT, WRIST)
 IMAGE_PREFIX = "observation.images."
 
-# What only a simulator knows.
+# Known to a simulator alone.
 TRUTH_PAD_WRENCH = "truth.pad_wrench"
 TRUTH_CONTACT = "truth.contact"
 TRUTH_SLIP = "truth.slip"
@@ -38,7 +38,7 @@ TRUTH_PROGRESS = "truth.progress"
 TRUTH_SUCCESS = "truth.success"
 TRUTH_FAILURE = "truth.failure"  # of tasks that can fail before their time is up
 
-N_JOINTS = 7  # of an FR3, for which policies are; see `features_of` for other arms
+N_JOINTS = 7  # of an FR3, which policies are made for; see `features_of` for other arms
 CONTROL_HZ = 20
 TACTILE_SHAPE = (240, 320, 3)
 CAMERA_SHAPE = (128, 128, 3)
@@ -61,7 +61,7 @@ _IMAGE_NAMES = ("height", "width", "channels")
 
 
 def _of_joints(joints: int) -> dict[str, Feature]:
-    """The columns that differ between arms."""
+    """Return the columns that depend on the number of joints."""
     names = [f"joint_{i}" for i in range(1, joints + 1)]
     return {
         STATE: Feature(
@@ -74,8 +74,8 @@ def _of_joints(joints: int) -> dict[str, Feature]:
             "float32",
             (2 * joints,),
             (*(f"{j}.pos" for j in names), *(f"{j}.vel" for j in names)),
-            "joint positions (rad) commanded up to now, and by how much they changed in the last "
-            "tick (rad/s): no delay lies in it, nor what the arm meets",
+            "commanded joint positions (rad) and their change in the last tick (rad/s), without delay "
+            "or contact",
         ),
         ACTION: Feature(
             "float32",
@@ -132,5 +132,5 @@ FEATURES: dict[str, Feature] = {
 
 
 def features_of(joints: int) -> dict[str, Feature]:
-    """`FEATURES` of an arm with so many joints: 7 of an FR3, 6 of a UR5e."""
+    """Return `FEATURES` for an arm with this many joints: 7 for an FR3, 6 for a UR5e."""
     return FEATURES | _of_joints(joints)

@@ -1,9 +1,9 @@
-"""What deployment asks of an arm, a gripper, a camera, a fingertip and a load cell.
+"""Interfaces of arm, gripper, camera, fingertip, load cell and actor.
 
 Every reading is a frozen snapshot with `stamp`, the monotonic time (s, `time.monotonic`) at which its
-content was new. A driver that hears nothing more returns the old reading with its old stamp: ages,
-not exceptions, tell that something is stale. `read` and `command` never wait for hardware for longer
-than a time-out; what is broken for good raises DriverError.
+content was new. A driver without news returns the old reading with its old stamp, so that its age shows.
+`read` and `command` wait for hardware no longer than a time-out; a device that is broken for good raises
+DriverError.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from touchgoal.control.tactile.sensor_models import SensorModel
 Joints = Float[np.ndarray, "n"]
 
 STOPPED_ON_REQUEST = "stopped on request"
-"""What the fault of an arm begins with that has nothing but been stopped."""
+"""Prefix of the fault message of an arm that was stopped on request."""
 
 
 class DriverError(RuntimeError):
@@ -32,12 +32,12 @@ class ArmReading:
     Attributes:
         q: joint positions, rad.
         velocity: of the joints, rad/s.
-        wrench: force (N) and torque (Nm) of the environment on the robot at the TCP, base frame; not a
-            number where the arm cannot tell, as an FR3 near a singularity.
-        torque: that the environment puts on each joint, Nm.
-        fault: why the arm refuses commands until a person recovers it; empty if it does not.
-        stamp: s; the controller's clock advanced then.
-        time: s, that clock, from an origin of its own.
+        wrench: force (N) and torque (Nm) of the environment on the robot at the TCP, base frame; NaN
+            where the arm measures none, as an FR3 near a singularity.
+        torque: external torque on each joint, Nm.
+        fault: why the arm refuses commands until a person recovers it; empty if it takes them.
+        stamp: s, when the controller's clock last advanced.
+        time: s, that clock.
     """
 
     q: Joints
@@ -65,8 +65,8 @@ class Frame:
 
     Attributes:
         image: RGB.
-        sequence: counts the frames taken, those that nobody read included.
-        stamp: s, right after the frame was grabbed; of a frozen camera, when its picture last changed.
+        sequence: number of frames taken, unread ones included.
+        stamp: s, right after the grab; for a frozen camera, when its picture last changed.
     """
 
     image: UInt8[np.ndarray, "h w 3"]
@@ -76,7 +76,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class LoadReading:
-    """A force (N) that a load cell measured; `rejected` counts lines refused so far."""
+    """Force (N) measured by a load cell; `rejected` counts refused lines."""
 
     force: float
     rejected: int
@@ -92,11 +92,11 @@ class Arm(Protocol):
     """
 
     def read(self) -> ArmReading:
-        """The newest state."""
+        """Return the newest state."""
         ...
 
     def command(self, q: Joints) -> None:
-        """Go on to `q` (rad); DriverError if stopped or at fault, UserError if beyond the range."""
+        """Move on to `q` (rad); DriverError if stopped or at fault, UserError if beyond the range."""
         ...
 
     def stop(self) -> None:
@@ -108,7 +108,7 @@ class Arm(Protocol):
         ...
 
     def close(self) -> None:
-        """Bring the arm to rest and disconnect."""
+        """Bring the arm to rest, then disconnect."""
         ...
 
 
@@ -117,7 +117,7 @@ class Gripper(Protocol):
     """A parallel gripper; `command` takes the width (m) to go to, or to hold something before it."""
 
     def read(self) -> GripperReading:
-        """The newest state."""
+        """Return the newest state."""
         ...
 
     def command(self, width: float) -> None:
@@ -142,7 +142,7 @@ class Gripper(Protocol):
 
 @runtime_checkable
 class Camera(Protocol):
-    """A stream of pictures of which only the newest matters."""
+    """A stream of images; only the newest counts."""
 
     @property
     def rate(self) -> float:
@@ -151,11 +151,11 @@ class Camera(Protocol):
 
     @property
     def problem(self) -> str:
-        """What a person should know: lost, frozen; empty if all is well."""
+        """Problem for a person to know, such as lost or frozen; empty if none."""
         ...
 
     def read(self) -> Frame:
-        """The newest frame; it waits for the first, DriverError if none comes."""
+        """Return the newest frame; wait for the first, DriverError if none comes."""
         ...
 
     def close(self) -> None:
@@ -169,7 +169,7 @@ class TactileSensor(Camera, Protocol):
 
     @property
     def model(self) -> SensorModel:
-        """What the sensor is."""
+        """Model of the sensor."""
         ...
 
 
@@ -178,7 +178,7 @@ class LoadCell(Protocol):
     """A one-axis force sensor."""
 
     def read(self) -> LoadReading:
-        """The newest accepted line; it waits for the first, DriverError if none comes."""
+        """Return the newest accepted line; wait for the first, DriverError if none comes."""
         ...
 
     def close(self) -> None:

@@ -164,7 +164,7 @@ IDEAL_DEPLOYMENT = DeploymentConfig(
     plan_ticks=(0,),
     force_ceiling=False,
 )
-# Measured on the wire, `shared/research/deployment.md`: a state is 7 to 18 ms old, commands take 20 to
+# Measured on the wire (touchgoal benchmark deploy, replay): a state is 7 to 18 ms old, commands take 20 to
 # 25 ms of which the tracker has its share; fingertips and cameras send 25 to 30 pictures a second; a
 # plan is asked for a tick early.
 AS_DEPLOYED = DeploymentConfig(

@@ -102,3 +102,11 @@ def test_the_robots_pc_needs_neither_torch_nor_mujoco() -> None:
     """With both blocked the scripted plan and a user's policy run on a cell; the command parses."""
     program = Path(__file__).parent / "without_torch_and_mujoco.py"
     subprocess.run([sys.executable, program], check=True, timeout=120)
+
+
+def test_code_cites_published_sources() -> None:
+    """Notes that only the authors have are no source for a limit or a constant."""
+    private = [
+        str(p) for f in ORDER for p in (ROOT / f).rglob("*.py") if "shared/" in p.read_text()
+    ]
+    assert not private

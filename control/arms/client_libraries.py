@@ -1,4 +1,4 @@
-"""The makers' client libraries through which arms are driven: their names, and how to install them."""
+"""The makers' client libraries that drive the arms, and how to install them."""
 
 import importlib
 import importlib.metadata
@@ -10,11 +10,11 @@ from touchgoal.runtime.errors import UserError, install_extra
 
 @dataclass(frozen=True)
 class ClientLibrary:
-    """One library.
+    """A client library.
 
     Attributes:
-        package: its name on PyPI.
-        install: how to get it, for messages.
+        package: name on PyPI.
+        install: how to install it, for messages.
     """
 
     package: str
@@ -22,14 +22,14 @@ class ClientLibrary:
 
     @property
     def version(self) -> str | None:
-        """Of what is installed; None where it is not."""
+        """Installed version; None if it is not installed."""
         try:
             return importlib.metadata.version(self.package)
         except importlib.metadata.PackageNotFoundError:
             return None
 
     def load(self, module: str) -> Any:
-        """One of its modules; UserError with how to install it where it is missing."""
+        """Import one of its modules; UserError with how to install it if it is missing."""
         try:
             return importlib.import_module(module)
         except ImportError as error:

@@ -1,9 +1,9 @@
-"""A driver in a process of its own: it may hang, crash or lose its parent, and is ended in time.
+"""A driver in its own process, which may hang, crash or lose its parent, and is ended in time.
 
 Vendors' client libraries hang on a taken robot, ignore Ctrl-C and crash when a link drops. Here they
-run in a fresh interpreter that imports nothing else. Three things end it: a call that is not answered
-in time, a dead parent (the pipe closes), and the kernel's alarm when the library hangs meanwhile; a
-controller stops its arm when its client is gone.
+run in a fresh interpreter that imports nothing else. It ends when a call is not answered in time, when
+the parent dies (the pipe closes), or by the kernel's alarm when the library hangs. A controller stops
+its arm when its client is gone.
 """
 
 import os
@@ -23,13 +23,13 @@ from touchgoal.runtime.errors import UserError
 
 _GRACE = 1.0  # s that the kernel's alarm gives beyond the parent's patience
 _CLOSING = 3.0  # s to bring an arm to rest and disconnect
-NEVER = 1e6  # s, as a driver's period: it ticks when it is told to
+NEVER = 1e6  # s, period of a driver that ticks on request alone
 _EXIT_WITH_REASON = 3  # exit code; the reason is the last line of output
 
 
 @runtime_checkable
 class Driver(Protocol):
-    """What runs in the child: `tick` every `period` s, any other method when the parent calls it."""
+    """Driver in the child process: `tick` runs every `period` s, other methods on the parent's call."""
 
     period: float
 
@@ -43,16 +43,16 @@ class Driver(Protocol):
 
 
 class DriverProcess:
-    """Parent's end: makes `driver(*args)` in a child process and calls its methods.
+    """Parent's end: it makes `driver(*args)` in a child process and calls its methods.
 
     `driver` is a class at the top of an importable module; arguments and answers are pickled. Calls
     may come from several threads, not from a signal handler.
 
     Attributes:
-        exit_reason: why there is no process any more; empty while there is.
+        exit_reason: why the process ended; empty while it runs.
 
     Raises:
-        UserError, DriverError: what the driver raised, or it did not connect in time.
+        UserError, DriverError: raised by the driver, or it did not connect in time.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class DriverProcess:
         return self._process.poll() is None
 
     def call(self, method: str, *args: Any, timeout: float = 1.5) -> Any:
-        """The method's result; DriverError if it fails, or takes too long and is killed."""
+        """Return the method's result; DriverError if it fails, or takes too long and is killed."""
         return self._exchange((method, args, timeout), timeout, method)
 
     def close(self) -> None:
@@ -129,24 +129,24 @@ class DriverProcess:
         if code == _EXIT_WITH_REASON:
             return last
         how = signal.Signals(-code).name if code < 0 else f"code {code}"
-        return f"{self._name} ended by itself ({how}): {last or 'it said nothing'}"
+        return f"{self._name} ended by itself ({how}): {last or 'without a message'}"
 
 
 def _picklable(error: Exception) -> Exception:
-    """An exception that the parent can unpickle without the client's library."""
+    """Return an exception that the parent can unpickle without the client's library."""
     if isinstance(error, UserError | DriverError):
         return error
     return DriverError(error_line(error))
 
 
 def error_line(error: Exception) -> str:
-    """What a library says, for a person; the project's own errors are for a person already."""
+    """Return the message for a person, on one line."""
     text = " ".join(str(error).split())
     return text if isinstance(error, UserError | DriverError) else f"{type(error).__name__}: {text}"
 
 
 def _alarm(seconds: float) -> None:
-    """From now on the kernel ends this process unless it calls again within `seconds`."""
+    """Let the kernel end this process unless it calls again within `seconds`."""
     signal.setitimer(signal.ITIMER_REAL, seconds)
 
 
@@ -161,7 +161,7 @@ def _answer(driver: Driver, pipe: Connection) -> None:
 
 
 def _serve(driver: Driver, pipe: Connection) -> None:
-    """Ticks and answers until the parent closes the pipe or dies."""
+    """Tick and answer until the parent closes the pipe or dies."""
     due = time.monotonic()
     while True:
         _alarm(driver.period + _CLOSING)

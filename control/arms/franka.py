@@ -29,11 +29,12 @@ STATE_TIMEOUT = 0.5  # s; libfranka itself gives up after 1 s
 _COMMAND_MS = 100  # of each
 _POSITION_GAIN = 10.0  # 1/s towards the commanded position
 _SHARE = 0.9  # of franky's limits that the stream uses; the rest is for the pull
-_TORQUE_REFLEX, _FORCE_REFLEX = 20.0, 30.0  # Nm and N; franky's defaults, beyond RobotLimits.force
+# Nm and N: franky's defaults for libfranka's setCollisionBehavior, above RobotLimits.force.
+_TORQUE_REFLEX, _FORCE_REFLEX = 20.0, 30.0
 
 
 class FrankaClient(ArmClient):
-    """In the child: one FR3."""
+    """One FR3, in the driver's process."""
 
     def _connect(self, recover: bool) -> JointLimits:
         self._franky = client = FRANKY.load("franky")
@@ -53,7 +54,7 @@ class FrankaClient(ArmClient):
         return self._limits(robot)
 
     def _limits(self, robot: "franky.Robot") -> JointLimits:
-        """Sets franky's limits and returns the stream's.
+        """Set franky's limits and return the stream's.
 
         franky's defaults are the Panda's, in part above the FR3's, and cannot be raised where they
         are below; 1 and 2 % are for the controller's differences of rounded positions.
@@ -126,11 +127,11 @@ class FrankaClient(ArmClient):
 
 
 def wrench_on_robot(estimate: Float[np.ndarray, "6"]) -> Float[np.ndarray, "6"]:
-    """libfranka's O_F_ext_hat_K (N, Nm) as a wrench of the environment on the robot.
+    """Return libfranka's O_F_ext_hat_K (N, Nm) as a wrench of the environment on the robot.
 
     libfranka's robot_state.h: "Forces applied by the robot to the environment are positive, while
     forces applied by the environment on the robot are negative. Becomes [0,0,0,0,0,0] when near or in
-    a singularity." Nothing is known there: not a number.
+    a singularity." The result is NaN there: unknown.
     """
     return np.full(6, np.nan) if not np.any(estimate) else -np.asarray(estimate)
 

@@ -1,7 +1,7 @@
-"""What the Franka's and the UR's drivers share: targets become a stream, faults latch.
+"""Common part of the Franka's and the UR's drivers: targets become a stream, faults latch.
 
-The policy's targets (10 to 20 Hz) go through the tracker, so whatever comes when, the stream stays
-inside the interface's limits and ends at rest at the last target.
+The policy's targets (10 to 20 Hz) go through the tracker, so the stream stays inside the
+interface's limits and ends at rest at the last target.
 """
 
 import time
@@ -26,17 +26,16 @@ _REST, _LOOK = 0.01, 0.05  # rad/s over so many s that count as rest
 
 @dataclass(frozen=True)
 class ArmConfig:
-    """Where an arm is and how it is driven.
+    """Address of an arm and rates of its driver.
 
     Attributes:
         address: of the controller.
-        robot: its geometry, tool and limits.
-        hz: of the commands that come.
-        rate: Hz of the stream that goes out.
+        robot: geometry, tool and limits.
+        hz: rate of the incoming commands.
+        rate: rate of the outgoing stream, Hz.
         state_timeout: s without news of the controller after which it is lost. Each driver has its own;
             a simulator on a loaded machine needs more.
-        lock_step: a twin's time stands but when told to go on; then `advance` takes the place of the
-            clock's ticks.
+        lock_step: the twin advances only when `advance` is called.
     """
 
     address: str
@@ -48,10 +47,10 @@ class ArmConfig:
 
 
 class ArmClient(ABC):
-    """In the child: a vendor's client behind five methods. `config.rate` times a second it ticks.
+    """A vendor's client behind five methods, in the driver's process; it ticks at `config.rate`.
 
-    When the link is lost, by the controller's silence too, the process ends: no library mends its
-    link while nobody looks, and a controller stops the arm of a dead client.
+    When the link is lost, or the controller is silent, the process ends: no library reconnects
+    unwatched, and a controller stops the arm of a dead client.
     """
 
     _commanded: Joints  # the controller's own present command, rad; `_measure` sets it
@@ -75,11 +74,11 @@ class ArmClient(ABC):
 
     @abstractmethod
     def _connect(self, recover: bool) -> JointLimits:
-        """Take the arm, clearing its errors if a person asked for that; what the stream may use."""
+        """Connect, clear errors if a person asked for that, and return the stream's limits."""
 
     @abstractmethod
     def _measure(self) -> ArmReading:
-        """The newest state, stamped by `_stamped`. It and `_send` raise when the link is lost."""
+        """Return the newest state, stamped by `_stamped`. It and `_send` raise when the link is lost."""
 
     @abstractmethod
     def _send(self, q: Joints, velocity: Joints) -> None:
@@ -91,14 +90,14 @@ class ArmClient(ABC):
 
     @abstractmethod
     def _disconnect(self) -> None:
-        """Let go of the arm; an exception changes nothing."""
+        """Disconnect; an exception changes nothing."""
 
     def read(self) -> ArmReading:
-        """The state as of the last tick."""
+        """Return the state as of the last tick."""
         return replace(self._reading, fault=self._refusal)
 
     def command(self, q: Joints) -> None:
-        """A new target (rad)."""
+        """Set a new target (rad)."""
         if self._refusal:
             raise DriverError(f"no command is taken: {self._refusal}")
         limits = self.config.robot.interface
@@ -116,7 +115,7 @@ class ArmClient(ABC):
     def tick(self) -> None:
         """Read the state and stream the next command.
 
-        The stream goes by the controller's clock: a simulator may be slower than the one on the wall.
+        The stream follows the controller's clock: a simulator may be slower than real time.
         """
         now = time.monotonic()
         punctual = now - self._ticked < self.config.state_timeout / 2
@@ -144,13 +143,13 @@ class ArmClient(ABC):
         self._streams = True
 
     def advance(self, time: float) -> bool:
-        """Tick at a twin's time (s); whether its stream goes out, and the arm is to be driven by it."""
+        """Tick at a twin's time (s); return whether the stream drives the arm."""
         self._twin_time = time
         self.tick()
         return self._streams
 
     def close(self) -> None:
-        """Bring the arm to rest and let go of it."""
+        """Bring the arm to rest and disconnect."""
         self._refuse_from_now_on("closed")
         end = time.monotonic() + _BRAKING
         with suppress(Exception):
@@ -175,14 +174,14 @@ class ArmClient(ABC):
             self._disconnect()
 
     def _stamped(self, clock: float) -> float:
-        """The stamp of a measurement with the controller's time: now if it advanced, else as before."""
+        """Return the stamp of a measurement: now if the controller's clock advanced, else as before."""
         if clock != self._clock:
             self._clock, self._stamp = clock, time.monotonic()
         return self._stamp
 
 
 class ArmProcess:
-    """The Arm protocol over an ArmClient in a child process."""
+    """Arm over an ArmClient in a child process."""
 
     def __init__(
         self, client: type[ArmClient], config: ArmConfig, connect_timeout: float = 30.0
@@ -194,7 +193,7 @@ class ArmProcess:
         self._last: ArmReading = self._process.call("read")
 
     def read(self) -> ArmReading:
-        """See Arm. Of a lost arm it is the last reading, with the reason as its fault."""
+        """See Arm. A lost arm keeps its last reading, with the reason as its fault."""
         try:
             self._last = self._process.call("read")
         except DriverError as error:
@@ -206,14 +205,14 @@ class ArmProcess:
         self._process.call("command", q)
 
     def advance(self, time: float) -> bool:
-        """See ArmClient; False of a lost arm, whose next reading says so."""
+        """See ArmClient; False for a lost arm."""
         try:
             return self._process.call("advance", time)
         except DriverError:
             return False
 
     def stop(self) -> None:
-        """See Arm. There is nothing to do for a lost arm: its controller stops it."""
+        """See Arm. A lost arm is stopped by its controller."""
         if self._process.alive:
             with suppress(DriverError):
                 self._process.call("stop")
@@ -237,5 +236,5 @@ class ArmProcess:
 def shift_wrench(
     wrench: Float[np.ndarray, "6"], origin: Float[np.ndarray, "3"], point: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "6"]:
-    """A wrench (N, Nm) about `origin` as seen about `point` (m), all in one frame."""
+    """Return a wrench (N, Nm) about `origin` as a wrench about `point` (m), all in one frame."""
     return np.concatenate([wrench[:3], wrench[3:] + np.cross(origin - point, wrench[:3])])

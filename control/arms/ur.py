@@ -1,9 +1,8 @@
 """Universal Robots e-Series (UR5e) through ur-rtde, in a child process.
 
-ur-rtde says that a command succeeded when the link is long dead, and later connects again by itself
-and crashes (measured). So the controller's clock is watched here, 50 ms of standstill end the
-process, and only a person's `recover` starts a new one. The controller's own watchdog stops the
-arm if this process dies.
+ur-rtde reports success on a dead link, and later reconnects by itself and crashes (measured). So 50 ms
+without progress of the controller's clock end the process, and only a person's `recover` starts a new
+one. The controller's own watchdog stops the arm if this process dies.
 """
 
 import time
@@ -31,7 +30,7 @@ _WATCHDOG = 10.0  # Hz; with fewer commands the controller stops its program, an
 
 
 class UrClient(ArmClient):
-    """In the child: one UR."""
+    """One UR, in the driver's process."""
 
     def _connect(self, recover: bool) -> JointLimits:
         robot = self.config.robot
@@ -44,14 +43,14 @@ class UrClient(ArmClient):
             raise DriverError(self._stopped())
         self._control = UR_RTDE.load("rtde_control").RTDEControlInterface(self.config.address)
         self._control.setPayload(robot.tool.mass, list(robot.tool.centre_of_mass))
-        if not recover:  # what presses after a stop is to be felt
+        if not recover:  # a force that remains after a stop must stay visible
             self._control.zeroFtSensor()
         self._control.setWatchdog(_WATCHDOG)
         self._lookahead = float(np.clip(2 * self.period, *_LOOKAHEAD))
         return self.config.robot.interface
 
     def _unlock(self) -> None:
-        """As a person does it at the pendant; the controller refuses for the first 5 s."""
+        """Unlock as at the pendant; the controller refuses for the first 5 s."""
         dashboard = UR_RTDE.load("dashboard_client").DashboardClient(self.config.address)
         dashboard.connect(int(1e3 * _UNLOCKING))
         dashboard.closeSafetyPopup()
@@ -115,5 +114,5 @@ class UrClient(ArmClient):
 
 
 def connect_ur(config: ArmConfig) -> ArmProcess:
-    """Connects to a UR in remote control."""
+    """Connect to a UR in remote control."""
     return ArmProcess(UrClient, config)

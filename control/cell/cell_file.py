@@ -71,9 +71,7 @@ def read_cell_file(
             cell = replace(cell, arm="sim")
         if seed is not None:
             if cell.arm != "sim" and not cell.task.twin:
-                raise UserError(
-                    "--seed is of a simulated arm or a twin: nobody can set a real scene"
-                )
+                raise UserError("--seed sets a simulated scene; leave it out on a real arm")
             cell = replace(cell, task=replace(cell.task, seed=seed))
     except ValidationError as error:
         raise UserError(f"{path}: {_explain(error)}") from error
@@ -83,7 +81,7 @@ def read_cell_file(
 
 
 def cell_table(cell: CellConfig) -> dict[str, Any]:
-    """A cell as a cell file has it, ready for JSON; what is as by default is left out."""
+    """Return a cell as JSON-able keys of a cell file, without defaults."""
     return _CELL.dump_python(cell, mode="json", exclude_defaults=True)
 
 
@@ -100,7 +98,7 @@ def _refuse_control_characters(path: Path, value: Any, name: str = "") -> None:
 
 
 def _explain(error: ValidationError) -> str:
-    """The first mistake in one line; unknown keys first, as they are often missing ones misspelt."""
+    """Return the first mistake in one line; unknown keys first, often misspelt ones."""
     found = error.errors()
     unknown = [e for e in found if e["type"] == "unexpected_keyword_argument"]
     first = (unknown or found)[0]
@@ -126,7 +124,7 @@ def _explain(error: ValidationError) -> str:
 
 
 def _section(where: list[str]) -> Any:
-    """The dataclass that a section's keys belong to."""
+    """Return the dataclass of a section."""
     kind: Any = CellConfig
     for key in where:
         kind = _dataclass_in(get_type_hints(kind).get(key)) or kind
@@ -134,14 +132,14 @@ def _section(where: list[str]) -> Any:
 
 
 def _dataclass_in(hint: Any) -> Any:
-    """The dataclass that a hint names, if any: itself, or in an optional, or in a dictionary."""
+    """Return the dataclass in a type hint, if any."""
     if is_dataclass(hint):
         return hint
     return next((kind for part in get_args(hint) if (kind := _dataclass_in(part))), None)
 
 
 def _meaning(location: tuple[int | str, ...]) -> str:
-    """What the key stands for, from its field."""
+    """Return the description of a key's field."""
     keys = [str(part) for part in location]
     for end in range(len(keys), 0, -1):
         found = _section(keys[: end - 1]).__pydantic_fields__.get(keys[end - 1])

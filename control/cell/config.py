@@ -1,7 +1,6 @@
-"""The cell file's content: which arm, gripper, sensors, task and limits belong together.
+"""Sections and keys of a cell file: arm, gripper, sensors, task and limits of one cell.
 
-Every field says what it means and what is allowed; `cell_file` reads a file into these and puts both
-into its messages.
+`cell_file` puts each field's description and range into its messages.
 """
 
 from dataclasses import field
@@ -50,7 +49,7 @@ class GripperSection:
 
 @dataclass(frozen=True, config=STRICT)
 class ToolSection:
-    """What the arm carries: gripper, mounts and fingertip sensors together.
+    """Everything the arm carries: gripper, mounts and fingertip sensors together.
 
     Hand frame: at the flange, z out of it, the fingers close along y.
     """
@@ -58,7 +57,7 @@ class ToolSection:
     tcp: Annotated[float, Field(gt=0, le=0.5)]
     """Distance from the flange to the middle between the two gels' centres, along the hand's z axis, m."""
     mass: Annotated[float, Field(gt=0, le=10)]
-    """Mass of all beyond the flange, kg."""
+    """Mass beyond the flange, kg."""
     centre_of_mass: HandPoint
     """Centre of that mass, m (hand frame)."""
     finger_corners: Annotated[tuple[HandPoint, ...], Field(min_length=4)]
@@ -70,26 +69,26 @@ class FingertipsSection:
     """The two fingertip sensors."""
 
     sensor: str
-    """Which model both are, such as gelsight_mini."""
+    """Model of both sensors, such as gelsight_mini."""
     left: str
     """USB serial number, or address of a stream."""
     right: str
     """USB serial number, or address of a stream."""
     rate: Rate | None = None
-    """Pictures a second, Hz; not given: the model's."""
+    """Pictures a second, Hz; default: the model's."""
     sensor_files: tuple[str, str] | None = None
-    """Folders that calibrate made of the left and of the right sensor; not given: the model's for both."""
+    """Folders that calibrate wrote for the left and the right sensor; default: the model's for both."""
     size: tuple[Pixels, Pixels] | None = None
-    """Width and height to ask the sensors' cameras for, pixels; not given: their default."""
+    """Width and height to ask the sensors' cameras for, pixels; default: their default."""
     border: Annotated[float, Field(ge=0, lt=0.5)] | None = None
-    """Share cut off at each side of a camera's picture; not given: the model's."""
+    """Share cut off at each side of a camera's picture; default: the model's."""
     corners: tuple[Corners, Corners] | None = None
-    """Of the left and of the right gel in its camera's picture, px (top left, top right, bottom left, bottom
-    right), where the camera sees it at an angle (gelsight_wedge), in place of a border."""
+    """Corners of the left and the right gel in the camera's picture, px (top left, top right, bottom left,
+    bottom right), for a camera at an angle (gelsight_wedge), in place of a border."""
     exposure: Exposure | None = None
-    """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); not given: as it is set."""
+    """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); default: as it is set."""
     white_balance: Kelvin | None = None
-    """White balance to lock, K; not given: as it is set."""
+    """White balance to lock, K; default: as it is set."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -101,35 +100,35 @@ class CameraSection:
     rate: Rate = 30.0
     """Pictures a second, Hz."""
     size: tuple[Pixels, Pixels] | None = None
-    """Width and height to ask the camera for, pixels; not given: its default."""
+    """Width and height to ask the camera for, pixels; default: its default."""
     exposure: Exposure | None = None
-    """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); not given: as it is set."""
+    """Exposure to lock, in the camera's units (v4l2-ctl --list-ctrls); default: as it is set."""
     white_balance: Kelvin | None = None
-    """White balance to lock, K; not given: as it is set."""
+    """White balance to lock, K; default: as it is set."""
 
 
 @dataclass(frozen=True, config=STRICT)
 class TaskSection:
-    """What is to be done."""
+    """The task."""
 
     name: Literal["pick-place", "bead-maze"]
-    """Which task."""
+    """Name of the task."""
     policy: Annotated[str, Field(min_length=1)]
-    """Who acts: expert (pick-place, from known positions), follower (bead-maze), shipped, a folder that
-    train-policy made, or a class of your own (file.py:Class)."""
+    """Policy: expert (pick-place, from known positions), follower (bead-maze), shipped, a folder that
+    train-policy made, or a class of your own (file.py:Class), whose code then runs."""
     instruction: str = ""
-    """The task in words; it is recorded."""
+    """Instruction in words, for the record."""
     seconds: Annotated[float, Field(gt=0, le=3600)] = 30.0
-    """After how many seconds the run ends."""
+    """Time limit of the run, s."""
     start: tuple[Angle, ...] | None = None
-    """Joint positions to begin from, rad; not given: from where the arm is."""
+    """Joint positions to begin from, rad; default: those of the arm."""
     grasp: tuple[Coordinate, Coordinate, Coordinate, Angle] | None = None
-    """For the expert, where to close the hand: x, y, z (m, base frame) and yaw (rad)."""
+    """Expert's grasp: x, y, z (m, base frame) and yaw (rad) of the closing hand."""
     goal: tuple[Coordinate, Coordinate] | None = None
-    """For the expert, where on the table the object is to go: x, y (m, base frame)."""
+    """Expert's goal for the object on the table: x, y (m, base frame)."""
     twin: str = ""
-    """Control port (token@host:port) of a twin: it puts its scene back before each run, and says where
-    things are and whether the task is done."""
+    """Control port (token@host:port) of a twin, which resets its scene before each run and reports the
+    places of objects and the success."""
     seed: Seed = seeds.EVALUATION.start
     """Random seed of the scene of a simulated arm or a twin."""
     objects: tuple[str, ...] = ()
@@ -140,16 +139,16 @@ class TaskSection:
     """Goals whose distance is shown and recorded during the run, as those of reward-curves:
     episode:FOLDER#K, image:PATH, text:SENTENCE."""
     encoder: str = ""
-    """Touch encoder that measures that distance, by name or folder; sentences need one that is aligned with
-    texts. Not given: the one that ships for the fingertips."""
+    """Touch encoder for that distance, by name or folder; sentences need one aligned with texts. Default:
+    the one that ships for the fingertips."""
     normalizer: str = ""
-    """What normalises that distance: a normalizer.json that fit-normalizer made of successes in this cell. Not
-    given: the encoder's own on a simulated arm or a twin, the raw distance elsewhere."""
+    """Normaliser of that distance: a normalizer.json that fit-normalizer made from successes in this cell.
+    Default: the encoder's own on a simulated arm or a twin, the raw distance elsewhere."""
 
 
 @dataclass(frozen=True, config=STRICT)
 class SafetySection:
-    """Limits for this cell; what is not given stays as in `control.safety.limits`."""
+    """Limits for this cell; defaults are in `control.safety.limits`."""
 
     flange_lower: Corner | None = None
     """Lower corner of the box that the flange stays in, m (base frame)."""
@@ -164,19 +163,19 @@ class SafetySection:
     velocity_share: Annotated[float, Field(gt=0, le=1)] | None = None
     """Share of the maker's joint speed that a policy may use."""
     force: Annotated[float, Field(gt=0, le=100)] | None = None
-    """Force from outside at the hand that stops the arm, N, and change of the load cell's; not given: the
+    """Force from outside at the hand that stops the arm, N, and change of the load cell's; default: the
     task's own, which is above what its demonstrations reach and below the arm's reflex."""
     torque: Annotated[float, Field(gt=0, le=100)] | None = None
-    """Torque from outside in a joint that stops the arm, Nm; not given: the task's own."""
+    """Torque from outside in a joint that stops the arm, Nm; default: the task's own."""
     indentation: Annotated[float, Field(gt=0, le=0.005)] | None = None
-    """Depth that a gel is pressed in at which the arm stops and the hand opens, m; not given: the task's
+    """Depth that a gel is pressed in at which the arm stops and the hand opens, m; default: the task's
     own, as deep as the sensor file can read."""
     observation_age: Seconds = 0.1
     """Age of a picture at which the arm holds, s; five times that stops it."""
     state_age: Seconds = 0.05
     """Age of the arm's state at which the arm holds, s; five times that stops it."""
     state_timeout: Seconds | None = None
-    """Seconds without news of the controller after which it counts as lost; not given: the driver's."""
+    """Time without news of the controller after which it counts as lost, s; default: the driver's."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -184,32 +183,32 @@ class CellConfig:
     """Everything `deploy` needs to know."""
 
     arm: Literal["fr3", "ur5e", "sim"]
-    """Which arm; sim is a simulated FR3 in place of what is named."""
+    """Arm; sim is a simulated FR3."""
     gripper: GripperSection
     """The gripper."""
     task: TaskSection
-    """What is to be done."""
+    """The task."""
     tool: ToolSection | None = None
-    """What the arm carries; a simulated arm has its own."""
+    """Gripper, mounts and fingertips together; a simulated arm has its own."""
     address: str = ""
     """Network address of the arm's controller, such as 172.16.0.2."""
     fingertips: FingertipsSection | None = None
     """The two fingertip sensors."""
     cameras: dict[CameraName, CameraSection] = field(default_factory=dict)
-    """The cameras by where they are."""
+    """Cameras by place, front or wrist."""
     load_cell: LoadCellConfig | None = None
     """A load cell under the table."""
     safety: SafetySection = field(default_factory=SafetySection)
     """Limits for this cell."""
     lock_step: bool = False
-    """Whether the arm is a twin that waits for its client; the control loop then goes by its clock."""
+    """Whether the arm is a twin that waits for its client; the control loop then follows its clock."""
 
     @property
     def time_waits(self) -> bool:
-        """Whether the arm's time stands still while this program works: all goes by that time."""
+        """Whether the arm's time stands still while this program works."""
         return self.arm == "sim" or self.lock_step
 
     @property
     def sensor(self) -> str:
-        """The fingertips' model."""
+        """Model of the fingertips."""
         return self.fingertips.sensor if self.fingertips else "gelsight_mini"

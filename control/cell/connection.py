@@ -1,4 +1,4 @@
-"""A cell's devices, connected: what the control loop reads and commands, and by which clock."""
+"""A cell's connected devices, and the clock that the control loop follows."""
 
 import time
 from collections import deque
@@ -38,18 +38,18 @@ _HISTORY_LENGTH = 2000  # of them
 
 @runtime_checkable
 class Clock(Protocol):
-    """What a control loop goes by, in s."""
+    """Clock of a control loop, s."""
 
     def now(self) -> float:
-        """The present, from any origin."""
+        """Return the present time, from any origin."""
         ...
 
     def age(self, stamp: float) -> float:
-        """Since a reading's stamp."""
+        """Return the time since a reading's stamp."""
         ...
 
     def wait(self, until: float) -> None:
-        """Return then, or at once if that has gone by."""
+        """Wait until that time, if it lies ahead."""
         ...
 
 
@@ -70,10 +70,10 @@ class RealClock:
 
 
 class ArmClock:
-    """The arm's own: of a UR's twin in lock-step, whose time passes as slowly as the machine needs.
+    """The arm's own clock, for a UR's twin in lock-step, whose time passes as the machine allows.
 
-    Stamps count the time on the wall; what the arm's clock said then is remembered. When it stands
-    for longer than a loaded machine explains, time goes on all the same, so that ages tell.
+    Stamps are wall time; a history maps them to the arm's. When the arm's clock stands for longer than
+    a loaded machine explains, time goes on all the same, so that ages show it.
     """
 
     def __init__(self, arm: Arm) -> None:
@@ -104,9 +104,8 @@ class CellConnection:
     """Connected devices; `close` brings the arm to rest and releases all of them.
 
     Attributes:
-        cameras: fingertips included, by their key in the vocabulary.
-        truth: what a simulator knows (`sim_envs.twin.cell.SimulatedCell.truth`); None of a real cell. It may
-            take a while: not for the control loop.
+        cameras: with the fingertips, by their key in `features`.
+        truth: returns what a simulator knows; None for a real cell. It may take a while.
     """
 
     robot: RobotLimits
@@ -118,7 +117,7 @@ class CellConnection:
     truth: Callable[[], dict[str, Any]] | None = None
 
     def close(self) -> None:
-        """The arm first; a device that fails to close holds up no other."""
+        """Close the arm first; a device that fails to close holds up no other."""
         if isinstance(self.clock, LockStepClock):
             self.clock.close()
         with ExitStack() as stack:
@@ -131,7 +130,7 @@ def connect_cell(cell: CellConfig, hz: float) -> CellConnection:
     """Connect to everything in a cell with a real arm or a twin; commands will come at `hz`.
 
     Raises:
-        UserError, DriverError: something is not there; what was connected is released.
+        UserError, DriverError: a device is missing; the connected ones are released.
     """
     robot = cell_limits(cell)
     with ExitStack() as undo:
@@ -181,7 +180,7 @@ def _gripper(cell: CellConfig) -> Gripper:
 
 
 def _tactile_camera(whole: CellConfig, cell: FingertipsSection, side: int) -> TactileCamera:
-    """Of the left (0) or right (1) finger, at a device, a USB serial number or a stream."""
+    """Open the left (0) or right (1) fingertip at a device, a USB serial number or a stream."""
     source = (cell.left, cell.right)[side]
     model = find_sensor(cell.sensor_files[side] if cell.sensor_files else cell.sensor)
     corners = cell.corners[side] if cell.corners else None
@@ -197,7 +196,7 @@ def _tactile_camera(whole: CellConfig, cell: FingertipsSection, side: int) -> Ta
 
 
 def _timed(config: VideoConfig, cell: CellConfig) -> VideoConfig:
-    """Pictures of a lock-step twin come when they come."""
+    """Return the video's settings without deadlines for a lock-step twin, whose pictures come late."""
     if not cell.lock_step:
         return config
     return replace(

@@ -1,8 +1,8 @@
-"""The clock of a twin in lock-step: its time stands but while a deployment waits for it.
+"""Clock of a twin in lock-step: its time advances only while a deployment waits for it.
 
-So nothing depends on how fast the machine is: the same seed and cell file give the same run. Arm and
-hand are told of every step, and what is on its way, a command to the hand, its answer, a picture, is
-waited for before time goes on. libfranka's own 1 kHz loop takes part in every millisecond as ever.
+So nothing depends on the machine's speed: the same seed and cell file give the same run. Arm and hand
+take part in every step, and time goes on only once every command, answer and picture under way has
+arrived. libfranka's own 1 kHz loop takes part in every millisecond.
 """
 
 import json
@@ -28,7 +28,7 @@ _HISTORY_LENGTH = 400  # of a few steps each, for the ages of readings
 
 
 class LockStepClock:
-    """See Clock. Once a twin has ended, time goes on as on the wall, so that ages tell."""
+    """See Clock. Once a twin has ended, time goes on in real time, so that ages show it."""
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class LockStepClock:
         cameras: dict[str, Camera],
         load_cell: SerialLoadCell | None,
     ) -> None:
-        """Let the twin's time stand; `address` (token@host:port) is of its control port.
+        """Stop the twin's time; `address` (token@host:port) is its control port.
 
         Raises:
             UserError: no twin is there, or it is not in lock-step.
@@ -112,8 +112,7 @@ class LockStepClock:
             self._arm.advance(self._time)
 
     def _swallowed_pictures(self, sent: dict[str, int]) -> dict[str, int]:
-        """How many of those sent each camera has not counted, once all have arrived; DriverError of a
-        camera that is broken."""
+        """Return the number of sent pictures that each camera has missed; DriverError for a broken one."""
         while True:
             found = {
                 key: sent[n] - camera.read().sequence for key, n, camera in self._streams(sent)
@@ -126,12 +125,12 @@ class LockStepClock:
                 return found
 
     def _streams(self, sent: dict[str, int]) -> list[tuple[str, str, Camera]]:
-        """Key, the twin's name and the camera of each of its streams that is read here."""
+        """Return key, the twin's name and camera of each stream that is read here."""
         named = ((key, key.rpartition(".")[2], camera) for key, camera in self._cameras.items())
         return [(key, name, camera) for key, name, camera in named if name in sent]
 
     def _await_pictures(self, sent: dict[str, int]) -> None:
-        """Until all that the twin has sent are here, or are not going to be."""
+        """Wait for all pictures that the twin has sent, but for lost ones."""
         end = time.monotonic() + _PICTURE_TIMEOUT
         for key, name, camera in self._streams(sent):
             with suppress(DriverError):
@@ -142,8 +141,7 @@ class LockStepClock:
                     time.sleep(_DT / 2)
 
     def _await_load(self, sent: float) -> None:
-        """Until the load cell's line of that time is here. One whose lines are lost is not waited for
-        again."""
+        """Wait for the load cell's line of that time; a cell that loses lines is not waited for again."""
         end = time.monotonic() + _PICTURE_TIMEOUT
         while self._load_cell is not None and self._load_cell.clock < sent:
             if time.monotonic() > end:

@@ -1,4 +1,4 @@
-"""What a connection's devices say in one control tick, in the vocabulary and with its age."""
+"""Observation of one control tick from a cell's devices, with its age."""
 
 from dataclasses import dataclass, replace
 
@@ -26,15 +26,16 @@ _MAX_LOAD_CELL_AGE = 0.5  # s without a good line after which a load cell counts
 
 @dataclass(frozen=True)
 class CellReading:
-    """One tick.
+    """Readings of one tick.
 
     Attributes:
         observation: by the keys of `control/features.py`.
-        age: s since the oldest picture was taken.
-        oldest_source: whose picture that was.
-        indentation: m that the left and the right gel are pressed in; 0 without fingertips.
-        arm, gripper: the last ones in which all are numbers, with the stamps of then: ages tell.
-        fault: what a device says is wrong with it; empty if nothing.
+        arm, gripper: the last ones without NaN, with their own stamps, so that ages tell.
+        load: of the load cell; None without one.
+        age: of the oldest picture, s.
+        oldest_source: source of that picture.
+        indentation: depth in the left and the right gel, m; 0 without fingertips.
+        fault: a device's own report of a fault; empty if none.
     """
 
     observation: dict[str, np.ndarray]
@@ -48,9 +49,7 @@ class CellReading:
 
 
 class ObservationReader:
-    """Reads a connection whose fingertips are untouched at first.
-
-    It never waits: drivers keep the newest reading of everything.
+    """Reader of a connection whose fingertips are untouched at first; it never waits for a device.
 
     Attributes:
         unsound: values of the newest arm and gripper readings that are not numbers; empty if none.
@@ -60,7 +59,7 @@ class ObservationReader:
     def __init__(
         self, connection: CellConnection, camera_size: tuple[int, int] = ft.CAMERA_SHAPE[:2]
     ) -> None:
-        """Gives cameras' pictures that size; UserError if one takes smaller ones."""
+        """Resize camera images to that size (rows, columns); UserError if one takes smaller ones."""
         self._connection, self._size = connection, camera_size
         for key, camera in connection.cameras.items():
             taken = camera.read().image.shape[:2]
@@ -77,16 +76,14 @@ class ObservationReader:
             if isinstance(camera, TactileSensor)
         }
         self.has_fingertips = bool(self._meters)
-        self._indentations: dict[
-            str, tuple[int, float]
-        ] = {}  # sequence of the last frame, indentation
+        self._indentations: dict[str, tuple[int, float]] = {}  # frame's sequence, depth (m)
         self._arm: ArmReading | None = None
         self._gripper: GripperReading | None = None
         self._first_load: float | None = None
         self.unsound = ""
 
     def read(self) -> CellReading:
-        """The newest of everything; DriverError if something broke for good."""
+        """Return the newest readings; DriverError if a device broke for good."""
         connection = self._connection
         arm, gripper = self._sound(connection.arm.read(), connection.gripper.read())
         frames = {key: camera.read() for key, camera in connection.cameras.items()}
@@ -117,7 +114,7 @@ class ObservationReader:
         )
 
     def _sound(self, arm: ArmReading, gripper: GripperReading) -> tuple[ArmReading, GripperReading]:
-        """The newest of either without a value that is not a number; faults are always the newest."""
+        """Return the newest readings without NaN; faults are always the newest."""
         parts = {
             "joint positions": arm.q,
             "joint velocity": arm.velocity,
@@ -135,7 +132,7 @@ class ObservationReader:
         return replace(self._arm, fault=arm.fault), replace(self._gripper, fault=gripper.fault)
 
     def _indentation(self, frames: dict[str, Frame]) -> Float[np.ndarray, "2"]:
-        """Every picture is measured once: between two of them there is no news."""
+        """Return the depth in both gels; every image is measured once."""
         for key, meter in self._meters.items():
             frame = frames[key]
             if key not in self._indentations or self._indentations[key][0] != frame.sequence:
@@ -145,7 +142,7 @@ class ObservationReader:
         )
 
     def problem(self) -> str:
-        """What the cameras say is wrong with them, for a report."""
+        """Return the cameras' own reports of problems."""
         found = []
         for key, camera in self._connection.cameras.items():
             try:
@@ -157,7 +154,7 @@ class ObservationReader:
         return "; ".join(found)
 
     def added_load(self, load: LoadReading | None) -> float:
-        """Force (N) on the load cell beyond what lay on it when this reader began; 0 without one."""
+        """Return the change of the load cell's force (N) since the first reading; 0 without one."""
         if load is None:
             return 0.0
         if self._first_load is None:
@@ -165,7 +162,7 @@ class ObservationReader:
         return load.force - self._first_load
 
     def proprioception(self, arm: ArmReading, gripper: GripperReading) -> dict[str, np.ndarray]:
-        """What the arm and the gripper say, by the keys of the vocabulary."""
+        """Return state, TCP pose and wrench by their keys."""
         position, R = self._kinematics.forward(arm.q)
         values = {
             ft.STATE: np.concatenate([arm.q, arm.velocity, [gripper.width]]),
@@ -176,7 +173,7 @@ class ObservationReader:
 
 
 def quaternion(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
-    """Rotation as wxyz, its largest component positive, as MuJoCo has it."""
+    """Return a rotation as wxyz, its largest component positive, as in MuJoCo."""
     vector = rotation_vector(R)
     angle = float(np.linalg.norm(vector))
     q = np.append(np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * vector)
@@ -186,7 +183,7 @@ def quaternion(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
 def crop_and_resize(
     image: UInt8[np.ndarray, "h w 3"], shape: tuple[int, int]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The middle of a picture, in the proportions and at the size (rows, columns) of `shape`."""
+    """Return the middle of an image, in the proportions and at the size (rows, columns) of `shape`."""
     rows, columns = shape
     height, width = image.shape[:2]
     if (height, width) == shape:

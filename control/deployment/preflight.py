@@ -1,4 +1,4 @@
-"""What is looked at before an arm moves: one finding a line; nothing goes on with one that fails."""
+"""Checks before an arm moves, one a line; none may fail."""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -30,7 +30,7 @@ _MIN_RATE_SHARE = 0.8  # of what the cell says of a camera
 # grasp makes 20 and more; real units differ by more than simulated ones (unmeasured here).
 _TOUCHED_COUNTS = 12.0
 _WATCH_SECONDS = 1.0  # s for which cameras are watched
-_MAX_REST_FORCE = 7.5  # N felt at rest above which the arm does not begin
+_MAX_REST_FORCE = 7.5  # N measured at rest above which the arm does not begin
 _MIN_FREE_BYTES = 2e9  # bytes: a 40 s episode with both fingertips takes 0.4 GB at most
 _MUJOCO = ClientLibrary("mujoco", "pip install mujoco")
 _CLIENTS = {"fr3": FRANKY, "ur5e": UR_RTDE, "sim": _MUJOCO}
@@ -74,7 +74,7 @@ def preflight(
 
 
 def measure_rates(connection: CellConnection) -> dict[str, float]:
-    """At what rate each camera runs (Hz), by the connection's clock."""
+    """Return the rate of each camera (Hz), by the connection's clock."""
     begin = connection.clock.now()
     before = _sequences(connection)
     connection.clock.wait(begin + _WATCH_SECONDS)
@@ -83,7 +83,7 @@ def measure_rates(connection: CellConnection) -> dict[str, float]:
 
 
 def _sequences(connection: CellConnection) -> dict[str, int]:
-    """How many pictures each camera has taken; 0 of one that is broken, which its check tells."""
+    """Return the number of pictures each camera has taken; 0 for a broken one."""
     counts = dict.fromkeys(connection.cameras, 0)
     for key, camera in connection.cameras.items():
         with suppress(DriverError):
@@ -100,7 +100,7 @@ def _run_checks(checks: list[tuple[str, Callable[[], str]]]) -> Iterator[CheckRe
 
 
 def check_client(cell: CellConfig) -> str:
-    """The maker's client library and its version; UserError if it is not installed."""
+    """Return the maker's client library and its version; UserError if it is not installed."""
     client = _CLIENTS[cell.arm]
     if client.version is None:
         raise UserError(f"{client.package} is not installed: {client.install}")
@@ -118,9 +118,11 @@ def _arm(connection: CellConnection, safety: ActionFilter) -> str:
         raise UserError("it moves: let it come to rest")
     force = float(np.linalg.norm(reading.wrench[:3]))
     if np.isnan(force):
-        raise UserError("it cannot tell forces here, near a singularity: move it by hand")
+        raise UserError("it measures no forces here, near a singularity: move it by hand")
     if force > _MAX_REST_FORCE:
-        raise UserError(f"it feels {force:.1f} N at rest: set the hand's mass in Desk, or clear it")
+        raise UserError(
+            f"it measures {force:.1f} N at rest: set the hand's mass in Desk, or clear it"
+        )
     safety.start(reading.q)
     return f"{connection.robot.arm.name} at {np.round(reading.q, 2).tolist()} rad, {force:.1f} N"
 
@@ -136,7 +138,7 @@ def _limits(cell: CellConfig, safety: ActionFilter) -> str:
 
 
 def _ceilings(cell: CellConfig, safety: ActionFilter) -> str:
-    """Where the arm is stopped by force, and where that comes from."""
+    """Return the force ceilings and their source."""
     task = TASK_FORCES[cell.task.name]
     ceilings = ("force", "torque", "indentation")
     own = [name for name in ceilings if getattr(cell.safety, name) is not None]
@@ -172,7 +174,7 @@ def _camera(camera: Camera, rate: float, nominal: float, gripper: Gripper) -> st
     if isinstance(camera, TactileSensor):
         check_untouched(camera.read().image, camera.model, "it")
         frame, background = _fingertip(camera)
-        # A unit differs from the sensor file's; a contact is told by far more than that.
+        # A unit differs from its sensor file; a contact differs by far more.
         strength = float(contact_strength(frame[None], background)[0])
         if strength > _TOUCHED_COUNTS:
             reading = gripper.read()
@@ -195,7 +197,7 @@ def _camera(camera: Camera, rate: float, nominal: float, gripper: Gripper) -> st
 
 
 def _fingertip(camera: TactileSensor) -> tuple[Picture, Picture]:
-    """What it shows and its sensor file's background, both without dots."""
+    """Return a fingertip's image and its sensor file's background, both without dots."""
     frame, model = camera.read().image, camera.model
     if model.markers is not None:  # every unit's dots lie elsewhere
         dots = find_markers(frame, model.markers, model.pixel_pitch)
@@ -204,7 +206,7 @@ def _fingertip(camera: TactileSensor) -> tuple[Picture, Picture]:
 
 
 def _fingertips(connection: CellConnection) -> str:
-    """Whether each is the one that its own sensor file was made of."""
+    """Check that each fingertip looks like its own sensor file."""
     left, right = (
         _fingertip(camera)
         for key in ft.TACTILE

@@ -1,4 +1,4 @@
-"""Planning while the arm moves: an inference thread, and a hand-over that skips what has gone by."""
+"""Planning while the arm moves: a planning thread, and a hand-over that skips the ticks gone by."""
 
 import threading
 import time
@@ -21,7 +21,7 @@ _CLOSE_TIMEOUT = 2.0  # s for a plan under way when the episode ends
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    tick: int  # of the observation that it was made from, at which its first action belongs
+    tick: int  # of its observation, at which its first action belongs
     end: int  # from here on the next plan is wanted
     actions: Float32[np.ndarray, "h 8"]
 
@@ -29,13 +29,13 @@ class _Plan:
 @dataclass(frozen=True, eq=False)
 class _Request:
     tick: int  # of the newest observation
-    seen: list[Observation]
-    at: float  # when that came, monotonic s
+    observations: list[Observation]
+    at: float  # monotonic s of the newest
 
 
 @runtime_checkable
 class Horizons(Protocol):
-    """What of a policy's config the hand-over needs; see `PolicyConfig`."""
+    """Horizons of a policy, in ticks."""
 
     @property
     def observation_horizon(self) -> int: ...  # noqa: D102
@@ -47,7 +47,7 @@ class Horizons(Protocol):
 
 @runtime_checkable
 class ChunkPlanner(Protocol):
-    """Anything that plans: a `Planner`."""
+    """A policy that plans; see `policies/acting.py` and `user_policy.py`."""
 
     @property
     def config(self) -> Horizons: ...  # noqa: D102
@@ -58,34 +58,33 @@ class ChunkPlanner(Protocol):
 
 
 class RealTimeActor(Actor):
-    """Answers at once, from the newest plan; the next one is made in a thread.
+    """Actor that answers at once from the newest plan, while a thread makes the next one.
 
-    A plan is stamped with the tick of its observation and meant for the tick after it, always: it is
-    asked for that much earlier, so it has a whole tick to be made, and what is done does not depend on
-    how fast the machine is. Its action k belongs to the tick k after its observation: a plan that is
-    late all the same makes no jump. If plans run out the arm is told to stand still, and that is
-    counted. Plans that are no longer than what is done of them are asked for when they are needed.
+    A plan belongs to the tick of its observation and is used from the tick after it. It is asked for
+    that much earlier, so it has a whole tick to be made, and the actions do not depend on the machine's
+    speed. Action k belongs to the tick k after the observation, so a late plan makes no jump. If plans
+    run out the arm stands still. A plan no longer than its executed part is asked for when needed.
 
     A policy has learned on an arm whose servo follows with a lag. An arm that follows at once answers
-    its corrections too soon, and in contact the two shake each other. `lag` puts that lag back; what
-    it has not passed on yet counts as commanded.
+    its corrections too soon, and in contact the two shake each other. `lag` restores that lag; joint
+    changes that it has not passed on yet count as commanded.
 
     Attributes:
-        latencies: seconds from an observation to its plan, of every plan but the first.
-        late_plans: ticks at which the plan that was meant for them was not there.
+        latencies: seconds from an observation to its plan, for every plan but the first.
+        late_plans: ticks at which the plan meant for them was not there.
         ticks_without_plan: ticks for which no plan at all was ready.
         action_age: s for which that has been so without a break.
-        failure: what ended the planning thread, if something did; `act` raises it.
+        failure: exception that ended the planning thread; `act` raises it.
     """
 
     def __init__(
         self, planner: ChunkPlanner, timeout: float | None = None, lag: ServoLag | None = None
     ) -> None:
-        """Starts an episode; `close` ends the thread.
+        """Begin an episode; `close` ends the thread.
 
         Args:
             planner: of this episode.
-            timeout: s for which a plan that should be there is waited for; None: half a tick.
+            timeout: s to wait for a plan that should be there; None: half a tick.
             lag: of the arm that the policy learned on; None: commands are passed on at once.
         """
         self._planner, self._config = planner, planner.config
@@ -107,7 +106,7 @@ class RealTimeActor(Actor):
         self._thread = threading.Thread(target=self._work, name="planner", daemon=True)
 
     def start(self, observation: Observation) -> None:
-        """Make the first plan, which warms everything up, before the first tick; the arm rests.
+        """Make the first plan, which warms everything up, before the first tick.
 
         Raises:
             UserError: there is none in 20 s.
@@ -116,7 +115,7 @@ class RealTimeActor(Actor):
             self._history = [observation] * self._planner.ticks_seen
             self._request = _Request(0, self._history, time.monotonic())
             self._thread.start()
-            if not self._condition.wait_for(self._nothing_asked, _FIRST_PLAN_TIMEOUT):
+            if not self._condition.wait_for(self._no_request, _FIRST_PLAN_TIMEOUT):
                 raise UserError(
                     f"the policy made no plan in {_FIRST_PLAN_TIMEOUT:.0f} s: make it smaller"
                 )
@@ -134,39 +133,38 @@ class RealTimeActor(Actor):
         action = self._answer({**observation, ft.COMMAND: wanted})
         return np.append(self._lag.update(action[:-1]), action[-1])
 
-    def _answer(self, observation: Observation) -> Float32[np.ndarray, "8"]:
-        """The action for this tick; the first one belongs to what `start` has seen, if it was called."""
-        if not self._history:
-            self.start(observation)
-        with self._condition:
-            self._tick += 1
-            self._history = [*self._history[1:], observation]
-            if self._request:  # the plan was meant for this tick
-                self._condition.wait_for(self._nothing_asked, self._timeout)
-                self.late_plans += self._request is not None
-            if self._request is None and self._due():
-                self._request = _Request(self._tick, self._history, time.monotonic())
-            self._condition.notify_all()
-            if self._lead == 0:
-                self._condition.wait_for(self._nothing_asked, self._timeout)
-            if self.failure is not None:
-                raise self.failure
-            return self._action()
-
     def close(self) -> None:
-        """Ends the thread; one that hangs is left behind."""
+        """End the thread; one that hangs is left behind."""
         with self._condition:
             self._closed = True
             self._condition.notify_all()
         if self._thread.is_alive():
             self._thread.join(_CLOSE_TIMEOUT)
 
+    def _answer(self, observation: Observation) -> Float32[np.ndarray, "8"]:
+        if not self._history:
+            self.start(observation)
+        with self._condition:
+            self._tick += 1
+            self._history = [*self._history[1:], observation]
+            if self._request:  # its plan was meant for this tick
+                self._condition.wait_for(self._no_request, self._timeout)
+                self.late_plans += self._request is not None
+            if self._request is None and self._due():
+                self._request = _Request(self._tick, self._history, time.monotonic())
+            self._condition.notify_all()
+            if self._lead == 0:
+                self._condition.wait_for(self._no_request, self._timeout)
+            if self.failure is not None:
+                raise self.failure
+            return self._action()
+
     def _due(self, ahead: int = 0) -> bool:
-        """Whether it is time to ask for the next plan, or will be in some ticks."""
+        """Return whether the next plan must be asked for, now or `ahead` ticks from now."""
         assert self._plan is not None
         return self._tick > self._plan.tick and (self._tick + ahead + self._lead >= self._plan.end)
 
-    def _action(self) -> np.ndarray:
+    def _action(self) -> Float32[np.ndarray, "8"]:
         assert self._plan is not None
         k = self._tick - self._plan.tick
         if k < len(self._plan.actions):
@@ -178,23 +176,23 @@ class RealTimeActor(Actor):
         self.action_age += 1 / self._config.control_hz
         return np.append(np.zeros(ft.N_JOINTS), self._width).astype(np.float32)
 
-    def _nothing_asked(self) -> bool:
+    def _no_request(self) -> bool:
         return self._closed or self.failure is not None or self._request is None
 
     def _work(self) -> None:
         try:
-            while (seen := self._wait()) is not None:
-                if isinstance(seen, _Request):
-                    self._take(seen, self._planner.plan(seen.seen))
+            while (work := self._next_work()) is not None:
+                if isinstance(work, _Request):
+                    self._take(work, self._planner.plan(work.observations))
                 else:
-                    self._planner.embed(seen)
+                    self._planner.embed(work)
         except BaseException as error:
             with self._condition:
                 self.failure = error
                 self._condition.notify_all()
 
     def _take(self, request: _Request, actions: Float32[np.ndarray, "h 8"]) -> None:
-        """A plan is there."""
+        """Hand a finished plan over."""
         horizon = self._config.execution_horizon
         with self._condition:
             end = request.tick + horizon
@@ -206,8 +204,8 @@ class RealTimeActor(Actor):
             self._plan, self._request = _Plan(request.tick, end, actions), None
             self._condition.notify_all()
 
-    def _wait(self) -> _Request | list[Observation] | None:
-        """What a plan is asked for from, or else what the next plan sees, too; None at the end."""
+    def _next_work(self) -> _Request | list[Observation] | None:
+        """Wait for a plan's request, or observations of the next plan to embed; None at the end."""
         ahead = self._config.observation_horizon - 1
 
         def to_embed() -> bool:

@@ -1,4 +1,4 @@
-"""What moves a deployed arm without learning: the start move, and picking and placing by plan."""
+"""Scripted actors: the start move, and picking and placing by plan."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -23,28 +23,23 @@ from touchgoal.control.safety.action_filter import ActionFilter
 _SPEED_SHARE = 0.9  # of what the safety layer lets a policy do: a plan should not be clamped
 _START_SPEED_SHARE = 0.3  # of that, for the start move: a person watches where it goes
 _HELD_ERROR = 0.02  # rad; the arm was held: the plan waits until it has caught up
-_MAX_LAG = (
-    0.12  # rad between command and arm beyond which the plan waits; 0.06 is usual at this speed
-)
-_GRIPPER_MOVES = 5e-4  # m a tick that the gripper does when it moves
+# rad between command and arm beyond which the plan waits; 0.06 is usual at this speed
+_MAX_LAG = 0.12
+_GRIPPER_MOVES = 5e-4  # m a tick, the least of a moving gripper
 _CLEARANCE = 0.12  # m above the object before and after the grasp
 _OFF_THE_FLOOR = 0.002, 0.0007  # m that fingertips keep above their box's floor: grasping, placing
 _PROBE_DEPTH = 0.004  # m below the grasp's height to look for the table
 _TABLE_FORCE = 2.5  # N upwards, more than while it was carried, that mean the table carries it
-_CLOSE_SECONDS, _PROBE_SECONDS, _HOLD_SECONDS = (
-    1.0,
-    3.0,
-    0.8,
-)  # s for closing the hand, feeling for the table, at the end
+_CLOSE_SECONDS, _PROBE_SECONDS, _HOLD_SECONDS = 1.0, 3.0, 0.8  # closing, probing the table, end
 
 
 @dataclass(frozen=True)
 class PickPlacePoses:
-    """Where things are in the base frame.
+    """Places of the object and the goal in the base frame.
 
     Attributes:
         grasp: x, y, z (m) and yaw (rad) of the hand closing on the object.
-        goal: x, y (m) of where it is to go.
+        goal: x, y (m) to place it at.
     """
 
     grasp: tuple[float, float, float, float]
@@ -53,9 +48,13 @@ class PickPlacePoses:
 
 @dataclass(frozen=True)
 class PlannedMove:
-    """A move along a path (without one: a wait) with the gripper going to `width` (m); may end by feeling.
+    """A move along a path, or a wait, with the gripper's target width.
 
-    It takes `seconds`, which is the path's own duration or longer.
+    Attributes:
+        path: None for a wait.
+        width: of the gripper, m.
+        seconds: duration, at least the path's own.
+        until_supported: end early once the table carries the object.
     """
 
     path: Trajectory | None
@@ -65,18 +64,18 @@ class PlannedMove:
 
 
 class ScriptedActor(Actor):
-    """An actor that walks through moves; the plan waits while the arm is held.
+    """Actor that walks through moves; the plan waits while the arm is held.
 
     Attributes:
         done: whether the last move is over.
     """
 
     def __init__(self, moves: list[PlannedMove], commanded: Callable[[], np.ndarray], hz: float):
-        """An actor.
+        """Begin the plan.
 
         Args:
-            moves: in their order; each begins where the one before ends.
-            commanded: the joint positions (rad) commanded now.
+            moves: in order; each begins where the one before ends.
+            commanded: returns the joint positions (rad) commanded now.
             hz: ticks per second.
         """
         self._commanded, self._tick = commanded, 1 / hz
@@ -85,7 +84,7 @@ class ScriptedActor(Actor):
         self._actions = self._run(moves)
 
     def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
-        """The action for the next tick."""
+        """Return the action for the next tick."""
         self._wrench = observation[ft.WRENCH]
         self._measured = observation[ft.STATE][: self._measured.size].astype(np.float64)
         width = float(observation[ft.STATE][-1])
@@ -121,9 +120,9 @@ class ScriptedActor(Actor):
 def start_move(
     goal: np.ndarray, width: float, safety: ActionFilter, commanded: Callable[[], np.ndarray]
 ) -> ScriptedActor:
-    """Slowly to a posture (rad), the gripper staying at `width` (m).
+    """Return the slow move to a posture (rad), the gripper staying at `width` (m).
 
-    UserError if the way leaves the workspace, or leads the arm into itself.
+    UserError if it leaves the workspace or leads the arm into itself.
     """
     limits = safety.joints.scaled(_START_SPEED_SHARE, _START_SPEED_SHARE)
     path = joint_move(commanded(), goal, limits)
@@ -135,9 +134,9 @@ def start_move(
 def pick_and_place(
     place: PickPlacePoses, safety: ActionFilter, commanded: Callable[[], np.ndarray]
 ) -> ScriptedActor:
-    """Grasp, carry, set down until the table is felt, and keep holding.
+    """Return the plan to grasp, carry, set down until the table carries the object, and hold it.
 
-    UserError if the arm cannot go there inside its workspace; nothing has moved then.
+    UserError if the arm cannot go there inside its workspace.
     """
     robot = safety.limits
     kinematics = Kinematics(robot.arm, robot.tool.tcp_offset)

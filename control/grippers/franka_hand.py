@@ -1,4 +1,4 @@
-"""Franka Hand through franky-control, in a child process; `hand_commands.py` says what it is told when."""
+"""Franka Hand through franky-control, in a child process; `hand_commands.py` chooses its commands."""
 
 import time
 from dataclasses import replace
@@ -18,13 +18,13 @@ _ANSWER_TIMEOUT = 1.0  # s for an answer that a twin has sent to arrive
 
 
 class FrankaHandClient:
-    """In the child: one hand. Its state comes every 20 to 50 ms."""
+    """One hand, in the driver's process; its state comes every 20 to 50 ms."""
 
     def __init__(self, address: str, force: float, lock_step: bool = False) -> None:
-        """With `lock_step`, `advance` takes the place of the clock's ticks."""
+        """Connect; with `lock_step` the hand advances only when `advance` is called."""
         self.period = NEVER if lock_step else PERIOD
         self._issued = 0  # commands sent to the hand
-        self._answered: int | None = None  # of them, as a twin says
+        self._answered: int | None = None  # of them, by a twin's count
         self._franky, self._force = FRANKY.load("franky"), force
         self._hand = self._franky.Gripper(address)
         self._max_width = self._hand.state.max_width
@@ -38,17 +38,17 @@ class FrankaHandClient:
         self._reading = self._measure()
 
     def read(self) -> GripperReading:
-        """The state as of the last tick; a fault counts from when it happened."""
+        """Return the state as of the last tick, with the newest fault."""
         return replace(self._reading, fault=self._fault)
 
     def command(self, width: float) -> None:
-        """A new target (m)."""
+        """Set a new target (m)."""
         if self._fault or self._stopped:
             raise DriverError(f"no command is taken: {self._fault or 'the hand was stopped'}")
         self._target = min(max(width, 0.0), self._max_width)
 
     def stop(self, release_to: float | None = None) -> None:
-        """End the command that runs and send no other, except to let go (m)."""
+        """End the running command and send no other, except to open to a width (m)."""
         if not self._stopped and self._running is not None and not self._running.wait(0.0):
             self._hand.stop_async().wait(_STOP_TIMEOUT)
         self._stopped, self._running = True, None
@@ -57,7 +57,7 @@ class FrankaHandClient:
             self._running = self._hand.move_async(width, SPEED)
 
     def tick(self) -> None:
-        """Read the state; send what there is to send."""
+        """Read the state and send the next command, if any."""
         try:
             self._reading = self._measure()
             if not self._fault and not self._stopped:
@@ -66,7 +66,7 @@ class FrankaHandClient:
             self._fault = f"{type(error).__name__}: {' '.join(str(error).split())}"
 
     def advance(self, answered: int) -> int:
-        """Tick, when a twin says that so many commands are answered; how many have been sent."""
+        """Tick, with the number of commands that a twin has answered; return the number sent."""
         self._answered = answered
         self.tick()
         return self._issued
@@ -83,7 +83,7 @@ class FrankaHandClient:
         return GripperReading(state.width, state.is_grasped, self._fault, stamp)
 
     def _last_command(self) -> LastCommand:
-        """Raises what went wrong with it."""
+        """Return how the last command stands; raise its error."""
         if self._running is None:
             return "arrived"
         arrives = self._answered is not None and self._answered >= self._issued
@@ -101,7 +101,7 @@ class FrankaHandClient:
         if not command.grasp:
             self._running = self._hand.move_async(command.width, SPEED)
             return
-        # What is met before that width counts as grasped, whatever its size.
+        # Any object met before that width counts as grasped.
         self._running = self._hand.grasp_async(
             command.width,
             SPEED,
@@ -112,7 +112,7 @@ class FrankaHandClient:
 
 
 class FrankaHand:
-    """The Gripper protocol over a hand; it closes with `force` (N, 30 to 70)."""
+    """Gripper over a Franka Hand; it closes with `force` (N, 30 to 70)."""
 
     def __init__(self, address: str, force: float = 30.0, lock_step: bool = False) -> None:
         self._process = DriverProcess(FrankaHandClient, address, force, lock_step)

@@ -1,10 +1,10 @@
-"""What a Franka Hand is told, and when: of its driver and of the environment that trains for it.
+"""Commands of a Franka Hand, shared by its driver and by the environment that trains for it.
 
 The hand takes one slow command at a time, while a policy asks for a width every tick. The newest width
-is sent when the last command has ended, which takes 0.8 s at most. So a width that merely passes on the
-way to another is not sent: one that changes faster than the hand could follow, unless it goes on doing
-so. A hand's grasp closes until it meets something, whatever width it is told, so only closing all the
-way grasps; any other width is a move, and one that meets something on its way in grasps that.
+is sent when the last command has ended, which takes 0.8 s at most. A width that only passes on the way
+to another, changing faster than the hand could follow, is not sent, unless that goes on. A grasp closes
+until it meets an object, whatever its width, so only closing all the way is a grasp. Any other width is
+a move; an inward move that meets an object becomes a grasp of it.
 """
 
 from dataclasses import dataclass
@@ -16,22 +16,22 @@ SHUT = 2e-3  # m between commands that differ, and up to which a width is shut
 _MOST_PASSING = 3  # looks in a row for which widths may pass
 
 LastCommand = Literal["runs", "arrived", "stopped short"]
-"""How the command before stands; "arrived" before the first, too."""
+"""State of the last command; "arrived" before the first."""
 
 
 @dataclass(frozen=True)
 class HandCommand:
-    """A move to a width (m), or a grasp: closing until something is met, before that width or after it."""
+    """A move to a width (m), or a grasp: closing until an object is met."""
 
     width: float
     grasp: bool
 
 
 class HandCommands:
-    """What to send, look by look: every `PERIOD`, and at every one of them."""
+    """Chooses the next command, once every `PERIOD`."""
 
     def __init__(self, width: float) -> None:
-        """The hand rests at that width (m)."""
+        """Begin with the hand at rest at that width (m)."""
         self._sent = self._last_target = width
         self._moves_inwards = False  # the last command
         self._passing = 0  # looks for which widths have passed
@@ -39,12 +39,12 @@ class HandCommands:
     def next(
         self, target: float, width: float, grasped: bool, last: LastCommand
     ) -> HandCommand | None:
-        """The command to send now, if any.
+        """Return the command to send now, if any.
 
         Args:
             target: newest width asked for, m.
-            width, grasped: what the hand says, m, and whether it holds something.
-            last: how the command before stands.
+            width, grasped: reported by the hand, m, and whether it holds an object.
+            last: state of the last command.
         """
         passes = self._passes(target)
         if last == "runs":
@@ -61,7 +61,7 @@ class HandCommands:
         return HandCommand(target, grasp=target <= SHUT)
 
     def _passes(self, target: float) -> bool:
-        """Whether it only passes, faster than the hand could follow."""
+        """Return whether the target only passes, faster than the hand could follow."""
         changed, self._last_target = abs(target - self._last_target), target
         passes = target > SHUT and changed > SPEED * PERIOD
         self._passing = self._passing + 1 if passes else 0

@@ -1,4 +1,4 @@
-"""A gripper behind a thread, for drivers whose answers take longer than a control loop can wait."""
+"""A gripper behind a thread, for drivers that answer more slowly than a control loop can wait."""
 
 import threading
 import time
@@ -10,7 +10,7 @@ _PAUSE = 0.01  # s between exchanges
 
 
 class NonBlockingGripper:
-    """The Gripper protocol over another one (measured: a Franka Hand answers in up to 50 ms)."""
+    """Gripper over another one whose answers are slow (a Franka Hand: up to 50 ms)."""
 
     def __init__(self, gripper: Gripper) -> None:
         self._gripper = gripper

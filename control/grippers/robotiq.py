@@ -50,7 +50,7 @@ class RobotiqConfig:
 
 
 class Robotiq:
-    """The Gripper protocol over a 2F-85; a thread talks to it, commands never wait."""
+    """Gripper over a 2F-85; a thread talks to it, commands never wait."""
 
     def __init__(self, config: RobotiqConfig) -> None:
         self.config = config
@@ -94,14 +94,14 @@ class Robotiq:
         self._port.close()
 
     def _position(self, width: float) -> int:
-        """Of a width (m), in counts."""
+        """Return a width (m) in counts."""
         opened, closed = self.config.widths
         share = min(max((opened - width) / (opened - closed), 0.0), 1.0)
         first, last = registers.POSITIONS
         return round(first + share * (last - first))
 
     def _start(self) -> None:
-        """Finds the gripper activated, or activates it if that is allowed."""
+        """Require an active gripper, or activate it if that is allowed."""
         if self._status()[0] >> 4 & 3 == registers.ACTIVE:
             return
         if not self.config.activate:
@@ -120,7 +120,7 @@ class Robotiq:
             time.sleep(0.1)
 
     def _status(self) -> bytes:
-        """The six bytes of its status."""
+        """Return the six bytes of its status."""
         read = self._modbus.read_registers
         return struct.pack(">3H", *_exchange(lambda: read(registers.STATUS, 3, functioncode=4)))
 
@@ -156,7 +156,7 @@ class Robotiq:
         )
 
     def _send(self) -> None:
-        """Every time, not only news: after a second of silence the gripper reports a fault."""
+        """Repeat the command: after a second of silence the gripper reports a fault."""
         if self._wanted is None:
             return
         speed = registers.to_count(self.config.speed, registers.SPEEDS)
@@ -165,7 +165,7 @@ class Robotiq:
 
 
 def _exchange(call: Callable[[], list[int] | None]) -> list[int]:
-    """One request and its answer; a missing or garbled answer raises DriverError.
+    """Return the answer to a request; a missing or garbled one raises DriverError.
 
     An unplugged port raises serial.SerialException.
     """

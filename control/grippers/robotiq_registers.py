@@ -3,7 +3,7 @@
 from touchgoal.control.motion.tool import ROBOTIQ_2F85
 
 SLAVE = 9  # Modbus address
-COMMAND, STATUS = 0x03E8, 0x07D0  # first registers of what is written and read; 6 bytes each
+COMMAND, STATUS = 0x03E8, 0x07D0  # first registers written and read; 6 bytes each
 ACTIVATE, GO = 0x01, 0x08  # bits of the first command byte
 ACTIVE = 3  # status of a finished activation: bits 4 and 5 of the first status byte
 MOVING, STOPPED_OPENING, STOPPED_CLOSING, ARRIVED = range(4)  # of an object: bits 6 and 7
@@ -14,10 +14,10 @@ FORCES = ROBOTIQ_2F85.force  # N for 0 to 255
 
 
 def to_count(value: float, span: tuple[float, float]) -> int:
-    """The byte (0 to 255) for a value, clipped to the span."""
+    """Return the byte (0 to 255) for a value, clipped to the span."""
     return round(255 * min(max((value - span[0]) / (span[1] - span[0]), 0.0), 1.0))
 
 
 def from_count(count: int, span: tuple[float, float]) -> float:
-    """What a byte (0 to 255) stands for."""
+    """Return the value of a byte (0 to 255)."""
     return span[0] + (span[1] - span[0]) * count / 255

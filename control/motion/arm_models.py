@@ -1,4 +1,4 @@
-"""The arms as their makers describe them: links, and limits of range, speed, acceleration and jerk.
+"""The makers' arm models: links, and limits of range, speed, acceleration and jerk.
 
 SI units; joint order from the base outwards; every number with its source.
 """
@@ -33,11 +33,11 @@ class JointLimits:
     taper: SpeedTaper | None = None
 
     def with_margin(self, margin: float) -> "JointLimits":
-        """The same with a range `margin` rad narrower at both ends."""
+        """Return limits with a range `margin` rad narrower at both ends."""
         return replace(self, lower=self.lower + margin, upper=self.upper - margin)
 
     def scaled(self, velocity: float, acceleration: float) -> "JointLimits":
-        """The same range at a share of the speed, and of acceleration and jerk."""
+        """Return limits at a share of the speed, and of acceleration and jerk."""
         return replace(
             self,
             velocity=velocity * self.velocity,
@@ -48,7 +48,7 @@ class JointLimits:
     def speed_range(
         self, q: Float[np.ndarray, "*k n"]
     ) -> tuple[Float[np.ndarray, "*k n"], Float[np.ndarray, "*k n"]]:
-        """Lowest (negative) and highest joint speed (rad/s) at joint positions `q`."""
+        """Return the lowest (negative) and highest joint speed (rad/s) at joint positions `q`."""
         ceiling = np.broadcast_to(self.velocity, q.shape)
         if self.taper is None:
             return -ceiling, ceiling
@@ -103,8 +103,10 @@ FR3_ARM = ArmModel(
     ),
     flange_offset=0.107,
     hand_yaw=-np.pi / 4,
-    # Range: franka_description joint_limits.yaml. Speed, acceleration, jerk, taper: libfranka
-    # rate_limiting.h ("Limits for Franka Research 3"), where gain is twice the deceleration.
+    # Franka's FCI documentation, "Robot and interface specifications", "Limits for Franka Research 3"
+    # (frankarobotics.github.io/docs/robot_specifications.html): range of franka_description's
+    # joint_limits.yaml; speed, acceleration, jerk and taper as in libfranka's rate_limiting.h, where
+    # gain is twice the deceleration.
     limits=JointLimits(
         lower=np.array([-2.7437, -1.7837, -2.9007, -3.0421, -2.8065, 0.5445, -3.0159]),
         upper=np.array([2.7437, 1.7837, 2.9007, -0.1518, 2.8065, 4.5169, 3.0159]),
@@ -137,10 +139,11 @@ UR5E_ARM = ArmModel(
     ),
     flange_offset=0.0996,
     hand_yaw=0.0,
-    # Range and speed: Universal_Robots_ROS2_Description ur5e/joint_limits.yaml (180 deg/s).
-    # Acceleration has no limit of its own (only torques have); 5 is the MoveIt configuration's of the
-    # UR driver for ROS 2. Jerk, which the controller does not enforce, is our choice: full acceleration
-    # in 20 ms; its lookahead at the shortest is 30.
+    # Range and speed: Universal Robots' UR5e technical specifications (360 deg, 180 deg/s), as in
+    # Universal_Robots_ROS2_Description ur5e/joint_limits.yaml. UR limits torques, not acceleration; 5
+    # is the value of the MoveIt configuration of UR's driver for ROS 2. Jerk, which the controller does
+    # not limit either, is our choice: full acceleration in 20 ms; servoj's shortest lookahead_time is
+    # 30 ms (URScript manual).
     limits=JointLimits(
         lower=-_UR5E_UPPER,
         upper=_UR5E_UPPER,

@@ -23,10 +23,10 @@ _TASK_STEP = 0.1, 0.5  # m and rad, farthest that a step goes
 _MARGIN = 1e-4  # rad that solutions keep from the joints' limits
 _ITERATIONS = 50
 _PULLED = 8  # of them draw the arm towards its home, ever less; then nothing disturbs the end
-# Other starts. Of 1,000 poses in reach, turned anyhow, 66 % (FR3) and 54 % (UR5e) are found from home,
+# Other starts. Of 1,000 poses in reach with any rotation, 66 % (FR3) and 54 % (UR5e) are found from home,
 # 100 % and 99.9 % with these.
 _RESTARTS = 48
-# Of squared errors: 10 mrad count as 1 mm.
+# Weights of squared errors: 10 mrad count as 1 mm.
 _ERROR_WEIGHTS = np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])
 
 
@@ -37,7 +37,7 @@ def _rotation(axis: str, angle: casadi.SX | float) -> casadi.SX:
 
 
 def _frames(arm: ArmModel, q: casadi.SX) -> list[tuple[casadi.SX, casadi.SX]]:
-    """Origin and rotation of the base, of each link behind its joint, and of the hand."""
+    """Return origin and rotation of the base, of each link behind its joint, and of the hand."""
     p, R = casadi.SX.zeros(3), casadi.SX.eye(3)
     frames = [(p, R)]
     for i, (offset, twist) in enumerate(arm.links):
@@ -48,7 +48,7 @@ def _frames(arm: ArmModel, q: casadi.SX) -> list[tuple[casadi.SX, casadi.SX]]:
 
 
 def _chain(arm: ArmModel, tcp_offset: float) -> casadi.Function:
-    """CasADi function q -> TCP position (3), rotation (3, 3), geometric Jacobian (6, n)."""
+    """Return the CasADi function q -> TCP position (3), rotation (3, 3), geometric Jacobian (6, n)."""
     q = casadi.SX.sym("q", len(arm.links))
     _, *joints, (hand, R) = _frames(arm, q)
     p = hand + R[:, 2] * tcp_offset
@@ -57,12 +57,11 @@ def _chain(arm: ArmModel, tcp_offset: float) -> casadi.Function:
 
 
 def _step(arm: ArmModel, tcp_offset: float) -> casadi.Function:
-    """CasADi function of one step of damped least squares, for `Kinematics.solve_ik_near`.
+    """Return the CasADi function of one step of damped least squares, for `solve_ik_near`.
 
     (q, target position and rotation by rows (12), posture, free, held) -> change of q, pose error
-    of q (6: m, rad). Joints where `free` is 0 change by `held` (rad), the others do what is left to
-    do; where it is 1 `held` counts for nothing. All in one function, so that a step is one call: 6
-    us, of which a numpy version would spend most between its calls.
+    of q (6: m, rad). Joints where `free` is 0 change by `held` (rad), the others do the rest. One
+    function makes a step one call of 6 us.
     """
     n = len(arm.links)
     q, target, posture, free, held = (
@@ -85,7 +84,7 @@ def _step(arm: ArmModel, tcp_offset: float) -> casadi.Function:
 
 
 def _rotation_error(R: casadi.SX) -> casadi.SX:
-    """`rotation_vector` for CasADi: by the quaternion, from the largest of four ways to get it."""
+    """Return `rotation_vector` for CasADi, by the largest of four forms of the quaternion."""
     skew = [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]
     signs = [(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]
     squares = [1 + sum(s * R[i, i] for i, s in enumerate(sign)) for sign in signs]
@@ -105,7 +104,7 @@ def _rotation_error(R: casadi.SX) -> casadi.SX:
 
 @dataclass(frozen=True)
 class IkSolution:
-    """Joint positions (rad) with what is left of the error, in m and rad."""
+    """Joint positions (rad) with their remaining error, m and rad."""
 
     q: Joints
     position_error: float
@@ -113,7 +112,7 @@ class IkSolution:
 
     @property
     def reached(self) -> bool:
-        """Within 0.1 mm and 1 mrad."""
+        """Whether the error is within 0.1 mm and 1 mrad."""
         return self.position_error < 1e-4 and self.rotation_error < 1e-3
 
 
@@ -129,18 +128,18 @@ class Kinematics:
         self._postures = rng.uniform(arm.lower + _MARGIN, arm.upper - _MARGIN, size)
 
     def forward(self, q: Joints) -> tuple[Vector3, Matrix3]:
-        """TCP position (m) and rotation in the base frame."""
+        """Return the TCP position (m) and rotation in the base frame."""
         p, R, _ = self._chain(q)
         return p.full().ravel(), R.full()
 
     def jacobian(self, q: Joints) -> Float[np.ndarray, "6 n"]:
-        """Geometric Jacobian of the TCP, base frame: linear rows (m/rad), then angular."""
+        """Return the geometric Jacobian of the TCP, base frame: linear rows (m/rad), then angular."""
         return self._chain(q)[2].full()
 
     def joint_change(self, q: Joints, change: Float[np.ndarray, "6"]) -> Joints:
-        """Least change of the joints (rad) for a small displacement (m) and turn (rad) of the TCP.
+        """Return the least joint change (rad) for a small displacement (m) and turn (rad) of the TCP.
 
-        Base frame; damped at singularities, where none would do.
+        Base frame; damped at singularities.
         """
         J = self.jacobian(q)
         return J.T @ np.linalg.solve(J @ J.T + DAMPING * np.eye(6), change)
@@ -148,14 +147,14 @@ class Kinematics:
     def jacobians(
         self, q: Float[np.ndarray, "b n"]
     ) -> tuple[Float[np.ndarray, "b 6 n"], Float[np.ndarray, "b 3 3"]]:
-        """`jacobian` of many joint positions at once, and the TCP's rotations there."""
+        """Return `jacobian` for many joint positions, and the TCP's rotations there."""
         _, R, J = (side_by_side.full() for side_by_side in self._chain.map(len(q))(q.T))
         return J.reshape(6, *q.shape).transpose(1, 0, 2), R.reshape(3, len(q), 3).transpose(1, 0, 2)
 
     def forward_many(
         self, q: Float[np.ndarray, "b n"]
     ) -> tuple[Float[np.ndarray, "b 3"], Float[np.ndarray, "b 3 3"]]:
-        """`forward` of many joint positions at once."""
+        """Return `forward` for many joint positions."""
         position, R, _ = (side_by_side.full() for side_by_side in self._chain.map(len(q))(q.T))
         return position.T, R.reshape(3, len(q), 3).transpose(1, 0, 2)
 
@@ -168,12 +167,12 @@ class Kinematics:
         posture: float = 0.02,
         tolerance: float = 1e-5,
     ) -> IkSolution:
-        """Damped least squares from `start`, near which the solution lies.
+        """Solve by damped least squares from `start`, near which the solution lies.
 
-        A joint that would leave its range is held at the end of it, and the others do the rest. An arm
-        with more than six joints is drawn to its home by `posture` (a share of the way a step), so
-        that the elbow stays where a person expects it; 0 moves the joints least. It ends within
-        `tolerance` m and ten times that in rad, or without.
+        A joint that would leave its range is held at its end, and the others do the rest. An arm with
+        more than six joints is drawn to its home by `posture` (a share of the way a step), so that the
+        elbow stays where a person expects it; 0 moves the joints least. It stops within `tolerance` m
+        and ten times that in rad, or after the last iteration.
         """
         lower, upper = self.arm.lower + _MARGIN, self.arm.upper - _MARGIN
         q, target = np.array(start, dtype=np.float64), np.concatenate([position, rotation.ravel()])
@@ -181,7 +180,10 @@ class Kinematics:
         free, pull, error = np.ones(q.size), np.empty(1), np.full(6, np.inf)
         posture = posture if q.size > 6 else 0.0
         buffer, step = self._step.buffer()
-        inputs, results = (q, target, pull, free, held), (change, error)  # kept: it points to them
+        inputs, results = (
+            (q, target, pull, free, held),
+            (change, error),
+        )  # referenced: the buffer points to them
         for i, value in enumerate(inputs):
             buffer.set_arg(i, value.data)  # pyright: ignore[reportCallIssue]
         for i, value in enumerate(results):
@@ -203,9 +205,9 @@ class Kinematics:
         return IkSolution(q, float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:])))
 
     def solve_ik(self, position: Vector3, rotation: Matrix3, start: Joints) -> Joints:
-        """Joint positions for a pose; UserError if the arm cannot reach it.
+        """Return joint positions for a pose; UserError if the arm cannot reach it.
 
-        If there is no way from `start`, another posture is looked for, which may be far from it.
+        Where `start` leads to none, other starts are tried; the solution may be far from it.
         """
         solution = self.solve_ik_near(position, rotation, start)
         for posture in self._postures:
@@ -222,11 +224,11 @@ class Kinematics:
     def points_on_links(
         self, points: Float[np.ndarray, "k 3"], frames: Sequence[int] | None = None
     ) -> casadi.Function:
-        """CasADi function of joint positions (n, m) -> points (m) fixed to parts of the arm.
+        """Return the CasADi function of joint positions (n, m) -> points (m) fixed to parts of the arm.
 
-        `frames` says of each point which part it is on and in whose frame it is given (m): 0 the
-        base, i the link behind joint i, n + 1 the hand; None: all on the hand. The result (3, m k)
-        has the k points of the first column first, in the base frame.
+        `frames` names the part and frame of each point: 0 the base, i the link behind joint i, n + 1
+        the hand; None: all on the hand. The result (3, m k) has the k points of the first column
+        first, in the base frame.
         """
         q = casadi.SX.sym("q", self.arm.home.size)
         placed = _frames(self.arm, q)

@@ -1,4 +1,4 @@
-"""Rotations as vectors and matrices, and how a hand with its fingers down is turned."""
+"""Rotations as vectors and matrices, and those of a hand with its fingers down."""
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ Matrix3 = Float[np.ndarray, "3 3"]
 
 
 def rotation_vector(R: Matrix3) -> Vector3:
-    """Axis times angle (rad) of a rotation matrix.
+    """Return axis times angle (rad) of a rotation matrix.
 
     Not by cv2.Rodrigues, which takes turns below 1e-5 rad for none: at 1 kHz that is 0.01 rad/s.
     """
@@ -27,18 +27,18 @@ def rotation_vector(R: Matrix3) -> Vector3:
 
 
 def rotation_matrix(vector: Vector3) -> Matrix3:
-    """The rotation about `vector` by its length (rad)."""
+    """Return the rotation about `vector` by its length (rad)."""
     return cv2.Rodrigues(np.asarray(vector, dtype=np.float64))[0]
 
 
 def fingers_down(yaw: float) -> Matrix3:
-    """TCP rotation in the base frame: approach straight down, hand turned by `yaw` about base z."""
+    """Return the TCP rotation in the base frame: approach down, turned by `yaw` about base z."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
 
 
 def fingers_across(direction: Vector3) -> Matrix3:
-    """TCP rotation in the base frame: x along a direction, approach as straight down as that lets.
+    """Return the TCP rotation in the base frame: x along a direction, approach as steep as possible.
 
     The fingers then close across the direction. It must not be vertical.
     """

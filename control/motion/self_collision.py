@@ -1,4 +1,4 @@
-"""How far an arm is from itself: its parts as capsules, the least gap between any two that may meet."""
+"""Self-collision: the arm's parts as capsules, and the least gap between any two that may meet."""
 
 from dataclasses import dataclass
 
@@ -25,7 +25,7 @@ class Capsule:
 
 
 def _hand(frame: int) -> tuple[Capsule, ...]:
-    """Franka Hand with GelSight Minis at any opening (limits.py: 70 mm to each side)."""
+    """Return a Franka Hand with GelSight Minis at any opening (70 mm to each side)."""
     return (
         Capsule(frame, (0.0, 0.06, 0.03), (0.0, -0.08, 0.02), 0.051),
         Capsule(frame, (0.0, 0.055, 0.08), (0.0, -0.055, 0.08), 0.038),
@@ -72,7 +72,7 @@ _NEIGHBOURS = 3  # parts in a row that the joints' ranges alone keep apart
 
 
 class SelfDistance:
-    """The gaps of one arm."""
+    """Gaps between the parts of one arm."""
 
     def __init__(self, arm: ArmModel) -> None:
         body = self.body = _BODIES[arm.name]
@@ -90,11 +90,11 @@ class SelfDistance:
         self._radii = radius[self._first] + radius[self._second]
 
     def gap(self, q: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " k"]:
-        """Least distance (m) between parts, for each of k postures; negative where they overlap."""
+        """Return the least distance (m) between parts for each posture; negative where they overlap."""
         return self.gaps(q).min(axis=1)
 
     def gaps(self, q: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k pairs"]:
-        """Distance (m) between the two parts of every pair, for each of k postures."""
+        """Return the distance (m) between the two parts of every pair, for each posture."""
         ends = self._ends(q.T).full().T.reshape(len(q), -1, 2, 3)
         first, second = ends[:, self._first], ends[:, self._second]
         apart = segment_distance(
@@ -106,7 +106,7 @@ class SelfDistance:
 def require_no_self_collision(
     trajectory: Trajectory, distance: SelfDistance, margin: float = 5e-3
 ) -> None:
-    """UserError if parts of the arm come closer than `margin` (m) on the way (looked at 100 Hz)."""
+    """UserError if parts of the arm come closer than `margin` (m) on the way (checked at 100 Hz)."""
     gap = distance.gap(trajectory.sample(100))
     if gap.min() < margin:
         k = int(np.argmax(gap < margin))
@@ -117,10 +117,9 @@ def require_no_self_collision(
 
 
 def segment_distance(a: Points, b: Points, c: Points, d: Points) -> Float[np.ndarray, "*k"]:
-    """Least distance (m) between the segments from `a` to `b` and from `c` to `d`, points included.
+    """Return the least distance (m) between the segments `a`-`b` and `c`-`d`, points included.
 
-    The nearest points of the two lines if both lie on the segments, else the nearest of what starts
-    at an end (Ericson, Real-Time Collision Detection, 5.1.9).
+    Ericson, Real-Time Collision Detection, 5.1.9.
     """
     u, v, w = b - a, d - c, a - c
     uv = (u * v).sum(-1)

@@ -1,4 +1,4 @@
-"""What an arm carries: a parallel gripper with a fingertip sensor on each finger.
+"""The tool of an arm: a parallel gripper with a fingertip sensor on each finger.
 
 The hand frame lies at the flange, turned by `ArmModel.hand_yaw`: z out of the flange, the fingers
 close along y.
@@ -19,8 +19,8 @@ class Tool:
             along the hand's z axis.
         stroke: m, least and greatest width between the gels.
         speed: m/s of width, the gripper's fastest.
-        force: N, least and greatest with which the gripper can be told to hold.
-        mass: kg, of all beyond the flange; the sensors' is unpublished and not in it.
+        force: N, least and greatest grasp force that can be set.
+        mass: kg, beyond the flange; the sensors' is unpublished and not included.
         centre_of_mass: m, hand frame.
         finger_corners: m, hand frame: corners of a box around the fingertips, fully open.
     """
@@ -36,10 +36,10 @@ class Tool:
 
 
 def _corners(tcp_offset: float, half_stroke: float) -> tuple[Point, ...]:
-    """Of a box around the GelSight Minis on two open fingers (GelSight's STEP file), rounded outwards.
+    """Return a box around the GelSight Minis on two open fingers (GelSight's STEP file), rounded up.
 
     A Mini is 28.5 mm wide; its outer face is 28.3 mm behind the gel, its ends half of 32.5 mm from the
-    gel's centre. What lies inside the box is watched with it, for limits are boxes, too.
+    gel's centre.
     """
     across, side, half = 0.0145, half_stroke + 0.03, 0.0165
     return tuple(

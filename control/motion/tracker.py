@@ -1,10 +1,9 @@
-"""From a policy's 10 to 20 Hz to a 1 kHz interface: smooth, inside all limits, near the path checked.
+"""From a policy's 10 to 20 Hz to a 1 kHz interface: smooth, inside all limits, near the checked path.
 
-A reference walks in straight lines from target to target, each within the policy's period; what goes
-out is its mean over the last moments. A mean never leaves the range of what it averages, all joints
-are late by the same time, and so the arm keeps near the path that the safety layer has checked, whatever
-comes when: it cuts that path's corners, see `touchgoal benchmark sent-stream`. Where the reference
-would have to stop or turn faster than the limits allow, it walks slower: it never leaves its path.
+A reference walks in straight lines from target to target, each within the policy's period; the command
+is its mean over a short window. A mean stays in the range of its values and delays all joints alike, so
+the arm stays near the path that the safety layer has checked; it cuts corners, see `touchgoal benchmark
+sent-stream`. Where the reference would turn faster than the limits allow, it walks slower along its path.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from touchgoal.control.motion.arm_models import JointLimits
 
 Joints = Float[np.ndarray, "n"]
 
-_RESERVE = 1.1  # by which the reference may be faster than targets come, to make up for late ones
+_RESERVE = 1.1  # times the targets' pace that the reference may reach, to make up for late ones
 _ROUNDING = 1e-12  # rad
 _MOST = 8  # targets on the way; more come from a clock that is not the policy's, and are cut short
 
@@ -29,8 +28,8 @@ class TrackerState:
 
     Attributes:
         q: commanded joint positions, rad.
-        targets: on the reference's way, the next one first, rad.
-        step: of the reference in a millisecond, at the pace at which targets come, rad.
+        targets: of the reference, the next one first, rad.
+        step: of the reference in a millisecond at the targets' pace, rad.
         window: the reference's last positions, oldest first, rad.
     """
 
@@ -41,13 +40,13 @@ class TrackerState:
 
 
 class Tracker:
-    """Inside `limits` for targets that come every `period` s; `dt` s is the interface's tick.
+    """Tracker inside `limits` for targets every `period` s; `dt` s is the interface's tick.
 
     Give it `RobotLimits.interface`, and as `speed` (rad/s) the highest of the targets,
     `RobotLimits.policy`'s; beyond a tenth above it the reference falls behind.
 
     Attributes:
-        lag: s by which what goes out is behind the reference.
+        lag: of the command behind the reference, s.
     """
 
     def __init__(self, limits: JointLimits, speed: Joints, period: float, dt: float = 1e-3) -> None:
@@ -62,19 +61,17 @@ class Tracker:
         self.lag = (self._weights.size - 1) / 2 * dt
         self._reach = limits.acceleration * self._m * dt**2  # rad a tick that may be gained or lost
         self._fastest = np.minimum(limits.velocity * dt, self._reach)
-        self.step(
-            self.start(speed)
-        )  # so that nothing is compiled, or read from the disk, in a loop
+        self.step(self.start(speed))  # compiles now, not in a loop
 
     def start(self, q: Joints) -> TrackerState:
-        """At rest in `q` (rad)."""
+        """Return the state at rest in `q` (rad)."""
         window = np.tile(q, (max(self._weights.size, self._m + 1), 1))
         return TrackerState(q, np.empty((0, q.size)), np.zeros(q.size), window)
 
     def set_target(self, state: TrackerState, target: Joints) -> TrackerState:
-        """A new target (rad) from the policy, clamped to the limits; not a number: it is left out.
+        """Add a target (rad) from the policy, clamped to the limits; NaN is left out.
 
-        It is to be reached one period after the last one, or as soon after as the limits allow.
+        It is reached one period after the last one, or as soon after as the limits allow.
         """
         if not np.isfinite(target).all():
             return state
@@ -87,7 +84,7 @@ class Tracker:
         return replace(state, targets=target[None], step=(target - reference) / self._ticks)
 
     def step(self, state: TrackerState) -> TrackerState:
-        """One tick of the interface; `q` of the result is the command."""
+        """Return the state after one tick of the interface; its `q` is the command."""
         return TrackerState(
             *_step(
                 state.targets,
@@ -105,7 +102,7 @@ class Tracker:
 @njit(cache=True)
 @no_type_check
 def _step(targets, step, window, weights, m, reach, fastest, ticks):
-    """The command, and what waits, the reference's step and its window after this tick."""
+    """Return the command, the remaining targets, the reference's step and its window."""
     reference = window[-1].copy()
     if len(targets):
         # How many times its step the reference may go, so that its mean keeps to the limits.

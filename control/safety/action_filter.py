@@ -28,7 +28,7 @@ class Mode(StrEnum):
 
 
 class Limit(StrEnum):
-    """What changed a command."""
+    """A limit that changed a command."""
 
     NOT_A_NUMBER = "not a number"
     STEP = "step"
@@ -57,7 +57,7 @@ class Fault:
     ceiling: float
 
     def __str__(self) -> str:
-        """For the operator."""
+        """Return the message for the operator."""
         if self.limit == Limit.NOT_A_NUMBER:
             return f"the policy's action was not a number for {self.value:.2f} s"
         if np.isnan(self.value):
@@ -67,7 +67,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class Deadline:
-    """Ages (s) beyond which something is too old: the arm holds, then stops."""
+    """Ages (s) beyond which the arm holds, then stops."""
 
     hold: float
     stop: float
@@ -75,10 +75,11 @@ class Deadline:
 
 @dataclass(frozen=True)
 class Watchdogs:
-    """Deadlines of camera and touch frames, of the policy's action, of the arm's and gripper's state.
+    """Deadlines for images, the policy's action, the arm's and the gripper's state.
 
-    Hold after 100 ms, two ticks at 20 Hz and 50 ms: shared/research/drivers.md 6. Stop: half a
-    second, well below the client libraries' own 1 s. A gripper's state comes every 20 to 50 ms.
+    Our choices. Hold: two ticks at 20 Hz for images and actions. Stop: below the 1 s after which
+    libfranka drops a silent connection (measured: NetworkException after 1.02 to 1.06 s). A Franka
+    Hand's state comes every 20 to 50 ms.
     """
 
     observation: Deadline = Deadline(0.1, 0.5)
@@ -89,15 +90,15 @@ class Watchdogs:
 
 @dataclass(frozen=True)
 class Measurements:
-    """What the sensors say in a tick.
+    """Measurements of one tick.
 
     Attributes:
         q: measured joint positions, rad.
-        force: N on the TCP from outside.
-        torque: Nm in each joint from outside.
-        indentation: m that each fingertip's gel is pressed in.
-        observation_age, action_age, state_age, gripper_age: s since the oldest of each was taken.
-        load: N more or less on the table than at first; 0 without a load cell.
+        force: external force on the TCP, N.
+        torque: external torque in each joint, Nm.
+        indentation: depth in each fingertip's gel, m.
+        observation_age, action_age, state_age, gripper_age: age of the oldest of each, s.
+        load: change of the load cell's force since the start, N; 0 without one.
     """
 
     q: Joints
@@ -113,7 +114,7 @@ class Measurements:
 
 @dataclass(frozen=True)
 class SafetyState:
-    """The safe command of this tick and what it is to be continued from.
+    """Safe command of a tick, from which the next one continues.
 
     Attributes:
         q: commanded joint positions, rad.
@@ -142,10 +143,10 @@ class ActionFilter:
 
     Attributes:
         limits: of the robot.
-        joints: what a policy may use of its joints.
+        joints: limits of a policy's joint commands.
         dt: s, of a control tick.
-        watchdogs: how old things may be.
-        fingertips: where the corners of the fingertips may be commanded, base frame.
+        watchdogs: deadlines.
+        fingertips: box for the commanded corners of the fingertips, base frame.
     """
 
     def __init__(self, limits: RobotLimits, hz: float, watchdogs: Watchdogs | None = None) -> None:
@@ -159,7 +160,7 @@ class ActionFilter:
         self._braking_ticks = int(np.ceil(self.joints.velocity / unit).max()) + 1
 
     def start(self, q: Joints) -> SafetyState:
-        """The state of an arm at rest; UserError if it rests where a policy may not be."""
+        """Return the state of an arm at rest; UserError if it rests outside a policy's limits."""
         outside = np.flatnonzero(~((q >= self.joints.lower) & (q <= self.joints.upper)))
         if outside.size:
             i = int(outside[0])
@@ -177,7 +178,7 @@ class ActionFilter:
     def filter_action(
         self, state: SafetyState, action: Joints, reading: Measurements
     ) -> SafetyState:
-        """One tick: the safe command for a wanted joint change (rad), relative to the last command.
+        """Return the safe command for a wanted joint change (rad), relative to the last command.
 
         The arm holds while something is stale or the action is not finite; it stops at the first
         fault, and only a new `start` ends that. In STOP the driver also stops by its own means.
@@ -193,27 +194,27 @@ class ActionFilter:
         return self._move(state, action)
 
     def filter_width(self, state: SafetyState, target: float, last: float) -> float:
-        """The gripper width (m) to command in the tick that led to `state`.
+        """Return the gripper width (m) to command in the tick that led to `state`.
 
-        The target inside the stroke; the last command while the arm holds or is stopped, so that
-        nothing is dropped or squeezed then, and for a target that is not finite.
+        It is the target inside the stroke. While the arm holds or is stopped, and for a target that is
+        not finite, it is the last command: no object is dropped or squeezed then.
         """
         if state.mode is not Mode.MOVE or not np.isfinite(target):
             return last
         return float(np.clip(target, *self.limits.tool.stroke))
 
     def inside_workspace(self, q: Float[np.ndarray, "k n"]) -> Bool[np.ndarray, " k"]:
-        """Whether flange and finger edges lie in their boxes, less the reserve, for each of k postures."""
+        """Return whether flange and finger edges lie in their boxes, less the reserve."""
         points = self.monitored_points(q)
         flange = self._flange.contains(points[:, 0])
         return flange & self.fingertips.contains(points[:, 1:]).all(axis=1)
 
     def monitored_points(self, q: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k p 3"]:
-        """Flange and the fingertips' corners in the base frame (m), for each of k postures."""
+        """Return the flange and the fingertips' corners (m, base frame) for each of k postures."""
         return self._points(q.T).full().T.reshape(len(q), -1, 3)
 
     def tip_speed(self, q: Joints, velocity: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " k"]:
-        """Speed (m/s) of the fastest monitored point over a tick, for each of k joint velocities."""
+        """Return the speed (m/s) of the fastest monitored point for each of k joint velocities."""
         points = self.monitored_points(np.vstack([q, q + velocity * self.dt]))
         return np.linalg.norm(points[1:] - points[0], axis=-1).max(axis=1) / self.dt
 
@@ -230,7 +231,7 @@ class ActionFilter:
         return tuple(name for name, age, dead in self._ages(reading) if not age <= dead.hold)
 
     def _fault(self, state: SafetyState, reading: Measurements) -> Fault | None:
-        """The first ceiling exceeded; a reading that is not a number exceeds its ceiling."""
+        """Return the first ceiling exceeded; NaN exceeds every ceiling."""
         limits = self.limits
         checks = [(name, age, dead.stop) for name, age, dead in self._ages(reading)]
         checks += [
@@ -287,7 +288,7 @@ class ActionFilter:
         )
 
     def _slowed(self, state: SafetyState, wanted: Joints) -> Joints:
-        """The wanted velocity, or as much of it beyond braking as keeps the fingertips slow enough."""
+        """Return as much of the wanted velocity, beyond braking, as keeps the fingertips slow enough."""
         if self.tip_speed(state.q, wanted[None])[0] <= self.limits.tip_speed:
             return wanted
         rest = braked_velocity(state.velocity, self.joints.acceleration, self.dt)
@@ -296,10 +297,10 @@ class ActionFilter:
         return tries[slow[0]] if slow.size else rest
 
     def _into_workspace(self, state: SafetyState, wanted: Joints) -> Joints:
-        """The wanted velocity, or as much of it as lets braking end inside the boxes.
+        """Return as much of the wanted velocity as lets braking end inside the boxes.
 
-        Braking itself is the path checked a tick ago, computed by the same operations in the same
-        order, hence inside to the last bit. Postures between two ticks are not looked at: the joints
+        Braking alone is the path checked a tick ago, computed by the same operations in the same
+        order, hence inside to the last bit. Postures between two ticks are not checked: the joints
         move by less than 0.03 rad, and a point leaves the chord by less than 0.1 mm.
         """
         if self._stops_inside(state.q, wanted[None])[0]:
@@ -312,7 +313,7 @@ class ActionFilter:
     def _stops_inside(
         self, q: Joints, velocity: Float[np.ndarray, "c n"]
     ) -> Bool[np.ndarray, " c"]:
-        """For each candidate velocity: are this tick and the braking after it inside the boxes?"""
+        """Return, for each candidate velocity, whether this tick and the braking after it stay inside."""
         path = [q + velocity * self.dt]
         for _ in range(self._braking_ticks):
             velocity = braked_velocity(velocity, self.joints.acceleration, self.dt)

@@ -1,4 +1,4 @@
-"""How fast a joint may go and still stop in time, exact for a command that changes once a tick."""
+"""Highest joint speed that still stops in time, exact for a command that changes once a tick."""
 
 import numpy as np
 from jaxtyping import Float
@@ -8,7 +8,7 @@ PerJoint = Float[np.ndarray, " joints"]
 
 
 def max_stoppable_speed(gap: Joints, acceleration: PerJoint, dt: float) -> Joints:
-    """Highest speed (rad/s) for this tick that can still be braked to rest within `gap` (rad).
+    """Return the highest speed (rad/s) for this tick that still brakes to rest within `gap` (rad).
 
     Braking takes `acceleration * dt` off the speed each tick of `dt` s. In these units speed u
     with n = floor(u) travels (n + 1) u - n (n + 1) / 2; this inverts it. Zero for no gap. Keeping
@@ -21,5 +21,5 @@ def max_stoppable_speed(gap: Joints, acceleration: PerJoint, dt: float) -> Joint
 
 
 def braked_velocity(velocity: Joints, acceleration: PerJoint, dt: float) -> Joints:
-    """Velocity (rad/s) after one tick of braking, each joint by itself."""
+    """Return the velocity (rad/s) after one tick of braking, each joint by itself."""
     return velocity - np.clip(velocity, -acceleration * dt, acceleration * dt)

@@ -1,4 +1,4 @@
-"""What a robot on its table may do: the maker's limits, and the tighter ones a policy works inside."""
+"""Limits of a robot on its table: the maker's, and the tighter ones that a policy works inside."""
 
 from dataclasses import dataclass
 
@@ -18,11 +18,11 @@ class Box:
     upper: Vector3
 
     def contains(self, points: Float[np.ndarray, "*k 3"]) -> Bool[np.ndarray, "*k"]:
-        """Whether each point lies inside; False for what is not a number."""
+        """Return whether each point lies inside; False for NaN."""
         return np.all((points >= self.lower) & (points <= self.upper), axis=-1)
 
     def shrunk(self, by: float) -> "Box":
-        """The same box, smaller by so many m at every side."""
+        """Return the box, smaller by `by` m at every side."""
         return Box(self.lower + by, self.upper - by)
 
 
@@ -31,18 +31,18 @@ class RobotLimits:
     """One arm with its tool on its table.
 
     Attributes:
-        arm: its geometry and its maker's limits.
-        tool: what it carries.
-        velocity_share, acceleration_share: what a policy may use of them.
-        margin: rad kept from the ends of the joints' ranges.
+        arm: geometry and the maker's limits.
+        tool: gripper and fingertips.
+        velocity_share, acceleration_share: shares of the maker's limits that a policy may use.
+        margin: distance from the ends of the joints' ranges, rad.
         max_step: rad, largest joint change in one control tick.
         tracking: rad between commanded and measured joints that mean a blocked or lost arm.
-        flange, fingertips: where the flange and the corners of the fingertips may be.
-        reserve: m that commands keep inside these boxes, so that the 1 kHz stream, which cuts the
-            corners of their path, keeps inside, too.
+        flange, fingertips: boxes for the flange and for the corners of the fingertips.
+        reserve: m by which commands stay inside these boxes, because the 1 kHz stream cuts the corners
+            of their path.
         tip_speed: m/s, of the flange and of each of those corners.
-        force, torque: N and Nm from outside at the TCP and in a joint, below the reflex.
-        indentation: m that anything may press into a gel, as seen (`control.tactile.indentation`).
+        force, torque: external force at the TCP (N) and torque in a joint (Nm) that stop the arm.
+        indentation: depth (m) in a gel that stops the arm (`control.tactile.indentation`).
     """
 
     arm: ArmModel
@@ -62,31 +62,33 @@ class RobotLimits:
 
     @property
     def hardware(self) -> JointLimits:
-        """The maker's limits; beyond them the controller stops the arm."""
+        """Maker's limits; beyond them the controller stops the arm."""
         return self.arm.limits
 
     @property
     def interface(self) -> JointLimits:
-        """What the 1 kHz command and the arm's own moves stay within: the maker's, less a margin."""
+        """Limits of the 1 kHz stream and of the arm's own moves: the maker's, less the margin."""
         return self.hardware.with_margin(self.margin)
 
     @property
     def policy(self) -> JointLimits:
-        """What a policy's commands are clamped to, tick by tick."""
+        """Limits that a policy's commands are clamped to, tick by tick."""
         return self.interface.scaled(self.velocity_share, self.acceleration_share)
 
 
-# Shares, margin, step, forces: proposals of shared/research/drivers.md 6, after what DROID (0.1 rad
-# margin, 20 N) and LeRobot (0.05 per step) do; Franka's reflex is set at 20 N and above. Half the
-# acceleration, not 30 %, because it also brakes. Tracking: our choice, without a source. Indentation: twice
-# what FEATS pressed into a Mini (0.86 mm); simulated, a golf ball at 30 N, the least that a Franka
-# Hand grasps with, goes in by 1.2 mm, a pebble's edge by 2 mm. Compare it with your sensor's sheet.
-
-# Reserve: the stream was at most 0.45 mm beside the commands' path in an hour (touchgoal benchmark
-# sent-stream); a third more.
-
-# Speed of the fingertips: twice ISO 10218-1's reduced speed of 0.25 m/s, at which a person may be near;
-# set that in the cell file on the first day.
+# Maker's limits: `motion/arm_models.py`. The values above are ours, below these:
+# - margin 0.1 rad from the ends of the joints, as in DROID (Khazatsky et al., RSS 2024).
+# - max_step 0.05 rad a tick, the order of LeRobot's `max_relative_target`.
+# - acceleration_share: half, because the arm also brakes with it.
+# - force 15 N and torque 10 Nm, below franky's reflex of 30 N and 20 Nm (libfranka,
+#   `Robot::setCollisionBehavior`; its examples set 20 N and 20 Nm).
+# - indentation: twice the deepest press into a Mini in FEATS (0.86 mm). In simulation a golf ball at
+#   30 N, the least force of a Franka Hand (product manual), goes in by 1.2 mm, a pebble's edge by 2.
+# - reserve: the stream was at most 0.45 mm beside the commands' path in an hour
+#   (touchgoal benchmark sent-stream); a third more.
+# - tip_speed: twice the reduced speed of ISO 10218-1, 0.25 m/s. Set that in the cell file on the first
+#   day, when a person may be near.
+# - tracking: our choice, without a source.
 
 # The half of the table in front of the arm; the table's top is z = 0, and fingertips keep 5 mm off it.
 _FLANGE = Box(np.array([0.15, -0.5, 0.12]), np.array([0.75, 0.5, 0.9]))

@@ -1,4 +1,4 @@
-"""How hard each task presses by itself, and the ceilings that follow: above the task, below the reflex."""
+"""Force ceilings of each task: above what its demonstrations reach, below the arm's reflex."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,12 +10,12 @@ _LEVER = 0.6  # m: farthest that a hand over the table is from the axis of a joi
 
 @dataclass(frozen=True)
 class TaskForces:
-    """What the demonstrations of a task reach.
+    """Peaks over a task's demonstrations.
 
     Attributes:
-        force: N on the hand, at most.
-        indentation: m that a gel is pressed in, at most, as `control.tactile.indentation` reads it.
-        episodes: successful ones of the scripted experts that say so, seeds from 30000.
+        force: on the hand, N.
+        indentation: depth in a gel, m, as `control.tactile.indentation` measures it.
+        episodes: number of successful demonstrations, seeds from 30000.
     """
 
     force: float
@@ -24,17 +24,17 @@ class TaskForces:
 
     @property
     def force_ceiling(self) -> float:
-        """N on the hand above which a run of this task is stopped."""
+        """Force (N) on the hand above which a run of this task is stopped."""
         return min(_MARGIN * self.force, _MOST)
 
     @property
     def torque_ceiling(self) -> float:
-        """Nm in a joint, likewise: what that force makes of it, so that neither stops the other's task."""
+        """Torque (Nm) that this force causes in a joint, so that neither limit comes first."""
         return _LEVER * self.force_ceiling
 
     @property
     def indentation_ceiling(self) -> float:
-        """m into a gel, likewise; `deepest_readable` says what a sensor can tell of it."""
+        """Depth (m) in a gel, likewise; `deepest_readable` bounds it for a sensor."""
         return _MARGIN * self.indentation
 
 
