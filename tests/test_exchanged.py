@@ -9,7 +9,7 @@ import cv2
 import mujoco
 import numpy as np
 import pytest
-from a_cell import MadeUpArm, MadeUpCamera, MadeUpClock, MadeUpGripper
+from fake_cell import FakeArm, FakeCamera, FakeClock, FakeGripper
 
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
@@ -56,7 +56,7 @@ def preflighted(
     pictures: list[np.ndarray], untouched: list[np.ndarray], tmp_path: Path
 ) -> dict[str, CheckResult]:
     """The pre-flight's lines on two fingertips that show these, each with a sensor file of its own."""
-    clock, folders = MadeUpClock(), []
+    clock, folders = FakeClock(), []
     for side, background in enumerate(untouched):
         folders.append(tmp_path / f"finger_{side}")
         tmp_path.mkdir(exist_ok=True)
@@ -70,10 +70,10 @@ def preflighted(
         '[task]\nname = "pick-place"\npolicy = "expert"\n'
     )
     cameras: dict[str, Camera] = {
-        key: TactileCamera(MadeUpCamera(clock, picture), find_sensor(str(folder)), NO_CROP)
+        key: TactileCamera(FakeCamera(clock, picture), find_sensor(str(folder)), NO_CROP)
         for key, picture, folder in zip(ft.TACTILE, pictures, folders, strict=True)
     }
-    connection = CellConnection(FR3, MadeUpArm(clock), MadeUpGripper(clock), cameras, None, clock)
+    connection = CellConnection(FR3, FakeArm(clock), FakeGripper(clock), cameras, None, clock)
     safety = ActionFilter(FR3, ft.CONTROL_HZ)
     lines = preflight(read_cell_file(file), connection, safety, tmp_path / "episodes", lambda: 0)
     return {line.name: line for line in lines}
@@ -132,10 +132,10 @@ def test_exchanged_cameras_are_noticed_where_there_is_something_to_see() -> None
 
 
 @dataclass
-class CameraOnTheArm(MadeUpCamera):
+class CameraOnTheArm(FakeCamera):
     """Shows a picture that moves as the first joint does."""
 
-    arm: MadeUpArm | None = None
+    arm: FakeArm | None = None
 
     def read(self) -> Frame:
         assert self.arm is not None
@@ -153,12 +153,12 @@ def test_a_run_with_exchanged_cameras_ends_after_the_start_move(
         'arm = "sim"\ngripper = { kind = "franka_hand" }\n'
         f'task = {{ name = "pick-place", policy = "expert", start = {start.tolist()} }}\n'
     )
-    clock, scene = MadeUpClock(), np.random.default_rng(0).integers(0, 255, (128, 128, 3), np.uint8)
-    arm = MadeUpArm(clock)
-    fixed, carried = MadeUpCamera(clock, scene), CameraOnTheArm(clock, scene, arm=arm)
+    clock, scene = FakeClock(), np.random.default_rng(0).integers(0, 255, (128, 128, 3), np.uint8)
+    arm = FakeArm(clock)
+    fixed, carried = FakeCamera(clock, scene), CameraOnTheArm(clock, scene, arm=arm)
     views = (carried, fixed) if exchanged else (fixed, carried)
     cameras: dict[str, Camera] = dict(zip(ft.CAMERAS, views, strict=True))
-    connection = CellConnection(FR3, arm, MadeUpGripper(clock), cameras, None, clock)
+    connection = CellConnection(FR3, arm, FakeGripper(clock), cameras, None, clock)
 
     def actor(loop: ControlLoop) -> ScriptedActor:
         return ScriptedActor([], loop.commanded, ft.CONTROL_HZ)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from killed import killed_in_epoch
+from interrupted_training import killed_in_epoch
 
 from touchgoal.encoders import pretrained
 from touchgoal.encoders.backbones.vit import patchify, random_masking

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from a_cell import MadeUpCamera, MadeUpClock
+from fake_cell import FakeCamera, FakeClock
 from toy_episodes import FPS, make_episode
 
 import touchgoal
@@ -120,8 +120,8 @@ def test_presses_tell_a_mirror_that_the_untouched_gel_does_not_show(tmp_path: Pa
 
 
 def test_a_fingertip_leaves_out_torn_pictures() -> None:
-    clock = MadeUpClock()
-    camera = MadeUpCamera(clock, MINI.background)
+    clock = FakeClock()
+    camera = FakeCamera(clock, MINI.background)
     fingertip = TactileCamera(camera, GELSIGHT_MINI, NO_CROP)
     clock.time = 1.0
     whole = fingertip.read()

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from a_cell import MadeUpCell, MadeUpLoadCell
+from fake_cell import FakeCell, FakeLoadCell
 
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.hand import HandMonitor, HeldObject
@@ -32,13 +32,13 @@ def set_(device: object, **values: object) -> Callable[[], None]:
 
 
 def test_every_stop_stops_the_gripper_too() -> None:
-    cell = MadeUpCell()
+    cell = FakeCell()
     cell.run(at(10, set_(cell.arm, fault="reflex")))
-    assert cell.arm.stopped and cell.gripper.told[-1] == "stop"
+    assert cell.arm.stopped and cell.gripper.commands[-1] == "stop"
 
 
 def test_a_gripper_that_falls_silent_holds_then_stops_the_arm() -> None:
-    cell = MadeUpCell()
+    cell = FakeCell()
     cell.gripper.silent_from = 1.0
     ending = cell.run(lambda _: None, step=0.001)
     assert ending.stopped and "gripper age" in ending.reason
@@ -57,7 +57,7 @@ def test_a_gripper_that_falls_silent_holds_then_stops_the_arm() -> None:
 def test_what_is_not_a_number_stops_the_arm_and_never_reaches_the_record(
     device: str, values: dict, said: str
 ) -> None:
-    cell = MadeUpCell()
+    cell = FakeCell()
     ending = cell.run(at(10, set_(getattr(cell, device), **values)), step=0.001)
     assert ending.stopped and said in ending.reason and np.isfinite(ending.rest_seconds)
     assert len(cell.log.rows) >= 10
@@ -65,7 +65,7 @@ def test_what_is_not_a_number_stops_the_arm_and_never_reaches_the_record(
 
 
 def test_a_moment_without_numbers_is_bridged() -> None:
-    cell = MadeUpCell()
+    cell = FakeCell()
 
     def each(tick: int) -> None:
         set_(cell.arm, velocity=np.full(7, NAN if tick == 10 else 0.0))()
@@ -75,7 +75,7 @@ def test_a_moment_without_numbers_is_bridged() -> None:
 
 
 def test_forces_that_nobody_knows_stop_the_arm() -> None:
-    cell = MadeUpCell()
+    cell = FakeCell()
     ending = cell.run(at(10, set_(cell.arm, wrench=np.full(6, NAN))))
     assert ending.reason == "external force is unknown" and "singularity" in ending.advice
 
@@ -83,16 +83,16 @@ def test_forces_that_nobody_knows_stop_the_arm() -> None:
 def test_what_presses_on_the_table_is_recorded_and_stops_the_arm() -> None:
     """More by the task's force ceiling than what lay there at first; a sudden relief counts, too."""
     for change in (40.0, -40.0):
-        cell = MadeUpCell()
-        cell.load_cell = MadeUpLoadCell(cell.clock, force=55.0)
+        cell = FakeCell()
+        cell.load_cell = FakeLoadCell(cell.clock, force=55.0)
         ending = cell.run(at(10, lambda c=cell, n=change: setattr(c.load_cell, "force", 55 + n)))
         assert ending.stopped and "load on the table 40" in ending.reason
         assert [row[ft.LOAD].item() for row in cell.log.rows] == [55.0] * len(cell.log.rows)
 
 
 def test_an_arm_that_took_other_devices_along_is_what_the_operator_reads() -> None:
-    cell = MadeUpCell()
-    cell.load_cell = MadeUpLoadCell(cell.clock)
+    cell = FakeCell()
+    cell.load_cell = FakeLoadCell(cell.clock)
 
     def power_cut() -> None:
         set_(cell.arm, fault="the controller closed the connection")()
@@ -112,10 +112,10 @@ def test_an_arm_that_took_other_devices_along_is_what_the_operator_reads() -> No
 
 
 def test_a_dry_run_imagines_one_consistent_arm() -> None:
-    cell = MadeUpCell()
+    cell = FakeCell()
     set_(cell.arm, wrench=np.full(6, 2.0))()
     ending = cell.run(lambda _: None, step=0.01, seconds=1.0, width=0.06, execute=False)
-    assert not ending.stopped and not cell.gripper.told
+    assert not ending.stopped and not cell.gripper.commands
     kinematics = Kinematics(FR3.arm, FR3.tool.tcp_offset)
     for row in cell.log.rows:
         position, _ = kinematics.forward(row[ft.STATE][:7].astype(float))
@@ -127,7 +127,7 @@ def test_a_dry_run_imagines_one_consistent_arm() -> None:
 
 
 def test_an_object_lost_on_the_way_stops_the_arm() -> None:
-    cell = MadeUpCell()
+    cell = FakeCell()
     set_(cell.gripper, width=0.04, grasped=True)()
     ending = cell.run(at(20, set_(cell.gripper, width=0.0, grasped=False)))
     assert ending.stopped and "lost its object" in ending.reason
@@ -182,7 +182,7 @@ def test_a_hand_that_follows_is_left_alone() -> None:
 
 
 def test_a_dead_hand_stops_the_arm() -> None:
-    cell = MadeUpCell()
+    cell = FakeCell()
     set_(cell.gripper, width=0.08)()
     ending = cell.run(lambda _: None, step=0.001, width=0.0)
     assert ending.stopped and "the hand does not follow" in ending.reason

@@ -19,7 +19,7 @@ class Blocker(MetaPathFinder):
 sys.meta_path.insert(0, Blocker())
 
 import numpy as np
-from a_cell import MadeUpArm, MadeUpClock, MadeUpGripper
+from fake_cell import FakeArm, FakeClock, FakeGripper
 
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.connection import CellConnection
@@ -54,8 +54,10 @@ class Turns:
 def run(folder: Path, policy: str, seconds: float) -> tuple[Result, dict]:
     file = folder / "cell.toml"
     file.write_text(CELL.replace("POLICY", policy).replace("40.0", str(seconds)))
-    cell, clock, recorded = read_cell_file(file), MadeUpClock(), {}
-    connection = CellConnection(FR3, MadeUpArm(clock), MadeUpGripper(clock), {}, None, clock)
+    cell, clock, recorded = read_cell_file(file), FakeClock(), {}
+    connection = CellConnection(
+        FR3, FakeArm(clock), FakeGripper(clock, follows=True), {}, None, clock
+    )
     safety = ActionFilter(FR3, 20)
     loaded = load_user_policy(cell, env_config_of(cell))
 

@@ -53,8 +53,8 @@ class ChunkPlanner(Protocol):
     def config(self) -> Horizons: ...  # noqa: D102
     @property
     def ticks_seen(self) -> int: ...  # noqa: D102
-    def embed(self, seen: Sequence[Observation]) -> None: ...  # noqa: D102
-    def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]: ...  # noqa: D102
+    def embed(self, observations: Sequence[Observation], /) -> None: ...  # noqa: D102
+    def plan(self, observations: Sequence[Observation], /) -> Float32[np.ndarray, "h 8"]: ...  # noqa: D102
 
 
 class RealTimeActor(Actor):

@@ -43,8 +43,8 @@ class Terminal:
     def __init__(self) -> None:
         self._request: Request = ""
         self._tick_count = 0
-        has_keys = sys.stdin is not None and sys.stdin.isatty()
-        self._keyboard = Keyboard(sys.stdin) if has_keys else None
+        keys = sys.stdin if sys.stdin is not None and sys.stdin.isatty() else None
+        self._keyboard = Keyboard(keys) if keys else None
         self._shows = sys.stdout is not None and sys.stdout.isatty()
 
     def operator_request(self) -> Request:

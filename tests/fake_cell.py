@@ -1,4 +1,4 @@
-"""A cell of made-up devices that do as they are told, for what the control loop makes of them."""
+"""A cell of fake devices that do as they are commanded, to test the control loop."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -14,7 +14,7 @@ from touchgoal.control.safety.limits import FR3
 
 
 @dataclass
-class MadeUpClock:
+class FakeClock:
     """Jumps where it is waited for."""
 
     time: float = 0.0
@@ -30,10 +30,10 @@ class MadeUpClock:
 
 
 @dataclass
-class MadeUpArm:
+class FakeArm:
     """Is at once where it is commanded."""
 
-    clock: MadeUpClock
+    clock: FakeClock
     reading: ArmReading = field(
         default_factory=lambda: ArmReading(
             FR3.arm.home, np.zeros(7), np.zeros(6), np.zeros(7), "", 0.0, 0.0
@@ -56,31 +56,34 @@ class MadeUpArm:
 
 
 @dataclass
-class MadeUpGripper:
-    """Remembers what it was told."""
+class FakeGripper:
+    """Remembers its commands; `follows` them, or stands still."""
 
-    clock: MadeUpClock
+    clock: FakeClock
     reading: GripperReading = field(default_factory=lambda: GripperReading(0.04, False, "", 0.0))
     silent_from: float = np.inf
-    told: list[str] = field(default_factory=list)
+    follows: bool = False
+    commands: list[str] = field(default_factory=list)
 
     def read(self) -> GripperReading:
         return replace(self.reading, stamp=min(self.clock.time, self.silent_from))
 
     def command(self, width: float) -> None:
-        self.told.append(f"{width:.3f}")
+        self.commands.append(f"{width:.3f}")
+        if self.follows:
+            self.reading = replace(self.reading, width=width)
 
     def stop(self, release_to: float | None = None) -> None:
-        self.told.append("stop" if release_to is None else f"open to {release_to:.3f}")
+        self.commands.append("stop" if release_to is None else f"open to {release_to:.3f}")
 
     def close(self) -> None: ...
 
 
 @dataclass
-class MadeUpCamera:
+class FakeCamera:
     """Shows one picture, new each time."""
 
-    clock: MadeUpClock
+    clock: FakeClock
     image: np.ndarray
     rate: float = 30.0
     problem: str = ""
@@ -92,10 +95,10 @@ class MadeUpCamera:
 
 
 @dataclass
-class MadeUpLoadCell:
+class FakeLoadCell:
     """Says one force (N)."""
 
-    clock: MadeUpClock
+    clock: FakeClock
     force: float = 0.0
 
     def read(self) -> LoadReading:
@@ -104,7 +107,7 @@ class MadeUpLoadCell:
     def close(self) -> None: ...
 
 
-class MadeUpCell:
+class FakeCell:
     """Its devices, and a run of the control loop on them.
 
     Attributes:
@@ -112,9 +115,9 @@ class MadeUpCell:
     """
 
     def __init__(self) -> None:
-        self.clock = MadeUpClock()
-        self.arm, self.gripper = MadeUpArm(self.clock), MadeUpGripper(self.clock)
-        self.load_cell: MadeUpLoadCell | None = None
+        self.clock = FakeClock()
+        self.arm, self.gripper = FakeArm(self.clock), FakeGripper(self.clock)
+        self.load_cell: FakeLoadCell | None = None
         self.cameras: dict = {}
         self.log = RunLog()
 
@@ -126,7 +129,7 @@ class MadeUpCell:
         seconds: float = 5.0,
         execute: bool = True,
     ) -> Ending:
-        """`each_tick` is told the number of the tick before the actor acts in it.
+        """`each_tick` gets the number of the tick before the actor acts in it.
 
         Args:
             step: rad that the first joint is to go each tick.

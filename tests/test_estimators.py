@@ -1,4 +1,4 @@
-"""Senses: what they say fits what a policy learns on, and a policy with them acts."""
+"""Estimators: their outputs fit the columns that a policy learns on, and a policy with them acts."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -65,13 +65,13 @@ def test_the_start_is_seen_from_the_hand() -> None:
     left = 2 * (yaw - hand)
     for contact in ([0.0, 1.0], [1.0, 1.0]):  # the object matters, or the goal
         held = contact == [1.0, 1.0]
-        seen = network_input(torch.tensor([pose + contact + start]), columns, "base_twist")[
+        observed = network_input(torch.tensor([pose + contact + start]), columns, "base_twist")[
             0, 11:
         ].numpy()
         way = np.array([0.0, 0.0, -0.17, 0.1, -0.2] if held else [-0.05, 0.05, -0.17, 0.0, 0.0])
         twice = [0.0, 0.0] if held else [np.cos(left), np.sin(left)]
         expected = [*way, *twice, *way / (np.abs(way) + 0.02)]
-        np.testing.assert_allclose(seen, expected, atol=1e-6)
+        np.testing.assert_allclose(observed, expected, atol=1e-6)
 
 
 def test_contact_is_learnt(tmp_path: Path) -> None:
@@ -92,9 +92,9 @@ def test_contact_is_learnt(tmp_path: Path) -> None:
 
 def test_contact_is_true_or_false() -> None:
     """As in what a policy learns on, however sure the network is."""
-    estimator, seen = toy_estimator(), toy_observations(1)[0]
-    seen |= {ft.FRONT: np.zeros((16, 16, 3), np.uint8)}
-    contact = estimator.estimate(seen, seen)[ft.TRUTH_CONTACT]
+    estimator, observed = toy_estimator(), toy_observations(1)[0]
+    observed |= {ft.FRONT: np.zeros((16, 16, 3), np.uint8)}
+    contact = estimator.estimate(observed, observed)[ft.TRUTH_CONTACT]
     assert contact.dtype == np.float32 and set(contact.tolist()) <= {0.0, 1.0}
 
 

@@ -1,4 +1,4 @@
-"""Trainings that are killed."""
+"""Trainings that are interrupted."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
