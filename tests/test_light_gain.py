@@ -83,7 +83,7 @@ def detector_strength(frame: Frame, rest: Frame) -> np.ndarray:
 
 
 def followed_indentation(frame: Frame, rest: Frame) -> np.ndarray:
-    """After a second in the light of the frame, as far as its corner shows it, without contact."""
+    """Return the indentation after a second without contact in the light of the frame."""
     meter = IndentationMeter(GELSIGHT_MINI, rest)
     alone = lit(rest, light_gain(frame, rest))
     for _ in range(25):
@@ -113,7 +113,7 @@ READERS: dict[str, Callable[[Frame, Frame], np.ndarray]] = {
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_every_reader_sees_the_same_touch_in_another_light(name: str) -> None:
+def test_every_reader_reads_a_touch_alike_in_another_light(name: str) -> None:
     read = READERS[name]
     rest, touched, _ = touches(GELSIGHT_MINI, 1)
     steady, dimmed = read(touched, rest), read(lit(touched, DIM), rest)
@@ -133,16 +133,16 @@ def test_the_background_follows_the_light_and_still_reports_it() -> None:
 
 
 @pytest.mark.parametrize("task", SHIPPED_POLICIES)
-def test_shipped_policies_feel_the_same_touch_in_another_light(task: str) -> None:
+def test_shipped_policies_embed_a_touch_alike_in_another_light(task: str) -> None:
     policy = SavedPolicy(SHIPPED_POLICIES[task])()
     embedder = policy.touch or policy._estimator.touch  # pyright: ignore
     sensor = find_sensor(embedder.sensor or "gelsight_mini")
     rest, touched, _ = touches(sensor, 2)
     first, now, dimmed = (
-        dict.fromkeys(ft.TACTILE, frame) for frame in (rest, touched, lit(touched, DIM))
+        {str(key): frame for key in ft.TACTILE} for frame in (rest, touched, lit(touched, DIM))
     )
-    felt, other, untouched = (embedder.embed_tick([tick], first) for tick in (now, dimmed, first))
-    assert np.linalg.norm(other - felt) < 0.05 * np.linalg.norm(felt - untouched)
+    steady, other, untouched = (embedder.embed_tick([tick], first) for tick in (now, dimmed, first))
+    assert np.linalg.norm(other - steady) < 0.05 * np.linalg.norm(steady - untouched)
 
 
 def test_the_environment_changes_the_light_after_the_first_picture() -> None:
