@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from touchgoal.control import features as ft
+from touchgoal.control.calibration.ball import find_circle
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector, contact_strength
 from touchgoal.control.tactile.depth import DepthEstimator
@@ -19,6 +20,7 @@ from touchgoal.control.tactile.light_gain import (
     light_gain,
     remove_gain,
 )
+from touchgoal.control.tactile.picture_guard import explain
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, SensorModel, find_sensor
 from touchgoal.encoders.preprocess import fine_preprocessor_for, preprocessor_for
@@ -101,6 +103,17 @@ READERS: dict[str, Callable[[Frame, Frame], np.ndarray]] = {
         )
     ),
     "indentation": followed_indentation,
+    "unexplained share": lambda frame, rest: np.array(
+        [
+            explain(
+                DepthEstimator(load(GELSIGHT_MINI.sensor_file), 8),
+                load(GELSIGHT_MINI.sensor_file),
+                frame,
+                rest.astype(np.float32),
+            ).unexplained
+        ]
+    ),
+    "ball": find_circle,
     "force": lambda frame, rest: change_statistics(frame, rest.astype(np.float32)),
     "encoders": lambda frame, rest: preprocessor_for("gelsight_mini")(frame[None], rest),
     "whitened encoders": lambda frame, rest: fine_preprocessor_for("gelsight_mini")(

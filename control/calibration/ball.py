@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from touchgoal.control.tactile import gel
+from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.control.tactile.sensor_calibration import SensorCalibration
 from touchgoal.runtime.errors import UserError
 
@@ -65,7 +66,7 @@ def find_circle(
     Raises:
         UserError: no change stands out.
     """
-    change = image.astype(np.float32) - background
+    change = remove_gain(image, background) - background
     change -= np.median(change, (0, 1))
     strength = np.sqrt((cv2.GaussianBlur(change, (0, 0), _FIND_BLUR) ** 2).sum(2))
     strongest = float(np.percentile(strength, 99.7))

@@ -18,6 +18,7 @@ from jaxtyping import Float32, UInt8
 
 from touchgoal.control.tactile.background import local_change
 from touchgoal.control.tactile.depth import DepthEstimator
+from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.control.tactile.sensor_calibration import SensorCalibration, load, shade
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.runtime.errors import UserError
@@ -186,7 +187,7 @@ def explain(
 ) -> Explanation:
     """Read a frame's depth and compare the frame with the rendering of that depth."""
     depth = estimator.estimate(frame, background)
-    change = frame.astype(np.float32) - background
+    change = remove_gain(frame, background) - background
     left = change - (shade(calibration, depth) - calibration.background)
     size = frame.shape[1] // _CELL, frame.shape[0] // _CELL
     strong, rest = (cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (change, left))
