@@ -115,7 +115,7 @@ def test_a_place_is_learnt(tmp_path: Path) -> None:
     assert pose_errors(sight, placements)["object_mm"][0] < 15  # 60 by chance
 
 
-def test_senses_survive_the_disk(tmp_path: Path) -> None:
+def test_estimators_survive_the_disk(tmp_path: Path) -> None:
     estimator = toy_estimator()
     save_estimator(estimator.network, tmp_path, {})
     with pytest.raises(UserError, match="trained with the touch encoder toy, .*train-estimators"):
