@@ -184,12 +184,12 @@ def test_time_up_has_an_exit_status_and_is_recorded_as_no_success(tmp_path: Path
 
 @pytest.mark.parametrize(
     ("request_", "success", "outcome"),
-    [("done", True, "success"), ("not done", False, "failure"), ("", None, "unknown")],
+    [("done", True, "success"), ("not done", False, "failure"), ("", False, "failure")],
 )
 def test_without_a_simulator_the_operator_says_whether_it_is_done(
     request_: Request, success: bool | None, outcome: str, bare: CellConfig, tmp_path: Path
 ) -> None:
-    """A plan that ends by itself is no success: nobody has seen it."""
+    """A plan that ends by itself with an empty hand is a failure."""
     connection = replace(simulate_cell(bare, ft.CONTROL_HZ), truth=None)
     safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(bare))
     actor, ticks = Acts(0, 0.0), []

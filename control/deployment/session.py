@@ -11,6 +11,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.deployment.control_loop import (
+    PLAN_ENDED,
     ControlLoop,
     Ending,
     Request,
@@ -103,6 +104,9 @@ class Session:
         finally:
             if watch:
                 watch.close()
+        picked = self.execute and self.cell.task.policy == "expert" and ending.reason == PLAN_ENDED
+        if picked and self._held_width() is None:  # it ends with the object in the hand
+            ending = Ending(f"{PLAN_ENDED}, but the hand holds nothing", done=False)
         success = self._success(ending)
         episode, recording_error = None, ""
         if self.execute and log.rows:
