@@ -57,7 +57,7 @@ class FakeArm:
 
 @dataclass
 class FakeGripper:
-    """Remembers its commands; `follows` them, or stands still."""
+    """Remembers its commands; `follows` them to an object of 40 mm, or stands still."""
 
     clock: FakeClock
     reading: GripperReading = field(default_factory=lambda: GripperReading(0.04, False, "", 0.0))
@@ -71,7 +71,7 @@ class FakeGripper:
     def command(self, width: float) -> None:
         self.commands.append(f"{width:.3f}")
         if self.follows:
-            self.reading = replace(self.reading, width=width)
+            self.reading = replace(self.reading, width=max(width, 0.04), grasped=width < 0.04)
 
     def stop(self, release_to: float | None = None) -> None:
         self.commands.append("stop" if release_to is None else f"open to {release_to:.3f}")
