@@ -1,4 +1,4 @@
-"""The bead maze: lead a bead along a bent wire by feel."""
+"""The bead maze: lead a bead along a bent wire by touch."""
 
 from typing import Any
 
@@ -64,7 +64,7 @@ class BeadMaze(FrankaTactileEnv):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        """With a config, or with those of its fields that differ from the default by name."""
+        """Take a config, options by name that override its fields, or both."""
         super().__init__(with_options(config or BeadMazeConfig(), options), render_mode)
 
     @property
@@ -73,21 +73,21 @@ class BeadMaze(FrankaTactileEnv):
         return self._ticks < GRASP_SECONDS * self.config.control_hz
 
     def begin_tick(self) -> None:
-        """The fixture holds the bead while the hand closes on it, and lets go of it then."""
+        """Let the fixture hold the bead while the hand closes on it."""
         self.data.eq_active[self.model.equality("fixture").id] = self.grasping
 
     def failures(self) -> list[str]:
-        """Of drop, jam and over_force, what is so after the last tick."""
+        """Return which of drop, jam and over_force hold after the last tick."""
         names = ft.FEATURES[ft.TRUTH_FAILURE].names
         failed = [name for name, true in zip(names, self.failure, strict=True) if true]
         return failed or super().failures()
 
     def instruction(self) -> str:
-        """The episode's task in words."""
+        """Return the episode's task in words."""
         return "lead the bead along the wire to its other end"
 
     def episode_info(self) -> dict[str, Any]:
-        """What distinguishes the episode: body and wire."""
+        """Return what distinguishes the episode: body, wire and disturbance."""
         return super().episode_info() | {
             "wire": self.wire.name,
             "family": self.wire.family,
@@ -97,16 +97,16 @@ class BeadMaze(FrankaTactileEnv):
     def sample_episode(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
         """Draw the wire, where it stands, and the grasp force."""
         config = self.config
-        wanted = with_options(BeadMazeReset(), options)
-        if wanted.wire is not None:
-            wire = wires.find(wanted.wire)
+        chosen = with_options(BeadMazeReset(), options)
+        if chosen.wire is not None:
+            wire = wires.find(chosen.wire)
         else:
             drawn = config.chosen_wires()
             wire = drawn[rng.integers(len(drawn))]
         place = np.array([0.5, 0.0, 0.17]) + rng.uniform(-0.02, 0.02, 3)
         self.wire = wire.moved(place, rng.uniform(-0.15, 0.15))
         force = rng.uniform(*config.grasp_force)
-        self.grasp_force = force if wanted.grasp_force is None else wanted.grasp_force
+        self.grasp_force = force if chosen.grasp_force is None else chosen.grasp_force
         self._friction = rng.uniform(*config.wire_friction)
         self.bodies = [Body(BEADS[config.bead], _SIZES[config.bead], BEAD_MASS)]
 
@@ -116,13 +116,13 @@ class BeadMaze(FrankaTactileEnv):
         add_bead_on_wire(spec, self.wire, self._friction)
 
     def place_objects(self, rng: np.random.Generator) -> None:
-        """The bead sits at the start, as the scene was built."""
+        """Put the bead at the start of the wire."""
         self.arc_length = START
         self.failure = np.zeros(3, bool)
         self._furthest, self._stalled_ticks = START, 0
 
     def start_joints(self, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
-        """Joint positions with the bead between the fingers, not quite in their middle."""
+        """Draw joint positions (rad) with the bead nearly in the middle between the fingers."""
         point, tangent = self.wire.at(START)
         R = fingers_across(tangent)
         if self.config.start_angle > 0:
@@ -136,7 +136,7 @@ class BeadMaze(FrankaTactileEnv):
         return self.kinematics.solve_ik(point + offset, R, guess)
 
     def _let_settle(self) -> None:
-        """The hand is open around the bead, just wide enough to keep off the wire."""
+        """Open the hand around the bead, just wide enough to stay off the wire."""
         self._finger_target = BEAD_RADIUS + 0.004
         self.data.qpos[self._fingers] = self._finger_target
         self.data.eq_active[self.model.equality("fixture").id] = 1
@@ -146,19 +146,18 @@ class BeadMaze(FrankaTactileEnv):
         return np.zeros(self.n_joints) if self.grasping else super()._disturbance()
 
     def evaluate(self) -> tuple[float, bool]:
-        """Progress along the wire in [0, 1] and success; updates `failure`."""
+        """Return progress along the wire in [0, 1] and success; update `failure`."""
         bead = self.object_pose()[:3]
         self.arc_length = self.wire.project(bead, self.arc_length)
         if self.grasping or self.arc_length > self._furthest + 0.002:
             self._furthest, self._stalled_ticks = self.arc_length, 0
         else:
             self._stalled_ticks += 1
-        self.failure = np.array([self._dropped(bead), self._jammed(), self._over_force()])
+        self.failure = np.array([self._dropped(bead), self._jammed(), self._force.exceeded])
         progress = float(np.clip((self.arc_length - START) / (END - START), 0.0, 1.0))
         return progress, progress == 1.0 and not self.failure.any()
 
     def _dropped(self, bead: np.ndarray) -> bool:
-        """Whether the bead left the fingers, or (which physics should forbid) the wire."""
         if self.grasping:
             return False
         geom = self.model.geom("object").id
@@ -169,15 +168,12 @@ class BeadMaze(FrankaTactileEnv):
     def _jammed(self) -> bool:
         return self._stalled_ticks > self.config.stall_seconds * self.config.control_hz
 
-    def _over_force(self) -> bool:
-        return bool(np.linalg.norm(self._external[:3]) > self.config.max_force)
-
     def _info(self, progress: float, success: bool) -> dict[str, Any]:
         return super()._info(progress, success) | {ft.TRUTH_FAILURE: self.failure}
 
 
 def add_wire(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
-    """The wire as a chain of capsules, on two posts."""
+    """Add the wire as a chain of capsules on two posts."""
     steel = {
         "type": mujoco.mjtGeom.mjGEOM_CAPSULE,
         "contype": 0,

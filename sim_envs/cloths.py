@@ -64,7 +64,7 @@ class ClothClip:
 
 
 def press_cloth(config: RigConfig, index: int) -> ClothClip:
-    """One clip; the same config and index always give the same one."""
+    """Simulate one clip; the same config and index always give the same one."""
     rng, unit = np.random.default_rng([config.seed, index, 4]), rig_unit(config)
     number = index % len(CLOTHS)
     surface = _piece(CLOTHS[number], rng)
@@ -86,13 +86,13 @@ def press_cloth(config: RigConfig, index: int) -> ClothClip:
 
 
 def _dotted(image: np.ndarray, unit: SensorInstance) -> np.ndarray:
-    """With the gel's printed dots, at rest: a press without shear hardly moves them."""
+    """Draw the gel's printed dots at rest: a press without shear hardly moves them."""
     draw(image, unit.markers, unit.marker_radius)
     return image
 
 
 def _piece(cloth: Cloth, rng: np.random.Generator) -> Surface:
-    """One piece of a cloth, on something flat or on a finger."""
+    """Draw one piece of a cloth, on a flat object or on a finger."""
     pattern = _height(cloth, rng)
     relief = cloth.relief * rng.uniform(0.85, 1.15)
     body = "flat" if rng.random() < 0.5 else "cylinder"
@@ -102,7 +102,7 @@ def _piece(cloth: Cloth, rng: np.random.Generator) -> Surface:
 
 
 def _height(cloth: Cloth, rng: np.random.Generator) -> Tile:
-    """Of one piece, 0 to about 1; its yarns' number and course differ from piece to piece."""
+    """Draw one piece's height, 0 to about 1; pieces differ in the number and course of yarns."""
     along, across = (max(2, round(n * (1 + _YARN * rng.uniform(-1, 1)))) for n in cloth.yarns)
     y, x = np.mgrid[:TILE, :TILE].astype(np.float32) / TILE
     bend = 0.15 * _noise(rng, 40), 0.15 * _noise(rng, 40)
@@ -112,7 +112,7 @@ def _height(cloth: Cloth, rng: np.random.Generator) -> Tile:
 
 
 def _noise(rng: np.random.Generator, cells: float) -> Tile:
-    """Smooth noise without seams, of standard deviation 1."""
+    """Draw smooth noise without seams, of standard deviation 1."""
     white = rng.normal(size=(TILE, TILE)).astype(np.float32)
     wrapped = cv2.copyMakeBorder(white, 128, 128, 128, 128, cv2.BORDER_WRAP)
     smooth = cv2.GaussianBlur(wrapped, (0, 0), cells)[128:-128, 128:-128]
@@ -120,12 +120,11 @@ def _noise(rng: np.random.Generator, cells: float) -> Tile:
 
 
 def _round(phase: np.ndarray) -> np.ndarray:
-    """Cross-section of a yarn a period."""
     return np.sqrt(np.maximum(1 - (2 * (phase % 1) - 1) ** 2, 0))
 
 
 def _woven(over: int, under: int, step: int, bundle: int = 1, turn_after: int = 0) -> Pattern:
-    """Warp over so many wefts and under so many, each row of it so many steps on.
+    """Return a weave: warp over `over` wefts and under `under`, shifted by `step` from row to row.
 
     Args:
         over, under: wefts.
@@ -146,52 +145,43 @@ def _woven(over: int, under: int, step: int, bundle: int = 1, turn_after: int = 
 
 
 def _jersey(u: Tile, v: Tile) -> Tile:
-    """Columns of V-shaped stitches."""
     fold = np.abs(u % 1 - 0.5)
     return np.sqrt(np.abs(np.sin(np.pi * (v + 1.2 * fold)))) * (0.4 + 0.6 * _round(2 * u))
 
 
 def _purl(u: Tile, v: Tile) -> Tile:
-    """Rows of wavy bumps, a jersey's other side."""
     return _round(v + 0.25 * np.sin(2 * np.pi * u))
 
 
 def _ribs(share: float) -> Pattern:
-    """Ridges across, of so much of a period."""
     return lambda u, v: _round(np.minimum((u % 1) / share, 1)) + 0 * v
 
 
 def _rib_knit(u: Tile, v: Tile) -> Tile:
-    """Jersey in raised columns of two."""
     raised = (np.floor(u / 2) % 2).astype(np.float32)
     return 0.45 * raised + 0.55 * _jersey(u, v)
 
 
 def _waffle(u: Tile, v: Tile) -> Tile:
-    """Cells with raised walls."""
     wall = np.maximum(np.abs(u % 1 - 0.5), np.abs(v % 1 - 0.5)) * 2
     return wall**2
 
 
 def _mesh(u: Tile, v: Tile) -> Tile:
-    """Round holes, every other row shifted."""
     shifted = u + 0.5 * (np.floor(v) % 2)
     return np.minimum(np.hypot(shifted % 1 - 0.5, v % 1 - 0.5) * 2.2, 1)
 
 
 def _loops(u: Tile, v: Tile) -> Tile:
-    """Terry: knobs in rows that wander."""
     wander = v + 0.3 * np.sin(2.1 * np.floor(u))
     return _round(u) * _round(wander)
 
 
 def _nap(u: Tile, v: Tile) -> Tile:
-    """No yarn to be seen."""
     return 0.5 + 0 * (u + v)
 
 
 def _quilt(u: Tile, v: Tile) -> Tile:
-    """Cushions between diagonal seams."""
     return np.sqrt(np.abs(np.sin(np.pi * (u + v)) * np.sin(np.pi * (u - v))))
 
 

@@ -1,4 +1,4 @@
-"""Options of the simulated cell and of each task; light to import, for every command shows them."""
+"""Options of the simulated cell and of each task; light to import, because every command shows them."""
 
 from dataclasses import replace
 from typing import Annotated, Literal
@@ -22,7 +22,7 @@ from touchgoal.sim_envs.scene.wires import PER_FAMILY, TRAINED, Family, Split, W
 from touchgoal.sim_envs.scene.wires import find as find_wire
 
 Outcome = Literal["success", "never_touch", "drop", "wrong_object", "freeze"]
-"""How an expert of pick-place ends: it succeeds, or fails in one of four ways."""
+"""How an expert of pick-place ends: success, or one of four failures on purpose."""
 TaskName = Literal["pick-place", "bead-maze"]
 Camera = Literal["front", "wrist"]
 Indenter = Literal["sphere", "sharp", "flat"]
@@ -31,47 +31,47 @@ ObjectName = Annotated[str, AfterValidator(lambda name: find_object(name).name)]
 """A name of the catalogue of objects."""
 WireName = Annotated[str, AfterValidator(lambda name: find_wire(name).name)]
 """A name such as helix-1."""
-Force = Annotated[Positive, Field(le=40.0)]
-"""Of each finger, N; the simulated gripper presses with 40 N at most."""
+Force = Annotated[float, Field(gt=0, le=40.0)]
+"""N of each finger; the simulated gripper presses with 40 N at most."""
 ForceRange = Annotated[tuple[Force, Force], ORDERED]
-Mass = Annotated[Positive, Field(ge=0.001, le=3.0)]
-"""kg: lighter objects shake in the solver, heavier ones are beyond what an FR3 carries."""
-Friction = Annotated[Positive, Field(le=2.0)]
-Pixels = Annotated[int, Field(ge=16, multiple_of=2)]
-"""Rows or columns of a camera's picture; recorded video needs even ones."""
+Mass = Annotated[float, Field(ge=0.001, le=3.0)]
+"""kg; lighter objects shake in the solver, heavier ones exceed an FR3's payload (3 kg, FR3 data sheet)."""
+Friction = Annotated[float, Field(gt=0, le=2.0)]
+MAX_CAMERA_SIDE = 1280
+"""Rows or columns of the largest camera image, px."""
+Pixels = Annotated[int, Field(ge=16, le=MAX_CAMERA_SIDE, multiple_of=2)]
+"""Rows or columns of a camera image; recorded video needs even ones."""
 
-MAX_CAMERA_SIZE = (960, 1280)
-"""Rows and columns of the largest picture that the scene renders, px."""
 SETPOINT_PERIOD = 0.002
-"""s between the set-points that a control tick is divided into: coarser ones shake the wrist."""
+"""s between the set-points that divide a control tick; coarser ones shake the wrist."""
 
 STREAM_SIZE = (256, 256)
-"""Rows and columns of what a twin's cameras send, more than is recorded."""
+"""Rows and columns of a twin's camera streams, px."""
 
 
 @checked_dataclass
 class SensorRandomization:
-    """How much two fingertip sensors of one model differ.
+    """Differences between two fingertip sensors of one model.
 
-    Brightness: measured over real Minis (Tactile-MNIST: per-unit gain std 0.047; offset std 0.0094
-    and smooth pattern std 0.0093 of full scale; channels' noise correlated by 0.24 to 0.39). The
-    others: the differences between published calibrations.
+    Brightness: measured on real Minis (Tactile-MNIST: gain std 0.047 across sensors; offset std 0.0094 and
+    smooth pattern std 0.0093 of full scale; noise of the channels correlated by 0.24 to 0.39). The others:
+    differences between published calibrations.
     """
 
     gain: Annotated[NotNegative, Field(le=0.3)] = 0.047
-    """Standard deviation of each colour channel's brightness, as a share of it."""
+    """Standard deviation of each colour channel's gain."""
     offset: NotNegative = 2.4
-    """Standard deviation of a constant added to the untouched picture, counts of 255."""
+    """Standard deviation of a constant added to the untouched image, counts of 255."""
     pattern: NotNegative = 2.4
-    """Standard deviation of a smooth pattern added to the untouched picture, counts of 255."""
+    """Standard deviation of a smooth pattern added to the untouched image, counts of 255."""
     azimuth: Annotated[NotNegative, Field(le=180)] = 15.0
-    """Largest turn of each light around the gel, degrees."""
+    """Largest rotation of each light around the gel, degrees."""
     blur: Fraction = 0.3
-    """Largest change of how far the gel smooths an imprint, as a share of it."""
+    """Largest relative change of the gel's smoothing of an imprint."""
     pixel_pitch: bool = True
-    """Draw the millimetres per pixel from the range of the sensor model."""
+    """Draw the millimetres per pixel from the sensor model's range."""
     markers: Fraction = 0.1
-    """Largest shift of printed dots (share of their distance) and change of their size (share)."""
+    """Largest shift of printed dots (share of their spacing) and relative change of their size."""
 
 
 NO_RANDOMIZATION = SensorRandomization(
@@ -81,18 +81,18 @@ NO_RANDOMIZATION = SensorRandomization(
 
 @checked_dataclass
 class SceneConfig:
-    """What the scene is made of."""
+    """Options of the scene."""
 
     sensor: str = "gelsight_mini"
-    """Sensor on both fingertips: a name (`touchgoal list sensors`), or the folder of a sensor file
-    that `touchgoal calibrate` wrote."""
+    """Sensor on both fingertips: a name (`touchgoal list sensors`) or the folder of a sensor file
+    from `touchgoal calibrate`."""
     arm: Literal["fr3", "ur5e"] = "fr3"
     """Arm that carries the hand."""
     meshes: Annotated[Literal["fast", "full"], RARE] = "fast"
-    """What cameras see of the arm: its collision meshes (fast: 2,500 triangles, 1 ms a frame in
-    software OpenGL) or its visual ones (full: 242,000 triangles, 30 ms)."""
+    """Meshes of the arm in camera images: collision meshes (fast: 2,500 triangles, 1 ms a frame in
+    software OpenGL) or visual meshes (full: 242,000 triangles, 30 ms)."""
     timestep: Annotated[Positive, RARE] = 1e-3
-    """Time step of the physics, s; 2 ms is a whole number of them."""
+    """Time step of the physics, s; it must divide 2 ms."""
 
     def __post_init__(self) -> None:
         """Raises ValueError if set-points would not fall on steps of the physics."""
@@ -122,34 +122,32 @@ LightChange = Annotated[tuple[BrightnessChange, ...], AfterValidator(_one_or_thr
 
 @checked_dataclass
 class DeploymentConfig:
-    """Delays and dynamics of a real arm, drawn anew for each episode.
+    """Delays and dynamics of a real arm, drawn for each episode.
 
-    What is not given follows `as_deployed`: all of it as over the wire (`AS_DEPLOYED`), or none.
+    An option that is not given follows `--env.as-deployed`: as over the wire with it, none without.
     """
 
     tracker: bool | None = None
-    """The arm is driven as `deploy` drives it: the lag of deploy's loop, the safety layer's limits,
-    the 1 kHz tracker, and an arm that follows its set-point without a lag of its own."""
+    """Drive the arm as `deploy` does: servo lag, the safety layer's limits, the 1 kHz tracker, and an arm
+    that follows its set-points without lag."""
     franka_hand: bool | None = None
-    """The hand is a Franka Hand: one command at a time, each runs to its end; closing to 0 grasps
-    what it meets, any other width is a move. Its width is read every 50 ms."""
+    """Act as a Franka Hand: one command at a time, each runs to its end; a target of 0 grasps, any other
+    width is a move. The width is read every 50 ms."""
     estimated_wrench: bool | None = None
-    """The force on the hand is a real arm's estimate: with noise, bias, drift and lag."""
+    """Observe the force on the hand as a real arm estimates it: with noise, bias, drift and lag."""
     state_delay: DelayRange | None = None
-    """Age of joint positions, velocities and force when the policy sees them, s."""
+    """Least and largest age of joint positions, velocities and force in an observation, s."""
     picture_delay: DelayRange | None = None
-    """Age of the pictures of cameras and fingertips when the policy sees them, s."""
+    """Least and largest age of camera and tactile images in an observation, s."""
     picture_rate: Annotated[float, Field(ge=5, le=1000)] | None = None
-    """Pictures a second that cameras and fingertips take, Hz: between two of them the last is seen."""
+    """Frame rate of cameras and fingertip sensors, Hz. An observation holds the latest frame; as deployed
+    30 Hz, else one frame per millisecond."""
     command_delay: DelayRange | None = None
-    """From the policy's answer until arm and hand get it, s."""
+    """Least and largest time from the policy's action until arm and hand receive it, s."""
     jitter: DelayRange | None = None
-    """How much each of these delays varies from tick to tick: up to so much is added, s."""
+    """Range of an episode's jitter, s. Each tick adds a random time between 0 and the jitter to each delay."""
     plan_ticks: TickRange | None = None
-    """Control ticks by which a learned policy's plans come late: one of these."""
-    force_ceiling: bool | None = None
-    """An episode ends, failed, once the force on the hand is above the task's ceiling, at which
-    `deploy` stops the arm."""
+    """Control ticks by which a learned policy's plans are late; one of these is drawn."""
 
 
 IDEAL_DEPLOYMENT = DeploymentConfig(
@@ -162,11 +160,10 @@ IDEAL_DEPLOYMENT = DeploymentConfig(
     command_delay=(0.0, 0.0),
     jitter=(0.0, 0.0),
     plan_ticks=(0,),
-    force_ceiling=False,
 )
-# Measured on the wire (touchgoal benchmark deploy, replay): a state is 7 to 18 ms old, commands take 20 to
-# 25 ms of which the tracker has its share; fingertips and cameras send 25 to 30 pictures a second; a
-# plan is asked for a tick early.
+# Measured between `touchgoal deploy` and `touchgoal twin` (`touchgoal benchmark deploy`): states are 7 to
+# 18 ms old; commands take 20 to 25 ms, the tracker's lag included; cameras and fingertips send 25 to 30
+# frames a second (GelSight Mini and DIGIT data sheets); a plan is requested one tick early.
 AS_DEPLOYED = DeploymentConfig(
     tracker=True,
     franka_hand=True,
@@ -177,59 +174,53 @@ AS_DEPLOYED = DeploymentConfig(
     command_delay=(0.005, 0.02),
     jitter=(0.0, 0.02),
     plan_ticks=(1,),
-    force_ceiling=True,
 )
 
 
 @checked_dataclass
 class EnvConfig(SceneConfig):
-    """Options every task has."""
+    """Options of every task."""
 
     cameras: tuple[Camera, ...] = ("front", "wrist")
-    """Cameras that are observed; fewer is faster."""
-    camera_size: tuple[
-        Annotated[Pixels, Field(le=MAX_CAMERA_SIZE[0])],
-        Annotated[Pixels, Field(le=MAX_CAMERA_SIZE[1])],
-    ] = ft.CAMERA_SHAPE[:2]
-    """Rows and columns of the cameras' pictures, px."""
+    """Observed cameras; fewer is faster."""
+    camera_size: tuple[Pixels, Pixels] = ft.CAMERA_SHAPE[:2]
+    """Rows and columns of camera images, px; both even."""
     tactile: bool = True
-    """Observe the pictures of both fingertips."""
+    """Observe the tactile images of both fingertips."""
     control_hz: Annotated[Count, RARE] = ft.CONTROL_HZ
     """Control ticks per second; a divisor of 500."""
     max_seconds: Positive = 8.0
-    """Length after which an episode ends, s."""
+    """Time limit of an episode, s."""
     disturbance: Annotated[NotNegative, Field(le=0.1)] = 0.0
-    """Random motion added to what is commanded, so that an expert shows how to come back (DART,
-    Laskey 2017): rms speed along each axis, m/s. For each m/s the hand also turns, by 2 rad/s in
-    pick-place and 20 rad/s in bead-maze, whose bead turns with it."""
+    """Random hand motion added to each action, so that demonstrations show recoveries (DART, Laskey 2017):
+    RMS speed along each axis, m/s. The hand also turns, at 2 rad/s (pick-place) or 20 rad/s (bead-maze)
+    per m/s."""
     randomization: Annotated[SensorRandomization, RARE] = SensorRandomization()
-    """How much the two fingertip sensors differ, drawn anew for each episode."""
+    """Differences between the two fingertip sensors, drawn for each episode."""
     light_change: Annotated[LightChange, RARE] = (0.0,)
-    """Change of the fingertips' light after an episode's first picture, as a share: one value, or
+    """Change of the fingertips' light after an episode's first image, as a share: one value, or
     red, green and blue. -0.15 dims them by 15 %."""
     as_deployed: bool = False
-    """Behave as the arm does when it is deployed: driven, delayed and sensed as over the wire."""
+    """Simulate deployment: the delays, limits and measurement errors of an arm driven by `deploy`."""
     deployment: DeploymentConfig = DeploymentConfig()
-    """Overrides of single as-deployed settings."""
+    """Overrides of single settings of `--env.as-deployed`."""
 
     def resolved_deployment(self) -> DeploymentConfig:
-        """What lies between policy and arm, every field of it given."""
+        """Return the deployment with every field set."""
         base = AS_DEPLOYED if self.as_deployed else IDEAL_DEPLOYMENT
         own = {name: value for name, value in vars(self.deployment).items() if value is not None}
         return replace(base, **own)
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a tick is no whole number of set-points, or an episode has none."""
+        """Raises ValueError if a tick is no whole number of set-points, or an episode has no tick."""
         super().__post_init__()
         if not _is_multiple(1 / self.control_hz, SETPOINT_PERIOD):
             raise ValueError(
-                "control_hz must divide 500, for set-points come every 2 ms (10, 20, 25, 50, 100, "
-                f"...), not {self.control_hz}"
+                f"control_hz is {self.control_hz}; it must divide 500 (10, 20, 25, 50, 100, ...), "
+                "because set-points come every 2 ms"
             )
         if self.resolved_deployment() != IDEAL_DEPLOYMENT and not _is_multiple(1e-3, self.timestep):
-            raise ValueError(
-                f"as deployed, time goes by in ms: timestep 0.001, not {self.timestep:g}"
-            )
+            raise ValueError(f"timestep is {self.timestep:g}; as deployed it must divide 1 ms")
         if self.max_seconds * self.control_hz < 1:
             raise ValueError(f"max_seconds must be at least a tick of 1/{self.control_hz} s")
 
@@ -241,16 +232,16 @@ class PickPlaceConfig(EnvConfig):
     objects: tuple[ObjectName, ...] = ()
     """Objects to draw from (`touchgoal list objects`); default: all."""
     distractors: Annotated[int, Field(ge=0, le=4)] = 0
-    """Other objects on the table."""
+    """Number of other objects on the table."""
     mass: Annotated[tuple[Mass, Mass], ORDERED] = (0.02, 0.2)
-    """Lightest and heaviest object, kg."""
+    """Range of the object's mass, kg."""
     grasp_force: ForceRange = (5.0, 30.0)
-    """Weakest and strongest force of each finger, N."""
-    tolerance: Annotated[Positive, Field(le=0.1)] = 0.02
-    """Distance from the goal within which the object's centre counts as placed, m."""
+    """Range of the force of each finger, N."""
+    tolerance: Annotated[float, Field(gt=0, le=0.1)] = 0.02
+    """Largest distance of the placed object's centre from the goal, m."""
     release: bool = False
-    """The object must also be let go. The paper's reward curves end in touch, so by default an
-    episode ends with the placed object still held."""
+    """Success also requires that the hand lets go. The paper's reward curves end in touch, so by default
+    an episode ends with the placed object still in the hand."""
 
 
 @checked_dataclass
@@ -258,48 +249,45 @@ class PickPlaceReset:
     """Options of `PickPlace.reset`, each in place of a random draw."""
 
     object: ObjectName | None = None
-    """Name of the catalogue (`touchgoal list objects`)."""
+    """Name from the catalogue (`touchgoal list objects`)."""
     mass: Mass | None = None
-    """Of the object, kg."""
+    """Mass of the object, kg."""
     grasp_force: Force | None = None
-    """Of each finger, N."""
+    """Force of each finger, N."""
 
 
 @checked_dataclass
 class BeadMazeConfig(EnvConfig):
     """Options of bead-maze; reset's `options` override the random draws."""
 
-    # Only a gel with markers shows the shear, by which the wire's sideways force is felt.
     sensor: str = "gelsight_mini_markers"
-    """Sensor on both fingertips: a name (`touchgoal list sensors`), or the folder of a sensor file
-    that `touchgoal calibrate` wrote. Only a gel with printed dots shows sideways force well."""
+    """Sensor on both fingertips: a name (`touchgoal list sensors`) or the folder of a sensor file
+    from `touchgoal calibrate`. Only a gel with printed dots shows shear well."""
     cameras: tuple[Camera, ...] = ()
-    """Cameras that are observed; fewer is faster."""
+    """Observed cameras; fewer is faster."""
     max_seconds: Positive = 40.0
-    """Length after which an episode ends, s."""
+    """Time limit of an episode, s."""
     wires: tuple[WireName, ...] = ()
-    """Wires to draw from, by name, such as helix-1; default: the first `n-wires` of `split`."""
+    """Wires to draw from, such as helix-1; default: the first `n-wires` of `split`."""
     split: Split = "training"
-    """Set from which wires are taken; no wire is in two of them."""
+    """Set of wires to draw from; the sets are disjoint."""
     families: tuple[Family, ...] = TRAINED
-    """Shapes of wires to take."""
+    """Families of wires to draw from."""
     n_wires: Count | None = None
-    """Number of wires to draw from; default: 200, or all where the split has fewer."""
+    """Number of wires to draw from; default: 200, or all if the split has fewer."""
     bead: Literal["sphere", "cylinder"] = "sphere"
-    """Shape of the bead: a cylinder feels the wire's direction as a torque, a sphere much less."""
+    """Shape of the bead; the wire's direction acts on a cylinder as a torque, on a sphere hardly."""
     grasp_force: ForceRange = (8.0, 12.0)
-    """Weakest and strongest force of each finger, N."""
+    """Range of the force of each finger, N."""
     start_angle: Annotated[NotNegative, Field(le=45)] = 0.0
-    """Largest angle between the hand and the wire's first direction at the start, degrees."""
+    """Largest angle between hand and wire at the start, degrees."""
     wire_friction: Annotated[tuple[Friction, Friction], ORDERED] = (0.15, 0.25)
-    """Least and greatest friction coefficient between bead and wire."""
+    """Range of the friction coefficient between bead and wire."""
     stall_seconds: Positive = 5.0
     """Time without 2 mm of progress after which the bead counts as jammed, s."""
-    max_force: Positive = 30.0
-    """External force on the hand that counts as too much, N."""
 
     def chosen_wires(self, count: int | None = None) -> list[Wire]:
-        """The wires to draw from; if a count is given, so many of them, named ones in turn."""
+        """Return the wires to draw from, or `count` of them; named wires repeat in turn."""
         if not self.wires:
             most = min(200, PER_FAMILY[self.split] * len(self.families))
             return choose(self.split, count or self.n_wires or most, self.families)
@@ -314,7 +302,7 @@ class BeadMazeReset:
     wire: WireName | None = None
     """Name such as helix-1."""
     grasp_force: Force | None = None
-    """Of each finger, N."""
+    """Force of each finger, N."""
 
 
 def _is_multiple(value: float, of: float) -> bool:
@@ -330,33 +318,33 @@ TASKS: dict[TaskName, type[PickPlaceConfig] | type[BeadMazeConfig]] = {
 
 @checked_dataclass
 class TeleoperatorConfig:
-    """How the hand follows the keys, and gives way to what it meets."""
+    """Options of keyboard teleoperation: a compliant hand that follows the keys."""
 
     speed: Positive = 0.025
-    """Speed at which a key moves the free hand, m/s."""
+    """Speed of the free hand while a key is held, m/s."""
     turn_speed: Positive = 0.5
-    """Speed at which a key turns the free hand, rad/s."""
+    """Turning speed of the free hand while a key is held, rad/s."""
     compliance: NotNegative = 2e-3
-    """Speed by which the hand gives way to a force, m/s per N."""
+    """Speed per force at which the hand yields, m/s per N."""
     rotational_compliance: NotNegative = 2.0
-    """Speed by which the hand gives way to a torque, rad/s per N m."""
+    """Speed per torque at which the hand yields, rad/s per Nm."""
     hold_seconds: Positive = 0.5
-    """How long a typed key counts as held, s. A terminal does not report that a key was released; it
-    repeats a held one after about 0.4 s, and only the last of several."""
+    """Time for which a typed key counts as held, s. A terminal reports no key releases; it repeats a held
+    key after about 0.4 s, and only the last of several."""
 
 
 @checked_dataclass
 class RigConfig:
-    """What is pressed into what."""
+    """Options of the indenter rig."""
 
     sensor: str = "gelsight_mini_markers"
-    """Fingertip sensor, by name or folder of a sensor file."""
+    """Fingertip sensor: a name or the folder of a sensor file."""
     indenters: tuple[Indenter, ...] = ("sphere", "sharp", "flat")
-    """Probes, which strokes take in turn."""
+    """Probes, used in turn."""
     load: Annotated[PositiveRange, RARE] = (0.5, 5.0)
-    """Least and most normal load, N."""
+    """Range of the normal load, N."""
     shear_relief: bool = True
-    """The gel piles up in front of what is drawn over it and sinks behind, the one trace of shear in pictures without
-    printed dots. Shipped encoders were trained on pictures without it."""
+    """Simulate that the gel piles up in front of what slides over it and sinks behind: the only trace of shear
+    without printed dots. Shipped encoders were trained without it."""
     seed: Seed = 0
-    """Random seed of the sensor's unit and of all strokes."""
+    """Random seed of the sensor and of all strokes."""

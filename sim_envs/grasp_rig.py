@@ -1,19 +1,19 @@
-"""A hand without an arm that grasps, lifts and shakes objects: grasp attempts for TacBench T4.
+"""Grasp attempts for TacBench T4: a hand without an arm that grasps, lifts and shakes objects.
 
-After the Feeling of Success (Calandra et al. 2017), whose recordings Sparsh's appendix C.6 uses: fingertips
-before the grasp, with the object gripped, and just lifted; and whether the object is still held in the
-end. Physics, objects and fingertips are those of the scenes. Grip, mass and place of the
+After the Feeling of Success (Calandra et al. 2017), whose recordings Sparsh's appendix C.6 uses: tactile
+images before the grasp, with the object gripped, and just lifted; and whether the hand still holds the
+object in the end. Physics, objects and fingertips are those of the scenes. Grip, mass and place of the
 grasp are drawn so widely that about half of the attempts fail.
 """
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import mujoco
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from touchgoal.control.motion.tool import SENSOR_BELOW_CARRIAGE
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.sim_envs.config import RigConfig, SceneConfig
 from touchgoal.sim_envs.scene.build import SIDES, add_body, add_fingertip, set_options
@@ -23,16 +23,15 @@ from touchgoal.sim_envs.tactile.pad import TactilePad
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
 MOMENTS = ("before", "during", "after")
-"""Of an attempt's pictures: untouched, gripped, lifted by a centimetre."""
+"""Moments of an attempt's images: untouched, gripped, lifted by a centimetre."""
 _MASS, _GRIP = (0.1, 1.0), (0.8, 10.0)  # kg, N of each finger: drawn log-uniformly
 _ASIDE, _ABOVE = 8e-3, (-4e-3, 10e-3)  # m from the object's middle, along the pads and upwards
 _TURN = math.radians(12)  # of the object from where the pads meet it squarely
 _OPEN, _CLOSING, _LIFTING = 0.04, 0.08, 0.1  # m of one finger; m/s of one finger; m/s
 _LOOKS = 0.05  # s between two looks at the pads, whose stick and slip have a memory
-_SEEN_AT, _TOP = 0.01, 0.06  # m of lift
+_SHOWN_AT, _TOP = 0.01, 0.06  # m of lift
 _SHAKE, _SHAKES, _SHAKING = 0.012, 3.0, 1.0  # m, Hz, s
 _LOWEST = 0.018  # m: of the pads' middle, or the cases touch the table
-_SERVO, _SERVO_DAMPING = 4e4, 4e2  # N/m and N s/m of what moves the hand
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +55,7 @@ class GraspAttempt:
 
 
 def attempt_grasp(config: RigConfig, index: int) -> GraspAttempt:
-    """One attempt; the same config and index always give the same one."""
+    """Simulate one attempt; the same config and index always give the same one."""
     sensor, rng = find_sensor(config.sensor), np.random.default_rng([config.seed, index, 3])
     kinds = list(CATALOGUE.values())
     mass, grip = (float(np.exp(rng.uniform(*np.log(ends)))) for ends in (_MASS, _GRIP))
@@ -70,7 +69,7 @@ def attempt_grasp(config: RigConfig, index: int) -> GraspAttempt:
     hand.look(keep=True)
     hand.close()
     hand.look(keep=True)
-    hand.lift(_SEEN_AT)
+    hand.lift(_SHOWN_AT)
     hand.look(keep=True)
     hand.lift(_TOP)
     hand.shake()
@@ -80,7 +79,7 @@ def attempt_grasp(config: RigConfig, index: int) -> GraspAttempt:
 
 
 class _Hand:
-    """The scene of one attempt, and what was seen in it."""
+    """Scene of one attempt, with its images and wrenches."""
 
     def __init__(
         self,
@@ -105,7 +104,7 @@ class _Hand:
         self.wrenches: list[np.ndarray] = []
 
     def place(self, rng: np.random.Generator) -> None:
-        """The object on the table, the open hand around it, a little off."""
+        """Put the object on the table and the open hand around it, a little off."""
         body, data = self._body, self.data
         aside, above = rng.uniform(-_ASIDE, _ASIDE), rng.uniform(*_ABOVE)
         turn = rng.uniform(-_TURN, _TURN)
@@ -120,22 +119,21 @@ class _Hand:
         mujoco.mj_forward(self.model, data)
 
     def run(self, seconds: float) -> None:
-        """Physics."""
         mujoco.mj_step(self.model, self.data, nstep=round(seconds / self.model.opt.timestep))
 
     def look(self, keep: bool = False) -> None:
-        """Pictures of both pads; to be taken in order of time, kept or not."""
+        """Read both pads, in order of time; `keep` stores images and wrenches."""
         mujoco.mj_forward(self.model, self.data)
         pads, _ = self._reader.read(self.data)
-        seen = [
+        images = [
             p.sense(self.data, c, self._rng).image for p, c in zip(self._pads, pads, strict=True)
         ]
         if keep:
-            self.pictures.append(seen)
+            self.pictures.append(images)
             self.wrenches.append(np.concatenate([w for c in pads for w in (c.force, c.torque)]))
 
     def close(self) -> None:
-        """Fingers go together until they press with the grip, and a little longer."""
+        """Close the fingers until they press with the grip, and a little longer."""
         deepest = -2 * self._grip / float(self.model.actuator("gripper").gainprm[0])
         while self._fingers > -0.005:
             self._fingers -= _CLOSING * _LOOKS / 5
@@ -145,7 +143,6 @@ class _Hand:
         self.run(0.2)
 
     def lift(self, height: float) -> None:
-        """Go up to so much above the table's grasp."""
         servo = self.data.actuator("lift")
         while servo.ctrl[0] < self._height + height:
             servo.ctrl = servo.ctrl + _LIFTING * _LOOKS / 5
@@ -153,7 +150,6 @@ class _Hand:
         self.look()
 
     def shake(self) -> None:
-        """To and fro along the pads, then still."""
         step = 0.01
         for t in np.arange(0.0, _SHAKING, step):
             self.data.actuator("shake").ctrl = _SHAKE * math.sin(2 * math.pi * _SHAKES * t)
@@ -162,68 +158,15 @@ class _Hand:
         self.run(0.2)
 
     def holds(self) -> bool:
-        """Whether the object is in the air."""
         height = self.data.joint(self._body.name).qpos[2]
         return bool(height > self._body.rest_height + _TOP / 3)
 
 
 def _scene(body: Body, sensor: SensorModel) -> mujoco.MjSpec:
-    """A table, an object and a hand on two servos, up and along the pads."""
-    spec = mujoco.MjSpec()
+    """Build the hand on its servos with fingertips, table and object."""
+    spec = mujoco.MjSpec.from_file(str(Path(__file__).parent / "scene" / "grasp_rig.xml"))
     set_options(spec, SceneConfig())
-    slide, box = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtGeom.mjGEOM_BOX
-    spec.worldbody.add_geom(name="table", type=box, size=[0.2, 0.2, 0.02], pos=[0, 0, -0.02])
-    base = spec.worldbody.add_body(name="base", gravcomp=1)
-    hand = base.add_body(name="hand", pos=[0, 0, SENSOR_BELOW_CARRIAGE], quat=[0, 1, 0, 0])
-    for part, mass in ((base, 0.1), (hand, 1.0)):
-        part.explicitinertial, part.mass, part.inertia = True, mass, np.full(3, 1e-3)
-        part.ipos, part.iquat, part.gravcomp = np.zeros(3), np.array([1.0, 0, 0, 0]), 1
-    base.add_joint(name="shake", type=slide, axis=[1, 0, 0])
-    base.add_joint(name="lift", type=slide, axis=[0, 0, 1])
-    hand.add_site(name="tcp", pos=[0, 0, SENSOR_BELOW_CARRIAGE])
-    for k, side in enumerate(SIDES):
-        finger = hand.add_body(name=f"{side}_finger", quat=[[1, 0, 0, 0], [0, 0, 0, 1]][k])
-        finger.explicitinertial, finger.mass, finger.inertia = True, 0.1, np.full(3, 1e-4)
-        finger.ipos, finger.iquat = np.zeros(3), np.array([1.0, 0, 0, 0])
-        finger.gravcomp = 1
-        finger.add_joint(
-            name=f"finger_joint{k + 1}", type=slide, axis=[0, 1, 0], damping=[20, 0, 0]
-        )
     for side in SIDES:
         add_fingertip(spec, side, sensor)
-    _add_servos(spec)
     add_body(spec, body)
     return spec
-
-
-def _add_servos(spec: mujoco.MjSpec) -> None:
-    """Of the hand's two slides, and of the mean opening; both fingers go the same way, as a Franka Hand's."""
-    affine = {
-        "gaintype": mujoco.mjtGain.mjGAIN_FIXED,
-        "biastype": mujoco.mjtBias.mjBIAS_AFFINE,
-    }
-    together = spec.add_tendon(name="split")
-    for k in (1, 2):
-        together.wrap_joint(f"finger_joint{k}", 0.5)
-    equal = spec.add_equality(
-        type=mujoco.mjtEq.mjEQ_JOINT, name1="finger_joint1", name2="finger_joint2"
-    )
-    equal.objtype = mujoco.mjtObj.mjOBJ_JOINT
-    equal.data[:2] = 0.0, 1.0
-    equal.solref = np.array([0.004, 1])
-    servos = (
-        ("shake", "shake", mujoco.mjtTrn.mjTRN_JOINT, _SERVO, _SERVO_DAMPING),
-        ("lift", "lift", mujoco.mjtTrn.mjTRN_JOINT, _SERVO, _SERVO_DAMPING),
-        ("gripper", "split", mujoco.mjtTrn.mjTRN_TENDON, 2e4, 2e2),
-    )
-    for name, target, kind, stiffness, damping in servos:
-        spec.add_actuator(
-            name=name,
-            target=target,
-            trntype=kind,
-            gainprm=[stiffness] + [0] * 9,
-            biasprm=[0, -stiffness, -damping] + [0] * 7,
-            forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
-            forcerange=[-2e3, 2e3],
-            **affine,
-        )

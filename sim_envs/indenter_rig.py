@@ -66,7 +66,7 @@ class Stroke:
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """What the rig does in one stroke, frame by frame.
+    """Load and motion of the rig in one stroke, frame by frame.
 
     Attributes:
         load: normal force, N; 0 is untouched.
@@ -82,7 +82,7 @@ class Path:
 
 
 def simulate(config: RigConfig, index: int) -> Stroke:
-    """One stroke; the same config and index always give the same one."""
+    """Simulate one stroke; the same config and index always give the same one."""
     sensor, rng = find_sensor(config.sensor), np.random.default_rng([config.seed, index, 1])
     indenter = config.indenters[index % len(config.indenters)]
     friction = FRICTION * (1 + FRICTION_SPREAD * rng.uniform(-1, 1))
@@ -114,14 +114,14 @@ def simulate(config: RigConfig, index: int) -> Stroke:
 
 
 def rig_unit(config: RigConfig) -> SensorInstance:
-    """The rig's one sensor."""
+    """Draw the rig's sensor, the same one for all strokes of a config."""
     return sample_instance(find_sensor(config.sensor), np.random.default_rng([config.seed, 0]))
 
 
 def shear_force(
     moved: Float[np.ndarray, " t"], load: Float[np.ndarray, " t"], stiffness: float, friction: float
 ) -> tuple[Float[np.ndarray, " t"], Bool[np.ndarray, " t"]]:
-    """Tangential force (N) on a gel of so many N/m, and whether the probe slides, frame by frame.
+    """Return the tangential force (N) on a gel of `stiffness` N/m, and whether the probe slides, by frame.
 
     The gel follows the probe until friction gives way; what the probe has slid stays slid.
 
@@ -143,7 +143,7 @@ def shear_force(
 def _loads(
     path: Path, sensor: SensorModel, friction: float
 ) -> Iterator[tuple[float, np.ndarray, np.ndarray, bool]]:
-    """Of each frame: load (N), shear (N, 2), where the probe is (m, 2), whether it slides."""
+    """Yield each frame's load (N), shear (N, 2), probe position (m, 2), and whether it slides."""
     force, slides = shear_force(path.moved, path.load, sensor.shear_stiffness, friction)
     for load, moved, pull, slip in zip(path.load, path.moved, force, slides, strict=True):
         yield float(load), pull * path.direction, path.start + moved * path.direction, bool(slip)
@@ -170,7 +170,7 @@ def _draw_path(
 
 
 def _probe(indenter: Indenter, friction: float) -> Body:
-    """A hard smooth probe, its tip towards the gel (the body's -z)."""
+    """Return a hard smooth probe, its tip towards the gel (the body's -z)."""
     material = Material(Texture.SMOOTH, 0.0, 1e-3, HARD, friction, (0.6, 0.6, 0.6, 1.0))
     shapes: dict[Indenter, tuple[Shape, tuple[float, ...]]] = {
         "sphere": ("sphere", (4e-3,)),
@@ -183,7 +183,7 @@ def _probe(indenter: Indenter, friction: float) -> Body:
 
 
 def _blunt_cone() -> Float[np.ndarray, "n 3"]:
-    """Points of a cone about z, its blunt tip at z = 0 and its base above."""
+    """Return points of a cone about z, its blunt tip at z = 0 and its base above."""
     angle = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     rings = ((_TIP, 0.0), (_CONE, (_CONE - _TIP) / math.tan(_OPENING / 2)))
     return np.concatenate(

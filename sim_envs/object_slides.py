@@ -5,8 +5,8 @@ with another velocity. Changes of the pose over five frames are drawn log-unifor
 large ones are as common. The gel's stick and slip are those of the indenter rig, with torsion: a patch is
 turned in the gel as a ring of its mean radius is drawn along it.
 
-For TacBench T3 (pose) two things are slid: the face of a bar, and a can on its side. To learn from
-without labels, as Sparsh does from Touch-Slide, the objects of pick-and-place are, any side of them.
+For TacBench T3 (pose): the face of a bar and a can on its side. For self-supervised learning, as Sparsh
+does from Touch-Slide: the objects of pick-and-place, any side of them.
 """
 
 import math
@@ -65,7 +65,7 @@ class Slide:
 
 
 def simulate_slide(config: RigConfig, index: int) -> Slide:
-    """One slide of the bar or the can; the same config and index always give the same one."""
+    """Simulate one slide of the bar or the can; the same config and index always give the same one."""
     rng = np.random.default_rng([config.seed, index, 2])
     load = float(rng.uniform(*config.load))
     body, flat = _body(HELD[index % len(HELD)])
@@ -74,7 +74,7 @@ def simulate_slide(config: RigConfig, index: int) -> Slide:
 
 
 def simulate_catalogue_slide(config: RigConfig, index: int) -> Slide:
-    """One slide of an object of pick-and-place, any side of it, on a unit of its own of the sensor."""
+    """Simulate one slide of an object of pick-and-place, any side of it, on a sensor of its own."""
     sensor, rng = find_sensor(config.sensor), np.random.default_rng([config.seed, index, 5])
     kinds = list(CATALOGUE.values())
     body = sample_body(kinds[index % len(kinds)], rng, _MASS)
@@ -92,7 +92,7 @@ def _slide(
     relief: bool,
     rng: np.random.Generator,
 ) -> Slide:
-    """A body slid over a unit with a load (N); `side` is its rotation when it is not turned."""
+    """Slide a body over a sensor with a load (N); `side` is its rotation at turn 0."""
     pose = _draw_poses(rng)
     bench = PressBench(body, sensor, unit, relief)
     depth = -load / sensor.normal_stiffness
@@ -124,7 +124,7 @@ def _slide(
 def pulled(
     places: Float[np.ndarray, "t d"], stiffness: float, limit: float
 ) -> tuple[Float[np.ndarray, "t d"], Bool[np.ndarray, " t"]]:
-    """Forces (N) on a gel of so many N/m under an object at these places (m), and whether it slips.
+    """Return forces (N) on a gel of `stiffness` N/m under an object at these places (m), and slip.
 
     The gel's point of rest is drawn along as soon as it would pull with more than `limit` N.
 
@@ -146,7 +146,7 @@ def pulled(
 
 
 def mean_radius(field: ForceField) -> float:
-    """Mean distance of the load from its middle, m."""
+    """Return the mean distance of the load from its centre, m."""
     y, x = np.indices(field.normal.shape)
     normal, load = field.normal, field.normal.sum()
     away = np.hypot(x - (normal * x).sum() / load, y - (normal * y).sum() / load)
@@ -154,7 +154,7 @@ def mean_radius(field: ForceField) -> float:
 
 
 def _draw_poses(rng: np.random.Generator) -> Float[np.ndarray, "t 3"]:
-    """x, y (m) and turn (rad), frame by frame; velocities turn round where the field ends."""
+    """Draw x, y (m) and turn (rad) by frame; velocities reverse at the field's edge."""
     most = np.array([_FIELD, _FIELD, _TURN])
     ranges = np.log([_SHIFTS, _SHIFTS, _TURNS])
     pose = np.empty((FRAMES, 3))
@@ -172,7 +172,7 @@ def _draw_poses(rng: np.random.Generator) -> Float[np.ndarray, "t 3"]:
 
 
 def _body(held: HeldObject) -> tuple[Body, Float[np.ndarray, "3 3"]]:
-    """The object, and how it lies on the gel when it is not turned."""
+    """Return the object, and its rotation on the gel at turn 0."""
     material = Material(Texture.SMOOTH, 0.0, 1e-3, HARD, FRICTION, (0.6, 0.6, 0.6, 1.0))
     if held == "bar":
         return Body(ObjectKind(held, "box", material, ()), (4e-3, 1.5e-3, 4e-3), _MASS), np.eye(3)
@@ -181,7 +181,7 @@ def _body(held: HeldObject) -> tuple[Body, Float[np.ndarray, "3 3"]]:
 
 
 def _random_side(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
-    """A rotation: half of them lay an axis of the object along the sensor's, the others are any."""
+    """Draw a rotation; half of them align an object's axis with the sensor's."""
     if rng.random() < 0.5:
         rotation = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)
     else:

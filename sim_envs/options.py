@@ -11,7 +11,7 @@ Config = TypeVar("Config")
 
 
 def with_options(config: Config, options: Mapping[str, Any]) -> Config:
-    """The config with the fields named in `options` replaced.
+    """Return the config with the fields named in `options` replaced.
 
     Args:
         config: a dataclass.

@@ -39,21 +39,21 @@ class PickPlace(FrankaTactileEnv):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        """With a config, or with those of its fields that differ from the default by name."""
+        """Take a config, options by name that override its fields, or both."""
         super().__init__(with_options(config or PickPlaceConfig(), options), render_mode)
         self.kinds = [find(name) for name in self.config.objects] or list(CATALOGUE.values())
 
     def instruction(self) -> str:
-        """The episode's task in words."""
+        """Return the episode's task in words."""
         return f"pick up the {self.bodies[0].kind.name.replace('_', ' ')} and place it on the disc"
 
     def scene_layout(self) -> dict[str, list[float]]:
-        """The object's pose; where to close the hand (m, and yaw in rad); where it is to go (m)."""
+        """Return object pose, grasp (m, yaw in rad) and goal (m), base frame."""
         grasp = [*self.object_pose()[:3].tolist(), self.grasp_yaw()]
         return super().scene_layout() | {"grasp": grasp, "goal": self.goal.tolist()}
 
     def grasp_yaw(self, name: str = "object") -> float:
-        """Hand yaw that closes across an object, within a quarter turn of the comfortable one."""
+        """Return the hand yaw that closes across an object, within a quarter turn of the comfortable one."""
         body = next(b for b in self.bodies if b.name == name)
         if body.kind.shape in ("sphere", "cylinder", "mesh"):
             return 0.0
@@ -64,10 +64,10 @@ class PickPlace(FrankaTactileEnv):
         return float((yaw + np.pi / 2) % np.pi - np.pi / 2)
 
     def rearrange(self) -> tuple[Observation, dict[str, Any]]:
-        """Start again with the same objects, without the cost of a reset.
+        """Start a new episode with the same objects, without the cost of a reset.
 
-        All objects are moved over the table as they lie, to where they, the goal and the hand could
-        be after a reset, at rest.
+        Objects are moved over the table as they lie, at rest, to places that a reset could draw; so are the goal
+        and the hand.
         """
         rng, data = self.np_random, self.data
         *positions, self.goal = _random_positions(rng, len(self.bodies) + 1)
@@ -81,22 +81,21 @@ class PickPlace(FrankaTactileEnv):
         self.command = self._command_before = self.start_joints(rng)
         data.qpos[self.arm_positions] = self.command
         data.qvel[:] = 0
-        self._deployed = None
         self.update_contacts()
         self._note_start()
-        self._begin_deployment()
+        self._begin_episode()
         return self._observe(), self._info(0.0, False)
 
     def sample_episode(self, rng: np.random.Generator, options: dict[str, Any]) -> None:
         """Draw the object, its mass, the grasp force, the distractors, and where all of them go."""
         config = self.config
-        wanted = with_options(PickPlaceReset(), options)
+        chosen = with_options(PickPlaceReset(), options)
         kind = self.kinds[rng.integers(len(self.kinds))]
-        if wanted.object is not None:
-            kind = find(wanted.object)
+        if chosen.object is not None:
+            kind = find(chosen.object)
         mass, force = rng.uniform(*config.mass), rng.uniform(*config.grasp_force)
-        self.grasp_force = force if wanted.grasp_force is None else wanted.grasp_force
-        self.bodies = [sample_body(kind, rng, mass if wanted.mass is None else wanted.mass)]
+        self.grasp_force = force if chosen.grasp_force is None else chosen.grasp_force
+        self.bodies = [sample_body(kind, rng, mass if chosen.mass is None else chosen.mass)]
         others = [k for k in CATALOGUE.values() if k.name != kind.name]
         for i in range(config.distractors):
             other = others[rng.integers(len(others))]
@@ -131,7 +130,6 @@ class PickPlace(FrankaTactileEnv):
         self._note_start()
 
     def _note_start(self) -> None:
-        """Take note of how an episode begins."""
         position, twice = self.object_pose()[:3], 2 * self.grasp_yaw()
         self.start = np.array([*position, np.cos(twice), np.sin(twice), *self.goal], np.float32)
         self._initial_distance = max(self._tcp_distance(position), 1e-3)
@@ -144,7 +142,7 @@ class PickPlace(FrankaTactileEnv):
         return np.zeros(self.n_joints) if self._put_down else super()._disturbance()
 
     def evaluate(self) -> tuple[float, bool]:
-        """Progress in [0, 1] and success; takes note of what was lifted and put down."""
+        """Return progress in [0, 1] and success; record what was lifted and put down."""
         position = self.object_pose()[:3]
         height = float(position[2] - self.start[2])
         self._lifted |= height > _LIFTED
@@ -188,14 +186,14 @@ class PickPlace(FrankaTactileEnv):
         return float(np.linalg.norm(self.data.site("tcp").xpos - position))
 
     def object_on_table(self, name: str = "object") -> bool:
-        """Whether the table carries the object."""
+        """Return whether the table carries the object."""
         return self._reader.touches(
             self.data, self.model.geom(name).id, self.model.geom("table").id
         )
 
 
 def _random_positions(rng: np.random.Generator, n: int) -> list[np.ndarray]:
-    """Random positions in the workspace, m, at least `_APART` from each other."""
+    """Draw positions in the workspace (m), at least `_APART` from each other."""
     low, high = np.array(WORKSPACE).T
     points: list[np.ndarray] = []
     misses = 0

@@ -1,4 +1,4 @@
-"""The tasks: their environments by name or by config, and who demonstrates them."""
+"""The tasks: environments by name or config, and their experts."""
 
 from typing import Any, Literal, overload
 
@@ -22,7 +22,7 @@ def make(
     task: Literal["bead-maze"], *, render_mode: str | None = None, **options: Any
 ) -> BeadMaze: ...
 def make(task: str, *, render_mode: str | None = None, **options: Any) -> FrankaTactileEnv:
-    """The environment of a task, as Gymnasium's: `reset`, `step`, `render`, `close`.
+    """Make the Gymnasium environment of a task.
 
     Args:
         task: "pick-place" or "bead-maze".
@@ -41,19 +41,19 @@ def make(task: str, *, render_mode: str | None = None, **options: Any) -> Franka
 
 
 def make_env(config: TaskConfig) -> FrankaTactileEnv:
-    """The environment of a task's config."""
+    """Make the environment of a task's config."""
     return BeadMaze(config) if isinstance(config, BeadMazeConfig) else PickPlace(config)
 
 
 def task_name(config: EnvConfig) -> TaskName:
-    """What the commands call the task of a config."""
+    """Return the commands' name of a config's task."""
     return "bead-maze" if isinstance(config, BeadMazeConfig) else "pick-place"
 
 
 def make_expert(
     env: FrankaTactileEnv, outcome: Outcome = "success"
 ) -> PickPlaceExpert | BeadMazeExpert:
-    """The expert for an environment after its reset."""
+    """Make the expert for an environment after its reset."""
     if isinstance(env, PickPlace):
         return PickPlaceExpert(env, outcome)
     assert isinstance(env, BeadMaze)

@@ -7,6 +7,7 @@ import pytest
 
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.follower import WireFollower
+from touchgoal.control.safety.task_ceilings import TASK_FORCES
 from touchgoal.control.tactile.contact import detect_contact
 from touchgoal.episodes.recording import run
 from touchgoal.policies.evaluation.evaluate import run_trials, trial_specs
@@ -125,7 +126,7 @@ def test_expert_comes_back_when_led_astray(bead) -> None:
     env = BeadMaze(replace(BLIND, disturbance=0.004, bead=bead))
     ticks = lead(env, BeadMazeExpert, find("roller-3"))
     force = np.linalg.norm([tick[ft.WRENCH][:3] for tick in ticks], axis=1)
-    assert ticks[-1][ft.TRUTH_SUCCESS] and 5 < force.max() < env.config.max_force
+    assert ticks[-1][ft.TRUTH_SUCCESS] and 5 < force.max() < TASK_FORCES[env.task].force_ceiling
 
 
 def test_it_takes_touch(maze: BeadMaze) -> None:

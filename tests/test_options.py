@@ -19,7 +19,7 @@ from touchgoal.sim_envs.config import BeadMazeConfig, EnvConfig, PickPlaceConfig
         (EnvConfig, {"camera_size": (-6, 128)}, "camera_size must be greater than or equal to 16"),
         (EnvConfig, {"camera_size": (128, 1282)}, "camera_size must be less than or equal to 1280"),
         (EnvConfig, {"camera_size": (97, 96)}, "camera_size must be a multiple of 2"),
-        (EnvConfig, {"control_hz": 60}, "control_hz must divide 500"),
+        (EnvConfig, {"control_hz": 60}, "control_hz is 60; it must divide 500"),
         (EnvConfig, {"timestep": 0.0015}, "timestep must divide 2 ms"),
         (EnvConfig, {"max_seconds": 0.01}, "max_seconds must be at least a tick of 1/20 s"),
         (EnvConfig, {"disturbance": 3.0}, "disturbance must be less than or equal to 0.1"),

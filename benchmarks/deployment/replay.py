@@ -23,7 +23,7 @@ from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import Box, RobotLimits
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
-from touchgoal.sim_envs.cell.deployed_arm import all_well
+from touchgoal.sim_envs.cell.deployed_arm import measurements_at_rest
 from touchgoal.sim_envs.config import DeploymentConfig, PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 
@@ -175,7 +175,7 @@ def _over_the_wire(cell: CellConfig, actions: list[np.ndarray], seed: int) -> Re
     try:
         for action in actions:
             step = lag.update(action[:-1].astype(np.float32).astype(np.float64))
-            state = safety.filter_action(state, step, all_well(state.q))
+            state = safety.filter_action(state, step, measurements_at_rest(state.q))
             arm.command(state.q)
             connection.gripper.command(float(action[-1]))
             connection.clock.wait(connection.clock.now() + 1 / _HZ)

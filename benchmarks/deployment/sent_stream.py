@@ -13,7 +13,7 @@ from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3, UR5E, RobotLimits
 from touchgoal.runtime.option_types import Positive, Seed, checked_dataclass
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.cell.deployed_arm import all_well
+from touchgoal.sim_envs.cell.deployed_arm import measurements_at_rest
 
 
 @checked_dataclass
@@ -45,7 +45,7 @@ def wild_commands(layer: ActionFilter, ticks: int, rng: np.random.Generator) -> 
     for tick in range(ticks):
         if tick % round(_PUSH_SECONDS / layer.dt) == 0:
             push = rng.choice([0.05, 1.0, 1e300]) * rng.standard_normal(n)
-        state = layer.filter_action(state, push, all_well(state.q))
+        state = layer.filter_action(state, push, measurements_at_rest(state.q))
         commands.append(state.q)
     return commands
 

@@ -1,12 +1,11 @@
-"""An environment's arm as it is deployed: what lies between policy and arm, a millisecond at a time.
+"""The environment's arm as `deploy` drives it, a millisecond at a time.
 
-Joint changes pass deploy's lag, the safety layer and the 1 kHz tracker, as on the wire; what the
-policy sees is as old as it is there. The twin's own arm (`twin/cell.py`) follows its set-points as
-this one does.
+Joint changes pass deploy's lag, the safety layer and the 1 kHz tracker, as on the wire; observations are as
+old as they are there. The twin's own arm (`simulated_cell.py`) follows its set-points in the same way.
 """
 
 from collections import deque
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,41 +14,42 @@ from touchgoal.control import features as ft
 from touchgoal.control.motion.servo_lag import SERVO_DAMPING, ServoLag
 from touchgoal.control.motion.tracker import Tracker
 from touchgoal.control.safety.action_filter import ActionFilter, Measurements
-from touchgoal.control.safety.task_ceilings import TASK_FORCES
 from touchgoal.sim_envs.cell.deployed_hand import DeployedHand
 from touchgoal.sim_envs.cell.estimated_wrench import EstimatedWrench
 from touchgoal.sim_envs.config import DeploymentConfig
 
 _DT = 1e-3  # s
-_WRENCH_PERIOD = 10  # ms between readings of the force on the hand
+_WRENCH_PERIOD = 10  # ms between estimates of the force on the hand
+_FORCE_PERIOD = 2  # ms between looks at the true force
 _AHEAD = 10  # ticks for which delays are drawn beyond an episode's end
 
 Joints = Float[np.ndarray, " n"]
+Value = TypeVar("Value")
 
 
 class _Drive(Protocol):
-    """How joint changes become set-points of the servo."""
+    """Turns joint changes into set-points of the servo."""
 
     def accept(self, delta: Joints) -> Joints:
-        """The target (rad) that a tick's joint change (rad) leads to."""
+        """Return the target (rad) of a tick's joint change (rad)."""
         ...
 
     def set_target(self, target: Joints) -> None:
-        """A target arrives at the arm."""
+        """Let a target arrive at the arm."""
         ...
 
     def step(self) -> Joints:
-        """The servo's set-point (rad) of the next millisecond."""
+        """Return the servo's set-point (rad) of the next millisecond."""
         ...
 
     @property
     def command(self) -> Joints:
-        """Where all that was wanted so far leads to, rad."""
+        """Commanded joint positions, rad: the sum of all accepted changes."""
         ...
 
 
 class _DirectDrive:
-    """As without a deployment: in a straight line to each target, in a tick."""
+    """Without deployment: a straight line to each target, within one tick."""
 
     def __init__(self, start: Joints, limits: Float[np.ndarray, "n 2"], ticks: int) -> None:
         self.command, self._limits, self._ticks = start, limits, ticks
@@ -87,7 +87,8 @@ class _TrackedDrive:
 
     def accept(self, delta: Joints) -> Joints:
         step = self._lag.update(delta)
-        self._state = self._safety.filter_action(self._state, step, all_well(self._state.q))
+        at_rest = measurements_at_rest(self._state.q)
+        self._state = self._safety.filter_action(self._state, step, at_rest)
         return self._state.q
 
     def set_target(self, target: Joints) -> None:
@@ -103,12 +104,12 @@ class DeployedArm:
     """One episode, from where the arm rests.
 
     Attributes:
-        plan_ticks: by which a learned policy's plans come late.
-        contacts: of the pads, when the pictures of the last observation were taken.
-        stopped: whether the force on the hand, as the policy saw it, was above the task's ceiling.
+        plan_ticks: control ticks by which a learned policy's plans are late.
+        contacts: of the pads, when the images of the last observation were taken.
     """
 
     def __init__(self, env: Any, between: DeploymentConfig, rng: np.random.Generator) -> None:
+        """Draw delays of an environment's episode from a resolved config."""
         assert between.plan_ticks is not None
         self._env = env
         hz = env.config.control_hz
@@ -142,12 +143,9 @@ class DeployedArm:
         self._states = {0: self._read_state()}
         self._pictures = {0: (env.take_pictures(), env.pad_contacts())}
         self.contacts = env.pad_contacts()
-        forces = TASK_FORCES.get(env.task) if between.force_ceiling else None
-        self._ceiling = forces.force_ceiling if forces else np.inf
-        self.stopped = False
 
     def run_tick(self, delta: Joints, width: float) -> None:
-        """A control tick of physics, with what the policy has just answered."""
+        """Run a control tick of physics with the policy's action; end it where the force is too high."""
         env = self._env
         target = self._drive.accept(np.asarray(delta, np.float64))
         env.command = self._drive.command
@@ -156,35 +154,35 @@ class DeployedArm:
         end = self._ms + self._tick_ms
         reads = self._moments(self._state_at, end)
         shots = self._moments(self._picture_at, end)
-        while self._ms < end:
+        too_high = False
+        while self._ms < end and not too_high:
             while self._commands and self._commands[0][0] <= self._ms:
                 _, target, self._width = self._commands.popleft()
                 self._drive.set_target(target)
             width = self._hand.step(self._ms, self._width) if self._hand else self._width
             env.step_physics(self._drive.step(), width, env.robot.tool.speed, self._steps)
             self._ms += 1
-            self._sense(self._ms in reads, self._ms in shots)
+            self._measure(self._ms in reads, self._ms in shots)
+            if self._ms % _FORCE_PERIOD == 0:
+                too_high = env.monitor_force(_FORCE_PERIOD * _DT)
         env.update_contacts()
 
     def observation(self) -> dict[str, np.ndarray]:
-        """What the policy sees after the last tick."""
-        read_at, shot_at = int(self._state_at[self._tick]), int(self._picture_at[self._tick])
-        self._states = _since(self._states, read_at)
-        self._pictures = _since(self._pictures, shot_at)
-        pictures, self.contacts = self._pictures[shot_at]
-        state = self._states[read_at]
-        self.stopped |= bool(np.linalg.norm(state[ft.WRENCH][:3]) > self._ceiling)
+        """Return the policy's observation after the last tick."""
+        self._states, state = _latest(self._states, int(self._state_at[self._tick]))
+        self._pictures, latest = _latest(self._pictures, int(self._picture_at[self._tick]))
+        pictures, self.contacts = latest
         return {**state, **pictures}
 
-    def _sense(self, read: bool, shoot: bool) -> None:
-        """Measure and take pictures, where this millisecond is the time for it."""
+    def _measure(self, read: bool, shoot: bool) -> None:
+        """Read the state and take images, where they are due in this millisecond."""
         env = self._env
-        feel = self._wrench is not None and self._ms % _WRENCH_PERIOD == 0
-        if not (read or shoot or feel):
+        wrench = self._wrench if self._ms % _WRENCH_PERIOD == 0 else None
+        if not (read or shoot or wrench):
             return
         env.update_contacts()
-        if feel and self._wrench:
-            self._wrench.update(env.external_wrench(), _WRENCH_PERIOD * _DT)
+        if wrench:
+            wrench.update(env.external_wrench(), _WRENCH_PERIOD * _DT)
         if read:
             self._states[self._ms] = self._read_state()
         if shoot:
@@ -199,12 +197,12 @@ class DeployedArm:
         return state
 
     def _moments(self, at: Int[np.ndarray, " t"], end: int) -> set[int]:
-        """The milliseconds of the coming tick at which something is read."""
+        """Milliseconds of the coming tick at which something is due."""
         return set(at[(at > self._ms) & (at <= end)].tolist())
 
 
-def all_well(q: Joints) -> Measurements:
-    """So that the safety layer clamps, as it does on the wire, and never stops: tasks do that here."""
+def measurements_at_rest(q: Joints) -> Measurements:
+    """Return measurements at which the safety layer clamps but never stops: here tasks stop."""
     return Measurements(
         q=q,
         force=np.zeros(3),
@@ -218,14 +216,14 @@ def all_well(q: Joints) -> Measurements:
 
 
 def _range(given: tuple[float, float] | None) -> tuple[float, float]:
-    assert given is not None, "a config that is resolved, see EnvConfig.resolved_deployment"
+    assert given is not None, "a resolved config, see EnvConfig.resolved_deployment"
     return given
 
 
 def _delays(
     rng: np.random.Generator, delay: tuple[float, float] | None, jitter: float, ticks: int
 ) -> Int[np.ndarray, " t"]:
-    """ms, of each tick: one delay for the episode, and what varies."""
+    """Draw each tick's delay (ms): one delay for the episode, plus jitter."""
     drawn = rng.uniform(*_range(delay)) + rng.uniform(0, 1, ticks) * jitter
     return np.round(drawn * 1000).astype(int)
 
@@ -238,9 +236,9 @@ def _read_times(
     tick_ms: int,
     period: float = 1.0,
 ) -> Int[np.ndarray, " t"]:
-    """When (ms) what is seen at each tick was measured, every `period` ms.
+    """Draw when (ms) each tick's measurement was taken, every `period` ms.
 
-    Never before the start, and in the order of time.
+    Never before the start, and in order of time.
     """
     at = np.arange(ticks) * tick_ms - _delays(rng, delay, jitter, ticks)
     if period > 1:
@@ -249,5 +247,7 @@ def _read_times(
     return np.maximum.accumulate(np.maximum(at, 0))
 
 
-def _since(kept: dict, moment: int) -> dict:
-    return {at: value for at, value in kept.items() if at >= moment}
+def _latest(values: dict[int, Value], moment: int) -> tuple[dict[int, Value], Value]:
+    """Drop what is older than the latest value at `moment`; return the rest and that value."""
+    latest = max(at for at in values if at <= moment)
+    return {at: value for at, value in values.items() if at >= latest}, values[latest]

@@ -1,4 +1,4 @@
-"""A Franka Hand behind its driver, in an environment: told what the driver would tell it."""
+"""A Franka Hand behind its driver, inside an environment."""
 
 from typing import Any
 
@@ -27,13 +27,13 @@ class DeployedHand:
         self._last: LastCommand = "arrived"
         self._grasps, self._age = False, 0
 
-    def step(self, ms: int, wanted: float) -> float:
-        """The width (m) that the fingers go to in this millisecond, while `wanted` is the newest."""
+    def step(self, ms: int, target_width: float) -> float:
+        """Return the width (m) that the fingers go to in this millisecond, given the latest target."""
         if ms % _PERIOD == self._phase:
-            self._look(wanted)
+            self._look(target_width)
         return self._goal
 
-    def _look(self, wanted: float) -> None:
+    def _look(self, target_width: float) -> None:
         before, self.width = self.width, self._env.width()
         self._age += 1
         if self._last == "runs" and self._age > _LEAST:
@@ -42,7 +42,7 @@ class DeployedHand:
             elif abs(self.width - before) < _STILL:
                 self._last = "stopped short"
         grasped = self._grasps and self._last != "runs" and self.width > SHUT
-        target = min(max(wanted, 0.0), self._env.robot.tool.stroke[1])
+        target = min(max(target_width, 0.0), self._env.robot.tool.stroke[1])
         command = self._commands.next(target, self.width, grasped, self._last)
         if command is not None:
             self._grasps = command.grasp

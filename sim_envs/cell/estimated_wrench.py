@@ -1,4 +1,4 @@
-"""The force on the hand as a real arm estimates it from its joint torques."""
+"""The force on the hand as a real arm estimates it from joint torques, and its ceiling."""
 
 from functools import cache
 
@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 _LAG = 0.02  # s, first order: the estimate's filter, as the twin's
-_NOISE = np.array([0.1] * 3 + [0.01] * 3)  # N, N m, standard deviation of each reading
-_BIAS = np.array([1.5] * 3 + [0.3] * 3)  # N, N m, at most, of an episode
-_WANDER = np.array([0.5] * 3 + [0.1] * 3)  # N, N m, standard deviation of what drifts
-_WANDER_TIME = 1.0  # s
+_NOISE = np.array([0.1] * 3 + [0.01] * 3)  # N, Nm: standard deviation of each reading
+_BIAS = np.array([1.5] * 3 + [0.3] * 3)  # N, Nm: largest of an episode
+_DRIFT = np.array([0.5] * 3 + [0.1] * 3)  # N, Nm: standard deviation of the drift
+_DRIFT_TIME = 1.0  # s
 
 Wrench = Float[np.ndarray, "6"]
 
@@ -23,17 +23,17 @@ class WrenchError:
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
         self._bias = rng.uniform(-_BIAS, _BIAS)
-        self._wandering = rng.normal(0, _WANDER)
+        self._drift = rng.normal(0, _DRIFT)
 
     def update(self, seconds: float) -> None:
-        """So long after the last time."""
-        keep, new = _wandering(seconds)
-        noise = _WANDER * self._rng.standard_normal(6)
-        self._wandering = keep * self._wandering + new * noise
+        """Advance the drift by `seconds`."""
+        keep = _decay(seconds, _DRIFT_TIME)
+        noise = _DRIFT * self._rng.standard_normal(6)
+        self._drift = keep * self._drift + float(np.sqrt(1 - keep**2)) * noise
 
     def read(self) -> Wrench:
-        """By how much the next reading is wrong (N, N m)."""
-        return self._bias + self._wandering + _NOISE * self._rng.standard_normal(6)
+        """Draw the error of the next reading (N, Nm)."""
+        return self._bias + self._drift + _NOISE * self._rng.standard_normal(6)
 
 
 class EstimatedWrench:
@@ -44,17 +44,41 @@ class EstimatedWrench:
         self._filtered = np.zeros(6)
 
     def update(self, true: Wrench, seconds: float) -> None:
-        """The true wrench (N, N m) so long after the last one."""
-        self._filtered += (1 - np.exp(-seconds / _LAG)) * (true - self._filtered)
+        """Take the true wrench (N, Nm), `seconds` after the last one."""
+        self._filtered += (1 - _decay(seconds, _LAG)) * (true - self._filtered)
         self._error.update(seconds)
 
     def read(self) -> Wrench:
-        """The estimate (N, N m)."""
+        """Return the estimate (N, Nm)."""
         return self._filtered + self._error.read()
 
 
+class ForceMonitor:
+    """The force on the hand, filtered as an arm filters it, against a ceiling.
+
+    Attributes:
+        exceeded: whether it has been above the ceiling in this episode.
+    """
+
+    def __init__(self, ceiling: float) -> None:
+        """`ceiling`: N."""
+        self._ceiling = ceiling
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self._filtered, self.exceeded = np.zeros(3), False
+
+    def update(self, force: Float[np.ndarray, "3"], seconds: float) -> None:
+        """Take the true force (N), `seconds` after the last one."""
+        self._filtered += (1 - _decay(seconds, _LAG)) * (force - self._filtered)
+        self.check(self._filtered)
+
+    def check(self, wrench: Float[np.ndarray, " n"]) -> None:
+        """Compare a force, or the force of a wrench, with the ceiling (N)."""
+        self.exceeded |= bool(np.linalg.norm(wrench[:3]) > self._ceiling)
+
+
 @cache
-def _wandering(seconds: float) -> tuple[float, float]:
-    """How much of what drifts is kept after a while, and how much is new."""
-    keep = float(np.exp(-seconds / _WANDER_TIME))
-    return keep, float(np.sqrt(1 - keep**2))
+def _decay(seconds: float, time_constant: float) -> float:
+    return float(np.exp(-seconds / time_constant))

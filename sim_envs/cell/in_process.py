@@ -1,8 +1,7 @@
-"""A cell file with `arm = "sim"`: the twin's cell behind the drivers' protocols, in this process.
+"""A cell file with `arm = "sim"`: the simulated cell behind the drivers' interfaces, in this process.
 
-Nothing runs by itself: the cell goes on while the control loop waits for its next tick, and stamps
-count simulated time. So a run repeats exactly, on however slow a machine; it never runs faster than
-the clock on the wall.
+The cell advances only while the control loop waits for its next tick, and stamps are simulated time:
+a run repeats exactly, on however slow a machine. It never runs faster than the wall clock.
 """
 
 import time
@@ -36,14 +35,14 @@ _HELD_FORCE = 0.5  # N on both pads that mean something is held
 
 
 class SimulatedClock:
-    """See Clock; waiting advances the cell, and what moves it."""
+    """Clock of a simulated cell; waiting advances the cell and its arm."""
 
     def __init__(self, cell: SimulatedCell, arm: "SimulatedArm") -> None:
         self._cell, self._arm = cell, arm
         self._next_step_at = time.monotonic()
 
     def now(self) -> float:
-        """Simulated s."""
+        """Return simulated time, s."""
         return self._cell.time
 
     def age(self, stamp: float) -> float:
@@ -64,7 +63,7 @@ class SimulatedClock:
 
 
 class SimulatedArm:
-    """The Arm protocol over the cell; targets go through the tracker, as with the real drivers."""
+    """Arm interface of the cell; targets pass the tracker, as with the real drivers."""
 
     def __init__(self, cell: SimulatedCell, hz: float) -> None:
         self._cell, self._limits = cell, cell.env.robot.interface
@@ -113,7 +112,7 @@ class SimulatedArm:
         self.stop()
 
     def step(self) -> None:
-        """One millisecond of the stream."""
+        """Advance the stream of set-points by a millisecond."""
         if self._state is None:
             return
         before = self._state.q
@@ -122,7 +121,7 @@ class SimulatedArm:
 
 
 class SimulatedGripper:
-    """The Gripper protocol over the cell; it closes with `force` (N)."""
+    """Gripper interface of the cell; it closes with `force` (N)."""
 
     def __init__(self, cell: SimulatedCell, force: float) -> None:
         self._cell, self._force = cell, force
@@ -157,7 +156,7 @@ class SimulatedGripper:
 
 
 class SimulatedCamera:
-    """The Camera protocol over one of the cell's; a picture is taken when it is looked at."""
+    """Camera interface of the cell; an image is rendered when it is read."""
 
     def __init__(self, cell: SimulatedCell, name: str, rate: float) -> None:
         self._cell, self._name, self._rate = cell, name, rate
@@ -189,7 +188,7 @@ class SimulatedCamera:
 
 
 class SimulatedTactileCamera(SimulatedCamera):
-    """The TactileSensor protocol over one of the cell's."""
+    """TactileSensor interface of the cell."""
 
     def __init__(self, cell: SimulatedCell, side: int, model: SensorModel) -> None:
         super().__init__(cell, ft.TACTILE[side], model.frame_rate)
@@ -200,7 +199,7 @@ class SimulatedTactileCamera(SimulatedCamera):
 
 
 class SimulatedLoadCell:
-    """The LoadCell protocol: under the table."""
+    """LoadCell interface of the cell: the force on the table."""
 
     def __init__(self, cell: SimulatedCell) -> None:
         self._cell = cell
@@ -214,7 +213,7 @@ class SimulatedLoadCell:
 
 
 def simulate_cell(config: CellConfig, hz: float) -> CellConnection:
-    """The connection of a cell file with `arm = "sim"`: its sensors, task and limits, in simulation."""
+    """Connect to a simulated cell: sensors, task and limits of a cell file with `arm = "sim"`."""
     env = make_env(replace(env_config_of(config), camera_size=STREAM_SIZE))
     cell = SimulatedCell(env, config.task.seed, wrench_error=True)
     env.update_contacts()

@@ -1,4 +1,4 @@
-"""The simulated cell behind the wire: physics at 1 kHz, set-points and gripper from outside."""
+"""The simulated cell in 1 kHz steps, with set-points and gripper commands from outside."""
 
 from dataclasses import dataclass
 from typing import Any, no_type_check
@@ -13,7 +13,6 @@ from touchgoal.control.safety.braking import braked_velocity
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.cell.estimated_wrench import WrenchError
-from touchgoal.sim_envs.cell.serial_arm import SerialArm
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE
 
@@ -36,7 +35,7 @@ Joints = Float[np.ndarray, " n"]
 
 @dataclass
 class GripperCommand:
-    """What the gripper is told: width (m), its speed (m/s of width), force of each finger (N)."""
+    """Target width (m), speed (m/s of width) and force of each finger (N)."""
 
     width: float
     speed: float
@@ -45,12 +44,12 @@ class GripperCommand:
 
 @dataclass
 class WorstCase:
-    """What has been worst since the episode began, for whoever injects faults.
+    """Extremes since the episode began, for fault-injection tests.
 
     Attributes:
         excess: rad beyond the maker's joint range.
         speed: share of the maker's joint speed.
-        force: N, on the robot from outside, as seen once a control tick.
+        force: N on the robot from outside, checked once a control tick.
     """
 
     excess: float = 0.0
@@ -75,7 +74,7 @@ class SimulatedCell:
     """
 
     def __init__(self, env: FrankaTactileEnv, seed: int, wrench_error: bool = False) -> None:
-        """With the error of a real arm's estimate of force, or without."""
+        """`wrench_error`: give the force estimate the error of a real arm's."""
         self.env, self._errs = env, wrench_error
         self.reset(seed)
 
@@ -86,8 +85,8 @@ class SimulatedCell:
         n = env.n_joints
         model = env.model
         model.actuator_ctrllimited[:n] = 0  # feed-forward reaches beyond the range; arms check it
-        self._serial_arm = SerialArm(model)
-        self._hand = model.body("hand").id
+        self._scratch = mujoco.MjData(model)
+        self._hand, self._tcp = model.body("hand").id, model.site("tcp").id
         self._servo = model.actuator_gainprm[:n].copy(), model.actuator_biasprm[:n].copy()
         self._friction = model.dof_frictionloss.copy()
         self._torque: Joints | None = None
@@ -107,16 +106,14 @@ class SimulatedCell:
         self.worst = WorstCase()
         self.least_width = 0.0
         self.progress, self.success, self.failures = 0.0, False, set[str]()
-        self._grasp_begun = (
-            False  # nobody knows when a client comes: the clock waits for the first grasp
-        )
+        self._grasp_begun = False  # the episode's clock waits for the first grasp
         self._rest_since = 0.0
         self._note_extremes()
 
     # What arms and grippers command.
 
     def set_target(self, q_d: Joints, dq_d: Joints) -> None:
-        """Be at `q_d` (rad), moving with `dq_d` (rad/s)."""
+        """Command joint positions `q_d` (rad), moving with `dq_d` (rad/s)."""
         self._enter_control_mode(torque=False)
         self.q_d, self.dq_d = q_d, dq_d
 
@@ -163,7 +160,7 @@ class SimulatedCell:
     # Time.
 
     def step(self) -> None:
-        """One millisecond."""
+        """Advance by a millisecond."""
         env = self.env
         tick = self._tick_steps
         if self._steps % tick == 0:
@@ -219,11 +216,19 @@ class SimulatedCell:
     def kinematics(
         self, q: Joints, offset: Float[np.ndarray, "3"]
     ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], Float[np.ndarray, "6 n"]]:
-        """Position (m), rotation and Jacobian, base frame, of a point `offset` (m) from the TCP."""
-        return self._serial_arm.pose_and_jacobian(q, offset)
+        """Return position (m), rotation and Jacobian, base frame, of a point `offset` m from the TCP."""
+        env, data = self.env, self._scratch
+        data.qpos[env.arm_positions] = q
+        mujoco.mj_kinematics(env.model, data)
+        mujoco.mj_comPos(env.model, data)
+        R = data.site_xmat[self._tcp].reshape(3, 3).copy()
+        point = data.site_xpos[self._tcp] + R @ offset
+        jacobian = np.empty((6, env.model.nv))
+        mujoco.mj_jac(env.model, data, jacobian[:3], jacobian[3:], point, self._hand)
+        return point, R, jacobian.take(env.arm_dofs, axis=1)
 
     def truth(self) -> dict[str, Any]:
-        """What only a simulator knows, as plain numbers; also where arm and gripper are."""
+        """Return ground truth, and the state of arm and gripper, as plain numbers."""
         return {
             "time": self.time,
             "instruction": self.env.instruction(),
@@ -275,7 +280,7 @@ class SimulatedCell:
             self._rest_since = self.time
 
     def _enter_control_mode(self, torque: bool) -> None:
-        """Leave braking and yielding, and change between position servo and torque control."""
+        """End braking and yielding; switch between position servo and torque control."""
         self._braking, self._yielding = None, False
         if torque == (self._torque is not None):
             return
@@ -292,7 +297,7 @@ class SimulatedCell:
 @njit(cache=True)
 @no_type_check
 def _extremes(q, dq, lower, upper, velocity):
-    """Greatest excess over a joint's range (rad), share of its speed, and speed (rad/s)."""
+    """Return the largest excess over a joint's range (rad), share of its speed, and speed (rad/s)."""
     excess, share, fastest = -np.inf, 0.0, 0.0
     for i in range(len(q)):
         excess = max(excess, lower[i] - q[i], q[i] - upper[i])

@@ -1,4 +1,4 @@
-"""What an environment's observations and actions are, for Gymnasium."""
+"""Observation and action spaces of an environment."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from touchgoal.sim_envs.config import EnvConfig
 
 
 def observation_space(config: EnvConfig, joints: int, sensor: SensorModel) -> gym.spaces.Dict:
-    """Of an arm with so many joints, the cameras that are observed, and these fingertips."""
+    """Return the space of an arm with `joints` joints, the observed cameras and the fingertips."""
     of_arm = ft.features_of(joints)
     spaces: dict[str, gym.Space[Any]] = {
         key: gym.spaces.Box(-np.inf, np.inf, of_arm[key].shape, np.float32)
@@ -26,7 +26,7 @@ def observation_space(config: EnvConfig, joints: int, sensor: SensorModel) -> gy
 
 
 def action_space(robot: RobotLimits, hz: int) -> gym.spaces.Box:
-    """Joint changes (rad) that the arm can make in a tick, and widths (m) of its gripper."""
+    """Return the space of joint changes (rad) in one tick, and gripper widths (m)."""
     step = robot.hardware.velocity / hz
     return gym.spaces.Box(
         np.append(-step, 0.0).astype(np.float32),

@@ -1,4 +1,4 @@
-"""The bead maze's demonstrator: it knows the wire, and comes back to it after a disturbance."""
+"""The bead maze's demonstrator; it knows the wire and returns to it after a disturbance."""
 
 import numpy as np
 
@@ -25,7 +25,7 @@ class BeadMazeExpert:
         self._env, self._speed = env, speed
 
     def act(self, observation: Observation) -> np.ndarray:
-        """The action for the next tick; the observation is not looked at."""
+        """Return the action for the next tick; the observation is not used."""
         env = self._env
         if env.grasping:
             return np.zeros(env.n_joints + 1)
@@ -46,7 +46,7 @@ class BeadMazeExpert:
         return np.append(joints - env.command, 0.0)
 
     def _grip(self) -> np.ndarray:
-        """Where the bead would sit in the TCP frame if the gels were not deflected, m."""
+        """Return where the bead would sit in the TCP frame if the gels were not deflected, m."""
         data = self._env.data
         sides = ("left", "right")
         gels = [data.body(f"{s}_gel").xpos - data.site(f"{s}_sensor").xpos for s in sides]

@@ -1,4 +1,4 @@
-"""Scripted demonstrators that know where everything is, and can be asked to fail."""
+"""A scripted demonstrator with ground truth, which can also fail on purpose."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import numpy as np
 from touchgoal.control.features import Observation
 from touchgoal.control.motion.rotations import fingers_down
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.cell.environment import GRIPPER_MAX_WIDTH
+from touchgoal.sim_envs.cell.hardware import GRIPPER_MAX_WIDTH
 from touchgoal.sim_envs.config import Outcome
 from touchgoal.sim_envs.pick_place import PickPlace
 
@@ -23,7 +23,7 @@ TOUCHDOWN_DEPTH = 0.010  # m below the grasp's height to look for the table when
 
 @dataclass(frozen=True)
 class Waypoint:
-    """Where the hand goes next, fingers down, straight and with minimum jerk, the gripper at `width`.
+    """Target of a straight minimum-jerk move, fingers down, with the gripper at `width`.
 
     Attributes:
         position: of the TCP at the end, m, base frame; None: stay.
@@ -40,7 +40,7 @@ class Waypoint:
 
 
 class PickPlaceExpert:
-    """Picks and places, or fails in the way `outcome` asks for.
+    """Picks and places, or fails as `outcome` says.
 
     never_touch closes the hand 8 cm above the object; drop lets go on the way; wrong_object takes
     the first distractor; freeze stops moving somewhere between the start and the goal.
@@ -55,10 +55,7 @@ class PickPlaceExpert:
         self._actions = self._run()
 
     def act(self, observation: Observation) -> np.ndarray:
-        """The action for the next tick; stands still once the plan is over.
-
-        The observation is not looked at: the expert sees the simulator's state.
-        """
+        """Return the action for the next tick, from ground truth; no motion once the plan is over."""
         return next(self._actions)
 
     def _run(self) -> Iterator[np.ndarray]:
@@ -125,7 +122,7 @@ class PickPlaceExpert:
         return "distractor_1" if self._outcome == "wrong_object" else "object"
 
     def _freeze_tick(self) -> float:
-        """When to stand still for good: on the way to the object or with it, as the seed says."""
+        """Draw the tick from which the expert stands still."""
         if self._outcome != "freeze":
             return np.inf
         return float(self._env.np_random.integers(15, 85))
@@ -141,5 +138,5 @@ class PickPlaceExpert:
 
 
 def _minimum_jerk(s: float) -> float:
-    """Flash and Hogan (1985): position along a rest-to-rest move at a fraction of its time."""
+    """Return the position along a rest-to-rest move at a share of its time (Flash and Hogan, 1985)."""
     return s**3 * (10 - 15 * s + 6 * s * s)

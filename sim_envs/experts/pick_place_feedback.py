@@ -1,11 +1,11 @@
-"""A pick-and-place expert that looks only at the current state: it can correct a policy anywhere."""
+"""A pick-and-place expert that acts on the current state alone, so it can correct a policy anywhere."""
 
 import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control.features import Observation
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
-from touchgoal.sim_envs.cell.environment import GRIPPER_MAX_WIDTH
+from touchgoal.sim_envs.cell.hardware import GRIPPER_MAX_WIDTH
 from touchgoal.sim_envs.experts.pick_place import (
     CLEARANCE,
     LOWEST_GRASP,
@@ -18,7 +18,7 @@ _STEEP = 3.0  # m of height per m that the hand is beside its place
 _NEAR, _GRIPPING = 0.006, 0.015  # m beside the object: for fingers to begin to close, to go on
 _OVER, _PLACED = 0.008, 0.014  # m beside the goal: for the object to go down, to stay there
 _PLACING = 3.0  # N, upwards on the hand, with which an object is held down where it is placed
-_FELT = 1.0  # N that an arm feels for sure
+_NOTICEABLE = 1.0  # N that an arm measures reliably
 _BEGUN = GRIPPER_MAX_WIDTH - 0.006  # m of width below which the fingers have begun to close
 _STILL = 0.006  # m/s of width: fingers that something stops
 _SPEED, _CLIMB, _TOUCHDOWN = 0.3, 0.2, 0.01  # m/s: at most over the table, up and down, near it
@@ -32,16 +32,16 @@ _TURN = 1.0  # rad/s
 
 
 class FeedbackExpert:
-    """Picks and places, to be asked in any state, whoever led the arm there.
+    """Picks and places from any state, whoever led the arm there.
 
-    It follows a funnel over the object, and once it holds it, over the goal: the farther beside, the
-    higher. Whatever it presses on, it gives way to. What it does depends on nothing but how the episode began and what can be sensed of the
-    present tick and the one before, so a policy that observes as much can do the same. An object
-    that is pushed away it does not follow, and it never lets go.
+    It follows a funnel over the object, and once it holds it, over the goal: the farther beside, the higher.
+    It yields to whatever it presses on. Its action depends on the start of the episode and on the sensed
+    state of this tick and the last, so a policy with these observations can do the same. It does not follow
+    a displaced object, and never lets go.
     """
 
     def __init__(self, env: PickPlace) -> None:
-        """For one episode, at its beginning."""
+        """Begin an episode right after its reset."""
         self._env = env
         self._object, self._yaw = env.object_pose()[:3].copy(), env.grasp_yaw()
         self._object[2] = max(self._object[2], LOWEST_GRASP)
@@ -50,10 +50,7 @@ class FeedbackExpert:
         self._width = env.width()
 
     def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
-        """The action for the next tick; to be asked at every tick, whoever acts.
-
-        The observation is not looked at: the expert sees the simulator's state.
-        """
+        """Return the action for the next tick, from ground truth; call it at every tick, whoever acts."""
         env, hz = self._env, self._env.config.control_hz
         (here, R), width = env.kinematics.forward(env.command), env.width()
         pace = (here - self._before) * hz
@@ -85,7 +82,7 @@ class FeedbackExpert:
     def _fetch(
         self, here: np.ndarray, turn: float, width: float
     ) -> tuple[np.ndarray, float, float]:
-        """Velocity (m/s), turn still to make (rad) and width (m) of a hand that holds nothing."""
+        """Velocity (m/s), remaining turn (rad) and width (m) for a hand that holds nothing."""
         off = self._object - here
         beside = float(np.linalg.norm(off[:2])) + 0.05 * abs(turn)
         reach = _GRIPPING if width < _BEGUN else _NEAR
@@ -94,11 +91,10 @@ class FeedbackExpert:
         return _funnel(off, beside - _NEAR), turn, GRIPPER_MAX_WIDTH
 
     def _carry(self, here: np.ndarray) -> np.ndarray:
-        """Velocity (m/s) of a hand that holds the object."""
         off = self._goal - here
         beside = float(np.linalg.norm(off[:2]))
         force = float(self._env.external_wrench()[2])
-        if beside < (_PLACED if force > _FELT else _OVER) and off[2] > -_CLOSE:
+        if beside < (_PLACED if force > _NOTICEABLE else _OVER) and off[2] > -_CLOSE:
             deepest = max(self._goal[2] - TOUCHDOWN_DEPTH, LOWEST_PLACE)
             lower = np.clip(1 - force / _PLACING, 0, 1) * (here[2] > deepest)
             return np.array([0, 0, -_TOUCHDOWN * lower])
@@ -108,16 +104,16 @@ class FeedbackExpert:
 def _righted(
     R: Float[np.ndarray, "3 3"], yaw: float, turn: float, share: float
 ) -> Float[np.ndarray, "3 3"]:
-    """The hand, at `yaw`, turned on by `turn` (rad), and its tilt less that share of it.
+    """Return the hand turned by `turn` (rad), with `share` of its tilt removed.
 
-    Not all of it at once: a policy whose plans come two ticks late, taught so, swings to and fro.
+    Not all at once: a policy with plans two ticks late, taught so, oscillates.
     """
     tilt = rotation_vector(fingers_down(yaw).T @ R)
     return fingers_down(yaw + turn) @ rotation_matrix((1 - share) * tilt)
 
 
 def _funnel(off: np.ndarray, beside: float, lower: float = _RETURN) -> np.ndarray:
-    """Velocity (m/s) towards a place `off` (m), from above it."""
+    """Return the velocity (m/s) towards a place `off` (m) from above it."""
     rise = off[2] + min(CLEARANCE, _STEEP * max(0.0, beside))
     distance = float(np.linalg.norm(off[:2]))
     high = np.clip(1 - rise / 0.04, 0, 1)  # over the table only where it is high enough

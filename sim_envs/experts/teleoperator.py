@@ -1,7 +1,7 @@
-"""A person who leads the bead with keys, as if guiding a compliant arm by hand.
+"""Keyboard teleoperation of the bead, as if guiding a compliant arm by hand.
 
-A key pushes the hand; the arm gives way to the forces of the wire on the bead. So the person gives the
-direction, and the wire the exact path.
+A key pushes the hand; the arm yields to the wire's forces on the bead. A person gives the direction,
+the wire the exact path.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ _PUSHES = {
 
 
 class Teleoperator:
-    """Acts on the commanded pose, as `press` says and the wire lets it."""
+    """Turns pressed keys into actions of a compliant hand."""
 
     def __init__(self, env: BeadMaze, config: TeleoperatorConfig) -> None:
         self._env, self._config = env, config
@@ -34,11 +34,11 @@ class Teleoperator:
 
     @property
     def held(self) -> str:
-        """The keys that count as held."""
+        """Keys that count as held."""
         return "".join(sorted(self._held))
 
     def press(self, keys: str) -> None:
-        """Keys were typed, in this order; those without a meaning have no effect."""
+        """Take typed keys, in this order; ignore keys without a meaning."""
         for key in keys:
             if key == STOP:
                 self._held.clear()
@@ -48,7 +48,7 @@ class Teleoperator:
                 self._held[key] = round(self._config.hold_seconds * self._env.config.control_hz)
 
     def act(self, observation: Observation) -> np.ndarray:
-        """The action for the next tick; none while the hand closes on the bead."""
+        """Return the action for the next tick; none while the hand closes on the bead."""
         env, c = self._env, self._config
         push = sum((_PUSHES[key] for key in self._held), np.zeros(6)).reshape(2, 3)
         self._held = {key: ticks - 1 for key, ticks in self._held.items() if ticks > 1}

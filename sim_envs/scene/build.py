@@ -15,7 +15,7 @@ from touchgoal.control.motion.tool import FRANKA_HAND, SENSOR_BELOW_CARRIAGE, To
 from touchgoal.control.safety import limits
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.config import MAX_CAMERA_SIZE, SceneConfig
+from touchgoal.sim_envs.config import MAX_CAMERA_SIDE, SceneConfig
 from touchgoal.sim_envs.scene.objects import FIRM, Body
 
 SIDES = ("left", "right")
@@ -32,7 +32,7 @@ _STIFFNESS = {
 
 
 def robot_model() -> Path:
-    """The FR3's MJCF inside the franky-sim wheel (not imported: it would pull pinocchio in)."""
+    """Return the FR3's MJCF inside the franky-sim wheel, without importing it (it imports pinocchio)."""
     found = importlib.util.find_spec("franky_sim")
     if found is None or found.origin is None:
         raise UserError("the FR3 model is missing; run: pip install franky-sim")
@@ -40,7 +40,7 @@ def robot_model() -> Path:
 
 
 def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpec:
-    """The scene's spec; tasks add to it before they compile it."""
+    """Build the scene's spec; tasks add to it before they compile it."""
     config = config or SceneConfig()
     if config.arm == "ur5e":
         spec = mujoco.MjSpec.from_file(str(_UR5E))
@@ -64,7 +64,7 @@ def build(bodies: list[Body], config: SceneConfig | None = None) -> mujoco.MjSpe
 
 
 def set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
-    """Solver and drawing, for whatever scene has a fingertip in it."""
+    """Set solver and drawing options of any scene with a fingertip."""
     option = spec.option
     option.timestep = config.timestep
     # `discrete` keeps implicit damping when an actuator saturates; with `implicitfast` MuJoCo
@@ -82,7 +82,7 @@ def set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     spec.stat.center = np.array([0.5, 0.0, 0.2])
     visual = spec.visual
     visual.map.znear, visual.map.zfar = 0.01, 10.0  # m: the wrist camera is near the fingers
-    visual.global_.offheight, visual.global_.offwidth = MAX_CAMERA_SIZE
+    visual.global_.offheight = visual.global_.offwidth = MAX_CAMERA_SIDE
     visual.headlight.active = 1
     visual.headlight.ambient, visual.headlight.diffuse = (
         np.full(3, 0.3, np.float32),
@@ -95,7 +95,7 @@ def set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
 
 
 def _strip(spec: mujoco.MjSpec, config: SceneConfig) -> None:
-    """Drop what the wheel's model brings and we replace: keyframes, servos, finger shapes."""
+    """Remove keyframes, servos and finger shapes of the wheel's model."""
     for item in [*spec.keys, *spec.actuators]:
         spec.delete(item)
     for side in SIDES:
@@ -118,14 +118,14 @@ def _strip(spec: mujoco.MjSpec, config: SceneConfig) -> None:
 
 
 def _compensate_gravity(body: mujoco.MjsBody) -> None:
-    """As libfranka does: the arm and its tool do not feel their own weight."""
+    """Compensate the weight of arm and tool, as libfranka does."""
     body.gravcomp = 1
     for child in body.bodies:
         _compensate_gravity(child)
 
 
 def add_fingertip(spec: mujoco.MjSpec, side: str, sensor: SensorModel) -> None:
-    """Carriage, adapter, sensor case and gel of one finger.
+    """Add carriage, adapter, sensor case and gel of one finger.
 
     The gel is one rigid plate on three springs (normal, two shear): the pad's force then is exact,
     and its displacement is what shear does to the image. The plate's collision box reaches 12 mm
@@ -201,7 +201,7 @@ def _add_gel(
 
 
 def arm_joints(arm: str) -> list[str]:
-    """Names of an arm's joints, from the base outwards."""
+    """Return the names of an arm's joints, from the base outwards."""
     return [f"{arm}_joint{i}" for i in range(1, ROBOTS[arm].arm.home.size + 1)]
 
 
@@ -314,14 +314,14 @@ def add_body(spec: mujoco.MjSpec, body: Body) -> None:
 
 
 def _quaternion(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> list[float]:
-    """wxyz of the frame whose axes, in the parent frame, are x, y, z."""
+    """Return the quaternion (wxyz) of a frame with axes x, y, z in the parent frame."""
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, np.stack([x, y, z], axis=1).ravel())
     return quat.tolist()
 
 
 def _look(eye: list[float], target: list[float], up: list[float]) -> list[float]:
-    """Orientation of a camera at `eye` that looks at `target` with `up` upwards in its image."""
+    """Return the orientation of a camera at `eye` that looks at `target`, `up` upwards in its image."""
     z = np.asarray(eye) - np.asarray(target)
     z = z / np.linalg.norm(z)
     x = np.cross(up, z)

@@ -1,4 +1,4 @@
-"""What the solver's contacts say about the fingertips: wrenches, slip, external force."""
+"""Contacts of the solver: wrenches and slip at the fingertips, external force."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, no_type_check
@@ -61,7 +61,7 @@ class ContactReader:
     def read(
         self, data: mujoco.MjData
     ) -> tuple[tuple[PadContact, PadContact], Float[np.ndarray, "6"]]:
-        """The left and the right pad's contact, and the external wrench.
+        """Return contacts of the left and right pad, and the external wrench.
 
         The wrench is the force (N) and torque (Nm) of everything outside on the robot, at the TCP,
         in the base frame.
@@ -90,13 +90,13 @@ class ContactReader:
         return (pad(0), pad(1)), wrenches[2]
 
     def joint_torque(self, data: mujoco.MjData) -> Float[np.ndarray, " nv"]:
-        """Generalised force of all contacts, J^T f; what the hand does to itself cancels out."""
+        """Return the generalised force of all contacts, J^T f; internal forces of the hand cancel out."""
         contact = _IS_CONTACT[data.efc_type]
         jacobian = data.efc_J.reshape(-1, self._model.nv)
         return data.efc_force[contact] @ jacobian[contact]
 
     def load(self, data: mujoco.MjData, geom: int) -> float:
-        """Force (N) with which everything presses down on a geom."""
+        """Return the force (N) that presses down on a geom."""
         force = 0.0
         for i in range(data.ncon):
             contact = data.contact[i]
@@ -106,13 +106,12 @@ class ContactReader:
         return float(force)
 
     def touches(self, data: mujoco.MjData, one: int, other: int) -> bool:
-        """Whether two geoms are in contact."""
+        """Return whether two geoms are in contact."""
         return any({int(g) for g in pair} == {one, other} for pair in data.contact.geom)
 
     def _wrench(
         self, data: mujoco.MjData, index: int, contact: mujoco.MjContact
     ) -> tuple[np.ndarray, np.ndarray]:
-        """World-frame force and torque of a contact's first geom on its second."""
         wrench = np.zeros(6)
         mujoco.mj_contactForce(self._model, data, index, wrench)
         frame = contact.frame.reshape(3, 3)
@@ -130,7 +129,7 @@ class Contacts(NamedTuple):
 
 
 class Moving(NamedTuple):
-    """What tells how fast a point of a geom moves: bodies, and their velocities about their tree's centre."""
+    """Bodies of geoms, and velocities of bodies about their tree's centre of mass."""
 
     bodies: Int[np.ndarray, " geoms"]
     roots: Int[np.ndarray, " bodies"]
@@ -141,7 +140,7 @@ class Moving(NamedTuple):
 @njit(cache=True)
 @no_type_check
 def _read_contacts(contacts, forces, is_robot, pads, origins, moving):
-    """What acts on the left pad, the right pad and the robot, and how fast things slip over the pads.
+    """Sum wrenches on left pad, right pad and robot; find the slip speed over each pad.
 
     Returns:
         forces (N) and torques (N m) about the three origins, in the world frame (3, 6), and m/s (2).
@@ -176,7 +175,6 @@ def _read_contacts(contacts, forces, is_robot, pads, origins, moving):
 @njit(inline="always")
 @no_type_check
 def _add_wrench(total, sign, force, torque, arm):
-    """Add a force at the end of an arm, and a torque."""
     total[:3] += sign * force
     total[3:] += sign * (np.cross(arm, force) + torque)
 
@@ -184,7 +182,7 @@ def _add_wrench(total, sign, force, torque, arm):
 @njit(inline="always")
 @no_type_check
 def _velocity(moving, geom, point):
-    """Of a point (m, world frame) fixed to a geom, m/s."""
+    """Return the velocity (m/s) of a point (m, world frame) fixed to a geom."""
     body = moving.bodies[geom]
     twist = moving.velocities[body]
     return twist[3:] + np.cross(twist[:3], point - moving.centres[moving.roots[body]])

@@ -27,7 +27,7 @@ class Texture(IntEnum):
 
 @dataclass(frozen=True)
 class Material:
-    """How a surface feels.
+    """Touch properties of a surface.
 
     Attributes:
         texture: its pattern.
@@ -51,7 +51,7 @@ HARD, FIRM, SOFT = 1e11, 6e8, 1.2e8  # Pa/m: far stiffer than the gel, twice as 
 
 @dataclass(frozen=True)
 class ObjectKind:
-    """One entry of the catalogue; `descriptions` say in different words how it feels."""
+    """One entry of the catalogue, with descriptions of its touch in different words."""
 
     name: str
     shape: Shape
@@ -118,7 +118,7 @@ _SIZES: dict[Shape, tuple[tuple[float, float], ...]] = {
 
 
 def find(name: str) -> ObjectKind:
-    """The catalogue's entry; UserError lists what there is."""
+    """Return the catalogue's entry; UserError lists the names."""
     if name not in CATALOGUE:
         raise UserError(f"unknown object {name!r}; choose from: {', '.join(CATALOGUE)}")
     return CATALOGUE[name]
@@ -127,14 +127,14 @@ def find(name: str) -> ObjectKind:
 def sample_body(
     kind: ObjectKind, rng: np.random.Generator, mass: float, name: str = "object"
 ) -> Body:
-    """An object of this kind with a random size; meshes also get a random convex hull."""
+    """Draw an object of this kind with a random size; meshes also get a random convex hull."""
     size = tuple(float(rng.uniform(*bounds)) for bounds in _SIZES[kind.shape])
     hull = size[0] * _unit_hull(rng) if kind.shape == "mesh" else None
     return Body(kind, size, mass, name, hull)
 
 
 def _unit_hull(rng: np.random.Generator, n: int = 24) -> Float[np.ndarray, "n 3"]:
-    """Points near the unit sphere, the shape of a stone."""
+    """Draw points near the unit sphere, the shape of a stone."""
     points = rng.normal(size=(n, 3))
     points *= rng.uniform(0.85, 1.0, (n, 1)) / np.linalg.norm(points, axis=1, keepdims=True)
     return points * (1.0, 1.0, 1.1)

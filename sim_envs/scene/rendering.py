@@ -1,4 +1,4 @@
-"""Off-screen OpenGL, or one clear line on what it lacks."""
+"""Off-screen OpenGL, or one clear message about what it lacks."""
 
 import os
 
@@ -13,9 +13,9 @@ _opened_in: int | None = None  # the process that first rendered; its forked chi
 
 
 class Renderer(mujoco.Renderer):
-    """MuJoCo's renderer, of one process: where a forked child would wait for ever, it refuses.
+    """MuJoCo's renderer for one process; in a forked child it refuses to render.
 
-    Mesa draws with threads, which a fork does not copy; a lock that one of them held stays locked.
+    Mesa draws with threads, which a fork does not copy: a lock that one of them held would stay locked.
     """
 
     def __init__(self, model: mujoco.MjModel, height: int, width: int) -> None:
@@ -24,18 +24,18 @@ class Renderer(mujoco.Renderer):
         super().__init__(model, height, width)
 
     def render(self, *, out: np.ndarray | None = None) -> np.ndarray:
-        """The scene's picture, RGB."""
+        """Render the scene, RGB."""
         check_process_may_render()
         return super().render(out=out)
 
     def close(self) -> None:
-        """Free the OpenGL context; in a forked child nothing is freed, for it is the parent's."""
+        """Free the OpenGL context; a forked child leaves it to its parent."""
         if getattr(self, "_process", None) == os.getpid():
             super().close()
 
 
 def open_renderer(model: mujoco.MjModel, rows: int, columns: int) -> Renderer:
-    """A renderer of its own OpenGL context; close it.
+    """Open a renderer with its own OpenGL context; close it after use.
 
     Raises:
         UserError: there are no OpenGL libraries, MuJoCo chose a platform that does not work, or the

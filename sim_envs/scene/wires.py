@@ -1,7 +1,7 @@
-"""Bent wires for the bead maze: five families, made from a seed, no two alike, three splits.
+"""Bent wires for the bead maze: five families, three disjoint splits, made from seeds.
 
-A wire is a curve of constant length, integrated from a heading and a pitch over arc length, so
-that its curvature is what its family says. Metres and radians.
+A wire is a curve of constant length, integrated from heading and pitch over arc length, so that its
+curvature is what its family defines. Metres and radians.
 """
 
 from collections.abc import Callable
@@ -51,7 +51,7 @@ class Wire:
 
     @property
     def name(self) -> str:
-        """Such as helix-1; `find` makes the wire of a name."""
+        """Name such as helix-1, for `find`."""
         return f"{self.family}-{self.seed}"
 
     @cached_property
@@ -61,7 +61,7 @@ class Wire:
         return t / np.linalg.norm(t, axis=1, keepdims=True)
 
     def at(self, s: float) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        """Point and unit tangent after `s` m of arc; the ends hold beyond them."""
+        """Return point and unit tangent after `s` m of arc; clipped at the ends."""
         k = min(max(s, 0.0), LENGTH) / STEP
         i = min(int(k), len(self.points) - 2)
         a = k - i
@@ -70,20 +70,20 @@ class Wire:
         return point, tangent / np.linalg.norm(tangent)
 
     def project(self, position: Float[np.ndarray, "3"], s: float) -> float:
-        """Arc length (m) of the point nearest to a position, near the arc length `s`."""
+        """Return the arc length (m) of the point nearest to a position, near the arc length `s`."""
         for _ in range(3):  # Newton; curvature times distance is below a tenth
             point, tangent = self.at(s)
             s = min(max(s + float((position - point) @ tangent), 0.0), LENGTH)
         return s
 
     def moved(self, position: Float[np.ndarray, "3"], yaw: float) -> "Wire":
-        """The wire turned by `yaw` about the vertical, then shifted."""
+        """Return the wire turned by `yaw` about the vertical, then shifted."""
         c, s = np.cos(yaw), np.sin(yaw)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return replace(self, points=self.points @ turn.T + position)
 
     def chords(self, sag: float, longest: float) -> Float[np.ndarray, "m 2 3"]:
-        """Ends of straight pieces, at most `longest` m, from which the wire bulges by `sag` m."""
+        """Return ends of straight pieces, at most `longest` m, that differ from the wire by `sag` m."""
         lengths = np.minimum(np.sqrt(8 * sag / np.maximum(self.curvature, 1e-3)), longest)
         pieces = np.cumsum(STEP / lengths)  # how many pieces end before each point
         count = int(np.ceil(pieces[-1]))
@@ -109,7 +109,7 @@ class Wire:
 
 
 def make(family: Family, seed: int) -> Wire | None:
-    """The wire of a family and a seed; None if it came out too tight, steep or close to itself."""
+    """Make the wire of a family and a seed; None if it is too tight, too steep or too close to itself."""
     heading, pitch = _FAMILIES[family](np.random.default_rng([FAMILIES.index(family), seed]))
     heading = heading - 0.5 * (heading.min() + heading.max())
     if np.abs(pitch).max() > MAX_SLOPE or heading.max() > MAX_TURN:
@@ -125,7 +125,7 @@ def make(family: Family, seed: int) -> Wire | None:
 
 
 def find(name: str) -> Wire:
-    """The wire of a name such as helix-1; UserError if there is none."""
+    """Return the wire of a name such as helix-1; UserError if there is none."""
     family, _, seed = name.rpartition("-")
     if family not in FAMILIES or not seed.isdecimal():
         raise UserError(
@@ -138,7 +138,7 @@ def find(name: str) -> Wire:
 
 
 def choose(split: Split, count: int, families: tuple[Family, ...] = TRAINED) -> list[Wire]:
-    """The first `count` wires of a split, families in turn.
+    """Return the first `count` wires of a split, families in turn.
 
     Within a family no two wires of any split are closer than `APART`. More wires of a split begin
     with the same ones.
@@ -159,7 +159,7 @@ def choose(split: Split, count: int, families: tuple[Family, ...] = TRAINED) -> 
 
 @lru_cache(maxsize=64)
 def _distinct(family: Family, split: Split, count: int) -> tuple[Wire, ...]:
-    """The first sound seeds of a split that are like none before them."""
+    """Return the first valid wires of a split that resemble none before them."""
     before: list[Wire] = []
     for earlier in ("test", "validation"):
         if earlier == split:
@@ -178,13 +178,13 @@ def _distinct(family: Family, split: Split, count: int) -> tuple[Wire, ...]:
 
 
 def shape(wire: Wire) -> Float[np.ndarray, "n 3"]:
-    """41 points of a wire about their centroid, for `distance`."""
+    """Return 41 points of a wire about their centroid, for `distance`."""
     points = wire.points[::20]
     return points - points.mean(axis=0)
 
 
 def distance(one: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "m n 3"]) -> float:
-    """RMS distance (m) of corresponding points to the nearest of others, best turned about z."""
+    """Return the RMS distance (m) of corresponding points to the nearest other wire, best turned about z."""
     a, b = one[:, 0] + 1j * one[:, 1], others[..., 0] + 1j * others[..., 1]
     # The best turn makes the sum of conj(a) b real and positive.
     flat = np.mean(np.abs(a) ** 2) + np.mean(np.abs(b) ** 2, axis=1)
@@ -199,20 +199,17 @@ _Angles = tuple[np.ndarray, np.ndarray]
 
 
 def _fourier(rng: np.random.Generator) -> _Angles:
-    """Random curvature and random slope."""
     heading = STEP * np.cumsum(_noise(rng, 0.05, 0.9 / MIN_RADIUS))
     heading *= min(1.0, 2.4 / np.ptp(heading))
     return heading, _noise(rng, 0.08, rng.uniform(0.2, 0.5))
 
 
 def _roller(rng: np.random.Generator) -> _Angles:
-    """Vertical waves on a gently bent course."""
     wave, _ = _wave(rng, 0.11, 0.22)
     return _noise(rng, 0.10, rng.uniform(0.2, 0.8)), rng.uniform(0.35, 0.55) * wave
 
 
 def _helix(rng: np.random.Generator) -> _Angles:
-    """Turns one way while it climbs or falls; opens or closes as a spiral does."""
     turn, spiral = rng.choice([-1, 1]) * rng.uniform(1.6, 3.0), rng.uniform(-0.6, 0.6)
     u = _S / LENGTH
     heading = turn * (u + spiral * u * (1 - u)) + _noise(rng, 0.15, rng.uniform(0.0, 0.2))
@@ -221,7 +218,7 @@ def _helix(rng: np.random.Generator) -> _Angles:
 
 
 def _arc(rng: np.random.Generator) -> _Angles:
-    """A straight lead, one or two circular bends, a straight tail, in a tilted plane."""
+    """Bend a straight line once or twice, circularly, in a tilted plane."""
     heading = np.zeros_like(_S)
     knots = np.sort(rng.uniform(0.05, LENGTH - 0.05, 4))
     for start, end in (knots[:2], knots[2:]):
@@ -233,7 +230,6 @@ def _arc(rng: np.random.Generator) -> _Angles:
 
 
 def _serpentine(rng: np.random.Generator) -> _Angles:
-    """Alternating bends of one size."""
     wave, k = _wave(rng, 0.10, 0.20)
     return rng.uniform(0.7, 0.95) / (k * MIN_RADIUS) * wave, _noise(rng, 0.08, 0.3)
 
@@ -248,7 +244,7 @@ _FAMILIES: dict[Family, Callable[[np.random.Generator], _Angles]] = {
 
 
 def _noise(rng: np.random.Generator, shortest: float, amplitude: float) -> np.ndarray:
-    """A smooth random function with waves of `shortest` m and longer, largest value `amplitude`."""
+    """Draw a smooth function with waves of `shortest` m and longer, and largest value `amplitude`."""
     total = np.zeros_like(_S)
     for k in range(1, int(LENGTH / shortest) + 1):
         wave = np.sin(np.pi * k * _S / LENGTH + rng.uniform(0, 2 * np.pi))
@@ -257,13 +253,13 @@ def _noise(rng: np.random.Generator, shortest: float, amplitude: float) -> np.nd
 
 
 def _wave(rng: np.random.Generator, shortest: float, longest: float) -> tuple[np.ndarray, float]:
-    """A sine of random phase and wavelength (m), and its wave number (rad/m)."""
+    """Draw a sine of random phase and wavelength (m); return it with its wave number (rad/m)."""
     k = 2 * np.pi / rng.uniform(shortest, longest)
     return np.sin(k * _S + rng.uniform(0, 2 * np.pi)), k
 
 
 def _ramp(u: np.ndarray) -> np.ndarray:
-    """0 before 0, 1 after 1, straight between but for rounded corners: a bend without kinks."""
+    """Ramp from 0 to 1 with rounded corners, for bends without kinks."""
     sharp = np.clip(u, 0, 1)
     width = 24  # points, 12 mm of arc
     padded = np.pad(sharp, width, mode="edge")

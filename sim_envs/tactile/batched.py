@@ -1,7 +1,7 @@
-"""The same pictures in torch: batched, on any device, differentiable in the height of the object.
+"""Tactile images in torch: batched, on any device, differentiable in the object's height.
 
-Follows `control.tactile.gel.deform` and `optics.render` step by step, without noise tile and markers;
-`tests/test_tactile.py` holds both to the same picture.
+Follows `control.tactile.gel.deform` and `optics.render` without noise and markers;
+`tests/test_tactile.py` compares both.
 """
 
 import math
@@ -19,7 +19,7 @@ Fields = Float[Tensor, "b h w"]
 
 
 def deform(overlap: Fields, pitch: float, blur_sigmas: tuple[float, ...]) -> Fields:
-    """Surfaces of gels under objects' overlaps (m), as `gel.deform`."""
+    """Deform gels under objects' overlaps (m), as `gel.deform`."""
     scale = pixels_per_cell(pitch)
     low = F.avg_pool2d(overlap, scale)
     around = 2 * NEARBY_CELLS + 1
@@ -34,7 +34,7 @@ def deform(overlap: Fields, pitch: float, blur_sigmas: tuple[float, ...]) -> Fie
 
 
 def colour_change(surface: Fields, instance: SensorInstance) -> Float[Tensor, "b 3 h w"]:
-    """What gel surfaces at half the image's resolution add to the untouched image, counts."""
+    """Return the colours (counts) that surfaces at half the image's resolution add to the untouched image."""
     calibration, pitch = instance.calibration, 2 * instance.pixel_pitch
     illumination, response, shadow = (
         torch.as_tensor(a, dtype=surface.dtype, device=surface.device)
@@ -54,7 +54,7 @@ def colour_change(surface: Fields, instance: SensorInstance) -> Float[Tensor, "b
 
 
 def render(overlap: Fields, instance: SensorInstance) -> Float[Tensor, "b 3 h2 w2"]:
-    """Noise-free RGB pictures, counts, of overlaps (m) at half the pictures' resolution."""
+    """Render noise-free RGB images (counts) of overlaps (m) at half the images' resolution."""
     surface = deform(overlap, 2 * instance.pixel_pitch, instance.calibration.blur_sigmas)
     background = COUNT_STEP * torch.as_tensor(instance.background).to(overlap)
     change = F.interpolate(colour_change(surface, instance), scale_factor=2, mode="bilinear")
@@ -64,7 +64,7 @@ def render(overlap: Fields, instance: SensorInstance) -> Float[Tensor, "b 3 h2 w
 def shadow_depth(
     surface: Fields, pitch: float, azimuths: tuple[float, ...], slope: float
 ) -> Float[Tensor, "b lights h w"]:
-    """How far (m) each point lies below the shadow line of each light, as `gel.shadow_depth`."""
+    """Return the depth (m) of each point below the shadow line of each light, as `gel.shadow_depth`."""
     scale = pixels_per_cell(pitch)
     low = F.avg_pool2d(surface, scale)
     third = torch.full((1, 3), 1 / 3).to(surface)[0]
@@ -95,7 +95,6 @@ def _features(
 
 
 def _shifted(field: Fields, dx: int, dy: int) -> Fields:
-    """The field at (x + dx, y + dy); far below where that is outside."""
     _, h, w = field.shape
     padded = F.pad(field, (max(-dx, 0), max(dx, 0), max(-dy, 0), max(dy, 0)), value=-1.0)
     top, left = max(dy, 0), max(dx, 0)
@@ -107,14 +106,14 @@ def _resize(field: Fields, rows: int, columns: int) -> Float[Tensor, "b rows col
 
 
 def _blur(field: Fields, kernel: Float[Tensor, " k"]) -> Fields:
-    """Separable blur, mirrored at the border without repeating its pixels (OpenCV's default)."""
+    """Blur separably, mirrored at the border without repeating its pixels (OpenCV's default)."""
     r = len(kernel) // 2
     padded = F.pad(field[:, None], (r, r, r, r), mode="reflect")
     return F.conv2d(F.conv2d(padded, kernel[None, None, None]), kernel[None, None, :, None])[:, 0]
 
 
 def _gaussian(sigma: float, like: Tensor) -> Float[Tensor, " k"]:
-    """OpenCV's kernel for float images: four standard deviations to each side."""
+    """Return OpenCV's kernel for float images: four standard deviations to each side."""
     size = round(sigma * 8 + 1) | 1
     x = torch.arange(size).to(like) - size // 2
     kernel = torch.exp(-0.5 * (x / sigma) ** 2)
@@ -122,6 +121,6 @@ def _gaussian(sigma: float, like: Tensor) -> Float[Tensor, " k"]:
 
 
 def _binomial(size: int, like: Tensor) -> Float[Tensor, " k"]:
-    """OpenCV's kernel of a given small size without a standard deviation."""
+    """Return OpenCV's kernel of a small size without a standard deviation."""
     row = [math.comb(size - 1, k) / 2 ** (size - 1) for k in range(size)]
     return torch.tensor(row, dtype=like.dtype, device=like.device)

@@ -1,4 +1,4 @@
-"""What is known on a gel's cells, where the camera sees it: the gel moves, the picture does not."""
+"""Fields on a gel's cells, resampled onto the image: the gel moves, the image does not."""
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ _FINE = 4  # samples along each side of such a cell
 def over_picture(
     values: Float[np.ndarray, "h w"], field: ForceField, picture: Grid
 ) -> Float32[np.ndarray, "h2 w2"]:
-    """Values on a field's cells, interpolated onto a grid centred on the picture; 0 beyond the gel."""
+    """Interpolate values on a field's cells onto a grid centred on the image; 0 beyond the gel."""
     cells = field.pitch / picture.pitch  # of the picture, for one of the gel
     middle = np.array(values.shape[::-1]) / 2 - 0.5 - np.array(field.displacement[:2]) / field.pitch
     shift = middle - (np.array([picture.columns, picture.rows]) / 2 - 0.5) / cells
@@ -28,7 +28,7 @@ def over_picture(
 def tractions(
     field: ForceField | None, shape: tuple[int, int], pitch: float
 ) -> Float32[np.ndarray, "3 24 24"]:
-    """Shear along x and y and pressure over a picture, kPa, the mean of each of 24 x 24 cells.
+    """Return shear along x and y and pressure over an image, kPa, averaged over 24 x 24 cells.
 
     Args:
         field: of the contact; None where nothing touches.

@@ -1,8 +1,8 @@
-"""The forces between a gel and what presses into it, cell by cell: pressure, shear, stick and slip.
+"""Forces between a gel and an object, cell by cell: pressure, shear, stick and slip.
 
-Pressure comes from how the object sits in the gel (`press`). Shear is a brush's: every cell of the
-gel is a bristle whose tip sticks to the object until friction lets it go, and the object moves over
-the gel until the bristles carry the tangential force and torsion that MuJoCo's solver found.
+Pressure follows from how the object sits in the gel (`press`). Shear is a brush model: every cell of the
+gel is a bristle whose tip sticks to the object until friction releases it; the object moves over the gel
+until the bristles carry the tangential force and torsion of MuJoCo's solver.
 
 Sensor frame as in `geometry`: x along columns, y along rows, z out of the gel; m, N, Nm, Pa.
 """
@@ -55,10 +55,7 @@ class ForceField:
 
     @property
     def incipient(self) -> bool:
-        """Whether slip has begun at the contact's rim: a quarter of the load slips.
-
-        A ball then bears 1 - (1 - sqrt(0.25))^2 = 75 % of the tangential force that it can.
-        """
+        """Whether slip has begun at the contact's rim: a quarter of the load slips."""
         return self.slip_fraction >= INCIPIENT
 
     @property
@@ -79,7 +76,7 @@ class ForceField:
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _pool(pressure, area, out):
-    """N per force cell from Pa per pressure cell of `area` m^2; two by two."""
+    """Sum Pa per pressure cell of `area` m^2 to N per force cell, two by two."""
     for i in range(out.shape[0]):
         row, above, below = out[i], pressure[2 * i], pressure[2 * i + 1]
         for j in range(out.shape[1]):
@@ -135,7 +132,7 @@ def _match_moments(normal, pitch, place, mx, my):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _bristles(normal, before, pitch, place, friction):
-    """Of each pressed cell: x, y from the centre of pressure, traction of before, friction limit.
+    """Return each pressed cell's x, y from the centre of pressure, previous traction, friction limit.
 
     Returns them with the centre of pressure and the load.
     """
@@ -171,7 +168,7 @@ def _bristles(normal, before, pitch, place, friction):
 @njit(cache=True, fastmath=True, error_model="numpy")  # a check for zero is no vector code
 @no_type_check
 def _brush_sums(bristles, stiffness, ux, uy, turn, total):
-    """Force, torsion, and how they grow with a motion, of bristles whose tips have moved."""
+    """Sum force, torsion, and their derivatives, of bristles with moved tips."""
     zero, one = np.float32(0.0), np.float32(1.0)
     x, y, qx, qy, limit = bristles[0], bristles[1], bristles[2], bristles[3], bristles[4]
     k, ux, uy, turn = np.float32(stiffness), np.float32(ux), np.float32(uy), np.float32(turn)
@@ -204,7 +201,7 @@ def _brush_sums(bristles, stiffness, ux, uy, turn, total):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _balance(bristles, stiffness, area, force_x, force_y, torsion):
-    """The rigid motion (x, y, turn) of the tips that makes them carry force and torsion."""
+    """Find the rigid motion (x, y, turn) of the tips that makes them carry force and torsion."""
     x, y, limit = bristles[0], bristles[1], bristles[4]
     most, radius = limit.sum(), math.sqrt((x * x + y * y).mean() + area)
     damping = _REGULARIZATION * stiffness * x.size
@@ -249,7 +246,7 @@ def _balance(bristles, stiffness, area, force_x, force_y, torsion):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _brush(normal, before, pitch, place, friction, stiffness, force, torque, out, slip):
-    """Tractions that balance force and torque about the origin; the share of the load that slips."""
+    """Find tractions that balance force and torque; return the share of the load that slips."""
     bristles, cx, cy, load = _bristles(normal, before, pitch, place, friction)
     if load == 0.0:
         return 0.0

@@ -1,8 +1,8 @@
-"""What presses into a gel: height fields of primitives by analytic rays, of meshes by scan lines.
+"""Height fields of objects over a gel: primitives by analytic rays, meshes by scan lines.
 
-Sensor frame: x along image columns, y along rows, z out of the gel, origin on the undeformed
-surface in the middle of the image; metres. A height field says how far above the undeformed
-surface plane, into the gel, an object's near side lies: positive where it penetrates.
+Sensor frame: x along image columns, y along rows, z out of the gel, origin on the undeformed surface in
+the middle of the image; metres. A height field is the height of an object's near side above the
+undeformed surface, into the gel: positive where it penetrates.
 """
 
 import math
@@ -28,7 +28,7 @@ class Grid:
     pitch: float
 
     def empty(self) -> HeightField:
-        """A height field that nothing has been added to yet."""
+        """Return a height field without objects."""
         return np.full((self.rows, self.columns), NO_SURFACE)
 
 
@@ -68,7 +68,7 @@ def _box(ox, oy, oz, inverse, size):
 @njit(inline="always", fastmath=True, error_model="numpy")
 @no_type_check
 def _side(ox, oy, oz, d, across, radius, half):
-    """The curved side of a cylinder along z; `across` is 1 / (dx^2 + dy^2)."""
+    """Intersect the curved side of a cylinder along z; `across` is 1 / (dx^2 + dy^2)."""
     b = (ox * d[0] + oy * d[1]) * across
     disc = b * b - (ox * ox + oy * oy - radius * radius) * across
     t = -b - math.sqrt(max(disc, np.float32(0.0)))
@@ -108,7 +108,6 @@ def _inverse(value):
 @njit(inline="always")
 @no_type_check
 def _span(centre, reach, cells):
-    """First and last + 1 of the cells within reach of a centre."""
     return max(int(centre - reach), 0), min(int(centre + reach) + 2, cells)
 
 
@@ -209,7 +208,7 @@ def _add_mesh(out, pitch, vertices, faces, position, rotation):
         a, b, c = faces[f]
         abx, aby, acx, acy = px[b] - px[a], py[b] - py[a], px[c] - px[a], py[c] - py[a]
         area = acx * aby - abx * acy
-        if area <= np.float32(1e-9):  # seen from behind, or edge-on
+        if area <= np.float32(1e-9):  # a back face, or edge-on
             continue
         top = max(int(math.ceil(min(py[a], py[b], py[c]) - margin)), 0)
         bottom = min(int(math.floor(max(py[a], py[b], py[c]) + margin)) + 1, rows)
@@ -253,7 +252,7 @@ def add_mesh(
 
     Args:
         vertices: in the mesh's frame, m.
-        faces: corners of the triangles, counter-clockwise seen from outside.
+        faces: corners of the triangles, counter-clockwise from outside.
         position, rotation: of the mesh in the sensor frame.
     """
     pose = (np.asarray(a, np.float32) for a in (position, rotation))

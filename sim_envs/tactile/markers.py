@@ -1,4 +1,4 @@
-"""Dots printed on a gel: where they rest in the image, how far the gel carries them, drawing them."""
+"""Dots printed on a gel: rest positions, motion with the gel, drawing."""
 
 from typing import no_type_check
 
@@ -22,7 +22,7 @@ _FREE = 0.8
 def rest_positions(
     grid: MarkerGrid, shape: tuple[int, int], pitch: float
 ) -> Float32[np.ndarray, "n 2"]:
-    """Where the dots of an untouched gel lie, row by row: (x, y) in px, pixel centres at integers.
+    """Return resting dots of an untouched gel, row by row: (x, y) in px, pixel centres at integers.
 
     Dots that do not lie fully inside the image are left out.
 
@@ -37,7 +37,6 @@ def rest_positions(
 
 
 def _raster(rows: int, columns: int, pitch: float) -> Float[np.ndarray, "n 2"]:
-    """(x, y) of the points of a grid centred on the origin, row by row."""
     y, x = np.mgrid[0:rows, 0:columns]
     return pitch * np.stack([x - (columns - 1) / 2, y - (rows - 1) / 2], -1).reshape(-1, 2)
 
@@ -45,7 +44,7 @@ def _raster(rows: int, columns: int, pitch: float) -> Float[np.ndarray, "n 2"]:
 def layer_compliance(
     sensor: SensorModel, k: Float[np.ndarray, "*shape"]
 ) -> tuple[Float[np.ndarray, "*shape"], Float[np.ndarray, "*shape"], Float[np.ndarray, "*shape"]]:
-    """How a gel's surface gives way, along itself, to a load that is a wave of number k (1/m).
+    """Return the surface compliance of a gel to loads that are waves of number k (1/m).
 
     The gel is an incompressible elastic layer bonded to a rigid base; the formulas solve the
     equations of plane and antiplane strain, as the test does numerically.
@@ -65,7 +64,7 @@ def layer_compliance(
 def _responses(
     sensor: SensorModel, step: float, size: float, offset: Float[np.ndarray, "n m 2"]
 ) -> Float32[np.ndarray, "5 n m"]:
-    """Displacement (m) per N on a square of `size` m, averaged over such a square at an offset.
+    """Return the displacement (m) per N on a square of `size` m, averaged over such a square at an offset.
 
     Of x per traction x; of x per traction y, which is that of y per traction x; of y per traction
     y; of x and of y per pressure. Sampled from a Fourier transform at `step` m.
@@ -135,7 +134,7 @@ def _move(normal, tangential, responses, patch, stiffness, here, out):
 
 
 class GelMotion:
-    """How far points of a gel's surface move along it under the forces of a contact.
+    """Displacement of points on a gel's surface under the forces of a contact.
 
     MuJoCo's gel shears as one plate, whatever presses on it. So that the picture's markers move
     with the picture's contact, shear is scaled: a traction shaped like the pressure moves the
@@ -160,7 +159,7 @@ class GelMotion:
         self._here = np.clip(y, 0, rows - 1) * columns + np.clip(x, 0, columns - 1)
 
     def __call__(self, field: ForceField) -> Float32[np.ndarray, "n 2"]:
-        """Displacement of the points, m."""
+        """Return the displacement of the points, m."""
         out = np.zeros(2 * len(self._here), np.float32)
         if field.normal.any():
             tractions = field.normal, field.tangential
@@ -188,8 +187,8 @@ def _draw(image, columns, centres, radius, darkness):
                 dx = column[k] - x
                 # Distance to the rim without a root: exact there to first order.
                 inside = half + scale * (room - dx * dx)
-                kept = one - darkness * min(max(inside, zero), one)
-                row[k] = np.uint8(np.float32(row[k]) * kept + half)
+                passed = one - darkness * min(max(inside, zero), one)
+                row[k] = np.uint8(np.float32(row[k]) * passed + half)
 
 
 def draw(

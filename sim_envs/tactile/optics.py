@@ -1,8 +1,7 @@
-"""From the gel's surface to what the sensor's camera sees.
+"""Colours of a gel's surface in the sensor's camera.
 
-The colours change with the surface's slopes and shadows as the sensor's calibration says. They are
-computed at half the image's resolution, where the surface is, and blended onto the sensor's own
-background and noise. Heights are metres into the gel.
+The colours follow from slopes and shadows by the sensor's calibration. They are computed at half the
+image's resolution and blended onto the sensor's background and noise. Heights are metres into the gel.
 """
 
 from typing import no_type_check
@@ -21,7 +20,7 @@ HeightField = Float32[np.ndarray, "h w"]
 @njit(inline="always", fastmath=True, error_model="numpy")
 @no_type_check
 def _response(x, y, depth, k):
-    """`sensor_calibration.shape_features` of a normal and a depth, times their coefficients."""
+    """Evaluate the response to a normal and a depth (`sensor_calibration.shape_features`)."""
     xx, xy, yy = x * x, x * y, y * y
     linear = k[0] * x + k[1] * y + k[9] * depth
     quadratic = k[2] * xx + k[3] * xy + k[4] * yy
@@ -31,8 +30,9 @@ def _response(x, y, depth, k):
 @njit(inline="always")
 @no_type_check
 def _along(k, slope, v):
-    """Coefficients of one channel along a row at height v, as a tuple: an array might alias the
-    output, which would keep the loops from being vectorised."""
+    """Return one channel's coefficients at height v, as a tuple: an array might alias the output,
+    which would prevent vectorisation.
+    """
     return (
         k[0] + v * slope[0],
         k[1] + v * slope[1],
@@ -50,7 +50,7 @@ def _along(k, slope, v):
 @njit(cache=True, fastmath=True, error_model="numpy")
 @no_type_check
 def _colours(surface, per_pitch, response, limits, dark, shadow, gain, out):
-    """`sensor_calibration.shade` less the background, at half its resolution, planar."""
+    """Compute `sensor_calibration.shade` less the background, at half its resolution, planar."""
     h, w = surface.shape
     half, one, zero = np.float32(0.5), np.float32(1.0), np.float32(0.0)
     across = ((4.0 * np.arange(w) + 1.0) / (2 * w - 1) - 1.0).astype(np.float32)
@@ -81,7 +81,7 @@ def _colours(surface, per_pitch, response, limits, dark, shadow, gain, out):
 
 
 def colour_change(surface: HeightField, instance: SensorInstance) -> Float32[np.ndarray, "3 h w"]:
-    """What a gel's shape adds to the untouched image, counts; all at half its resolution."""
+    """Return the colours (counts) that a surface adds to the untouched image, at half its resolution."""
     calibration, pitch = instance.calibration, 2 * instance.pixel_pitch
     change = np.empty((3, *surface.shape), np.float32)
     limits = calibration.max_slope, calibration.max_depth
@@ -101,7 +101,7 @@ def colour_change(surface: HeightField, instance: SensorInstance) -> Float32[np.
 @njit(cache=True, fastmath=True, error_model="numpy")
 @no_type_check
 def _blend(change, background, noise, oy, ox, out):
-    """Bilinear doubling of the change, plus background and noise, cut to bytes."""
+    """Double the change bilinearly, add background and noise, clip to bytes."""
     _, h, w = change.shape
     near, far = np.float32(0.75), np.float32(0.25)
     zero, half, full = np.float32(0.0), np.float32(0.5), np.float32(255.0)
@@ -128,7 +128,7 @@ def _blend(change, background, noise, oy, ox, out):
 def render(
     surface: HeightField, instance: SensorInstance, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """RGB frame of a gel surface given at half the frame's resolution.
+    """Render the RGB frame of a gel surface given at half the frame's resolution.
 
     `rng` picks which part of the noise tile this frame gets.
     """
@@ -142,7 +142,7 @@ def render(
 def render_untouched(
     instance: SensorInstance, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """RGB frame of a gel that nothing touches: background and noise alone."""
+    """Render the RGB frame of an untouched gel: background and noise."""
     oy, ox = rng.integers(0, NOISE_MARGIN, 2)
     _, h, w = instance.background.shape
     frame = instance.background + instance.noise[:, oy : oy + h, ox : ox + w]  # in steps

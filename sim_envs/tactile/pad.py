@@ -1,4 +1,4 @@
-"""The simulated fingertip sensor: what a GelSight would show for the scene as it is now."""
+"""The simulated fingertip sensor: its image, depth and forces for the present scene."""
 
 from dataclasses import dataclass
 from functools import reduce
@@ -76,10 +76,10 @@ class TactileFrame:
 class TactilePad:
     """One fingertip's sensor in a compiled model.
 
-    The solver says what force the pad carries and where, geometry gives the shape of the contact:
-    objects are pushed into the gel until an elastic foundation carries that force. The geometry is
-    taken in the sensor's frame, which the case carries, so that shear moves the contact in the
-    image. Stick and slip have a memory: frames are to be taken in order of time.
+    The solver gives the pad's force and its place, geometry the contact's shape: objects are pushed into the
+    gel until an elastic foundation carries that force. Geometry is in the sensor's frame, which the case
+    carries, so that shear moves the contact in the image. Stick and slip have a memory: read frames in order
+    of time.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class TactilePad:
         bodies: list[Body],
         relief: bool = False,
     ) -> None:
-        """Of one fingertip; with `relief` its surface rises and sinks where friction pulls along it."""
+        """`relief`: the surface rises and sinks where friction pulls along it."""
         self._model, self._sensor, self._instance = model, sensor, instance
         self._site = model.site(f"{side}_sensor").id
         self._materials = {int(model.body(b.name).id): b.kind.material for b in bodies}
@@ -113,7 +113,7 @@ class TactilePad:
     def sense(
         self, data: mujoco.MjData, contact: PadContact, rng: np.random.Generator
     ) -> TactileFrame:
-        """The reading for the present state; nothing is computed for a pad that touches nothing."""
+        """Read the sensor in the present state; an untouched pad costs almost nothing."""
         touched = self._touched(contact)
         if not touched or contact.normal_force <= 0:
             return self._untouched(rng)
@@ -139,23 +139,22 @@ class TactilePad:
         return TactileFrame(image, flat, flat, None)
 
     def _gel_motion(self) -> GelMotion:
-        """How the printed dots follow the gel."""
         h, w = self._sensor.image_shape
         centre = np.array([w - 1, h - 1]) / 2
         points = (self._instance.markers - centre) * self._instance.pixel_pitch
         return GelMotion(self._sensor, self._gel_grid, points)
 
     def _touched(self, contact: PadContact) -> list[int]:
-        """Bodies on the pad; the scene's own parts (table, case) leave no picture."""
+        """Return bodies on the pad; the scene's own parts (table, case) leave no image."""
         bodies = {int(self._model.geom_bodyid[geom]) for geom in contact.geoms}
         return sorted(bodies & self._geoms.keys())
 
     def _friction(self, contact: PadContact) -> float:
-        """The solver's coefficient: an object's own, which has priority over the gel's."""
+        """Return the solver's coefficient: the object's, which has priority over the gel's."""
         return max(float(self._model.geom_friction[geom, 0]) for geom in contact.geoms)
 
     def _modulus(self, material: Material) -> float:
-        """Of gel and object in series: the softer one takes the larger share of the overlap."""
+        """Return the modulus of gel and object in series: the softer one takes more of the overlap."""
         return 1 / (1 / self._sensor.foundation_modulus + 1 / material.foundation_modulus)
 
     def _press(self, data: mujoco.MjData, contact: PadContact, touched: list[int]) -> Press:
@@ -164,7 +163,6 @@ class TactilePad:
         return press_until_balanced(height, self._gel_grid.pitch, contact, modulus, self._sensor)
 
     def _overlap(self, data: mujoco.MjData, press: Press, touched: list[int]) -> HeightField:
-        """How deep the objects sit in the gel over the image, m."""
         return reduce(np.maximum, (self._one_overlap(data, press, body) for body in touched))
 
     def _one_overlap(self, data: mujoco.MjData, press: Press, body: int) -> HeightField:
@@ -179,7 +177,7 @@ class TactilePad:
         return height
 
     def _height(self, data: mujoco.MjData, body: int, grid: Grid) -> HeightField:
-        """Height field of one body before it is pushed into the gel, m."""
+        """Return one body's height field before it is pushed into the gel, m."""
         height, model = grid.empty(), self._model
         for geom in self._geoms[body]:
             pose = self._pose(data, data.geom_xpos[geom], data.geom_xmat[geom])
@@ -196,13 +194,13 @@ class TactilePad:
         position: Float[np.ndarray, "3"],
         matrix: Float[np.ndarray, "9"],
     ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-        """A world pose in the sensor's frame."""
+        """Transform a world pose into the sensor's frame."""
         R = data.site_xmat[self._site].reshape(3, 3)
         return (position - data.site_xpos[self._site]) @ R, R.T @ matrix.reshape(3, 3)
 
 
 def _solid_geoms(model: mujoco.MjModel, body: int) -> list[int]:
-    """Geoms of a body that press into gels."""
+    """Return the geoms of a body that press into gels."""
     first, count = int(model.body_geomadr[body]), int(model.body_geomnum[body])
     return [g for g in range(first, first + count) if model.geom_group[g] == OBJECT_GROUP]
 
@@ -210,7 +208,7 @@ def _solid_geoms(model: mujoco.MjModel, body: int) -> list[int]:
 def _triangles(
     model: mujoco.MjModel, geom: int
 ) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, "m 3"]]:
-    """Vertices and faces of a mesh geom, in its frame."""
+    """Return vertices and faces of a mesh geom, in its frame."""
     mesh = model.geom_dataid[geom]
     vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
     vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]]
@@ -218,6 +216,6 @@ def _triangles(
 
 
 def _gel_grid(sensor: SensorModel, pitch: float) -> Grid:
-    """A grid over the whole gel; its sizes are multiples of four."""
+    """Return a grid over the whole gel; its sizes are multiples of four."""
     columns, rows = (4 * round(size / pitch / 4) for size in sensor.gel_size)
     return Grid(rows, columns, pitch)

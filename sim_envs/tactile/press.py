@@ -1,7 +1,7 @@
-"""How an object sits in a gel: pushed in, and tilted a little, until pressure balances the solver.
+"""How an object sits in a gel: pushed in and tilted until pressure balances the solver's force.
 
-MuJoCo says what force one pad carries, and where; the object's height field says with what shape.
-Sensor frame as in `geometry`: x along columns, y along rows, z out of the gel; m, N, Nm, Pa.
+MuJoCo gives the force on a pad and its place; the object's height field gives the shape. Sensor frame as
+in `geometry`: x along columns, y along rows, z out of the gel; m, N, Nm, Pa.
 """
 
 import math
@@ -28,7 +28,7 @@ _CENTRE_TOLERANCE = 5e-6  # m
 
 @dataclass(frozen=True)
 class Press:
-    """How an object sits in a gel.
+    """Pose of an object in a gel, with the pressure under it.
 
     Attributes:
         shift: how far it is pushed in, m, and
@@ -51,7 +51,7 @@ class Press:
 
 
 def _columns(height: HeightField, pitch: float) -> Float32[np.ndarray, " w"]:
-    """x of the columns, m. A table: AVX2 cannot convert loop counters to floats eight at a time."""
+    """Return x of the columns, m, as a table: AVX2 cannot convert loop counters to floats."""
     n = height.shape[1]
     return ((np.arange(n) - (n - 1) / 2) * pitch).astype(np.float32)
 
@@ -69,7 +69,7 @@ def _add_plane(height, xs, pitch, shift, a, b):
 @njit(inline="always", fastmath=True)
 @no_type_check
 def solve3(a, b, c, d, e, f, u, v, w):
-    """Solution of the symmetric positive [[a, b, c], [b, d, e], [c, e, f]] against (u, v, w)."""
+    """Solve the symmetric positive [[a, b, c], [b, d, e], [c, e, f]] against (u, v, w)."""
     ba, ca = b / a, c / a
     d2, e2, f2 = d - ba * b, e - ba * c, f - ca * c
     ed = e2 / d2
@@ -82,7 +82,7 @@ def solve3(a, b, c, d, e, f, u, v, w):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _shear(height, shift_x, shift_y, out):
-    """The height field (shift_x, shift_y) cells off, interpolated; at outlines the nearest cell."""
+    """Shift the height field by (shift_x, shift_y) cells, interpolated; at outlines the nearest cell."""
     rows, columns = height.shape
     one, none = np.float32(1.0), NO_SURFACE * np.float32(0.5)
     shift_x = min(max(shift_x, -1.0 * columns), columns - 1.0)
@@ -110,7 +110,7 @@ def _shear(height, shift_x, shift_y, out):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _overlap_sums(height, top, xs, pitch, shift, a, b, total):
-    """Over the contact: number of cells times 1, x, y, xx, xy, yy; overlap times 1, x, y."""
+    """Sum over the contact: 1, x, y, xx, xy, yy of its cells; overlap times 1, x, y."""
     rows, columns = height.shape
     zero, one = np.float32(0.0), np.float32(1.0)
     reach, slope = abs(a) * xs[-1], np.float32(a)
@@ -145,7 +145,7 @@ def _overlap_sums(height, top, xs, pitch, shift, a, b, total):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _push(height, top, xs, pitch, volume, shift, a, b, most, tolerance, total):
-    """The shift at which the overlap sums to `volume`: Newton's steps on a convex function."""
+    """Find the shift at which the overlap sums to `volume`, by Newton's steps on a convex function."""
     for _ in range(60):
         _overlap_sums(height, top, xs, pitch, shift, a, b, total)
         error = total[6] - volume
@@ -158,14 +158,13 @@ def _push(height, top, xs, pitch, volume, shift, a, b, most, tolerance, total):
 @njit(inline="always", fastmath=True)
 @no_type_check
 def _room(value, step, limit):
-    """How many steps lead to the limit."""
     return (math.copysign(limit, step) - value) / step if step != 0.0 else 1.0
 
 
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _balance_press(height, xs, pitch, volume, mx, my, stiffness, limit):
-    """Shift and slopes; forces in units of a cell's area times the foundation modulus."""
+    """Find shift and slopes; forces in units of a cell's area times the foundation modulus."""
     top = np.empty(height.shape[0], np.float32)
     for i in range(height.shape[0]):
         top[i] = height[i].max()

@@ -1,4 +1,4 @@
-"""One manufactured sensor: what differs between two of the same model."""
+"""Differences between two sensors of one model."""
 
 from dataclasses import dataclass, replace
 
@@ -103,18 +103,18 @@ def _planar(image: Shaped[np.ndarray, "h w 3"], kind: type) -> Shaped[np.ndarray
 def _turned(
     response: Float32[np.ndarray, "3 k 3"], turns: Float[np.ndarray, "3"]
 ) -> Float32[np.ndarray, "3 k 3"]:
-    """The response of lights turned about the sensor's axis, rad from x towards y.
+    """Turn the lights of a response about the sensor's axis, rad from x towards y.
 
     A turned light sees a normal as the light itself saw it turned back: the coefficients that do
     so are found by least squares, which is exact.
     """
     x, y = np.random.default_rng(0).uniform(-1, 1, (2, 64))
-    seen = monomials(x, y).T
-    n = seen.shape[1]
+    basis = monomials(x, y).T
+    n = basis.shape[1]
     turned = response.copy()
     for channel, c, s in zip(turned, np.cos(turns), np.sin(turns), strict=True):
-        wanted = monomials(x * c + y * s, y * c - x * s).T @ channel[:n]
-        channel[:n] = np.linalg.lstsq(seen, wanted, rcond=None)[0]
+        rotated = monomials(x * c + y * s, y * c - x * s).T @ channel[:n]
+        channel[:n] = np.linalg.lstsq(basis, rotated, rcond=None)[0]
     return turned
 
 

@@ -1,9 +1,9 @@
-"""How a gel's surface rises and sinks where friction pulls along it.
+"""Rise and fall of a gel's surface where friction pulls along it.
 
-In front of what is drawn over a gel its surface piles up, behind it sinks: the trace of shear in the
-picture of a gel without printed dots. The gel is the elastic layer of `markers.layer_compliance`. A load
-there squeezes the surface aside by minus S times the pressure's gradient; by Betti's reciprocity
-the surface sinks by S times the traction's divergence.
+In front of an object drawn over a gel the surface piles up, behind it sinks: the trace of shear in images of
+a gel without printed dots. The gel is the elastic layer of `markers.layer_compliance`. A load there
+squeezes the surface aside by minus S times the pressure's gradient; by Betti's reciprocity the surface
+sinks by S times the traction's divergence.
 """
 
 import cv2
@@ -42,7 +42,7 @@ class ShearRelief:
     def __call__(
         self, field: ForceField, overlap: Float32[np.ndarray, "h w"]
     ) -> Float32[np.ndarray, "h w"]:
-        """Depth (m) to be added to the surface; none where the object itself holds it.
+        """Return the depth (m) to add to the surface; none where the object itself holds it.
 
         Args:
             field: of the contact.
@@ -53,7 +53,7 @@ class ShearRelief:
         return relief * cv2.GaussianBlur(free, (0, 0), _RIM / self._image.pitch)
 
     def depth(self, field: ForceField) -> Float[np.ndarray, "h w"]:
-        """How far the surface would sink under the shear alone, m, on the field's cells."""
+        """Return the depth (m) of the surface under the shear alone, on the field's cells."""
         h, w = field.normal.shape
         area, shape = self._pitch**2, (self._n, self._n)
         if not field.normal.any():

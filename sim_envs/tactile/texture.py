@@ -1,4 +1,4 @@
-"""The fine structure of surfaces: height patterns in micrometres that stick to any shape."""
+"""Fine structure of surfaces: height patterns in micrometres on any shape."""
 
 from typing import no_type_check
 
@@ -23,7 +23,7 @@ _ROUGH = (
 @njit(inline="always", fastmath=True, error_model="numpy")
 @no_type_check
 def _wave(cycles):
-    """sin(2 pi cycles) to 0.1 %, from two parabolas: unlike sin, the compiler vectorises it."""
+    """Approximate sin(2 pi cycles) to 0.1 % by two parabolas, which the compiler vectorises."""
     t = cycles - np.floor(cycles + np.float32(0.5))
     y = np.float32(8.0) * t * (np.float32(1.0) - np.float32(2.0) * abs(t))
     return y * (np.float32(0.776) + np.float32(0.224) * abs(y))
@@ -32,14 +32,13 @@ def _wave(cycles):
 @njit(inline="always", fastmath=True, error_model="numpy")
 @no_type_check
 def _ribs(x, y, z):
-    """Planes across the x + y diagonal, so that every side of an object has some."""
+    """Planes across the x + y diagonal, so that every side of an object shows some."""
     return _wave(np.float32(0.7071) * (x + y))
 
 
 @njit(inline="always", fastmath=True, error_model="numpy")
 @no_type_check
 def _dots(x, y, z):
-    """Bumps on a lattice."""
     return _wave(y) * (_wave(x) + _wave(z))
 
 

@@ -59,7 +59,7 @@ _STRONGEST_NUDGE = 500.0  # N
 
 @runtime_checkable
 class FaultyArm(Protocol):
-    """What can go wrong with an arm's controller and its link."""
+    """Faults of an arm's controller and its link."""
 
     @property
     def driven(self) -> bool:
@@ -70,26 +70,26 @@ class FaultyArm(Protocol):
         """Clear an error, as a person does at the controller; the stop button stays as it is."""
 
     def freeze(self, frozen: bool) -> None:
-        """Let nothing through in either direction, or let it through again."""
+        """Block or unblock both directions."""
 
     def drop(self) -> None:
         """Hang up on its clients."""
 
     def stop_button(self, pressed: bool) -> None:
-        """Press or release the stop that people press."""
+        """Press or release the user's stop."""
 
     def abort(self, error: str) -> None:
         """Stop with an error; UserError if there is none of that name."""
 
     def silence_gripper(self, silent: bool) -> None:
-        """Let nothing through to and from the gripper alone, or let it through again."""
+        """Block or unblock the gripper alone."""
 
     def set_nonsense(self, on: bool) -> None:
-        """Say that the joints' speeds are not numbers, or say them again."""
+        """Send NaN for joint speeds, or stop doing so."""
 
 
 class ControlPort:
-    """Serves the lines above at a port of its own."""
+    """Serves the commands above at a port of its own."""
 
     def __init__(
         self,
@@ -112,7 +112,7 @@ class ControlPort:
         self.address = f"{self._token}@{host}:{self._listener.port}"
 
     def receive(self) -> None:
-        """Do what has been asked."""
+        """Execute commands that have arrived."""
         if self._frozen_seconds > 0:
             self._frozen_seconds -= DT
             if self._frozen_seconds <= 0:
@@ -120,7 +120,7 @@ class ControlPort:
         self.hold()
 
     def hold(self) -> None:
-        """Do what has been asked; time may stand meanwhile."""
+        """Execute commands while time stands."""
         for client in self._listener.poll():
             for line in client.lines():
                 if _HTTP.search(line):
@@ -139,18 +139,18 @@ class ControlPort:
 
     @property
     def sockets(self) -> list[ListeningPort | ClientConnection]:
-        """On which someone may say something."""
+        """Sockets on which a command may arrive."""
         return [self._listener, *(client for client in self._listener.clients if client.open)]
 
     def send(self) -> None:
-        """Nothing is said unasked."""
+        """Do nothing: the port only answers."""
 
     def close(self) -> None:
         """Free the port."""
         self._listener.close()
 
     def _answer(self, line: str, client: ClientConnection) -> dict[str, Any] | None:
-        """The answer; None if it comes later."""
+        """Return the answer; None if it comes later."""
         command, _, rest = line.partition(" ")
         actions = {
             "truth": self._cell.truth,

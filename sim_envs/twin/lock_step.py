@@ -1,4 +1,4 @@
-"""Who may let a lock-step twin's time go on: a client that holds it, a few milliseconds at a time."""
+"""Time of a lock-step twin: a client that holds it advances it, a few milliseconds at a time."""
 
 import json
 import select
@@ -20,11 +20,11 @@ _PATIENCE = 3.0  # s on the wall for what a holder says is on its way
 
 
 class LockStep:
-    """Time stands while a client holds it, and goes on by what that asks for.
+    """Time that advances only as its holder asks.
 
-    A few steps begin once the arm's client drives it, if it is said to, and once the hand has got as
-    many commands as were sent; they are over once the arm's client has answered the last state. Pictures
-    are taken meanwhile, and waited for when a client asks how many there are.
+    Advancing begins once the arm's client drives it, if the holder says that it will, and once the hand has
+    received as many commands as were sent. It ends once the arm's client has answered the last state. Images
+    are taken meanwhile, and waited for when a client asks for their number.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class LockStep:
         self._asked = False  # whether an answer is owed
 
     def hold(self, client: ClientConnection) -> dict[str, Any]:
-        """From now on time is this client's, until it leaves; UserError if it is another's."""
+        """Give the time to a client until it leaves; UserError if another holds it."""
         if self.held:
             raise UserError("another program holds the time of this twin")
         self._holder, self._left, self._asked = client, 0, False
@@ -53,11 +53,11 @@ class LockStep:
         return self._report() | {"pictures": self.pictures()}
 
     def pictures(self) -> dict[str, int]:
-        """How many pictures of each stream are on their way to whoever watches, once all are that were due."""
+        """Return the number of images sent on each stream, once all due ones are."""
         return self._pictures.sent()
 
     def advance(self, client: ClientConnection, steps: int, driven: bool, issued: int) -> None:
-        """Go on by so many steps; the answer follows when they are made."""
+        """Advance by a number of steps; the answer follows when they are made."""
         if client is not self._holder:
             raise UserError("hold the time of this twin first")
         if not 0 < steps <= _MOST_STEPS:
@@ -73,7 +73,7 @@ class LockStep:
 
     @property
     def standing(self) -> bool:
-        """Whether time stands now; answers the holder where its steps are made."""
+        """Whether time stands now; answers the holder when its steps are made."""
         if not self.held:
             return False
         if self._left and self._ready():
@@ -85,16 +85,16 @@ class LockStep:
         return True
 
     def count_step(self) -> None:
-        """A step was made."""
+        """Count a step."""
         self._left -= self._left > 0
 
     def wait(self, sockets: Sequence[Any]) -> None:
-        """Until the arm's or hand's client says something, or someone on these sockets; not for long."""
+        """Wait briefly for a message of the arm's or hand's client, or on these sockets."""
         links = [*self._arm.link.sockets, *self._hand.link.sockets]
         select.select([*links, *sockets], [], [], _POLL_INTERVAL)
 
     def _ready(self) -> bool:
-        """Whether what is on its way has come; what does not come is not waited for much longer."""
+        """Return whether all expected messages have arrived, or waiting is over."""
         if self._arm.link.frozen or self._impatient:
             return True
         commanded = self._hand.commands - self._commands_before >= self._issued

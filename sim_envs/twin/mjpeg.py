@@ -1,4 +1,4 @@
-"""MJPEG streams over HTTP, with faults to order."""
+"""MJPEG streams over HTTP, with faults on request."""
 
 import threading
 import time
@@ -19,7 +19,7 @@ Picture = UInt8[np.ndarray, "h w 3"]
 
 @dataclass(eq=False)
 class Stream:
-    """One source of pictures.
+    """One stream of images.
 
     Attributes:
         stalled, frozen, lost, broken, halved: until when (s, time.monotonic) nothing comes, one picture
@@ -39,12 +39,12 @@ class Stream:
     condition: threading.Condition = field(default_factory=threading.Condition)
 
     @property
-    def wanted(self) -> bool:
-        """Whether a picture would be seen."""
+    def has_viewers(self) -> bool:
+        """Whether a client would get an image."""
         return self.clients > 0 and time.monotonic() >= self.stalled
 
     def publish(self, picture: Picture) -> None:
-        """A new picture for whoever watches."""
+        """Publish an image to all clients."""
         with self.condition:
             if time.monotonic() >= self.frozen or self.picture is None:
                 self.picture = picture
@@ -52,7 +52,7 @@ class Stream:
             self.condition.notify_all()
 
     def wait_until_sent(self) -> None:
-        """Until the last picture is on its way to whoever watches."""
+        """Wait until the last image is on its way to its clients."""
         with self.condition:
             self.condition.wait_for(
                 lambda: self.sent >= self.count or not self.clients, _SENDING_TIMEOUT
@@ -67,7 +67,7 @@ class StreamServer:
     """
 
     def __init__(self, streams: dict[str, Stream], host: str, port: int) -> None:
-        """`port` 0: any that is free. OSError if it is taken."""
+        """`port` 0: any that is free. Raises OSError if it is taken."""
         self._streams = streams
         handler = type("Handler", (_Handler,), {"streams": streams})
         self._server = ThreadingHTTPServer((host, port), handler)
@@ -76,7 +76,7 @@ class StreamServer:
         threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True).start()
 
     def close(self) -> None:
-        """Hang up on everyone."""
+        """Close all connections."""
         for stream in self._streams.values():
             stream.lost = np.inf
         self._server.shutdown()
@@ -84,7 +84,7 @@ class StreamServer:
 
 
 def _with_random_bytes(jpeg: UInt8[np.ndarray, " n"]) -> UInt8[np.ndarray, " n"]:
-    """With 20 bytes of what follows the header replaced."""
+    """Replace 20 bytes after the header."""
     rng, damaged = np.random.default_rng(), jpeg.copy()
     places = rng.integers(_JPEG_HEADER, len(jpeg) - 2, 20)
     damaged[places] = rng.integers(0, 256, 20)
@@ -120,12 +120,12 @@ class _Handler(BaseHTTPRequestHandler):
                 stream.clients -= 1
 
     def _serve(self, stream: Stream) -> None:
-        seen = stream.sent
+        last = stream.sent
         while time.monotonic() >= stream.lost:
             with stream.condition:
-                if stream.count == seen and not stream.condition.wait(_POLL_INTERVAL):
+                if stream.count == last and not stream.condition.wait(_POLL_INTERVAL):
                     continue
-                seen, picture = stream.count, stream.picture
+                last, picture = stream.count, stream.picture
             assert picture is not None
             now = time.monotonic()
             bgr = np.ascontiguousarray(picture[..., ::-1])
@@ -137,8 +137,8 @@ class _Handler(BaseHTTPRequestHandler):
             head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
             self.wfile.write(head.encode() + jpeg.tobytes() + b"\r\n")
             with stream.condition:
-                stream.sent = seen
+                stream.sent = last
                 stream.condition.notify_all()
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing."""
+        """Log nothing."""

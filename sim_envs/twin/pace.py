@@ -1,4 +1,4 @@
-"""How fast a twin's time goes by the clock on the wall, and what processor time that takes."""
+"""Speed of a twin's time against the wall clock, and its processor time."""
 
 import time
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ class _Reading:
 
 
 class Pace:
-    """Counts a twin's milliseconds, a second at a time; only seconds in which a client drives the arm.
+    """Counts simulated seconds in which a client drives the arm.
 
     Attributes:
         ratios: simulated over wall time of each.
@@ -31,7 +31,7 @@ class Pace:
         self._steps = 0
 
     def count_step(self, driven: bool, pictures: float) -> None:
-        """A millisecond has gone by.
+        """Count a millisecond.
 
         Args:
             driven: whether a client drives the arm.
@@ -52,7 +52,7 @@ class Pace:
         self._began, self._steps = now, 0
 
     def summary(self) -> dict[str, float]:
-        """Numbers of the seconds counted; of none nothing but that."""
+        """Return figures of the counted seconds."""
         if not self.ratios:
             return {"seconds": 0}
         return {

@@ -1,7 +1,7 @@
-"""The process in which a twin's pictures are taken and served: physics and clients do not wait for them.
+"""The process that renders and serves a twin's images; physics and clients do not wait for it.
 
-It holds a copy of the scene's model and follows the physics by its state. It ends with the twin, whose
-end of the pipe then closes.
+It has a copy of the scene's model and follows the physics by its state. It ends when the twin closes its
+end of the pipe.
 """
 
 import signal
@@ -29,7 +29,7 @@ Picture = UInt8[np.ndarray, "h w 3"]
 
 @dataclass(frozen=True)
 class Address:
-    """Where to serve which streams; `port` 0: at any that is free."""
+    """Host, port (0: any that is free) and names of the streams."""
 
     host: str
     port: int
@@ -38,7 +38,7 @@ class Address:
 
 @dataclass(frozen=True)
 class Scene:
-    """What pictures are taken of until the next one comes.
+    """Scene to render from now on.
 
     Attributes:
         camera_size: rows and columns, px.
@@ -54,7 +54,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Moment:
-    """Pictures to take.
+    """Images to take.
 
     Attributes:
         due: names of the streams that are to have one.
@@ -71,7 +71,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class Progress:
-    """So far: how many pictures of each stream are on their way, and processor time taken (s)."""
+    """Images sent on each stream, and processor time (s), so far."""
 
     sent: dict[str, int]
     processor_time: float
@@ -79,7 +79,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a stream until when (s, time.monotonic); `kind` is an attribute of Stream."""
+    """Fault of a stream until a time (s, time.monotonic); `kind` is an attribute of Stream."""
 
     name: str
     kind: str
@@ -87,7 +87,7 @@ class Fault:
 
 
 class PictureTaker:
-    """Takes the pictures of one scene."""
+    """Renders the images of one scene."""
 
     def __init__(self, scene: Scene, cameras: bool) -> None:
         self._scene, self._data = scene, mujoco.MjData(scene.model)
@@ -99,14 +99,14 @@ class PictureTaker:
         self._noise = self._noise_rng.normal(0.0, _CAMERA_NOISE, shape).astype(np.float32)
 
     def follow(self, moment: Moment) -> None:
-        """Be where the physics is."""
+        """Take over the physics' state."""
         model, data = self._scene.model, self._data
         mujoco.mj_setState(model, data, moment.state, STATE)
         mujoco.mj_forward(model, data)
         self._contacts = moment.contacts
 
     def take(self, name: str) -> Picture:
-        """What a camera or a fingertip shows."""
+        """Render a camera's or a fingertip's image."""
         if name in _TACTILE:
             side = _TACTILE.index(name)
             pad = self._scene.pads[side]
@@ -126,10 +126,9 @@ class PictureTaker:
 
 
 def serve(pipe: Connection) -> None:
-    """Take pictures when told to, until the twin has gone.
+    """Render images on request until the twin has gone.
 
-    The first message is an Address, whose port is answered, or the OSError. Of the others a Moment is
-    answered.
+    The first message is an Address, answered by the port or an OSError. Each Moment is answered by a Progress.
     """
     at: Address = pipe.recv()
     streams = {name: Stream() for name in at.names}
@@ -156,20 +155,20 @@ def serve(pipe: Connection) -> None:
 
 
 def _publish(taker: PictureTaker, moment: Moment, streams: dict[str, Stream]) -> None:
-    wanted = [streams[name] for name in moment.due if streams[name].wanted]
-    if not wanted:
+    viewed = [streams[name] for name in moment.due if streams[name].has_viewers]
+    if not viewed:
         return
     taker.follow(moment)
     for name in moment.due:
-        if streams[name] in wanted:
+        if streams[name] in viewed:
             streams[name].publish(taker.take(name))
     if moment.held:
-        for stream in wanted:
+        for stream in viewed:
             stream.wait_until_sent()
 
 
 def main() -> None:
-    """Serve the twin at the pipe whose number is the command's first argument."""
+    """Serve the twin at the pipe whose number is the first argument."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         serve(Connection(int(sys.argv[1])))

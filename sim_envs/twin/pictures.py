@@ -1,4 +1,4 @@
-"""The twin's cameras and fingertip sensors: when their pictures are due, and of what."""
+"""Images of the twin's cameras and fingertips: schedule and streams."""
 
 import subprocess
 import sys
@@ -37,7 +37,7 @@ class Pictures:
     """
 
     def __init__(self, cell: SimulatedCell, host: str, port: int) -> None:
-        """OSError if it cannot serve there."""
+        """Start the process; raises OSError if it cannot serve there."""
         self._cell, self._host = cell, host
         self.held = False
         self.taken = self.left_out = 0
@@ -65,17 +65,17 @@ class Pictures:
         self.reset()
 
     def addresses(self) -> dict[str, str]:
-        """Address of each stream, by its name."""
+        """Return the address of each stream by its name."""
         return {name: f"http://{self._host}:{self._port}/{name}" for name in self.rates}
 
     def receive(self) -> None:
-        """Nobody says anything here."""
+        """Do nothing: streams take no messages."""
 
     def hold(self) -> None:
-        """No picture is due while time stands."""
+        """Do nothing: no image is due while time stands."""
 
     def send(self) -> None:
-        """Have the pictures taken that are due."""
+        """Request the images that are due."""
         due = self._due[self._cell.steps % 1000]
         if due:
             env = self._cell.env
@@ -91,29 +91,29 @@ class Pictures:
             self.taken += len(due)
 
     def sent(self) -> dict[str, int]:
-        """How many pictures of each stream are on their way, once all are that were due."""
+        """Return the number of images sent on each stream, once all due ones are."""
         while self._unanswered:
             self._hear(_ANSWER_TIMEOUT)
         return self._progress.sent
 
     @property
     def processor_time(self) -> float:
-        """Processor s that their process has taken, as far as it has said."""
+        """Processor time of the rendering process, s, as last reported."""
         return self._progress.processor_time
 
     def set_fault(self, name: str, kind: str, seconds: float) -> None:
-        """Let a stream be `stalled`, `frozen`, `lost`, `broken` or `halved`; KeyError if there is none."""
+        """Make a stream `stalled`, `frozen`, `lost`, `broken` or `halved`; KeyError if there is none."""
         if name not in self.rates or kind not in _FAULTS:
             raise KeyError(name)
         self._tell(Fault(name, kind, time.monotonic() + seconds))
 
     def reset(self) -> None:
-        """Another episode has begun; the cameras' noise is from here on that of a twin that begins."""
+        """Follow a new episode; the cameras' noise begins anew."""
         env = self._cell.env
         self._tell(Scene(env.model, env.config.camera_size, env.tactile_pads(), env.np_random))
 
     def close(self) -> None:
-        """Hang up on everyone."""
+        """Close all streams and end the process."""
         self._pipe.close()
         try:
             self._process.wait(_END_TIMEOUT)
@@ -122,7 +122,6 @@ class Pictures:
             self._process.wait()
 
     def _open(self, at: Address) -> int:
-        """The port at which it serves."""
         self._tell(at)
         try:
             answer = self._pipe.recv() if self._pipe.poll(_START_TIMEOUT) else None
@@ -140,7 +139,7 @@ class Pictures:
             raise _ended() from error
 
     def _hear(self, timeout: float = 0.0) -> None:
-        """Take the answers that have come; with a time-out (s), wait for one."""
+        """Take answers that have arrived; with a time-out (s), wait for one."""
         try:
             if timeout and not self._pipe.poll(timeout):
                 raise TimeoutError
@@ -152,9 +151,8 @@ class Pictures:
 
 
 def _ended() -> UserError:
-    return UserError("the process that takes the twin's pictures has ended; what it said is above")
+    return UserError("the process that renders the twin's images has ended; its messages are above")
 
 
 def _is_due(steps: int, rate: int) -> bool:
-    """Whether something at `rate` Hz is due in this millisecond."""
     return steps * rate % 1000 < rate

@@ -1,4 +1,4 @@
-"""The twin put together: one loop with everything on the wire and the physics, 1 ms at a time."""
+"""The twin: one loop of all wire services and the physics, 1 ms at a time."""
 
 import time
 from contextlib import ExitStack
@@ -43,7 +43,7 @@ _RUN_SECONDS = 40.0
 
 @dataclass(frozen=True)
 class TwinConfig:
-    """A twin.
+    """Options of a twin.
 
     Attributes:
         task: what the cell is for; its own `arm` is overruled by `arm`.
@@ -68,16 +68,16 @@ class TwinConfig:
 
 @runtime_checkable
 class Service(Protocol):
-    """Something that clients talk to; never blocks."""
+    """A service for clients; its methods never block."""
 
     def receive(self) -> None:
-        """Before a physics step: take what clients have sent."""
+        """Take client messages, before a physics step."""
 
     def hold(self) -> None:
-        """In place of a step, while a lock-step twin's time stands."""
+        """Serve clients in place of a step, while a lock-step twin's time stands."""
 
     def send(self) -> None:
-        """After it: answer them."""
+        """Answer clients, after a physics step."""
 
     def close(self) -> None:
         """Free ports and files."""
@@ -124,7 +124,7 @@ class Twin:
             self.step()
 
     def step(self) -> None:
-        """One millisecond of everything, unless time stands."""
+        """Advance everything by a millisecond, unless time stands."""
         lock_step = self._lock_step
         if lock_step is not None and lock_step.standing:
             lock_step.wait(self._commands.sockets)
@@ -156,7 +156,7 @@ class Twin:
             time.sleep(self._next_step_at - now)
 
     def _open(self, config: TwinConfig) -> CellConfig:
-        """Open every service; returns the cell file's content for whoever deploys here."""
+        """Open every service; return the cell file's content."""
         cell, host, folder = self.cell, config.host, config.folder
         folder.mkdir(parents=True, exist_ok=True)
         services = self._services
@@ -216,7 +216,7 @@ def _cell_config(
     load_cell: LoadCellConfig,
     task: TaskSection,
 ) -> CellConfig:
-    """What `deploy` is to know of this twin.
+    """Return the cell file's content for this twin.
 
     In lock-step time goes as slowly as the machine needs: by the clock on the wall, which drivers go
     by, the link may be silent for longer.
@@ -242,7 +242,7 @@ def _cell_config(
         cameras=cameras,
         load_cell=load_cell,
         safety=SafetySection(
-            # The tasks' objects are grasped 2 mm above the table, which nobody can harm here.
+            # The tasks' objects are grasped 2 mm above the table, which a simulated one survives.
             fingertips_lower=(*limits.fingertips.lower[:2].tolist(), 0.0),
             state_timeout=_LOCK_STEP_TIMEOUT if config.lock_step else None,
         ),

@@ -1,4 +1,4 @@
-"""TCP ports that are looked after between two physics steps, and never wait for anyone."""
+"""Non-blocking TCP ports, polled between two physics steps."""
 
 import socket
 
@@ -7,7 +7,7 @@ _MOST_UNREAD = 300_000  # bytes it may send without making sense; a control scri
 
 
 class ClientConnection:
-    """A client; what it has sent is in `unread` until someone takes it."""
+    """A client; bytes that it sent wait in `unread`."""
 
     def __init__(self, sock: socket.socket) -> None:
         sock.setblocking(False)
@@ -18,11 +18,11 @@ class ClientConnection:
         self.open = True
 
     def fileno(self) -> int:
-        """For `select`."""
+        """Return the descriptor, for `select`."""
         return self._socket.fileno()
 
     def read(self) -> None:
-        """Take in what has come."""
+        """Receive bytes that have arrived."""
         try:
             chunk = self._socket.recv(65536)
         except BlockingIOError:
@@ -33,12 +33,12 @@ class ClientConnection:
         self.open &= bool(chunk) and len(self.unread) <= _MOST_UNREAD
 
     def lines(self) -> list[str]:
-        """Whole lines that have come."""
+        """Return whole lines that have arrived."""
         *lines, self.unread = self.unread.split(b"\n")
         return [line.decode(errors="replace").strip() for line in lines]
 
     def send(self, data: bytes) -> None:
-        """Send; what the client does not take yet is kept."""
+        """Send bytes; buffer those that the client does not take yet."""
         self._unsent += data
         try:
             self._unsent = self._unsent[self._socket.send(self._unsent) :]
@@ -54,7 +54,7 @@ class ClientConnection:
 
 
 class ListeningPort:
-    """A listening port; `greeting` is said to every client."""
+    """A listening port; `greeting` is sent to every client."""
 
     def __init__(self, host: str, port: int, greeting: bytes = b"") -> None:
         self._socket = socket.socket()
@@ -67,15 +67,15 @@ class ListeningPort:
 
     @property
     def port(self) -> int:
-        """The port's number."""
+        """Port number."""
         return self._socket.getsockname()[1]
 
     def fileno(self) -> int:
-        """For `select`."""
+        """Return the descriptor, for `select`."""
         return self._socket.fileno()
 
     def poll(self) -> list[ClientConnection]:
-        """Let new clients in, hear the others, forget those who left."""
+        """Accept new clients, receive from all, drop those who left."""
         try:
             client = ClientConnection(self._socket.accept()[0])
             client.send(self._greeting)

@@ -1,4 +1,4 @@
-"""One object held in front of one fingertip sensor, without robot or physics: presses for any use."""
+"""Presses of one object into one fingertip sensor, without robot or physics."""
 
 import mujoco
 import numpy as np
@@ -13,15 +13,15 @@ from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_in
 
 
 class PressBench:
-    """Presses a body into the left sensor at a place and with a force of one's choice.
+    """Presses a body into the left sensor at a given place with a given force.
 
-    Forces are taken as given, not solved for: any press can be asked for, possible or not.
+    Forces are prescribed, not solved for; an impossible press can be asked for, too.
     """
 
     def __init__(
         self, body: Body, sensor: SensorModel, instance: SensorInstance, relief: bool = False
     ) -> None:
-        """With one object; see TactilePad for `relief`."""
+        """`relief`: see TactilePad."""
         self._model = _scene(body)
         self._data = mujoco.MjData(self._model)
         mujoco.mj_forward(self._model, self._data)
@@ -50,7 +50,7 @@ class PressBench:
         depth: float = 0.0,
         torsion: float = 0.0,
     ) -> TactileFrame:
-        """The sensor's reading.
+        """Read the sensor.
 
         Args:
             force: with which the body presses, N.
@@ -70,7 +70,7 @@ class PressBench:
         depth: float,
         torsion: float = 0.0,
     ) -> PadContact:
-        """The pad's contact with the body; see `sense`."""
+        """Return the pad's contact with the body; see `sense`."""
         (x, y), (sx, sy) = centre, shear
         turning = x * sy - y * sx + torsion
         torque = np.array([-y * force + depth * sy, x * force - depth * sx, turning])
@@ -78,7 +78,6 @@ class PressBench:
 
 
 def _scene(body: Body) -> mujoco.MjModel:
-    """The body and the left sensor's frame, nothing else."""
     spec = mujoco.MjSpec()
     spec.worldbody.add_site(name="left_sensor")
     add_body(spec, body)
@@ -86,10 +85,7 @@ def _scene(body: Body) -> mujoco.MjModel:
 
 
 def warm_up(bodies: list[Body], sensor: SensorModel) -> None:
-    """Press each body once, and it drags: loading the machine code of a touch takes up to a second.
-
-    For a simulator that must keep up with a clock or a client.
-    """
+    """Press each body once and drag it: loading the compiled code of a touch takes up to a second."""
     rng = np.random.default_rng(0)
     instance = sample_instance(sensor, rng)
     for body in bodies:

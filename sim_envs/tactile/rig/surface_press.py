@@ -1,7 +1,6 @@
 """Presses of random surfaces, by the pad simulator alone: no robot, no physics, a millisecond each.
 
-For learning what touch looks like. The depth is drawn, not solved for; a press with forces is
-`press_bench`'s.
+For representation learning. The depth is drawn, not solved for; `press_bench` presses with a force.
 """
 
 import math
@@ -17,13 +16,13 @@ from touchgoal.sim_envs.tactile.rig.surfaces import TILE, TILE_PITCH, Surface
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance
 
 DEPTHS = 0.15e-3, 1.3e-3
-"""How deep a thing is pressed in, m: least and most of a light hand."""
+"""Range of the indentation by a light hand, m."""
 _NOTHING = -5e-3  # m: far below the gel
 
 
 @dataclass(frozen=True)
 class SurfacePose:
-    """How a surface is held against the gel.
+    """Pose of a surface against the gel.
 
     Attributes:
         centre: where the body's middle lies on the gel, m along x and y from the image's middle.
@@ -41,7 +40,7 @@ class SurfacePose:
 
 
 def random_pose(rng: np.random.Generator) -> SurfacePose:
-    """As a person presses a thing: somewhere near the middle, at any angle, not quite level."""
+    """Draw a pose as by hand: near the middle, at any angle, not quite level."""
     x, y = rng.normal(0, 2.5e-3, 2)
     a, b = rng.normal(0, 0.012, 2)
     u, v = rng.uniform(0, TILE, 2)
@@ -53,7 +52,7 @@ def random_pose(rng: np.random.Generator) -> SurfacePose:
 def overlap(
     surface: Surface, pose: SurfacePose, shape: tuple[int, int], pitch: float
 ) -> Float32[np.ndarray, "h w"]:
-    """How deep the surface lies in the undeformed gel, m; zero where it does not reach it.
+    """Return the depth of the surface in the undeformed gel, m; zero where it does not reach it.
 
     Args:
         surface: what presses.
@@ -85,7 +84,7 @@ def overlap(
 
 
 def _body(surface: Surface, x: np.ndarray, y: np.ndarray) -> Float32[np.ndarray, "h w"]:
-    """Height of the body's coarse shape over its own axes, 0 at its highest."""
+    """Return the height of the body's coarse shape over its own axes, 0 at its highest."""
     if surface.body == "ball":
         height = -(x * x + y * y) / np.float32(2 * surface.size)
     elif surface.body == "cylinder":
@@ -105,7 +104,7 @@ def _body(surface: Surface, x: np.ndarray, y: np.ndarray) -> Float32[np.ndarray,
 def press(
     surface: Surface, pose: SurfacePose, instance: SensorInstance, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """What one sensor shows of a press, RGB."""
+    """Render one sensor's image of a press, RGB."""
     _, h, w = instance.background.shape
     pitch = 2 * instance.pixel_pitch  # surfaces are at half the image's resolution
     raw = overlap(surface, pose, (h // 2, w // 2), pitch)
@@ -113,5 +112,5 @@ def press(
 
 
 def untouched(instance: SensorInstance, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
-    """The same sensor with nothing on it, RGB."""
+    """Render the same sensor untouched, RGB."""
     return render_untouched(instance, rng)

@@ -1,7 +1,7 @@
-"""Surfaces without end: bodies and textures drawn at random, as height maps in metres.
+"""Random surfaces: bodies and textures as height maps in metres.
 
-A surface is what one thing feels like all over: a body (flat, round, edged) and one or two textures on
-it. Textures are tiles that repeat; a press takes them anywhere, at any angle (`surface_press`).
+A surface is a body (flat, round, edged) with one or two textures. Textures are tiles that repeat; a press
+takes them anywhere, at any angle (`surface_press`).
 """
 
 from collections.abc import Callable
@@ -24,14 +24,14 @@ BODIES: tuple[Body, ...] = ("flat", "ball", "cylinder", "edge", "bar", "corner")
 
 @dataclass(frozen=True)
 class Surface:
-    """One thing to touch.
+    """One surface.
 
     Attributes:
         body: its coarse shape where it meets the gel.
         size: radius of a ball or cylinder, half the width of a bar, m; of no meaning to the others.
         slope: of what falls away beside an edge, bar or corner, m per m.
         texture: height added to the body, m.
-        firmness: share of the overlap that goes into the gel and not into the thing itself.
+        firmness: share of the overlap that indents the gel; the object takes the rest.
     """
 
     body: Body
@@ -42,7 +42,7 @@ class Surface:
 
 
 def random_surface(rng: np.random.Generator) -> Surface:
-    """Draw a thing to touch."""
+    """Draw a surface."""
     texture = np.zeros((TILE, TILE), np.float32)
     for _ in range(int(rng.choice([0, 1, 2], p=[0.08, 0.5, 0.42]))):
         amplitude = _log_uniform(rng, 8e-6, 6e-4)
@@ -61,13 +61,13 @@ def _log_uniform(rng: np.random.Generator, least: float, most: float) -> float:
 
 
 def _unit(tile: Tile) -> Tile:
-    """With a mean of 0 and a range of about 1."""
+    """Normalise to a mean of 0 and a range of about 1."""
     low, high = np.percentile(tile[::4, ::4], [1, 99])
     return ((tile - tile.mean()) / max(float(high - low), 1e-6)).astype(np.float32)
 
 
 def _noise(rng: np.random.Generator, wavelength: float, octaves: float, falloff: float) -> Tile:
-    """Noise from a wavelength (cells) down over some octaves, its amplitude falling off."""
+    """Draw noise from a wavelength (cells) down over some octaves of falling amplitude."""
     f = np.hypot(np.fft.fftfreq(TILE)[:, None], np.fft.rfftfreq(TILE)[None]).astype(np.float32)
     low, high = 1 / wavelength, 2**octaves / wavelength
     band = np.where((f >= low) & (f <= high), np.maximum(f, 1e-4) ** -falloff, 0)
@@ -82,13 +82,12 @@ def _rough(rng: np.random.Generator) -> Tile:
 
 
 def _wrinkles(rng: np.random.Generator) -> Tile:
-    """Creases or folds: a noise folded at its mean, either way up."""
     folded = np.abs(_noise(rng, _log_uniform(rng, 15, 100), rng.uniform(0.3, 2), 1.5))
     return folded * np.float32(rng.choice([-1, 1]))
 
 
 def _phases(rng: np.random.Generator) -> tuple[Tile, Tile]:
-    """Two crossing directions in radians, a whole number of periods a tile, a little uneven."""
+    """Draw two crossing phases (rad) with whole numbers of periods a tile, a little uneven."""
     periods = int(_log_uniform(rng, 4, 70))
     y, x = np.mgrid[:TILE, :TILE].astype(np.float32) * np.float32(2 * np.pi / TILE)
     uneven = np.float32(rng.uniform(0, 0.8))
@@ -108,7 +107,6 @@ def _knurl(rng: np.random.Generator) -> Tile:
 
 
 def _weave(rng: np.random.Generator) -> Tile:
-    """Threads over and under each other."""
     a, b = _phases(rng)
     over = np.sin(a / 2) * np.sin(b / 2) > 0
     return np.where(over, np.abs(np.cos(a / 2)), np.abs(np.cos(b / 2))) ** np.float32(
@@ -117,7 +115,6 @@ def _weave(rng: np.random.Generator) -> Tile:
 
 
 def _grains(rng: np.random.Generator) -> Tile:
-    """Half ellipsoids strewn about: grain, gravel, bristles, bumps."""
     tile = np.zeros((TILE, TILE), np.float32)
     length = _log_uniform(rng, 3, 30)
     width = length * rng.uniform(0.35, 1)
@@ -141,7 +138,6 @@ def _grains(rng: np.random.Generator) -> Tile:
 
 
 def _cells(rng: np.random.Generator) -> Tile:
-    """Foam, leather, bubbles: the distance to the nearest of some points."""
     seeds = np.full((TILE, TILE), 255, np.uint8)
     points = rng.integers(0, TILE, (int(_log_uniform(rng, 12, 900)), 2))
     seeds[points[:, 0], points[:, 1]] = 0
@@ -151,7 +147,6 @@ def _cells(rng: np.random.Generator) -> Tile:
 
 
 def _strands(rng: np.random.Generator) -> Tile:
-    """Hairs, wires and scratches."""
     tile = np.zeros((TILE, TILE), np.float32)
     width, main = int(rng.integers(1, 9)), rng.uniform(0, np.pi)
     spread = rng.choice([0.15, 1.5])
@@ -165,7 +160,6 @@ def _strands(rng: np.random.Generator) -> Tile:
 
 
 def _plateaus(rng: np.random.Generator) -> Tile:
-    """Buttons, letters and stamped figures."""
     tile = np.zeros((TILE, TILE), np.uint8)
     white = 255.0
     for _ in range(int(rng.integers(2, 14))):

@@ -1,4 +1,4 @@
-"""The arm's state as the wire has it, written in place every millisecond."""
+"""The arm's state in its wire format, updated in place every millisecond."""
 
 from typing import no_type_check
 
@@ -16,7 +16,7 @@ OTHER = 3  # controller of a motion that is not the client's own
 
 
 class ArmState:
-    """A `messages.ROBOT_STATE`.
+    """State message (`messages.ROBOT_STATE`).
 
     Attributes:
         record: its one element.
@@ -36,7 +36,7 @@ class ArmState:
     def write_joints(
         self, cell: SimulatedCell, ddq_d: limits.Joints, torque: limits.Joints, nonsense: bool
     ) -> None:
-        """Joints as they are and as they are to be; with `nonsense` their speeds are no numbers."""
+        """Write measured and commanded joints; with `nonsense` joint speeds are NaN."""
         fields = self.fields
         fields["q"][:] = fields["theta"][:] = q = cell.q
         fields["dtheta"][:] = dq = cell.dq
@@ -55,11 +55,11 @@ class ArmState:
         wrench: limits.Wrench,
         contact: limits.Contact,
     ) -> None:
-        """The end effector `ee` (on the TCP): its pose, where it is to be, and what it meets."""
+        """Write the end effector's pose, its target, and the wrench on it."""
         fields = self.fields
         fields["O_T_EE"][:] = now.T.ravel()
-        wanted, jacobian = end_effector(cell, ee, cell.q_d)
-        fields["O_T_EE_d"][:] = fields["O_T_EE_c"][:] = wanted.T.ravel()
+        target, jacobian = end_effector(cell, ee, cell.q_d)
+        fields["O_T_EE_d"][:] = fields["O_T_EE_c"][:] = target.T.ravel()
         fields["O_dP_EE_d"][:] = fields["O_dP_EE_c"][:] = jacobian @ cell.dq_d
         # The maker's signs: what the robot does to the environment. `cell` has it the other way round.
         sent = limits.estimate_sent(wrench, jacobian)
@@ -70,7 +70,7 @@ class ArmState:
             fields[name][:] = value
 
     def write_mode(self, mode: int, error: str, motion: Motion | None, success_rate: float) -> None:
-        """What the arm is doing, and what is wrong with it."""
+        """Write mode, errors and control command success rate."""
         fields = self.fields
         if error != self._error:
             self._error = error
@@ -86,7 +86,7 @@ class ArmState:
 def end_effector(
     cell: SimulatedCell, ee: Pose, q: limits.Joints
 ) -> tuple[Pose, Float[np.ndarray, "6 7"]]:
-    """Pose and Jacobian of the end effector, which a client may have moved off the TCP."""
+    """Return pose and Jacobian of the end effector, which a client may have moved off the TCP."""
     position, R, jacobian = cell.kinematics(q, ee[:3, 3])
     return _pose(position, R, ee), jacobian
 
@@ -94,7 +94,6 @@ def end_effector(
 @njit(cache=True)
 @no_type_check
 def _pose(position, R, ee):
-    """At a position, turned by R and then as `ee` is."""
     T = np.zeros((4, 4))
     for i in range(3):
         for j in range(3):

@@ -1,8 +1,8 @@
-"""The arm's side of the Franka control interface, in front of the cell; any libfranka client fits.
+"""The arm's side of the Franka control interface, in front of the cell, for any libfranka client.
 
-Motion in joint or Cartesian position or velocity, and torque; reflexes, limits and lost packets
-abort it with the errors a real arm gives. What it does not simulate: joint and Cartesian impedance
-set by the client (the servo stays at Franka's default), self-collision, guiding.
+Joint and Cartesian position and velocity motions, and torques; reflexes, limits and lost packets abort
+them with a real arm's errors. Not simulated: impedances set by the client (the servo keeps Franka's
+default), self-collision, guiding.
 """
 
 import time
@@ -65,7 +65,7 @@ class FrankaArm:
     # The twin's loop.
 
     def receive(self) -> None:
-        """Take what the client has sent, and set the cell's target for the next millisecond."""
+        """Take the client's messages; set the cell's target for the next millisecond."""
         motion = self._take_messages()
         if motion is not None and motion.begun:
             self._wait_for_client(motion)
@@ -73,7 +73,7 @@ class FrankaArm:
             self._try_recovery(self._recovery)
 
     def send(self) -> None:
-        """Look for faults after a millisecond, and send the state."""
+        """Check for faults after a millisecond, and send the state."""
         contact = self._estimate_wrench()
         if self._motion is not None:
             fault = limits.arm_fault(self.cell.q, self.cell.dq) or contact.fault
@@ -82,7 +82,7 @@ class FrankaArm:
         self._send_state(contact)
 
     def hold(self) -> None:
-        """While time stands: take what the client sends, and keep it from giving the arm up.
+        """Take the client's messages while time stands, and keep its connection alive.
 
         A client that drives the arm is sent the last state again, which it has answered: to it, too,
         no time passes. One that does not looks for new states; so does one whose motion begins.
@@ -105,7 +105,7 @@ class FrankaArm:
 
     @property
     def obeys(self) -> bool:
-        """Whether a client's set-points come, or none are taken."""
+        """Whether the client's set-points arrive, or none are taken."""
         motion = self._motion
         return self.mode != RobotMode.IDLE or (motion is not None and motion.begun)
 
@@ -135,15 +135,15 @@ class FrankaArm:
             self.mode, self.error = RobotMode.IDLE, ""
 
     def silence_gripper(self, silent: bool) -> None:
-        """Let nothing through to and from the hand, or let it through again."""
+        """Block or unblock the hand's link."""
         self._hand.frozen = silent
 
     def freeze(self, frozen: bool) -> None:
-        """Let nothing through in either direction, or let it through again."""
+        """Block or unblock both directions of both links."""
         self.link.frozen = self._hand.frozen = frozen
 
     def set_nonsense(self, on: bool) -> None:
-        """Say that the joints' speeds are not numbers, or say them again."""
+        """Send NaN for joint speeds, or stop doing so."""
         self._nonsense = on
 
     def drop(self) -> None:
@@ -159,7 +159,7 @@ class FrankaArm:
             self.mode = RobotMode.IDLE
 
     def _end(self, status: MoveStatus | None) -> None:
-        """End the motion, if there is one, tell the client how, and brake."""
+        """End the motion, if any; report to the client, and brake."""
         motion, self._motion = self._motion, None
         self.cell.brake(_BRAKING)
         self._reset_setpoint()
@@ -168,7 +168,7 @@ class FrankaArm:
             self.link.answer(motion.request, status)
 
     def _try_recovery(self, request: messages.Request) -> None:
-        """Clear an error once the arm rests and nothing presses; answer when states have said so."""
+        """Clear an error once the arm rests without contact; answer when the states show it."""
         if self._cleared:
             self.link.answer(request, 0)
             self._recovery = None
@@ -238,7 +238,7 @@ class FrankaArm:
     # Set-points.
 
     def _wait_for_client(self, motion: Motion) -> None:
-        """Give the client time to answer the last state; go on without, up to a point."""
+        """Wait for the client's answer to the last state, up to a time-out."""
         deadline = time.monotonic() + self.timeout
         while (
             self._motion is motion
@@ -263,7 +263,7 @@ class FrankaArm:
             self._go_to(motion, last.q + DT * (last.dq + DT * last.ddq))
 
     def _take_messages(self) -> Motion | None:
-        """Requests and set-points; then the motion there is, which ends with its client."""
+        """Take requests and set-points; return the motion, which ends with its client."""
         self._take_requests_and_orders()
         if self._motion is not None and not self.link.connected:
             self._end(None)
@@ -317,7 +317,7 @@ class FrankaArm:
         self.cell.set_target(now.q, now.dq)
 
     def _go_by_tcp(self, motion: Motion, order: np.void) -> None:
-        """One step of differential inverse kinematics from the last set-point."""
+        """Step from the last set-point by differential inverse kinematics."""
         q = self._setpoint.q
         now, jacobian = end_effector(self.cell, self._ee, q)
         if motion.generator == _POSE:
@@ -347,20 +347,19 @@ class FrankaArm:
     # State.
 
     def _load_code(self) -> None:
-        """Compile what a millisecond needs, or load it, before a client waits for it."""
+        """Compile or load compiled code before a client waits for it."""
         contact = self._estimate_wrench()
         self._state.write_tcp(self.cell, self._ee, self._pose, self._wrench, contact)
         limits.joint_fault(self._setpoint, self._setpoint, cartesian=False)
         limits.arm_fault(self.cell.q, self.cell.dq)
 
     def _reset_setpoint(self) -> None:
-        """What the next set-point is compared with, and the torque the next one."""
         zero = np.zeros(7)
         self._setpoint = Setpoint(self.cell.q_d.copy(), zero, zero)
         self._torque = zero
 
     def _estimate_wrench(self) -> limits.Contact:
-        """Estimate the wrench from outside and judge it; joint torques say what it is, roughly."""
+        """Estimate the external wrench from joint torques, and judge it."""
         self._pose, jacobian = end_effector(self.cell, self._ee, self.cell.q)
         known = limits.wrench_behind(self.cell.tau_ext, jacobian)
         self._wrench = known + self.cell.wrench_error

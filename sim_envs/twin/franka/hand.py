@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from touchgoal.sim_envs.cell.environment import GRIPPER_MAX_WIDTH, GRIPPER_SPEED
+from touchgoal.sim_envs.cell.hardware import GRIPPER_MAX_WIDTH, GRIPPER_SPEED
 from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE
 from touchgoal.sim_envs.twin.franka import messages
@@ -17,12 +17,12 @@ _SOMETHING = 1e-3  # m: narrower than this the fingers have met
 _STATE_INTERVAL = 20  # ms between states; a real hand takes 20 to 50
 _FIRST_STATE = 5  # ms: none is on its way when a lock-step client looks, every 50 ms
 _HELD_INTERVAL = 0.004  # s between states while time stands
-_KEPT = 2e-3  # m by which the width may change while something is held
+_GRASP_TOLERANCE = 2e-3  # m by which the width may change while something is held
 
 
 @dataclass
 class Job:
-    """A command in progress.
+    """Command in progress.
 
     Attributes:
         request: answered when the job ends.
@@ -58,7 +58,7 @@ class FrankaHand:
         self._state["max_width"], self._state["temperature"] = GRIPPER_MAX_WIDTH, 30
 
     def receive(self) -> None:
-        """Take the client's commands and see how the one in progress stands."""
+        """Take commands; advance the one in progress."""
         for request in self.link.requests():
             self._handle(request)
         if self._job is not None:
@@ -68,13 +68,13 @@ class FrankaHand:
         """Send the state when it is due."""
         self._milliseconds += 1
         if self._grasped:
-            self._grasped = abs(self.cell.env.width() - self._held) < _KEPT
+            self._grasped = abs(self.cell.env.width() - self._held) < _GRASP_TOLERANCE
         if self.cell.steps % _STATE_INTERVAL == _FIRST_STATE:
             self._write_state()
             self.link.send(self._state.tobytes())
 
     def hold(self) -> None:
-        """While time stands: take commands, and let the client see the state as it is."""
+        """Take commands while time stands, and send the present state."""
         for request in self.link.requests():
             self._handle(request)
         if time.monotonic() - self._held_at > _HELD_INTERVAL:
@@ -82,7 +82,7 @@ class FrankaHand:
             self.link.send(self._state.tobytes())
 
     def reset(self) -> None:
-        """Nothing is held or under way any more."""
+        """Abort the command in progress and forget the grasp."""
         self._grasped = False
         if self._job is not None:
             self.link.answer(self._job.request, HandStatus.ABORTED)  # whoever asked is gone

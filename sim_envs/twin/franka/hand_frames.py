@@ -1,4 +1,4 @@
-"""Where a Franka's hand is on its flange, as its states say it."""
+"""Frames of a Franka's hand on its flange, as its states report them."""
 
 import numpy as np
 from jaxtyping import Float
@@ -9,7 +9,7 @@ Pose = Float[np.ndarray, "4 4"]
 
 
 def flange_to_hand() -> Pose:
-    """Of the hand's tool centre point on the flange (F_T_NE)."""
+    """Return the pose of the hand's TCP on the flange (F_T_NE)."""
     T = np.eye(4)
     arm = FR3.arm
     c, s = np.cos(arm.hand_yaw), np.sin(arm.hand_yaw)
@@ -19,7 +19,7 @@ def flange_to_hand() -> Pose:
 
 
 def describe_hand(state: np.ndarray, ee: Pose, k: Pose) -> None:
-    """Write into a state (`messages.ROBOT_STATE`) where the hand, its end effector and K are."""
+    """Write the frames of hand, end effector and K into a state (`messages.ROBOT_STATE`)."""
     flange = flange_to_hand()
     state["F_T_NE"] = flange.T.ravel()
     state["F_T_EE"] = (flange @ ee).T.ravel()

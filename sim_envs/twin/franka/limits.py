@@ -1,4 +1,4 @@
-"""What the Franka control interface refuses: limits of set-points, of the arm, of contact."""
+"""Limits of the Franka control interface: set-points, arm, contact."""
 
 from dataclasses import dataclass
 from typing import no_type_check
@@ -43,13 +43,13 @@ class Setpoint:
 
 
 def next_setpoint(before: Setpoint, q: Joints) -> Setpoint:
-    """The set-point a millisecond later at `q`, with its derivatives."""
+    """Return the set-point a millisecond later at `q`, with its derivatives."""
     dq = (q - before.q) / DT
     return Setpoint(q, dq, (dq - before.dq) / DT)
 
 
 def joint_fault(before: Setpoint, now: Setpoint, cartesian: bool) -> str | None:
-    """Which limit a set-point breaks, as libfranka calls it.
+    """Return libfranka's name of the limit that a set-point breaks; None if none.
 
     A client that moves in Cartesian space is held to joint range and speed only, for its set-points
     pass through the twin's own inverse kinematics.
@@ -75,7 +75,7 @@ _SPEED = 1  # place of the last of them that holds for set-points in Cartesian s
 def _broken_limit(
     q, dq, ddq, ddq_before, lower, upper, velocity, acceleration, jerk, gain, below, above, offset
 ):
-    """The first of `_LIMITS` that any joint breaks; -1: none. Speeds as `JointLimits.speed_range`."""
+    """Return the first of `_LIMITS` that any joint breaks, or -1. Speeds: `JointLimits.speed_range`."""
     worst = len(_LIMITS)
     for i in range(len(q)):
         up = np.sqrt(max(gain[i] * (above[i] - q[i]), 0.0)) - offset[i]
@@ -94,7 +94,7 @@ def _broken_limit(
 
 
 def tcp_fault(twist: Wrench) -> str | None:
-    """Whether a Cartesian set-point is too fast; m/s, rad/s."""
+    """Return a fault if a Cartesian set-point (m/s, rad/s) is too fast."""
     slow = np.linalg.norm(twist[:3]) <= _SLACK * _TCP_SPEED
     if not slow or not np.linalg.norm(twist[3:]) <= _SLACK * _TCP_TURN:
         return "cartesian_motion_generator_velocity_limits_violation"
@@ -102,7 +102,7 @@ def tcp_fault(twist: Wrench) -> str | None:
 
 
 def torque_fault(before: Joints, now: Joints) -> str | None:
-    """Which limit commanded torques (N m) break."""
+    """Return the limit that commanded torques (Nm) break; None if none."""
     if not (np.abs(now) <= _SLACK * TORQUE).all():
         return "tau_j_range_violation"
     if not (np.abs(now - before) <= _SLACK * DT * _TORQUE_RATE).all():
@@ -111,7 +111,7 @@ def torque_fault(before: Joints, now: Joints) -> str | None:
 
 
 def arm_fault(q: Joints, dq: Joints) -> str | None:
-    """Whether the arm itself is where or as fast as it must not be, whoever drives it."""
+    """Return a fault if the arm is beyond its range or speed, whoever drives it."""
     hardware = FR3.hardware
     place = _worst_of_arm(q, dq, hardware.lower, hardware.upper, hardware.velocity)
     return _ARM_FAULTS[place]
@@ -123,7 +123,6 @@ _ARM_FAULTS = None, "joint_velocity_violation", "joint_position_limits_violation
 @njit(cache=True)
 @no_type_check
 def _worst_of_arm(q, dq, lower, upper, velocity):
-    """Which of `_ARM_FAULTS`."""
     worst = 0
     for i in range(len(q)):
         if q[i] < lower[i] - 0.01 or q[i] > upper[i] + 0.01:
@@ -134,7 +133,7 @@ def _worst_of_arm(q, dq, lower, upper, velocity):
 
 
 def estimate_sent(wrench: Wrench, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
-    """What O_F_ext_hat_K says of a wrench (N, Nm) of the environment on the robot.
+    """Return O_F_ext_hat_K for a wrench (N, Nm) of the environment on the robot.
 
     libfranka, robot_state.h: what the robot applies to the environment is positive, and all is 0 near
     or in a singularity.
@@ -146,7 +145,7 @@ def estimate_sent(wrench: Wrench, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
 
 @dataclass(frozen=True)
 class Contact:
-    """How hard each joint (N m) and axis of the TCP (N, N m) is touched: 0, contact, collision."""
+    """Contact (1) or collision (1) of each joint and each Cartesian axis; else 0."""
 
     joint_contact: Joints
     joint_collision: Joints
@@ -155,7 +154,7 @@ class Contact:
 
     @property
     def fault(self) -> str | None:
-        """The reflex a collision sets off."""
+        """Reflex that a collision triggers."""
         if self.joint_collision.any():
             return "joint_reflex"
         return "cartesian_reflex" if self.cartesian_collision.any() else None
@@ -176,11 +175,11 @@ class Thresholds:
 
     @classmethod
     def default(cls) -> "Thresholds":
-        """20 N and 20 N m, as libfranka's examples set them."""
+        """Return 20 N and 20 Nm, as in libfranka's examples."""
         return cls(*(np.full(n, 20.0) for n in (7, 7, 7, 7, 6, 6, 6, 6)))
 
     def judge(self, torque: Joints, wrench: Wrench, ddq: Joints) -> Contact:
-        """What a torque (N m) and wrench (N, N m) from outside mean at this acceleration."""
+        """Compare an external torque (Nm) and wrench (N, Nm) with the thresholds at an acceleration."""
         steady = max(ddq.max(), -ddq.min()) < _STEADY
         lower = self.lower_torque_nominal if steady else self.lower_torque_acceleration
         upper = self.upper_torque_nominal if steady else self.upper_torque_acceleration
@@ -194,7 +193,6 @@ class Thresholds:
 @njit(cache=True)
 @no_type_check
 def _above(values, lower, upper):
-    """1 where a value is beyond a threshold, either way, and 0 where it is not."""
     n = len(values)
     beyond_lower, beyond_upper = np.zeros(n), np.zeros(n)
     for i in range(n):
@@ -206,53 +204,18 @@ def _above(values, lower, upper):
 
 
 def pseudo_inverse(jacobian: Float[np.ndarray, "6 7"]) -> Float[np.ndarray, "6 7"]:
-    """Of J^T: joint torques to the wrench behind them; damped against singular poses."""
+    """Return the damped pseudo-inverse of J^T, which maps joint torques to a wrench."""
     return np.linalg.solve(jacobian @ jacobian.T + _DAMPING * np.eye(6), jacobian)
 
 
 @njit(cache=True)
 @no_type_check
 def wrench_behind(torque: Joints, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
-    """`pseudo_inverse(jacobian) @ torque`: the wrench (N, N m) that explains joint torques (N m) best."""
-    L, _ = _cholesky(jacobian, _DAMPING)
-    wrench = np.zeros(6)
-    for i in range(6):
-        for j in range(len(torque)):
-            wrench[i] += jacobian[i, j] * torque[j]
-    for i in range(6):
-        for k in range(i):
-            wrench[i] -= L[i, k] * wrench[k]
-        wrench[i] /= L[i, i]
-    for i in range(5, -1, -1):
-        for k in range(i + 1, 6):
-            wrench[i] -= L[k, i] * wrench[k]
-        wrench[i] /= L[i, i]
-    return wrench
+    """Return `pseudo_inverse(jacobian) @ torque`: the wrench (N, Nm) that best explains joint torques."""
+    return np.linalg.solve(jacobian @ jacobian.T + _DAMPING * np.eye(6), jacobian @ torque)
 
 
 @njit(cache=True)
 @no_type_check
 def _is_singular(jacobian):
-    """Whether the least singular value is below `_SINGULAR`, without finding it."""
-    return not _cholesky(jacobian, -(_SINGULAR**2))[1]
-
-
-@njit(cache=True)
-@no_type_check
-def _cholesky(jacobian, added):
-    """The factor of J J^T + `added` I, and whether that is positive definite."""
-    L = np.zeros((6, 6))
-    for i in range(6):
-        for j in range(i + 1):
-            rest = added if i == j else 0.0
-            for k in range(jacobian.shape[1]):
-                rest += jacobian[i, k] * jacobian[j, k]
-            for k in range(j):
-                rest -= L[i, k] * L[j, k]
-            if i > j:
-                L[i, j] = rest / L[j, j]
-            elif rest > 0:
-                L[i, i] = np.sqrt(rest)
-            else:
-                return L, False
-    return L, True
+    return np.linalg.eigvalsh(jacobian @ jacobian.T)[0] < _SINGULAR**2

@@ -77,7 +77,7 @@ HAND_STATE = np.dtype(
 
 
 class RobotCommand(IntEnum):
-    """What a client asks of the arm."""
+    """Commands to the arm."""
 
     CONNECT = 0
     MOVE = 1
@@ -94,7 +94,7 @@ class RobotCommand(IntEnum):
 
 
 class MoveStatus(IntEnum):
-    """How a motion stands."""
+    """Status of a motion."""
 
     SUCCESS = 0
     STARTED = 1
@@ -109,7 +109,7 @@ class MoveStatus(IntEnum):
 
 
 class RobotMode(IntEnum):
-    """What the arm is doing."""
+    """Mode of the arm."""
 
     IDLE = 1
     MOVE = 2
@@ -118,7 +118,7 @@ class RobotMode(IntEnum):
 
 
 class HandCommand(IntEnum):
-    """What a client asks of the hand."""
+    """Commands to the hand."""
 
     CONNECT = 0
     HOMING = 1
@@ -128,7 +128,7 @@ class HandCommand(IntEnum):
 
 
 class HandStatus(IntEnum):
-    """How a command to the hand ended."""
+    """Result of a command to the hand."""
 
     SUCCESS = 0
     FAIL = 1
@@ -212,11 +212,11 @@ class Link:
 
     Attributes:
         frozen: nothing gets through in either direction.
-        connected: whether a client is there and has said hello.
+        connected: whether a client is connected and has shaken hands.
     """
 
     def __init__(self, host: str, port: int, version: int, wide: bool) -> None:
-        """`wide`: the arm's messages have a 4-byte command and 1-byte status; the hand's, 2."""
+        """`wide`: the arm's messages have a 4-byte command and a 1-byte status, the hand's 2 and 2."""
         self._version, self._wide = version, wide
         self._header = struct.Struct("<III" if wide else "<HII")
         self._status = struct.Struct("<B" if wide else "<H")
@@ -235,16 +235,16 @@ class Link:
 
     @property
     def connected(self) -> bool:
-        """Whether a client is there and has said hello."""
+        """Whether a client is connected and has shaken hands."""
         return self._peer is not None
 
     @property
     def sockets(self) -> list[socket.socket]:
-        """On which a client may say something."""
+        """Sockets on which a client may send."""
         return [self._listener if self._tcp is None else self._tcp, self._udp]
 
     def requests(self) -> list[Request]:
-        """What the client has asked since; greets a new client by itself."""
+        """Return commands that have arrived; accept a new client."""
         if self.frozen:
             return []
         self._flush()
@@ -264,7 +264,7 @@ class Link:
         return list(self._parse_requests())
 
     def orders(self) -> list[bytes]:
-        """Datagrams that have come in."""
+        """Return datagrams that have arrived."""
         found = []
         while True:
             try:
@@ -275,11 +275,11 @@ class Link:
                 found.append(data)
 
     def wait(self, seconds: float) -> None:
-        """Until the client sends something, over either way."""
+        """Wait until the client sends on either socket."""
         select.select(self.sockets, [], [], seconds)
 
     def send(self, state: bytes) -> None:
-        """A state, if anyone is there; a datagram that does not get through is lost."""
+        """Send a state to the client, if any; a datagram may be lost."""
         if self._peer is not None and not self.frozen:
             try:
                 self._udp.sendto(state, self._peer)
@@ -332,7 +332,7 @@ class Link:
                 yield request
 
     def _well_formed(self, request: Request) -> bool:
-        """Whether the arguments have the size and, where they are numbers, the values that they can."""
+        """Return whether the arguments have the right size and possible values."""
         n = len(request.payload)
         if self._wide and request.command == RobotCommand.MOVE:
             return n >= _LEAST_OF_MOVE

@@ -20,7 +20,7 @@ _STILL, _SETTLED = 1e-3, 0.05  # m/s, s
 
 
 class SerialPort:
-    """A pseudo-terminal behind a path that stays the same when it is unplugged and plugged in.
+    """A pseudo-terminal behind a path that survives unplugging.
 
     Attributes:
         garble: share of messages that lose a byte on their way to the client.
@@ -44,7 +44,7 @@ class SerialPort:
         self.path.symlink_to(os.ttyname(self._ends[1]))
 
     def unplug(self) -> None:
-        """Pull it out: a client's next read fails."""
+        """Unplug it: a client's next read fails."""
         if self._ends is not None:
             for end in self._ends:
                 os.close(end)
@@ -52,14 +52,14 @@ class SerialPort:
             self.path.unlink(missing_ok=True)
 
     def read(self) -> bytes:
-        """What the client has sent."""
+        """Return bytes that the client has sent."""
         try:
             return os.read(self._ends[0], 4096) if self._ends else b""
         except OSError:
             return b""
 
     def write(self, message: bytes) -> None:
-        """Send; what nobody reads is lost, as on a wire."""
+        """Send bytes; unread ones are lost, as on a wire."""
         if self._rng.random() < self.garble:
             cut = int(self._rng.integers(len(message) - 2))  # a line without its \r is still whole
             message = message[:cut] + message[cut + 1 :]
@@ -86,22 +86,22 @@ class LoadCell:
         self._milliseconds = self.sent = 0
 
     def reset(self) -> None:
-        """From here on its noise and the times of its lines are those of a twin that begins."""
+        """Begin noise and line times as a new twin does."""
         self._rng = np.random.default_rng(1)
         self._milliseconds += -self._milliseconds % 1000  # a clock that goes back is a restart
 
     def receive(self) -> None:
-        """Nothing is said to a load cell."""
+        """Do nothing: a load cell takes no messages."""
 
     def hold(self) -> None:
-        """No line is due while time stands."""
+        """Do nothing: no line is due while time stands."""
 
     def send(self) -> None:
         """Write a line if one is due."""
         self._milliseconds += 1
         if self._milliseconds * _LOAD_RATE % 1000 >= _LOAD_RATE:
             return
-        self.port.read()  # whatever was said
+        self.port.read()  # discard
         counts = ZERO + self.cell.env.table_load() / NEWTONS_PER_COUNT
         counts += self._rng.normal(0.0, _LOAD_NOISE)
         line = f"{self._milliseconds},{round(counts)}".encode()
@@ -109,7 +109,7 @@ class LoadCell:
         self.sent = self._milliseconds
 
     def close(self) -> None:
-        """Pull the plug."""
+        """Unplug it."""
         self.port.unplug()
 
 
@@ -140,11 +140,11 @@ class Robotiq:
             self.port.write(answer + modbus_crc(answer))
 
     def hold(self) -> None:
-        """Take requests and answer them."""
+        """Answer requests while time stands."""
         self.receive()
 
     def send(self) -> None:
-        """See how far the fingers are."""
+        """Measure the fingers' motion."""
         width = self.cell.env.width()
         moved, self._width = abs(width - self._width), width
         self._still = self._still + DT if moved < _STILL * DT else 0.0
@@ -156,7 +156,7 @@ class Robotiq:
             )
 
     def close(self) -> None:
-        """Pull the plug."""
+        """Unplug it."""
         self.port.unplug()
 
     def _serve(self, frame: bytes) -> bytes:
@@ -215,7 +215,7 @@ class Robotiq:
 
 
 def _request_length(unread: bytes) -> int:
-    """Of the request that begins here; 0 if that cannot be said yet."""
+    """Return the length of the request that begins here; 0 if it is not known yet."""
     if len(unread) < 8:
         return 0
     return 9 + unread[6] if unread[1] == 16 else 8

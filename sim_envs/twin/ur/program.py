@@ -92,7 +92,7 @@ class UrProgram:
 
     @property
     def reported_running(self) -> bool:
-        """Whether clients are told that the program runs: not while a command is refused."""
+        """Running state for clients: false while a command is refused."""
         refusing = self._refused and self._cycles_refused < _REFUSAL_CYCLES
         return self.running and not refusing
 

@@ -1,0 +1,202 @@
+"""The one simulated cell: arm, hand, fingertips and cameras at a table, without any task."""
+
+from abc import ABC, abstractmethod
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from touchgoal.control import features as ft
+from touchgoal.control.features import Observation
+from touchgoal.control.motion.kinematics import Kinematics
+from touchgoal.control.motion.tool import FRANKA_HAND
+from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.sim_envs.config import EnvConfig, SceneConfig
+from touchgoal.sim_envs.scene.build import ROBOTS, SIDES, arm_joints, build
+from touchgoal.sim_envs.scene.contacts import ContactReader, PadContact
+from touchgoal.sim_envs.scene.objects import Body
+from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
+from touchgoal.sim_envs.tactile.pad import TactileFrame, TactilePad
+from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
+
+GRIPPER_MAX_WIDTH = FRANKA_HAND.stroke[1]  # m, to which experts open
+GRIPPER_SPEED = FRANKA_HAND.speed  # m/s of width
+_FINGER_LAG = 1e-3  # m by which a finger may follow its set-point while it moves freely
+
+_QUIET = 2.0  # Nm: 20 N on a hand over the table, from any side, put more on some joint
+
+
+class SimulatedHardware(ABC):
+    """Physics and sensors of the cell, a physics step at a time.
+
+    Attributes:
+        grasp_force: N of each finger.
+        bodies: objects of the scene, the task's first.
+    """
+
+    def __init__(self, config: EnvConfig) -> None:
+        self.config = config
+        self.sensor = find_sensor(config.sensor)
+        self.robot = ROBOTS[config.arm]
+        self.n_joints = self.robot.arm.home.size
+        self.kinematics = Kinematics(self.robot.arm, self.robot.tool.tcp_offset)
+        self.grasp_force = 15.0
+        self.bodies: list[Body] = []
+        self._renderer: Renderer | None = None
+        self._view_renderer: Renderer | None = None
+        self._pads: list[TactilePad] = []
+
+    @abstractmethod
+    def add_task_objects(self, spec: mujoco.MjSpec) -> None:
+        """Add the task's own parts to the scene."""
+
+    def scene(self, config: SceneConfig) -> mujoco.MjSpec:
+        """Build this episode's scene with other scene options."""
+        spec = build(self.bodies, config)
+        self.add_task_objects(spec)
+        return spec
+
+    def step_physics(self, joints: np.ndarray, width: float, speed: float, steps: int = 1) -> None:
+        """Run physics steps under a servo set-point (rad), while the gripper goes to `width` (m).
+
+        The gripper moves at `speed` (m/s of width) and presses with `grasp_force` at most.
+        """
+        travel = speed / 2 * steps * self.model.opt.timestep  # m of one finger
+        self._finger_target += min(max(width / 2 - self._finger_target, -travel), travel)
+        # No wind-up while something holds the fingers open: letting go would take as long again.
+        deepest = self.width() / 2 - 2 * self.grasp_force / self._finger_stiffness - _FINGER_LAG
+        self._finger_target = max(self._finger_target, deepest)
+        self.model.actuator_forcerange[self._gripper, 0] = -2 * self.grasp_force
+        self.data.ctrl[: self.n_joints] = joints
+        self.data.ctrl[self._gripper] = self._finger_target
+        mujoco.mj_step(self.model, self.data, nstep=steps)
+
+    def update_contacts(self) -> None:
+        """Recompute contacts and poses from the state."""
+        mujoco.mj_forward(self.model, self.data)
+        self._contacts, self._external = self._reader.read(self.data)
+
+    def joints(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return joint positions (rad) and velocities (rad/s)."""
+        return self.data.qpos[self.arm_positions], self.data.qvel[self.arm_dofs]
+
+    def joint_contact_torque(self) -> np.ndarray:
+        """Return the contact torque (Nm) on each joint in the last physics step."""
+        return self._reader.joint_torque(self.data)[self.arm_dofs]
+
+    def width(self) -> float:
+        """Return the gripper's width, m."""
+        left, right = self._fingers
+        positions = self.data.qpos
+        return float(positions[left] + positions[right])
+
+    def width_target(self) -> float:
+        """Return the width that the gripper was sent to, m."""
+        return 2 * self._finger_target
+
+    def external_wrench(self) -> Float[np.ndarray, "6"]:
+        """Return the contact wrench (N, Nm) on the robot at the TCP, base frame."""
+        return self._external
+
+    def contact_force(self) -> Float[np.ndarray, "3"]:
+        """Return the contact force (N) on the robot in the last physics step, base frame; 0 if small.
+
+        Reading contacts takes as long as a physics step, so they are read only where some joint bears more
+        than `_QUIET`.
+        """
+        if np.abs(self.data.qfrc_constraint[self.arm_dofs]).max() < _QUIET:
+            return np.zeros(3)
+        _, wrench = self._reader.read(self.data)
+        return wrench[:3]
+
+    def pad_contacts(self) -> tuple[PadContact, PadContact]:
+        """Return the exact wrench and slip of both pads at the last `update_contacts`."""
+        return self._contacts
+
+    def table_load(self) -> float:
+        """Return the force (N) that presses down on the table."""
+        return self._reader.load(self.data, self.model.geom("table").id)
+
+    def object_pose(self, name: str = "object") -> Float[np.ndarray, "7"]:
+        """Return an object's pose in the base frame: m, quaternion wxyz."""
+        return self.data.joint(name).qpos.copy()
+
+    def render_camera(self, camera: str) -> UInt8[np.ndarray, "h w 3"]:
+        """Render a camera, RGB."""
+        assert self._renderer is not None
+        self._renderer.update_scene(self.data, camera)
+        return self._renderer.render()
+
+    def read_tactile(self, side: int) -> TactileFrame:
+        """Read the left (0) or right (1) sensor; `update_contacts` first, in order of time."""
+        return self._pads[side].sense(self.data, self._contacts[side], self._noise_rng)
+
+    def tactile_frames(self) -> list[TactileFrame]:
+        """Return the last readings of the left and right sensor, with depth and contact mask."""
+        return self._frames
+
+    def tactile_pads(self) -> list[TactilePad]:
+        """Return the left and the right sensor; empty without `tactile`."""
+        return self._pads
+
+    def read_proprioception(self) -> Observation:
+        """Return state, TCP pose and wrench without delay; `update_contacts` first."""
+        data = self.data
+        quat = np.zeros(4)
+        mujoco.mju_mat2Quat(quat, data.site_xmat[self._tcp])
+        values = {
+            ft.STATE: np.concatenate([*self.joints(), [self.width()]]),
+            ft.TCP_POSE: np.concatenate([data.site_xpos[self._tcp], quat]),
+            ft.WRENCH: self._external,
+        }
+        return {key: value.astype(np.float32) for key, value in values.items()}
+
+    def take_pictures(self) -> Observation:
+        """Render cameras and read fingertips; `update_contacts` first, in order of time."""
+        pictures = {
+            ft.IMAGE_PREFIX + camera: self.render_camera(camera) for camera in self.config.cameras
+        }
+        if self._pads:
+            self._frames = [self.read_tactile(side) for side in range(2)]
+            for key, frame in zip(ft.TACTILE, self._frames, strict=True):
+                pictures[key] = frame.image
+        return pictures
+
+    def render_view(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Render the side camera, 480 x 640 RGB."""
+        if self._view_renderer is None:
+            self._view_renderer = open_renderer(self.model, 480, 640)
+        self._view_renderer.update_scene(self.data, "side")
+        return self._view_renderer.render()
+
+    def close(self) -> None:
+        """Free the OpenGL contexts."""
+        for renderer in (self._renderer, self._view_renderer):
+            if renderer is not None:
+                renderer.close()
+        self._renderer, self._view_renderer = None, None
+
+    def compile_scene(self, rng: np.random.Generator) -> None:
+        """Compile the scene of `bodies`; `rng` draws sensors and, later, camera noise."""
+        self.close()
+        self._noise_rng = rng
+        self.model = model = self.scene(self.config).compile()
+        self.data = mujoco.MjData(model)
+        joints = [model.joint(name) for name in arm_joints(self.config.arm)]
+        self.arm_positions = np.array([joint.qposadr[0] for joint in joints])
+        self.arm_dofs = np.array([joint.dofadr[0] for joint in joints])
+        self._fingers = [model.joint(f"finger_joint{i}").qposadr[0] for i in (1, 2)]
+        self._gripper = model.actuator("gripper").id
+        self._finger_stiffness = float(model.actuator_gainprm[self._gripper, 0])
+        self._tcp = model.site("tcp").id
+        self._reader = ContactReader(model)
+        self._frames: list[TactileFrame] = []
+        sensor, randomization = self.sensor, self.config.randomization
+        self._pads = [
+            TactilePad(
+                model, side, sensor, sample_instance(sensor, rng, randomization), self.bodies
+            )
+            for side in (SIDES if self.config.tactile else ())
+        ]
+        if self.config.cameras:
+            self._renderer = open_renderer(model, *self.config.camera_size)
