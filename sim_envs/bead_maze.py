@@ -186,7 +186,7 @@ def add_wire(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
         "group": VISUAL_GROUP,
         "rgba": [0.75, 0.76, 0.8, 1],
     }
-    # Drawn with 16 rings each, its capsules are most of a picture's time; a pixel or two tell the difference.
+    # With 16 rings each, the capsules take most of a render's time; the images hardly differ.
     spec.visual.quality.numstacks = 6
     maze = spec.worldbody.add_body(name="wire")  # a body of its own: one box to rule it out
     for start, end in wire.chords(sag=_SAG, longest=0.012):

@@ -1,8 +1,8 @@
 """Twenty cloths pressed into a fingertip sensor by hand, for TacBench T6 (textile).
 
-A cloth is woven, knitted or napped by a rule; every clip takes another piece of it, its yarn a little
-thicker or thinner and not quite even, on another body at another angle. As with GelSight recordings of
-textiles, a clip is one press that deepens and drifts.
+A cloth is woven, knitted or napped by a rule; every clip takes another piece of it, its yarn a
+little thicker or thinner and not quite even, on another body at another angle. As with GelSight
+recordings of textiles, a clip is one press that deepens and drifts.
 """
 
 from collections.abc import Callable

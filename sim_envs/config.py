@@ -1,4 +1,4 @@
-"""Options of the simulated cell and of each task; light to import, because every command shows them."""
+"""Options of the simulated cell and of each task; light to import."""
 
 from dataclasses import replace
 from typing import Annotated, Literal
@@ -35,7 +35,7 @@ Force = Annotated[float, Field(gt=0, le=40.0)]
 """N of each finger; the simulated gripper presses with 40 N at most."""
 ForceRange = Annotated[tuple[Force, Force], ORDERED]
 Mass = Annotated[float, Field(ge=0.001, le=3.0)]
-"""kg; lighter objects shake in the solver, heavier ones exceed an FR3's payload (3 kg, FR3 data sheet)."""
+"""kg; lighter objects shake in the solver; 3 kg is the payload in the FR3 data sheet."""
 Friction = Annotated[float, Field(gt=0, le=2.0)]
 MAX_CAMERA_SIDE = 1280
 """Rows or columns of the largest camera image, px."""
@@ -53,9 +53,9 @@ STREAM_SIZE = (256, 256)
 class SensorRandomization:
     """Differences between two fingertip sensors of one model.
 
-    Brightness: measured on real Minis (Tactile-MNIST: gain std 0.047 across sensors; offset std 0.0094 and
-    smooth pattern std 0.0093 of full scale; noise of the channels correlated by 0.24 to 0.39). The others:
-    differences between published calibrations.
+    Brightness: measured on real Minis (Tactile-MNIST: gain std 0.047 across sensors; offset std
+    0.0094 and smooth pattern std 0.0093 of full scale; noise of the channels correlated by 0.24 to
+    0.39). The others: differences between published calibrations.
     """
 
     gain: Annotated[NotNegative, Field(le=0.3)] = 0.047
@@ -95,7 +95,7 @@ class SceneConfig:
     """Time step of the physics, s; it must divide 2 ms."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError if set-points would not fall on steps of the physics."""
+        """Raise ValueError if set-points would not fall on steps of the physics."""
         if not _is_multiple(SETPOINT_PERIOD, self.timestep):
             raise ValueError(
                 f"timestep must divide 2 ms (0.002, 0.001, 0.0005, ...), not {self.timestep:g}"
@@ -128,11 +128,11 @@ class DeploymentConfig:
     """
 
     tracker: bool | None = None
-    """Drive the arm as `deploy` does: servo lag, the safety layer's limits, the 1 kHz tracker, and an arm
-    that follows its set-points without lag."""
+    """Drive the arm as `deploy` does: servo lag, the safety layer's limits, the 1 kHz tracker, and
+    an arm that follows its set-points without lag."""
     franka_hand: bool | None = None
-    """Act as a Franka Hand: one command at a time, each runs to its end; a target of 0 grasps, any other
-    width is a move. The width is read every 50 ms."""
+    """Act as a Franka Hand: one command at a time, each runs to its end; a target of 0 grasps, any
+    other width is a move. The width is read every 50 ms."""
     estimated_wrench: bool | None = None
     """Observe the force on the hand as a real arm estimates it: with noise, bias, drift and lag."""
     state_delay: DelayRange | None = None
@@ -140,12 +140,12 @@ class DeploymentConfig:
     picture_delay: DelayRange | None = None
     """Least and largest age of camera and tactile images in an observation, s."""
     picture_rate: Annotated[float, Field(ge=5, le=1000)] | None = None
-    """Frame rate of cameras and fingertip sensors, Hz. An observation holds the latest frame; as deployed
-    30 Hz, else one frame per millisecond."""
+    """Frame rate of cameras and fingertip sensors, Hz. An observation holds the latest frame; as
+    deployed 30 Hz, else one frame per millisecond."""
     command_delay: DelayRange | None = None
     """Least and largest time from the policy's action until arm and hand receive it, s."""
     jitter: DelayRange | None = None
-    """Range of an episode's jitter, s. Each tick adds a random time between 0 and the jitter to each delay."""
+    """Range of an episode's jitter, s. Each tick adds a random part of it to each delay."""
     plan_ticks: TickRange | None = None
     """Control ticks by which a learned policy's plans are late; one of these is drawn."""
 
@@ -161,9 +161,9 @@ IDEAL_DEPLOYMENT = DeploymentConfig(
     jitter=(0.0, 0.0),
     plan_ticks=(0,),
 )
-# Measured between `touchgoal deploy` and `touchgoal twin` (`touchgoal benchmark deploy`): states are 7 to
-# 18 ms old; commands take 20 to 25 ms, the tracker's lag included; cameras and fingertips send 25 to 30
-# frames a second (GelSight Mini and DIGIT data sheets); a plan is requested one tick early.
+# Measured between `touchgoal deploy` and `touchgoal twin` (`touchgoal benchmark deploy`): states are
+# 7 to 18 ms old; commands take 20 to 25 ms with the tracker's lag; a plan is requested a tick early.
+# Cameras and fingertips: 25 to 30 frames a second (GelSight Mini and DIGIT data sheets).
 AS_DEPLOYED = DeploymentConfig(
     tracker=True,
     franka_hand=True,
@@ -192,16 +192,16 @@ class EnvConfig(SceneConfig):
     max_seconds: Positive = 8.0
     """Time limit of an episode, s."""
     disturbance: Annotated[NotNegative, Field(le=0.1)] = 0.0
-    """Random hand motion added to each action, so that demonstrations show recoveries (DART, Laskey 2017):
-    RMS speed along each axis, m/s. The hand also turns, at 2 rad/s (pick-place) or 20 rad/s (bead-maze)
-    per m/s."""
+    """Random hand motion added to each action, so that demonstrations show recoveries (DART, Laskey
+    2017): RMS speed along each axis, m/s. The hand also turns, at 2 rad/s (pick-place) or 20 rad/s
+    (bead-maze) per m/s."""
     randomization: Annotated[SensorRandomization, RARE] = SensorRandomization()
     """Differences between the two fingertip sensors, drawn for each episode."""
     light_change: Annotated[LightChange, RARE] = (0.0,)
     """Change of the fingertips' light after an episode's first image, as a share: one value, or
     red, green and blue. -0.15 dims them by 15 %."""
     as_deployed: bool = False
-    """Simulate deployment: the delays, limits and measurement errors of an arm driven by `deploy`."""
+    """Simulate the delays, limits and measurement errors of an arm driven by `deploy`."""
     deployment: DeploymentConfig = DeploymentConfig()
     """Overrides of single settings of `--env.as-deployed`."""
 
@@ -212,7 +212,7 @@ class EnvConfig(SceneConfig):
         return replace(base, **own)
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a tick is no whole number of set-points, or an episode has no tick."""
+        """Raise ValueError if a tick is no whole number of set-points, or an episode has none."""
         super().__post_init__()
         if not _is_multiple(1 / self.control_hz, SETPOINT_PERIOD):
             raise ValueError(
@@ -240,8 +240,8 @@ class PickPlaceConfig(EnvConfig):
     tolerance: Annotated[float, Field(gt=0, le=0.1)] = 0.02
     """Largest distance of the placed object's centre from the goal, m."""
     release: bool = False
-    """Success also requires that the hand lets go. The paper's reward curves end in touch, so by default
-    an episode ends with the placed object still in the hand."""
+    """Success also requires that the hand lets go. The paper's reward curves end in touch, so by
+    default an episode ends with the placed object still in the hand."""
 
 
 @checked_dataclass
@@ -276,7 +276,7 @@ class BeadMazeConfig(EnvConfig):
     n_wires: Count | None = None
     """Number of wires to draw from; default: 200, or all if the split has fewer."""
     bead: Literal["sphere", "cylinder"] = "sphere"
-    """Shape of the bead; the wire's direction acts on a cylinder as a torque, on a sphere hardly."""
+    """Shape of the bead; the wire turns a cylinder by a torque, a sphere hardly."""
     grasp_force: ForceRange = (8.0, 12.0)
     """Range of the force of each finger, N."""
     start_angle: Annotated[NotNegative, Field(le=45)] = 0.0
@@ -329,8 +329,8 @@ class TeleoperatorConfig:
     rotational_compliance: NotNegative = 2.0
     """Speed per torque at which the hand yields, rad/s per Nm."""
     hold_seconds: Positive = 0.5
-    """Time for which a typed key counts as held, s. A terminal reports no key releases; it repeats a held
-    key after about 0.4 s, and only the last of several."""
+    """Time for which a typed key counts as held, s. A terminal reports no key releases; it repeats
+    a held key after about 0.4 s, and only the last of several."""
 
 
 @checked_dataclass
@@ -344,7 +344,7 @@ class RigConfig:
     load: Annotated[PositiveRange, RARE] = (0.5, 5.0)
     """Range of the normal load, N."""
     shear_relief: bool = True
-    """Simulate that the gel piles up in front of what slides over it and sinks behind: the only trace of shear
-    without printed dots. Shipped encoders were trained without it."""
+    """Simulate that the gel piles up in front of what slides over it and sinks behind: the only
+    trace of shear without printed dots. Shipped encoders were trained without it."""
     seed: Seed = 0
     """Random seed of the sensor and of all strokes."""

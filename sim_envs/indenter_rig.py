@@ -1,12 +1,12 @@
 """An indenter rig: a probe pressed into one fingertip sensor and drawn over it, without a robot.
 
-Follows the normal and shear load test of Sparsh (Higuera et al. 2024, appendix C.4): a press up to a
-random load of at most 5 N, then a slide of at most 2 mm in a random direction. What differs: a slide is
-about as long as friction holds, so that sticking and slipping are both common, and there is no
-dynamics. Pictures are the pad simulator's.
+Follows the normal and shear load test of Sparsh (Higuera et al. 2024, appendix C.4): a press up to
+a random load of at most 5 N, then a slide of at most 2 mm in a random direction. What differs: a
+slide is about as long as friction holds, so that sticking and slipping are both common, and there
+is no dynamics. Pictures are the pad simulator's.
 
-Stick and slip are the pad's own. The gel is one plate on springs: while the probe sticks, the gel goes
-along and its shear force grows; at the friction cone the probe slides.
+Stick and slip are the pad's own. The gel is one plate on springs: while the probe sticks, the gel
+goes along and its shear force grows; at the friction cone the probe slides.
 """
 
 import math
@@ -30,7 +30,7 @@ FRICTION = 0.6
 FRICTION_SPREAD = 0.15
 """By which share a stroke's own coefficient may differ: labels by the nominal cone err near it."""
 REST = 6
-"""Untouched frames at the start of a stroke: one more than the 5 that lie between two frames of a pair."""
+"""Untouched frames at the start of a stroke: one more than lie between frames of a pair."""
 MAX_SLIDE = 2e-3  # m
 _PLACES = 3e-3  # m from the middle of the picture, along x and y
 _PRESS_FRAMES = 8, 16
@@ -121,7 +121,7 @@ def rig_unit(config: RigConfig) -> SensorInstance:
 def shear_force(
     moved: Float[np.ndarray, " t"], load: Float[np.ndarray, " t"], stiffness: float, friction: float
 ) -> tuple[Float[np.ndarray, " t"], Bool[np.ndarray, " t"]]:
-    """Return the tangential force (N) on a gel of `stiffness` N/m, and whether the probe slides, by frame.
+    """Return tangential force (N) on a gel of `stiffness` N/m, and slip, by frame.
 
     The gel follows the probe until friction gives way; what the probe has slid stays slid.
 

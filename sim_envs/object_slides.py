@@ -1,12 +1,12 @@
 """Objects held against one fingertip sensor and slid and turned under it.
 
-As in Sparsh's appendix C.5, the load holds and the object is moved by hand: every fraction of a second
-with another velocity. Changes of the pose over five frames are drawn log-uniformly, so that small and
-large ones are as common. The gel's stick and slip are those of the indenter rig, with torsion: a patch is
-turned in the gel as a ring of its mean radius is drawn along it.
+As in Sparsh's appendix C.5, the load holds and the object is moved by hand: every fraction of a
+second with another velocity. Changes of the pose over five frames are drawn log-uniformly, so that
+small and large ones are as common. The gel's stick and slip are those of the indenter rig, with
+torsion: a patch is turned in the gel as a ring of its mean radius is drawn along it.
 
-For TacBench T3 (pose): the face of a bar and a can on its side. For self-supervised learning, as Sparsh
-does from Touch-Slide: the objects of pick-and-place, any side of them.
+For TacBench T3 (pose): the face of a bar and a can on its side. For self-supervised learning, as
+Sparsh does from Touch-Slide: the objects of pick-and-place, any side of them.
 """
 
 import math
@@ -65,7 +65,7 @@ class Slide:
 
 
 def simulate_slide(config: RigConfig, index: int) -> Slide:
-    """Simulate one slide of the bar or the can; the same config and index always give the same one."""
+    """Simulate a slide of the bar or the can; config and index determine it."""
     rng = np.random.default_rng([config.seed, index, 2])
     load = float(rng.uniform(*config.load))
     body, flat = _body(HELD[index % len(HELD)])
@@ -129,7 +129,7 @@ def pulled(
     The gel's point of rest is drawn along as soon as it would pull with more than `limit` N.
 
     Args:
-        places: x, y and, if it turns, the way along a ring of the patch's mean radius, whose force is
+        places: x, y and, if it turns, the way along a ring of the patch's mean radius; its force is
             torsion over that radius.
         stiffness: of the gel, N/m.
         limit: that friction bears, N.

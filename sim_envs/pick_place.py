@@ -53,7 +53,7 @@ class PickPlace(FrankaTactileEnv):
         return super().scene_layout() | {"grasp": grasp, "goal": self.goal.tolist()}
 
     def grasp_yaw(self, name: str = "object") -> float:
-        """Return the hand yaw that closes across an object, within a quarter turn of the comfortable one."""
+        """Return the hand yaw that closes across an object, in [-pi/2, pi/2]."""
         body = next(b for b in self.bodies if b.name == name)
         if body.kind.shape in ("sphere", "cylinder", "mesh"):
             return 0.0
@@ -66,8 +66,8 @@ class PickPlace(FrankaTactileEnv):
     def rearrange(self) -> tuple[Observation, dict[str, Any]]:
         """Start a new episode with the same objects, without the cost of a reset.
 
-        Objects are moved over the table as they lie, at rest, to places that a reset could draw; so are the goal
-        and the hand.
+        Objects are moved over the table as they lie, at rest, to places that a reset could draw; so
+        are the goal and the hand.
         """
         rng, data = self.np_random, self.data
         *positions, self.goal = _random_positions(rng, len(self.bodies) + 1)

@@ -1,7 +1,8 @@
 """The environment's arm as `deploy` drives it, a millisecond at a time.
 
-Joint changes pass deploy's lag, the safety layer and the 1 kHz tracker, as on the wire; observations are as
-old as they are there. The twin's own arm (`simulated_cell.py`) follows its set-points in the same way.
+Joint changes pass deploy's lag, the safety layer and the 1 kHz tracker, as on the wire;
+observations are as old as they are there. The twin's own arm (`simulated_cell.py`) follows its
+set-points in the same way.
 """
 
 from collections import deque
@@ -145,7 +146,7 @@ class DeployedArm:
         self.contacts = env.pad_contacts()
 
     def run_tick(self, delta: Joints, width: float) -> None:
-        """Run a control tick of physics with the policy's action; end it where the force is too high."""
+        """Run a control tick with the policy's action; end it where the force is too high."""
         env = self._env
         target = self._drive.accept(np.asarray(delta, np.float64))
         env.command = self._drive.command

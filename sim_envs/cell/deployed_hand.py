@@ -28,7 +28,7 @@ class DeployedHand:
         self._grasps, self._age = False, 0
 
     def step(self, ms: int, target_width: float) -> float:
-        """Return the width (m) that the fingers go to in this millisecond, given the latest target."""
+        """Return the width (m) that the fingers go to now, given the latest target."""
         if ms % _PERIOD == self._phase:
             self._look(target_width)
         return self._goal

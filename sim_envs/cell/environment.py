@@ -41,33 +41,34 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
 
     ## Observation space
 
-    `Dict`; keys, shapes and units as in `control/features.py`, poses and wrenches in the base frame.
+    `Dict`; keys, shapes and units as in `control/features.py`, poses and wrenches in the base
+    frame.
 
     | key | shape | meaning | unit |
     |---|---|---|---|
-    | `observation.state` | (2n + 1,) | joint positions and velocities, gripper width | rad, rad/s, m |
+    | `observation.state` | (2n + 1,) | joints, joint velocities, gripper width | rad, rad/s, m |
     | `observation.command` | (2n,) | commanded joint positions and velocities | rad, rad/s |
     | `observation.tcp_pose` | (7,) | tool centre point: position, quaternion wxyz | m |
     | `observation.wrench` | (6,) | force and torque on the robot at the TCP | N, Nm |
     | `observation.images.<camera>` | (h, w, 3) | RGB, one for each of `cameras` | 0 to 255 |
-    | `observation.images.tactile_left` | (h, w, 3) | RGB of the left fingertip, if `tactile` | 0 to 255 |
+    | `observation.images.tactile_left` | (h, w, 3) | RGB of the left fingertip (`tactile`) | 0 to 255 |
     | `observation.images.tactile_right` | (h, w, 3) | RGB of the right one | 0 to 255 |
 
     ## Reward
 
-    Progress of this tick minus progress of the tick before. Progress is in [0, 1], and 1 on success:
-    an episode's rewards sum to its last progress.
+    Progress of this tick minus progress of the tick before. Progress is in [0, 1], and 1 on
+    success: an episode's rewards sum to its last progress.
 
     ## Episode end
 
-    Terminated: success, or a failure (`failures()`). `over_force`: the force on the hand is above the
-    task's ceiling (`control/safety/task_ceilings.py`), at which `deploy` stops the arm. Truncated:
-    after `max_seconds`.
+    Terminated: success, or a failure (`failures()`). `over_force`: the force on the hand is above
+    the task's ceiling (`control/safety/task_ceilings.py`), at which `deploy` stops the arm.
+    Truncated: after `max_seconds`.
 
     ## Info
 
-    `truth.*` of `control/features.py`, known to a simulator alone: pad wrenches, contact, slip, object
-    pose, progress, success. Truth about the pads is as old as the tactile images.
+    `truth.*` of `control/features.py`, known to a simulator alone: pad wrenches, contact, slip,
+    object pose, progress, success. Truth about the pads is as old as the tactile images.
     """
 
     task: str  # its name in commands and episodes
@@ -236,7 +237,7 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         return self.kinematics.joint_change(self.command, twist * tick)
 
     def _run_tick(self, delta: np.ndarray, width: float, seconds: float) -> None:
-        """Run one tick's physics with interpolated set-points; end it where the force is too high."""
+        """Run a tick with interpolated set-points; end it where the force is too high."""
         setpoints = round(seconds / SETPOINT_PERIOD)
         steps = round(SETPOINT_PERIOD / self.model.opt.timestep)
         start = self.command
@@ -250,7 +251,7 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         self.update_contacts()
 
     def monitor_force(self, seconds: float) -> bool:
-        """Follow the force on the hand, `seconds` after the last call; return whether it is too high."""
+        """Update the force monitor `seconds` after the last call; return whether it trips."""
         self._force.update(self.contact_force(), seconds)
         return self._force.exceeded
 

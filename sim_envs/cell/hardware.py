@@ -99,10 +99,10 @@ class SimulatedHardware(ABC):
         return self._external
 
     def contact_force(self) -> Float[np.ndarray, "3"]:
-        """Return the contact force (N) on the robot in the last physics step, base frame; 0 if small.
+        """Return the robot's contact force (N) in the last step, base frame; 0 if small.
 
-        Reading contacts takes as long as a physics step, so they are read only where some joint bears more
-        than `_QUIET`.
+        Reading contacts takes as long as a physics step, so they are read only where some joint
+        bears more than `_QUIET`.
         """
         if np.abs(self.data.qfrc_constraint[self.arm_dofs]).max() < _QUIET:
             return np.zeros(3)

@@ -1,7 +1,7 @@
-"""A cell file with `arm = "sim"`: the simulated cell behind the drivers' interfaces, in this process.
+"""The simulated cell behind the drivers' interfaces, for cell files with `arm = "sim"`.
 
-The cell advances only while the control loop waits for its next tick, and stamps are simulated time:
-a run repeats exactly, on however slow a machine. It never runs faster than the wall clock.
+The cell advances only while the control loop waits for its next tick, and stamps are simulated
+time: a run repeats exactly, on however slow a machine. It never runs faster than the wall clock.
 """
 
 import time

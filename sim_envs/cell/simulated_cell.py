@@ -23,8 +23,8 @@ _TORQUE_FILTER_TIME = (
     0.02  # s, first order: how fast the arm's estimate of external torque follows; our choice
 )
 _YIELD_TIME = 0.02  # s, likewise: how fast an arm that was hit gives way; our choice
-# rad/s^2 of a reflex: four times what motions may use. At once, a wrist would be asked for more torque
-# than it has, and chatter between both ends of it for good.
+# rad/s^2 of a reflex, four times that of motions. An instant stop would saturate a wrist's torque and
+# make it chatter.
 _REFLEX_DECELERATION = 40.0
 
 _ERROR_STREAM = 1  # of random numbers, beside the seed
@@ -216,7 +216,7 @@ class SimulatedCell:
     def kinematics(
         self, q: Joints, offset: Float[np.ndarray, "3"]
     ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], Float[np.ndarray, "6 n"]]:
-        """Return position (m), rotation and Jacobian, base frame, of a point `offset` m from the TCP."""
+        """Return position (m), rotation and Jacobian of a point `offset` m from the TCP."""
         env, data = self.env, self._scratch
         data.qpos[env.arm_positions] = q
         mujoco.mj_kinematics(env.model, data)
@@ -297,7 +297,7 @@ class SimulatedCell:
 @njit(cache=True)
 @no_type_check
 def _extremes(q, dq, lower, upper, velocity):
-    """Return the largest excess over a joint's range (rad), share of its speed, and speed (rad/s)."""
+    """Return the largest excess over a joint's range (rad), share of its speed, speed (rad/s)."""
     excess, share, fastest = -np.inf, 0.0, 0.0
     for i in range(len(q)):
         excess = max(excess, lower[i] - q[i], q[i] - upper[i])

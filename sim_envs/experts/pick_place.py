@@ -55,7 +55,7 @@ class PickPlaceExpert:
         self._actions = self._run()
 
     def act(self, observation: Observation) -> np.ndarray:
-        """Return the action for the next tick, from ground truth; no motion once the plan is over."""
+        """Return the next action, from ground truth; no motion once the plan is over."""
         return next(self._actions)
 
     def _run(self) -> Iterator[np.ndarray]:
@@ -138,5 +138,5 @@ class PickPlaceExpert:
 
 
 def _minimum_jerk(s: float) -> float:
-    """Return the position along a rest-to-rest move at a share of its time (Flash and Hogan, 1985)."""
+    """Return the share of a rest-to-rest move at a share of its time (Flash and Hogan, 1985)."""
     return s**3 * (10 - 15 * s + 6 * s * s)

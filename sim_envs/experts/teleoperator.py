@@ -1,7 +1,7 @@
 """Keyboard teleoperation of the bead, as if guiding a compliant arm by hand.
 
-A key pushes the hand; the arm yields to the wire's forces on the bead. A person gives the direction,
-the wire the exact path.
+A key pushes the hand; the arm yields to the wire's forces on the bead. A person gives the
+direction, the wire the exact path.
 """
 
 import numpy as np
@@ -15,8 +15,8 @@ from touchgoal.sim_envs.config import TeleoperatorConfig
 STOP = " "
 HELP = "w/s on/back  a/d left/right  r/f up/down  j/l yaw  i/k pitch  u/o roll  space stop"
 
-# Of each axis of the hand (x along the wire, y to the right, z down): the key that pushes it or turns
-# it about the axis, and the one that does the opposite.
+# A pair an axis of the hand (x along the wire, y to the right, z down): the key that pushes the hand
+# along it or turns it about it, and the key that does the opposite.
 _PAIRS = ("ws", "da", "fr", "ou", "ik", "lj")
 _PUSHES = {
     key: sign * axis

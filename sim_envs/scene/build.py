@@ -1,4 +1,4 @@
-"""The MuJoCo scene: an FR3 or UR5e with a fingertip sensor on each finger, a table, cameras, objects.
+"""The MuJoCo scene: an arm with two fingertip sensors, a table, cameras, objects.
 
 Solver settings and their measured effects (creep of a held object, speed) are explained where they
 are set. World frame = the robot's base frame, table top at z = 0.
@@ -32,7 +32,7 @@ _STIFFNESS = {
 
 
 def robot_model() -> Path:
-    """Return the FR3's MJCF inside the franky-sim wheel, without importing it (it imports pinocchio)."""
+    """Return the FR3's MJCF in the franky-sim wheel, without importing it (and pinocchio)."""
     found = importlib.util.find_spec("franky_sim")
     if found is None or found.origin is None:
         raise UserError("the FR3 model is missing; run: pip install franky-sim")
@@ -305,7 +305,7 @@ def add_body(spec: mujoco.MjSpec, body: Body) -> None:
         # The object's contact parameters hold against gel and table alike.
         priority=1,
         condim=6 if rolls else 4,
-        # Torsion as a patch of 5 mm radius, a 10 N grasp's, bears it (8/15 of that, Hertz' pressure).
+        # Torsion of a patch of 5 mm radius, as of a 10 N grasp (8/15 of it: Hertz' pressure).
         friction=[kind.material.friction, 0.0025, 0.0005 if rolls else 0.0001],
         solref=[0.008 if soft else 0.004, 1],
         solimp=[0.95, 0.99, 0.001, 0.5, 2],
@@ -321,7 +321,7 @@ def _quaternion(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> list[float]:
 
 
 def _look(eye: list[float], target: list[float], up: list[float]) -> list[float]:
-    """Return the orientation of a camera at `eye` that looks at `target`, `up` upwards in its image."""
+    """Return the orientation of a camera at `eye` that looks at `target`, `up` upwards."""
     z = np.asarray(eye) - np.asarray(target)
     z = z / np.linalg.norm(z)
     x = np.cross(up, z)

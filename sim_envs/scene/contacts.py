@@ -90,7 +90,7 @@ class ContactReader:
         return (pad(0), pad(1)), wrenches[2]
 
     def joint_torque(self, data: mujoco.MjData) -> Float[np.ndarray, " nv"]:
-        """Return the generalised force of all contacts, J^T f; internal forces of the hand cancel out."""
+        """Return the generalised force of all contacts, J^T f; internal forces cancel."""
         contact = _IS_CONTACT[data.efc_type]
         jacobian = data.efc_J.reshape(-1, self._model.nv)
         return data.efc_force[contact] @ jacobian[contact]
@@ -143,7 +143,7 @@ def _read_contacts(contacts, forces, is_robot, pads, origins, moving):
     """Sum wrenches on left pad, right pad and robot; find the slip speed over each pad.
 
     Returns:
-        forces (N) and torques (N m) about the three origins, in the world frame (3, 6), and m/s (2).
+        forces (N) and torques (Nm) about the three origins, world frame (3, 6); m/s (2).
     """
     wrenches, slip = np.zeros((3, 6)), np.zeros(2)
     for i in range(contacts.addresses.size):
@@ -151,7 +151,7 @@ def _read_contacts(contacts, forces, is_robot, pads, origins, moving):
         address, point = contacts.addresses[i], contacts.points[i]
         if address < 0 or not (is_robot[first] or is_robot[second]):
             continue
-        # With elliptic cones the solver's rows are the first geom's wrench on the second, in the contact's frame.
+        # With elliptic cones the rows are the first geom's wrench on the second, contact frame.
         force, torque = np.zeros(3), np.zeros(3)
         for k in range(contacts.sizes[i]):
             axis = contacts.frames[i, 3 * (k % 3) : 3 * (k % 3) + 3]

@@ -18,12 +18,12 @@ _HEIGHT = 240  # px
 class SceneRecorder:
     """Films an environment after its reset: front camera left, both tactile images right.
 
-    The scene is drawn in a model of its own, so that the environment, its observations and its speed do
-    not change.
+    The scene is drawn in a model of its own, so that the environment, its observations and its
+    speed do not change.
     """
 
     def __init__(self, env: FrankaTactileEnv, meshes: Literal["fast", "full"] = "full") -> None:
-        """Film with the arm's full meshes and shadows, or 40 times faster (see `SceneConfig.meshes`)."""
+        """Film with full meshes and shadows, or 40 times faster (see `SceneConfig.meshes`)."""
         self._env = env
         spec = env.scene(replace(env.config, meshes=meshes))
         self._model = spec.compile()
@@ -33,7 +33,7 @@ class SceneRecorder:
         self._pictures: list[np.ndarray] = []
 
     def capture(self) -> None:
-        """Draw the environment as it is now; call it once a tick, of which every second is drawn."""
+        """Draw the environment; call it once a tick, of which every second is drawn."""
         self._ticks += 1
         if self._ticks % TICKS_PER_PICTURE != 1:
             return

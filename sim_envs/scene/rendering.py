@@ -15,7 +15,8 @@ _opened_in: int | None = None  # the process that first rendered; its forked chi
 class Renderer(mujoco.Renderer):
     """MuJoCo's renderer for one process; in a forked child it refuses to render.
 
-    Mesa draws with threads, which a fork does not copy: a lock that one of them held would stay locked.
+    Mesa draws with threads, which a fork does not copy: a lock that one of them held would stay
+    locked.
     """
 
     def __init__(self, model: mujoco.MjModel, height: int, width: int) -> None:

@@ -83,7 +83,7 @@ class Wire:
         return replace(self, points=self.points @ turn.T + position)
 
     def chords(self, sag: float, longest: float) -> Float[np.ndarray, "m 2 3"]:
-        """Return ends of straight pieces, at most `longest` m, that differ from the wire by `sag` m."""
+        """Return ends of straight pieces, at most `longest` m, within `sag` m of the wire."""
         lengths = np.minimum(np.sqrt(8 * sag / np.maximum(self.curvature, 1e-3)), longest)
         pieces = np.cumsum(STEP / lengths)  # how many pieces end before each point
         count = int(np.ceil(pieces[-1]))
@@ -109,7 +109,7 @@ class Wire:
 
 
 def make(family: Family, seed: int) -> Wire | None:
-    """Make the wire of a family and a seed; None if it is too tight, too steep or too close to itself."""
+    """Make the wire of a family and a seed; None if too tight, too steep or close to itself."""
     heading, pitch = _FAMILIES[family](np.random.default_rng([FAMILIES.index(family), seed]))
     heading = heading - 0.5 * (heading.min() + heading.max())
     if np.abs(pitch).max() > MAX_SLOPE or heading.max() > MAX_TURN:
@@ -184,7 +184,7 @@ def shape(wire: Wire) -> Float[np.ndarray, "n 3"]:
 
 
 def distance(one: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "m n 3"]) -> float:
-    """Return the RMS distance (m) of corresponding points to the nearest other wire, best turned about z."""
+    """Return the RMS point distance (m) to the nearest other wire, best turned about z."""
     a, b = one[:, 0] + 1j * one[:, 1], others[..., 0] + 1j * others[..., 1]
     # The best turn makes the sum of conj(a) b real and positive.
     flat = np.mean(np.abs(a) ** 2) + np.mean(np.abs(b) ** 2, axis=1)
@@ -244,7 +244,7 @@ _FAMILIES: dict[Family, Callable[[np.random.Generator], _Angles]] = {
 
 
 def _noise(rng: np.random.Generator, shortest: float, amplitude: float) -> np.ndarray:
-    """Draw a smooth function with waves of `shortest` m and longer, and largest value `amplitude`."""
+    """Draw a smooth function of waves of at least `shortest` m, with maximum `amplitude`."""
     total = np.zeros_like(_S)
     for k in range(1, int(LENGTH / shortest) + 1):
         wave = np.sin(np.pi * k * _S / LENGTH + rng.uniform(0, 2 * np.pi))

@@ -34,7 +34,7 @@ def deform(overlap: Fields, pitch: float, blur_sigmas: tuple[float, ...]) -> Fie
 
 
 def colour_change(surface: Fields, instance: SensorInstance) -> Float[Tensor, "b 3 h w"]:
-    """Return the colours (counts) that surfaces at half the image's resolution add to the untouched image."""
+    """Return the colours (counts) that surfaces add to the untouched image, half size."""
     calibration, pitch = instance.calibration, 2 * instance.pixel_pitch
     illumination, response, shadow = (
         torch.as_tensor(a, dtype=surface.dtype, device=surface.device)
@@ -64,7 +64,7 @@ def render(overlap: Fields, instance: SensorInstance) -> Float[Tensor, "b 3 h2 w
 def shadow_depth(
     surface: Fields, pitch: float, azimuths: tuple[float, ...], slope: float
 ) -> Float[Tensor, "b lights h w"]:
-    """Return the depth (m) of each point below the shadow line of each light, as `gel.shadow_depth`."""
+    """Return each point's depth (m) below each light's shadow line, as `gel.shadow_depth`."""
     scale = pixels_per_cell(pitch)
     low = F.avg_pool2d(surface, scale)
     third = torch.full((1, 3), 1 / 3).to(surface)[0]

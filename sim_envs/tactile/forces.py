@@ -1,8 +1,8 @@
 """Forces between a gel and an object, cell by cell: pressure, shear, stick and slip.
 
-Pressure follows from how the object sits in the gel (`press`). Shear is a brush model: every cell of the
-gel is a bristle whose tip sticks to the object until friction releases it; the object moves over the gel
-until the bristles carry the tangential force and torsion of MuJoCo's solver.
+Pressure follows from how the object sits in the gel (`press`). Shear is a brush model: every cell
+of the gel is a bristle whose tip sticks to the object until friction releases it; the object moves
+over the gel until the bristles carry the tangential force and torsion of MuJoCo's solver.
 
 Sensor frame as in `geometry`: x along columns, y along rows, z out of the gel; m, N, Nm, Pa.
 """
@@ -132,7 +132,7 @@ def _match_moments(normal, pitch, place, mx, my):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _bristles(normal, before, pitch, place, friction):
-    """Return each pressed cell's x, y from the centre of pressure, previous traction, friction limit.
+    """Return pressed cells: x, y from the centre of pressure, last traction, friction limit.
 
     Returns them with the centre of pressure and the load.
     """

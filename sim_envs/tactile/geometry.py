@@ -1,8 +1,8 @@
 """Height fields of objects over a gel: primitives by analytic rays, meshes by scan lines.
 
-Sensor frame: x along image columns, y along rows, z out of the gel, origin on the undeformed surface in
-the middle of the image; metres. A height field is the height of an object's near side above the
-undeformed surface, into the gel: positive where it penetrates.
+Sensor frame: x along image columns, y along rows, z out of the gel, origin on the undeformed
+surface in the middle of the image; metres. A height field is the height of an object's near side
+above the undeformed surface, into the gel: positive where it penetrates.
 """
 
 import math

@@ -64,7 +64,7 @@ def layer_compliance(
 def _responses(
     sensor: SensorModel, step: float, size: float, offset: Float[np.ndarray, "n m 2"]
 ) -> Float32[np.ndarray, "5 n m"]:
-    """Return the displacement (m) per N on a square of `size` m, averaged over such a square at an offset.
+    """Return displacements (m) per N on a square of `size` m, averaged over one at an offset.
 
     Of x per traction x; of x per traction y, which is that of y per traction x; of y per traction
     y; of x and of y per pressure. Sampled from a Fourier transform at `step` m.

@@ -1,7 +1,8 @@
 """Colours of a gel's surface in the sensor's camera.
 
-The colours follow from slopes and shadows by the sensor's calibration. They are computed at half the
-image's resolution and blended onto the sensor's background and noise. Heights are metres into the gel.
+The colours follow from slopes and shadows by the sensor's calibration. They are computed at half
+the image's resolution and blended onto the sensor's background and noise. Heights are metres into
+the gel.
 """
 
 from typing import no_type_check
@@ -81,7 +82,7 @@ def _colours(surface, per_pitch, response, limits, dark, shadow, gain, out):
 
 
 def colour_change(surface: HeightField, instance: SensorInstance) -> Float32[np.ndarray, "3 h w"]:
-    """Return the colours (counts) that a surface adds to the untouched image, at half its resolution."""
+    """Return the colours (counts) that a surface adds to the untouched image, half size."""
     calibration, pitch = instance.calibration, 2 * instance.pixel_pitch
     change = np.empty((3, *surface.shape), np.float32)
     limits = calibration.max_slope, calibration.max_depth

@@ -76,10 +76,10 @@ class TactileFrame:
 class TactilePad:
     """One fingertip's sensor in a compiled model.
 
-    The solver gives the pad's force and its place, geometry the contact's shape: objects are pushed into the
-    gel until an elastic foundation carries that force. Geometry is in the sensor's frame, which the case
-    carries, so that shear moves the contact in the image. Stick and slip have a memory: read frames in order
-    of time.
+    The solver gives the pad's force and its place, geometry the contact's shape: objects are pushed
+    into the gel until an elastic foundation carries that force. Geometry is in the sensor's frame,
+    which the case carries, so that shear moves the contact in the image. Stick and slip have a
+    memory: read frames in order of time.
     """
 
     def __init__(
@@ -154,7 +154,7 @@ class TactilePad:
         return max(float(self._model.geom_friction[geom, 0]) for geom in contact.geoms)
 
     def _modulus(self, material: Material) -> float:
-        """Return the modulus of gel and object in series: the softer one takes more of the overlap."""
+        """Return the modulus of gel and object in series."""
         return 1 / (1 / self._sensor.foundation_modulus + 1 / material.foundation_modulus)
 
     def _press(self, data: mujoco.MjData, contact: PadContact, touched: list[int]) -> Press:

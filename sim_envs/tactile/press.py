@@ -1,7 +1,7 @@
 """How an object sits in a gel: pushed in and tilted until pressure balances the solver's force.
 
-MuJoCo gives the force on a pad and its place; the object's height field gives the shape. Sensor frame as
-in `geometry`: x along columns, y along rows, z out of the gel; m, N, Nm, Pa.
+MuJoCo gives the force on a pad and its place; the object's height field gives the shape. Sensor
+frame as in `geometry`: x along columns, y along rows, z out of the gel; m, N, Nm, Pa.
 """
 
 import math
@@ -82,7 +82,7 @@ def solve3(a, b, c, d, e, f, u, v, w):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _shear(height, shift_x, shift_y, out):
-    """Shift the height field by (shift_x, shift_y) cells, interpolated; at outlines the nearest cell."""
+    """Shift the height field by cells, interpolated; at outlines the nearest cell."""
     rows, columns = height.shape
     one, none = np.float32(1.0), NO_SURFACE * np.float32(0.5)
     shift_x = min(max(shift_x, -1.0 * columns), columns - 1.0)
@@ -145,7 +145,7 @@ def _overlap_sums(height, top, xs, pitch, shift, a, b, total):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _push(height, top, xs, pitch, volume, shift, a, b, most, tolerance, total):
-    """Find the shift at which the overlap sums to `volume`, by Newton's steps on a convex function."""
+    """Find the shift at which the overlap sums to `volume`, by Newton's method."""
     for _ in range(60):
         _overlap_sums(height, top, xs, pitch, shift, a, b, total)
         error = total[6] - volume

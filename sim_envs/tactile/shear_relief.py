@@ -1,9 +1,9 @@
 """Rise and fall of a gel's surface where friction pulls along it.
 
-In front of an object drawn over a gel the surface piles up, behind it sinks: the trace of shear in images of
-a gel without printed dots. The gel is the elastic layer of `markers.layer_compliance`. A load there
-squeezes the surface aside by minus S times the pressure's gradient; by Betti's reciprocity the surface
-sinks by S times the traction's divergence.
+In front of an object drawn over a gel the surface piles up, behind it sinks: the trace of shear in
+images of a gel without printed dots. The gel is the elastic layer of `markers.layer_compliance`. A
+load there squeezes the surface aside by minus S times the pressure's gradient; by Betti's
+reciprocity the surface sinks by S times the traction's divergence.
 """
 
 import cv2
@@ -22,8 +22,8 @@ _RIM = 0.3e-3  # m: how softly the relief ends where an object holds the surface
 class ShearRelief:
     """Depth that a contact's shear adds to a gel's surface.
 
-    As in `markers.GelMotion` shear is scaled so that the patch moves, on the average over the pressure,
-    as far as MuJoCo's plate.
+    As in `markers.GelMotion` shear is scaled so that the patch moves, on the average over the
+    pressure, as far as MuJoCo's plate.
     """
 
     def __init__(self, sensor: SensorModel, gel: Grid, image: Grid) -> None:

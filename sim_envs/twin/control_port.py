@@ -1,33 +1,33 @@
 """One line-based port by which another process puts the twin's scene back, breaks the twin and asks
 for the truth.
 
-    truth                         what only a simulator knows, and where the arm is
-    hold                          let the time of a lock-step twin stand until this connection closes
-    advance STEPS DRIVEN COMMANDS let it go on by so many ms, once a client drives the arm if DRIVEN is
+    truth                         what only a simulator knows, and where the arm is hold
+    let the time of a lock-step twin stand until this connection closes advance STEPS DRIVEN
+    COMMANDS let it go on by so many ms, once a client drives the arm if DRIVEN is
                                   1, and once so many commands have come to the hand since `hold`
-    pictures                      how many of each stream are on their way, once all are that were due
-    reset SEED [OPTIONS]          put the scene, the arm and the open hand where an episode starts, and
+    pictures                      how many of each stream are on their way, once all are that were
+    due reset SEED [OPTIONS]          put the scene, the arm and the open hand where an episode
+    starts, and
                                   clear an error as a person does in Desk; OPTIONS is a JSON object
                                   of the task's
     freeze SECONDS                nothing passes between the arm (and its hand) and its clients, for
                                   so long simulated
-    drop                          hang up on the arm's clients
-    stop-button on|off            user stop of a Franka, emergency stop of a UR
-    error NAME                    stop the arm with an error, such as cartesian_reflex
-    nudge FX FY FZ SECONDS        push the hand, N in the base frame
+    drop                          hang up on the arm's clients stop-button on|off            user
+    stop of a Franka, emergency stop of a UR error NAME                    stop the arm with an
+    error, such as cartesian_reflex nudge FX FY FZ SECONDS        push the hand, N in the base frame
     stall|repeat|lose NAME SECONDS  a camera or sensor sends nothing, one picture, cuts clients off
-    break|halve NAME SECONDS      its JPEGs come with wrong bytes, or cut in half
-    silence-gripper on|off  a Franka Hand says nothing any more
-    jam-gripper WIDTH             the fingers close to WIDTH (m) and no further, until the next reset
-    take-object                   take the object of pick-and-place out of the hand, or from its place
-    nonsense on|off               the arm says that its joints' speeds are not numbers
-    garble NAME SHARE             a serial port's messages lose bytes
-    unplug|plug NAME              a serial port
-    kill                          end the twin's process at once, as kill -9 does
+    break|halve NAME SECONDS      its JPEGs come with wrong bytes, or cut in half silence-gripper
+    on|off  a Franka Hand says nothing any more jam-gripper WIDTH             the fingers close to
+    WIDTH (m) and no further, until the next reset take-object                   take the object of
+    pick-and-place out of the hand, or from its place nonsense on|off               the arm says
+    that its joints' speeds are not numbers garble NAME SHARE             a serial port's messages
+    lose bytes unplug|plug NAME              a serial port kill                          end the
+    twin's process at once, as kill -9 does
 
 Before each line goes the twin's token and a space; the cell file has it before the port's address
-(`token@host:port`). Every answer is one line of JSON; a mistake is {"error": ...}. Who says no token, or
-is a browser, is hung up on at the first line: no web page and no program on the network may break a twin.
+(`token@host:port`). Every answer is one line of JSON; a mistake is {"error": ...}. Who says no
+token, or is a browser, is hung up on at the first line: no web page and no program on the network
+may break a twin.
 
 From a shell: python -m touchgoal.sim_envs.twin.control_port runs/twin/cell.json stop-button on
 """

@@ -22,7 +22,7 @@ class Stream:
     """One stream of images.
 
     Attributes:
-        stalled, frozen, lost, broken, halved: until when (s, time.monotonic) nothing comes, one picture
+        stalled, frozen, lost, broken, halved: until when (time.monotonic) nothing comes, one image
             repeats, clients are cut off and turned away, JPEGs have wrong bytes or are cut in half.
         clients, count, sent: who watches; pictures published; pictures sent to the last who came.
     """

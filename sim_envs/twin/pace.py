@@ -20,7 +20,7 @@ class Pace:
 
     Attributes:
         ratios: simulated over wall time of each.
-        twin, pictures: processor s that each took of the twin's process and of that of its pictures.
+        twin, pictures: processor s of the twin's process and of its images' process.
     """
 
     def __init__(self) -> None:

@@ -1,7 +1,7 @@
 """The process that renders and serves a twin's images; physics and clients do not wait for it.
 
-It has a copy of the scene's model and follows the physics by its state. It ends when the twin closes its
-end of the pipe.
+It has a copy of the scene's model and follows the physics by its state. It ends when the twin
+closes its end of the pipe.
 """
 
 import signal
@@ -128,7 +128,8 @@ class PictureTaker:
 def serve(pipe: Connection) -> None:
     """Render images on request until the twin has gone.
 
-    The first message is an Address, answered by the port or an OSError. Each Moment is answered by a Progress.
+    The first message is an Address, answered by the port or an OSError. Each Moment is answered by
+    a Progress.
     """
     at: Address = pipe.recv()
     streams = {name: Stream() for name in at.names}

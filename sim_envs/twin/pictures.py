@@ -102,7 +102,7 @@ class Pictures:
         return self._progress.processor_time
 
     def set_fault(self, name: str, kind: str, seconds: float) -> None:
-        """Make a stream `stalled`, `frozen`, `lost`, `broken` or `halved`; KeyError if there is none."""
+        """Make a stream stalled, frozen, lost, broken or halved; KeyError if there is none."""
         if name not in self.rates or kind not in _FAULTS:
             raise KeyError(name)
         self._tell(Fault(name, kind, time.monotonic() + seconds))

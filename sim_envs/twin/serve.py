@@ -86,8 +86,8 @@ class Service(Protocol):
 class Twin:
     """The cell with its services, in one thread.
 
-    In real time the cell catches up with the clock. In lock-step it waits for the client that drives
-    the arm, and while a client holds the time (`lock_step.py`), for that.
+    In real time the cell catches up with the clock. In lock-step it waits for the client that
+    drives the arm, and while a client holds the time (`lock_step.py`), for that.
 
     Attributes:
         cell_config: where everything is, for whoever deploys on it.
@@ -218,8 +218,8 @@ def _cell_config(
 ) -> CellConfig:
     """Return the cell file's content for this twin.
 
-    In lock-step time goes as slowly as the machine needs: by the clock on the wall, which drivers go
-    by, the link may be silent for longer.
+    In lock-step time goes as slowly as the machine needs: by the clock on the wall, which drivers
+    go by, the link may be silent for longer.
     """
     cameras: dict[CameraName, CameraSection] = {}
     for name in get_args(CameraName):

@@ -85,7 +85,7 @@ def _scene(body: Body) -> mujoco.MjModel:
 
 
 def warm_up(bodies: list[Body], sensor: SensorModel) -> None:
-    """Press each body once and drag it: loading the compiled code of a touch takes up to a second."""
+    """Press and drag each body once, to load compiled code, which takes up to a second."""
     rng = np.random.default_rng(0)
     instance = sample_instance(sensor, rng)
     for body in bodies:

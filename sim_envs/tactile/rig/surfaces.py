@@ -1,7 +1,7 @@
 """Random surfaces: bodies and textures as height maps in metres.
 
-A surface is a body (flat, round, edged) with one or two textures. Textures are tiles that repeat; a press
-takes them anywhere, at any angle (`surface_press`).
+A surface is a body (flat, round, edged) with one or two textures. Textures are tiles that repeat; a
+press takes them anywhere, at any angle (`surface_press`).
 """
 
 from collections.abc import Callable

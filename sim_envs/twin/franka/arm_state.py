@@ -61,7 +61,7 @@ class ArmState:
         target, jacobian = end_effector(cell, ee, cell.q_d)
         fields["O_T_EE_d"][:] = fields["O_T_EE_c"][:] = target.T.ravel()
         fields["O_dP_EE_d"][:] = fields["O_dP_EE_c"][:] = jacobian @ cell.dq_d
-        # The maker's signs: what the robot does to the environment. `cell` has it the other way round.
+        # The maker's sign: the robot's wrench on the environment; `cell` has the opposite.
         sent = limits.estimate_sent(wrench, jacobian)
         fields["tau_ext_hat_filtered"][:] = -cell.tau_ext
         fields["O_F_ext_hat_K"][:] = sent

@@ -1,8 +1,8 @@
 """The arm's side of the Franka control interface, in front of the cell, for any libfranka client.
 
-Joint and Cartesian position and velocity motions, and torques; reflexes, limits and lost packets abort
-them with a real arm's errors. Not simulated: impedances set by the client (the servo keeps Franka's
-default), self-collision, guiding.
+Joint and Cartesian position and velocity motions, and torques; reflexes, limits and lost packets
+abort them with a real arm's errors. Not simulated: impedances set by the client (the servo keeps
+Franka's default), self-collision, guiding.
 """
 
 import time
@@ -26,8 +26,8 @@ _MAX_LOST_PACKETS = 20  # packets in a row after which the arm stops: Franka's d
 _POSITION, _VELOCITY, _POSE, _TWIST, _TORQUE = range(5)  # motion generators; 4 is none
 _EXTERNAL = 2  # controller: torque; the others are the robot's own
 _SETTERS = {*range(RobotCommand.SET_COLLISION_BEHAVIOUR, RobotCommand.SET_LOAD + 1)}
-# s between states while time stands: to a client that does not drive the arm, whose motion begins, that
-# drives it (libfranka gives up after 1 s).
+# s between states while time stands, to a client that does not drive the arm, whose motion begins,
+# that drives it (libfranka gives up after 1 s).
 _HELD_INTERVALS = 0.005, 0.02, 0.2
 _BRAKING = FR3.hardware.acceleration  # rad/s^2 of braking; a real reflex brakes harder
 
@@ -84,8 +84,9 @@ class FrankaArm:
     def hold(self) -> None:
         """Take the client's messages while time stands, and keep its connection alive.
 
-        A client that drives the arm is sent the last state again, which it has answered: to it, too,
-        no time passes. One that does not looks for new states; so does one whose motion begins.
+        A client that drives the arm is sent the last state again, which it has answered: to it,
+        too, no time passes. One that does not looks for new states; so does one whose motion
+        begins.
         """
         motion = self._take_messages()
         interval = _HELD_INTERVALS[0 if motion is None else 1 + motion.begun]

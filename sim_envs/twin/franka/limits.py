@@ -18,7 +18,7 @@ _TCP_SPEED, _TCP_TURN, _TORQUE_RATE = 3.0, 2.5, 1000.0
 TORQUE = np.array([87.0] * 4 + [12.0] * 3)  # N m
 _SLACK = 1.01  # for the wire's rounding
 _STEADY = 0.1  # rad/s^2: below it the thresholds for nominal motion hold
-# Least singular value of the Jacobian below which the arm gives no wrench; the maker's is unpublished.
+# Singular value of the Jacobian below which the arm gives no wrench; our choice.
 _SINGULAR = 0.02
 _DAMPING = 1e-8  # m^2: makes the wrench at a singular pose finite
 _NEVER_ZERO = 1e-6  # N: what a measured estimate differs from 0 by, with nothing touching
@@ -75,7 +75,7 @@ _SPEED = 1  # place of the last of them that holds for set-points in Cartesian s
 def _broken_limit(
     q, dq, ddq, ddq_before, lower, upper, velocity, acceleration, jerk, gain, below, above, offset
 ):
-    """Return the first of `_LIMITS` that any joint breaks, or -1. Speeds: `JointLimits.speed_range`."""
+    """Return the first of `_LIMITS` that a joint breaks, or -1; see `JointLimits.speed_range`."""
     worst = len(_LIMITS)
     for i in range(len(q)):
         up = np.sqrt(max(gain[i] * (above[i] - q[i]), 0.0)) - offset[i]
@@ -135,8 +135,8 @@ def _worst_of_arm(q, dq, lower, upper, velocity):
 def estimate_sent(wrench: Wrench, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
     """Return O_F_ext_hat_K for a wrench (N, Nm) of the environment on the robot.
 
-    libfranka, robot_state.h: what the robot applies to the environment is positive, and all is 0 near
-    or in a singularity.
+    libfranka, robot_state.h: what the robot applies to the environment is positive, and all is 0
+    near or in a singularity.
     """
     if _is_singular(jacobian):
         return np.zeros(6)
@@ -179,7 +179,7 @@ class Thresholds:
         return cls(*(np.full(n, 20.0) for n in (7, 7, 7, 7, 6, 6, 6, 6)))
 
     def judge(self, torque: Joints, wrench: Wrench, ddq: Joints) -> Contact:
-        """Compare an external torque (Nm) and wrench (N, Nm) with the thresholds at an acceleration."""
+        """Compare external torques (Nm) and a wrench (N, Nm) with the thresholds."""
         steady = max(ddq.max(), -ddq.min()) < _STEADY
         lower = self.lower_torque_nominal if steady else self.lower_torque_acceleration
         upper = self.upper_torque_nominal if steady else self.upper_torque_acceleration
@@ -211,7 +211,7 @@ def pseudo_inverse(jacobian: Float[np.ndarray, "6 7"]) -> Float[np.ndarray, "6 7
 @njit(cache=True)
 @no_type_check
 def wrench_behind(torque: Joints, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
-    """Return `pseudo_inverse(jacobian) @ torque`: the wrench (N, Nm) that best explains joint torques."""
+    """Return the wrench (N, Nm) that best explains joint torques (Nm)."""
     return np.linalg.solve(jacobian @ jacobian.T + _DAMPING * np.eye(6), jacobian @ torque)
 
 

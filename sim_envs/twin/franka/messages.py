@@ -216,7 +216,7 @@ class Link:
     """
 
     def __init__(self, host: str, port: int, version: int, wide: bool) -> None:
-        """`wide`: the arm's messages have a 4-byte command and a 1-byte status, the hand's 2 and 2."""
+        """`wide`: 4-byte command and 1-byte status (arm), else 2 and 2 (hand)."""
         self._version, self._wide = version, wide
         self._header = struct.Struct("<III" if wide else "<HII")
         self._status = struct.Struct("<B" if wide else "<H")

@@ -1,8 +1,9 @@
 """A UR controller in front of the cell, for ur-rtde's control, receive and dashboard clients.
 
 Simulated: RTDE, the dashboard's state, power and stop commands, the script port for ur-rtde's own
-control program (`program.py` lists its commands). Not simulated: other URScript, rtde_io, force mode,
-freedrive, speed scaling by safety, the primary and secondary interface (their ports accept and say nothing).
+control program (`program.py` lists its commands). Not simulated: other URScript, rtde_io, force
+mode, freedrive, speed scaling by safety, the primary and secondary interface (their ports accept
+and say nothing).
 """
 
 import re

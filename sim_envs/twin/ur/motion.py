@@ -149,7 +149,7 @@ class Servo:
 
 @dataclass
 class Speed:
-    """`speedj` or `speedl`: a constant joint speed (rad/s), or with a cell a TCP twist (m/s, rad/s)."""
+    """`speedj` or, with a cell, `speedl`: constant joint speed (rad/s) or twist (m/s, rad/s)."""
 
     goal: Joints
     acceleration: float
@@ -186,6 +186,6 @@ class Stop:
 def _joint_velocity(
     cell: SimulatedCell, q: Joints, twist: Float[np.ndarray, "6"], offset: Vector3
 ) -> Joints:
-    """Joint velocity (rad/s) for a twist (m/s, rad/s) of the point `offset` m from the hand's TCP."""
+    """Return the joint velocity (rad/s) for a twist of the point `offset` m from the TCP."""
     _, _, J = cell.kinematics(q, offset)
     return J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(6), twist)

@@ -1,10 +1,11 @@
 """The control program that ur-rtde uploads, executed command by command.
 
-The URScript itself is not interpreted. Arguments of a command lie in the input registers, answers in
-the output registers; output register 0 is 1 (ready for a command) or 2 (done). Simulated: moveJ, moveL,
-servoJ, servoL, speedJ, speedL, their stops, the watchdog, the TCP, kinematics, zeroFtSensor and
-protective stops. Payload and gains are accepted without effect. All else is refused: servoC, paths, force
-mode, freedrive, jogging, contact detection, joint torques, pose arithmetic, digital and analog outputs.
+The URScript itself is not interpreted. Arguments of a command lie in the input registers, answers
+in the output registers; output register 0 is 1 (ready for a command) or 2 (done). Simulated: moveJ,
+moveL, servoJ, servoL, speedJ, speedL, their stops, the watchdog, the TCP, kinematics, zeroFtSensor
+and protective stops. Payload and gains are accepted without effect. All else is refused: servoC,
+paths, force mode, freedrive, jogging, contact detection, joint torques, pose arithmetic, digital
+and analog outputs.
 """
 
 from collections.abc import Callable
@@ -139,8 +140,8 @@ class UrProgram:
     def _refuse(self, command: int) -> None:
         """Let ur-rtde's call fail while the program goes on.
 
-        The client gives up on a command when the program is reported as stopped. A call that reads no
-        answer gets a protective stop.
+        The client gives up on a command when the program is reported as stopped. A call that reads
+        no answer gets a protective stop.
         """
         print(f"REFUSED: the twin does not simulate ur-rtde's command {command}", flush=True)
         if command in _UNANSWERED:
@@ -157,8 +158,8 @@ class UrProgram:
     def report_done(self) -> None:
         """Report a client's own script, for which it would wait 300 s, as done.
 
-        The client then uploads the control program again; because that does not run within 5 s, its call
-        raises. A protective stop is what a UR does to a script that it cannot go on with.
+        The client then uploads the control program again; because that does not run within 5 s, its
+        call raises. A protective stop is what a UR does to a script that it cannot go on with.
         """
         self.ints[0] = _DONE
 
@@ -221,7 +222,7 @@ class UrProgram:
         return LineMove(self.cell, self._offset(), pose[:3], R, *self._pace())
 
     def _inverse(self, near: np.ndarray) -> Float[np.ndarray, "6"]:
-        """Joint positions for the pose in the registers; without a solution a UR stops its program."""
+        """Solve for the pose in the registers; without a solution a UR stops its program."""
         position, R = self._target(self._doubles(0))
         if (np.abs(position) < 2 * _REACH).all() and np.isfinite(R).all():
             solution = self._kinematics.solve_ik_near(position, R, near, posture=0.0)
