@@ -6,7 +6,7 @@ set-points in the same way.
 """
 
 from collections import deque
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -28,29 +28,12 @@ Joints = Float[np.ndarray, " n"]
 Value = TypeVar("Value")
 
 
-class _Drive(Protocol):
-    """Turns joint changes into set-points of the servo."""
-
-    def accept(self, delta: Joints) -> Joints:
-        """Return the target (rad) of a tick's joint change (rad)."""
-        ...
-
-    def set_target(self, target: Joints) -> None:
-        """Let a target arrive at the arm."""
-        ...
-
-    def step(self) -> Joints:
-        """Return the servo's set-point (rad) of the next millisecond."""
-        ...
-
-    @property
-    def command(self) -> Joints:
-        """Commanded joint positions, rad: the sum of all accepted changes."""
-        ...
-
-
 class _DirectDrive:
-    """Without deployment: a straight line to each target, within one tick."""
+    """Set-points without deployment: a straight line to each target, within one tick.
+
+    Attributes:
+        command: commanded joint positions, rad: the sum of all accepted changes.
+    """
 
     def __init__(self, start: Joints, limits: Float[np.ndarray, "n 2"], ticks: int) -> None:
         self.command, self._limits, self._ticks = start, limits, ticks
@@ -58,13 +41,16 @@ class _DirectDrive:
         self._left = 0
 
     def accept(self, delta: Joints) -> Joints:
+        """Return the target (rad) of a tick's joint change (rad)."""
         self.command = np.clip(self.command + delta, self._limits[:, 0], self._limits[:, 1])
         return self.command
 
     def set_target(self, target: Joints) -> None:
+        """Let a target arrive at the arm."""
         self._target, self._left = target, self._ticks
 
     def step(self) -> Joints:
+        """Return the servo's set-point (rad) of the next millisecond."""
         if self._left:
             self._now = self._now + (self._target - self._now) / self._left
             self._left -= 1
@@ -72,7 +58,7 @@ class _DirectDrive:
 
 
 class _TrackedDrive:
-    """As deployed: lag, safety layer, tracker, and an arm that follows its set-point at once."""
+    """Set-points as deployed: lag, safety layer, tracker, an arm without lag; see `_DirectDrive`."""
 
     def __init__(self, start: Joints, safety: ActionFilter) -> None:
         self._safety, self._state = safety, safety.start(start)
@@ -120,7 +106,9 @@ class DeployedArm:
         if between.tracker:
             # Set-points with feed-forward reach beyond the joints' range; the tracker keeps to it.
             env.model.actuator_ctrllimited[:n] = 0
-            self._drive: _Drive = _TrackedDrive(start, ActionFilter(env.robot, hz))
+            self._drive: _TrackedDrive | _DirectDrive = _TrackedDrive(
+                start, ActionFilter(env.robot, hz)
+            )
         else:
             limits = env.model.actuator_ctrlrange[:n]
             self._drive = _DirectDrive(start, limits, self._tick_ms)

@@ -40,7 +40,7 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
@@ -48,53 +48,25 @@ from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.twin_client import ask_twin
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
+from touchgoal.sim_envs.twin.franka.controller import FrankaArm
 from touchgoal.sim_envs.twin.lock_step import LockStep
 from touchgoal.sim_envs.twin.pictures import Pictures
 from touchgoal.sim_envs.twin.serial.devices import SerialPort
+from touchgoal.sim_envs.twin.service import Service
 from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort
+from touchgoal.sim_envs.twin.ur.controller import UrController
 
 _HTTP = re.compile(r" HTTP/\d")  # what any browser's first line ends in
 _STRONGEST_NUDGE = 500.0  # N
 
 
-@runtime_checkable
-class FaultyArm(Protocol):
-    """Faults of an arm's controller and its link."""
-
-    @property
-    def driven(self) -> bool:
-        """Whether a client drives the arm."""
-        ...
-
-    def clear_error(self) -> None:
-        """Clear an error, as a person does at the controller; the stop button stays as it is."""
-
-    def freeze(self, frozen: bool) -> None:
-        """Block or unblock both directions."""
-
-    def drop(self) -> None:
-        """Hang up on its clients."""
-
-    def stop_button(self, pressed: bool) -> None:
-        """Press or release the user's stop."""
-
-    def abort(self, error: str) -> None:
-        """Stop with an error; UserError if there is none of that name."""
-
-    def silence_gripper(self, silent: bool) -> None:
-        """Block or unblock the gripper alone."""
-
-    def set_nonsense(self, on: bool) -> None:
-        """Send NaN for joint speeds, or stop doing so."""
-
-
-class ControlPort:
+class ControlPort(Service):
     """Serves the commands above at a port of its own."""
 
     def __init__(
         self,
         cell: SimulatedCell,
-        arm: FaultyArm,
+        arm: FrankaArm | UrController,
         pictures: Pictures,
         ports: dict[str, SerialPort],
         host: str,
@@ -141,9 +113,6 @@ class ControlPort:
     def sockets(self) -> list[ListeningPort | ClientConnection]:
         """Sockets on which a command may arrive."""
         return [self._listener, *(client for client in self._listener.clients if client.open)]
-
-    def send(self) -> None:
-        """Do nothing: the port only answers."""
 
     def close(self) -> None:
         """Free the port."""

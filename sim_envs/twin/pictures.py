@@ -19,6 +19,7 @@ from touchgoal.sim_envs.twin.picture_process import (
     Progress,
     Scene,
 )
+from touchgoal.sim_envs.twin.service import Service
 
 CAMERA_RATE = 25  # Hz, as fingertips: more than a policy looks
 _START_TIMEOUT, _ANSWER_TIMEOUT, _END_TIMEOUT = 120.0, 60.0, 5.0  # s, on a machine however loaded
@@ -27,7 +28,7 @@ _PROGRAM = "from touchgoal.sim_envs.twin.picture_process import main; main()"
 _FAULTS = ("stalled", "frozen", "lost", "broken", "halved")
 
 
-class Pictures:
+class Pictures(Service):
     """Streams every camera and sensor of the cell at `http://host:port/NAME`, by `picture_process`.
 
     Attributes:
@@ -67,12 +68,6 @@ class Pictures:
     def addresses(self) -> dict[str, str]:
         """Return the address of each stream by its name."""
         return {name: f"http://{self._host}:{self._port}/{name}" for name in self.rates}
-
-    def receive(self) -> None:
-        """Do nothing: streams take no messages."""
-
-    def hold(self) -> None:
-        """Do nothing: no image is due while time stands."""
 
     def send(self) -> None:
         """Request the images that are due."""

@@ -4,7 +4,7 @@ import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol, get_args, runtime_checkable
+from typing import Literal, get_args
 
 from touchgoal.control.cell.config import (
     CameraName,
@@ -32,6 +32,7 @@ from touchgoal.sim_envs.twin.lock_step import LockStep
 from touchgoal.sim_envs.twin.pace import Pace
 from touchgoal.sim_envs.twin.pictures import CAMERA_RATE, Pictures
 from touchgoal.sim_envs.twin.serial import devices as serial_ports
+from touchgoal.sim_envs.twin.service import Service
 from touchgoal.sim_envs.twin.ur.controller import UrController
 
 _MAX_BACKLOG = 0.1  # s behind real time beyond which the twin stops trying to catch up
@@ -64,23 +65,6 @@ class TwinConfig:
     lock_step: bool
     folder: Path
     wrench_error: bool = True
-
-
-@runtime_checkable
-class Service(Protocol):
-    """A service for clients; its methods never block."""
-
-    def receive(self) -> None:
-        """Take client messages, before a physics step."""
-
-    def hold(self) -> None:
-        """Serve clients in place of a step, while a lock-step twin's time stands."""
-
-    def send(self) -> None:
-        """Answer clients, after a physics step."""
-
-    def close(self) -> None:
-        """Free ports and files."""
 
 
 class Twin:

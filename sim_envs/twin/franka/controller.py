@@ -21,6 +21,7 @@ from touchgoal.sim_envs.twin.franka.hand_frames import describe_hand
 from touchgoal.sim_envs.twin.franka.limits import Setpoint, Thresholds
 from touchgoal.sim_envs.twin.franka.messages import MoveStatus, RobotCommand, RobotMode
 from touchgoal.sim_envs.twin.franka.motion import Motion
+from touchgoal.sim_envs.twin.service import Service
 
 _MAX_LOST_PACKETS = 20  # packets in a row after which the arm stops: Franka's documentation
 _POSITION, _VELOCITY, _POSE, _TWIST, _TORQUE = range(5)  # motion generators; 4 is none
@@ -32,7 +33,7 @@ _HELD_INTERVALS = 0.005, 0.02, 0.2
 _BRAKING = FR3.hardware.acceleration  # rad/s^2 of braking; a real reflex brakes harder
 
 
-class FrankaArm:
+class FrankaArm(Service):
     """Serves an arm at `host`, port 1337.
 
     Attributes:

@@ -10,6 +10,7 @@ from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE
 from touchgoal.sim_envs.twin.franka import messages
 from touchgoal.sim_envs.twin.franka.messages import HandCommand, HandStatus
+from touchgoal.sim_envs.twin.service import Service
 
 _STILL = 1e-3  # m/s of width
 _SETTLED = 0.1  # s without motion after which a move is over
@@ -37,7 +38,7 @@ class Job:
     still: float = 0.0
 
 
-class FrankaHand:
+class FrankaHand(Service):
     """Serves the hand at `host`, port 1338.
 
     A grasp closes until something resists; closing on air fails, whatever width was expected.

@@ -11,6 +11,7 @@ from touchgoal.control.grippers import robotiq_registers as registers
 from touchgoal.control.sensors.load_cell import with_checksum
 from touchgoal.control.sensors.serial_port import modbus_crc
 from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
+from touchgoal.sim_envs.twin.service import Service
 
 _LOAD_RATE = 80  # Hz, an HX711's faster rate
 NEWTONS_PER_COUNT, ZERO = 2e-4, 84_213  # of the load cell; a bridge is never balanced
@@ -70,7 +71,7 @@ class SerialPort:
             pass
 
 
-class LoadCell:
+class LoadCell(Service):
     """A load cell under the table: lines `milliseconds,counts*CRC`, 80 a second.
 
     Force in N is `NEWTONS_PER_COUNT * (counts - ZERO)`; CRC is Modbus' CRC-16 of all bytes before
@@ -90,12 +91,6 @@ class LoadCell:
         self._rng = np.random.default_rng(1)
         self._milliseconds += -self._milliseconds % 1000  # a clock that goes back is a restart
 
-    def receive(self) -> None:
-        """Do nothing: a load cell takes no messages."""
-
-    def hold(self) -> None:
-        """Do nothing: no line is due while time stands."""
-
     def send(self) -> None:
         """Write a line if one is due."""
         self._milliseconds += 1
@@ -113,7 +108,7 @@ class LoadCell:
         self.port.unplug()
 
 
-class Robotiq:
+class Robotiq(Service):
     """A 2F gripper's Modbus registers in front of the cell's gripper; it begins activated.
 
     Position 3 is the tool's stroke between the pads, 230 is closed.

@@ -14,6 +14,7 @@ import numpy as np
 from touchgoal.control.safety.limits import UR5E
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
+from touchgoal.sim_envs.twin.service import Service
 from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort
 from touchgoal.sim_envs.twin.ur import messages
 from touchgoal.sim_envs.twin.ur.messages import Package, Safety
@@ -40,8 +41,8 @@ class Client:
         self.started = False
 
 
-class UrController:
-    """Serves a UR at `host`, on the ports every UR has.
+class UrController(Service):
+    """Serves a UR at `host`, on the ports of every UR; without lock-step, for clients answer no states.
 
     Attributes:
         frozen: nothing gets through in either direction.
@@ -92,9 +93,6 @@ class UrController:
                 self.cell.set_target(q, dq)
             else:
                 self.protective_stop()
-
-    def hold(self) -> None:
-        """Do nothing: a UR cannot run in lock-step, for its clients answer no states."""
 
     def send(self) -> None:
         """Look for collisions after a millisecond, and send data that is due."""

@@ -1,10 +1,10 @@
 """How a UR moves between commands: moves with trapezoidal speed, servo, speed, stop."""
 
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
+from ruckig import InputParameter, Ruckig, Trajectory
 
 from touchgoal.control.motion.rotations import rotation_matrix, rotation_vector
 from touchgoal.control.safety.braking import braked_velocity
@@ -19,51 +19,27 @@ Joints = Float[np.ndarray, "6"]
 Target = tuple[Joints, Joints]  # rad, rad/s
 
 
-@runtime_checkable
-class Activity(Protocol):
-    """One motion of the arm."""
-
-    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
-        """Return the next millisecond's target after the last one, under a speed slider."""
-        ...
-
-    @property
-    def done(self) -> bool:
-        """Whether the motion has ended."""
-        ...
-
-
-@dataclass
 class _Trapezoid:
-    """Distance covered at constant acceleration, speed, deceleration, from rest to rest."""
+    """Distance covered from rest to rest, at most at a speed and an acceleration."""
 
-    length: float
-    speed: float
-    acceleration: float
-    time: float = 0.0
-
-    def __post_init__(self) -> None:
-        # Too short a way for the full speed: a triangle.
-        self.speed = min(self.speed, np.sqrt(self.length * self.acceleration))
-        self.speed = max(self.speed, 1e-9)
-        self.duration = self.length / self.speed + self.speed / self.acceleration
+    def __init__(self, length: float, speed: float, acceleration: float) -> None:
+        self._length, self._time = max(length, 1e-9), 0.0
+        limits = InputParameter(1)
+        limits.target_position = [self._length]
+        limits.max_velocity, limits.max_acceleration = [speed], [acceleration]
+        self._trajectory = Trajectory(1)
+        Ruckig(1).calculate(limits, self._trajectory)
 
     def advance(self, dt: float) -> tuple[float, float]:
         """Return the share of the way after another `dt` s, and its rate (1/s)."""
-        self.time = min(self.time + dt, self.duration)
-        ramp, left = self.speed / self.acceleration, self.duration - self.time
-        if self.time < ramp:
-            way, rate = self.acceleration * self.time**2 / 2, self.acceleration * self.time
-        elif left > ramp:
-            way, rate = self.speed * (self.time - ramp / 2), self.speed
-        else:
-            way, rate = self.length - self.acceleration * left**2 / 2, self.acceleration * left
-        return way / max(self.length, 1e-12), rate / max(self.length, 1e-12)
+        self._time += dt
+        (way,), (rate,), _ = self._trajectory.at_time(self._time)
+        return way / self._length, rate / self._length
 
     @property
     def done(self) -> bool:
         """Whether the end is reached."""
-        return bool(self.time >= self.duration)
+        return self._time >= self._trajectory.duration
 
 
 class JointMove:
@@ -181,6 +157,9 @@ class Stop:
         dq = dq * (left / fastest if fastest > 0 else 0.0)
         self.done = left == 0.0
         return q + DT * dq, dq
+
+
+Activity = JointMove | LineMove | Servo | Speed | Stop
 
 
 def _joint_velocity(
