@@ -1,33 +1,30 @@
-"""One line-based port by which another process puts the twin's scene back, breaks the twin and asks
-for the truth.
+"""Control port of the twin: commands that reset the scene, inject faults and return the truth.
 
-    truth                         what only a simulator knows, and where the arm is hold
-    let the time of a lock-step twin stand until this connection closes advance STEPS DRIVEN
-    COMMANDS let it go on by so many ms, once a client drives the arm if DRIVEN is
-                                  1, and once so many commands have come to the hand since `hold`
-    pictures                      how many of each stream are on their way, once all are that were
-    due reset SEED [OPTIONS]          put the scene, the arm and the open hand where an episode
-    starts, and
-                                  clear an error as a person does in Desk; OPTIONS is a JSON object
-                                  of the task's
-    freeze SECONDS                nothing passes between the arm (and its hand) and its clients, for
-                                  so long simulated
-    drop                          hang up on the arm's clients stop-button on|off            user
-    stop of a Franka, emergency stop of a UR error NAME                    stop the arm with an
-    error, such as cartesian_reflex nudge FX FY FZ SECONDS        push the hand, N in the base frame
-    stall|repeat|lose NAME SECONDS  a camera or sensor sends nothing, one picture, cuts clients off
-    break|halve NAME SECONDS      its JPEGs come with wrong bytes, or cut in half silence-gripper
-    on|off  a Franka Hand says nothing any more jam-gripper WIDTH             the fingers close to
-    WIDTH (m) and no further, until the next reset take-object                   take the object of
-    pick-and-place out of the hand, or from its place nonsense on|off               the arm says
-    that its joints' speeds are not numbers garble NAME SHARE             a serial port's messages
-    lose bytes unplug|plug NAME              a serial port kill                          end the
-    twin's process at once, as kill -9 does
+    truth                           ground truth, and the state of arm and gripper
+    reset SEED [OPTIONS]            reset scene, arm and hand to an episode's start and clear errors;
+                                    OPTIONS: the task's reset options as a JSON object
+    hold                            stop a lock-step twin's time until this connection closes
+    advance STEPS DRIVEN COMMANDS   advance it by STEPS ms, once a client drives the arm (DRIVEN 1)
+                                    and the hand has received COMMANDS commands since `hold`
+    pictures                        number of images sent on each stream, once all due ones are
+    freeze SECONDS                  block arm and hand from their clients, for simulated SECONDS
+    drop                            close the arm's connections
+    stop-button on|off              user stop of a Franka, emergency stop of a UR
+    error NAME                      stop the arm with an error, such as cartesian_reflex
+    nonsense on|off                 report NaN as joint speeds
+    nudge FX FY FZ SECONDS          push the hand, N in the base frame
+    take-object                     remove the object of pick-and-place
+    silence-gripper on|off          block a Franka Hand's link
+    jam-gripper WIDTH               jam the fingers at WIDTH (m), until the next reset
+    stall|repeat|lose NAME SECONDS  stream: no image, one image, closed connections
+    break|halve NAME SECONDS        stream: JPEGs with wrong bytes, or cut in half
+    garble NAME SHARE               serial port: messages lose bytes
+    unplug|plug NAME                serial port
+    kill                            end the twin's process at once, as kill -9 does
 
-Before each line goes the twin's token and a space; the cell file has it before the port's address
-(`token@host:port`). Every answer is one line of JSON; a mistake is {"error": ...}. Who says no
-token, or is a browser, is hung up on at the first line: no web page and no program on the network
-may break a twin.
+A line begins with the twin's token and a space; the cell file has it before the port's address
+(`token@host:port`). Every answer is one line of JSON, an error {"error": ...}. A client without the
+token, or a browser, is disconnected at its first line: no web page may break a twin.
 
 From a shell: python -m touchgoal.sim_envs.twin.control_port runs/twin/cell.json stop-button on
 """
