@@ -20,9 +20,9 @@ from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance
 
 FRAMES = 5
-"""Of a clip, of which the first is untouched."""
-_UNEVEN = 0.1  # of the relief: fuzz and slubs
-_YARN = 0.06  # by which share the yarn of two pieces of a cloth differs, at most
+"""Frames of a clip; the first is untouched."""
+_UNEVEN = 0.1  # share of the relief that is fuzz and slubs
+_YARN = 0.06  # largest relative difference of yarn between pieces of a cloth
 _DEPTHS = (0.3e-3, 1.0e-3)  # m, at the end of a press
 _DRIFT = 0.15e-3  # m from one frame to the next, standard deviation
 
@@ -36,7 +36,6 @@ class Cloth:
     """One kind of cloth.
 
     Attributes:
-        name: of it.
         yarns: along and across the 25.6 mm of a tile.
         relief: from the lowest to the highest point, m.
         pattern: how its yarns lie.
@@ -128,7 +127,7 @@ def _woven(over: int, under: int, step: int, bundle: int = 1, turn_after: int = 
 
     Args:
         over, under: wefts.
-        step: by which the rule moves from one warp to the next.
+        step: shift of the rule from one warp to the next.
         bundle: yarns that go together.
         turn_after: wefts after which the diagonal turns back (herringbone); 0: never.
     """

@@ -124,7 +124,7 @@ LightChange = Annotated[tuple[BrightnessChange, ...], AfterValidator(_one_or_thr
 class DeploymentConfig:
     """Delays and dynamics of a real arm, drawn for each episode.
 
-    An option that is not given follows `--env.as-deployed`: as over the wire with it, none without.
+    Options not given follow `--env.as-deployed`: as over the wire with it, none without.
     """
 
     tracker: bool | None = None
@@ -161,8 +161,8 @@ IDEAL_DEPLOYMENT = DeploymentConfig(
     jitter=(0.0, 0.0),
     plan_ticks=(0,),
 )
-# Measured between `touchgoal deploy` and `touchgoal twin` (`touchgoal benchmark deploy`): states are
-# 7 to 18 ms old; commands take 20 to 25 ms with the tracker's lag; a plan is requested a tick early.
+# Measured between `touchgoal deploy` and `touchgoal twin` (`touchgoal benchmark deploy`): states
+# are 7 to 18 ms old; commands take 20 to 25 ms with the tracker's lag; plans come a tick late.
 # Cameras and fingertips: 25 to 30 frames a second (GelSight Mini and DIGIT data sheets).
 AS_DEPLOYED = DeploymentConfig(
     tracker=True,

@@ -28,16 +28,16 @@ FPS = 60
 FRICTION = 0.6
 """Coefficient that the experimenter takes for all strokes: the nominal friction cone."""
 FRICTION_SPREAD = 0.15
-"""By which share a stroke's own coefficient may differ: labels by the nominal cone err near it."""
+"""Largest relative deviation of a stroke's friction from `FRICTION`."""
 REST = 6
 """Untouched frames at the start of a stroke: one more than lie between frames of a pair."""
 MAX_SLIDE = 2e-3  # m
 _PLACES = 3e-3  # m from the middle of the picture, along x and y
 _PRESS_FRAMES = 8, 16
 _SLIDE_FRAMES = 12, 25
-_SLIDES = 0.5, 3.0  # of the way that friction holds
-_WOBBLE = 0.05  # of the load while sliding
-_TIP, _CONE, _OPENING = 0.3e-3, 4e-3, math.radians(120)  # of the sharp probe: m, m, rad
+_SLIDES = 0.5, 3.0  # slide as a multiple of the distance that friction holds
+_WOBBLE = 0.05  # relative change of the load while sliding
+_TIP, _CONE, _OPENING = 0.3e-3, 4e-3, math.radians(120)  # sharp probe: m, m, rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +49,9 @@ class Stroke:
         wrench: force (N) and torque (Nm) of the probe on the pad, sensor frame; pressed is -z.
         slip: whether the probe slides over the gel.
         field: tractions over the picture, kPa; see `field_on_picture.tractions`. Recordings of
-            strokes leave it out: whoever wants it simulates the stroke again.
+            strokes leave it out; simulate the stroke again for it.
         indenter: which probe.
-        load: that the press went up to, N.
+        load: largest normal load, N.
         friction: coefficient of this stroke.
     """
 
@@ -72,7 +72,7 @@ class Path:
         load: normal force, N; 0 is untouched.
         moved: how far the probe has been drawn since it touched, m.
         start: where it touches, m in the sensor's frame.
-        direction: of the slide, a unit vector.
+        direction: unit vector of the slide.
     """
 
     load: Float[np.ndarray, " t"]
@@ -128,7 +128,7 @@ def shear_force(
     Args:
         moved: how far the probe has been drawn, m.
         load: normal force, N.
-        stiffness: of the gel in shear, N/m.
+        stiffness: shear stiffness of the gel, N/m.
         friction: coefficient.
     """
     force, slides, slid = np.zeros(len(moved)), np.zeros(len(moved), bool), 0.0

@@ -35,7 +35,7 @@ from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_in
 HeldObject = Literal["bar", "can"]
 HELD: tuple[HeldObject, ...] = ("bar", "can")
 FRAMES = 60
-"""Of a slide, after the untouched ones."""
+"""Frames of a slide, after the untouched ones."""
 _SEGMENT = 6, 13  # frames of one velocity, least and one more than most
 _WINDOW = 5  # frames over which changes are drawn
 _SHIFTS, _TURNS = (0.03e-3, 8e-3), (math.radians(0.02), math.radians(4))  # least and most change
@@ -51,9 +51,9 @@ class Slide:
         frames: the sensor's pictures, RGB, of which the first `REST` are untouched.
         wrench: force (N) and torque (Nm) of the object on the pad, sensor frame.
         slip: whether it slides over the gel.
-        pose: of the object in the sensor frame: x and y (m), and its turn about z (rad).
+        pose: x and y (m) of the object in the sensor frame, and its turn about z (rad).
         held: name of the object.
-        load: with which it is held, N.
+        load: normal load, N.
     """
 
     frames: UInt8[np.ndarray, "t h w 3"]
@@ -131,8 +131,8 @@ def pulled(
     Args:
         places: x, y and, if it turns, the way along a ring of the patch's mean radius; its force is
             torsion over that radius.
-        stiffness: of the gel, N/m.
-        limit: that friction bears, N.
+        stiffness: shear stiffness of the gel, N/m.
+        limit: largest friction force, N.
     """
     rest = places[0].astype(float)
     force, slip = np.zeros(places.shape), np.zeros(len(places), bool)

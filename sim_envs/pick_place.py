@@ -16,7 +16,7 @@ from touchgoal.sim_envs.scene.objects import CATALOGUE, find, sample_body
 
 WORKSPACE = ((0.40, 0.60), (-0.20, 0.20))  # m, where objects start and goals lie, base frame
 _LIFTED = 0.03  # m above rest that counts as picked up
-_MOST_MISSES = 200  # draws too near to another place, before all are drawn anew
+_MOST_MISSES = 200  # draws too near to another place, before all are drawn again
 _APART = 0.12  # m at least between objects, and between start and goal
 
 

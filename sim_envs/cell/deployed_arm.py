@@ -58,7 +58,7 @@ class _DirectDrive:
 
 
 class _TrackedDrive:
-    """Set-points as deployed: lag, safety layer, tracker, an arm without lag; see `_DirectDrive`."""
+    """Set-points as deployed: lag, safety layer and tracker; see `_DirectDrive`."""
 
     def __init__(self, start: Joints, safety: ActionFilter) -> None:
         self._safety, self._state = safety, safety.start(start)
@@ -92,7 +92,7 @@ class DeployedArm:
 
     Attributes:
         plan_ticks: control ticks by which a learned policy's plans are late.
-        contacts: of the pads, when the images of the last observation were taken.
+        contacts: the pads' contacts at the time of the last observation's images.
     """
 
     def __init__(self, env: Any, between: DeploymentConfig, rng: np.random.Generator) -> None:

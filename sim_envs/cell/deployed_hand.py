@@ -16,7 +16,7 @@ class DeployedHand:
     """The hand in one episode, open and at rest at first.
 
     Attributes:
-        width: as last read, m.
+        width: last reading, m.
     """
 
     def __init__(self, env: Any, rng: np.random.Generator) -> None:

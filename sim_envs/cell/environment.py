@@ -51,8 +51,8 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
     | `observation.tcp_pose` | (7,) | tool centre point: position, quaternion wxyz | m |
     | `observation.wrench` | (6,) | force and torque on the robot at the TCP | N, Nm |
     | `observation.images.<camera>` | (h, w, 3) | RGB, one for each of `cameras` | 0 to 255 |
-    | `observation.images.tactile_left` | (h, w, 3) | RGB of the left fingertip (`tactile`) | 0 to 255 |
-    | `observation.images.tactile_right` | (h, w, 3) | RGB of the right one | 0 to 255 |
+    | `observation.images.tactile_left` | (h, w, 3) | RGB, left fingertip | 0 to 255 |
+    | `observation.images.tactile_right` | (h, w, 3) | RGB, right fingertip | 0 to 255 |
 
     ## Reward
 

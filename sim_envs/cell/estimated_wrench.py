@@ -17,7 +17,7 @@ Wrench = Float[np.ndarray, "6"]
 class WrenchError:
     """Noise, bias and drift of the estimate, drawn for one episode.
 
-    The sizes are guesses: no data sheet and no recording of an arm was at hand to check them by.
+    The sizes are guesses, not checked against an arm.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:

@@ -140,7 +140,7 @@ class SimulatedGripper:
         self._go(width)
 
     def stop(self, release_to: float | None = None) -> None:
-        """See Gripper: what is held goes on being pressed."""
+        """See Gripper; a held object stays pressed."""
         cell = self._cell
         if release_to is not None:
             self._go(release_to)

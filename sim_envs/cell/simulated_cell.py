@@ -23,11 +23,11 @@ _TORQUE_FILTER_TIME = (
     0.02  # s, first order: how fast the arm's estimate of external torque follows; our choice
 )
 _YIELD_TIME = 0.02  # s, likewise: how fast an arm that was hit gives way; our choice
-# rad/s^2 of a reflex, four times that of motions. An instant stop would saturate a wrist's torque and
-# make it chatter.
+# rad/s^2 of a reflex, four times that of motions. An instant stop would saturate a wrist's
+# torque and make it chatter.
 _REFLEX_DECELERATION = 40.0
 
-_ERROR_STREAM = 1  # of random numbers, beside the seed
+_ERROR_STREAM = 1  # random stream of the wrench error, beside the seed
 _NO_FORCE = np.zeros(3)
 
 Joints = Float[np.ndarray, " n"]

@@ -26,7 +26,7 @@ class Waypoint:
     """Target of a straight minimum-jerk move, fingers down, with the gripper at `width`.
 
     Attributes:
-        position: of the TCP at the end, m, base frame; None: stay.
+        position: TCP position at the end, m, base frame; None: stay.
         width: gripper target throughout, m.
         seconds: duration.
         until_supported: end early once the table carries the object.

@@ -32,10 +32,10 @@ _TURN = 1.0  # rad/s
 
 
 class FeedbackExpert:
-    """Picks and places from any state, whoever led the arm there.
+    """Picks and places from any state of arm and object.
 
     It follows a funnel over the object, and once it holds it, over the goal: the farther beside,
-    the higher. It yields to whatever it presses on. Its action depends on the start of the episode
+    the higher. It yields to contact. Its action depends on the start of the episode
     and on the sensed state of this tick and the last, so a policy with these observations can do
     the same. It does not follow a displaced object, and never lets go.
     """
@@ -50,7 +50,7 @@ class FeedbackExpert:
         self._width = env.width()
 
     def act(self, observation: Observation) -> Float[np.ndarray, " n"]:
-        """Return the next action, from ground truth; call it at every tick, whoever acts."""
+        """Return the next action, from ground truth; call it at every tick."""
         env, hz = self._env, self._env.config.control_hz
         (here, R), width = env.kinematics.forward(env.command), env.width()
         pace = (here - self._before) * hz

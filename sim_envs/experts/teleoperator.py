@@ -15,8 +15,8 @@ from touchgoal.sim_envs.config import TeleoperatorConfig
 STOP = " "
 HELP = "w/s on/back  a/d left/right  r/f up/down  j/l yaw  i/k pitch  u/o roll  space stop"
 
-# A pair an axis of the hand (x along the wire, y to the right, z down): the key that pushes the hand
-# along it or turns it about it, and the key that does the opposite.
+# A pair an axis of the hand (x along the wire, y to the right, z down): the key that pushes or turns
+# the hand, and the key that does the opposite.
 _PAIRS = ("ws", "da", "fr", "ou", "ik", "lj")
 _PUSHES = {
     key: sign * axis

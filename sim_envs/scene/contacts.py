@@ -22,9 +22,9 @@ class PadContact:
     """One pad's contact.
 
     Attributes:
-        force, torque: of the object on the pad, N and Nm, in the sensor frame about its origin;
+        force, torque: on the pad, N and Nm, in the sensor frame about its origin;
             a squeeze is a negative z force.
-        slip_speed: of the object over the pad, m/s, the fastest contact point.
+        slip_speed: speed of the fastest contact point over the pad, m/s.
         geoms: ids of the geoms that touch the pad.
     """
 

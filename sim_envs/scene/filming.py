@@ -58,6 +58,7 @@ def _beside(scene: np.ndarray, tactile: list[np.ndarray]) -> np.ndarray:
     column = []
     for name, image in zip(("left", "right"), tactile, strict=False):
         small = cv2.resize(image, (2 * _HEIGHT // 3, _HEIGHT // 2), interpolation=cv2.INTER_AREA)
-        cv2.putText(small, name, (5, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1, cv2.LINE_AA)  # fmt: skip
+        font, white = cv2.FONT_HERSHEY_SIMPLEX, (255, 255, 255)
+        cv2.putText(small, name, (5, 13), font, 0.4, white, 1, cv2.LINE_AA)
         column.append(small)
     return np.hstack([scene, np.vstack(column)]) if column else scene

@@ -31,8 +31,8 @@ class Material:
 
     Attributes:
         texture: its pattern.
-        amplitude: of the pattern, half of peak to peak, m.
-        wavelength: of the pattern, m.
+        amplitude: amplitude of the pattern, m.
+        wavelength: wavelength of the pattern, m.
         foundation_modulus: pressure per indentation, Pa/m; the gel's own is 3e8.
         friction: sliding friction coefficient against gel and table.
         rgba: colour.
@@ -64,7 +64,7 @@ class Body:
     """One object to put into a scene.
 
     Attributes:
-        kind: what it is.
+        kind: entry of the catalogue.
         size: half extents as MuJoCo takes them (box: xyz; cylinder and capsule: radius, half
             length; sphere: radius; mesh: scale of the unit hull), m.
         mass: kg.
@@ -107,7 +107,7 @@ def _read_catalogue() -> dict[str, ObjectKind]:
 
 CATALOGUE = _read_catalogue()
 
-# Ranges of half extents, m: what the hand can span (8 cm) and the case can get around on a table.
+# Ranges of half extents, m: within the hand's 8 cm, and tall enough for the sensor cases.
 _SIZES: dict[Shape, tuple[tuple[float, float], ...]] = {
     "box": ((0.015, 0.028), (0.014, 0.028), (0.022, 0.035)),
     "cylinder": ((0.014, 0.028), (0.022, 0.038)),

@@ -16,7 +16,7 @@ def over_picture(
     values: Float[np.ndarray, "h w"], field: ForceField, picture: Grid
 ) -> Float32[np.ndarray, "h2 w2"]:
     """Interpolate values on a field's cells onto a grid centred on the image; 0 beyond the gel."""
-    cells = field.pitch / picture.pitch  # of the picture, for one of the gel
+    cells = field.pitch / picture.pitch  # image cells per gel cell
     middle = np.array(values.shape[::-1]) / 2 - 0.5 - np.array(field.displacement[:2]) / field.pitch
     shift = middle - (np.array([picture.columns, picture.rows]) / 2 - 0.5) / cells
     to_cells = np.column_stack([np.eye(2) / cells, shift])
@@ -31,9 +31,9 @@ def tractions(
     """Return shear along x and y and pressure over an image, kPa, averaged over 24 x 24 cells.
 
     Args:
-        field: of the contact; None where nothing touches.
+        field: the contact's forces; None without contact.
         shape: rows and columns of the picture.
-        pitch: of its pixels, m.
+        pitch: m per pixel.
     """
     if field is None:
         return np.zeros((3, CELLS, CELLS), np.float32)

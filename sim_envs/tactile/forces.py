@@ -22,12 +22,12 @@ from touchgoal.sim_envs.tactile.press import Press, solve3
 INCIPIENT = 0.25  # share of the normal force whose cells slip
 # Not all: cells that a sliding object has just reached are not loaded yet, and carry up to 1 %.
 GROSS = 0.98
-_ON_CONE = 0.99  # of the friction limit
-_MAX_CORRECTION = 0.9  # of a cell's normal force
+_ON_CONE = 0.99  # share of the friction limit that counts as slip
+_MAX_CORRECTION = 0.9  # share of a cell's normal force
 # What beyond friction's reach keeps the bristles' motion finite, as a share of their stiffness. The
 # force comes first: torsion gives way where the patch cannot bear both.
 _REGULARIZATION, _REGULARIZATION_TORSION = 1e-5, 1e-3
-_FORCE_TOLERANCE = 1e-4  # of the friction limit
+_FORCE_TOLERANCE = 1e-4  # share of the friction limit
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class ForceField:
         tangential: N per cell, along the sensor's x and y.
         slipping: cells where the object slides: their traction lies on the friction cone.
         slip_fraction: share of the normal force that slipping cells carry.
-        pitch: of the cells, m.
-        displacement: of the whole gel from rest, (x, y, z) in m.
+        pitch: size of a cell, m.
+        displacement: (x, y, z) of the whole gel from rest, m.
     """
 
     normal: Float32[np.ndarray, "h w"]

@@ -181,7 +181,7 @@ def add_primitive(
 
     Args:
         kind: BOX, CYLINDER, SPHERE or CAPSULE.
-        position, rotation: of the primitive in the sensor frame.
+        position, rotation: pose of the primitive in the sensor frame.
         size: as MuJoCo takes it, m.
     """
     p, R, s = (np.asarray(a, np.float32) for a in (position, rotation, size))
@@ -253,7 +253,7 @@ def add_mesh(
     Args:
         vertices: in the mesh's frame, m.
         faces: corners of the triangles, counter-clockwise from outside.
-        position, rotation: of the mesh in the sensor frame.
+        position, rotation: pose of the mesh in the sensor frame.
     """
     pose = (np.asarray(a, np.float32) for a in (position, rotation))
     _add_mesh(height, np.float32(pitch), vertices, faces, *pose)

@@ -136,7 +136,7 @@ def _move(normal, tangential, responses, patch, stiffness, here, out):
 class GelMotion:
     """Displacement of points on a gel's surface under the forces of a contact.
 
-    MuJoCo's gel shears as one plate, whatever presses on it. So that the picture's markers move
+    MuJoCo's gel shears as one plate under any object. So that the image's markers move
     with the picture's contact, shear is scaled: a traction shaped like the pressure moves the
     patch, on the average over the pressure, as far as it moves the plate.
     """

@@ -48,7 +48,7 @@ class TactileFrame:
     """One sensor reading.
 
     Attributes:
-        image: what the camera sees, RGB.
+        image: camera image, RGB.
         surface: depth of the gel below its rest plane at half the image's resolution, m.
         overlap: how deep the object itself lies in the undeformed gel, m; zero where it does not
             touch.

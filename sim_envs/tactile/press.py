@@ -34,8 +34,8 @@ class Press:
         shift: how far it is pushed in, m, and
         tilt: its slope along x and y: `shift + tilt[0] x + tilt[1] y` is added to its height.
         pressure: on the gel's own cells, Pa; zero where nothing touches.
-        pitch: of the cells, m.
-        displacement: of the cells from their rest grid, centred on the sensor frame: (x, y, z) in
+        pitch: size of a cell, m.
+        displacement: of the cells from rest, centred on the sensor frame: (x, y, z) in
             m. The whole gel shears and sinks under the solver's force, as its plate does.
     """
 
@@ -238,10 +238,10 @@ def press_until_balanced(
     `TILT_STIFFNESS` let them.
 
     Args:
-        height: of the object over the whole gel, m; where it is all NO_SURFACE, nothing presses.
-        pitch: of its grid, m.
+        height: object height over the whole gel, m; all NO_SURFACE: nothing presses.
+        pitch: size of a cell, m.
         contact: the solver's, with a normal force above zero.
-        modulus: of gel and object in series, Pa/m.
+        modulus: foundation modulus of gel and object in series, Pa/m.
     """
     force, torque, normal = contact.force, contact.torque, contact.normal_force
     dx, dy = float(force[0]) / sensor.shear_stiffness, float(force[1]) / sensor.shear_stiffness

@@ -25,7 +25,7 @@ class SensorInstance:
     """One simulated sensor: its sensor file, varied as two of a model differ.
 
     Attributes:
-        calibration: what its lights make of its gel's shape.
+        calibration: colours of its gel's shapes.
         background: the untouched frame, RGB in STEPs.
         illumination: how strongly the light falls, per channel, at half the image's resolution.
         noise: tile of camera noise in STEPs, larger than the image by NOISE_MARGIN.

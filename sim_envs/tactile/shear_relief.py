@@ -45,8 +45,8 @@ class ShearRelief:
         """Return the depth (m) to add to the surface; none where the object itself holds it.
 
         Args:
-            field: of the contact.
-            overlap: of the object with the undeformed gel, on the image's grid.
+            field: the contact's forces.
+            overlap: object's overlap with the undeformed gel, on the image's grid.
         """
         relief = over_picture(self.depth(field), field, self._image)
         free = (overlap <= 0).astype(np.float32)
@@ -60,7 +60,7 @@ class ShearRelief:
             return np.zeros((h, w))
         pressure = np.fft.rfft2(field.normal / area, shape)
         yielding = np.fft.irfft2(self._give * pressure, shape)[:, :h, :w]
-        give = (yielding * field.normal).sum((1, 2))  # of the patch under unit-like traction
+        give = (yielding * field.normal).sum((1, 2))  # the patch's motion under unit traction
         scale = field.normal.sum() ** 2 / (self._stiffness * give)
         x, y = np.fft.rfft2(field.tangential * scale[:, None, None] / area, shape)
         spectrum = 1j * self._squeeze * (self._kx * x + self._ky * y)

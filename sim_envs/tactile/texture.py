@@ -111,7 +111,7 @@ def add_texture(
     shape without seams.
 
     Args:
-        position, rotation: of the object in the sensor frame.
+        position, rotation: pose of the object in the sensor frame.
     """
     if not material.texture or not material.amplitude:
         return

@@ -1,7 +1,7 @@
 """Control port of the twin: commands that reset the scene, inject faults and return the truth.
 
     truth                           ground truth, and the state of arm and gripper
-    reset SEED [OPTIONS]            reset scene, arm and hand to an episode's start and clear errors;
+    reset SEED [OPTIONS]            reset scene, arm and hand to an episode's start, clear errors;
                                     OPTIONS: the task's reset options as a JSON object
     hold                            stop a lock-step twin's time until this connection closes
     advance STEPS DRIVEN COMMANDS   advance it by STEPS ms, once a client drives the arm (DRIVEN 1)
@@ -53,7 +53,7 @@ from touchgoal.sim_envs.twin.service import Service
 from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort
 from touchgoal.sim_envs.twin.ur.controller import UrController
 
-_HTTP = re.compile(r" HTTP/\d")  # what any browser's first line ends in
+_HTTP = re.compile(r" HTTP/\d")  # end of a browser's first line
 _STRONGEST_NUDGE = 500.0  # N
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-_QUALITY = 95  # of JPEG; real GelSight Minis send MJPEG, too
+_QUALITY = 95  # JPEG; real GelSight Minis send MJPEG, too
 _JPEG_HEADER = 640  # bytes of OpenCV's
 _SENDING_TIMEOUT = 2.0  # s
 _POLL_INTERVAL = 0.2  # s between looks at whether the stream is to end

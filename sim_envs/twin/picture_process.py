@@ -20,7 +20,7 @@ from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
 from touchgoal.sim_envs.tactile.pad import TactilePad
 from touchgoal.sim_envs.twin.mjpeg import Stream, StreamServer
 
-STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # of the physics: all that a picture could depend on
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # all that an image may depend on
 _CAMERA_NOISE = 1.5  # counts: by it a driver tells a still scene from a frozen camera
 _TACTILE = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.TACTILE]
 
@@ -43,7 +43,7 @@ class Scene:
     Attributes:
         camera_size: rows and columns, px.
         pads: left and right fingertip; empty without them.
-        rng: of the fingertips' noise.
+        rng: draws the fingertips' noise.
     """
 
     model: mujoco.MjModel
@@ -58,9 +58,9 @@ class Moment:
 
     Attributes:
         due: names of the streams that are to have one.
-        state: of the physics (`STATE`).
-        contacts: of the left and right pad.
-        held: whether to answer when they are on their way to whoever watches, not before.
+        state: physics state (`STATE`).
+        contacts: left and right pad.
+        held: whether to answer only once the images are sent.
     """
 
     due: tuple[str, ...]
@@ -114,7 +114,7 @@ class PictureTaker:
         assert self._renderer is not None
         self._renderer.update_scene(self._data, name)
         picture = self._renderer.render()
-        # one field of noise, shifted: drawing anew takes longer than the picture
+        # One field of noise, shifted: drawing noise takes longer than rendering.
         shift = self._noise_rng.integers(0, picture.shape[:2])
         noise = np.roll(self._noise, shift, axis=(0, 1))
         return np.clip(picture + noise, 0, 255).astype(np.uint8)

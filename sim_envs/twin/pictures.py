@@ -44,7 +44,7 @@ class Pictures(Service):
         self.taken = self.left_out = 0
         env = cell.env
         self.rates: dict[str, int] = {}
-        if env.config.tactile:  # first: what is drawn later is later on its way
+        if env.config.tactile:  # first, because later images are sent later
             names = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.TACTILE]
             self.rates |= dict.fromkeys(names, round(env.sensor.frame_rate))
         self.rates |= dict.fromkeys(env.config.cameras, CAMERA_RATE)

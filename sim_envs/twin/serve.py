@@ -47,11 +47,11 @@ class TwinConfig:
     """Options of a twin.
 
     Attributes:
-        task: what the cell is for; its own `arm` is overruled by `arm`.
+        task: task of the cell; its `arm` is replaced by `arm`.
         arm: an FR3 with the Franka Hand, or a UR5e whose gripper talks as a Robotiq does.
-        seed: of the first episode.
+        seed: random seed of the first episode.
         host: loopback address of everything; twins at different ones run side by side.
-        port: of the pictures; the next one is the control port. 0: any that are free.
+        port: image port; the next one is the control port. 0: any that are free.
         lock_step: wait for the client that drives the arm, so that runs repeat.
         folder: where serial devices appear.
         wrench_error: the arm's estimate of force is as wrong as a real arm's.
@@ -74,8 +74,8 @@ class Twin:
     drives the arm, and while a client holds the time (`lock_step.py`), for that.
 
     Attributes:
-        cell_config: where everything is, for whoever deploys on it.
-        pace: of its time.
+        cell_config: content of the cell file.
+        pace: speed against the wall clock.
         pictures: its cameras and fingertips.
         stopped: set it to end `run`.
     """

@@ -1,4 +1,4 @@
-"""What the twin's loop calls on each of its services."""
+"""Interface between the twin's loop and its services."""
 
 
 class Service:

@@ -53,8 +53,8 @@ class PressBench:
         """Read the sensor.
 
         Args:
-            force: with which the body presses, N.
-            rng: of the camera's noise.
+            force: normal force, N.
+            rng: draws camera noise.
             shear: force along the sensor's x and y, N.
             centre: where the forces act, m in the sensor's frame, and
             depth: how far below the gel's rest plane, m.

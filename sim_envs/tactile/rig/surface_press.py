@@ -29,7 +29,7 @@ class SurfacePose:
         turn: about the gel's normal, rad.
         tilt: slopes along x and y, m per m.
         texture_at: which cell of the texture lies in the body's middle.
-        depth: of the highest point in the undeformed gel, m.
+        depth: depth of the highest point in the undeformed gel, m.
     """
 
     centre: tuple[float, float]
@@ -55,10 +55,10 @@ def overlap(
     """Return the depth of the surface in the undeformed gel, m; zero where it does not reach it.
 
     Args:
-        surface: what presses.
+        surface: the pressed surface.
         pose: how.
         shape: rows and columns of the grid, centred on the image.
-        pitch: of the grid, m.
+        pitch: size of a cell, m.
     """
     h, w = shape
     x = (np.arange(w, dtype=np.float32) - (w - 1) / 2) * np.float32(pitch)

@@ -29,7 +29,7 @@ class Surface:
     Attributes:
         body: its coarse shape where it meets the gel.
         size: radius of a ball or cylinder, half the width of a bar, m; of no meaning to the others.
-        slope: of what falls away beside an edge, bar or corner, m per m.
+        slope: slope beside an edge, bar or corner, m per m.
         texture: height added to the body, m.
         firmness: share of the overlap that indents the gel; the object takes the rest.
     """

@@ -283,7 +283,7 @@ class FrankaArm(Service):
             order = np.frombuffer(datagram, messages.ROBOT_ORDER, 1)[0]
             if (
                 self._echoed < int(order["message_id"]) < max(self._sent, 1)
-            ):  # of a state that was sent
+            ):  # answers a state that was sent
                 self._echoed = int(order["message_id"])
                 # Set-points that come after the arm has gone on without them are too old.
                 late = self._motion is not None and self._motion.lost > 0

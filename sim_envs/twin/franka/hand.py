@@ -41,7 +41,7 @@ class Job:
 class FrankaHand(Service):
     """Serves the hand at `host`, port 1338.
 
-    A grasp closes until something resists; closing on air fails, whatever width was expected.
+    A grasp closes until something resists; closing on air fails for every expected width.
 
     Attributes:
         commands, answers: how many commands have come, and how many were answered.
@@ -86,7 +86,7 @@ class FrankaHand(Service):
         """Abort the command in progress and forget the grasp."""
         self._grasped = False
         if self._job is not None:
-            self.link.answer(self._job.request, HandStatus.ABORTED)  # whoever asked is gone
+            self.link.answer(self._job.request, HandStatus.ABORTED)  # its client is gone
         self._job = None
         self._write_state()
 

@@ -21,7 +21,7 @@ _STEADY = 0.1  # rad/s^2: below it the thresholds for nominal motion hold
 # Singular value of the Jacobian below which the arm gives no wrench; our choice.
 _SINGULAR = 0.02
 _DAMPING = 1e-8  # m^2: makes the wrench at a singular pose finite
-_NEVER_ZERO = 1e-6  # N: what a measured estimate differs from 0 by, with nothing touching
+_NEVER_ZERO = 1e-6  # N: a measured estimate is never exactly 0
 
 
 _TAPER = FR3.hardware.taper
@@ -111,7 +111,7 @@ def torque_fault(before: Joints, now: Joints) -> str | None:
 
 
 def arm_fault(q: Joints, dq: Joints) -> str | None:
-    """Return a fault if the arm is beyond its range or speed, whoever drives it."""
+    """Return a fault if the arm is beyond its range or speed."""
     hardware = FR3.hardware
     place = _worst_of_arm(q, dq, hardware.lower, hardware.upper, hardware.velocity)
     return _ARM_FAULTS[place]
@@ -135,7 +135,7 @@ def _worst_of_arm(q, dq, lower, upper, velocity):
 def estimate_sent(wrench: Wrench, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
     """Return O_F_ext_hat_K for a wrench (N, Nm) of the environment on the robot.
 
-    libfranka, robot_state.h: what the robot applies to the environment is positive, and all is 0
+    libfranka, robot_state.h: the robot's wrench on the environment is positive; all is 0
     near or in a singularity.
     """
     if _is_singular(jacobian):

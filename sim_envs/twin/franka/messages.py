@@ -317,7 +317,7 @@ class Link:
         while len(self._unread) >= size:
             command, id, length = self._header.unpack_from(self._unread)
             if not size <= length <= _LONGEST:
-                self.drop()  # whatever speaks there, it is no libfranka
+                self.drop()  # not libfranka
                 return
             if len(self._unread) < length:
                 return

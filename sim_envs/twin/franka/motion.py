@@ -11,7 +11,7 @@ class Motion:
 
     Attributes:
         request: the Move command, answered when the motion ends.
-        generator, controller: what drives it.
+        generator, controller: numbers of the interface.
         begun: whether the client has sent a set-point.
         lost: milliseconds since the last one.
     """

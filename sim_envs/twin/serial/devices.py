@@ -14,7 +14,7 @@ from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 from touchgoal.sim_envs.twin.service import Service
 
 _LOAD_RATE = 80  # Hz, an HX711's faster rate
-NEWTONS_PER_COUNT, ZERO = 2e-4, 84_213  # of the load cell; a bridge is never balanced
+NEWTONS_PER_COUNT, ZERO = 2e-4, 84_213  # load cell; a bridge is never balanced
 _LOAD_NOISE = 25.0  # counts
 
 _STILL, _SETTLED = 1e-3, 0.05  # m/s, s

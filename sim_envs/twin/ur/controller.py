@@ -42,7 +42,7 @@ class Client:
 
 
 class UrController(Service):
-    """Serves a UR at `host`, on the ports of every UR; without lock-step, for clients answer no states.
+    """Serves a UR at `host`; without lock-step, because its clients answer no states.
 
     Attributes:
         frozen: nothing gets through in either direction.
