@@ -15,7 +15,7 @@ from touchgoal.sim_envs.config import TeleoperatorConfig
 STOP = " "
 HELP = "w/s on/back  a/d left/right  r/f up/down  j/l yaw  i/k pitch  u/o roll  space stop"
 
-# A pair an axis of the hand (x along the wire, y to the right, z down): the key that pushes or turns
+# A pair an axis of the hand (x along the wire, y right, z down): the key that pushes or turns
 # the hand, and the key that does the opposite.
 _PAIRS = ("ws", "da", "fr", "ou", "ik", "lj")
 _PUSHES = {
