@@ -31,12 +31,12 @@ ObjectName = Annotated[str, AfterValidator(lambda name: find_object(name).name)]
 """A name of the catalogue of objects."""
 WireName = Annotated[str, AfterValidator(lambda name: find_wire(name).name)]
 """A name such as helix-1."""
-Force = Annotated[float, Field(gt=0, le=40.0)]
+Force = Annotated[float, Field(gt=0, le=40.0, allow_inf_nan=False)]
 """N of each finger; the simulated gripper presses with 40 N at most."""
 ForceRange = Annotated[tuple[Force, Force], ORDERED]
-Mass = Annotated[float, Field(ge=0.001, le=3.0)]
+Mass = Annotated[float, Field(ge=0.001, le=3.0, allow_inf_nan=False)]
 """kg; lighter objects shake in the solver; 3 kg is the payload in the FR3 data sheet."""
-Friction = Annotated[float, Field(gt=0, le=2.0)]
+Friction = Annotated[float, Field(gt=0, le=2.0, allow_inf_nan=False)]
 MAX_CAMERA_SIDE = 1280
 """Rows or columns of the largest camera image, px."""
 Pixels = Annotated[int, Field(ge=16, le=MAX_CAMERA_SIDE, multiple_of=2)]
@@ -237,7 +237,7 @@ class PickPlaceConfig(EnvConfig):
     """Range of the object's mass, kg."""
     grasp_force: ForceRange = (5.0, 30.0)
     """Range of the force of each finger, N."""
-    tolerance: Annotated[float, Field(gt=0, le=0.1)] = 0.02
+    tolerance: Annotated[float, Field(gt=0, le=0.1, allow_inf_nan=False)] = 0.02
     """Largest distance of the placed object's centre from the goal, m."""
     release: bool = False
     """Success also requires that the hand lets go. The paper's reward curves end in touch, so by
