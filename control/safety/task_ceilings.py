@@ -1,7 +1,6 @@
 """Force ceilings of each task: above what its demonstrations reach, below the arm's reflex."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 _MARGIN = 1.5  # by which a ceiling lies above what demonstrations reach
 _MOST = 28.0  # N: the arm is stopped before it stops itself, an FR3 at 30 N (`arms/franka.py`)
@@ -40,7 +39,7 @@ class TaskForces:
 
 # By `touchgoal benchmark task-ceilings`: 60 episodes of pick-place, and 60 with --feedback; 29 of the maze with
 # the bead led astray at 4 mm/s, and for its indentation the first six without.
-TASK_FORCES: dict[Literal["pick-place", "bead-maze"], TaskForces] = {
+TASK_FORCES: dict[str, TaskForces] = {
     "pick-place": TaskForces(force=16.5, indentation=2.1e-3, episodes=120),
     "bead-maze": TaskForces(force=17.9, indentation=1.15e-3, episodes=29),
 }
