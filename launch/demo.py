@@ -76,7 +76,8 @@ def until_release(episode: "Episode") -> "Episode":
 
     There the object is placed and still touched, so that this tick is the goal of the touch, too.
     """
-    width, touched = episode.frames[ACTION][:, -1], episode.frames[TRUTH_CONTACT].any(axis=1)
+    width = episode.frames[ACTION][:, -1]
+    touched = episode.frames[TRUTH_CONTACT].max(axis=1)
     opens = [t for t in range(1, len(episode)) if width[t] > width[t - 1] and touched[t]]
     end = opens[0] + 1 if opens else len(episode)
     return replace(episode, frames={key: values[:end] for key, values in episode.frames.items()})

@@ -250,6 +250,7 @@ def test_what_is_returned_is_what_is_saved(tmp_path: Path) -> None:
         TRAIN, VAL, FakeTowers(), replace(CONFIG, epochs=1), tmp_path, {"data": "toy"}
     )
     saved = pretrained.load_encoder(tmp_path / "encoder", "gelsight_mini")
+    assert isinstance(saved, TouchEncoder)
     assert torch.equal(weights(saved), weights(encoder))
     provenance = pretrained.ENCODER_FORMAT.provenance(tmp_path / "encoder")
     assert (

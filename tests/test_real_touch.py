@@ -14,6 +14,7 @@ from touchgoal.benchmarks.real_touch.embedders import find_embedder
 from touchgoal.benchmarks.real_touch.force_onset import EmbeddedGrasp, cost_table, judge_cost
 from touchgoal.benchmarks.real_touch.videos import Config, embed_touch, read_touch, run
 from touchgoal.control.tactile.force import calibrate_force, change_statistics, resized
+from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.probes import property_probe
@@ -116,8 +117,10 @@ def test_adapting_says_what_it_needs(clips: Path, tmp_path: Path) -> None:
         main(["train-encoder", "adapt", "--data", str(clips), "--encoder", "gelsight_mini",
               "--out", str(tmp_path / "a")])  # fmt: skip
     one = [video for video in read_labelled_videos(clips) if video.path.stem.endswith("_0")]
+    surfaces = load_encoder("gelsight_mini_surfaces")
+    assert isinstance(surfaces, PooledEncoder)
     with pytest.raises(UserError, match="no object has two videos"):
-        adapt(load_encoder("gelsight_mini_surfaces"), one, 0.1, OfflineTowers())
+        adapt(surfaces, one, 0.1, OfflineTowers())
 
 
 def test_sentences_lie_where_what_they_tell_of_is_felt() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from killed import killed_in_epoch
+from interrupted_training import killed_in_epoch
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from toy_touches import SENSOR, moving_blobs
 

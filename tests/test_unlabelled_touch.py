@@ -99,7 +99,7 @@ def test_what_cannot_be_learned_from_together_is_one_line(tmp_path: Path) -> Non
 
 
 def test_a_preset_sets_defaults_that_options_override() -> None:
-    words = "dino --data x --preset paper --dino.epochs 3".split()
+    words = ["dino", "--data", "x", "--preset", "paper", "--dino.epochs", "3"]
     _, config = read_options("train-encoder", words)
     assert config.dino == replace(DINO_PRESETS["paper"], epochs=3)
     _, config = read_options("train-encoder", ["dino", "--data", "x"])

@@ -98,7 +98,7 @@ def run(config: Config) -> dict[str, Any]:
     embedder = EpisodeEmbedder(load_towers(encoder.towers or "offline"), encoder)
     with tempfile.TemporaryDirectory() as folder:
         tests = record_and_measure(
-            config, encoder.config.sensor, embedder, normalizer, Path(folder)
+            config, str(encoder.config.sensor), embedder, normalizer, Path(folder)
         )
     successes = [t for t in tests if t.outcome == "success"]
     claims = judge_claims(successes, [t for t in tests if t.outcome == "never_touch"])

@@ -177,9 +177,11 @@ class _Peer(nn.Module):
     def __init__(self, config: ViTConfig) -> None:
         super().__init__()
         patch = (config.patch_size, config.patch_size)
-        convolution = nn.Conv2d if config.tubelet == 1 else nn.Conv3d
-        size = patch if config.tubelet == 1 else (config.tubelet, *patch)
-        self.patch = convolution(config.channels, config.width, size, size)
+        if config.tubelet == 1:
+            self.patch = nn.Conv2d(config.channels, config.width, patch, patch)
+        else:
+            clip = (config.tubelet, *patch)
+            self.patch = nn.Conv3d(config.channels, config.width, clip, clip)
         layer = nn.TransformerEncoderLayer(
             config.width,
             config.heads,

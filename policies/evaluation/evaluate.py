@@ -9,9 +9,10 @@ From Python::
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from gymnasium.spaces import Box
 
 from touchgoal.control import features as ft
 from touchgoal.control.tactile.light_gain import LightWatch
@@ -160,7 +161,8 @@ def run_trial(config: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec) -> Tri
         force = np.linalg.norm(wrench[:, :3], axis=1)
         goal = env.goal if isinstance(env, PickPlace) else None
         away = None if goal is None else np.linalg.norm(last[ft.TRUTH_OBJECT_POSE][:2] - goal)
-        low, high = env.action_space.low - _TOLERANCE, env.action_space.high + _TOLERANCE
+        limits = cast(Box, env.action_space)
+        low, high = limits.low - _TOLERANCE, limits.high + _TOLERANCE
         return Trial(
             seed=spec.seed,
             success=bool(last[ft.TRUTH_SUCCESS][0]),
@@ -171,7 +173,7 @@ def run_trial(config: TaskConfig, policy: PolicyMaker, spec: EpisodeSpec) -> Tri
             peak_pad_force=float(np.abs(pads[:, [2, 8]]).max()),
             goal_distance=None if away is None else float(away),
             seconds=(len(rows) - 1) / config.control_hz,
-            clamped=float(((actions < low) | (actions > high)).any(1)[:-1].mean()),
+            clamped=float(np.any((actions < low) | (actions > high), axis=1)[:-1].mean()),
             light_change=light.change,
             episode=env.episode_info(),
         )

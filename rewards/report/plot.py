@@ -10,7 +10,9 @@ from matplotlib.figure import Figure
 from touchgoal.episodes.film import COLORS
 
 # Colours that colour-blind readers can tell apart; the dashes distinguish them in grey.
-COLOR = dict(zip(("image", "tactile", "text", "image+tactile", "image+text"), COLORS, strict=True))
+COLOR: dict[str, str] = dict(
+    zip(("image", "tactile", "text", "image+tactile", "image+text"), COLORS, strict=True)
+)
 DASHES = {
     "image": (0, (5, 2)),
     "tactile": (0, (1.5, 1.5)),
