@@ -223,4 +223,5 @@ def test_lock_step_repeats(fr3: RunningTwin) -> None:
         fr3.begin("reset 5")
         through_franky(two_moves, fr3)
         ends.append(fr3.ask("truth")["q"])
-    np.testing.assert_allclose(*ends, rtol=0, atol=1e-4)
+    # franky may begin a millisecond earlier or later
+    np.testing.assert_allclose(*ends, rtol=0, atol=5e-4)

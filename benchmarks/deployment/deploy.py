@@ -59,7 +59,7 @@ class Config(BenchmarkOptions):
 
 
 EXAMPLES = {"pick-place": "sim.toml", "bead-maze": "sim_maze.toml"}
-_CELLS = Path(__file__).parents[1] / "control" / "cell" / "examples"
+_CELLS = Path(__file__).parents[2] / "control" / "cell" / "examples"
 
 
 def run(config: Config) -> dict[str, Any]:
