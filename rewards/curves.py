@@ -13,9 +13,9 @@ Every curve has these properties:
 - potential-based reward of the step into frame t: F_t = gamma Phi_t - Phi_{t-1} with the state
   reward as potential Phi (Ng, Harada and Russell 1999). Added to a task's own reward with the same
   gamma, it leaves the best policy unchanged. F_0 = 0.
-- causal: the values of frame t depend only on frames up to t, with two exceptions that the reports
-  state: the background of a fingertip is the median of the first 5 frames, and a goal that is a
-  frame of the trajectory itself is known only when that frame is recorded.
+- causal: the values of frame t depend only on frames up to t, with two exceptions: the background of
+  a fingertip is the median of the first 5 frames, and a goal that is a frame of the trajectory itself
+  (`Curves.same_episode`, `goal_is_own_frame` in the JSON) is known only when that frame is recorded.
 """
 
 from collections.abc import Mapping

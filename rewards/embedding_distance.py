@@ -78,7 +78,7 @@ class EmbeddedEpisode:
     words: bool = True
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
         return self.touches().shape[1] if self.image is None else len(self.image)
 
     @property

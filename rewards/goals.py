@@ -28,13 +28,13 @@ from typing import ClassVar, Literal
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, UnidentifiedImageError
 
 from touchgoal.control.features import FRONT, TRUTH_CONTACT
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.rewards.metrics import START_FRAMES
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.picture_file import read_picture
 
 Modality = Literal["image", "tactile", "text"]
 MODALITIES: tuple[Modality, ...] = ("image", "tactile", "text")
@@ -110,19 +110,11 @@ class PictureFile:
         Raises:
             UserError: there is no such file, it is not an image, or it is too small.
         """
-        try:
-            with Image.open(self.path) as picture:
-                pixels = np.asarray(picture.convert("RGB"))
-        except FileNotFoundError:
-            raise UserError(f"goal image {self.path} does not exist") from None
-        except (
-            UnidentifiedImageError,
-            OSError,
-            ValueError,
-            SyntaxError,
-            Image.DecompressionBombError,
-        ):
-            raise UserError(f"goal image {self.path} cannot be read as an image") from None
+        pixels = read_picture(self.path)
+        if pixels is None and not self.path.exists():
+            raise UserError(f"goal image {self.path} does not exist")
+        if pixels is None:
+            raise UserError(f"goal image {self.path} cannot be read as an image")
         return _not_tiny(pixels, f"goal image {self.path}")
 
 

@@ -116,9 +116,12 @@ def test_curves_are_causal(embedder: EpisodeEmbedder) -> None:
 def test_contact_is_the_simulators_or_detected() -> None:
     episode = recorded()
     assert first_contact(episode) == Contact(7, "truth")
-    seen = {k: v for k, v in episode.frames.items() if k != TRUTH_CONTACT}
-    assert first_contact(replace(episode, frames=seen)) == Contact(7, "detected")
-    assert first_contact(replace(episode, frames={FRONT: seen[FRONT]})).label_source == "no touch"
+    without_truth = {k: v for k, v in episode.frames.items() if k != TRUTH_CONTACT}
+    assert first_contact(replace(episode, frames=without_truth)) == Contact(7, "detected")
+    assert (
+        first_contact(replace(episode, frames={FRONT: without_truth[FRONT]})).label_source
+        == "no touch"
+    )
 
 
 def test_episode_is_embedded_once_for_all_goals(embedder: EpisodeEmbedder) -> None:
@@ -188,8 +191,8 @@ def test_what_cannot_be_embedded_is_refused(embedder: EpisodeEmbedder) -> None:
     with pytest.raises(UserError, match="starts in contact"):
         embedder.embed_episode(recorded(contact=2), 20.0, "mine")
     touch_alone = {k: v for k, v in recorded().frames.items() if k != FRONT}
-    felt = embedder.embed_episode(replace(recorded(), frames=touch_alone), 20.0, "mine")
-    assert felt.modalities == ("tactile", "text") and len(felt) == 12
+    touched = embedder.embed_episode(replace(recorded(), frames=touch_alone), 20.0, "mine")
+    assert touched.modalities == ("tactile", "text") and len(touched) == 12
     other_camera = touch_alone | {WRIST: recorded().frames[FRONT]}
     with pytest.raises(UserError, match=f"choose --camera {WRIST}"):
         embedder.embed_episode(replace(recorded(), frames=other_camera), 20.0, "mine")

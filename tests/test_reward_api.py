@@ -116,7 +116,7 @@ def test_a_sentence_is_a_goal_for_pictures_with_towers_that_know_words() -> None
         ),
     ],
 )
-def test_mistakes_are_told_in_one_line(call: Callable[[], Any], message: str) -> None:
+def test_a_mistake_is_one_line(call: Callable[[], Any], message: str) -> None:
     with pytest.raises(UserError, match=message) as error:
         call()
     assert "\n" not in str(error.value)
@@ -182,7 +182,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["episodes", "--encoder", "nobody"], "there is no touch encoder 'nobody'"),
     ],
 )
-def test_told_before_any_encoder_is_loaded(
+def test_mistakes_are_found_before_any_encoder_is_loaded(
     run_folder: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
 ) -> None:
     def loaded(*_: Any) -> None:

@@ -60,7 +60,7 @@ def direction(degrees: Sequence[float] | Sequence[Sequence[float]] | np.ndarray)
 def embedded(name: str, touches: bool = True, jitter: float = 0.0) -> EmbeddedEpisode:
     rng = np.random.default_rng(len(name))
     held = np.arange(N) >= CONTACT if touches else np.zeros(N, bool)
-    felt = np.where(held, 30.0, 90.0) + jitter * rng.normal(size=(2, N))
+    angles = np.where(held, 30.0, 90.0) + jitter * rng.normal(size=(2, N))
     return EmbeddedEpisode(
         source=name,
         fps=20.0,
@@ -68,7 +68,7 @@ def embedded(name: str, touches: bool = True, jitter: float = 0.0) -> EmbeddedEp
         made_with=MADE,
         image=direction(np.linspace(90, 0, N) + jitter * rng.normal(size=N)),
         sides=(TACTILE_LEFT, TACTILE_RIGHT),
-        touch=direction(felt),
+        touch=direction(angles),
         descriptions=direction([60.0]),
         object="apple",
         success=touches,

@@ -65,42 +65,16 @@ def report_json(
         "contact": {"frame": curves.contact.frame, "label_source": curves.contact.label_source},
         "unit": curves.unit,
         "metrics": {name: m.as_dict() for name, m in curves.metrics().items()},
-        "cost": {
-            "definition": _COST_NORMALISED if curves.normalised else _COST_RAW,
-            "values": _rounded(curves.costs),
-        },
-        "state_reward": {
-            "definition": "-cost",
-            "range": "at most 0, about -1 at the usual start" if curves.normalised else "-2 to 0",
-            "values": _rounded(curves.rewards),
-        },
+        "cost": {"values": _rounded(curves.costs)},
+        "state_reward": {"definition": "-cost", "values": _rounded(curves.rewards)},
         "potential_reward": {
             "definition": "gamma * Phi(frame) - Phi(frame before), Phi = -cost; 0 at frame 0",
             "gamma": gamma,
             "values": _rounded(curves.potential_rewards(gamma)),
         },
-        "causal": _causality(curves),
+        "goal_is_own_frame": sorted(curves.same_episode),
         "provenance": dict(provenance),
     }
-
-
-_COST_NORMALISED = (
-    "0 as near the goal as successful episodes usually end, or nearer; 1 where they usually start"
-)
-_COST_RAW = (
-    "cosine distance 1 - cos between embeddings, 0 to 2; no normalizer was fitted on such data"
-)
-
-
-def _causality(curves: Curves) -> str:
-    """Return which frames the value of a frame depends on."""
-    says = "a frame's values depend on no later frame"
-    if {"tactile", "text"} & curves.raw.keys():
-        says += "; the untouched fingertips are the median of the first 5 frames"
-    if curves.same_episode:
-        named = " and ".join(sorted(curves.same_episode))
-        says += f"; but the goal of {named} is a frame of this trajectory, known at its end alone"
-    return says
 
 
 def _rounded(curves: Mapping[str, np.ndarray]) -> dict[str, list[float]]:
