@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.transforms import Bbox
+from matplotlib.transforms import BboxBase
 from PIL import Image
 
 from touchgoal.control.features import TRUTH_PROGRESS
@@ -66,7 +66,7 @@ def caption_of(episode: Episode) -> str:
 
 def _draw_panel(
     height: int, curves: Mapping[str, np.ndarray], control_hz: int, end: float, label: str
-) -> tuple[np.ndarray, Bbox]:
+) -> tuple[np.ndarray, BboxBase]:
     """Return an image of all curves up to `end` (s), and the box of its axes (px)."""
     figure = Figure(figsize=(_PANEL / _DPI, height / _DPI), dpi=_DPI)
     axes = figure.add_axes((0.16, 0.17, 0.8, 0.66))
@@ -83,7 +83,7 @@ def _draw_panel(
     return np.asarray(Image.open(png).convert("RGB")), axes.get_window_extent()
 
 
-def _up_to(panel: np.ndarray, box: Bbox, share: float) -> np.ndarray:
+def _up_to(panel: np.ndarray, box: BboxBase, share: float) -> np.ndarray:
     """Return the panel with the future faded and a line at the present, a share of the time axis."""
     shown = panel.copy()
     column = round(box.x0 + share * (box.x1 - box.x0))

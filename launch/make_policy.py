@@ -22,9 +22,7 @@ RECIPE = "recipe.json"
 _DEPLOYED = shlex.split(
     "--env.as-deployed --env.deployment.state-delay 0 0.05 --env.deployment.picture-delay 0 0.08 "
     "--env.deployment.command-delay 0 0.04 --env.deployment.jitter 0 0.03 "
-    "--env.deployment.plan-ticks 0 1 1 2 "
-    # Beyond the ceiling the expert demonstrates how to give way.
-    "--env.deployment.force-ceiling False"
+    "--env.deployment.plan-ticks 0 1 1 2"
 )
 # The policy is trained on the simulator's truth, so these episodes need no images.
 _NO_IMAGES = ["--env.no-tactile", "--env.cameras"]
