@@ -50,7 +50,7 @@ class LearnedPolicy:
         directory: where it was read from; None if it never was on disk.
         plan_ticks: control ticks from an observation to its plan. The next plan is asked for so much
             earlier, and its actions for the ticks that have gone by are left out.
-        ticks_seen: number of observations that `plan` takes: the network's own, and those before
+        history_ticks: number of observations that `plan` takes: the network's own, and those before
             them that the touch encoder looks back to.
     """
 
@@ -86,7 +86,7 @@ class LearnedPolicy:
         self._network, self.touch, self._estimator = network, touch, estimator
         self.plan_ticks, self.directory = plan_ticks, directory
         self._check_delay(plan_ticks)
-        self.ticks_seen = config.observation_horizon + (touch.reach if touch else 0)
+        self.history_ticks = config.observation_horizon + (touch.reach if touch else 0)
         self.reset()
 
     def __repr__(self) -> str:
@@ -109,7 +109,7 @@ class LearnedPolicy:
     def act(self, observation: Observation) -> Float32[np.ndarray, "8"]:
         """Return the action (`features.ACTION`) for the next tick."""
         horizon, first = self.config.execution_horizon, not self._recent
-        before = self._recent or [observation] * self.ticks_seen
+        before = self._recent or [observation] * self.history_ticks
         self._recent = [*before[1:], observation]
         if first:
             self._todo = list(self.plan(self._recent)[:horizon])
@@ -125,30 +125,30 @@ class LearnedPolicy:
         if not self._todo:
             self._todo, self._next = self._next, []
 
-    def plan(self, seen: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]:
+    def plan(self, history: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]:
         """Return actions from the latest observation on.
 
         Args:
-            seen: the last `ticks_seen` observations, oldest first. The oldest one of an episode's
+            history: the last `history_ticks` observations, oldest first. The oldest one of an episode's
                 first call is its first observation, untouched.
         """
         with one_thread():
-            self.embed(seen)
+            self.embed(history)
             _, touch, state = zip(*self._embedded, strict=True)
             touch, state = (torch.from_numpy(np.stack(x)).float()[None] for x in (touch, state))
-            batch = ObservationBatch(touch, state, self._difference_images(seen[-1]))
+            batch = ObservationBatch(touch, state, self._difference_images(history[-1]))
             return self._network.plan(batch, self._generator)[0].numpy()
 
-    def embed(self, seen: Sequence[Observation]) -> None:
+    def embed(self, history: Sequence[Observation]) -> None:
         """Embed observations ahead of a `plan` that begins with some of them: most of the work."""
-        self._first = self._first or seen[0]
-        ends = range(len(seen) - self.config.observation_horizon + 1, len(seen) + 1)
+        self._first = self._first or history[0]
+        ends = range(len(history) - self.config.observation_horizon + 1, len(history) + 1)
         with one_thread():
-            self._embedded = [(seen[end - 1], *self._embed_tick(seen[:end])) for end in ends]
+            self._embedded = [(history[end - 1], *self._embed_tick(history[:end])) for end in ends]
 
-    def _embed_tick(self, seen: Sequence[Observation]) -> tuple[np.ndarray, np.ndarray]:
+    def _embed_tick(self, history: Sequence[Observation]) -> tuple[np.ndarray, np.ndarray]:
         """Return the touch embedding (e,) and the proprioception (s,) of the latest tick."""
-        observation = seen[-1]
+        observation = history[-1]
         for before, touch, state in self._embedded:
             if before is observation:
                 return touch, state
@@ -158,12 +158,12 @@ class LearnedPolicy:
         if ft.WRENCH in self.config.proprioception:
             known[ft.WRENCH] = tare(observation[ft.WRENCH], self._first[ft.WRENCH])
         state = np.concatenate([known[key] for key in self.config.proprioception])
-        return self._embed_touch(seen), state
+        return self._embed_touch(history), state
 
-    def _embed_touch(self, seen: Sequence[Observation]) -> Float32[np.ndarray, " e"]:
+    def _embed_touch(self, history: Sequence[Observation]) -> Float32[np.ndarray, " e"]:
         if self.touch is None:
             return np.empty(0, np.float32)
-        return self.touch.embed_tick(seen, self._first)
+        return self.touch.embed_tick(history, self._first)
 
     def _difference_images(self, observation: Observation) -> UInt8[Tensor, "1 k h w 3"] | None:
         end_to_end = self.config.end_to_end

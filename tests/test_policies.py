@@ -9,16 +9,20 @@ import pytest
 import torch
 
 from touchgoal.control import features as ft
+from touchgoal.encoders.training.run import open_training
 from touchgoal.encoders.training.weights import WeightsFormat
+from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.recording import EpisodeSpec, collect, episode_specs
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.launch import train_policy
 from touchgoal.launch.__main__ import main
 from touchgoal.policies import checkpoint
 from touchgoal.policies.by_name import prepare_policy
-from touchgoal.policies.checkpoint import load_policy
+from touchgoal.policies.checkpoint import SHIPPED_POLICIES, load_policy
 from touchgoal.policies.evaluation import evaluate as evaluation
-from touchgoal.policies.evaluation.evaluate import evaluate, run_trials
+from touchgoal.policies.evaluation.evaluate import evaluate, run_trials, trial_specs
+from touchgoal.policies.evaluation.report import film_trials
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.evaluation.table import table
 from touchgoal.policies.training.training_data import (
@@ -27,6 +31,9 @@ from touchgoal.policies.training.training_data import (
     find_task,
 )
 from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.folder_lock import FolderLock
+from touchgoal.runtime.provenance import portable
+from touchgoal.runtime.run_folder import release_runs
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.tasks import make_env
@@ -194,6 +201,7 @@ def test_every_outcome_meets_every_object() -> None:
     assert len(specs) == 9 == len(met) and len({spec.seed for spec in specs}) == 9
 
 
+BLIND_ENV = PickPlaceConfig(cameras=(), tactile=False, max_seconds=0.5)
 BLIND = ("--env.objects", "glass_ball", "--env.no-tactile", "--env.cameras", "--workers", "1")
 
 
@@ -271,3 +279,31 @@ def test_only_what_is_known_to_be_good_is_learned_from(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="more than one task"):
         find_task([(episodes, [0]), (arm, [0])], None)
     assert common_sensor([(arm, [0])]) == "digit"
+
+
+def test_two_trainings_do_not_share_a_folder(tmp_path: Path) -> None:
+    config = train_policy.Config(data=tmp_path / "a", validation=tmp_path / "b", out=tmp_path)
+    held = FolderLock(tmp_path)
+    with pytest.raises(UserError, match="another command is writing into"):
+        open_training(config, "train-policy")
+    held.release()
+    open_training(config, "train-policy")
+    release_runs()
+
+
+def test_shipped_records_name_no_folder_of_a_machine() -> None:
+    records = list(SHIPPED_POLICIES["pick-place"].parent.rglob("*.json"))
+    assert len(records) == 5
+    for path in records:
+        record = json.loads(path.read_text())
+        assert portable(record) == record
+
+
+def test_the_films_show_the_trials(tmp_path: Path) -> None:
+    """The same images are rendered, so the same random numbers are drawn."""
+    config, specs = BLIND_ENV, trial_specs(BLIND_ENV, 2, 5)
+    trials = list(run_trials(config, PickPlaceExpert, specs, workers=1))
+    film_trials(tmp_path, config, specs, trials, PickPlaceExpert, workers=1)
+    frames, fps = read_frames(tmp_path / "worst.mp4")
+    assert fps == 10 and len(frames) == 6
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["best.mp4", "worst.mp4"]

@@ -291,7 +291,7 @@ class HangingPlanner:
     config = PolicyConfig(
         touch_dim=0, touch="", observation_horizon=1, execution_horizon=8, prediction_horizon=16
     )
-    ticks_seen = 1
+    history_ticks = 1
 
     def __init__(self, width: float, mark_broken: Callable[[], None]) -> None:
         self._width, self._mark_broken, self._plans = width, mark_broken, 0

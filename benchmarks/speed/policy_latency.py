@@ -106,7 +106,7 @@ def _stages(config: Config) -> list[Stage]:
     stages.append(
         _time("denoising", config.repeats, lambda: policy.head.sample(condition, generator))
     )
-    turn, horizon = iter(range(10**9)), planner.ticks_seen
+    turn, horizon = iter(range(10**9)), planner.history_ticks
 
     def tick() -> None:
         i = next(turn)

@@ -52,7 +52,7 @@ class ChunkPlanner(Protocol):
     @property
     def config(self) -> Horizons: ...  # noqa: D102
     @property
-    def ticks_seen(self) -> int: ...  # noqa: D102
+    def history_ticks(self) -> int: ...  # noqa: D102
     def embed(self, observations: Sequence[Observation], /) -> None: ...  # noqa: D102
     def plan(self, observations: Sequence[Observation], /) -> Float32[np.ndarray, "h 8"]: ...  # noqa: D102
 
@@ -112,7 +112,7 @@ class RealTimeActor(Actor):
             UserError: there is none in 20 s.
         """
         with self._condition:
-            self._history = [observation] * self._planner.ticks_seen
+            self._history = [observation] * self._planner.history_ticks
             self._request = _Request(0, self._history, time.monotonic())
             self._thread.start()
             if not self._condition.wait_for(self._no_request, _FIRST_PLAN_TIMEOUT):

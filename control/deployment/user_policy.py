@@ -61,7 +61,7 @@ class CheckedPolicy:
     """
 
     config = _EveryTick()
-    ticks_seen = 1
+    history_ticks = 1
 
     def __init__(self, policy: Policy, name: str, n_joints: int = ft.N_JOINTS) -> None:
         self._policy, self._name, self._n_joints = policy, name, n_joints

@@ -59,7 +59,7 @@ def film_trials(
 ) -> None:
     """Run the worst, the median and the best episode again, and film them side by side."""
     ranked = [specs[i] for i in worst_first(trials)]
-    chosen = {"worst": ranked[0], "median": ranked[len(ranked) // 2], "best": ranked[-1]}
+    chosen = {"worst": ranked[0], "best": ranked[-1], "median": ranked[len(ranked) // 2]}
     names = list(chosen)[: len(ranked)]
     paths = [out / f"{name}.mp4" for name in names]
     with one_core_workers(min(workers, len(names))) as pool:
