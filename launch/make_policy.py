@@ -1,7 +1,7 @@
 """Make a shipped policy again, from its recordings to its weights.
 
-Every step is a command, printed before it runs; recipe.json beside the weights lists all of them with their
-seeds, episodes and hours.
+Every step is a command, printed before it runs; recipe.json beside the weights lists all of them
+with their seeds, episodes and hours.
 """
 
 import os
@@ -46,19 +46,20 @@ class Config:
     corrections: Count | None = None
     """Episodes in each round of corrections; default: 200 for pick-place, 80 for the maze."""
     rounds: CountOrNone | None = None
-    """Rounds of DAgger after the first training: the policy acts, the expert's actions are recorded, and
-    the policy is trained again; default and most: 5 for pick-place, 3 for the maze."""
+    """Rounds of DAgger after the first training: the policy acts, the expert's actions are
+    recorded, and the policy is trained again; default and most: 5 for pick-place, 3 for the
+    maze."""
     epochs: Count | None = None
     """Passes over the data in each training; default: 16 for pick-place, 5 for the maze."""
     trials: CountOrNone = 24
-    """Number of validation episodes in which every snapshot of the last training is tried; 0 takes the
-    last snapshot."""
+    """Number of validation episodes in which every snapshot of the last training is tried; 0 takes
+    the last snapshot."""
     touch: Annotated[Path | None, RARE] = None
-    """Run folder of a new touch encoder (the maze), or of a new state estimator (pick-place), instead of
-    the shipped one; for new pads."""
+    """Run folder of a new touch encoder (the maze), or of a new state estimator (pick-place),
+    instead of the shipped one; for new pads."""
     learn_touch: bool = False
-    """The maze: first train a touch encoder without labels on the demonstrations, instead of using the
-    shipped one; for new pads."""
+    """The maze: first train a touch encoder without labels on the demonstrations, instead of using
+    the shipped one; for new pads."""
     resume: bool = False
     """Continue an interrupted run in `out`."""
     workers: Count = os.cpu_count() or 1
@@ -104,7 +105,7 @@ def _task_of(command: str) -> str:
 
 
 def _run(step: list[str]) -> None:
-    """Run a command; one that was interrupted continues after its last finished epoch or episode."""
+    """Run a command, or continue it after its last finished epoch or episode."""
     from touchgoal.encoders.training.checkpoint import has_checkpoint
     from touchgoal.launch.__main__ import read_options
 
@@ -118,7 +119,7 @@ def _run(step: list[str]) -> None:
 
 
 def _pick_place(config: Config, out: Path) -> list[list[str]]:
-    """Return the steps: a regression of the feedback expert, corrected in the states that it reaches."""
+    """Return the steps: regression of the feedback expert, corrected in the states it reaches."""
     from touchgoal.policies.checkpoint import ESTIMATOR, SHIPPED_POLICIES
 
     deployed = [*_NO_IMAGES, *_DEPLOYED]
@@ -142,7 +143,7 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
 
 
 def _bead_maze(config: Config, out: Path) -> list[list[str]]:
-    """Return the steps: a regression of the expert that knows the wire, corrected where it gets to.
+    """Return the steps: regression of the expert that knows the wire, corrected likewise.
 
     It observes four ticks: with two it led the bead less often on validation wires.
     """

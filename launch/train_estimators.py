@@ -1,4 +1,4 @@
-"""Train the state estimator of pick-place: contact from touch, object and goal from camera images."""
+"""Train the state estimator of pick-place: contact from touch, poses from camera images."""
 
 import os
 from dataclasses import replace
@@ -24,11 +24,11 @@ class Config(TrainingOptions):
     out: Path | None = None
     """Folder of the run; the state estimator goes to its `estimator/`."""
     encoder: Path | None = None
-    """Frozen touch encoder: a folder (train-encoder), which is copied beside the estimator; default: the
-    shipped one, which is not copied."""
+    """Frozen touch encoder: a folder (train-encoder), which is copied beside the estimator;
+    default: the shipped one, which is not copied."""
     pose: Annotated[Path | None, RARE] = None
-    """Folder of a state estimator whose pose estimator is reused: only contact is learned. For new pads
-    with the same cameras."""
+    """Folder of a state estimator whose pose estimator is reused: only contact is learned. For new
+    pads with the same cameras."""
     objects: Count = 1200
     """Number of objects, of random shape and size, to render."""
     placements: Count = 12

@@ -34,8 +34,8 @@ ENVS: dict[TaskName, TaskConfig] = {
     "pick-place": PickPlaceConfig(),
 }
 """Default options of each task's environment."""
-# Sparsh (C.7). It leaves open how many ticks of a plan are done (here all 8), at what rate, and for how
-# long to train (here the 600 epochs of diffusion_policy's real-robot tasks).
+# Sparsh (C.7). It leaves open how many ticks of a plan are done (here all 8), at what rate, and for
+# how long to train (here the 600 epochs of diffusion_policy's real-robot tasks).
 _PAPER = {
     "head": "published",
     "representation": "delta",
@@ -56,7 +56,7 @@ class Config(TrainingOptions):
     PRESETS: ClassVar = {"paper": _PAPER}
 
     data: Path
-    """Episode set to train on: its successful episodes, and those in which an expert corrected a policy."""
+    """Episode set to train on: successful episodes, and those in which an expert corrected one."""
     validation: Path
     """Episode set for the validation loss; it must share no recording with --data."""
     preset: Literal["default", "paper"] = "default"
@@ -67,14 +67,15 @@ class Config(TrainingOptions):
     trim_pauses: bool = False
     """Leave out the frames of each episode before arm or gripper first move."""
     task: TaskName | None = None
-    """Task of the episodes, in which snapshots are tried; default: the one that the episodes name."""
+    """Task of the episodes, in which snapshots are tried; default: the one they name."""
     encoder: Path | None = None
-    """Frozen touch encoder: a folder (train-encoder), or the name of one that ships; default: none."""
+    """Frozen touch encoder: a folder (train-encoder), or the name of a shipped one; default: none."""
     end_to_end: bool = False
     """Train a touch ViT jointly with the policy, instead of a frozen encoder."""
     estimator: Path | None = None
-    """Folder of a state estimator (train-estimators). The policy is trained on the simulator's contacts
-    and object poses, so its episodes need no images; when it acts, the estimator supplies both."""
+    """Folder of a state estimator (train-estimators). The policy is trained on the simulator's
+    contacts and object poses, so its episodes need no images; when it acts, the estimator supplies
+    both."""
     out: Path | None = None
     """Folder of the run; the policy goes to its `policy/`."""
     share: Annotated[Fraction, RARE] = 1.0
@@ -82,16 +83,16 @@ class Config(TrainingOptions):
     head: Head = "small"
     """Size of the U-Net of a diffusion policy, or regression, which predicts plans directly."""
     representation: ActionRepresentation = "body_twist"
-    """Actions as the network predicts them: delta (joint change of each control tick), relative (joint
-    change since the plan's start), absolute (joint positions), base_twist or body_twist (displacement
-    and rotation of the hand along the base's or the hand's axes). body_twist also gives the network the
-    hand's motion along its own axes; with --estimator take base_twist."""
+    """Actions as the network predicts them: delta (joint change of each control tick), relative
+    (joint change since the plan's start), absolute (joint positions), base_twist or body_twist
+    (displacement and rotation of the hand along the base's or the hand's axes). body_twist also
+    gives the network the hand's motion along its own axes; with --estimator take base_twist."""
     arm_state: ArmState = "measured"
-    """Arm state that the policy reads: measured, or commanded, which no delay affects; commanded needs
-    episodes with the column observation.command."""
+    """Arm state that the policy reads: measured, or commanded, which no delay affects; commanded
+    needs episodes with the column observation.command."""
     touch_input: TouchInput = "wrench"
-    """Input from a frozen touch encoder: wrench (a small network trained on the simulator's pad forces
-    and torques), or embedding (a projection trained on the actions alone)."""
+    """Input from a frozen touch encoder: wrench (a small network trained on the simulator's pad
+    forces and torques), or embedding (a projection trained on the actions alone)."""
     touch_projection_dim: Annotated[Count, RARE] = 64
     """Width of that projection, with --touch-input embedding."""
     touch_noise: Annotated[NotNegative, RARE] = 0.1

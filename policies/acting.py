@@ -1,4 +1,4 @@
-"""A learned policy as it acts: `reset()` begins an episode, `act(observation)` gives each tick's action."""
+"""Learned policy: `reset()` begins an episode, `act(observation)` returns a tick's action."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -40,16 +40,16 @@ class Estimator(Protocol):
 class LearnedPolicy:
     """A trained network that acts, one episode after the other.
 
-    It does `execution_horizon` ticks of a plan, then the next plan's. The same seed and observations
-    give the same actions. Torch computes each plan on one thread: two lose badly when the other core
-    is taken.
+    It does `execution_horizon` ticks of a plan, then the next plan's. The same seed and
+    observations give the same actions. Torch computes each plan on one thread: two lose badly when
+    the other core is taken.
 
     Attributes:
         config: of the network.
         touch: embedder of the fingertips; None for a policy without touch.
         directory: where it was read from; None if it never was on disk.
-        plan_ticks: control ticks from an observation to its plan. The next plan is asked for so much
-            earlier, and its actions for the ticks that have gone by are left out.
+        plan_ticks: control ticks from an observation to its plan. The next plan is asked for so
+            much earlier, and its actions for the ticks that have gone by are left out.
         history_ticks: number of observations that `plan` takes: the network's own, and those before
             them that the touch encoder looks back to.
     """
@@ -129,8 +129,8 @@ class LearnedPolicy:
         """Return actions from the latest observation on.
 
         Args:
-            history: the last `history_ticks` observations, oldest first. The oldest one of an episode's
-                first call is its first observation, untouched.
+            history: the last `history_ticks` observations, oldest first. The oldest one of an
+                episode's first call is its first observation, untouched.
         """
         with one_thread():
             self.embed(history)

@@ -1,8 +1,8 @@
 """Chunks of actions: their representations, and normalisation.
 
 An action (8,) is the joint change (7) of one tick, rad, and the gripper width target, m
-(`features.ACTION`). A chunk, or plan, is the actions of h ticks from the latest observation on. A network
-predicts it in a representation, each tick normalised by itself.
+(`features.ACTION`). A chunk, or plan, is the actions of h ticks from the latest observation on. A
+network predicts it in a representation, each tick normalised by itself.
 """
 
 from functools import cache
@@ -56,7 +56,7 @@ def to_actions(
 
 
 def _base_jacobian_and_elbow(joints: Float[Tensor, "b 7"]) -> Float[Tensor, "b 7 7"]:
-    """Return the matrix from joint changes to the hand's displacement, rotation and third joint."""
+    """Return the Jacobian of the hand's displacement and rotation, with the third joint as a row."""
     rows, _ = _kinematics().jacobians(joints.cpu().numpy().astype(np.float64))
     elbow = torch.eye(N_JOINTS)[2].expand(len(rows), 1, -1)
     return torch.cat([torch.from_numpy(rows).float(), elbow], 1).to(joints)
@@ -69,7 +69,7 @@ def nearest(widths: Float[Tensor, "b h"], allowed: tuple[float, ...]) -> Float[T
 
 
 def body_jacobian(joints: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 6 7"]:
-    """Return the matrix from joint changes to the TCP's displacement and rotation along its own axes."""
+    """Return the Jacobian of the TCP's displacement and rotation along its own axes."""
     J, R = _kinematics().jacobians(joints.reshape(-1, N_JOINTS).cpu().numpy().astype(np.float64))
     own = R.mT[:, None] @ J.reshape(-1, 2, 3, N_JOINTS)
     return torch.from_numpy(own).float().to(joints).reshape(*joints.shape[:-1], 6, N_JOINTS)
@@ -86,7 +86,7 @@ def tcp_poses(joints: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7"]:
 
 
 def _damped_pseudoinverse(J: Float[Tensor, "b 6 7"]) -> Float[Tensor, "b 7 6"]:
-    """Return the matrix from displacement and rotation to the least joint change, damped if singular."""
+    """Return the matrix from displacement and rotation to the least joint change."""
     return J.mT @ torch.linalg.inv(J @ J.mT + DAMPING * torch.eye(6).to(J))
 
 

@@ -39,8 +39,8 @@ POLICY_FORMAT = WeightsFormat("policy", "policy", "train one with: touchgoal tra
 def save(policy: PolicyNetwork, directory: Path, provenance: dict[str, Any]) -> None:
     """Write a network; an older one in the directory is replaced.
 
-    Weights are stored as float16, normalizers as float32: rounding a joint position to float16 would
-    move the hand by a millimetre.
+    Weights are stored as float16, normalizers as float32: rounding a joint position to float16
+    would move the hand by a millimetre.
 
     Args:
         policy: the network.
@@ -54,7 +54,7 @@ def save(policy: PolicyNetwork, directory: Path, provenance: dict[str, Any]) -> 
 
 
 def load(directory: Path) -> PolicyNetwork:
-    """Read a network for inference, as float32 on the CPU; UserError if there is none or it is damaged."""
+    """Read a network for inference on the CPU; UserError if there is none or it is damaged."""
     with torch.random.fork_rng(devices=[]):  # its initialisation draws from the global generator
         network = PolicyNetwork(POLICY_FORMAT.read_config(directory, _config))
     POLICY_FORMAT.load_weights(network, directory)

@@ -1,4 +1,4 @@
-"""Options of policies and of their trainings; light to import, for `touchgoal --help` shows them."""
+"""Options of policies and of their trainings; light to import for `touchgoal --help`."""
 
 from typing import Annotated, Literal
 
@@ -21,10 +21,11 @@ Head = Literal["small", "published", "tiny", "regression"]
 ArmState = Literal["measured", "commanded"]
 TouchInput = Literal["wrench", "embedding"]
 ActionRepresentation = Literal["delta", "relative", "absolute", "base_twist", "body_twist"]
-"""How a plan is written; see `train_policy.Config`. "relative" is UMI's word (Chi et al. 2024). The hand's
-displacement and rotation (m, rad) are to first order. "base_twist" adds the third joint's change for the
-elbow and is nearly the same wherever on the table the hand does the same; with "body_twist" the elbow goes
-where the joints move least. The gripper's width is a target in all of them."""
+"""How a plan is written; see `train_policy.Config`. "relative" is UMI's word (Chi et al. 2024). The
+hand's displacement and rotation (m, rad) are to first order. "base_twist" adds the third joint's
+change for the elbow and is nearly the same wherever on the table the hand does the same; with
+"body_twist" the elbow goes where the joints move least. The gripper's width is a target in all of
+them."""
 Box = tuple[int, int, int, int]
 
 
@@ -33,15 +34,16 @@ class SamplerConfig:
     """Noise schedule in training, and denoising when a plan is made."""
 
     kind: Literal["ddpm", "ddim", "flow"] = "ddim"
-    """ddpm draws fresh noise at every step (Ho et al. 2020), ddim none (Song et al. 2021); both train the
-    same network. flow goes straight from noise to data (Lipman et al. 2023)."""
+    """ddpm draws fresh noise at every step (Ho et al. 2020), ddim none (Song et al. 2021); both
+    train the same network. flow goes straight from noise to data (Lipman et al. 2023)."""
     prediction_type: Literal["epsilon", "velocity", "sample"] = "sample"
-    """Prediction of the network: the noise (epsilon) or the flow's velocity, as published, or the clean
-    sample, which needs fewer steps and less training where samples vary little (Ze et al. 2024)."""
+    """Prediction of the network: the noise (epsilon) or the flow's velocity, as published, or the
+    clean sample, which needs fewer steps and less training where samples vary little (Ze et al.
+    2024)."""
     num_train_timesteps: Annotated[int, Field(ge=2)] = 100
     """Steps of the squared-cosine noise schedule (Nichol and Dhariwal 2021)."""
     num_inference_steps: Count = 2
-    """Network calls for one plan. Two suffice for ddim with sample; ddpm with epsilon needs more."""
+    """Network calls for one plan. Two suffice for ddim with sample, not for ddpm with epsilon."""
     clip: Positive = 1.0
     """Largest magnitude of a clean sample, normalised."""
 
@@ -85,16 +87,16 @@ class PoseEstimatorConfig:
     """Crops of the camera images, and sizes of the networks."""
 
     size: tuple[Count, Count] = (256, 256)
-    """Rows and columns of the camera images, px. With half as many a pixel covers 5 mm of the table, and
-    objects are located to 3 mm at best."""
+    """Rows and columns of the camera images, px. With half as many a pixel covers 5 mm of the
+    table, and objects are located to 3 mm at best."""
     crops: tuple[tuple[str, Box], ...] = ((ft.FRONT, (104, 232, 16, 240)),)
-    """Crop of each camera's images that shows the table: column of the episodes, then rows and columns
-    (from, to; from, to), px."""
+    """Crop of each camera's images that shows the table: column of the episodes, then rows and
+    columns (from, to; from, to), px."""
     channels: Count = 32
     """Feature maps; each of their cells covers 4 x 4 pixels."""
     dilations: tuple[Count, ...] = (1, 2, 4)
-    """Dilation of each further layer, cells. Together they cover the largest object, or its shape, and so
-    its height, cannot be estimated."""
+    """Dilation of each further layer, cells. Together they cover the largest object, or its shape,
+    and so its height, cannot be estimated."""
     keypoints: Count = 16
     """Keypoints of each image, found by a spatial softmax."""
     keypoint_features: Count = 32
@@ -118,5 +120,5 @@ class EstimatorTrainConfig:
     contact_epochs: Count = 4
     """Passes over the control ticks, for contact: 256 ticks a step, at a learning rate of 1e-3."""
     touch_noise: NotNegative = 0.5
-    """Noise on touch embeddings in training, relative to their standard deviation, so that contact is
-    recognised with other sensors of the same model."""
+    """Noise on touch embeddings in training, relative to their standard deviation, so that contact
+    is recognised with other sensors of the same model."""

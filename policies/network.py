@@ -38,23 +38,26 @@ class PolicyConfig:
     Attributes:
         touch_dim: of the frozen embedding of both fingertips together; 0 without touch.
         touch: names what made the embeddings: encoder, sensor, background.
-        touch_input: "wrench": a small network, trained on the simulator's pad forces and on nothing else
-            (TacBench's T1), reads the wrenches on both pads from the embedding, and the head gets those 12
-            numbers. "embedding": a projection that is trained on the actions alone, for episodes without
-            that truth.
+        touch_input: "wrench": a small network, trained on the simulator's pad forces and on nothing
+            else (TacBench's T1), reads the wrenches on both pads from the embedding, and the head
+            gets those 12 numbers. "embedding": a projection that is trained on the actions alone,
+            for episodes without that truth.
         touch_projection_dim: width of the projection, with "embedding".
-        touch_noise: standard deviation of noise on normalised embeddings in training. Without it the
-            network recognises each recorded episode by its sensors.
-        position_noise: likewise on joint and TCP positions, one draw for all ticks observed, so that the
-            place on the table does not tell how a wire goes on. "body_twist" reads no positions.
-        gripper_widths: m, the only two that the demonstrations command; what is predicted in between
-            becomes the nearer one, for the hand would go to a width on the way. Empty: any width.
+        touch_noise: standard deviation of noise on normalised embeddings in training. Without it
+            the network recognises each recorded episode by its sensors.
+        position_noise: likewise on joint and TCP positions, one draw for all ticks observed, so
+            that the place on the table does not tell how a wire goes on. "body_twist" reads no
+            positions.
+        gripper_widths: m, the only two that the demonstrations command; what is predicted in
+            between becomes the nearer one, for the hand would go to a width on the way. Empty: any
+            width.
         end_to_end: touch encoder that is trained jointly; None without.
-        proprioception: columns of `features.FEATURES`, the state first. Columns that only a simulator
-            knows come from a state estimator on an arm. The wrench is tared, see `proprioception.tare`.
+        proprioception: columns of `features.FEATURES`, the state first. Columns that only a
+            simulator knows come from a state estimator on an arm. The wrench is tared, see
+            `proprioception.tare`.
         observation_horizon: ticks observed, the latest included.
-        prediction_horizon: ticks planned, from the latest observation on; diffusion_policy counts from the
-            oldest one.
+        prediction_horizon: ticks planned, from the latest observation on; diffusion_policy counts
+            from the oldest one.
         execution_horizon: ticks of a plan that are executed before the next one.
         representation: of the actions in training.
         control_hz: ticks per second.
@@ -192,8 +195,8 @@ class PolicyNetwork(nn.Module):
     ) -> None:
         """Fit the normalizers to training data: n ticks, and the chunks of m windows.
 
-        Inputs get variance 1. Actions get the range -1 to 1, each tick of the chunk by itself: the last of
-        a relative plan moves eight times as far as the first. Padded actions do not count.
+        Inputs get variance 1. Actions get the range -1 to 1, each tick of the chunk by itself: the
+        last of a relative plan moves eight times as far as the first. Padded actions do not count.
         """
         if self.config.touch_dim:
             self.touch_normalizer.fit_mean_std(touch)

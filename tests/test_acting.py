@@ -76,10 +76,10 @@ class SlowPolicy(LearnedPolicy):
         super().__init__(policy, None)
         self.pause, self.plans = pause, []
 
-    def plan(self, seen):
+    def plan(self, history):
         time.sleep(self.pause if self.plans else 0.0)
-        actions = super().plan(seen)
-        self.plans.append((int(seen[-1][ft.STATE][0]), actions))
+        actions = super().plan(history)
+        self.plans.append((int(history[-1][ft.STATE][0]), actions))
         return actions
 
 

@@ -1,12 +1,13 @@
 """Open-loop error of a policy along recorded demonstrations, for Table 10 of Sparsh.
 
-The paper compares "the compounded trajectory from predicted delta joint angles" with a demonstration on an
-unseen maze, and leaves open how. Three readings, in mm at the TCP:
+The paper compares "the compounded trajectory from predicted delta joint angles" with a
+demonstration on an unseen maze, and leaves open how. Three readings, in mm at the TCP:
 
 - chunk: one plan, compounded from the measured joints, after each of its ticks.
-- teacher_forced: the first action of each tick's plan, compounded over the demonstration; every plan
-  observes the recording.
-- free_running: the same, but every plan observes the joints compounded so far (and the recorded touch).
+- teacher_forced: the first action of each tick's plan, compounded over the demonstration; every
+  plan observes the recording.
+- free_running: the same, but every plan observes the joints compounded so far (and the recorded
+  touch).
 """
 
 from collections.abc import Callable

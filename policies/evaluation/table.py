@@ -1,4 +1,4 @@
-"""Table of trials: success by shape of object or family of wires and in all, and what went wrong."""
+"""Table of trials: success by shape of object or family of wires, and failures."""
 
 from collections import Counter
 from collections.abc import Sequence

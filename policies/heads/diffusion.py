@@ -61,9 +61,11 @@ class RegressionConfig:
 
 
 class Regression(nn.Module):
-    """Prediction of the median of the demonstrations, by the absolute error as in ACT (Zhao et al. 2023).
+    """Prediction of the median of the demonstrations, by the absolute error as in ACT (Zhao et al.
+    2023).
 
-    Unlike a squared error it weighs small motions like large ones, and chooses one of several modes.
+    Unlike a squared error it weighs small motions like large ones, and chooses one of several
+    modes.
     """
 
     def __init__(self, config: RegressionConfig, ticks: int, action_dim: int, condition_dim: int):

@@ -56,8 +56,8 @@ PRESETS: dict[str, UNetConfig] = {
 class UNet(nn.Module):
     """Network from noisy chunk, diffusion step and condition to a chunk of the same shape.
 
-    Layers and wiring are those of `ConditionalUnet1D` in diffusion_policy, whose first level's skip is
-    unused, too.
+    Layers and wiring are those of `ConditionalUnet1D` in diffusion_policy, whose first level's skip
+    is unused, too.
     """
 
     def __init__(self, config: UNetConfig, action_dim: int, condition_dim: int) -> None:
@@ -148,8 +148,8 @@ class ResidualBlock(nn.Module):
 class ShortConv1d(nn.Conv1d):
     """Convolution over few ticks, padded to the same number, as one matrix product.
 
-    Torch's own takes a slow path: with 192 channels and 2 ticks, on one core, it takes 3.5 times as long
-    at batch 1 and 4 times in training.
+    Torch's own takes a slow path: with 192 channels and 2 ticks, on one core, it takes 3.5 times as
+    long at batch 1 and 4 times in training.
     """
 
     def forward(self, input: Float[Tensor, "b i h"]) -> Float[Tensor, "b o h"]:

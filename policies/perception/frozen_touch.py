@@ -53,8 +53,8 @@ class TouchEmbedder:
         """Embed the latest tick, with the same result as `embed`.
 
         Args:
-            observations: the last `1 + reach`, oldest first; if fewer, the oldest is repeated. Frames
-                of an object that was passed before are not preprocessed again.
+            observations: the last `1 + reach`, oldest first; if fewer, the oldest is repeated.
+                Frames of an object that was passed before are not preprocessed again.
             untouched: an observation without contact.
         """
         sides = [
@@ -77,7 +77,7 @@ def load_touch(name_or_path: str | Path) -> TouchEmbedder:
 
 
 def load_touch_of(directory: Path, name: str) -> TouchEmbedder:
-    """Load the embedder that a policy was trained with: from its folder, else the shipped one of that name.
+    """Load the embedder of a policy's training, from its folder or else the shipped one by name.
 
     Args:
         directory: `touch/` of the policy's folder; it need not exist.
@@ -94,7 +94,7 @@ def load_touch_of(directory: Path, name: str) -> TouchEmbedder:
 
 
 def shipped_touch(name: str) -> str | None:
-    """Return the shipped encoder whose embeddings have a name (`TouchEmbedder.name`), if there is one."""
+    """Return the shipped encoder whose embeddings have this `TouchEmbedder.name`, if any."""
     names = pretrained.encoder_names()
     return next((n for n in names if _digest(pretrained.find_encoder(n)) in name), None)
 

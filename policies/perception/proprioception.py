@@ -1,11 +1,11 @@
 """Proprioception as a network reads it.
 
-In the base frame: joints and TCP pose. Along the hand's own axes ("body_twist"): the hand's velocity and the
-vertical, without place or heading, so that what is learned on one wire holds for every wire that bends as
-much.
+In the base frame: joints and TCP pose. Along the hand's own axes ("body_twist"): the hand's
+velocity and the vertical, without place or heading, so that what is learned on one wire holds for
+every wire that bends as much.
 
-With `observation.command` among the columns the commanded arm stands in for the measured one: delays and the
-arm's lag then do not change the input, and no correction is made twice.
+With `observation.command` among the columns the commanded arm stands in for the measured one:
+delays and the arm's lag then do not change the input, and no correction is made twice.
 """
 
 import numpy as np
@@ -59,8 +59,8 @@ def network_input(
     quaternion jumps to its negative as the hand turns, the matrix does not (Zhou et al. 2019).
     `truth.start` becomes relative to the hand, in axes parallel to the base's.
 
-    Along the hand's axes the state becomes the TCP's linear and angular velocity (m/s, rad/s) and the
-    gripper's width, the TCP's pose the vertical.
+    Along the hand's axes the state becomes the TCP's linear and angular velocity (m/s, rad/s) and
+    the gripper's width, the TCP's pose the vertical.
     """
     parts, start = {}, 0
     for key in columns:

@@ -1,7 +1,7 @@
 """State estimation from touch and camera images: contact, and the poses at the start.
 
-A policy is trained on the simulator's truth and acts on the estimates. So the estimator can be trained on far
-more than demonstrations, and the policy on demonstrations without images.
+A policy is trained on the simulator's truth and acts on the estimates. So the estimator can be
+trained on far more than demonstrations, and the policy on demonstrations without images.
 """
 
 from collections.abc import Mapping
@@ -75,8 +75,8 @@ class StateEstimator:
         if touch.name != network.config.touch:
             raise UserError(
                 f"the state estimator was trained with the touch encoder {network.config.touch}, "
-                f"this is {touch.name}: put the former into `touch/` beside the estimator, or train "
-                "the estimator again (touchgoal train-estimators; what ships: make pick-place-policy)"
+                f"this is {touch.name}: put the former into `touch/` beside the estimator, or "
+                "train it again (touchgoal train-estimators; the shipped one: make pick-place-policy)"
             )
         self.network, self.touch = network, touch
         self.camera_size = network.config.pose_estimator.size
@@ -124,7 +124,7 @@ def save_estimator(
 
 
 def load_estimator(directory: Path) -> StateEstimator:
-    """Read what `save_estimator` wrote, and the touch encoder: in `touch/` beside it, else the shipped one.
+    """Read a state estimator with its touch encoder: in `touch/` beside it, else the shipped one.
 
     Raises:
         UserError: nothing there, damaged, or another touch encoder than the training's.

@@ -29,7 +29,7 @@ _HUBER_BETA = 0.3  # standard deviations beyond which an error of the pose count
 def embed_touch_and_contact(
     episodes: EpisodeSet, touch: TouchEmbedder, workers: int
 ) -> tuple[Float[Tensor, "n e"], Bool[Tensor, "n 2"]]:
-    """Return touch embeddings of all ticks of a set, cached on disk, and the contact of each pad."""
+    """Return touch embeddings of all ticks of a set (cached on disk), and contact of each pad."""
     rows = embed_episodes(episodes, range(len(episodes)), touch, workers)
     truth = [episodes.read(i, [ft.TRUTH_CONTACT]).frames for i in range(len(episodes))]
     contact = np.concatenate([frames[ft.TRUTH_CONTACT] for frames in truth])
@@ -155,8 +155,8 @@ def contact_error_rate(
 def pose_errors(estimator: PoseEstimator, placements: Placements) -> dict[str, list[float]]:
     """Return median and 90th percentile of the errors.
 
-    Errors of the object's and the goal's position on the table (mm), of the object's height (mm), and of
-    the grasp's yaw (degrees) for objects that are not round.
+    Errors of the object's and the goal's position on the table (mm), of the object's height (mm),
+    and of the grasp's yaw (degrees) for objects that are not round.
     """
     predicted, true = estimator(placements.pictures, placements.tcp), placements.start
     off = predicted - true

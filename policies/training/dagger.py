@@ -18,8 +18,8 @@ from touchgoal.sim_envs.experts.pick_place_feedback import FeedbackExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.tasks import make_expert
 
-# Standard deviations of the noise on `features.TRUTH_START`: m, and cosine and sine of twice the yaw. A little
-# above the errors of the shipped pose estimator (`estimator.json`).
+# Standard deviations of the noise on `features.TRUTH_START`: m, and cosine and sine of twice the
+# yaw. A little above the errors of the shipped pose estimator (`estimator.json`).
 _START_ERROR = np.array([0.003, 0.003, 0.0015, 0.03, 0.03, 0.0015, 0.0015])
 
 
@@ -28,9 +28,9 @@ class DaggerRoles:
     """Actor and expert of a recording, see `Roles` in `episodes/recording.py`.
 
     Attributes:
-        policy: makes the policy that acts while the expert's actions are recorded (DAgger, Ross et al.
-            2011); one with a state estimator acts on the simulator's truth with noise instead. None: the
-            expert itself acts.
+        policy: makes the policy that acts while the expert's actions are recorded (DAgger, Ross et
+            al. 2011); one with a state estimator acts on the simulator's truth with noise instead.
+            None: the expert itself acts.
     """
 
     policy: Callable[[Any], Actor] | None = None
@@ -80,7 +80,8 @@ def dagger_roles(policy: str | None, task: TaskConfig, feedback: bool) -> Dagger
 class _NearlyTrueState:
     """The simulator's truth, with an error that stays for an episode as a pose estimator's does.
 
-    A policy that acts on the exact truth never reaches the states to which its estimates will lead it.
+    A policy that acts on the exact truth never reaches the states to which its estimates will lead
+    it.
     """
 
     def __init__(self, env: PickPlace) -> None:

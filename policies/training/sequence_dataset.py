@@ -63,8 +63,8 @@ def load_recordings(
         config: says which columns are read.
         embedder: of touch; None for a policy without.
         workers: processes that embed.
-        skip: ticks of each chosen episode to leave out at its start. Images and forces stay relative to
-            its very first tick.
+        skip: ticks of each chosen episode to leave out at its start. Images and forces stay
+            relative to its very first tick.
 
     Raises:
         UserError: nothing chosen, a missing column, another rate or embedder than the config's, or
@@ -120,7 +120,7 @@ def _check(
         )
     if tuple(episodes.features[ft.STATE]["shape"]) != ft.FEATURES[ft.STATE].shape:
         raise UserError(
-            f"{episodes.root} is of another arm: policies command the {ft.N_JOINTS} joints of an FR3"
+            f"{episodes.root} is of another arm: policies command an FR3's {ft.N_JOINTS} joints"
         )
     if missing := set(config.proprioception) - set(episodes.features):
         raise UserError(f"{episodes.root} has no {sorted(missing)[0]}, which the policy reads")
@@ -190,9 +190,10 @@ def _embed(episodes: EpisodeSet, embedder: TouchEmbedder, i: int) -> None:
 class SequenceDataset:
     """One window for every recorded tick.
 
-    Before an episode's start its first observation is repeated, as in diffusion_policy. Ticks after its
-    end are padding (`action_is_pad`), which does not count in training. So is the last tick: its observation
-    is the result of the last action, and the action recorded beside it was never executed.
+    Before an episode's start its first observation is repeated, as in diffusion_policy. Ticks after
+    its end are padding (`action_is_pad`), which does not count in training. So is the last tick:
+    its observation is the result of the last action, and the action recorded beside it was never
+    executed.
     """
 
     def __init__(self, recorded: Recordings, config: PolicyConfig) -> None:

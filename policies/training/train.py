@@ -35,8 +35,9 @@ def train(
 ) -> PolicyNetwork:
     """Train a policy; the moving average of its weights is the result.
 
-    Beside the files of `trainer.fit` it writes snapshots to `snapshots/epoch-<n>/`, and the last one to
-    `policy/`. A run that is killed and resumed ends with the same weights as an uninterrupted one.
+    Beside the files of `trainer.fit` it writes snapshots to `snapshots/epoch-<n>/`, and the last
+    one to `policy/`. A run that is killed and resumed ends with the same weights as an
+    uninterrupted one.
 
     Args:
         policy: inputs and outputs.

@@ -41,8 +41,8 @@ def choose_episodes(episodes: EpisodeSet, include_unknown: bool = False) -> Chos
 
     Args:
         episodes: the set.
-        include_unknown: also take those that do not say whether they succeeded, such as recordings of
-            an arm.
+        include_unknown: also take those that do not say whether they succeeded, such as recordings
+            of an arm.
 
     Raises:
         UserError: none is left.
@@ -97,8 +97,8 @@ def check_sensor(recorded: str, tried: str) -> None:
     tried = find_sensor(tried).name
     if recorded and tried != recorded:
         raise UserError(
-            f"the episodes were recorded with {recorded}, snapshots would be tried with {tried}: add "
-            f"--env.sensor {recorded}"
+            f"the episodes were recorded with {recorded}, snapshots would be tried with {tried}: "
+            f"add --env.sensor {recorded}"
         )
 
 
@@ -112,12 +112,12 @@ def succeeded(meta: Mapping[str, Any]) -> bool | None:
 
 
 def common_sensor(sets: Sequence[tuple[EpisodeSet, Sequence[int]]]) -> str:
-    """Return the fingertip sensor of all chosen episodes; "" if none is named; UserError if several."""
+    """Return the fingertip sensor of the episodes, "" if none is named; UserError if several."""
     return _common("sensor", sets, lambda meta: str(meta.get("sensor", "")))
 
 
 def task_of(meta: Mapping[str, Any]) -> str:
-    """Return an episode's task from its meta; other recorders name only the wire or the object's shape."""
+    """Return an episode's task from its meta, which may name only the wire or the object's shape."""
     if "task" in meta:
         return str(meta["task"])
     if "wire" in meta:
