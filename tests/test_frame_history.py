@@ -62,9 +62,9 @@ def test_a_policy_feels_what_its_training_did(vit: ViTConfig, real_time: bool) -
     planner, felt = LearnedPolicy(PolicyNetwork(config).eval(), touch), {}
     embed = planner._embed_touch
 
-    def watched(seen):
-        rows = embed(seen)
-        felt[float(seen[-1][ft.STATE][0])] = rows
+    def watched(history):
+        rows = embed(history)
+        felt[float(history[-1][ft.STATE][0])] = rows
         return rows
 
     planner._embed_touch = watched

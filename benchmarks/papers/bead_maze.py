@@ -74,12 +74,12 @@ class ShuffledTouchPolicy(LearnedPolicy):
     recorded_touch: Float[np.ndarray, "t e"]
     tick = -1
 
-    def plan(self, seen: Any) -> Float[np.ndarray, "h 8"]:
+    def plan(self, history: Any) -> Float[np.ndarray, "h 8"]:
         """See LearnedPolicy."""
         self.tick = min(self.tick + self.config.execution_horizon, len(self.recorded_touch) - 1)
-        return super().plan(seen)
+        return super().plan(history)
 
-    def _embed_touch(self, seen: Sequence[Observation]) -> Float[np.ndarray, " e"]:
+    def _embed_touch(self, history: Sequence[Observation]) -> Float[np.ndarray, " e"]:
         return self.recorded_touch[max(self.tick, 0)]
 
 
