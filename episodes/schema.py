@@ -44,7 +44,7 @@ class Episode:
     """One recorded attempt at a task.
 
     Attributes:
-        frames: Key of `FEATURES` -> array (T, *shape) in the key's dtype, one row a frame. Images are
+        frames: Key of `FEATURES` -> array (T, ...) in the key's dtype, one row a frame. Images are
             uint8 RGB (T, h, w, 3). Within a set, image sizes and the arm's number of joints are equal.
         task: Instruction in words.
         meta: Facts about the whole episode, such as object, seed and outcome; the same keys with the
