@@ -97,7 +97,7 @@ def headline(name: str) -> str:
 
 
 def render(page: str) -> str:
-    """Return a page with its tables written anew from the records."""
+    """Return a page with its tables rewritten from the records."""
     tables = {"headlines": _headlines, "results": _results}
     return _BLOCK.sub(lambda found: f"{found[1]}{tables[found[2]]()}{found[3]}", page)
 

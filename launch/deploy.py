@@ -2,7 +2,7 @@
 
 A dry run unless --execute is given: everything is read, checked and planned, nothing is commanded.
 
-Exit status: 0 the task is done, or nobody can tell, or a dry run; 1 something is missing or wrong, and
+Exit status: 0 the task is done, or its outcome is unknown, or a dry run; 1 something is missing or wrong, and
 nothing moved, or the episode could not be saved; 3 the task is not done, or time was up; 4 the arm was
 stopped, by a fault or the operator.
 """

@@ -191,13 +191,18 @@ class LearnedPolicy:
             task = cast(Task, TASKS[cast(TaskName, config.task)](control_hz=config.control_hz))
             task = replace(task, sensor=config.sensor or task.sensor)
         self._check_task(task)
-        estimator = self._estimator if isinstance(self._estimator, StateEstimator) else None
+        estimator = self._learned_estimator
         reads_touch = config.touch_dim > 0 or config.end_to_end is not None or estimator is not None
         if estimator is None:
             return replace(task, tactile=reads_touch, cameras=())
         cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key in estimator.cameras)
         size = estimator.camera_size
         return replace(task, tactile=reads_touch, cameras=cameras, camera_size=size)
+
+    @property
+    def _learned_estimator(self) -> StateEstimator | None:
+        """The estimator unless the simulator's ground truth stands in its place."""
+        return self._estimator if isinstance(self._estimator, StateEstimator) else None
 
     @property
     def _name(self) -> str:
@@ -221,7 +226,7 @@ class LearnedPolicy:
                 f"{self._name} acts at {config.control_hz} Hz, not {task.control_hz}: leave out "
                 "--env.control-hz, or train a policy at that rate"
             )
-        estimator = self._estimator if isinstance(self._estimator, StateEstimator) else None
+        estimator = self._learned_estimator
         sensor = find_sensor(task.sensor).name
         trained = {
             config.sensor,

@@ -229,7 +229,7 @@ class _Stream:
 def _table(rows: list[EncoderSpeed], config: Config) -> str:
     lines = [
         f"one core, processor time, medians; in batches of {config.batch_size}, and one raw frame at a time with the earlier ones'",
-        "preprocessing cached (in brackets: anew); ratio: plain torch's time for the same over ours",
+        "preprocessing cached (in brackets: uncached); ratio: plain torch's time for the same over ours",
         f"{'encoder':<30}{'M par.':>8}{'':>6}{'frames/s':>10}{'ratio':>7}{'ms a frame':>20}{'ratio':>7}",
     ]
     lines += [

@@ -1,4 +1,4 @@
-"""What the hand does, from its readings: holds an object, has lost it, does not follow commands."""
+"""State of the hand from its readings: it holds an object, has lost it, or does not follow."""
 
 import numpy as np
 from jaxtyping import Float

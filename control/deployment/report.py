@@ -1,4 +1,4 @@
-"""What a finished deployment reports: the numbers of metrics.json, and the operator's lines."""
+"""Report of a finished deployment: the numbers of metrics.json, and the operator's lines."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from touchgoal.control.deployment.session import Result
 from touchgoal.control.tactile.light_gain import LightWatch, light_advice
 
 _LIGHT_TICKS = 10  # from one look at the fingertips' light to the next
-_VERDICTS = {True: "done", False: "not done", None: "nobody can tell whether it is done"}
+_VERDICTS = {True: "done", False: "not done", None: "unknown whether it is done"}
 
 
 def metrics(result: Result) -> dict[str, Any]:

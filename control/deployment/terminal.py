@@ -29,7 +29,7 @@ _TICKS_PER_LINE = 4
 
 
 def say(text: str) -> None:
-    """Print the report; on stderr where nobody reads stdout any more (Ctrl-C ends `tee`, too)."""
+    """Print the report; on stderr if the reader of stdout has gone (Ctrl-C ends `tee`, too)."""
     try:
         print(text, flush=True)
     except BrokenPipeError:

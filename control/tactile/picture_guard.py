@@ -30,9 +30,7 @@ _EDGE = 10  # share of a picture (1/n) at either end where a seam may be the sen
 _SEAM_PARTS = 32  # along a row, half of which must show the step
 _CLEARLY = 0.85  # of the difference that another order or mirror may leave
 _CLEARLY_MOVED = 0.75  # of the difference that another scale or shift may leave
-_SAME_UNIT = (
-    0.035  # difference below which the file is of this very unit: others are cut differently
-)
+_SAME_UNIT = 0.035  # difference below which the file is of this very unit
 _OPEN = 1.5  # times the difference up to which presses have to decide
 _EXPLAINS = 0.8  # of the unexplained change that another order or mirror may leave
 UNEXPLAINED = 0.65
@@ -221,8 +219,7 @@ def _fault(differences: dict[_View | tuple, float]) -> str:
     if (x, y) != (1, 1):
         return (
             f"it fits when scaled by {x:g} along its rows and {y:g} along its columns: cut and "
-            "scale "
-            "it as when the sensor file was made"
+            "scale it as when the sensor file was made"
         )
     return (
         f"it fits when moved by about {_COARSE * right} px to the right and {_COARSE * down} px "

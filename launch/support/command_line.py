@@ -129,10 +129,7 @@ def _default(field: dataclasses.Field, parent: Any) -> Any:
 
 def _options(config_type: type) -> list[tuple[dataclasses.Field, Any, str]]:
     """Return the fields of a dataclass with annotations and help texts, ranges included."""
-    hints, texts = (
-        get_type_hints(config_type, include_extras=True),
-        docstrings(config_type),
-    )
+    hints, texts = get_type_hints(config_type, include_extras=True), docstrings(config_type)
     return [
         (f, hints[f.name], _with_range(texts.get(f.name, ""), hints[f.name]))
         for f in dataclasses.fields(config_type)
