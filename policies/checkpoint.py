@@ -86,7 +86,7 @@ class SavedPolicy:
 
     def network(self) -> PolicyNetwork:
         """Return the network alone."""
-        return _load_once(self.directory, _stamp(self.directory))
+        return self._parts()[0]
 
     def _parts(self) -> tuple[PolicyNetwork, TouchEmbedder | None, StateEstimator | None]:
         return _load_parts(self.directory, _stamp(self.directory))
@@ -102,15 +102,10 @@ def _stamp(directory: Path) -> _Stamp:
 
 
 @lru_cache(maxsize=4)
-def _load_once(directory: Path, stamp: _Stamp) -> PolicyNetwork:
-    return load(directory)
-
-
-@lru_cache(maxsize=4)
 def _load_parts(
     directory: Path, stamp: _Stamp
 ) -> tuple[PolicyNetwork, TouchEmbedder | None, StateEstimator | None]:
-    network = _load_once(directory, stamp)
+    network = load(directory)
     config = network.config
     with torch.random.fork_rng(devices=[]):
         touch = load_touch_of(directory / TOUCH, config.touch) if config.touch_dim else None
