@@ -19,18 +19,12 @@ class TactilePreprocessor:
 
     Any change of the output in steady light needs a new version: encoders refuse to load under
     another preprocessor than they were trained with.
-
-    Attributes:
-        sensor: `SensorModel.name`.
-        version: Version of the numbers.
-        size: Height and width of the output, px.
-        scale: Grey levels (of 255) that become 1.0; about the contrast of a firm contact.
     """
 
-    sensor: str
-    version: int
-    size: tuple[int, int]
-    scale: float
+    sensor: str  # `SensorModel.name`
+    version: int  # version of the numbers
+    size: tuple[int, int]  # height and width of the output, px
+    scale: float  # grey levels (of 255) that become 1.0; about the contrast of a firm contact
 
     @property
     def id(self) -> str:
@@ -46,8 +40,7 @@ class TactilePreprocessor:
         (interpolated if the frames are smaller than the output) after the subtraction, so that
         rounding keeps faint contacts.
 
-        Raises:
-            UserError: The frames have another aspect ratio than the sensor's.
+        UserError: the frames have another aspect ratio than the sensor's.
         """
         self._check(frames.shape[1:3])
         h, w = self.size

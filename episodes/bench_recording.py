@@ -50,8 +50,7 @@ def record_bench(
 ) -> EpisodeSet:
     """Record the first `count` episodes of a rig; those that the folder holds are not simulated again.
 
-    Raises:
-        UserError: The folder holds recordings of another rig, or cannot be written to.
+    UserError: the folder holds recordings of another rig, or cannot be written to.
     """
     shapes = {"strokes": config.indenters, "slides": HELD, "catalogue slides": ("objects",)}
     low, high = config.load

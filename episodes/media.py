@@ -73,8 +73,7 @@ def decode_video(
 
     Only these frames and the key frames before them are decoded.
 
-    Raises:
-        UserError: The video has no such frame.
+    UserError: the video has no such frame.
     """
     wanted = sorted(set(frames))
     with av.open(io.BytesIO(video), "r") as container:
@@ -100,8 +99,7 @@ def decode_video(
 def write_video(path: Path, frames: UInt8[np.ndarray, "n h w 3"], fps: float | int) -> None:
     """Write an MP4 (H.264, yuv420p, crf 18) that any browser plays, and make its folder.
 
-    Raises:
-        UserError: No frame, or odd height or width.
+    UserError: no frame, or odd height or width.
     """
     data = _encode(frames, fps, "libx264", "yuv420p", {"crf": "18"})
     write_file(path, data)

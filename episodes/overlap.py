@@ -33,8 +33,7 @@ class ChecksummedRecording(Protocol):
 def require_no_shared_frames(train: EpisodeSet, validation: EpisodeSet) -> None:
     """Compare two sets frame by frame: robot state if both have it, else tactile images.
 
-    Raises:
-        UserError: An episode of `validation` contains frames of an episode of `train`.
+    UserError: an episode of `validation` contains frames of an episode of `train`.
     """
     common = [k for k in (STATE, *TACTILE) if {k} <= train.features.keys() & validation.features]
     if common:

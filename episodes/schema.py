@@ -56,7 +56,6 @@ class Episode:
     meta: dict[str, MetaValue] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        """Number of frames, T."""
         return next((len(values) for values in self.frames.values()), 0)
 
     @property

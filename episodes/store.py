@@ -87,7 +87,6 @@ class EpisodeWriter:
         return found
 
     def __len__(self) -> int:
-        """Number of episodes in the set."""
         return 0 if self._metadata is None else self._metadata.n_episodes
 
     def close(self) -> None:
@@ -155,7 +154,6 @@ class EpisodeSet:
                     raise set_files.unreadable(self.root, name, FileNotFoundError())
 
     def __len__(self) -> int:
-        """Return the number of episodes."""
         return len(self._rows)
 
     @cached_property
@@ -235,7 +233,6 @@ class EpisodeSet:
         return Episode({key: read[key] for key in keys}, self.task(i), self.meta(i))
 
     def __repr__(self) -> str:
-        """Return folder, size and features."""
         return f"EpisodeSet({str(self.root)!r}: {len(self)} episodes, {', '.join(self.features)})"
 
     def _files(self, row: Row) -> list[str]:

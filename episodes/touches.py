@@ -26,32 +26,22 @@ _LOOKED_AT = 8  # episodes of a set whose first frames are checked
 
 @dataclass(frozen=True, eq=False)
 class Touches:
-    """n tactile frames of e episodes, with b backgrounds: one per episode and side.
+    """n tactile frames of e episodes, with b backgrounds: one per episode and side."""
 
-    Attributes:
-        frames: Raw sensor RGB, one side each.
-        background: The same sensors without contact, per episode and side.
-        background_index: Row of `background` for each frame.
-        view: The wrist camera's unoccluded image of the object, one per episode.
-        view_index: Row of `view` for each frame.
-        object: Catalogue id of the object that each frame touches; "" without contact.
-        descriptions: Catalogue id -> sentences on how the object feels.
-        side: Index into `features.TACTILE` of each frame: 0 left, 1 right.
-        episode_index: Index in the set of each frame's episode.
-    """
-
-    frames: UInt8[np.ndarray, "n h w 3"]
+    frames: UInt8[np.ndarray, "n h w 3"]  # raw sensor RGB, one side each
+    # the same sensors without contact, per episode and side
     background: UInt8[np.ndarray, "b h w 3"]
-    background_index: Int[np.ndarray, " n"]
+    background_index: Int[np.ndarray, " n"]  # row of `background` for each frame
+    # the wrist camera's unoccluded image of the object, one per episode
     view: UInt8[np.ndarray, "e H W 3"]
-    view_index: Int[np.ndarray, " n"]
+    view_index: Int[np.ndarray, " n"]  # row of `view` for each frame
+    # catalogue id of the object that each frame touches; "" without contact
     object: tuple[str, ...]
-    descriptions: dict[str, list[str]]
-    side: Int[np.ndarray, " n"]
-    episode_index: Int[np.ndarray, " n"]
+    descriptions: dict[str, list[str]]  # catalogue id -> sentences on how the object feels
+    side: Int[np.ndarray, " n"]  # index into `features.TACTILE` of each frame: 0 left, 1 right
+    episode_index: Int[np.ndarray, " n"]  # index in the set of each frame's episode
 
     def __len__(self) -> int:
-        """Return the number of touches, n."""
         return len(self.frames)
 
 
@@ -133,8 +123,7 @@ def check_fingertips(episodes: EpisodeSet, chosen: Sequence[int]) -> None:
 
     The first frames of some episodes are compared with the sensor file, and with each other.
 
-    Raises:
-        UserError: see `picture_guard.check_untouched`; or two episodes have them exchanged.
+    UserError: see `picture_guard.check_untouched`; or two episodes have them exchanged.
     """
     keys = [key for key in TACTILE if key in episodes.features]
     looked_at = [chosen[i] for i in np.linspace(0, len(chosen) - 1, _LOOKED_AT).astype(int)]

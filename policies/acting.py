@@ -90,7 +90,6 @@ class LearnedPolicy:
         self.reset()
 
     def __repr__(self) -> str:
-        """Name where it was read from, and its task."""
         return f"LearnedPolicy({str(self.directory or '')!r}, task={self.config.task!r})"
 
     def reset(self, seed: int = 0) -> None:

@@ -40,9 +40,8 @@ def scripted(task: TaskName) -> str:
 def prepare_policy(policy: AnyPolicy, task: TaskConfig) -> tuple[PolicyMaker, TaskConfig]:
     """Return the maker of a policy, and the task's options with the images that it reads.
 
-    Raises:
-        UserError: no such policy, it cannot act in the task, or an option of the task is set to
-            something else than the policy needs.
+    UserError: no such policy, it cannot act in the task, or an option of the task is set to
+    something else than the policy needs.
     """
     maker = choose_policy(policy, task)
     needed = env_config_for(maker, task)
@@ -70,8 +69,7 @@ def _option(name: str, value: object) -> str:
 def choose_policy(policy: AnyPolicy, task: TaskConfig) -> PolicyMaker:
     """Return the maker of a policy that is named, loaded, or a user's own.
 
-    Raises:
-        UserError: no such policy.
+    UserError: no such policy.
     """
     if isinstance(policy, LearnedPolicy) and policy.directory is not None:
         return SavedPolicy(policy.directory, policy.plan_ticks)
@@ -105,8 +103,7 @@ def choose_policy(policy: AnyPolicy, task: TaskConfig) -> PolicyMaker:
 def env_config_for(maker: PolicyMaker, task: TaskConfig) -> TaskConfig:
     """Return the task's options with the images that the policy reads: no others are rendered.
 
-    Raises:
-        UserError: the policy cannot act in the task.
+    UserError: the policy cannot act in the task.
     """
     if isinstance(maker, SavedPolicy | UserPolicy):
         return maker.env_config(task)

@@ -48,7 +48,6 @@ class SamplerConfig:
     """Largest magnitude of a clean sample, normalised."""
 
     def __post_init__(self) -> None:
-        """Raise UserError for options that do not go together."""
         if self.prediction_type == ("epsilon" if self.kind == "flow" else "velocity"):
             raise UserError(
                 f"a network for {self.kind} cannot predict {self.prediction_type}: try sample"

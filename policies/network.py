@@ -33,59 +33,41 @@ _CLIP = 5.0  # standard deviations
 
 @dataclass(frozen=True)
 class PolicyConfig:
-    """Inputs and outputs of a policy.
+    """Inputs and outputs of a policy."""
 
-    Attributes:
-        touch_dim: of the frozen embedding of both fingertips together; 0 without touch.
-        touch: names what made the embeddings: encoder, sensor, background.
-        touch_input: "wrench": a small network, trained on the simulator's pad forces and on nothing
-            else (TacBench's T1), reads the wrenches on both pads from the embedding, and the head
-            gets those 12 numbers. "embedding": a projection that is trained on the actions alone,
-            for episodes without that truth.
-        touch_projection_dim: width of the projection, with "embedding".
-        touch_noise: standard deviation of noise on normalised embeddings in training. Without it
-            the network recognises each recorded episode by its sensors.
-        position_noise: likewise on joint and TCP positions, one draw for all ticks observed, so
-            that the place on the table does not tell how a wire goes on. "body_twist" reads no
-            positions.
-        gripper_widths: m, the only two that the demonstrations command; what is predicted in
-            between becomes the nearer one, for the hand would go to a width on the way. Empty: any
-            width.
-        end_to_end: touch encoder that is trained jointly; None without.
-        proprioception: columns of `features.FEATURES`, the state first. Columns that only a
-            simulator knows come from a state estimator on an arm. The wrench is tared, see
-            `proprioception.tare`.
-        observation_horizon: ticks observed, the latest included.
-        prediction_horizon: ticks planned, from the latest observation on; diffusion_policy counts
-            from the oldest one.
-        execution_horizon: ticks of a plan that are executed before the next one.
-        representation: of the actions in training.
-        control_hz: ticks per second.
-        head: predicts the plan.
-        task: of the training episodes, such as "bead-maze"; "" if unknown.
-        sensor: of the fingertips in them; "" without touch.
-    """
-
-    touch_dim: int
-    touch: str
+    touch_dim: int  # of the frozen embedding of both fingertips together; 0 without touch
+    touch: str  # names what made the embeddings: encoder, sensor, background
+    # "wrench": a small network, trained on the simulator's pad forces and on nothing else
+    # (TacBench's T1), reads the wrenches on both pads from the embedding, and the head gets those
+    # 12 numbers. "embedding": a projection that is trained on the actions alone, for episodes
+    # without that truth
     touch_input: TouchInput = "wrench"
-    touch_projection_dim: int = 64
+    touch_projection_dim: int = 64  # width of the projection, with "embedding"
+    # standard deviation of noise on normalised embeddings in training. Without it the network
+    # recognises each recorded episode by its sensors
     touch_noise: float = 0.1
+    # likewise on joint and TCP positions, one draw for all ticks observed, so that the place on the
+    # table does not tell how a wire goes on. "body_twist" reads no positions
     position_noise: float = 0.3
+    # m, the only two that the demonstrations command; what is predicted in between becomes the
+    # nearer one, for the hand would go to a width on the way. Empty: any width
     gripper_widths: tuple[float, ...] = ()
-    end_to_end: EndToEndConfig | None = None
+    end_to_end: EndToEndConfig | None = None  # touch encoder that is trained jointly; None without
+    # columns of `features.FEATURES`, the state first. Columns that only a simulator knows come from
+    # a state estimator on an arm. The wrench is tared, see `proprioception.tare`
     proprioception: tuple[str, ...] = (ft.STATE, ft.TCP_POSE)
-    observation_horizon: int = 2
+    observation_horizon: int = 2  # ticks observed, the latest included
+    # ticks planned, from the latest observation on; diffusion_policy counts from the oldest one
     prediction_horizon: int = 8
-    execution_horizon: int = 2
-    representation: ActionRepresentation = "relative"
-    control_hz: int = ft.CONTROL_HZ
+    execution_horizon: int = 2  # ticks of a plan that are executed before the next one
+    representation: ActionRepresentation = "relative"  # of the actions in training
+    control_hz: int = ft.CONTROL_HZ  # ticks per second
+    # predicts the plan
     head: DiffusionConfig | RegressionConfig = field(default_factory=DiffusionConfig)
-    task: str = ""
-    sensor: str = ""
+    task: str = ""  # of the training episodes, such as "bead-maze"; "" if unknown
+    sensor: str = ""  # of the fingertips in them; "" without touch
 
     def __post_init__(self) -> None:
-        """Raise UserError for values that do not go together."""
         if self.proprioception[:1] != (ft.STATE,) or not set(self.proprioception) <= set(
             ft.FEATURES
         ):
@@ -131,16 +113,13 @@ class PolicyConfig:
 
 @dataclass(frozen=True, eq=False)
 class ObservationBatch:
-    """Observations of the last ticks, oldest first.
+    """Observations of the last ticks, oldest first."""
 
-    Attributes:
-        touch: frozen embeddings of the left and the right fingertip, side by side.
-        state: columns of `PolicyConfig.proprioception`, side by side, SI units.
-        pictures: difference images of the latest tick, for the end-to-end encoder; None without.
-    """
-
+    # frozen embeddings of the left and the right fingertip, side by side
     touch: Float[Tensor, "b o e"]
+    # columns of `PolicyConfig.proprioception`, side by side, SI units
     state: Float[Tensor, "b o s"]
+    # difference images of the latest tick, for the end-to-end encoder; None without
     pictures: UInt8[Tensor, "b k h w 3"] | None = None
 
     @property

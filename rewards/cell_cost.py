@@ -11,8 +11,7 @@ from touchgoal.rewards.reward_model import load_reward_model
 def load_cell_cost(cell: CellConfig) -> OnlineCost:
     """Return the distance to the cell's goals, measured in a thread; `close` ends it.
 
-    Raises:
-        UserError: a goal, encoder or normalizer that does not fit the cell.
+    UserError: a goal, encoder or normalizer that does not fit the cell.
     """
     simulated = cell.arm == "sim" or bool(cell.task.twin)
     inputs = Inputs(

@@ -79,11 +79,9 @@ class Curves:
     note: str = ""
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(next(iter(self.raw.values())))
 
     def __repr__(self) -> str:
-        """Return name, length, unit, and first and last cost of each curve, in one line."""
         costs = ", ".join(f"{name} {c[0]:.2f} to {c[-1]:.2f}" for name, c in self.costs.items())
         note = f" ({self.note})" if self.note else ""
         return f"<Curves of {self.source}, {len(self)} frames, {self.unit}: {costs}{note}>"

@@ -48,37 +48,25 @@ from touchgoal.runtime.errors import UserError
 
 @dataclass(frozen=True)
 class EmbeddedEpisode:
-    """One embedded trajectory; its distance to a goal is then a dot product per frame.
+    """One embedded trajectory; its distance to a goal is then a dot product per frame."""
 
-    Attributes:
-        source: name of the trajectory, for people.
-        fps: frames per second.
-        contact: first contact.
-        made_with: encoders and sensors; only embeddings of equal ones can be compared.
-        image: unit image embeddings; None without a camera.
-        sides: keys of the fingertips that have touch embeddings.
-        touch: unit touch embeddings; None without touch.
-        descriptions: unit embeddings of the sentences about its object; None if there are none or
-            they were not requested.
-        object: catalogue id of the object, "" if unknown.
-        success: whether the episode reached its goal, None if unknown.
-        words: whether its touch embeddings can be compared with sentences.
-    """
-
-    source: str
-    fps: float
-    contact: Contact
+    source: str  # name of the trajectory, for people
+    fps: float  # frames per second
+    contact: Contact  # first contact
+    # encoders and sensors; only embeddings of equal ones can be compared
     made_with: EmbeddingSource
-    image: Float32[np.ndarray, "n d"] | None = None
-    sides: tuple[str, ...] = ()
+    image: Float32[np.ndarray, "n d"] | None = None  # unit image embeddings; None without a camera
+    sides: tuple[str, ...] = ()  # keys of the fingertips that have touch embeddings
+    # unit touch embeddings; None without touch
     touch: Float32[np.ndarray, "sides n k"] | None = None
+    # unit embeddings of the sentences about its object; None if there are none or they were not
+    # requested
     descriptions: Float32[np.ndarray, "m k"] | None = None
-    object: str = ""
-    success: bool | None = None
-    words: bool = True
+    object: str = ""  # catalogue id of the object, "" if unknown
+    success: bool | None = None  # whether the episode reached its goal, None if unknown
+    words: bool = True  # whether its touch embeddings can be compared with sentences
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return self.touches().shape[1] if self.image is None else len(self.image)
 
     @property
@@ -101,14 +89,10 @@ class EmbeddedEpisode:
 
 @dataclass(frozen=True)
 class EmbeddedGoal:
-    """A goal as unit embeddings, one per modality that has a goal.
+    """A goal as unit embeddings, one per modality that has a goal."""
 
-    Attributes:
-        forms: the goals as a user writes them, by modality.
-        same_episode: modalities whose goal is a frame of the measured trajectory itself.
-    """
-
-    forms: Mapping[str, str]
+    forms: Mapping[str, str]  # the goals as a user writes them, by modality
+    # modalities whose goal is a frame of the measured trajectory itself
     same_episode: frozenset[str]
     image: Float32[np.ndarray, " d"] | None = None
     touch: Float32[np.ndarray, "sides k"] | None = None
@@ -209,9 +193,8 @@ class EpisodeEmbedder:
     def embed_goal(self, goal: Goal, own: EmbeddedEpisode) -> EmbeddedGoal:
         """Embed a goal for one trajectory; frames of `own` are not embedded again.
 
-        Raises:
-            UserError: a frame beyond the trajectory, an unreadable picture or episode, or an
-                episode with other fingertips.
+        UserError: a frame beyond the trajectory, an unreadable picture or episode, or an episode
+        with other fingertips.
         """
         image = None if goal.image is None else self._goal_picture(goal.image, own)
         touch = None if goal.tactile is None else self._goal_touch(goal.tactile, own)
@@ -339,8 +322,7 @@ def compute_curves(
 ) -> Curves:
     """Return the curves of one trajectory to one goal; without a normalizer raw, and none fused.
 
-    Raises:
-        UserError: the normalizer lacks a modality or was fitted for something else.
+    UserError: the normalizer lacks a modality or was fitted for something else.
     """
     raw = compute_distances(episode, goal)
     same = goal.same_episode

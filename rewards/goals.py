@@ -45,23 +45,14 @@ _SMALLEST = 16  # px, the smallest camera image that the environments take
 
 @dataclass(frozen=True)
 class Inputs:
-    """Everything known about trajectories before they are read.
+    """Everything known about trajectories before they are read."""
 
-    Attributes:
-        name: name for messages; of several trajectories the shortest.
-        camera: key of the camera; "" for a plain video, None without images.
-        sides: keys of the fingertips with tactile images.
-        sensor: name of the fingertip sensor; None if unknown.
-        scene: where they were recorded, see `scene_of`.
-        length: number of frames of the shortest; None if unknown.
-    """
-
-    name: str
-    camera: str | None
-    sides: tuple[str, ...] = ()
-    sensor: str | None = None
-    scene: str = "unknown"
-    length: int | None = None
+    name: str  # name for messages; of several trajectories the shortest
+    camera: str | None  # key of the camera; "" for a plain video, None without images
+    sides: tuple[str, ...] = ()  # keys of the fingertips with tactile images
+    sensor: str | None = None  # name of the fingertip sensor; None if unknown
+    scene: str = "unknown"  # where they were recorded, see `scene_of`
+    length: int | None = None  # number of frames of the shortest; None if unknown
 
     @property
     def modalities(self) -> tuple[Modality, ...]:
@@ -77,7 +68,6 @@ class LastFrame:
     modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
 
     def __str__(self) -> str:
-        """Return the form that a user writes."""
         return "last"
 
 
@@ -89,7 +79,6 @@ class FrameNumber:
     modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
 
     def __str__(self) -> str:
-        """Return the form that a user writes."""
         return f"frame:{self.index}"
 
 
@@ -101,14 +90,12 @@ class PictureFile:
     modalities: ClassVar[tuple[Modality, ...]] = ("image",)
 
     def __str__(self) -> str:
-        """Return the form that a user writes."""
         return f"image:{self.path}"
 
     def read(self) -> UInt8[np.ndarray, "1 h w 3"]:
         """Return the image, RGB.
 
-        Raises:
-            UserError: there is no such file, it is not an image, or it is too small.
+        UserError: there is no such file, it is not an image, or it is too small.
         """
         pixels = read_picture(self.path)
         if pixels is None and not self.path.exists():
@@ -126,7 +113,6 @@ class PictureArray:
     modalities: ClassVar[tuple[Modality, ...]] = ("image",)
 
     def __str__(self) -> str:
-        """Return a name for messages."""
         return "image: an array"
 
     def read(self) -> UInt8[np.ndarray, "1 h w 3"]:
@@ -136,19 +122,13 @@ class PictureArray:
 
 @dataclass(frozen=True, eq=False)
 class TouchArrays:
-    """Tactile images of the goal, from a script.
+    """Tactile images of the goal, from a script."""
 
-    Attributes:
-        pictures: by key of the fingertip, in the goal state.
-        backgrounds: the same fingertips untouched.
-    """
-
-    pictures: Mapping[str, UInt8[np.ndarray, "h w 3"]]
-    backgrounds: Mapping[str, UInt8[np.ndarray, "h w 3"]]
+    pictures: Mapping[str, UInt8[np.ndarray, "h w 3"]]  # by key of the fingertip, in the goal state
+    backgrounds: Mapping[str, UInt8[np.ndarray, "h w 3"]]  # the same fingertips untouched
     modalities: ClassVar[tuple[Modality, ...]] = ("tactile",)
 
     def __str__(self) -> str:
-        """Return a name for messages."""
         return "touch: arrays"
 
 
@@ -161,7 +141,6 @@ class EpisodeEnd:
     modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
 
     def __str__(self) -> str:
-        """Return the form that a user writes."""
         return f"episode:{self.root}#{self.index}"
 
     def read(self, keys: Sequence[str]) -> Episode:
@@ -192,7 +171,6 @@ class Sentence:
     modalities: ClassVar[tuple[Modality, ...]] = ("text",)
 
     def __str__(self) -> str:
-        """Return the form that a user writes."""
         return f"text:{self.text}"
 
 
@@ -227,8 +205,7 @@ class Goal:
 def parse_goal(text: str) -> GoalSpec:
     """Read a goal in one of the five forms of this module.
 
-    Raises:
-        UserError: any other text; the message lists the forms.
+    UserError: any other text; the message lists the forms.
     """
     kind, _, value = text.strip().partition(":")
     value = value.strip()
@@ -287,8 +264,7 @@ def assign_goals(
 def check_goal(goal: Goal, inputs: Inputs) -> None:
     """Check before any work that a goal can be read.
 
-    Raises:
-        UserError: a frame beyond the trajectory; no such image, set, episode, camera or fingertip.
+    UserError: a frame beyond the trajectory; no such image, set, episode, camera or fingertip.
     """
     for spec in (goal.image, goal.tactile):
         if isinstance(spec, LastFrame | FrameNumber) and inputs.length is not None:

@@ -40,42 +40,28 @@ class CurveMetrics:
 
     With v = -d and t the frame number: d_0 is the median of the first 5 frames, d_T the last frame,
     and net drop = d_0 - d_T. Times of drops are None unless the net drop exceeds eps.
-
-    Attributes:
-        frames: n.
-        sigma: noise (curve), 1.4826 MAD(diff d) / sqrt 2 before the contact.
-        eps: max(3 sigma, EPS_FLOOR) unless it was given (curve).
-        start: d_0 (curve).
-        end: d_T (curve).
-        net_drop: d_0 - d_T (curve).
-        spearman: rank correlation of v and t, average ranks for ties; None for a constant curve.
-        kendall_tau_b: tau-b of v and t; None for a constant curve.
-        peaks: local maxima, ends excluded, with prominence >= eps. White noise of standard
-            deviation sigma has about 4 in 100 frames.
-        largest_rebound: max_t (d_t - min_{s<=t} d_s), the largest rise after a minimum (curve).
-        area: integral of d over the episode's duration taken as 1 (trapezoids); lower is earlier.
-        t_drop_10: first frame at which 10 % of the net drop has fallen.
-        t_drop_25: the same for 25 %.
-        t_drop_50: the same for 50 %, the primary one.
-        contact: first contact frame, as given.
-        contact_lag: t_drop_50 - contact (frames); negative when the curve falls before contact.
     """
 
-    frames: int
-    sigma: float
-    eps: float
-    start: float
-    end: float
-    net_drop: float
+    frames: int  # n
+    sigma: float  # noise (curve), 1.4826 MAD(diff d) / sqrt 2 before the contact
+    eps: float  # max(3 sigma, EPS_FLOOR) unless it was given (curve)
+    start: float  # d_0 (curve)
+    end: float  # d_T (curve)
+    net_drop: float  # d_0 - d_T (curve)
+    # rank correlation of v and t, average ranks for ties; None for a constant curve
     spearman: float | None
-    kendall_tau_b: float | None
+    kendall_tau_b: float | None  # tau-b of v and t; None for a constant curve
+    # local maxima, ends excluded, with prominence >= eps. White noise of standard deviation sigma
+    # has about 4 in 100 frames
     peaks: int
-    largest_rebound: float
+    largest_rebound: float  # max_t (d_t - min_{s<=t} d_s), the largest rise after a minimum (curve)
+    # integral of d over the episode's duration taken as 1 (trapezoids); lower is earlier
     area: float
-    t_drop_10: int | None
-    t_drop_25: int | None
-    t_drop_50: int | None
-    contact: int | None
+    t_drop_10: int | None  # first frame at which 10 % of the net drop has fallen
+    t_drop_25: int | None  # the same for 25 %
+    t_drop_50: int | None  # the same for 50 %, the primary one
+    contact: int | None  # first contact frame, as given
+    # t_drop_50 - contact (frames); negative when the curve falls before contact
     contact_lag: int | None
 
     def as_dict(self) -> dict[str, Any]:

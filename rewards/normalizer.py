@@ -30,19 +30,12 @@ REAL_SCENE = "recorded, not simulated"
 
 @dataclass(frozen=True)
 class EmbeddingSource:
-    """Encoders, camera and sensor of embeddings; only those of equal ones can be compared.
+    """Encoders, camera and sensor of embeddings; only those of equal ones can be compared."""
 
-    Attributes:
-        towers: "offline", or the hash of a CLIP's weights.
-        camera: key of the camera; "" for a plain video, whose camera is unknown.
-        encoder: hash of the touch encoder's weights and preprocessor; "" without touch.
-        sensor: name of the fingertip sensor; "" without touch.
-    """
-
-    towers: str
-    camera: str
-    encoder: str = ""
-    sensor: str = ""
+    towers: str  # "offline", or the hash of a CLIP's weights
+    camera: str  # key of the camera; "" for a plain video, whose camera is unknown
+    encoder: str = ""  # hash of the touch encoder's weights and preprocessor; "" without touch
+    sensor: str = ""  # name of the fingertip sensor; "" without touch
 
 
 def scene_of(features: Iterable[str]) -> str:
@@ -72,22 +65,15 @@ class DistanceNormalizer:
 
     n(d) = (d - goal) / (start - goal): 1 at the usual start, 0 at the usual end, below 0 nearer than
     that. There is one pair of medians for each `median_name`.
-
-    Attributes:
-        start: median raw distance of the start of a training episode to a goal.
-        goal: the same for its end.
-        separated: share of (episode, goal) pairs whose end is nearer the goal than its start.
-        source: encoders, camera and sensor of the embeddings.
-        scene: see `scene_of`.
-        episodes: number of training episodes.
     """
 
-    start: dict[str, float]
-    goal: dict[str, float]
+    start: dict[str, float]  # median raw distance of the start of a training episode to a goal
+    goal: dict[str, float]  # the same for its end
+    # share of (episode, goal) pairs whose end is nearer the goal than its start
     separated: dict[str, float]
-    source: EmbeddingSource
-    scene: str
-    episodes: int
+    source: EmbeddingSource  # encoders, camera and sensor of the embeddings
+    scene: str  # see `scene_of`
+    episodes: int  # number of training episodes
 
     def mismatch(
         self, source: EmbeddingSource, modalities: Iterable[str], same_episode: frozenset[str]
@@ -149,11 +135,7 @@ class DistanceNormalizer:
 
     @classmethod
     def load(cls, path: Path) -> "DistanceNormalizer":
-        """Read a file that `save` wrote.
-
-        Raises:
-            UserError: no such file, or not a normalizer.
-        """
+        """Read a file that `save` wrote. UserError: no such file, or not a normalizer."""
         if not path.is_file():
             raise UserError(
                 f"there is no normalizer at {path}: make one with touchgoal fit-normalizer"

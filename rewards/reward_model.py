@@ -25,19 +25,12 @@ _FIT = "touchgoal fit-normalizer, on successful episodes of your own"
 
 @dataclass(frozen=True)
 class RewardModel:
-    """Encoders, goal and normalizer: turns an embedded trajectory into cost and reward curves.
+    """Encoders, goal and normalizer: turns an embedded trajectory into cost and reward curves."""
 
-    Attributes:
-        embedder: the encoders.
-        goal: the goal of each modality.
-        normalizer: normalizer of the distances; None for raw ones.
-        note: which normalizer, or why there is none, for people.
-    """
-
-    embedder: EpisodeEmbedder
-    goal: Goal
-    normalizer: DistanceNormalizer | None
-    note: str
+    embedder: EpisodeEmbedder  # the encoders
+    goal: Goal  # the goal of each modality
+    normalizer: DistanceNormalizer | None  # normalizer of the distances; None for raw ones
+    note: str  # which normalizer, or why there is none, for people
 
     def curves(self, trajectory: EmbeddedEpisode) -> Curves:
         """Return the curves of a trajectory that this model's embedder embedded."""

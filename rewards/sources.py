@@ -33,19 +33,12 @@ CAMERAS = (FRONT, WRIST)
 
 @dataclass(frozen=True)
 class EpisodeSource:
-    """Chosen episodes of a set, with one camera and, if there are any, the fingertips.
+    """Chosen episodes of a set, with one camera and, if there are any, the fingertips."""
 
-    Attributes:
-        path: the set's folder.
-        camera: key of the camera.
-        indices: the chosen episodes.
-        with_touch: whether touch is measured.
-    """
-
-    path: Path
-    camera: str
-    indices: tuple[int, ...]
-    with_touch: bool
+    path: Path  # the set's folder
+    camera: str  # key of the camera
+    indices: tuple[int, ...]  # the chosen episodes
+    with_touch: bool  # whether touch is measured
 
     @cached_property
     def episodes(self) -> EpisodeSet:

@@ -149,21 +149,14 @@ class BestEpoch:
 
 @dataclass(frozen=True, eq=False)
 class AlignedBatch:
-    """b touches with their sentences and images, as unit vectors of the shared space.
+    """b touches with their sentences and images, as unit vectors of the shared space."""
 
-    Attributes:
-        touch: Touch embeddings.
-        text: Embedding of one sentence for each touch.
-        image: Embedding of one image for each touch, meaningless without contact.
-        contact: Whether the touch has an image.
-        same: Whether touches i and j have the same object or the same sentence.
-    """
-
-    touch: Float[Tensor, "b d"]
-    text: Float[Tensor, "b d"]
+    touch: Float[Tensor, "b d"]  # touch embeddings
+    text: Float[Tensor, "b d"]  # embedding of one sentence for each touch
+    # embedding of one image for each touch, meaningless without contact
     image: Float[Tensor, "b d"]
-    contact: Bool[Tensor, " b"]
-    same: Bool[Tensor, "b b"]
+    contact: Bool[Tensor, " b"]  # whether the touch has an image
+    same: Bool[Tensor, "b b"]  # whether touches i and j have the same object or the same sentence
 
 
 def make_batch(

@@ -21,30 +21,19 @@ NO_CONTACT = ""
 
 @dataclass(frozen=True, eq=False)
 class TouchData:
-    """n touches of the objects in `names`, with their images and sentences.
+    """n touches of the objects in `names`, with their images and sentences."""
 
-    Attributes:
-        touch: Preprocessed frames in half precision, to save memory.
-        label: Row of `names` of each touch.
-        contact: False for touches without contact, which have sentences but no image.
-        view_index: Row of `images` of each touch.
-        images: Image tower's embedding of each view, not normalised.
-        texts: Text tower's embedding of each sentence, not normalised.
-        describes: Whether sentence j describes name i.
-        names: Catalogue ids, sorted; "" stands for no contact and comes first.
-    """
-
-    touch: Float16[Tensor, "n 3 h w"]
-    label: Int[Tensor, " n"]
+    touch: Float16[Tensor, "n 3 h w"]  # preprocessed frames in half precision, to save memory
+    label: Int[Tensor, " n"]  # row of `names` of each touch
+    # False for touches without contact, which have sentences but no image
     contact: Bool[Tensor, " n"]
-    view_index: Int[Tensor, " n"]
-    images: Float[Tensor, "e i"]
-    texts: Float[Tensor, "m t"]
-    describes: Bool[Tensor, "k m"]
-    names: tuple[str, ...]
+    view_index: Int[Tensor, " n"]  # row of `images` of each touch
+    images: Float[Tensor, "e i"]  # image tower's embedding of each view, not normalised
+    texts: Float[Tensor, "m t"]  # text tower's embedding of each sentence, not normalised
+    describes: Bool[Tensor, "k m"]  # whether sentence j describes name i
+    names: tuple[str, ...]  # catalogue ids, sorted; "" stands for no contact and comes first
 
     def __len__(self) -> int:
-        """Number of touches."""
         return len(self.label)
 
     def draw_sentences(self, rows: Int[Tensor, " b"], noise: BatchNoise) -> Int[Tensor, " b"]:

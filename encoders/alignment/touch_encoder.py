@@ -14,27 +14,16 @@ from touchgoal.encoders.towers.towers import Towers
 
 @dataclass(frozen=True)
 class TouchEncoderConfig:
-    """Architecture of an aligned encoder, and what it was trained with.
+    """Architecture of an aligned encoder, and what it was trained with."""
 
-    Attributes:
-        vit: Touch backbone.
-        embedding_dim: Width of the shared space.
-        sensor: Name of the fingertip sensor.
-        preprocessor: `TactilePreprocessor.id` at training.
-        towers: `Towers.name` of the frozen towers.
-        image_dim: Width of their image embeddings.
-        text_dim: Width of their text embeddings.
-        pretrained_together: Whether the towers' own space is the shared space.
-    """
-
-    vit: ViTConfig
-    embedding_dim: int
-    sensor: str
-    preprocessor: str
-    towers: str
-    image_dim: int
-    text_dim: int
-    pretrained_together: bool
+    vit: ViTConfig  # touch backbone
+    embedding_dim: int  # width of the shared space
+    sensor: str  # name of the fingertip sensor
+    preprocessor: str  # `TactilePreprocessor.id` at training
+    towers: str  # `Towers.name` of the frozen towers
+    image_dim: int  # width of their image embeddings
+    text_dim: int  # width of their text embeddings
+    pretrained_together: bool  # whether the towers' own space is the shared space
 
     @classmethod
     def for_towers(

@@ -36,21 +36,14 @@ _HALF_LENGTH = 4.0  # counts at which an embedding has half of its length
 
 @dataclass(frozen=True)
 class PooledEncoderConfig:
-    """Config of a whitened encoder.
+    """Config of a whitened encoder."""
 
-    Attributes:
-        features: Width of an embedding.
-        sensor: Name of the fingertip sensor.
-        preprocessor: `TactilePreprocessor.id` at training.
-        towers: `Towers.name` of the towers whose sentences it embeds; None without sentences.
-        text_dim: Width of their text embeddings.
-    """
-
-    features: int
-    sensor: str
-    preprocessor: str
+    features: int  # width of an embedding
+    sensor: str  # name of the fingertip sensor
+    preprocessor: str  # `TactilePreprocessor.id` at training
+    # `Towers.name` of the towers whose sentences it embeds; None without sentences
     towers: str | None = None
-    text_dim: int = 0
+    text_dim: int = 0  # width of their text embeddings
 
     @classmethod
     def for_sensor(cls, sensor: str) -> "PooledEncoderConfig":

@@ -23,17 +23,12 @@ class SparshPreprocessor:
     Each channel is the change in grey levels plus 127, clipped to 0 to 255. Landscape images are
     rotated clockwise, others than 4:3 cropped about the centre, and resized bilinearly as PIL does.
     Mean and variance are not normalised, and a change of the light stays in, as published.
-
-    Attributes:
-        size: Height and width of the output, px: 320 x 240 as trained, 224 x 224 for learned
-            positions.
-        subtract: Subtract the untouched sensor.
-        sensor: None, for any sensor.
     """
 
+    # height and width of the output, px: 320 x 240 as trained, 224 x 224 for learned positions
     size: tuple[int, int]
-    subtract: bool = True
-    sensor: None = None
+    subtract: bool = True  # subtract the untouched sensor
+    sensor: None = None  # any sensor
 
     @classmethod
     def of(cls, identity: str, size: tuple[int, int]) -> "SparshPreprocessor":

@@ -54,8 +54,7 @@ def load_sparsh(path: Path) -> ViT:
     whichever the learned positions fit, else 320 x 240. Other objects pickled in a training's
     `.ckpt` are dropped, their code never runs.
 
-    Raises:
-        UserError: Not such a file, or tensors that do not fit, which are listed.
+    UserError: not such a file, or tensors that do not fit, which are listed.
     """
     tensors = _encoder_tensors(path, _read(path))
     with torch.device("meta"):

@@ -19,19 +19,13 @@ BATCH = 64  # frames at once
 
 @dataclass(frozen=True)
 class TouchBackboneConfig:
-    """Architecture of a backbone, and what it was trained with.
+    """Architecture of a backbone, and what it was trained with."""
 
-    Attributes:
-        vit: The ViT.
-        sensor: Name of the fingertip sensor; None for a published Sparsh encoder, which takes any.
-        preprocessor: `TactilePreprocessor.id` at training, or one of `sparsh_input.py`.
-        stride: Frames between the input frames: two stacked ones (six channels) or a clip
-            (tubelets).
-    """
-
-    vit: ViTConfig
+    vit: ViTConfig  # the ViT
+    # name of the fingertip sensor; None for a published Sparsh encoder, which takes any
     sensor: str | None
-    preprocessor: str
+    preprocessor: str  # `TactilePreprocessor.id` at training, or one of `sparsh_input.py`
+    # frames between the input frames: two stacked ones (six channels) or a clip (tubelets)
     stride: int = 1
 
     @classmethod
@@ -88,8 +82,7 @@ class BaseTouchEncoder(nn.Module):
     def embed_text_goal(self, texts: list[str], towers: Towers) -> Float32[np.ndarray, "n d"]:
         """Embed sentences among touches, to be compared with `embed_frames`.
 
-        Raises:
-            UserError: The encoder was trained with other towers.
+        UserError: the encoder was trained with other towers.
         """
         self.check_towers(towers)
         return self.project_text(towers.embed_texts(texts).to(self.device)).cpu().numpy()

@@ -14,43 +14,27 @@ from touchgoal.runtime.errors import UserError
 
 @dataclass(frozen=True)
 class ViTConfig:
-    """Size of a transformer.
+    """Size of a transformer."""
 
-    Attributes:
-        image_size: Height and width of the input, px; other sizes work without learned positions.
-        patch_size: Side of a square patch, px.
-        channels: Input channels.
-        width: Width of a token.
-        depth: Number of blocks.
-        heads: Attention heads; they divide `width`.
-        mlp_ratio: Hidden width of a block's MLP over `width`.
-        class_token: Prepend a learned token and pool by it; otherwise pool by the mean.
-        registers: Learned tokens without position, not part of the output (Darcet et al. 2024).
-        layer_scale: Initial value of learned factors on both branches of a block (Touvron et al.
-            2021); None for none.
-        tubelet: Frames in a token; 1 for images, more for clips of any multiple of it.
-        frames: Frames of a clip; 1 for images.
-        learned_positions: Learn the position codes; the input size is then fixed.
-        norm_epsilon: Epsilon of every LayerNorm.
-    """
-
+    # height and width of the input, px; other sizes work without learned positions
     image_size: tuple[int, int] = (120, 160)
-    patch_size: int = 16
-    channels: int = 3
-    width: int = 192
-    depth: int = 6
-    heads: int = 3
-    mlp_ratio: float = 4.0
-    class_token: bool = False
+    patch_size: int = 16  # side of a square patch, px
+    channels: int = 3  # input channels
+    width: int = 192  # width of a token
+    depth: int = 6  # number of blocks
+    heads: int = 3  # attention heads; they divide `width`
+    mlp_ratio: float = 4.0  # hidden width of a block's MLP over `width`
+    class_token: bool = False  # prepend a learned token and pool by it; otherwise pool by the mean
+    # learned tokens without position, not part of the output (Darcet et al. 2024)
     registers: int = 0
+    # initial value of learned factors on both branches of a block (Touvron et al. 2021), if any
     layer_scale: float | None = None
-    tubelet: int = 1
-    frames: int = 1
-    learned_positions: bool = False
-    norm_epsilon: float = 1e-5
+    tubelet: int = 1  # frames in a token; 1 for images, more for clips of any multiple of it
+    frames: int = 1  # frames of a clip; 1 for images
+    learned_positions: bool = False  # learn the position codes; the input size is then fixed
+    norm_epsilon: float = 1e-5  # epsilon of every LayerNorm
 
     def __post_init__(self) -> None:
-        """Raise UserError for sizes that cannot be built."""
         if self.width % (4 * self.heads) or self.width % self.heads:
             raise UserError(
                 f"ViT width {self.width} must be divisible by 4 x heads ({self.heads}): "
@@ -177,9 +161,8 @@ class ViT(nn.Module):
     def embed_patches(self, images: Float[Tensor, "b c *t h w"]) -> Float[Tensor, "b n d"]:
         """Return patch embeddings with positions, row by row, without class token and registers.
 
-        Raises:
-            UserError: Clips of a length that is no multiple of `tubelet`, or another size than the
-                configured one with learned positions.
+        UserError: clips of a length that is no multiple of `tubelet`, or another size than the
+        configured one with learned positions.
         """
         size, tubelet = self.config.patch_size, self.config.tubelet
         h, w = images.shape[-2:]

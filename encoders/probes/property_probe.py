@@ -25,15 +25,10 @@ Objects = Shaped[np.ndarray, " n"]
 
 @dataclass(frozen=True)
 class PropertyPrediction:
-    """Ranks of unseen objects' properties.
+    """Ranks of unseen objects' properties."""
 
-    Attributes:
-        ranks: most probable rank of each property, 0 to 2.
-        scores: expected rank.
-    """
-
-    ranks: Int[np.ndarray, "n properties"]
-    scores: Float[np.ndarray, "n properties"]
+    ranks: Int[np.ndarray, "n properties"]  # most probable rank of each property, 0 to 2
+    scores: Float[np.ndarray, "n properties"]  # expected rank
 
 
 def nearest_is_same(

@@ -72,7 +72,6 @@ class MaeConfig(_UnlabelledConfig):
     """AdamW's beta 2: decay of its running mean of squared gradients."""
 
     def __post_init__(self) -> None:
-        """Raise OptionError for a network that cannot be built."""
         if self.vit == "base" and not self.stacked:
             raise ValueError("base is Sparsh's, which stacks two frames: it needs stacked")
         _check_heads("decoder", self.decoder_width, self.decoder_heads)
@@ -184,7 +183,6 @@ class PredictorConfig(SelfDistillationConfig):
     """Greatest height over width of a target block."""
 
     def __post_init__(self) -> None:
-        """Raise OptionError for a predictor that cannot be built, or an empty range."""
         _check_heads("predictor", self.predictor_width, self.predictor_heads)
         if self.shortest > self.tallest:
             raise ValueError("shortest must not be above tallest")

@@ -23,21 +23,16 @@ Recording = ClipRecording | VideoRecording
 
 @dataclass(frozen=True, eq=False)
 class TouchFrames:
-    """n touches.
+    """n touches."""
 
-    Attributes:
-        touch: Preprocessed frames in half precision, to save memory. For objectives on several frames,
-            the t frames of a sample, newest first.
-        wrench: Simulated wrench on each pad (N, Nm, pad frame), for probes only; None if the episodes
-            do not record it.
-        sensor: Name of the fingertip sensor.
-        stride: Ticks between the frames of a sample.
-    """
-
+    # preprocessed frames in half precision, to save memory. For objectives on several frames, the t
+    # frames of a sample, newest first
     touch: Float16[Tensor, "n *t 3 h w"]
+    # simulated wrench on each pad (N, Nm, pad frame), for probes only; None if the episodes do not
+    # record it
     wrench: Float[Tensor, "n 6"] | None
-    sensor: str
-    stride: int = 1
+    sensor: str  # name of the fingertip sensor
+    stride: int = 1  # ticks between the frames of a sample
 
     @classmethod
     def from_samples(
@@ -61,7 +56,6 @@ class TouchFrames:
         return cls(torch.cat([part.touch for part in parts]), wrench, first.sensor, first.stride)
 
     def __len__(self) -> int:
-        """Return the number of touches."""
         return len(self.touch)
 
 

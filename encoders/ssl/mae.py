@@ -30,8 +30,7 @@ class MaskedAutoencoder(nn.Module):
     def __init__(self, config: MaeConfig, sensor: str, stride: int = 1) -> None:
         """Build both, randomly initialised; `stride` is the ticks between stacked frames.
 
-        Raises:
-            UserError: Unknown sensor, or nothing is masked.
+        UserError: unknown sensor, or nothing is masked.
         """
         super().__init__()
         self.config = config

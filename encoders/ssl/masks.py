@@ -78,8 +78,7 @@ def draw_targets(
 
     An image with fewer than `least` patches left has its blocks drawn again.
 
-    Raises:
-        UserError: The grid is too small for that.
+    UserError: the grid is too small for that.
     """
     ids = draw_blocks(grid, size, count, blocks, generator)
     for _ in range(_TRIES):

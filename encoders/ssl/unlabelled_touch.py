@@ -27,17 +27,11 @@ Draw = Callable[[int, int, Offsets], TouchFrames]
 
 @dataclass(frozen=True)
 class UnlabelledTouch:
-    """Touches for training and validation.
+    """Touches for training and validation."""
 
-    Attributes:
-        train: Draws training touches.
-        validation: Draws validation touches.
-        recipe: JSON-able provenance.
-    """
-
-    train: Draw
-    validation: Draw
-    recipe: dict[str, Any]
+    train: Draw  # draws training touches
+    validation: Draw  # draws validation touches
+    recipe: dict[str, Any]  # JSON-able provenance
 
 
 @dataclass(frozen=True)
@@ -84,9 +78,8 @@ def open_touch(
 
     Recordings that a folder of `data` holds out are added to the validation data.
 
-    Raises:
-        UserError: No such folder, an unknown or another sensor, nothing to validate on, or frames
-            both in the training and in the validation data.
+    UserError: no such folder, an unknown or another sensor, nothing to validate on, or frames both
+    in the training and in the validation data.
     """
     training_folders = {folder.resolve() for folder in data}
     for folder in validation:

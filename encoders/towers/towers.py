@@ -29,19 +29,12 @@ _HASH_SUFFIX = re.compile(r"#[0-9a-f]{12}$")
 
 @runtime_checkable  # beartype checks arguments in tests
 class Towers(Protocol):
-    """Networks that embed images and sentences and are never trained.
+    """Networks that embed images and sentences and are never trained."""
 
-    Attributes:
-        name: Identity of the weights; an encoder works only with the towers it was trained with.
-        image_dim: Width of an image embedding.
-        text_dim: Width of a text embedding.
-        pretrained_together: Whether images and texts share one space already (as in CLIP).
-    """
-
-    name: str
-    image_dim: int
-    text_dim: int
-    pretrained_together: bool
+    name: str  # identity of the weights; an encoder works only with the towers it was trained with
+    image_dim: int  # width of an image embedding
+    text_dim: int  # width of a text embedding
+    pretrained_together: bool  # whether images and texts share one space already (as in CLIP)
 
     def embed_images(self, images: UInt8[np.ndarray, "n h w 3"]) -> Float[Tensor, "n d"]:
         """Return one embedding for each RGB image, on the CPU, not normalised."""

@@ -16,16 +16,11 @@ class BatchNoise:
 
     Every process draws the numbers of the whole batch from the same generator and takes its own rows,
     so any number of processes trains with the same noise.
-
-    Attributes:
-        generator: Generator on the CPU, in the same state in all processes.
-        rank: Index of this process.
-        world: Number of processes; each has as many rows of the batch.
     """
 
-    generator: torch.Generator
-    rank: int = 0
-    world: int = 1
+    generator: torch.Generator  # generator on the CPU, in the same state in all processes
+    rank: int = 0  # index of this process
+    world: int = 1  # number of processes; each has as many rows of the batch
 
     def draw(self, rows: int, sample: Callable[[int, torch.Generator], Drawn]) -> Drawn:
         """Return this process's rows of `sample(rows of the whole batch, generator)`.

@@ -44,8 +44,7 @@ def open_training(config: Any, command: str) -> Path:
 def open_sets(data: Path, validation: Path) -> tuple[EpisodeSet, EpisodeSet]:
     """Open the training and the validation set.
 
-    Raises:
-        UserError: They are the same, share frames, or are damaged.
+    UserError: they are the same, share frames, or are damaged.
     """
     if data.resolve() == validation.resolve():
         raise UserError(

@@ -37,39 +37,28 @@ Metrics = dict[str, Any]
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Settings of Adam and its schedules.
+    """Settings of Adam and its schedules."""
 
-    Attributes:
-        epochs: Passes over the data.
-        batch_size: Samples a step over all processes; all of them if there are fewer. Samples that
-            fill no batch are left out of their epoch.
-        lr: Highest learning rate.
-        weight_decay: Weight decay of weight matrices and convolutions; biases, norms and tokens have
-            none.
-        final_weight_decay: Weight decay at the end, reached by a cosine; None keeps it constant.
-        betas: Adam's betas.
-        decoupled_weight_decay: AdamW (Loshchilov and Hutter 2019); otherwise Adam with weight decay
-            as an L2 term in the gradient.
-        warmup: Share of the steps in which the rate rises linearly from 0.
-        max_warmup_steps: Upper bound of these steps.
-        final_lr: Rate at the end over `lr`, reached by a cosine; 1 keeps the rate constant.
-        max_grad_norm: Norm that gradients are clipped to; None clips nothing.
-    """
-
-    epochs: int
+    epochs: int  # passes over the data
+    # samples a step over all processes; all of them if there are fewer. Samples that fill no batch
+    # are left out of their epoch
     batch_size: int
-    lr: float
+    lr: float  # highest learning rate
+    # weight decay of weight matrices and convolutions; biases, norms and tokens have none
     weight_decay: float
-    betas: tuple[float, float] = (0.9, 0.999)
+    betas: tuple[float, float] = (0.9, 0.999)  # Adam's betas
+    # AdamW (Loshchilov and Hutter 2019); otherwise Adam with weight decay as an L2 term in the
+    # gradient
     decoupled_weight_decay: bool = True
-    warmup: float = 0.1
-    max_warmup_steps: float = math.inf
+    warmup: float = 0.1  # share of the steps in which the rate rises linearly from 0
+    max_warmup_steps: float = math.inf  # upper bound of these steps
+    # rate at the end over `lr`, reached by a cosine; 1 keeps the rate constant
     final_lr: float = 0.0
-    max_grad_norm: float | None = None
+    max_grad_norm: float | None = None  # norm that gradients are clipped to; None clips nothing
+    # weight decay at the end, reached by a cosine; None keeps it constant
     final_weight_decay: float | None = None
 
     def __post_init__(self) -> None:
-        """Raise UserError for settings that cannot train."""
         if self.epochs < 1 or self.batch_size < 1:
             raise UserError("training needs at least 1 epoch and a batch size of at least 1")
         if not (math.isfinite(self.lr) and self.lr > 0 and self.weight_decay >= 0):
@@ -120,33 +109,26 @@ def _nothing(*_: Any) -> None:
 
 @dataclass(eq=False)
 class Training:
-    """A training: its loss, its data and its callbacks.
+    """A training: its loss, its data and its callbacks."""
 
-    Attributes:
-        loss: Module called with a batch; returns named scalars, of which "loss" is minimised. Its
-            parameters that require a gradient are trained.
-        n_samples: Samples of an epoch.
-        batch: Makes a batch of these samples on the CPU; all that is random about it, and one entry a
-            sample, comes from the noise.
-        optimizer: Settings of the optimizer.
-        identity: JSON-able checksum of the data and settings. A run resumes only with the same.
-        evaluate: Called after every epoch; returns metrics to record beside the mean losses.
-        progress: Returns the line to print for an epoch's metrics.
-        after_step: Called after every update of the weights.
-        after_epoch: Called with all metrics so far and the provenance before the checkpoint is
-            written; in every process, see `on_first_process`.
-        extra_state: Further objects with `state_dict` and `load_state_dict` for the checkpoint.
-    """
-
+    # module called with a batch; returns named scalars, of which "loss" is minimised. Its
+    # parameters that require a gradient are trained
     loss: nn.Module
-    n_samples: int
+    n_samples: int  # samples of an epoch
+    # makes a batch of these samples on the CPU; all that is random about it, and one entry a
+    # sample, comes from the noise
     batch: Callable[[Int[Tensor, " b"], BatchNoise], dict[str, Any]]
-    optimizer: OptimizerConfig
+    optimizer: OptimizerConfig  # settings of the optimizer
+    # JSON-able checksum of the data and settings. A run resumes only with the same
     identity: Mapping[str, Any]
+    # called after every epoch; returns metrics to record beside the mean losses
     evaluate: Callable[[], Metrics] = dict
-    progress: Callable[[Metrics], str] = str
-    after_step: Callable[[], None] = _nothing
+    progress: Callable[[Metrics], str] = str  # returns the line to print for an epoch's metrics
+    after_step: Callable[[], None] = _nothing  # called after every update of the weights
+    # called with all metrics so far and the provenance before the checkpoint is written; in every
+    # process, see `on_first_process`
     after_epoch: Callable[[list[Metrics], dict[str, Any]], None] = _nothing
+    # further objects with `state_dict` and `load_state_dict` for the checkpoint
     extra_state: dict[str, Any] = field(default_factory=dict)
 
 

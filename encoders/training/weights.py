@@ -24,17 +24,11 @@ Config = TypeVar("Config")
 
 @dataclass(frozen=True)
 class WeightsFormat:
-    """File format of one kind of weights, each in its own folder.
+    """File format of one kind of weights, each in its own folder."""
 
-    Attributes:
-        stem: Stem of both file names.
-        label: Name in messages.
-        remedy: What to do if there are none.
-    """
-
-    stem: str
-    label: str
-    remedy: str
+    stem: str  # stem of both file names
+    label: str  # name in messages
+    remedy: str  # what to do if there are none
 
     def weights_path(self, directory: Path) -> Path:
         """Return the path of the weights."""

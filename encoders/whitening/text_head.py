@@ -26,15 +26,10 @@ EmbedTexts = Callable[[list[str]], Float[Tensor, "k t"]]
 
 @dataclass(frozen=True, eq=False)
 class TextHead:
-    """Linear map from a text tower's embeddings to touch.
+    """Linear map from a text tower's embeddings to touch."""
 
-    Attributes:
-        mean: Mean of the unit text embeddings.
-        matrix: Map from centred text embeddings to touch.
-    """
-
-    mean: Float[Tensor, " t"]
-    matrix: Float[Tensor, "t d"]
+    mean: Float[Tensor, " t"]  # mean of the unit text embeddings
+    matrix: Float[Tensor, "t d"]  # map from centred text embeddings to touch
 
     def __call__(self, texts: Float[Tensor, "n t"]) -> Float[Tensor, "n d"]:
         """Return unit vectors among the touch embeddings."""

@@ -52,47 +52,31 @@ _PNG = [
 
 @dataclass(frozen=True)
 class Description:
-    """Everything about an episode but its frames and its place in a set.
+    """Everything about an episode but its frames and its place in a set."""
 
-    Attributes:
-        fps: Frames per second.
-        features: As in LeRobot's meta/info.json.
-        task: Instruction.
-        meta: Facts about the episode.
-        length: Number of frames.
-        stats: Key -> statistics, without the index columns.
-        video_crc32: Camera key -> checksum of its MP4 file.
-    """
-
-    fps: int
-    features: dict[str, dict[str, Any]]
-    task: str
-    meta: dict[str, MetaValue]
-    length: int
-    stats: dict[str, statistics.Stats]
-    video_crc32: dict[str, int]
+    fps: int  # frames per second
+    features: dict[str, dict[str, Any]]  # as in LeRobot's meta/info.json
+    task: str  # instruction
+    meta: dict[str, MetaValue]  # facts about the episode
+    length: int  # number of frames
+    stats: dict[str, statistics.Stats]  # key -> statistics, without the index columns
+    video_crc32: dict[str, int]  # camera key -> checksum of its MP4 file
 
 
 @dataclass(frozen=True, eq=False)
 class EncodedEpisode:
-    """An episode ready to be appended; it pickles.
+    """An episode ready to be appended; it pickles."""
 
-    Attributes:
-        description: Everything but the frames.
-        columns: Key -> PNG bytes per frame for touch, array (T, d) for numbers.
-        videos: Camera key -> MP4 bytes.
-    """
-
-    description: Description
+    description: Description  # everything but the frames
+    # key -> PNG bytes per frame for touch, array (T, d) for numbers
     columns: dict[str, Shaped[np.ndarray, "n d"] | list[bytes]]
-    videos: dict[str, bytes]
+    videos: dict[str, bytes]  # camera key -> MP4 bytes
 
 
 def encode(episode: Episode, fps: int) -> EncodedEpisode:
     """Compress an episode recorded at `fps` frames per second.
 
-    Raises:
-        UserError: The episode does not pass `Episode.check`.
+    UserError: the episode does not pass `Episode.check`.
     """
     episode.check()
     columns, videos, stats = {}, {}, {}
@@ -186,8 +170,7 @@ def has_description(file: pq.ParquetFile) -> bool:
 def read_description(file: pq.ParquetFile) -> Description:
     """Return the description in a data file's footer.
 
-    Raises:
-        UserError: touchgoal did not write the file, or its footer is damaged.
+    UserError: touchgoal did not write the file, or its footer is damaged.
     """
     if not has_description(file):
         raise UserError("this Parquet file was not written by touchgoal")

@@ -38,20 +38,13 @@ from touchgoal.runtime.errors import UserError
 
 @dataclass(frozen=True)
 class SetMetadata:
-    """Content of meta/.
+    """Content of meta/."""
 
-    Attributes:
-        fps: Frames per second.
-        features: As in info.json.
-        tasks: All instructions; the position is the task_index.
-        stats: Statistics over all frames by key.
-        episodes: Table meta/episodes, one row an episode; None before the first.
-    """
-
-    fps: int
-    features: dict[str, dict[str, Any]]
-    tasks: tuple[str, ...] = ()
-    stats: dict[str, Stats] | None = None
+    fps: int  # frames per second
+    features: dict[str, dict[str, Any]]  # as in info.json
+    tasks: tuple[str, ...] = ()  # all instructions; the position is the task_index
+    stats: dict[str, Stats] | None = None  # statistics over all frames by key
+    # table meta/episodes, one row an episode; None before the first
     episodes: pa.Table | None = None
 
     @property
@@ -67,8 +60,7 @@ class SetMetadata:
     def with_episode(self, description: Description, file_number: int) -> "SetMetadata":
         """Return this metadata with one more episode, whose files have number `file_number`.
 
-        Raises:
-            UserError: Its frame rate, features or meta keys differ from the set's.
+        UserError: its frame rate, features or meta keys differ from the set's.
         """
         self._check_same(description)
         tasks = tuple(dict.fromkeys((*self.tasks, description.task)))
@@ -174,8 +166,7 @@ class SetMetadata:
     def load(cls, root: Path) -> "SetMetadata":
         """Read all of meta/.
 
-        Raises:
-            UserError: No set, an unknown version, or a file that cannot be read.
+        UserError: no set, an unknown version, or a file that cannot be read.
         """
         info = load_info(root)
         return cls(

@@ -85,8 +85,7 @@ def _require_own_set(root: Path) -> None:
 def validate(root: str | os.PathLike[str]) -> list[str]:
     """Read every file of a set and return what is wrong, one line a problem; [] if it is sound.
 
-    Raises:
-        UserError: Not a set, one of another version, or one that lerobot wrote or continued.
+    UserError: not a set, one of another version, or one that lerobot wrote or continued.
     """
     root = set_files.set_folder(Path(root))
     _require_own_set(root)

@@ -72,11 +72,7 @@ def read_video(root: Path, name: str, crc32: int) -> bytes:
 
 
 def load_info(root: Path) -> dict[str, Any]:
-    """Read meta/info.json.
-
-    Raises:
-        UserError: No set, one of another version, or a value that cannot be.
-    """
+    """Read meta/info.json. UserError: no set, one of another version, or a value that cannot be."""
     if not (root / INFO).exists():
         raise UserError(
             f"{root} is not a set of episodes (it has no {INFO}): give the folder that a recording "
@@ -121,8 +117,7 @@ def load_json(root: Path, name: str) -> dict[str, Any]:
 def load_table(root: Path, name: str, leave_out: str | None = None) -> pa.Table:
     """Read a Parquet file of a set, without the columns that begin with `leave_out`.
 
-    Raises:
-        UserError: The file is missing or broken.
+    UserError: the file is missing or broken.
     """
     try:
         with pq.ParquetFile(root / name, page_checksum_verification=True) as file:

@@ -27,28 +27,20 @@ _MAX_NAME = 200  # letters
 
 @dataclass(frozen=True, eq=False)
 class GraspTrial:
-    """One grasp.
+    """One grasp."""
 
-    Attributes:
-        name: Name for messages.
-        object: Name of the object.
-        held: Whether it was still in the hand after lifting.
-        held_out: Whether it belongs to the published test files.
-        fingers: Each fingertip's images at `MOMENTS`, the first without contact.
-    """
-
-    name: str
-    object: str
-    held: bool
-    held_out: bool
+    name: str  # name for messages
+    object: str  # name of the object
+    held: bool  # whether it was still in the hand after lifting
+    held_out: bool  # whether it belongs to the published test files
+    # each fingertip's images at `MOMENTS`, the first without contact
     fingers: tuple[TouchClip, TouchClip]
 
 
 def read_grasps(folder: Path, sensor: str | None = None) -> Iterator[GraspTrial]:
     """Read the grasps of a folder, one file at a time.
 
-    Raises:
-        UserError: No such files, another sensor's, or a content that is not as published.
+    UserError: no such files, another sensor's, or a content that is not as published.
     """
     paths = _files(folder)
     if not paths:

@@ -22,22 +22,15 @@ _COLUMNS = ("force_newtons", "gripper_width_m")
 
 @dataclass(frozen=True, eq=False)
 class ForceGrasp:
-    """One grasp, from the open hand and back.
+    """One grasp, from the open hand and back."""
 
-    Attributes:
-        trial: Name of the grasp.
-        object: Id of the object.
-        video: Video file.
-        force: Grasp force of each frame, N, as the load cell gives it, with spikes and drift.
-        width: Gripper width of each frame, m.
-        corners: Corners of the gel in the images, px, if they are to be rectified.
-    """
-
-    trial: str
-    object: str
-    video: Path
+    trial: str  # name of the grasp
+    object: str  # id of the object
+    video: Path  # video file
+    # grasp force of each frame, N, as the load cell gives it, with spikes and drift
     force: Float[np.ndarray, " n"]
-    width: Float[np.ndarray, " n"]
+    width: Float[np.ndarray, " n"]  # gripper width of each frame, m
+    # corners of the gel in the images, px, if they are to be rectified
     corners: Corners | None = None
 
     def frames(self) -> UInt8[np.ndarray, "m h w 3"]:
@@ -51,8 +44,7 @@ class ForceGrasp:
 def read_force_grasps(folder: Path, corners: Corners | None = None) -> list[ForceGrasp]:
     """Read the grasps of a folder; with corners of the gel, their images are rectified.
 
-    Raises:
-        UserError: A table, a column or a video is missing.
+    UserError: a table, a column or a video is missing.
     """
     index = folder / "grasps.csv"
     if not index.is_file():

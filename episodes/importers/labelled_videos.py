@@ -26,20 +26,13 @@ _COLUMNS = ("file", "object", "name", "split", *PROPERTIES)
 
 @dataclass(frozen=True)
 class LabelledVideo:
-    """One press of an object.
+    """One press of an object."""
 
-    Attributes:
-        path: Video file.
-        object: Id of the object.
-        name: Name of the object.
-        split: train, val, test or unlabelled.
-        ranks: Hardness, roughness and bumpiness, 0 to 2; None where not ranked.
-    """
-
-    path: Path
-    object: str
-    name: str
-    split: str
+    path: Path  # video file
+    object: str  # id of the object
+    name: str  # name of the object
+    split: str  # train, val, test or unlabelled
+    # hardness, roughness and bumpiness, 0 to 2; None where not ranked
     ranks: tuple[int, int, int] | None
 
     def frames(self) -> UInt8[np.ndarray, "n h w 3"]:
@@ -55,8 +48,7 @@ def has_labels(folder: Path) -> bool:
 def read_labelled_videos(folder: Path) -> list[LabelledVideo]:
     """List the videos of a folder, in the order of `labels.csv`.
 
-    Raises:
-        UserError: No such table, a column or a video is missing, or a rank is not 0, 1 or 2.
+    UserError: no such table, a column or a video is missing, or a rank is not 0, 1 or 2.
     """
     table = folder / _TABLE
     if not has_labels(folder):

@@ -19,17 +19,11 @@ _TABLES = 5
 
 @dataclass(frozen=True, eq=False)
 class MarkerPicture:
-    """One image with the other tracker's result.
+    """One image with the other tracker's result."""
 
-    Attributes:
-        path: Image file.
-        positions: (x, y) of the markers, px.
-        found: Whether the tracker found each.
-    """
-
-    path: Path
-    positions: Float[np.ndarray, "rows columns 2"]
-    found: Bool[np.ndarray, "rows columns"]
+    path: Path  # image file
+    positions: Float[np.ndarray, "rows columns 2"]  # (x, y) of the markers, px
+    found: Bool[np.ndarray, "rows columns"]  # whether the tracker found each
 
     @property
     def series(self) -> str:
@@ -52,8 +46,7 @@ def has_markers(folder: Path) -> bool:
 def read_marker_pictures(folder: Path) -> list[MarkerPicture]:
     """Read the images of a folder, by name.
 
-    Raises:
-        UserError: An image is missing, or a file does not hold the tables.
+    UserError: an image is missing, or a file does not hold the tables.
     """
     return [_read(path) for path in sorted(folder.glob("*_*.json"))]
 

@@ -36,8 +36,7 @@ class _Unpickler(pickle.Unpickler):
 def read_plain_pickle(path: Path) -> Any:
     """Return the value in a pickle of containers, numbers, text, bytes and numpy arrays.
 
-    Raises:
-        UserError: There is no such file, it is damaged, or it asks for anything else.
+    UserError: there is no such file, it is damaged, or it asks for anything else.
     """
     try:
         with path.open("rb") as file:

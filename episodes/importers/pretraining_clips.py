@@ -41,20 +41,13 @@ _LAYOUTS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Recording:
-    """One unlabelled recording; its file is read whole when it is opened.
+    """One unlabelled recording; its file is read whole when it is opened."""
 
-    Attributes:
-        path: Pickle of images.
-        sensor: Sensor model.
-        held_out: Whether the published split holds it out of training.
-        exchanged: Whether red and blue are exchanged in the file.
-        backgrounds: Images of untouched gels, one of them this sensor's; empty if unknown.
-    """
-
-    path: Path
-    sensor: str
-    held_out: bool
-    exchanged: bool = False
+    path: Path  # pickle of images
+    sensor: str  # sensor model
+    held_out: bool  # whether the published split holds it out of training
+    exchanged: bool = False  # whether red and blue are exchanged in the file
+    # images of untouched gels, one of them this sensor's; empty if unknown
     backgrounds: tuple[Path, ...] = ()
 
     @property
@@ -69,8 +62,7 @@ class Recording:
     def open(self) -> tuple[TouchClip, UInt8[np.ndarray, "h w 3"]]:
         """Read the images, and the untouched sensor.
 
-        Raises:
-            UserError: The file is damaged, or `bgs/` holds images of another size.
+        UserError: the file is damaged, or `bgs/` holds images of another size.
         """
         clip = TouchClip(self.name, self.sensor, read_pictures(self.path), self.exchanged)
         median = clip.median_image()

@@ -39,25 +39,16 @@ _MOST_FORCE = 100.0  # N: the load cell, an ATI Nano17, ends at 70
 
 @dataclass(frozen=True, eq=False)
 class ForceStroke:
-    """A probe pressed on the gel and drawn over it.
+    """A probe pressed on the gel and drawn over it."""
 
-    Attributes:
-        name: Probe, batch and number.
-        probe: sphere, sharp or flat.
-        clip: All images of the batch.
-        rows: Indices of the stroke's images among them, in time.
-        force: Force, N; two components along the gel, the third into it, positive under pressure.
-        slip: Whether the probe slides.
-        untouched: Index of the last image without contact before the stroke.
-    """
-
-    name: str
-    probe: str
-    clip: TouchClip
-    rows: Int64[np.ndarray, " n"]
+    name: str  # probe, batch and number
+    probe: str  # sphere, sharp or flat
+    clip: TouchClip  # all images of the batch
+    rows: Int64[np.ndarray, " n"]  # indices of the stroke's images among them, in time
+    # force, N; two components along the gel, the third into it, positive under pressure
     force: Float64[np.ndarray, "n 3"]
-    slip: Bool[np.ndarray, " n"]
-    untouched: int
+    slip: Bool[np.ndarray, " n"]  # whether the probe slides
+    untouched: int  # index of the last image without contact before the stroke
 
     def frames(self) -> UInt8[np.ndarray, "n h w 3"]:
         """Decode the stroke's RGB images."""

@@ -39,24 +39,16 @@ _OFF_ROTATION = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class PoseBag:
-    """One recording of an object moved by hand under a finger.
+    """One recording of an object moved by hand under a finger."""
 
-    Attributes:
-        name: Name for messages.
-        object: sugar or pringles.
-        held_out: Whether it belongs to the published test set.
-        clip: Images.
-        change: Change of the object's pose over the last `STRIDE` images (m along x and y, rad), one row
-            an image; the first `STRIDE` rows have no such past.
-        untouched: Image file of the finger without contact.
-    """
-
-    name: str
-    object: str
-    held_out: bool
-    clip: TouchClip
+    name: str  # name for messages
+    object: str  # sugar or pringles
+    held_out: bool  # whether it belongs to the published test set
+    clip: TouchClip  # images
+    # change of the object's pose over the last `STRIDE` images (m along x and y, rad), one row an
+    # image; the first `STRIDE` rows have no such past
     change: Float64[np.ndarray, "n 3"]
-    untouched: Path
+    untouched: Path  # image file of the finger without contact
 
     def background(self) -> UInt8[np.ndarray, "h w 3"]:
         """Read the image of the finger without contact."""

@@ -20,26 +20,18 @@ _MOST_BYTES = 65_536
 
 @dataclass(frozen=True, eq=False)
 class TextileClip:
-    """One grasp of a textile.
+    """One grasp of a textile."""
 
-    Attributes:
-        clip: Images.
-        label: Class, 0 to 19.
-        name: Name of the class.
-        held_out: Whether it belongs to the published test set.
-    """
-
-    clip: TouchClip
-    label: int
-    name: str
-    held_out: bool
+    clip: TouchClip  # images
+    label: int  # class, 0 to 19
+    name: str  # name of the class
+    held_out: bool  # whether it belongs to the published test set
 
 
 def read_textiles(folder: Path, sensor: str | None = None) -> Iterator[TextileClip]:
     """Read the clips of a folder with train/ and test/, one at a time.
 
-    Raises:
-        UserError: No such files, another sensor's, or a content that is not as published.
+    UserError: no such files, another sensor's, or a content that is not as published.
     """
     layout = "*/*/dataset_gelsight.pkl"
     paths = [p for use in ("train", "test") for p in sorted(folder.glob(f"{use}/{layout}"))]

@@ -24,29 +24,20 @@ Picture = UInt8[np.ndarray, "h w 3"]
 
 @dataclass(frozen=True, eq=False)
 class TouchClip:
-    """Images of one fingertip, in time.
+    """Images of one fingertip, in time."""
 
-    Attributes:
-        name: Name for messages.
-        sensor: `control.tactile.sensor_models.SensorModel.name`.
-        pictures: JPEG or PNG files.
-        red_and_blue_exchanged: Whether the writer took RGB for BGR.
-    """
-
-    name: str
-    sensor: str
-    pictures: Sequence[bytes]
-    red_and_blue_exchanged: bool = False
+    name: str  # name for messages
+    sensor: str  # `control.tactile.sensor_models.SensorModel.name`
+    pictures: Sequence[bytes]  # JPEG or PNG files
+    red_and_blue_exchanged: bool = False  # whether the writer took RGB for BGR
 
     def __len__(self) -> int:
-        """Return the number of images."""
         return len(self.pictures)
 
     def frames(self, rows: Sequence[int] | Int[np.ndarray, " n"]) -> UInt8[np.ndarray, "n h w 3"]:
         """Return RGB images, turned as the sensor's model: a DIGIT's upright, a GelSight's lying.
 
-        Raises:
-            UserError: One of them is broken, or of another size than the others.
+        UserError: one of them is broken, or of another size than the others.
         """
         pictures = [self._frame(int(row)) for row in rows]
         if len({picture.shape for picture in pictures}) > 1:
@@ -68,9 +59,8 @@ class TouchClip:
 def decode(data: bytes, name: str) -> Picture:
     """Decode a JPEG or PNG file; `name` is for the message.
 
-    Raises:
-        UserError: It is neither, too large, or damaged: a PNG is compared with its checksums, a JPEG
-            must decode without a warning.
+    UserError: it is neither, too large, or damaged: a PNG is compared with its checksums, a JPEG
+    must decode without a warning.
     """
     whole = data[:8] == _PNG and _is_whole_png(data)
     if whole or data[:2] == _JPEG:
@@ -107,8 +97,7 @@ def turned(picture: Picture, sensor: str) -> UInt8[np.ndarray, "height width 3"]
 def read_pictures(path: Path) -> list[bytes]:
     """Return the list of encoded images that a pickle holds.
 
-    Raises:
-        UserError: It is no such list, or an empty one.
+    UserError: it is no such list, or an empty one.
     """
     return encoded_pictures(read_plain_pickle(path), str(path))
 
@@ -125,8 +114,7 @@ def encoded_pictures(value: object, name: str) -> list[bytes]:
 def read_picture_file(path: Path, sensor: str) -> Picture:
     """Read an image file, in the orientation of the sensor's model.
 
-    Raises:
-        UserError: It is missing or broken.
+    UserError: it is missing or broken.
     """
     try:
         return turned(decode(path.read_bytes(), str(path)), sensor)
@@ -137,8 +125,7 @@ def read_picture_file(path: Path, sensor: str) -> Picture:
 def check_sensor(sensor: str | None, possible: tuple[str, ...], folder: Path) -> str:
     """Return the sensor of a layout: the one named, if it is possible, else the first possible one.
 
-    Raises:
-        UserError: The layout is another sensor's.
+    UserError: the layout is another sensor's.
     """
     if sensor is None:
         return possible[0]

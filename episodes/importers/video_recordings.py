@@ -16,15 +16,10 @@ _LEARNED = "train", "unlabelled"
 
 @dataclass(frozen=True)
 class VideoRecording:
-    """One video; its ranks are not used.
+    """One video; its ranks are not used."""
 
-    Attributes:
-        video: Video, decoded whole whenever it is opened.
-        sensor: Sensor model.
-    """
-
-    video: LabelledVideo
-    sensor: str = "gelsight_mini"
+    video: LabelledVideo  # video, decoded whole whenever it is opened
+    sensor: str = "gelsight_mini"  # sensor model
 
     @property
     def held_out(self) -> bool:
@@ -53,7 +48,6 @@ class DecodedVideo:
     pictures: UInt8[np.ndarray, "n h w 3"]
 
     def __len__(self) -> int:
-        """Return the number of images."""
         return len(self.pictures)
 
     def frames(self, rows: Sequence[int] | Int[np.ndarray, " k"]) -> UInt8[np.ndarray, "k h w 3"]:
@@ -64,8 +58,7 @@ class DecodedVideo:
 def read_video_recordings(folder: Path) -> list[VideoRecording]:
     """List the videos of a folder with `labels.csv`.
 
-    Raises:
-        UserError: The table lacks a column, names a missing video, or has none to train on.
+    UserError: the table lacks a column, names a missing video, or has none to train on.
     """
     recordings = [VideoRecording(video) for video in read_labelled_videos(folder)]
     if all(recording.held_out for recording in recordings):

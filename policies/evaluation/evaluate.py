@@ -83,7 +83,6 @@ class Evaluation:
         return float(np.mean([t.progress for t in self.trials]))
 
     def __str__(self) -> str:
-        """Return the success rate, such as 49/50 [0.90, 1.00]."""
         return str(self.rate)
 
 

@@ -28,19 +28,12 @@ Plan = Callable[[ObservationBatch], Float[Tensor, "b h 8"]]
 
 @dataclass(frozen=True, eq=False)
 class OpenLoopErrors:
-    """Errors along one demonstration, mm.
+    """Errors along one demonstration, mm."""
 
-    Attributes:
-        chunk: mean over all plans, after each tick of the plan.
-        teacher_forced: at each tick.
-        free_running: at each tick.
-        path: length of the TCP's path, mm.
-    """
-
-    chunk: Float[np.ndarray, " h"]
-    teacher_forced: Float[np.ndarray, " t"]
-    free_running: Float[np.ndarray, " t"]
-    path: float
+    chunk: Float[np.ndarray, " h"]  # mean over all plans, after each tick of the plan
+    teacher_forced: Float[np.ndarray, " t"]  # at each tick
+    free_running: Float[np.ndarray, " t"]  # at each tick
+    path: float  # length of the TCP's path, mm
 
 
 def open_loop_errors(plan: Plan, demonstration: SequenceDataset, control_hz: int) -> OpenLoopErrors:

@@ -19,6 +19,5 @@ class SuccessRate:
         return float(interval.low), float(interval.high)
 
     def __str__(self) -> str:
-        """Return such as 49/50 [0.90, 1.00]."""
         low, high = self.interval
         return f"{self.successes}/{self.trials} [{low:.2f}, {high:.2f}]"

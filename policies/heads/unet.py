@@ -15,22 +15,14 @@ from touchgoal.runtime.errors import UserError
 
 @dataclass(frozen=True)
 class UNetConfig:
-    """Size of a U-Net.
+    """Size of a U-Net."""
 
-    Attributes:
-        channels: of each level; every level but the last halves the number of ticks.
-        kernel: ticks a convolution covers, odd.
-        groups: of the group norms; divides every number of channels.
-        step_embedding_dim: of the diffusion step's embedding, even.
-    """
-
-    channels: tuple[int, ...]
-    kernel: int = 5
-    groups: int = 8
-    step_embedding_dim: int = 128
+    channels: tuple[int, ...]  # of each level; every level but the last halves the number of ticks
+    kernel: int = 5  # ticks a convolution covers, odd
+    groups: int = 8  # of the group norms; divides every number of channels
+    step_embedding_dim: int = 128  # of the diffusion step's embedding, even
 
     def __post_init__(self) -> None:
-        """Raise UserError for sizes that do not go together."""
         if not self.channels or any(c % self.groups for c in self.channels):
             raise UserError(
                 f"U-Net channels {self.channels} must be multiples of the {self.groups} groups"

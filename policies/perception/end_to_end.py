@@ -16,15 +16,11 @@ _SCALE = 16.0  # grey levels per 1.0 of the input, as in `encoders/preprocess.py
 
 @dataclass(frozen=True)
 class EndToEndConfig:
-    """Size of a ViT for both tactile images of the latest tick.
+    """Size of a ViT for both tactile images of the latest tick."""
 
-    Attributes:
-        size: rows and columns of its input; twice as many of either train nine times slower.
-        width: of the embedding of one image.
-    """
-
+    # rows and columns of its input; twice as many of either train nine times slower
     size: tuple[int, int] = (60, 80)
-    width: int = 64
+    width: int = 64  # of the embedding of one image
 
 
 def difference_images(

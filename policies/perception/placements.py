@@ -16,20 +16,13 @@ from touchgoal.sim_envs.pick_place import PickPlace
 
 @dataclass(frozen=True, eq=False)
 class Placements:
-    """Starts of n episodes.
+    """Starts of n episodes."""
 
-    Attributes:
-        pictures: camera images by column.
-        tcp: pose of the hand, `features.TCP_POSE`.
-        start: true poses, `features.TRUTH_START`.
-    """
-
-    pictures: dict[str, UInt8[Tensor, "n h w 3"]]
-    tcp: Float32[Tensor, "n 7"]
-    start: Float32[Tensor, "n 7"]
+    pictures: dict[str, UInt8[Tensor, "n h w 3"]]  # camera images by column
+    tcp: Float32[Tensor, "n 7"]  # pose of the hand, `features.TCP_POSE`
+    start: Float32[Tensor, "n 7"]  # true poses, `features.TRUTH_START`
 
     def __len__(self) -> int:
-        """Return the number of starts."""
         return len(self.start)
 
 

@@ -31,17 +31,11 @@ ESTIMATED = (ft.TRUTH_CONTACT, ft.TRUTH_START)
 
 @dataclass(frozen=True)
 class StateEstimatorConfig:
-    """Inputs of a state estimator.
+    """Inputs of a state estimator."""
 
-    Attributes:
-        touch: names the embedder of the fingertips, see `frozen_touch.py`.
-        touch_dim: width of its embedding of both fingertips.
-        pose_estimator: for the cameras.
-    """
-
-    touch: str
-    touch_dim: int
-    pose_estimator: PoseEstimatorConfig = PoseEstimatorConfig()
+    touch: str  # names the embedder of the fingertips, see `frozen_touch.py`
+    touch_dim: int  # width of its embedding of both fingertips
+    pose_estimator: PoseEstimatorConfig = PoseEstimatorConfig()  # for the cameras
 
 
 class StateEstimatorNetwork(nn.Module):
@@ -126,8 +120,7 @@ def save_estimator(
 def load_estimator(directory: Path) -> StateEstimator:
     """Read a state estimator with its touch encoder: in `touch/` beside it, else the shipped one.
 
-    Raises:
-        UserError: nothing there, damaged, or another touch encoder than the training's.
+    UserError: nothing there, damaged, or another touch encoder than the training's.
     """
     network, own = load_network(directory), directory / "touch"
     return StateEstimator(network, load_touch(own if own.is_dir() else pretrained.DEFAULT_ENCODER))

@@ -28,22 +28,15 @@ from touchgoal.runtime.worker_pool import one_core_workers
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """n ticks of several episodes, one after the other.
+    """n ticks of several episodes, one after the other."""
 
-    Attributes:
-        touch: embeddings of both fingertips.
-        state: proprioception.
-        actions: `features.ACTION`.
-        lengths: ticks of each episode.
-        pictures: difference images for the end-to-end encoder; None without.
-        wrench: on both pads (N, Nm, pad frames); None unless the policy is trained on it.
-    """
-
-    touch: Float16[Tensor, "n e"]
-    state: Float32[Tensor, "n s"]
-    actions: Float32[Tensor, "n 8"]
-    lengths: tuple[int, ...]
+    touch: Float16[Tensor, "n e"]  # embeddings of both fingertips
+    state: Float32[Tensor, "n s"]  # proprioception
+    actions: Float32[Tensor, "n 8"]  # `features.ACTION`
+    lengths: tuple[int, ...]  # ticks of each episode
+    # difference images for the end-to-end encoder; None without
     pictures: UInt8[Tensor, "n k h w 3"] | None = None
+    # on both pads (N, Nm, pad frames); None unless the policy is trained on it
     wrench: Float32[Tensor, "n 12"] | None = None
 
 
@@ -210,7 +203,6 @@ class SequenceDataset:
         self.action_is_pad: Bool[Tensor, "n h"] = torch.from_numpy(planned >= last)
 
     def __len__(self) -> int:
-        """Return the number of windows."""
         return len(self._observed)
 
     @property

@@ -17,20 +17,13 @@ _PAUSE = 0.5  # s
 
 @dataclass(frozen=True)
 class ChosenEpisodes:
-    """Episodes of a set to train on.
+    """Episodes of a set to train on."""
 
-    Attributes:
-        rows: their indices.
-        failed: number of failed ones, which are left out.
-        unknown: number of those left out because their success is not recorded.
-    """
-
-    rows: list[int]
-    failed: int
-    unknown: int
+    rows: list[int]  # their indices
+    failed: int  # number of failed ones, which are left out
+    unknown: int  # number of those left out because their success is not recorded
 
     def __str__(self) -> str:
-        """Return such as `12 episodes (3 that failed left out)`."""
         left = [f"{self.failed} that failed"] * bool(self.failed)
         left += [f"{self.unknown} of unknown success"] * bool(self.unknown)
         return f"{len(self.rows)} episodes" + (f" ({', '.join(left)} left out)" if left else "")
@@ -81,8 +74,7 @@ def report_pauses(pauses: Sequence[int], fps: int, trimmed: bool) -> None:
 def find_task(chosen: Sequence[tuple[EpisodeSet, Sequence[int]]], task: str | None) -> TaskName:
     """Return the task of the chosen episodes, which is to be the one asked for, if one is.
 
-    Raises:
-        UserError: they are of several tasks or of another one, or name none and none is asked for.
+    UserError: they are of several tasks or of another one, or name none and none is asked for.
     """
     root, found = chosen[0][0].root, _common("task", chosen, task_of)
     if task and found not in ("", task):

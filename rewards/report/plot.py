@@ -27,19 +27,12 @@ _LABEL_GAP = 0.06  # least distance between two curve labels, share of the first
 
 @dataclass(frozen=True)
 class PlotText:
-    """Texts of a plot.
+    """Texts of a plot."""
 
-    Attributes:
-        heading: name of the trajectory.
-        goal: its goal.
-        axes: label of the vertical axis of each panel.
-        contact: label of the first contact.
-    """
-
-    heading: str
-    goal: str
-    axes: tuple[str, str, str]
-    contact: str
+    heading: str  # name of the trajectory
+    goal: str  # its goal
+    axes: tuple[str, str, str]  # label of the vertical axis of each panel
+    contact: str  # label of the first contact
 
 
 def draw(
