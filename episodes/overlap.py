@@ -4,8 +4,7 @@ Names, order and stride do not matter: a validation set of every second training
 """
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from typing import Protocol, runtime_checkable
+from collections.abc import Iterable
 
 from touchgoal.control.features import STATE, TACTILE
 from touchgoal.episodes.store import EpisodeSet
@@ -14,20 +13,8 @@ from touchgoal.runtime.progress import track
 
 # Simulated episodes may begin with the same resting frames; above this share they are copies.
 _SHARED_FRACTION = 0.1
-
-
-@runtime_checkable
-class ChecksummedRecording(Protocol):
-    """A recording whose frames have checksums."""
-
-    @property
-    def name(self) -> str:
-        """Name for messages."""
-        ...
-
-    def frame_checksums(self) -> frozenset[int]:
-        """Return the checksums of all frames."""
-        ...
+NamedChecksums = tuple[str, frozenset[int]]
+"""A recording's name for messages, and the checksums of all its frames."""
 
 
 def require_no_shared_frames(train: EpisodeSet, validation: EpisodeSet) -> None:
@@ -37,27 +24,16 @@ def require_no_shared_frames(train: EpisodeSet, validation: EpisodeSet) -> None:
     """
     common = [k for k in (STATE, *TACTILE) if {k} <= train.features.keys() & validation.features]
     if common:
-        _compare(_checksums(train, common[0]), _checksums(validation, common[0]))
+        require_disjoint(_checksums(train, common[0]), _checksums(validation, common[0]))
 
 
-def require_no_shared_recordings(
-    train: Sequence[ChecksummedRecording], validation: Sequence[ChecksummedRecording]
-) -> None:
-    """Compare recordings frame by frame; errors as in `require_no_shared_frames`."""
-    _compare(
-        ((recording.name, recording.frame_checksums()) for recording in train),
-        ((recording.name, recording.frame_checksums()) for recording in validation),
-    )
-
-
-def _checksums(episodes: EpisodeSet, key: str) -> Iterable[tuple[str, frozenset[int]]]:
+def _checksums(episodes: EpisodeSet, key: str) -> Iterable[NamedChecksums]:
     for i in track(range(len(episodes)), "comparing frames", "episode"):
         yield f"episode {i} of {episodes.root}", episodes.frame_checksums(i, key)
 
 
-def _compare(
-    train: Iterable[tuple[str, frozenset[int]]], validation: Iterable[tuple[str, frozenset[int]]]
-) -> None:
+def require_disjoint(train: Iterable[NamedChecksums], validation: Iterable[NamedChecksums]) -> None:
+    """Raise UserError if a recording of `validation` contains frames of one of `train`."""
     names, sizes, recordings_of = [], [], {}
     for i, (name, checksums) in enumerate(train):
         names.append(name)

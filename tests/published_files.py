@@ -118,9 +118,3 @@ def write_grasps(path: Path, held: list[bool]) -> None:
             stored = [cv2.imencode(".jpg", frame)[1].tobytes() for frame in frames]
             value[f"gelsight{finger}_{moment}"] = stored
     write(path, value)
-
-
-def write_textile(clip: Path, label: int, name: str) -> None:
-    """A clip of the textile set."""
-    write(clip / "dataset_gelsight.pkl", [encoded(gel(label + t, (240, 320))) for t in range(3)])
-    (clip / "metadata.txt").write_text(f"label: {label}\nclass_name: {name}\n")

@@ -1,4 +1,4 @@
-"""Published touch with labels: force and slip, pose, grasps, textiles; whole, damaged, incomplete."""
+"""Published touch with labels: force and slip, pose, grasps; whole, damaged, incomplete."""
 
 import pickle
 from collections.abc import Callable, Iterable
@@ -15,13 +15,11 @@ from published_files import (
     write_force_batch,
     write_grasps,
     write_pose_set,
-    write_textile,
 )
 
 from touchgoal.episodes.importers.feeling_of_success import read_grasps
 from touchgoal.episodes.importers.tacbench_forces import read_strokes
 from touchgoal.episodes.importers.tacbench_poses import read_bags
-from touchgoal.episodes.importers.textiles import read_textiles
 from touchgoal.runtime.errors import UserError
 
 
@@ -163,26 +161,6 @@ def test_grasps_are_held_or_not_and_felt_by_two_fingers(tmp_path: Path) -> None:
         list(read_grasps(tmp_path))
     with pytest.raises(UserError, match="give a folder of Feeling of Success"):
         next(read_grasps(tmp_path / "none"))
-
-
-def test_textiles_have_the_class_of_their_metadata(tmp_path: Path) -> None:
-    write_textile(tmp_path / "train" / "denim" / "clip_0", 7, "denim")
-    write_textile(tmp_path / "test" / "wool" / "clip_3", 11, "wool")
-    clips = list(read_textiles(tmp_path))
-    assert [(c.label, c.name, c.held_out) for c in clips] == [
-        (7, "denim", False),
-        (11, "wool", True),
-    ]
-    assert len(clips[0].clip) == 3 and near(clips[0].clip.frames([1])[0], gel(8, (240, 320)))
-    metadata = tmp_path / "test" / "wool" / "clip_3" / "metadata.txt"
-    metadata.write_text("label: many")
-    with pytest.raises(UserError, match="no line 'label: NUMBER'"):
-        list(read_textiles(tmp_path))
-    metadata.unlink()
-    with pytest.raises(UserError, match="metadata.txt is missing"):
-        list(read_textiles(tmp_path))
-    with pytest.raises(UserError, match="give a folder of textiles"):
-        next(read_textiles(tmp_path / "train"))
 
 
 def use_strokes(folder: Path) -> None:

@@ -11,13 +11,13 @@ from torch import Tensor
 from touchgoal.control.features import TACTILE, TRUTH_PAD_WRENCH
 from touchgoal.encoders.backbones.frame_history import past_rows
 from touchgoal.encoders.preprocess import preprocessor_for
+from touchgoal.episodes.importers.labelled_videos import LabelledVideo
 from touchgoal.episodes.importers.pretraining_clips import Recording as ClipRecording
-from touchgoal.episodes.importers.video_recordings import VideoRecording
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
-Recording = ClipRecording | VideoRecording
+Recording = ClipRecording | LabelledVideo
 """One fingertip's images in a file, and the untouched sensor."""
 
 
@@ -125,7 +125,8 @@ def sample_recordings(
     for i, recording in enumerate(track(recordings, "touches", "recording")):
         clip, background = recording.open()
         _, rows, where = _draw_rows(len(clip), per_recording, [seed, i], offsets)
-        touch.append(torch.from_numpy(preprocess(clip.frames(rows), background)).half()[where])
+        frames = clip[rows] if isinstance(clip, np.ndarray) else clip.frames(rows)
+        touch.append(torch.from_numpy(preprocess(frames, background)).half()[where])
     return TouchFrames.from_samples(touch, None, sensor, offsets)
 
 

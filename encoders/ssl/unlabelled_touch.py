@@ -12,10 +12,9 @@ from touchgoal.encoders.ssl.frames import (
     sample_frames,
     sample_recordings,
 )
-from touchgoal.episodes.importers.labelled_videos import has_labels
+from touchgoal.episodes.importers.labelled_videos import has_labels, read_labelled_videos
 from touchgoal.episodes.importers.pretraining_clips import read_recordings
-from touchgoal.episodes.importers.video_recordings import read_video_recordings
-from touchgoal.episodes.overlap import require_no_shared_frames, require_no_shared_recordings
+from touchgoal.episodes.overlap import require_disjoint, require_no_shared_frames
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.provenance import provenance
@@ -43,24 +42,17 @@ class _Source:
     episodes: EpisodeSet | None
     recordings: Sequence[Recording] = ()
 
-    @property
-    def training(self) -> list[Recording]:
-        return [recording for recording in self.recordings if not recording.held_out]
+    def chosen(self, held_out: bool) -> list[Recording]:
+        """Return the recordings for training, or those that are held out of it."""
+        return [recording for recording in self.recordings if recording.held_out == held_out]
 
-    @property
-    def held_out(self) -> list[Recording]:
-        return [recording for recording in self.recordings if recording.held_out]
-
-    @property
     def record(self) -> dict[str, Any]:
+        """Return the source's part of the provenance."""
         path = str(self.folder)
         if (episodes := self.episodes) is not None:
             return {"path": path, "episodes": len(episodes), "checksum": episodes.checksum}
-        return {
-            "path": path,
-            "recordings": len(self.training),
-            "held_out": len(self.held_out),
-        }
+        trained, held_out = (len(self.chosen(held_out)) for held_out in (False, True))
+        return {"path": path, "recordings": trained, "held_out": held_out}
 
     def draw(self, recordings: Sequence[Recording]) -> Draw:
         """Return a function that draws from the episode set, or else from these recordings."""
@@ -92,22 +84,22 @@ def open_touch(
     train = [first, *(_open(folder, first.sensor) for folder in data[1:])]
     other = [_open(folder, first.sensor) for folder in validation]
     for source in train:
-        if not other and not source.held_out:
+        if not other and not source.chosen(held_out=True):
             raise UserError(
                 f"{source.folder} holds no recordings out: name other episodes with --validation"
             )
     _require_no_overlap(train, other)
     return UnlabelledTouch(
-        _join([source.draw(source.training) for source in train]),
+        _join([source.draw(source.chosen(held_out=False)) for source in train]),
         _join(
-            [source.draw(source.held_out) for source in train if source.held_out]
+            [source.draw(held) for source in train if (held := source.chosen(held_out=True))]
             + [source.draw(source.recordings) for source in other]
         ),
         {
             **provenance(),
             "data": {
-                "train": [source.record for source in train],
-                "validation": [source.record for source in other],
+                "train": [source.record() for source in train],
+                "validation": [source.record() for source in other],
             },
         },
     )
@@ -118,10 +110,11 @@ def _require_no_overlap(train: Sequence[_Source], other: Sequence[_Source]) -> N
         for two in other:
             if one.episodes is not None and two.episodes is not None:
                 require_no_shared_frames(one.episodes, two.episodes)
-    require_no_shared_recordings(
-        [recording for source in train for recording in source.training],
-        [recording for source in train for recording in source.held_out]
-        + [recording for source in other for recording in source.recordings],
+    trained = [recording for source in train for recording in source.chosen(held_out=False)]
+    tested = [recording for source in train for recording in source.chosen(held_out=True)]
+    tested += [recording for source in other for recording in source.recordings]
+    require_disjoint(
+        *([(str(r.path), r.frame_checksums()) for r in some] for some in (trained, tested))
     )
 
 
@@ -129,7 +122,14 @@ def _open(folder: Path, sensor: str | None) -> _Source:
     if (folder / "meta").exists():
         episodes = EpisodeSet(folder)
         return _Source(folder, find_sensor_name(sensor, episodes), episodes)
-    found = read_video_recordings(folder) if has_labels(folder) else read_recordings(folder, sensor)
+    if labelled := has_labels(folder):
+        found = read_labelled_videos(folder)
+    else:
+        found = read_recordings(folder, sensor)
+    if labelled and all(video.held_out for video in found):
+        raise UserError(
+            f"{folder} has no video to train on: name the split train or unlabelled in labels.csv"
+        )
     recorded = found[0].sensor
     if sensor not in (None, recorded):
         raise UserError(f"{folder} was recorded with {recorded}, not {sensor}")

@@ -7,12 +7,14 @@ unlabelled), hardness, roughness and bumpiness (0, 1 or 2 each; empty where not 
 import csv
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from touchgoal.episodes.media import read_frames
+from touchgoal.episodes.touches import touch_background
 from touchgoal.runtime.errors import UserError
 
 PROPERTIES = ("hardness", "roughness", "bumpiness")
@@ -34,10 +36,25 @@ class LabelledVideo:
     split: str  # train, val, test or unlabelled
     # hardness, roughness and bumpiness, 0 to 2; None where not ranked
     ranks: tuple[int, int, int] | None
+    sensor: ClassVar[str] = "gelsight_mini"
 
     def frames(self) -> UInt8[np.ndarray, "n h w 3"]:
         """Return the RGB frames; the first few are without contact."""
         return read_frames(self.path)[0]
+
+    @property
+    def held_out(self) -> bool:
+        """Whether training leaves it out."""
+        return self.split not in ("train", "unlabelled")
+
+    def frame_checksums(self) -> frozenset[int]:
+        """Return checksums of the images, comparable in this process."""
+        return frozenset(hash(picture.tobytes()) for picture in self.frames())
+
+    def open(self) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "h w 3"]]:
+        """Decode the images, and the untouched sensor: the median of the first five."""
+        frames = self.frames()
+        return frames, touch_background(frames)
 
 
 def has_labels(folder: Path) -> bool:

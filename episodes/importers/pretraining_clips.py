@@ -50,11 +50,6 @@ class Recording:
     # images of untouched gels, one of them this sensor's; empty if unknown
     backgrounds: tuple[Path, ...] = ()
 
-    @property
-    def name(self) -> str:
-        """Name for messages."""
-        return str(self.path)
-
     def frame_checksums(self) -> frozenset[int]:
         """Return checksums of the encoded images, comparable in this process."""
         return frozenset(hash(picture) for picture in read_pictures(self.path))
@@ -64,7 +59,7 @@ class Recording:
 
         UserError: the file is damaged, or `bgs/` holds images of another size.
         """
-        clip = TouchClip(self.name, self.sensor, read_pictures(self.path), self.exchanged)
+        clip = TouchClip(str(self.path), self.sensor, read_pictures(self.path), self.exchanged)
         median = clip.median_image()
         if not self.backgrounds:
             return clip, median
@@ -72,7 +67,7 @@ class Recording:
         fitting = [picture for picture in found if picture.shape == median.shape]
         if not fitting:
             raise UserError(
-                f"no image in {self.backgrounds[0].parent} has the size of {self.name}'s: "
+                f"no image in {self.backgrounds[0].parent} has the size of {self.path}'s: "
                 "make them equal"
             )
         return clip, min(fitting, key=lambda p: np.median(np.abs(median - p.astype(int))))
