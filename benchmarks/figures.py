@@ -12,20 +12,20 @@ def successes(metrics: Metrics) -> str:
     return str(SuccessRate(metrics["successes"], metrics["trials"]))
 
 
+def _rate(trials: list[Metrics]) -> SuccessRate:
+    return SuccessRate(sum(trial["success"] for trial in trials), len(trials))
+
+
 def deployed(metrics: Metrics) -> str:
     """Success rate by arm."""
     rows = metrics["deployments"]
     arms = dict.fromkeys(row["arm"] for row in rows)
-    rates = {arm: [row["success"] for row in rows if row["arm"] == arm] for arm in arms}
-    return "; ".join(f"{arm} {SuccessRate(sum(r), len(r))}" for arm, r in rates.items())
+    return "; ".join(f"{arm} {_rate([r for r in rows if r['arm'] == arm])}" for arm in arms)
 
 
 def fewest_and_most(metrics: Metrics) -> str:
     """Success of the worst and the best row."""
-    done = [
-        SuccessRate(sum(t["success"] for t in r["trials"]), len(r["trials"]))
-        for r in metrics["rows"]
-    ]
+    done = [_rate(row["trials"]) for row in metrics["rows"]]
     worst, best = (f(done, key=lambda rate: rate.successes) for f in (min, max))
     return f"{worst} (worst row) to {best} (best row)"
 
@@ -35,7 +35,7 @@ def maze(metrics: Metrics, **names: str) -> str:
     found = []
     for label, part in names.items():
         [own] = [trials for key, trials in metrics["closed_loop"].items() if part in key]
-        found.append(f"{label} {SuccessRate(sum(t['success'] for t in own), len(own))}")
+        found.append(f"{label} {_rate(own)}")
     return "; ".join(found)
 
 
@@ -60,21 +60,16 @@ def plan(metrics: Metrics) -> str:
 def encoder_speed(metrics: Metrics) -> str:
     """Time and rate of the first encoder."""
     row = metrics["rows"][0]
-    return (
-        f"{row['encoder']} {row['tick']:.1f} ms a frame, {row['batched']:.0f} frames/s in batches"
-    )
+    rates = f"{row['tick']:.1f} ms a frame, {row['batched']:.0f} frames/s in batches"
+    return f"{row['encoder']} {rates}"
 
 
 def realism(metrics: Metrics) -> str:
     """Median PSNR, beside Taxim's table."""
 
     def median(sensor: str, method: str) -> float:
-        psnr = sorted(
-            row["psnr_near"]
-            for row in metrics["rows"]
-            if (row["sensor"], row["method"]) == (sensor, method)
-        )
-        return psnr[len(psnr) // 2]
+        own = [r for r in metrics["rows"] if (r["sensor"], r["method"]) == (sensor, method)]
+        return sorted(row["psnr_near"] for row in own)[len(own) // 2]
 
     ours, taxim = "ours, circles corrected", "taxim table, on our background"
     return "; ".join(

@@ -28,22 +28,13 @@ FOLDER = ROOT / "benchmarks" / "results"
 
 @dataclass(frozen=True)
 class Quoted:
-    """One entry of records.toml.
+    """One entry of records.toml."""
 
-    Attributes:
-        topic: heading in docs/results.md.
-        claim: what is measured.
-        command: as a user types it.
-        figure: function of `figures` that gives the headline.
-        of: its further arguments.
-        in_readme: whether README's table shows it.
-    """
-
-    topic: str
-    claim: str
+    topic: str  # heading in docs/results.md
+    claim: str  # what is measured
     command: str
-    figure: str
-    of: dict[str, str] = field(default_factory=dict)
+    figure: str  # function of `figures` that gives the headline
+    of: dict[str, str] = field(default_factory=dict)  # its further arguments
     in_readme: bool = False
 
 
@@ -55,25 +46,12 @@ _BLOCK = re.compile(r"(<!-- (headlines|results) -->\n).*?(<!-- end -->)", re.DOT
 
 
 def load_record(name: str) -> dict[str, Any]:
-    """Return a record.
-
-    Returns:
-        `command`, `measured` (date and commit), `hardware`, `printed` (lines), `metrics`.
-
-    Raises:
-        UserError: there is no such record.
-    """
-    if name not in QUOTED:
-        raise UserError(f"there is no record {name!r}; choose from: {', '.join(QUOTED)}")
+    """Return a record: `command`, `measured` (date and commit), `hardware`, `printed`, `metrics`."""
     return json.loads((FOLDER / f"{name}.json").read_text())
 
 
 def records_of(benchmark: str) -> list[str]:
-    """Return the names of a benchmark's records, or the record of that very name.
-
-    Raises:
-        UserError: there is none.
-    """
+    """Return the names of a benchmark's records, or that very name; UserError if there is none."""
     start = f"touchgoal benchmark {benchmark} "
     names = [name for name, quoted in QUOTED.items() if f"{quoted.command} ".startswith(start)]
     if benchmark in QUOTED and benchmark not in names:
@@ -108,29 +86,22 @@ def pages() -> list[Path]:
 
 
 def measure(name: str) -> None:
-    """Run the command of a record and write the record.
-
-    Raises:
-        UserError: there is no such record.
-        CalledProcessError: the command failed.
-    """
+    """Run the command of a record and write the record; UserError if there is no such record."""
     if name not in QUOTED:
         raise UserError(f"there is no record {name!r}; choose from: {', '.join(QUOTED)}")
     command, out = QUOTED[name].command, ROOT / "runs" / "results" / name
     program = [sys.executable, "-m", "touchgoal.launch", *shlex.split(command)[1:]]
-    done = subprocess.run(
-        [*program, "--out", str(out)], check=True, text=True, stdout=subprocess.PIPE
-    )
-    lines = [line.rstrip() for line in done.stdout.splitlines()]
-    printed = [x for x in lines if not (str(out) in x or x.startswith("hardware: "))]
-    write_record(name, command, printed, json.loads((out / "metrics.json").read_text()))
+    printed = subprocess.check_output([*program, "--out", str(out)], text=True)
+    lines = [line.rstrip() for line in printed.splitlines()]
+    table = [x for x in lines if not (str(out) in x or x.startswith("hardware: "))]
+    write_record(name, command, table, json.loads((out / "metrics.json").read_text()))
 
 
 def write_record(name: str, command: str, printed: list[str], metrics: dict[str, Any]) -> None:
     """Write a record; its metrics stand on one line."""
     metrics.pop("command", None)  # has the folders of this machine
     asked = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
-    commit = subprocess.run(asked, check=True, capture_output=True, text=True).stdout.strip()
+    commit = subprocess.check_output(asked, text=True).strip()
     record = {
         "command": command,
         "measured": f"{date.today()}, commit {commit}",
@@ -138,33 +109,24 @@ def write_record(name: str, command: str, printed: list[str], metrics: dict[str,
         "printed": printed,
         "metrics": None,
     }
-    text = json.dumps(record, indent=1).replace(
-        '"metrics": null', f'"metrics": {json.dumps(metrics)}'
-    )
+    numbers = f'"metrics": {json.dumps(metrics)}'
+    text = json.dumps(record, indent=1).replace('"metrics": null', numbers)
     (FOLDER / f"{name}.json").write_text(text + "\n")
 
 
 def _headlines() -> str:
-    rows = ["| measured | figure | record |", "|---|---|---|"]
-    rows += [
-        f"| {quoted.claim} | {headline(name)} | `{name}` |"
-        for name, quoted in QUOTED.items()
-        if quoted.in_readme
-    ]
-    return "\n".join(rows) + "\n"
+    return _table([name for name, quoted in QUOTED.items() if quoted.in_readme])
 
 
 def _results() -> str:
-    rows = []
-    for topic in dict.fromkeys(quoted.topic for quoted in QUOTED.values()):
-        rows += [f"**{topic}**", "", "| measured | figure | record |", "|---|---|---|"]
-        rows += [
-            f"| {quoted.claim} | {headline(name)} | `{name}` |"
-            for name, quoted in QUOTED.items()
-            if quoted.topic == topic
-        ]
-        rows.append("")
-    return "\n".join(rows)
+    topics = dict.fromkeys(quoted.topic for quoted in QUOTED.values())
+    of = {topic: [n for n, quoted in QUOTED.items() if quoted.topic == topic] for topic in topics}
+    return "\n".join(f"**{topic}**\n\n{_table(names)}" for topic, names in of.items())
+
+
+def _table(names: list[str]) -> str:
+    rows = [f"| {QUOTED[name].claim} | {headline(name)} | `{name}` |" for name in names]
+    return "\n".join(["| measured | figure | record |", "|---|---|---|", *rows]) + "\n"
 
 
 def main(arguments: list[str]) -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from touchgoal.benchmarks.papers.tacbench.data import read_cloths, read_grasps
-from touchgoal.benchmarks.papers.tacbench.field import field_metrics
+from touchgoal.benchmarks.papers.tacbench.force import field_metrics
 from touchgoal.benchmarks.papers.tacbench.labels import grasp_task, label_metrics, textile_task
 from touchgoal.benchmarks.papers.tacbench.task import split_grasp
 from touchgoal.benchmarks.papers.tacbench_report.published import published

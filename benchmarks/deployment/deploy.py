@@ -12,12 +12,12 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from touchgoal.benchmarks.deployment.deployed_episode import Deployment, Scene, deploy, limited
-from touchgoal.benchmarks.deployment.deployed_twin import DeployedTwin
+from touchgoal.benchmarks.deployment.deployed_twin import deployed_twin
 from touchgoal.benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
 from touchgoal.episodes.recording import EpisodeSpec
@@ -30,6 +30,8 @@ from touchgoal.runtime.progress import track
 from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskName
 
+Arm = Literal["environment", "in-process", "lock-step", "real-time"]
+
 
 @checked_dataclass
 class Config(BenchmarkOptions):
@@ -39,12 +41,7 @@ class Config(BenchmarkOptions):
     """Tasks."""
     policies: tuple[str, ...] = ("scripted", "shipped")
     """Policies, named as for deploy; scripted: the task's own, the expert or the follower."""
-    arms: tuple[Literal["environment", "in-process", "lock-step", "real-time"], ...] = (
-        "environment",
-        "in-process",
-        "lock-step",
-        "real-time",
-    )
+    arms: tuple[Arm, ...] = get_args(Arm)
     """Ways to act. environment: the task's environment; in-process: a simulated arm from the
     example cell file; lock-step: a fresh twin over libfranka whose time waits for the client;
     real-time: the same against the wall clock."""
@@ -78,10 +75,8 @@ def run(config: Config) -> dict[str, Any]:
                     ]
                     bar = f"{task}, {policy}, {arm}"
                     rows = [job.result() for job in track(begun, bar, "deployment")]
-                lines += _lines(rows)
-                print(
-                    "\n".join(lines[-1 - sum(not row.success for row in rows) :]), file=sys.stderr
-                )
+                lines += (own := _lines(rows))
+                print("\n".join(own), file=sys.stderr)
                 done += rows
     return {"table": "\n".join(lines), "deployments": [asdict(row) for row in done]}
 
@@ -115,30 +110,22 @@ def _cell(scene: Scene, arm: str, folder: Path, number: int) -> Iterator[Path]:
     """Provide a cell file whose arm lasts as long as the context."""
     if arm == "in-process":
         cell = read_cell_file(_CELLS / EXAMPLES[scene.task])
-        maze = scene.task == "bead-maze"
-        task = replace(
-            cell.task,
-            seed=scene.seed,
-            objects=() if maze else (scene.item,),
-            wires=(scene.item,) if maze else (),
-        )
+        kind, other = ("wires", "objects") if scene.task == "bead-maze" else ("objects", "wires")
+        task = replace(cell.task, seed=scene.seed, **{kind: (scene.item,), other: ()})
         path = folder / "cell.json"
         path.write_text(json.dumps(cell_table(replace(cell, task=task))))
         yield path
         return
-    with DeployedTwin(scene.task, scene.seed, scene.item, arm == "lock-step", folder, number) as t:
-        yield t.cell_file
+    with deployed_twin(scene, arm == "lock-step", folder, number) as cell_file:
+        yield cell_file
 
 
 def _in_environment(scene: Scene, policy: str) -> Deployment:
-    task = scene.config()
-    maker, task = prepare_policy(policy, task)
+    maker, task = prepare_policy(policy, scene.config())
     trial = run_trial(task, maker, EpisodeSpec(scene.seed))
-    kind = (scene.task, policy, "environment", scene.seed, scene.item)
-    ending = trial.failure or "done"
-    return Deployment(
-        *kind, trial.success, trial.progress, ending, "", trial.seconds, trial.peak_force, {}, 0.0
-    )
+    ending, peak = trial.failure or "done", trial.peak_force
+    result = trial.success, trial.progress, ending, "", trial.seconds, peak, {}, 0.0
+    return Deployment(scene.task, policy, "environment", scene.seed, scene.item, *result)
 
 
 def _lines(rows: list[Deployment]) -> list[str]:
@@ -155,9 +142,8 @@ def _lines(rows: list[Deployment]) -> list[str]:
     lines = [f"{what:<34}{rate!s:<23}{peak:>12}{late:>9.1f}{pace:>6.2f}  {clamped or 'never'}"]
     for row in rows:
         if not row.success:
-            at = "" if row.progress is None else f", progress {row.progress:.2f}"
+            ending = f"{row.ending} at {row.seconds:.1f} s"
             phase = f", {row.phase}" if row.phase else ""
-            lines.append(
-                f"    {row.seed} {row.item}: {row.ending} at {row.seconds:.1f} s{phase}{at}"
-            )
+            at = "" if row.progress is None else f", progress {row.progress:.2f}"
+            lines.append(f"    {row.seed} {row.item}: {ending}{phase}{at}")
     return lines

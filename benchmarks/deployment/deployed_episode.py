@@ -32,17 +32,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Deployment:
-    """Result of one deployment.
-
-    Attributes:
-        progress: progress of the task at the end, in [0, 1]; None if unknown.
-        ending: how it ended.
-        phase: state of the fingers at the end.
-        peak_force: largest external force on the hand, N.
-        clamped: share of the ticks in which each limit changed the command.
-        late: 99th percentile of the ticks' lateness, ms.
-        pace: arm clock over wall clock in the median second; 1 in lock-step.
-    """
+    """Result of one deployment."""
 
     task: str
     policy: str
@@ -50,14 +40,14 @@ class Deployment:
     seed: int
     item: str
     success: bool
-    progress: float | None
+    progress: float | None  # of the task at the end, in [0, 1]; None if unknown
     ending: str
-    phase: str
+    phase: str  # of the fingers at the end
     seconds: float
-    peak_force: float
-    clamped: dict[str, float]
-    late: float
-    pace: float = 1.0
+    peak_force: float  # external, on the hand, N
+    clamped: dict[str, float]  # share of the ticks in which each limit changed the command
+    late: float  # 99th percentile of the ticks' lateness, ms
+    pace: float = 1.0  # arm clock over wall clock in the median second; 1 in lock-step
 
 
 def limited(cell: Path, seconds: float) -> Path:

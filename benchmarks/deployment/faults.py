@@ -7,7 +7,6 @@ twin's truth says what the arm did.
 
 import json
 import multiprocessing
-import os
 import resource
 import signal
 import sys
@@ -16,12 +15,14 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from touchgoal.benchmarks.deployment.deployed_twin import own_address
 from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
@@ -109,25 +110,19 @@ CASES = (
 class FaultRow:
     """What one fault did.
 
-    Attributes:
-        message: message to the operator.
-        rest: s (simulated) from the fault until the arm is at rest; not a number if the fault stops
-            no arm, or takes the controller, and so the twin, away.
-        excess: rad beyond the maker's joint range; speed: share of the maker's joint speed.
-        force: N, the most that pressed on the robot from outside.
-        episodes_whole: whether all is on disk and whole that had been finished, this run's episode included
-            unless its process or its disk was what failed.
-        late: ms by which 99 % of the ticks were late at most.
+    `rest` is not a number if the fault stops no arm, or takes the controller, and so the twin, away.
+    `episodes_whole` tells whether all is on disk and whole that had been finished, this run's episode
+    included unless its process or its disk was what failed.
     """
 
     name: str
-    message: str
-    rest: float
-    excess: float
-    speed: float
-    force: float
+    message: str  # to the operator
+    rest: float  # s (simulated) from the fault until the arm is at rest
+    excess: float  # rad beyond the maker's joint range
+    speed: float  # share of the maker's joint speed
+    force: float  # N, the most that pressed on the robot from outside
     episodes_whole: bool
-    late: float
+    late: float  # ms by which 99 % of the ticks were late at most
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -146,10 +141,8 @@ def run(config: Config) -> dict[str, Any]:
 
 def _run(case: FaultCase, folder: Path, lock_step: bool, number: int) -> FaultRow:
     folder.mkdir()
-    pid = os.getpid()
-    host = f"127.{60 + number}.{pid // 250 % 250}.{1 + pid % 250}"
     broken_at = folder / "broken_at"
-    twin = _spawn(_serve, host, folder, lock_step)
+    twin = _spawn(_serve, own_address(60 + number), folder, lock_step)
     _wait_until(lambda: (folder / "cell.json").exists() or not twin.is_alive())
     cell = read_cell_file(folder / "cell.json")
     cell = replace(cell, task=replace(cell.task, start=None))
@@ -174,10 +167,10 @@ def _run(case: FaultCase, folder: Path, lock_step: bool, number: int) -> FaultRo
     stops = message != PLAN_ENDED and (case.kills or case.control_line or broken_at.exists())
     rest = after["time"] - after["rest"] - before if after and stops else float("nan")
     finished = 1 if case.kills or case.full else 2
-    episodes_whole = len(EpisodeSet(episodes)) == finished and not _damaged(episodes)
-    return FaultRow(
-        case.name, message, rest, **worst, episodes_whole=episodes_whole, late=float(late)
-    )
+    # What an interrupted episode left behind belongs to none.
+    damaged = any("belongs to no episode" not in line for line in validate(episodes))
+    whole = len(EpisodeSet(episodes)) == finished and not damaged
+    return FaultRow(case.name, message, rest, **worst, episodes_whole=whole, late=float(late))
 
 
 def _inject(
@@ -185,16 +178,15 @@ def _inject(
 ) -> tuple[float, dict[str, Any] | None]:
     """Break it while the arm moves; the twin's time then, and its truth once the arm rests."""
     port = cell.task.twin
+    truth = partial(ask_twin, port, "truth")
 
-    def truth() -> dict[str, Any]:
-        return ask_twin(port, "truth")
-
-    def begun(now: dict[str, Any]) -> bool:
+    def begun() -> bool:
+        now = truth()
         if case.carrying:
             return now["layout"]["object"][2] > _IN_THE_AIR
         return max(np.abs(now["dq"])) > 0.1
 
-    _wait_until(lambda: begun(truth()) or report.exists() or not deploy.is_alive())
+    _wait_until(lambda: begun() or report.exists() or not deploy.is_alive())
     moment = truth()["time"]
     if case.kills:
         deploy.kill()
@@ -255,9 +247,8 @@ def _deploy(
         late = 1e3 * float(np.percentile(result.log.lateness or [np.nan], 99))
         message = result.recording_error or result.ending.reason
         if case.policy == "outwards":
-            message += "; clamped: " + ", ".join(
-                f"{name} {n}" for name, n in result.log.limit_counts.items()
-            )
+            counts = result.log.limit_counts.items()
+            message += "; clamped: " + ", ".join(f"{name} {n}" for name, n in counts)
     except (DriverError, UserError) as error:  # nothing has moved
         message = f"it did not begin: {error}"
     resource.setrlimit(resource.RLIMIT_FSIZE, (_UNLIMITED, _UNLIMITED))
@@ -322,11 +313,6 @@ def _wait_until(holds: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-def _damaged(episodes: Path) -> bool:
-    """Whether a finished episode is; what an interrupted one left behind belongs to none."""
-    return any("belongs to no episode" not in line for line in validate(episodes))
-
-
 def _line(row: FaultRow) -> str:
     episodes_whole = "whole" if row.episodes_whole else "LOST"
     rest = "-" if np.isnan(row.rest) else f"{row.rest:.2f}"
@@ -338,8 +324,6 @@ def _line(row: FaultRow) -> str:
 
 
 def _table(rows: list[FaultRow]) -> str:
-    head = (
-        f"{'fault':<25}{'rest s':>7}{'beyond':>9}{'speed':>7}{'force N':>8}{'late ms':>8}  {'whole':<7}"
-        "what the operator sees"
-    )
+    head = f"{'fault':<25}{'rest s':>7}{'beyond':>9}{'speed':>7}{'force N':>8}{'late ms':>8}  "
+    head += f"{'whole':<7}what the operator sees"
     return "\n".join([head, *(_line(row) for row in rows)])

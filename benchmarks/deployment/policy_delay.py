@@ -1,38 +1,24 @@
 """Success in the environment under late observations, plans and commands, or by cause.
 
 The arm is as deployed otherwise. With `causes`, each part of `--env.as-deployed` is added alone and
-left out alone. All rows share their seeds.
+left out alone.
 """
 
-import sys
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
-from touchgoal.benchmarks.options import CORES, BenchmarkOptions
-from touchgoal.policies.by_name import prepare_policy
-from touchgoal.policies.evaluation.evaluate import Evaluation, Trial, run_trials, trial_specs
-from touchgoal.runtime import seeds
-from touchgoal.runtime.option_types import Count, NotNegative, Positive, Seed, checked_dataclass
-from touchgoal.sim_envs.config import (
-    AS_DEPLOYED,
-    IDEAL_DEPLOYMENT,
-    BeadMazeConfig,
-    DeploymentConfig,
-    PickPlaceConfig,
-    TaskConfig,
-    TaskName,
-)
+from touchgoal.benchmarks.deployment.trials import ENVS, TrialOptions, try_cases
+from touchgoal.runtime.option_types import NotNegative, Positive, checked_dataclass
+from touchgoal.sim_envs.config import AS_DEPLOYED, IDEAL_DEPLOYMENT, DeploymentConfig, TaskName
 
 
 @checked_dataclass
-class Config(BenchmarkOptions):
+class Config(TrialOptions):
     """Options of benchmark policy-delay."""
 
     task: TaskName = "pick-place"
     """Task; for the maze, on validation wires."""
-    policy: str = "shipped"
-    """Policy, named as for run-policy."""
     causes: bool = False
     """Run an ablation instead of delays: each effect of a deployment alone, then all but it."""
     delay: tuple[NotNegative, ...] = (0.0, 50.0, 100.0, 150.0)
@@ -42,12 +28,6 @@ class Config(BenchmarkOptions):
     """Largest extra delay of each half, drawn each tick, ms."""
     rates: tuple[Positive, ...] = (30.0, 15.0)
     """Image rates, Hz."""
-    episodes: Count = 20
-    """Episodes of each row."""
-    seed: Seed = seeds.POLICY_TEST.start
-    """Random seed of the first episode; each further one adds one."""
-    workers: Count = CORES
-    """Processes that simulate."""
 
 
 # parts of `--env.as-deployed`
@@ -63,16 +43,15 @@ _PARTS = {
 
 def run(config: Config) -> dict[str, Any]:
     """Return success by delay, jitter and image rate, or by cause, with the trials."""
+    task = ENVS[config.task]
     cases = _causes() if config.causes else _delays(config)
-    lines = [f"{'':<46}{'success [95 % Wilson]':<24}{'peak N':>7}"]
-    rows = []
-    for what, as_deployed, between in cases:
-        trials = _trials(config, as_deployed, between)
-        peak = max(trial.peak_force for trial in trials)
-        lines.append(f"{what:<46}{Evaluation(trials)!s:<24}{peak:>7.0f}")
-        print(lines[-1], file=sys.stderr, flush=True)
-        rows.append({"what": what, "trials": [asdict(trial) for trial in trials]})
-    return {"table": "\n".join(lines), "rows": rows}
+    return try_cases(
+        config,
+        (
+            (what, replace(task, as_deployed=as_deployed, deployment=between))
+            for what, as_deployed, between in cases
+        ),
+    )
 
 
 def _delays(config: Config) -> Iterator[tuple[str, bool, DeploymentConfig]]:
@@ -100,13 +79,3 @@ def _causes() -> Iterator[tuple[str, bool, DeploymentConfig]]:
     for what, fields in _PARTS.items():
         own = {field: getattr(IDEAL_DEPLOYMENT, field) for field in fields}
         yield f"as deployed, but for {what}", True, DeploymentConfig(**own)
-
-
-def _trials(config: Config, as_deployed: bool, between: DeploymentConfig) -> tuple[Trial, ...]:
-    task: TaskConfig = PickPlaceConfig()
-    if config.task == "bead-maze":
-        task = BeadMazeConfig(split="validation")
-    task = replace(task, as_deployed=as_deployed, deployment=between)
-    policy, task = prepare_policy(config.policy, task)
-    specs = trial_specs(task, config.episodes, config.seed)
-    return tuple(run_trials(task, policy, specs, config.workers))

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.benchmarks.deployment.deployed_twin import DeployedTwin
+from touchgoal.benchmarks.deployment.deployed_episode import Scene
+from touchgoal.benchmarks.deployment.deployed_twin import deployed_twin
 from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
@@ -45,25 +46,16 @@ _DELAY = 0.005  # s from a command to the arm: half of the two streams' periods
 _WAVE_SECONDS, _WAVE = 2.0, 0.012  # s, and rad a tick at most
 _ABOVE = 0.005  # m of the fingers' lowest corner above the table where it slows down
 _PRESSED = -5e-4  # m, the same as commanded at the end
-_DOWN_SECONDS, _PRESS_SECONDS, _HOLD_SECONDS = (
-    2.5,
-    2.5,
-    0.5,
-)  # s; faster, and the arm's reflex would end it
+_DOWN, _PRESS, _HOLD = 2.5, 2.5, 0.5  # s; faster, and the arm's reflex would end it
 _TOUCHING = 1.0  # N
 
 
 @dataclass(frozen=True)
 class Replayed:
-    """Measurements of a sequence of actions, tick by tick.
+    """Measurements of a sequence of actions, tick by tick."""
 
-    Attributes:
-        q: measured joint positions, rad.
-        force: external force on the hand, N (base frame).
-    """
-
-    q: Float[np.ndarray, "t 7"]
-    force: Float[np.ndarray, "t 3"]
+    q: Float[np.ndarray, "t 7"]  # joint positions, rad
+    force: Float[np.ndarray, "t 3"]  # external, on the hand, N (base frame)
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -77,26 +69,26 @@ def run(config: Config) -> dict[str, Any]:
                 f"{row['motion'] + ', ' + str(row['seed']):<18}{row['joints']:>12.4f}"
                 f"{1e3 * row['tool']:>10.2f}{forces if row['motion'] == 'press' else '':>18}"
             )
-    lines.append(
-        "joints and tool: greatest distance at a tick; force: median while the table is pressed,"
-    )
-    lines.append("in the environment and over the wire")
+    lines += [
+        "joints and tool: greatest distance at a tick; force: median while the table is pressed,",
+        "in the environment and over the wire",
+    ]
     return {"rows": rows, "table": "\n".join(lines)}
 
 
 def replay_both(seed: int, number: int = 0) -> Iterator[dict[str, Any]]:
     """Yield the distance of the arms in a wave and in a press, on a twin of their own.
 
-    `joints` (rad) and `tool` (m): greatest distance at any tick. `force here`, `force there`: median force
-    (N) while the table is pressed, in the environment and over the wire. Twins of different numbers run
-    side by side.
+    `joints` (rad) and `tool` (m): greatest distance at any tick. `force here`, `force there`: median
+    force (N) while the table is pressed, in the environment and over the wire.
     """
     env = _environment()
+    scene = Scene("pick-place", seed, _OBJECT)
     with (
         tempfile.TemporaryDirectory() as name,
-        DeployedTwin("pick-place", seed, _OBJECT, True, Path(name), number, exact=True) as twin,
+        deployed_twin(scene, True, Path(name), number, exact=True) as cell_file,
     ):
-        cell = replace(read_cell_file(twin.cell_file), cameras={}, fingertips=None)
+        cell = replace(read_cell_file(cell_file), cameras={}, fingertips=None)
         for motion, actions_of in (("wave", _wave), ("press", _press)):
             env.reset(seed=seed)
             actions = list(actions_of(env, seed))
@@ -137,20 +129,15 @@ def _wave(env: PickPlace, seed: int) -> Iterator[np.ndarray]:
 def _press(env: PickPlace, _: int) -> Iterator[np.ndarray]:
     """Yield a slow descent onto the table with a closed hand."""
     q = env.command.copy()
-    position, R = env.kinematics.forward(q)
-    corners = (
-        position
-        + (np.array(env.robot.tool.finger_corners) - [0, 0, env.robot.tool.tcp_offset]) @ R.T
-    )
+    tool, (position, R) = env.robot.tool, env.kinematics.forward(q)
+    corners = position + (np.array(tool.finger_corners) - [0, 0, tool.tcp_offset]) @ R.T
     drop = corners[:, 2].min()
-    down = np.concatenate(
-        [
-            np.linspace(0, drop - _ABOVE, round(_DOWN_SECONDS * _HZ)),
-            np.linspace(drop - _ABOVE, drop - _PRESSED, round(_PRESS_SECONDS * _HZ)),
-            np.full(round(_HOLD_SECONDS * _HZ), drop - _PRESSED),
-        ]
-    )
-    for depth in down:
+    stages = [
+        np.linspace(0, drop - _ABOVE, round(_DOWN * _HZ)),
+        np.linspace(drop - _ABOVE, drop - _PRESSED, round(_PRESS * _HZ)),
+        np.full(round(_HOLD * _HZ), drop - _PRESSED),
+    ]
+    for depth in np.concatenate(stages):
         wanted = env.kinematics.solve_ik_near(position - [0, 0, depth], R, q).q
         yield np.append(wanted - q, 0.0)
         q = wanted

@@ -38,8 +38,7 @@ _PIECE = 10.0  # s of motion that are judged together
 
 
 def wild_commands(layer: ActionFilter, ticks: int, rng: np.random.Generator) -> list[Joints]:
-    """Return the filtered joint targets (rad) of a policy that pushes anywhere, often at full
-    force."""
+    """Return the filtered joint targets (rad) of a policy that pushes anywhere, often very hard."""
     n = layer.joints.lower.size
     state, push, commands = layer.start(layer.limits.arm.home), np.zeros(n), []
     for tick in range(ticks):

@@ -1,6 +1,5 @@
 """Force and indentation of demonstrations, and the ceilings that follow for deployments."""
 
-from collections.abc import Mapping
 from dataclasses import field
 from pathlib import Path
 from typing import Any
@@ -37,8 +36,7 @@ def peak_force(episode: Episode) -> float:
 
 
 def peak_indentation(episode: Episode, sensor: str) -> float:
-    """Return the deepest indentation of either gel, m, read as in a deployment; 0 without
-    tactile images."""
+    """Return the deepest indentation of either gel, m, as read in a deployment; 0 without images."""
     peaks = [0.0]
     for key in set(ft.TACTILE) & set(episode.frames):
         pictures = episode.frames[key]
@@ -47,14 +45,11 @@ def peak_indentation(episode: Episode, sensor: str) -> float:
     return max(peaks)
 
 
-def _demonstrates(meta: Mapping[str, Any]) -> bool:
-    return bool(succeeded(meta)) and meta.get("outcome") != CORRECTED
-
-
 def run(config: Config) -> dict[str, Any]:
     """Read every successful episode of a set."""
     episodes = EpisodeSet(config.data)
-    good = [i for i in range(len(episodes)) if _demonstrates(episodes.meta(i))]
+    metas = enumerate(map(episodes.meta, range(len(episodes))))
+    good = [i for i, meta in metas if succeeded(meta) and meta.get("outcome") != CORRECTED]
     if not good:
         raise UserError(f"no episode of {config.data} says that it succeeded")
     sensor = str(episodes.meta(good[0])["sensor"])
@@ -70,9 +65,8 @@ def run(config: Config) -> dict[str, Any]:
     }
     lines = [f"{'of an episode, at most':<24}{'median':>10}{'99 %':>10}{'highest':>10}"]
     for name, values in (("force N", peaks[:, 0]), ("indentation mm", 1e3 * peaks[:, 1])):
-        lines.append(
-            f"{name:<24}" + "".join(f"{np.quantile(values, q):>10.2f}" for q in (0.5, 0.99, 1.0))
-        )
+        cells = (f"{np.quantile(values, q):>10.2f}" for q in (0.5, 0.99, 1.0))
+        lines.append(f"{name:<24}{''.join(cells)}")
     proposed = ", ".join(f"{name} {value:.3g} {unit}" for name, (value, unit) in ceilings.items())
     lines.append(f"ceilings that follow from {len(good)} successful episodes: {proposed}")
     return {

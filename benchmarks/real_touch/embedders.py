@@ -33,12 +33,9 @@ class Embedder(Protocol):
     def __call__(
         self, frames: Frames, background: Untouched, rows: Int[np.ndarray, " k"] | None = None
     ) -> Embeddings:
-        """Return the embeddings of some rows, or of all.
+        """Return the embeddings of some rows of consecutive frames, or of all.
 
-        Args:
-            frames: consecutive frames; an encoder may look back.
-            background: untouched frame of the same sensor.
-            rows: rows to embed; default: all.
+        The background is an untouched frame of the same sensor.
         """
         ...
 
@@ -47,16 +44,13 @@ _PIXELS = 20, 15  # width and height
 
 
 def find_embedder(name: str, seed: int) -> Embedder:
-    """Find an embedder by name.
+    """Find an embedder by name; UserError if there is none.
 
     Args:
         name: a shipped touch encoder, a folder, or a published Sparsh file or id; `random:NAME` for the
             same network untrained; `pixels` for 20 x 15 pixels of change; `efficientnet` for the offline
             towers' ImageNet network; or the id or folder of a Hugging Face vision model.
         seed: seed of random weights.
-
-    Raises:
-        UserError: there is no such embedder.
     """
     if name == "pixels":
         return _one_by_one(_embed_pixels)
@@ -124,8 +118,7 @@ def _of_pictures(network: Callable[[Frames], torch.Tensor]) -> Embedder:
 
 
 def _hugging_face(name: str) -> Embedder:
-    """Return the pooled output of a Hugging Face vision model, or of an image-text model's image
-    tower."""
+    """Return the pooled output of a Hugging Face vision model, or of a model's image tower."""
     try:
         from transformers import AutoImageProcessor, AutoModel
     except ImportError as error:

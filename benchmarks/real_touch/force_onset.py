@@ -1,5 +1,4 @@
-"""Tactile cost of real grasps: when it falls after first force, and whether it separates
-objects."""
+"""Tactile cost of real grasps: when it falls after first force; whether it separates objects."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,20 +16,13 @@ _NEAR = 3  # frames
 
 @dataclass(frozen=True, eq=False)
 class EmbeddedGrasp:
-    """One grasp with one encoder's embeddings.
-
-    Attributes:
-        trial, object: names of the trial and the object.
-        embeddings: embedding of each frame.
-        firmest: frame of the largest force.
-        begins: first frame with 0.5 N on the load cell; None if the hand was not open before.
-    """
+    """One grasp with one encoder's embeddings."""
 
     trial: str
     object: str
     embeddings: Float[np.ndarray, "n d"]
-    firmest: int
-    begins: int | None
+    firmest: int  # frame of the largest force
+    begins: int | None  # first with 0.5 N on the load cell; None if the hand was not open before
 
     @property
     def goal(self) -> Float[np.ndarray, " d"]:

@@ -76,44 +76,34 @@ def judge_grasps(grasps: list[ForceGrasp], embedders: dict[str, Embedder]) -> di
         firmest = int(np.where(force < _IMPOSSIBLE, force, 0).argmax())
         for name, embed in embedders.items():
             embeddings = embed(frames, untouched).astype(np.float64)
-            start = begins if open_hand else None
-            embedded[name].append(
-                EmbeddedGrasp(grasp.trial, grasp.object, embeddings, firmest, start)
+            one = EmbeddedGrasp(
+                grasp.trial, grasp.object, embeddings, firmest, begins if open_hand else None
             )
-    every, force, frame_objects = (
-        np.concatenate(rows),
-        np.concatenate(forces),
-        np.concatenate(objects),
-    )
+            embedded[name].append(one)
+    every, force, frame_objects = map(np.concatenate, (rows, forces, objects))
     judged = (force <= RANGE) & (force > -1)
-    error = np.full(len(force), np.nan)
-    for name in np.unique(frame_objects):
+    error, names = np.full(len(force), np.nan), np.unique(frame_objects)
+    for name in names:
         known = judged & (frame_objects != name)
         reader = calibrate_force(every[known], force[known])
         own = frame_objects == name
         error[own] = np.abs(reader.predict(every[own]) - force[own])
     pressed = judged & (force > _PRESSED)
+    if len(names) == len(grasps):  # an object grasped once has no other grasp to compare with
+        embedded = {}
     return {
         "grasps": len(grasps),
-        "objects": len(np.unique(frame_objects)),
-        "median_error": float(np.median(error[pressed])),
-        "median_error_interval": interval(
-            error[pressed], frame_objects[pressed], lambda v: float(np.median(v))
-        ),
-        "by_object": {
-            str(n): float(np.median(error[pressed & (frame_objects == n)]))
-            for n in np.unique(frame_objects)
-        },
+        "objects": len(names),
+        "median_error": _median(error[pressed]),
+        "median_error_interval": interval(error[pressed], frame_objects[pressed], _median),
+        "by_object": {str(n): _median(error[pressed & (frame_objects == n)]) for n in names},
         "contact_delay": contact,
-        # An object grasped once has no other grasp to compare with.
-        "cost": {n: judge_cost(embeddings) for n, embeddings in embedded.items()}
-        if _again(grasps)
-        else {},
+        "cost": {name: judge_cost(embeddings) for name, embeddings in embedded.items()},
     }
 
 
-def _again(grasps: list[ForceGrasp]) -> bool:
-    return len({grasp.object for grasp in grasps}) < len(grasps)
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values))
 
 
 def force_table(result: dict[str, Any]) -> str:

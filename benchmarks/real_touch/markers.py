@@ -44,9 +44,9 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def judge_markers(pictures: Sequence[MarkerPicture]) -> dict[str, Any]:
-    """Follow every series from its first image.
+    """Follow every series from its first image, and compare displacements.
 
-    Displacements are compared, not positions: each tracker has its own convention for the first pixel.
+    Positions would not do: each tracker has its own convention for the first pixel.
     """
     series: dict[str, list[MarkerPicture]] = {}
     for picture in pictures:

@@ -78,13 +78,8 @@ def run(config: Config) -> dict[str, Any]:
     lines = [_table(rows), _LEGEND]
     if not has_jax():
         lines.append(f"taxim's pictures are left out; to compare: {install_extra('peers')}")
-    return {
-        "rows": rows,
-        "table": "\n".join(lines),
-        "pictures": {
-            "pictures": side_by_side([real for real, _ in examples], [made for _, made in examples])
-        },
-    }
+    picture = side_by_side([real for real, _ in examples], [made for _, made in examples])
+    return {"rows": rows, "table": "\n".join(lines), "pictures": {"pictures": picture}}
 
 
 def _methods(
@@ -126,11 +121,6 @@ def _examples(test: PressSet, simulated: list[Colours]) -> list[tuple[Colours, C
     return cuts[:_EXAMPLES_PER_SENSOR]
 
 
-def _median(rows: list[dict[str, Any]], sensor: str, method: str, error: str) -> float:
-    found = [r[error] for r in rows if r["sensor"] == sensor and r["method"] == method]
-    return float(np.median(found))
-
-
 def _table(rows: list[dict[str, Any]]) -> str:
     splits = len({r["seed"] for r in rows})
     lines = [
@@ -139,8 +129,9 @@ def _table(rows: list[dict[str, Any]]) -> str:
     ]
     for sensor in dict.fromkeys(r["sensor"] for r in rows):
         for method in dict.fromkeys(r["method"] for r in rows if r["sensor"] == sensor):
+            own = [r for r in rows if (r["sensor"], r["method"]) == (sensor, method)]
             l1, psnr, ssim, whole = (
-                _median(rows, sensor, method, error)
+                np.median([r[error] for r in own])
                 for error in ("l1_near", "psnr_near", "ssim_near", "l1")
             )
             lines.append(

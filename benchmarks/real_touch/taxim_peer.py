@@ -26,7 +26,7 @@ _UNTOUCHED_HEIGHT = 5.0  # mm above the gel
 
 
 def real_presses(sensor: str) -> PressSet:
-    """Return the wheel's presses of `gelsight` (48) or `gelsight_mini` (24), at 320x240.
+    """Return the wheel's 48 presses of `gelsight` or 24 of `gelsight_mini`, at 320x240.
 
     Raises:
         UserError: the wheel is not installed.
@@ -57,29 +57,22 @@ def has_jax() -> bool:
 class TaximRenderer:
     """Taxim's images of a ball, RGB counts at 320x240, with shadows.
 
-    Attributes:
-        untouched: its untouched image, off the real one by 4 (GelSight) to 18 counts (Mini).
+    Its untouched image is off the real one by 4 (GelSight) to 18 counts (Mini).
     """
 
     def __init__(self, sensor: str) -> None:
         taxim: Any = importlib.import_module("taxim")
-        calibrations = {
-            "gelsight": taxim.CALIB_GELSIGHT,
-            "gelsight_mini": taxim.CALIB_GELSIGHT_MINI,
-        }
-        self._simulator = taxim.Taxim(calib_folder=calibrations[sensor], backend="jax")
+        calibration = getattr(taxim, f"CALIB_{sensor.upper()}")
+        self._simulator = taxim.Taxim(calib_folder=calibration, backend="jax")
         self.untouched = self._picture(np.full(_FULL_SHAPE, _UNTOUCHED_HEIGHT, np.float32))
 
     def render(
         self, circle: Circle, ball_radius: float, contact_share: float
     ) -> Float32[np.ndarray, "h w 3"]:
-        """Render one press.
+        """Render one press: circle of contact (px), radius (m).
 
-        Args:
-            circle: circle of contact, px.
-            ball_radius: m.
-            contact_share: share of the deepest overlap that counts as contact. 0: the circle where the ball
-                cuts the flat gel; 0.4: where taxim's own gel model clings to it.
+        The share of the deepest overlap counts as contact; 0: the circle where the ball cuts the
+        flat gel; 0.4: where taxim's own gel model clings to it.
         """
         return self._picture(_ball_height(circle, ball_radius, contact_share))
 

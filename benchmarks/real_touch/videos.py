@@ -61,38 +61,24 @@ BRIGHTER = 1.1
 
 @dataclass(frozen=True, eq=False)
 class VideoTouch:
-    """One video.
-
-    Attributes:
-        video: its labels.
-        chosen: rows of the frames with the largest change.
-        rest: row of an untouched frame.
-        background: untouched image.
-        untouched, peak: contact strength of the first three frames, and the largest, in counts.
-        threshold: contact threshold from the first frames' noise, in counts.
-    """
+    """One video; strengths of contact in counts."""
 
     video: LabelledVideo
-    chosen: Int[np.ndarray, " k"]
-    rest: int
+    chosen: Int[np.ndarray, " k"]  # rows of the frames with the largest change
+    rest: int  # row of an untouched frame
     background: UInt8[np.ndarray, "h w 3"]
-    untouched: float
-    peak: float
-    threshold: float
+    untouched: float  # strength in the first three frames
+    peak: float  # largest strength
+    threshold: float  # from the first frames' noise
 
 
 @dataclass(frozen=True, eq=False)
 class VideoEmbedding:
-    """One encoder's embeddings of a video.
+    """One encoder's embeddings of a video."""
 
-    Attributes:
-        touch: mean over the chosen frames.
-        rest, brighter: embedding of an untouched frame, and of the same frame in more light.
-    """
-
-    touch: Float[np.ndarray, " d"]
-    rest: Float[np.ndarray, " d"]
-    brighter: Float[np.ndarray, " d"]
+    touch: Float[np.ndarray, " d"]  # mean over the chosen frames
+    rest: Float[np.ndarray, " d"]  # untouched frame
+    brighter: Float[np.ndarray, " d"]  # the same frame in more light
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -145,23 +131,17 @@ def judge(
     objects = np.array([touch.video.object for touch in touches])[ranked]
     ranks = np.array([touch.video.ranks for touch in touches if touch.video.ranks is not None])
     embeddings = every[ranked]
-    same = nearest_is_same(embeddings, objects)
-    adapted = adapted_nearest_is_same(embeddings, objects)
     sentences = sentences_right(embeddings, ranks, objects, embed_texts)
     predicted = predict_properties(embeddings, ranks, objects)
     right = predicted.ranks == ranks
-    all_right = np.asarray(right.all(1))
     rng = np.random.default_rng(0)
     frequent = [np.bincount(column).max() / len(column) for column in ranks.T]
     return {
         "videos": len(objects),
         "objects": len(set(objects)),
-        "nearest": float(same.mean()),
-        "nearest_interval": interval(same, objects),
-        "adapted": float(adapted.mean()),
-        "adapted_interval": interval(adapted, objects),
-        "all_right": float(all_right.mean()),
-        "all_right_interval": interval(all_right, objects),
+        **_with_interval("nearest", nearest_is_same(embeddings, objects), objects),
+        **_with_interval("adapted", adapted_nearest_is_same(embeddings, objects), objects),
+        **_with_interval("all_right", np.asarray(right.all(1)), objects),
         "properties": _by_property(right.mean(0)),
         "pc": _by_property(
             pair_accuracy(*own, objects) for own in zip(predicted.ranks.T, ranks.T, strict=True)
@@ -178,6 +158,10 @@ def judge(
         "most_frequent": _by_property(frequent),
         "light": light_shift(touches, embedded),
     }
+
+
+def _with_interval(name: str, right: np.ndarray, objects: np.ndarray) -> dict[str, Any]:
+    return {name: float(right.mean()), f"{name}_interval": interval(right, objects)}
 
 
 def _by_property(values: Iterable[float]) -> dict[str, float]:

@@ -9,9 +9,8 @@ import copy
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
-import cv2
 import numpy as np
 import torch
 from pydantic import Field
@@ -35,6 +34,7 @@ from touchgoal.encoders.published import STRIDES
 from touchgoal.runtime.option_types import RARE, Count, checked_dataclass
 from touchgoal.runtime.progress import track
 
+Precision = Literal["fp32", "bf16"]
 SparshShape = Literal["mae-tiny", "mae-small", "mae-base", "dino-base", "ijepa-base", "vjepa-base"]
 
 
@@ -44,19 +44,9 @@ class Config(BenchmarkOptions):
 
     encoders: tuple[str, ...] = ("gelsight_mini", "gelsight_mini_surfaces")
     """Touch encoders: a name, a folder, or a published Sparsh file or id."""
-    shapes: tuple[SparshShape, ...] = (
-        "mae-tiny",
-        "mae-small",
-        "mae-base",
-        "dino-base",
-        "ijepa-base",
-        "vjepa-base",
-    )
+    shapes: tuple[SparshShape, ...] = get_args(SparshShape)
     """Sparsh's networks with random weights: base as published, tiny and small narrower."""
-    precisions: Annotated[tuple[Literal["fp32", "bf16"], ...], Field(min_length=1)] = (
-        "fp32",
-        "bf16",
-    )
+    precisions: Annotated[tuple[Precision, ...], Field(min_length=1)] = get_args(Precision)
     """Number formats of the networks."""
     batch_size: Count = 8
     """Frames in a batch."""
@@ -74,27 +64,16 @@ _PAPER = "MAE 104, DINO 112, I-JEPA 112, V-JEPA 60"  # frames/s of the base pres
 
 @dataclass(frozen=True)
 class EncoderSpeed:
-    """One encoder at one precision.
-
-    Attributes:
-        encoder: its name.
-        parameters: parameters, millions.
-        precision: fp32 or bf16.
-        batched: frames a second in batches of prepared input.
-        batched_ratio: the same over the peer's; None without a peer.
-        tick: ms from a raw frame to its embedding, with cached preprocessing.
-        tick_anew: the same without the cache.
-        tick_ratio: the peer's time over `tick`; None without a peer.
-    """
+    """One encoder at one precision; ratios are None without a peer."""
 
     encoder: str
-    parameters: float
+    parameters: float  # millions
     precision: str
-    batched: float
-    batched_ratio: float | None
-    tick: float
-    tick_anew: float
-    tick_ratio: float | None
+    batched: float  # frames a second in batches of prepared input
+    batched_ratio: float | None  # the same over the peer's
+    tick: float  # ms from a raw frame to its embedding, with cached preprocessing
+    tick_anew: float  # the same without the cache
+    tick_ratio: float | None  # the peer's time over `tick`
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -107,18 +86,11 @@ def run(config: Config) -> dict[str, Any]:
         for precision in config.precisions
         if precision == "fp32" or not isinstance(encoder, PooledEncoder)
     ]
-    threads, cv_threads = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    try:
-        with one_core():
-            rows = [
-                _measure(name, encoders[name], precision, config)
-                for name, precision in track(measured, "timing", "encoder")
-            ]
-    finally:
-        torch.set_num_threads(threads)
-        cv2.setNumThreads(cv_threads)
+    with one_core():
+        rows = [
+            _measure(name, encoders[name], precision, config)
+            for name, precision in track(measured, "timing", "encoder")
+        ]
     return {"table": _table(rows, config), "rows": [asdict(row) for row in rows]}
 
 
@@ -177,19 +149,16 @@ class _Peer(nn.Module):
     def __init__(self, config: ViTConfig) -> None:
         super().__init__()
         patch = (config.patch_size, config.patch_size)
-        if config.tubelet == 1:
-            self.patch = nn.Conv2d(config.channels, config.width, patch, patch)
-        else:
-            clip = (config.tubelet, *patch)
-            self.patch = nn.Conv3d(config.channels, config.width, clip, clip)
+        clip = (config.tubelet, *patch)
+        self.patch = (
+            nn.Conv2d(config.channels, config.width, patch, patch)
+            if config.tubelet == 1
+            else nn.Conv3d(config.channels, config.width, clip, clip)
+        )
+        hidden = round(config.mlp_ratio * config.width)
+        like_ours: dict[str, Any] = {"dropout": 0.0, "activation": "gelu", "norm_first": True}
         layer = nn.TransformerEncoderLayer(
-            config.width,
-            config.heads,
-            round(config.mlp_ratio * config.width),
-            0.0,
-            "gelu",
-            batch_first=True,
-            norm_first=True,
+            config.width, config.heads, hidden, batch_first=True, **like_ours
         )
         self.blocks = nn.TransformerEncoder(layer, config.depth, enable_nested_tensor=False)
 

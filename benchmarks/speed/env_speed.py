@@ -4,7 +4,6 @@ import os
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import mujoco
 import numpy as np
 
@@ -37,7 +36,6 @@ TICKS_UNTIL_HELD = 70  # ticks after which the expert holds the object in the ai
 def run(config: Config) -> dict[str, Any]:
     """Measure everything on one core, in wall-clock time."""
     os.environ["LP_NUM_THREADS"] = "0"  # software OpenGL draws in this thread
-    cv2.setNumThreads(1)
     with one_core():
         rows = [*_physics(config), *_env(config), *_maze(config)]
     return {
@@ -51,9 +49,7 @@ def _physics(config: Config) -> list[Row]:
     peer = mujoco.MjModel.from_xml_string(_franky_sim_model())
     peer_data = mujoco.MjData(peer)
     mujoco.mj_resetDataKeyframe(peer, peer_data, 0)
-    rows = [
-        _rate("peer: bare FR3 of the wheel, its own settings", config, n, peer, peer_data),
-    ]
+    rows = [_rate("peer: bare FR3 of the wheel, its own settings", config, n, peer, peer_data)]
     env = PickPlace(PickPlaceConfig(cameras=(), tactile=False))
     for name, ticks in (("object on the table", 0), ("object held in the air", TICKS_UNTIL_HELD)):
         _reset_and_run_expert(env, ticks)
@@ -63,7 +59,6 @@ def _physics(config: Config) -> list[Row]:
 
 
 def _env(config: Config) -> list[Row]:
-    n = config.env_steps
     rows = []
     both = ["soda_can", "pebble"]  # a primitive and a mesh
     for what, task, objects in (
@@ -74,16 +69,7 @@ def _env(config: Config) -> list[Row]:
         env = PickPlace(replace(task, max_seconds=1e6))
         for name in objects:
             _reset_and_run_expert(env, TICKS_UNTIL_HELD, name)
-
-            def step(env: PickPlace = env) -> None:
-                for _ in range(n):
-                    env.step(NO_MOTION)
-
-            rows.append(
-                measure(
-                    f"env step (50 physics steps), {what}, holding {name}", config.repeats, n, step
-                )
-            )
+            rows.append(_step_rate(f"{what}, holding {name}", config, env))
         env.close()
     return rows
 
@@ -95,19 +81,20 @@ def _maze(config: Config) -> list[Row]:
         env = BeadMaze(BeadMazeConfig(tactile=tactile, max_seconds=1e6))
         env.reset(seed=1, options={"wire": "fourier-3"})
         if not tactile:
-            n = config.physics_steps
-            rows.append(
-                _rate("physics, whole cell, bead on the wire", config, n, env.model, env.data)
-            )
-
-        def step(env: BeadMaze = env) -> None:
-            for _ in range(config.env_steps):
-                env.step(NO_MOTION)
-
-        name = f"env step (50 physics steps), {what}, bead on the wire"
-        rows.append(measure(name, config.repeats, config.env_steps, step))
+            n, where = config.physics_steps, "bead on the wire"
+            rows.append(_rate(f"physics, whole cell, {where}", config, n, env.model, env.data))
+        rows.append(_step_rate(f"{what}, bead on the wire", config, env))
         env.close()
     return rows
+
+
+def _step_rate(what: str, config: Config, env: PickPlace | BeadMaze) -> Row:
+    def steps() -> None:
+        for _ in range(config.env_steps):
+            env.step(NO_MOTION)
+
+    name = f"env step (50 physics steps), {what}"
+    return measure(name, config.repeats, config.env_steps, steps)
 
 
 def _reset_and_run_expert(env: PickPlace, ticks: int, name: str = "soda_can") -> None:

@@ -58,13 +58,8 @@ class Stage:
 
 def run(config: Config) -> dict[str, Any]:
     """Time all stages on one core."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with one_core(), torch.inference_mode():
-            stages = _stages(config) + _published(config)
-    finally:
-        torch.set_num_threads(threads)
+    with one_core(), torch.inference_mode():
+        stages = _stages(config) + _published(config)
     period = 1000 / config.control_hz
     lines = [f"{'one core, ms':<58}{'median':>9}{'p95':>9}{'slowest':>9}"]
     lines += [f"{s.what:<58}{s.median:>9.1f}{s.p95:>9.1f}{s.slowest:>9.1f}" for s in stages]
@@ -92,14 +87,11 @@ def _stages(config: Config) -> list[Stage]:
             ),
             _time("touch encoder, both", config.repeats, lambda: encoder.embed_touch(touch)),
         ]
-    if (
-        end_to_end := policy.config.end_to_end
-    ) is not None and policy.end_to_end_encoder is not None:
-        pictures = [
-            difference_images(ticks[1][k][None], ticks[0][k], end_to_end.size) for k in ft.TACTILE
-        ]
+    look = policy.end_to_end_encoder
+    if policy.config.end_to_end is not None and look is not None:
+        size = policy.config.end_to_end.size
+        pictures = [difference_images(ticks[1][k][None], ticks[0][k], size) for k in ft.TACTILE]
         images = torch.from_numpy(np.stack(pictures, 1))
-        look = policy.end_to_end_encoder
         stages.append(_time("end-to-end encoder", config.repeats, lambda: look(images)))
     condition = torch.zeros(1, policy.condition_dim)
     generator = torch.Generator().manual_seed(0)

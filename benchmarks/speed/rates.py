@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+import torch
 
 
 @dataclass(frozen=True)
@@ -21,16 +23,21 @@ class Row:
 
 @contextmanager
 def one_core() -> Iterator[None]:
-    """Keep this process on one core (Linux)."""
-    if not hasattr(os, "sched_setaffinity"):
-        yield
-        return
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(before)})
+    """Keep this process on one core (Linux), torch and OpenCV on one thread."""
+    threads, cv_threads, cores = (
+        torch.get_num_threads(),
+        cv2.getNumThreads(),
+        os.sched_getaffinity(0),
+    )
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    os.sched_setaffinity(0, {min(cores)})
     try:
         yield
     finally:
-        os.sched_setaffinity(0, before)
+        os.sched_setaffinity(0, cores)
+        cv2.setNumThreads(cv_threads)
+        torch.set_num_threads(threads)
 
 
 def measure(

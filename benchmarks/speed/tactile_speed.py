@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, no_type_check
 
-import cv2
 import numpy as np
 from numba import njit
 
@@ -17,7 +16,7 @@ from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI_MARKERS, Senso
 from touchgoal.runtime.errors import install_extra
 from touchgoal.runtime.option_types import Count, checked_dataclass
 from touchgoal.sim_envs.config import NO_RANDOMIZATION
-from touchgoal.sim_envs.scene.objects import CATALOGUE, HARD, Body, Material, ObjectKind, Texture
+from touchgoal.sim_envs.scene.objects import CATALOGUE, HARD, Body, Material, Texture
 from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
@@ -41,7 +40,6 @@ _TEXTURED = Material(Texture.DOTTED, 40e-6, 1.5e-3, HARD, 0.8, (0.7, 0.7, 0.7, 1
 
 def run(config: Config) -> dict[str, Any]:
     """Measure everything on one core, in processor time, which other processes distort least."""
-    cv2.setNumThreads(1)
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     with one_core():
         rows = [*_ours(config), *_peer(config)]
@@ -56,7 +54,8 @@ def _ours(config: Config) -> list[Row]:
     for sensor in (full, half):
         h, w = sensor.image_shape
         for name, body, distance in _bodies():
-            for what, kind in (("smooth", body.kind), ("textured", _textured(body.kind))):
+            textured = replace(body.kind, material=_TEXTURED)
+            for what, kind in (("smooth", body.kind), ("textured", textured)):
                 bench = PressBench(replace(body, kind=kind), sensor, _instance(sensor))
                 bench.place(np.array([1e-3, -0.5e-3, distance - 5e-4]))
                 rows.append(_measure(f"{h}x{w} {name}, {what}", config, _frame(bench)))
@@ -66,8 +65,7 @@ def _ours(config: Config) -> list[Row]:
 
 
 def _frame(bench: PressBench, force: float = 8.0) -> Callable[[], object]:
-    """Return a function that renders all stages: geometry, forces, slip, gel, shadows, colours,
-    noise, dots."""
+    """Return a function that renders all stages of a frame."""
     rng = np.random.default_rng(0)
     return lambda: bench.sense(force, rng, shear=(1.5, 0.5), centre=(1e-3, -0.5e-3))
 
@@ -101,10 +99,6 @@ def _bodies() -> list[tuple[str, Body, float]]:
         ("mesh of 1,280 triangles", Body(pebble, (1.0,), 0.1, hull=small), radius),
         ("mesh of 20,480 triangles", Body(pebble, (1.0,), 0.1, hull=large), radius),
     ]
-
-
-def _textured(kind: ObjectKind) -> ObjectKind:
-    return replace(kind, material=_TEXTURED)
 
 
 def _sphere_points(n: int) -> np.ndarray:
@@ -155,6 +149,7 @@ def _measure(
 
 def _limits(config: Config) -> dict[str, float]:
     """Return the core's own limits and the frame rate that they would allow."""
+    # Alignment of the two arrays changes it tenfold on some machines.
     copied = max(_copy_rate(config, offset) for offset in (0, 16, 1024))
     flop = _measure("fma", replace(config, frames=20), _multiply_and_add).median * _FMA_FLOP
     return {
@@ -166,10 +161,7 @@ def _limits(config: Config) -> dict[str, float]:
 
 
 def _copy_rate(config: Config, offset: int) -> float:
-    """Return bytes read and written a second by copies of 256 kB, as large as a frame's arrays.
-
-    The best of several counts: alignment of the two arrays changes it tenfold on some machines.
-    """
+    """Return bytes read and written a second by copies of 256 kB, as large as a frame's arrays."""
     source = np.ones((1 << 16) + offset, np.float32)[offset:]
     target = np.ones(1 << 16, np.float32)
     copies = replace(config, frames=2000)

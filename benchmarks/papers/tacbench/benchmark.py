@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from touchgoal.benchmarks.papers.tacbench.config import Config
+from touchgoal.benchmarks.papers.tacbench.config import RECORDED_AS, Config, Recording
 from touchgoal.benchmarks.papers.tacbench.data import (
     RigFrames,
     read_cloths,
@@ -31,9 +31,8 @@ from touchgoal.benchmarks.papers.tacbench.probes import (
 )
 from touchgoal.benchmarks.papers.tacbench.published_recordings import check_tasks, find_published
 from touchgoal.benchmarks.papers.tacbench.task import Task
-from touchgoal.benchmarks.papers.tacbench.tasks import RECORDED_AS, TASKS, Recording
-from touchgoal.benchmarks.papers.tacbench.trainings import Answers, Job, Subject, work
-from touchgoal.benchmarks.papers.tacbench_report.figures import Read, pictures
+from touchgoal.benchmarks.papers.tacbench.trainings import TASKS, Answers, Job, Subject, work
+from touchgoal.benchmarks.papers.tacbench_report.figures import draw_by_labels
 from touchgoal.benchmarks.papers.tacbench_report.tables import table
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
@@ -65,7 +64,6 @@ class Bench:
     folder: Path
     bar: tqdm
     rows: list[dict[str, Any]]
-    reads: list[Read]
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -81,7 +79,8 @@ def run(config: Config) -> dict[str, Any]:
     readings: dict[Recording, Reading]
     if published is None:
         folder = config.data or folder
-        readings = {what: _record(what, folder, config) for what in _recordings(config)}
+        recordings: dict[Recording, None] = dict.fromkeys(RECORDED_AS[t] for t in config.tasks)
+        readings = {what: _record(what, folder, config) for what in recordings}
     else:
         folder.mkdir(parents=True, exist_ok=True)
         readings = {published.what: partial(published.read, getattr(config, published.what))}
@@ -90,19 +89,15 @@ def run(config: Config) -> dict[str, Any]:
         on_interruption(lambda: f"recordings are in {config.data or folder}; probes are not saved"),
         progress_bar("probes", trainings, "training") as bar,
     ):
-        bench = Bench(config, sensor, folder, bar, [], [])
+        bench = Bench(config, sensor, folder, bar, [])
         for what, reading in readings.items():
             _run_recording(bench, what, reading, encoders)
     bench.rows.sort(key=lambda row: config.tasks.index(row["task"]))
     return {
         "table": table(bench.rows, sensor, config, config.data if published else None),
         "rows": bench.rows,
-        "pictures": pictures(bench.rows, bench.reads, sensor),
+        "pictures": {"by_labels": draw_by_labels(bench.rows, sensor)},
     }
-
-
-def _recordings(config: Config) -> list[Recording]:
-    return list(dict.fromkeys(RECORDED_AS[task] for task in config.tasks))
 
 
 def _record(what: Recording, folder: Path, config: Config) -> Reading:
@@ -140,9 +135,8 @@ def _run_recording(
             for task in tasks
             for share in bench.config.shares
         ]
-        for (job, frames), answers in zip(
-            jobs, workers.map(work, [job for job, _ in jobs]), strict=True
-        ):
+        answered = workers.map(work, [job for job, _ in jobs])
+        for (job, frames), answers in zip(jobs, answered, strict=True):
             _judge(bench, job, frames, answers)
             bench.bar.update(bench.config.seeds)
     frames = shared[0][1]
@@ -187,7 +181,6 @@ def _judge(bench: Bench, job: Job, frames: RigFrames, answers: Answers) -> None:
         predicted = [torch.from_numpy(outputs) for outputs in answers.predicted[test]]
         about = facts | {"test": test, "test_samples": len(rows)}
         bench.rows.append(about | task.judge(predicted, validation, rows))
-        bench.reads.append(Read(job.task, task, frames, name, job.share, test, rows, predicted[0]))
 
 
 def _references(name: str, task: Task) -> list[dict[str, Any]]:

@@ -1,7 +1,7 @@
 """Options of `touchgoal benchmark tacbench`."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
@@ -10,6 +10,15 @@ from touchgoal.runtime.option_types import RARE, Count, Positive, Seed, checked_
 from touchgoal.sim_envs.config import RigConfig
 
 TacbenchTask = Literal["force", "field", "slip", "pose", "grasp", "textile"]
+Recording = Literal["strokes", "slides", "grasps", "cloths"]
+RECORDED_AS: dict[str, Recording] = {
+    "force": "strokes",
+    "field": "strokes",
+    "slip": "strokes",
+    "pose": "slides",
+    "grasp": "grasps",
+    "textile": "cloths",
+}
 Share = Annotated[float, Field(gt=0, le=1)]
 
 
@@ -17,14 +26,7 @@ Share = Annotated[float, Field(gt=0, le=1)]
 class Config(BenchmarkOptions):
     """Options of benchmark tacbench."""
 
-    tasks: Annotated[tuple[TacbenchTask, ...], Field(min_length=1)] = (
-        "force",
-        "field",
-        "slip",
-        "pose",
-        "grasp",
-        "textile",
-    )
+    tasks: Annotated[tuple[TacbenchTask, ...], Field(min_length=1)] = get_args(TacbenchTask)
     """Tasks: force (T1), field (T1A, forces over the pad), slip (T2), pose (T3, change of a held
     object's pose), grasp (T4, success of a grasp), textile (T6)."""
     encoders: Annotated[tuple[str, ...], Field(min_length=1)] = (

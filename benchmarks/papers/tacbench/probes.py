@@ -3,7 +3,6 @@
 import contextlib
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
@@ -11,6 +10,7 @@ import torch
 from jaxtyping import Float, Float16
 from torch import Tensor, nn
 
+from touchgoal.benchmarks.papers.tacbench.config import Config
 from touchgoal.benchmarks.papers.tacbench.data import STRIDE, RigFrames, Rows
 from touchgoal.benchmarks.papers.tacbench.task import Outputs, Task
 from touchgoal.benchmarks.real_touch.embedders import untrained, vit_of
@@ -35,33 +35,11 @@ _WEIGHT_DECAY = 0.05
 Inputs = Float[Tensor, "b ..."]
 
 
-@dataclass(frozen=True)
-class ProbeTraining:
-    """Schedule of a probe's training.
-
-    Attributes:
-        steps: updates.
-        batch_size: pairs of frames in each, drawn with replacement.
-        lr: peak learning rate of AdamW.
-        seed: seed of initial weights and data order.
-    """
-
-    steps: int
-    batch_size: int
-    lr: float
-    seed: int
-
-
 class PairTokens(nn.Module):
     """An encoder's tokens of a frame and of the one before it, side by side at every patch.
 
-    An encoder that looks back by itself gives its own tokens.
-
-    Attributes:
-        offsets: frames before the newest that are read.
-        looks_back: whether the encoder itself reads earlier frames.
-        features: width of a token.
-        grid: rows and columns of the patches.
+    An encoder that looks back by itself gives its own tokens. `offsets` are the frames before the
+    newest that are read, `features` the width of a token, `grid` rows and columns of the patches.
     """
 
     def __init__(self, encoder: BaseTouchEncoder) -> None:
@@ -84,12 +62,9 @@ class PairTokens(nn.Module):
 
 
 def find_encoder_of(name: str, sensor: str, seed: int) -> BaseTouchEncoder:
-    """Find an encoder by its name in the benchmark.
+    """Find an encoder by its name in the benchmark: see `Config.encoders`.
 
-    Args:
-        name: NAME, random:NAME or end-to-end:NAME of an encoder or its folder; end-to-end:PRESET of a ViT.
-        sensor: sensor of the rig, for a preset's network.
-        seed: seed of random weights.
+    The sensor is the rig's, for a preset's network; the seed is of random weights.
     """
     preset = name.removeprefix(END_TO_END)
     if preset != name and preset in PRESETS:
@@ -137,8 +112,7 @@ class Reader(nn.Module):
         self._task = [task]  # in a list: not part of the state
 
     def outputs(self, inputs: Inputs) -> Outputs:
-        """Return the probe's outputs on frozen tokens, or on frame pairs when it trains its
-        encoder."""
+        """Return the probe's outputs on frozen tokens, or on frames when the encoder is trained."""
         return self.probe(inputs if self.encoder is None else self.encoder(inputs))
 
     def forward(self, inputs: Inputs, targets: Tensor) -> dict[str, Tensor]:
@@ -151,22 +125,20 @@ def train_reader(
     task: Task,
     inputs_of: Callable[[Rows], Inputs],
     train: Rows,
-    training: ProbeTraining,
+    config: Config,
+    seed: int,
     scratch: Path,
     log: TextIO,
 ) -> None:
-    """Train a reader and keep the snapshot that does best on validation frames.
+    """Train a reader on some rows and keep the snapshot that does best on validation frames.
 
-    Args:
-        reader: probe to train.
-        task: gives the loss.
-        inputs_of: rows to the reader's input.
-        train: training rows.
-        training: schedule.
-        scratch: folder for snapshots.
-        log: file for the trainer's lines.
+    Snapshots go to the folder `scratch`, the trainer's lines to `log`.
     """
-    per_snapshot = max(training.steps // _SNAPSHOTS, 1) * training.batch_size
+    steps, batch_size, lr = config.steps, config.batch_size, config.lr
+    if reader.encoder is not None:
+        steps, batch_size = config.end_to_end_steps, config.end_to_end_batch_size
+        lr = config.end_to_end_lr
+    per_snapshot = max(steps // _SNAPSHOTS, 1) * batch_size
     every = max(-(-len(task.split.validation) // _MAX_VALIDATION), 1)
     validation = task.split.validation[::every]
     best: dict[str, Tensor] = {}
@@ -184,16 +156,11 @@ def train_reader(
             best.update({name: value.clone() for name, value in reader.state_dict().items()})
         return {"validation_error": error}
 
-    optimizer = OptimizerConfig(
-        min(training.steps, _SNAPSHOTS),
-        training.batch_size,
-        training.lr,
-        _WEIGHT_DECAY,
-        max_grad_norm=1.0,
-    )
+    epochs = min(steps, _SNAPSHOTS)
+    optimizer = OptimizerConfig(epochs, batch_size, lr, _WEIGHT_DECAY, max_grad_norm=1.0)
     work = Training(reader, per_snapshot, batch, optimizer, identity={}, evaluate=evaluate)
     with tempfile.TemporaryDirectory(dir=scratch) as folder, contextlib.redirect_stdout(log):
-        fit(work, Path(folder) / "probe", TrainerOptions(seed=training.seed), {})
+        fit(work, Path(folder) / "probe", TrainerOptions(seed=seed), {})
     reader.load_state_dict(best)
 
 

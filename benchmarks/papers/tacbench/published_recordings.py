@@ -15,9 +15,9 @@ import torch
 from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
+from touchgoal.benchmarks.papers.tacbench.config import RECORDED_AS, Recording
 from touchgoal.benchmarks.papers.tacbench.data import STRIDE, RigFrames, rows_before
 from touchgoal.benchmarks.papers.tacbench.task import TEST, VALIDATION
-from touchgoal.benchmarks.papers.tacbench.tasks import RECORDED_AS, Recording
 from touchgoal.encoders.preprocess import Preprocessor
 from touchgoal.episodes.importers.feeling_of_success import MOMENTS, is_grasp_set, read_grasps
 from touchgoal.episodes.importers.tacbench_forces import is_force_set, read_strokes
@@ -34,17 +34,11 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class Published:
-    """A published folder.
-
-    Attributes:
-        what: kind of recordings, in the bench's terms.
-        sensor: sensor that recorded it.
-        read: reads a number of recordings, preprocessed.
-    """
+    """A published folder."""
 
     what: Recording
     sensor: str
-    read: Callable[[int, Preprocessor], RigFrames]
+    read: Callable[[int, Preprocessor], RigFrames]  # reads a number of recordings
 
 
 def find_published(folder: Path, sensor: str) -> Published | None:
@@ -72,8 +66,7 @@ def find_published(folder: Path, sensor: str) -> Published | None:
 def read_published_strokes(
     folder: Path, sensor: str, count: int, preprocess: Preprocessor
 ) -> RigFrames:
-    """Read about that many strokes, as many of each probe; uses are assigned as in the
-    simulation."""
+    """Read about that many strokes, as many of each probe; uses are as in the simulation."""
     chosen = _evenly(list(read_strokes(folder, sensor)), lambda stroke: stroke.probe, count)
     touch, force, slip = [], [], []
     for stroke in track(chosen, "strokes", "stroke"):
@@ -159,8 +152,7 @@ def _variant(asked: str, found: str) -> str:
 
 
 def _evenly(items: list[Item], group: Callable[[Item], Hashable], count: int) -> list[Item]:
-    """Return about that many, in order, evenly and in the same share from each group, at least
-    one."""
+    """Return about that many, in order, and the same share of each group, at least one."""
     groups: dict[Hashable, list[int]] = {}
     for i, item in enumerate(items):
         groups.setdefault(group(item), []).append(i)

@@ -51,8 +51,8 @@ class SlipTask:
 
     def error(self, outputs: Outputs, rows: Rows) -> float:
         """Return 1 - F1 at its best threshold."""
-        truth = self.truth(rows)
-        return 1 - max(f1_score(outputs[:, 0].numpy() > t, truth) for t in _cuts(outputs))
+        best = self.threshold(outputs, rows)
+        return 1 - f1_score(outputs[:, 0].numpy() > best, self.truth(rows))
 
     def threshold(self, outputs: Outputs, rows: Rows) -> float:
         """Return the threshold on the raw output with the best F1."""
@@ -66,8 +66,7 @@ class SlipTask:
     def judge(
         self, predicted: list[Outputs], validation: list[ValidationOutputs], rows: Rows
     ) -> Metrics:
-        """Return F1 at validation thresholds, and the mean absolute error of the force change,
-        mN."""
+        """Return F1 at validation thresholds, and the mean absolute force change error, mN."""
         cuts = [self.threshold(outputs, self.split.validation) for outputs in validation]
         slips = np.stack([o[:, 0].numpy() > t for o, t in zip(predicted, cuts, strict=True)])
         errors = [(o[:, 1:] * self._scale - self._change[rows]).abs().mean() for o in predicted]
@@ -75,8 +74,7 @@ class SlipTask:
         return metrics | {"change_mae_mn": 1e3 * float(np.mean(errors)), "thresholds": cuts}
 
     def references(self, rows: Rows) -> dict[str, Metrics]:
-        """Return the metrics of "always slips" and of the true forces with the nominal friction
-        cone."""
+        """Return the metrics of "always slips" and of true forces with the nominal cone."""
         truth, objects = self.truth(rows), self._frames.stroke[rows.numpy()]
         force = self._frames.force[rows].double().numpy()
         cone = np.hypot(force[:, 0], force[:, 1]) >= FRICTION * force[:, 2]

@@ -1,6 +1,6 @@
 """The interface of a TacBench task, and which recordings it trains on, selects by and reports."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -17,16 +17,10 @@ _MOST = 800  # frames of a force test, evenly spaced: neighbours are alike
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Rows of frames by use; no recording has two uses.
-
-    Attributes:
-        train: training set.
-        validation: selects snapshot and threshold.
-        tests: test sets, by name.
-    """
+    """Rows of frames by use; no recording has two uses."""
 
     train: Rows
-    validation: Rows
+    validation: Rows  # selects snapshot and threshold
     tests: dict[str, Rows]
 
 
@@ -46,9 +40,7 @@ class Task(Protocol):
     def probe(self, features: int, grid: tuple[int, int]) -> nn.Module:
         """Return a probe with random weights, from tokens (b t f) to outputs.
 
-        Args:
-            features: width of a token.
-            grid: rows and columns of the patches; the last tokens are theirs.
+        The last tokens are those of the patches, `grid` rows and columns of them.
         """
         ...
 
@@ -67,12 +59,9 @@ class Task(Protocol):
     def judge(
         self, predicted: list[Outputs], validation: list[ValidationOutputs], rows: Rows
     ) -> Metrics:
-        """Return the metrics of all training seeds together.
+        """Return the metrics of all training seeds together, from each seed's outputs.
 
-        Args:
-            predicted: each seed's outputs on `rows`.
-            validation: each seed's outputs on the validation frames, to choose thresholds.
-            rows: test frames.
+        Thresholds are chosen by the outputs on validation frames.
         """
         ...
 
@@ -87,11 +76,10 @@ def split_force(frames: RigFrames) -> Split:
     A second test set has held-out strokes of the trained probes.
     """
     known = frames.pressed & (frames.indenter != "flat")
-    tests = {
-        "flat probe, unseen": _evenly(_rows(frames.pressed & (frames.indenter == "flat"))),
-        "known probes": _evenly(_of_use(frames, known, TEST)),
-    }
-    return Split(_training(frames, known), _of_use(frames, known, VALIDATION), tests)
+    split = _split(frames, known, "known probes")
+    tests = {"flat probe, unseen": _rows(frames.pressed & (frames.indenter == "flat"))}
+    tests |= split.tests
+    return replace(split, tests={name: _evenly(rows) for name, rows in tests.items()})
 
 
 def split_slip(frames: RigFrames) -> Split:
@@ -111,9 +99,7 @@ def split_grasp(frames: RigFrames) -> Split:
     untouched_before = ~frames.later[frames.before.numpy()]
     test = split.tests["all"]
     gripped = torch.from_numpy(untouched_before)[test]
-    return Split(
-        split.train, split.validation, {"gripped": test[gripped], "lifted": test[~gripped]}
-    )
+    return replace(split, tests={"gripped": test[gripped], "lifted": test[~gripped]})
 
 
 def split_textile(frames: RigFrames) -> Split:
@@ -128,8 +114,9 @@ def thinned(rows: Rows, count: int, seed: int) -> Rows:
 
 
 def _split(frames: RigFrames, chosen: Bool[np.ndarray, " n"], test: str) -> Split:
-    tests = {test: _of_use(frames, chosen, TEST)}
-    return Split(_training(frames, chosen), _of_use(frames, chosen, VALIDATION), tests)
+    use = _use(frames)
+    tests = {test: _rows(chosen & (use == TEST))}
+    return Split(_rows(chosen & (use < VALIDATION)), _rows(chosen & (use == VALIDATION)), tests)
 
 
 def _use(frames: RigFrames) -> Int[np.ndarray, " n"]:
@@ -143,16 +130,8 @@ def _use(frames: RigFrames) -> Int[np.ndarray, " n"]:
     return use
 
 
-def _of_use(frames: RigFrames, chosen: Bool[np.ndarray, " n"], use: int) -> Rows:
-    return _rows(chosen & (_use(frames) == use))
-
-
 def _evenly(rows: Rows) -> Rows:
     return rows[:: max(-(-len(rows) // _MOST), 1)]
-
-
-def _training(frames: RigFrames, chosen: Bool[np.ndarray, " n"]) -> Rows:
-    return _rows(chosen & (_use(frames) < VALIDATION))
 
 
 def _rows(chosen: Bool[np.ndarray, " n"]) -> Rows:

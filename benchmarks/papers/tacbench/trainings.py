@@ -12,94 +12,81 @@ from jaxtyping import Float
 
 from touchgoal.benchmarks.papers.tacbench.config import Config
 from touchgoal.benchmarks.papers.tacbench.data import RigFrames, Rows
+from touchgoal.benchmarks.papers.tacbench.force import FieldTask, ForceTask
+from touchgoal.benchmarks.papers.tacbench.labels import grasp_task, textile_task
+from touchgoal.benchmarks.papers.tacbench.pose import PoseTask
 from touchgoal.benchmarks.papers.tacbench.probes import (
     Inputs,
     PairTokens,
-    ProbeTraining,
     Reader,
     find_encoder_of,
     inputs_of_tokens,
     read,
     train_reader,
 )
+from touchgoal.benchmarks.papers.tacbench.slip import SlipTask
 from touchgoal.benchmarks.papers.tacbench.task import Task, thinned
-from touchgoal.benchmarks.papers.tacbench.tasks import TASKS
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 
+TASKS: dict[str, Callable[[RigFrames], Task]] = {
+    "force": ForceTask,
+    "field": FieldTask,
+    "slip": SlipTask,
+    "pose": PoseTask,
+    "grasp": grasp_task,
+    "textile": textile_task,
+}
 _LEAST_SAMPLES = 8
-_Answered = list[Float[np.ndarray, "_ _"]]  # by seed: frames, outputs
+_BySeed = list[Float[np.ndarray, "_ _"]]  # outputs of frames
 
 
 @dataclass(frozen=True)
 class Subject:
-    """One encoder on one kind of recordings.
-
-    Attributes:
-        name: encoder, as the user named it.
-        sensor: sensor of the rig.
-        frames: file of `RigFrames` from the encoder's preprocessor.
-        tokens: file of a frozen encoder's tokens; None for one that is trained.
-    """
+    """One encoder, as the user named it, on one kind of recordings."""
 
     name: str
     sensor: str
-    frames: Path
-    tokens: Path | None
+    frames: Path  # file of `RigFrames` from the encoder's preprocessor
+    tokens: Path | None  # file of a frozen encoder's tokens; None for one that is trained
 
 
 @dataclass(frozen=True)
 class Job:
-    """One encoder, task and share of the labels, all seeds.
-
-    Attributes:
-        subject: encoder and its data.
-        task: task by name.
-        share: share of the training labels.
-        config: schedule and seeds.
-        log: file for the trainer's lines.
-    """
+    """One encoder, task and share of the training labels, all seeds."""
 
     subject: Subject
     task: str
     share: float
     config: Config
-    log: Path
+    log: Path  # for the trainer's lines
 
 
 @dataclass(frozen=True)
 class Answers:
-    """Outputs of a job's probes.
+    """Outputs of a job's probes on each test set and on the validation frames."""
 
-    Attributes:
-        predicted: outputs on each test set, by seed.
-        validation: outputs on the validation frames, by seed.
-        samples: number of training labels.
-        seconds: time of each training.
-    """
-
-    predicted: dict[str, _Answered]
-    validation: _Answered
-    samples: int
-    seconds: float
+    predicted: dict[str, _BySeed]
+    validation: _BySeed
+    samples: int  # training labels
+    seconds: float  # of each training
 
 
 def work(job: Job) -> Answers:
     """Train a job's probes, one a seed, and read the test frames; on one core."""
     torch.set_num_threads(1)
-    config, began, scratch = job.config, time.monotonic(), job.subject.frames.parent
-    frames = _mapped(job.subject.frames)
+    config, subject, began = job.config, job.subject, time.monotonic()
+    frames = _mapped(subject.frames)
     task = TASKS[job.task](frames)
-    encoder = _encoder(job.subject.name, job.subject.sensor, config.seed)
-    inputs_of = _inputs_of(job.subject, encoder, frames)
+    encoder = _encoder(subject.name, subject.sensor, config.seed)
+    inputs_of = _inputs_of(subject, encoder, frames)
     count = max(round(job.share * len(task.split.train)), _LEAST_SAMPLES)
-    predicted: dict[str, _Answered] = {test: [] for test in task.split.tests}
-    validation: _Answered = []
+    predicted: dict[str, _BySeed] = {test: [] for test in task.split.tests}
+    validation: _BySeed = []
     for seed in range(config.seed, config.seed + config.seeds):
-        reader = _reader(job.subject, encoder, task, seed)
+        reader = _reader(subject, encoder, task, seed)
         train = thinned(task.split.train, count, seed)
-        training = _training(config, job.subject.tokens is None, seed)
         with job.log.open("a") as log:
-            train_reader(reader, task, inputs_of, train, training, scratch, log)
+            train_reader(reader, task, inputs_of, train, config, seed, subject.frames.parent, log)
         validation.append(read(reader, inputs_of, task.split.validation).numpy())
         for test, rows in task.split.tests.items():
             predicted[test].append(read(reader, inputs_of, rows).numpy())
@@ -134,15 +121,3 @@ def _reader(subject: Subject, encoder: BaseTouchEncoder, task: Task, seed: int) 
         if trained:
             encoder = find_encoder_of(subject.name, subject.sensor, seed)
         return Reader(task, PairTokens(encoder), trained)
-
-
-def _training(config: Config, trained: bool, seed: int) -> ProbeTraining:
-    if trained:
-        steps, size, lr = (
-            config.end_to_end_steps,
-            config.end_to_end_batch_size,
-            config.end_to_end_lr,
-        )
-    else:
-        steps, size, lr = config.steps, config.batch_size, config.lr
-    return ProbeTraining(steps, size, lr, seed)

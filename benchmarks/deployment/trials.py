@@ -1,0 +1,49 @@
+"""Success and force of one policy in several environments; all rows of a task share their seeds."""
+
+import sys
+from collections.abc import Iterable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from touchgoal.benchmarks.options import CORES, BenchmarkOptions
+from touchgoal.policies.evaluation.evaluate import evaluate
+from touchgoal.runtime import seeds
+from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
+from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
+
+ENVS: dict[TaskName, TaskConfig] = {
+    "pick-place": PickPlaceConfig(),
+    "bead-maze": BeadMazeConfig(split="validation"),
+}
+
+
+@checked_dataclass
+class TrialOptions(BenchmarkOptions):
+    """Options of a benchmark that tries a policy."""
+
+    policy: str = "shipped"
+    """Policy, named as for run-policy."""
+    episodes: Count = 20
+    """Episodes of each row."""
+    seed: Seed = seeds.POLICY_TEST.start
+    """Random seed of the first episode; each further one adds one."""
+    workers: Count = CORES
+    """Processes that simulate."""
+
+
+def try_cases(config: TrialOptions, cases: Iterable[tuple[str, TaskConfig]]) -> dict[str, Any]:
+    """Return the table and the trials of a policy in each named environment."""
+    lines = [f"{'':<46}{'success [95 % Wilson]':<24}{'peak force N, mean':>19}{'sd':>6}{'max':>6}"]
+    rows = []
+    for what, task in cases:
+        result = evaluate(
+            config.policy, task, episodes=config.episodes, seed=config.seed, workers=config.workers
+        )
+        peak = [trial.peak_force for trial in result.trials]
+        force = f"{np.mean(peak):>19.1f}{np.std(peak):>6.1f}{max(peak):>6.1f}"
+        lines.append(f"{what:<46}{result!s:<24}{force}")
+        print(lines[-1], file=sys.stderr, flush=True)
+        rows.append({"what": what, "trials": [asdict(trial) for trial in result.trials]})
+    return {"table": "\n".join(lines), "rows": rows}
