@@ -85,15 +85,10 @@ class ShuffledTouchPolicy(LearnedPolicy):
 
 @dataclass(frozen=True)
 class ShuffledTouch:
-    """Makes a policy whose touch comes from an episode on another wire, drawn by the trial's seed.
-
-    Attributes:
-        policy: makes the policy with its own touch.
-        episodes: embedded episodes, see `load_recordings`.
-    """
+    """Makes a policy whose touch comes from an episode on another wire, drawn by the trial's seed."""
 
     policy: SavedPolicy
-    episodes: EpisodeSet
+    episodes: EpisodeSet  # embedded, see `load_recordings`
 
     def __call__(self, env: BeadMaze) -> Actor:
         """Make the policy for one episode."""
@@ -101,15 +96,11 @@ class ShuffledTouch:
         assert touch is not None
         ticks = self.policy.plan_ticks
         policy = ShuffledTouchPolicy(self.policy.network(), touch, plan_ticks=ticks)
-        rows = other_wires(self.episodes, env.wire.name)
+        wires = [self.episodes.meta(i)["wire"] for i in range(len(self.episodes))]
+        rows = [i for i, wire in enumerate(wires) if wire != env.wire.name]
         chosen = rows[int(env.np_random.integers(len(rows)))]
         policy.recorded_touch = cached_embeddings(self.episodes, chosen, touch).astype(np.float32)
         return policy
-
-
-def other_wires(episodes: EpisodeSet, wire: str) -> list[int]:
-    """Return episodes that were recorded on other wires."""
-    return [i for i in range(len(episodes)) if episodes.meta(i)["wire"] != wire]
 
 
 def _specs(wires: list[Wire], seed: int) -> list[EpisodeSpec]:
@@ -118,15 +109,15 @@ def _specs(wires: list[Wire], seed: int) -> list[EpisodeSpec]:
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Measure open loop, then closed loop.
-
-    Returns:
-        `table`, and the numbers behind it.
-    """
+    """Measure open loop, then closed loop."""
     config = replace(config, policies=config.policies or (SHIPPED_POLICIES["bead-maze"],))
     arms = _group_by_recipe(config.policies)
+    maze = config.env
+    wires = choose(maze.split, config.demonstrations, maze.families)
     with tempfile.TemporaryDirectory() as folder:
-        recorded = _record(config, Path(folder) / "episodes")
+        root = Path(folder) / "episodes"
+        collect(root, maze, _specs(wires, seeds.POLICY_TEST.start), config.workers)
+        recorded = EpisodeSet(root)
         opened = {name: _open_loop(arm, recorded, config.workers) for name, arm in arms.items()}
         closed = _closed_loop(config, arms, recorded)
     table = "\n\n".join([_closed_table(closed), _open_table(opened)])
@@ -161,18 +152,14 @@ def _encoder_name(policy: Path, config: PolicyConfig) -> str:
     return next((n for n in ("align", *get_args(Method), "untrained") if n in known), "another")
 
 
-# ---- closed loop
-
-
 def _closed_loop(
     config: Config, arms: dict[str, list[Path]], recorded: EpisodeSet
 ) -> dict[str, list[Trial]]:
     maze = config.env
     blind = replace(maze, tactile=False)
-    jobs = _specs(choose(maze.split, config.wires, maze.families), seeds.POLICY_TEST.start)
-    other = _specs(
-        choose(maze.split, config.held_out, (HELD_OUT,)), seeds.POLICY_TEST.start + 10_000
-    )
+    first_seed = seeds.POLICY_TEST.start
+    jobs = _specs(choose(maze.split, config.wires, maze.families), first_seed)
+    other = _specs(choose(maze.split, config.held_out, (HELD_OUT,)), first_seed + 10_000)
     results: dict[str, list[Trial]] = {}
 
     def run_arm(name: str, env: BeadMazeConfig, makers: list[Callable], trials: list) -> None:
@@ -207,13 +194,13 @@ def _closed_table(results: dict[str, list[Trial]]) -> str:
     ]
     for name, trials in results.items():
         rate = SuccessRate(sum(t.success for t in trials), len(trials))
-        failures = [
+        drops, jams, forced = (
             sum(t.failure == kind for t in trials) for kind in ("drop", "jam", "over_force")
-        ]
+        )
         low, high = bootstrap([(str(t.episode["wire"]), t.progress) for t in trials])
         done = f"{np.mean([t.progress for t in trials]):.0%} [{low:.0%}, {high:.0%}]"
         lines.append(
-            f"{name:<{width}}{rate!s:<24}{done:<22}{failures[0]:>5}{failures[1]:>5}{failures[2]:>6}"
+            f"{name:<{width}}{rate!s:<24}{done:<22}{drops:>5}{jams:>5}{forced:>6}"
             f"{np.median([t.peak_force for t in trials]):>8.1f}"
         )
     return "\n".join(lines)
@@ -233,17 +220,6 @@ def bootstrap(values: list[tuple[str, float]], draws: int = 5000) -> tuple[float
     return float(low), float(high)
 
 
-# ---- open loop
-
-
-def _record(config: Config, root: Path) -> EpisodeSet:
-    """Record expert demonstrations on test wires."""
-    maze = config.env
-    wires = choose(maze.split, config.demonstrations, maze.families)
-    collect(root, maze, _specs(wires, seeds.POLICY_TEST.start), config.workers)
-    return EpisodeSet(root)
-
-
 def _open_loop(
     directories: list[Path], episodes: EpisodeSet, workers: int
 ) -> dict[str, dict[str, Any]]:
@@ -260,9 +236,8 @@ def _open_loop(
         for i in range(count):
             plans = {"policy": _sampled(policy)}
             if touch:
-                plans["policy, shuffled touch"] = _with_shuffled_touch(
-                    policy, recorded[(i + 1) % count].touch
-                )
+                other = recorded[(i + 1) % count].touch
+                plans["policy, shuffled touch"] = _with_shuffled_touch(policy, other)
             if seed == 0:
                 others = [r.actions.mean(0) for k, r in enumerate(recorded) if k != i]
                 plans |= {
@@ -270,10 +245,9 @@ def _open_loop(
                     "repeat last": open_loop.repeat_last(config.control_hz, horizon),
                     "mean action": open_loop.constant_action(torch.stack(others).mean(0), horizon),
                 }
+            windows = SequenceDataset(recorded[i], config)
             for name, plan in plans.items():
-                errors = open_loop_errors(
-                    plan, SequenceDataset(recorded[i], config), config.control_hz
-                )
+                errors = open_loop_errors(plan, windows, config.control_hz)
                 rows.setdefault(name, []).append((str(i), errors))
     return {name: _summary(errors) for name, errors in rows.items()}
 
@@ -296,12 +270,11 @@ def _with_shuffled_touch(policy: PolicyNetwork, recorded_touch: torch.Tensor) ->
 
 def _summary(rows: list[tuple[str, OpenLoopErrors]]) -> dict[str, Any]:
     errors = [e for _, e in rows]
+    forced = [(name, float(e.teacher_forced.mean())) for name, e in rows]
     return {
         "chunk_mm": np.mean([e.chunk for e in errors], 0).tolist(),
-        "forced_mm": [float(e.teacher_forced.mean()) for e in errors],
-        "forced_interval_mm": bootstrap(
-            [(name, float(e.teacher_forced.mean())) for name, e in rows]
-        ),
+        "forced_mm": [error for _, error in forced],
+        "forced_interval_mm": bootstrap(forced),
         "forced_final_mm": [float(e.teacher_forced[-1]) for e in errors],
         "free_mm": [float(e.free_running.mean()) for e in errors],
         "path_mm": float(np.mean([e.path for e in errors])),
@@ -317,15 +290,11 @@ def _open_table(arms: dict[str, dict[str, dict[str, Any]]]) -> str:
             f"{'open loop, mm: ' + arm:<{width}}{'(A) tick 1':>11}{'(A) tick 8':>11}"
             f"{'(B) mean [95 %]':>24}{'(B) final':>10}{'(C) mean':>10}   way {path:.0f} mm"
         )
-        lines += [
-            f"{'  ' + name:<{width}}{r['chunk_mm'][0]:>11.2f}{r['chunk_mm'][-1]:>11.2f}"
-            f"{_forced(r):>24}{np.mean(r['forced_final_mm']):>10.2f}"
-            f"{np.mean(r['free_mm']):>10.2f}"
-            for name, r in rows.items()
-        ]
+        for name, r in rows.items():
+            low, high = r["forced_interval_mm"]
+            forced = f"{np.mean(r['forced_mm']):.2f} [{low:.1f}, {high:.1f}]"
+            lines.append(
+                f"{'  ' + name:<{width}}{r['chunk_mm'][0]:>11.2f}{r['chunk_mm'][-1]:>11.2f}"
+                f"{forced:>24}{np.mean(r['forced_final_mm']):>10.2f}{np.mean(r['free_mm']):>10.2f}"
+            )
     return "\n".join(lines)
-
-
-def _forced(row: dict[str, Any]) -> str:
-    low, high = row["forced_interval_mm"]
-    return f"{np.mean(row['forced_mm']):.2f} [{low:.1f}, {high:.1f}]"

@@ -22,7 +22,7 @@ from touchgoal.episodes.schema import MetaValue
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.rewards.curves import Curves
-from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EpisodeEmbedder, compute_curves
+from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
 from touchgoal.rewards.goals import EpisodeEnd, Goal, LastFrame, Sentence
 from touchgoal.rewards.metrics import CurveMetrics, measure_curve
 from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
@@ -76,18 +76,12 @@ _GOAL_ATTEMPTS = 3  # the expert places 98 of 100
 
 @dataclass(frozen=True)
 class HeldOutEpisode:
-    """One held-out episode, measured against three kinds of goal.
-
-    Attributes:
-        own: cost to its own last frame (Figure 8).
-        words: touch to a sentence (Figure 9), image to its own last frame.
-        other: cost to the end of another, successful episode with the same object.
-    """
+    """One held-out episode, measured against three kinds of goal."""
 
     outcome: str
-    own: Curves
-    words: Curves
-    other: Curves
+    own: Curves  # to its own last frame (Figure 8)
+    words: Curves  # touch to a sentence (Figure 9), image to its own last frame
+    other: Curves  # to the end of another, successful episode with the same object
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -96,10 +90,9 @@ def run(config: Config) -> dict[str, Any]:
     encoder = pretrained.load_encoder(directory)
     normalizer = DistanceNormalizer.load(directory / NORMALIZER)
     embedder = EpisodeEmbedder(load_towers(encoder.towers or "offline"), encoder)
+    sensor = str(encoder.config.sensor)
     with tempfile.TemporaryDirectory() as folder:
-        tests = record_and_measure(
-            config, str(encoder.config.sensor), embedder, normalizer, Path(folder)
-        )
+        tests = record_and_measure(config, sensor, embedder, normalizer, Path(folder))
     successes = [t for t in tests if t.outcome == "success"]
     claims = judge_claims(successes, [t for t in tests if t.outcome == "never_touch"])
     parts = [
@@ -117,7 +110,11 @@ def run(config: Config) -> dict[str, Any]:
         "claims": [vars(c) for c in claims],
         "auc": {o: failure_auc(tests, o) for o in OUTCOMES if o != "success"},
         "episodes": [
-            {"outcome": t.outcome, "own": _metrics_json(t.own), "words": _metrics_json(t.words)}
+            {"outcome": t.outcome}
+            | {
+                kind: {name: m.as_dict() for name, m in curves.metrics().items()}
+                for kind, curves in (("own", t.own), ("words", t.words))
+            }
             for t in tests
         ],
     }
@@ -143,26 +140,21 @@ def record_and_measure(
         for i in track(range(len(episodes)), f"measuring {outcome}", "episode"):
             episode = embedder.embed_episode(episodes.read(i), episodes.fps, f"{outcome}#{i}")
             sentence = Sentence(SENTENCES[names[i]])
-            own, words, other = (
-                _curves(embedder, normalizer, episode, goal)
-                for goal in (
-                    Goal(image=LastFrame(), tactile=LastFrame()),
-                    Goal(image=LastFrame(), text=sentence),
-                    Goal(image=ends[i], tactile=ends[i], text=sentence),
-                )
+            goals = (
+                Goal(image=LastFrame(), tactile=LastFrame()),
+                Goal(image=LastFrame(), text=sentence),
+                Goal(image=ends[i], tactile=ends[i], text=sentence),
             )
-            tests.append(HeldOutEpisode(str(episodes.meta(i)["outcome"]), own, words, other))
+            embedded = (embedder.embed_goal(goal, episode) for goal in goals)
+            curves = (compute_curves(episode, goal, normalizer) for goal in embedded)
+            tests.append(HeldOutEpisode(str(episodes.meta(i)["outcome"]), *curves))
     return tests
 
 
 def collect_goals(
     names: Sequence[str], sensor: str, folder: Path, workers: int
 ) -> list[EpisodeEnd]:
-    """Return the end of a successful episode with each object, trying further seeds after a failure.
-
-    Raises:
-        UserError: an object was not placed in `_GOAL_ATTEMPTS` attempts.
-    """
+    """Return the end of a successful episode with each object; UserError after too many failures."""
     ends: dict[int, EpisodeEnd] = {}
     for attempt in range(_GOAL_ATTEMPTS):
         missing = [i for i in range(len(names)) if i not in ends]
@@ -191,22 +183,12 @@ def is_goal(meta: Mapping[str, MetaValue], sensor: str) -> bool:
     return bool(meta["success"])
 
 
-def _curves(
-    embedder: EpisodeEmbedder, normalizer: DistanceNormalizer, episode: EmbeddedEpisode, goal: Goal
-) -> Curves:
-    return compute_curves(episode, embedder.embed_goal(goal, episode), normalizer)
-
-
 @dataclass(frozen=True)
 class Claim:
-    """One claim with its verdict.
-
-    Attributes:
-        verdict: "holds", "fails", or "unsure" where the interval of a mean includes 0.
-    """
+    """One claim with its verdict."""
 
     claim: str
-    verdict: str
+    verdict: str  # "holds", "fails", or "unsure" where the interval of a mean includes 0
     evidence: str
 
     @property
@@ -281,9 +263,8 @@ def _fall_after_contact(curves: Curves) -> float:
     d, contact = curves.costs["text"], curves.contact.frame
     assert contact is not None  # the expert's successes touch
     second = round(curves.fps)
-    return float(
-        np.median(d[max(0, contact - second) : contact]) - np.median(d[contact + 3 :][:second])
-    )
+    before, after = d[max(0, contact - second) : contact], d[contact + 3 :][:second]
+    return float(np.median(before) - np.median(after))
 
 
 def failure_auc(tests: Sequence[HeldOutEpisode], outcome: str) -> dict[str, float]:
@@ -333,7 +314,3 @@ def _bootstrap(values: Sequence[float]) -> tuple[float, float]:
 def _interval(values: Sequence[float]) -> str:
     low, high = _bootstrap(values)
     return f"{np.mean(values):.2f} [{low:.2f}, {high:.2f}]"
-
-
-def _metrics_json(curves: Curves) -> dict[str, Any]:
-    return {name: m.as_dict() for name, m in curves.metrics().items()}

@@ -1,6 +1,5 @@
 """Samples of TacBench from the bench's recordings: frames of one sensor, and their labels."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -37,32 +36,21 @@ Rows = Int[Tensor, " _"]
 class RigFrames:
     """Labelled frames of n rows; a recording's frames are consecutive.
 
-    Attributes:
-        touch: preprocessed images, half precision to save memory.
-        before: row of the pair's other frame: `STRIDE` earlier, or the recording's first; for a grasp the
-            moment before.
-        force: force on the pad, N: shear x and y, and normal, positive when pressed.
-        slip: whether the probe slides.
-        stroke: recording of each frame; both fingers of a grasp share one.
-        indenter: name of the probe, object or cloth.
-        pose: object pose on the gel, x and y (mm) and turn (degrees); None if unknown.
-        label: grasp success, or number of the cloth; None if the set has none.
-        field: shear along x and y and pressure over the image, kPa; None if unknown.
-        moments: frames of each finger of a grasp; 0 for recordings in time.
-        use: published use of a recording (see `task.Split`); None to assign one.
+    `before` is the row of the pair's other frame: `STRIDE` earlier, or the recording's first; for a
+    grasp the moment before.
     """
 
-    touch: Float16[Tensor, "n 3 h w"]
+    touch: Float16[Tensor, "n 3 h w"]  # preprocessed; half precision saves memory
     before: Rows
-    force: Float[Tensor, "n 3"]
-    slip: Bool[Tensor, " n"]
-    stroke: Int[np.ndarray, " n"]
-    indenter: np.ndarray
-    pose: Float[Tensor, "n 3"] | None = None
-    label: Int[Tensor, " n"] | None = None
-    field: Float[Tensor, "n 3 24 24"] | None = None
-    moments: int = 0
-    use: Int[np.ndarray, " n"] | None = None
+    force: Float[Tensor, "n 3"]  # on the pad, N: shear x and y; normal, positive when pressed
+    slip: Bool[Tensor, " n"]  # whether the probe slides
+    stroke: Int[np.ndarray, " n"]  # recording of each frame; both fingers of a grasp share one
+    indenter: np.ndarray  # name of the probe, object or cloth
+    pose: Float[Tensor, "n 3"] | None = None  # of the object: x and y (mm), turn (degrees)
+    label: Int[Tensor, " n"] | None = None  # grasp success, or number of the cloth
+    field: Float[Tensor, "n 3 24 24"] | None = None  # shear along x and y, and pressure, kPa
+    moments: int = 0  # frames of each finger of a grasp; 0 for recordings in time
+    use: Int[np.ndarray, " n"] | None = None  # published, see `task.Split`; None to assign one
 
     def stacked(self, rows: Rows, offsets: tuple[int, ...]) -> Float[Tensor, "k t 3 h w"]:
         """Return frames and those before each; a stroke's first frames repeat its first.
@@ -159,7 +147,7 @@ def with_fields(frames: RigFrames, rig: RigConfig, workers: int) -> RigFrames:
     """Add the true field, simulated again from the same strokes."""
     count = int(frames.stroke[-1]) + 1
     with one_core_workers(workers) as pool:
-        made: Iterable = pool.map(partial(_field, rig), range(count))
+        made = pool.map(partial(_field, rig), range(count))
         fields = list(track(made, "force fields", "stroke", total=count))
     return replace(frames, field=torch.from_numpy(np.concatenate(fields)))
 
@@ -176,7 +164,7 @@ def _preprocessed(
 
 
 def rows_before(lengths: list[int], stride: int) -> Rows:
-    """Return the rows some frames earlier, or the first of each recording."""
+    """Return the rows `stride` frames earlier, or the first of each recording."""
     starts = np.repeat(np.cumsum(lengths) - lengths, lengths)
     return torch.from_numpy(np.maximum(np.arange(sum(lengths)) - stride, starts))
 

@@ -18,21 +18,13 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Layout:
-    """Layout of a task's rows.
-
-    Attributes:
-        title: heading.
-        measure: key of the main number.
-        digits: its decimals.
-        less_is_better: whether it is an error.
-        others: further numbers by header.
-    """
+    """Layout of a task's rows."""
 
     title: str
-    measure: str
+    measure: str  # key of the main number
     digits: int
     less_is_better: bool
-    others: dict[str, Callable[[Row], str]]
+    others: dict[str, Callable[[Row], str]]  # further numbers by header
 
 
 def _axis(key: str, k: int, digits: int) -> Callable[[Row], str]:
@@ -101,13 +93,11 @@ def table(rows: list[Row], sensor: str, config: Config, published_in: Path | Non
     recorded = (
         f"simulated: {sensor}, {config.strokes} strokes, {config.slides} slides, {config.grasps} "
         f"grasps, {config.cloths} presses of cloth"
-        if published_in is None
-        else f"published files in {published_in}: {sensor}"
     )
-    lines = [
-        f"TacBench, {recorded}, "
-        f"{config.seeds} training seed{'s' * (config.seeds > 1)}; [95 % over test recordings]"
-    ]
+    if published_in is not None:
+        recorded = f"published files in {published_in}: {sensor}"
+    trained = f"{config.seeds} training seed{'s' * (config.seeds > 1)}"
+    lines = [f"TacBench, {recorded}, {trained}; [95 % over test recordings]"]
     for task in config.tasks:
         lines += ["", *_task_lines([row for row in rows if row["task"] == task], task)]
         lines += _published_lines(task, sensor)
@@ -146,19 +136,18 @@ def _published_lines(task: str, sensor: str) -> list[str]:
 
 
 def _summary(rows: list[Row], config: Config) -> list[str]:
-    """Compare the best frozen encoder with the best end-to-end one by task and share, as Table
-    11."""
+    """Compare the best frozen encoder with the best end-to-end one, as Table 11."""
     shares = "".join(f"{share:>14.2g}" for share in config.shares)
-    lines = [
-        f"{'best frozen encoder against end to end, %; * intervals apart':<66}{shares}   paper"
-    ]
+    head = "best frozen encoder against end to end, %; * intervals apart"
+    lines = [f"{head:<66}{shares}   paper"]
     for task in config.tasks:
         for test in dict.fromkeys(row["test"] for row in rows if row["task"] == task):
             cells = [_gain(rows, task, test, share) for share in config.shares]
             if any(cells):
                 paper = BEST_AGAINST_END_TO_END.get(task)
-                cell = "" if paper is None else f"{paper:8.0f}"
-                lines.append(f"{f'  {task}, {test}':<66}{''.join(f'{c:>14}' for c in cells)}{cell}")
+                published_cell = "" if paper is None else f"{paper:8.0f}"
+                ours = "".join(f"{cell:>14}" for cell in cells)
+                lines.append(f"{f'  {task}, {test}':<66}{ours}{published_cell}")
     return lines if len(lines) > 1 else []
 
 
