@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import UserError, require_all_ok
 from touchgoal.runtime.option_types import Seed, checked_dataclass
 
 if TYPE_CHECKING:
@@ -60,12 +60,7 @@ def main(config: Config) -> None:
 
         cost = load_cell_cost(cell)
     check_client(cell)
-    try:
-        out = open_run(config.out, "deploy", config, adds=True)
-    except OSError as error:
-        raise UserError(
-            f"cannot write into the folder of this run ({error.strerror}): give another --out"
-        ) from error
+    out = open_run(config.out, "deploy", config, adds=True)
     print(_summary(cell, config), flush=True)
     connection = _connect(cell)
     try:
@@ -138,7 +133,6 @@ def _deploy(
     from touchgoal.control.safety.action_filter import ActionFilter
     from touchgoal.episodes.schema import Episode
     from touchgoal.episodes.store import EpisodeWriter
-    from touchgoal.runtime.checks import require_all_ok
 
     def count_episodes() -> int:
         return len(EpisodeWriter(episodes, ft.CONTROL_HZ))

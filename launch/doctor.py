@@ -6,8 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from touchgoal.runtime.checks import CheckResult, require_all_ok
-from touchgoal.runtime.errors import UserError, install_extra
+from touchgoal.runtime.errors import CheckResult, UserError, install_extra, require_all_ok
 from touchgoal.runtime.option_types import checked_dataclass
 
 _GL_PROBE = "import touchgoal, mujoco; c = mujoco.GLContext(64, 64); c.make_current(); c.free()"

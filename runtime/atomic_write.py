@@ -14,11 +14,8 @@ _FULL = 1_000_000  # bytes free, below which a failed write is blamed on the dis
 def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a temporary name to write to; move the file to `path` once it is on disk.
 
-    To change two files together, open first the one that is to be replaced last. A block that fails
-    leaves the older file as it was.
-
-    Args:
-        path: Path of the file; its folder is made if needed.
+    Its folder is made if needed. To change two files together, open first the one that is to be
+    replaced last. A block that fails leaves the older file as it was.
 
     Raises:
         OSError: It cannot be written; with the path, also where a library reports a full disk in

@@ -1,6 +1,10 @@
-"""Exception for a user's mistake."""
+"""Exception for a user's mistake, and results of checks with their remedies."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+
+_MARKS = {True: "ok", False: "MISSING", None: "-"}
 
 
 class UserError(ValueError):
@@ -8,6 +12,28 @@ class UserError(ValueError):
 
     Commands print the message and exit with 1; any other exception is a bug and shows its traceback.
     """
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """Result of a check: one line of a table."""
+
+    name: str
+    ok: bool | None  # None for something optional that is absent
+    detail: str  # what was found
+    remedy: str = ""  # what to do if it does not work
+
+    def __str__(self) -> str:
+        """Return the line."""
+        remedy = f"  ->  {self.remedy}" if self.remedy else ""
+        return f"{_MARKS[self.ok]:<9}{self.name:<18}{self.detail}{remedy}"
+
+
+def require_all_ok(results: Sequence[CheckResult]) -> None:
+    """Raise UserError if a check failed."""
+    broken = [f for f in results if f.ok is False]
+    if broken:
+        raise UserError("; ".join(f"{f.name}: {f.remedy or f.detail}" for f in broken))
 
 
 def install_extra(extra: str) -> str:

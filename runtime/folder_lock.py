@@ -23,12 +23,9 @@ class FolderLock:
     ) -> None:
         """Take the lock.
 
-        Args:
-            folder: Folder to lock.
-            refusal: Message where another one holds it; {} stands for the folder.
-
         Raises:
-            UserError: Another one holds it, or the folder cannot be made.
+            UserError: Another one holds it, with the refusal ({} stands for the folder); or the
+                folder cannot be made.
         """
         made = not folder.exists()
         try:

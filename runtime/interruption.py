@@ -15,9 +15,7 @@ class Terminated(KeyboardInterrupt):
 def on_interruption(message: Callable[[], str]) -> Iterator[None]:
     """Add a note to an interruption of the block.
 
-    Args:
-        message: Returns what is saved and the command that continues, such as
-            "7 of 20 episodes are in runs/x; to continue: touchgoal …"; called on interruption only.
+    `message`, called on interruption only, says what is saved and what command continues.
     """
     try:
         yield

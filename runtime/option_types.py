@@ -45,11 +45,7 @@ PositiveRange = Annotated[tuple[Positive, Positive], ORDERED]
 
 
 class OptionError(UserError):
-    """Values out of range.
-
-    Attributes:
-        problems: Name of each wrong field ("" for several together), and what is wrong.
-    """
+    """Values out of range: each wrong field ("" for several together), and what is wrong."""
 
     def __init__(self, config: str, problems: list[tuple[str, str]]) -> None:
         lines = dict.fromkeys(f"{name} {what}".strip() for name, what in problems)

@@ -28,21 +28,17 @@ def read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"] | None:
 
 def decode_picture(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"] | None:
     """Decode an image file's bytes, as `read_picture`; `name` is for the message."""
-    if not data:
-        return None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(data)) as picture:  # reads the header alone
                 width, height = picture.size
-        too_large = width * height > _MOST_PIXELS
+        size = f"{width} x {height} pixels" if width * height > _MOST_PIXELS else ""
     except Image.DecompressionBombError:
-        width = height = 0
-        too_large = True
+        size = "far too many pixels"
     except (OSError, ValueError, SyntaxError):
         return None
-    if too_large:
-        size = f"{width} x {height} pixels" if width else "far too many pixels"
+    if size:
         raise UserError(f"{name} has {size}: make it smaller than {_MOST_PIXELS / 1e6:.0f} million")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)

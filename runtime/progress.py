@@ -11,12 +11,9 @@ Item = TypeVar("Item")
 
 
 def progress_bar(what: str, total: int | None, unit: str) -> "tqdm[Any]":
-    """Return a bar that counts units of work: `with progress_bar(…) as bar: … bar.update()`.
+    """Return a bar that counts work, such as "filming", in a unit, in the singular.
 
-    Args:
-        what: Work that is done, such as "filming".
-        total: Number of units; None if unknown.
-        unit: Unit in the singular.
+    `with progress_bar(…) as bar: … bar.update()`; the total is None if unknown.
     """
     terminal = sys.stderr.isatty()
     return tqdm(
@@ -31,8 +28,9 @@ def progress_bar(what: str, total: int | None, unit: str) -> "tqdm[Any]":
 
 def track(items: Iterable[Item], what: str, unit: str, total: int | None = None) -> Iterator[Item]:
     """Iterate over items and count them; arguments as in `progress_bar`."""
-    known = len(items) if total is None and isinstance(items, Sized) else total
-    with progress_bar(what, known, unit) as bar:
+    if total is None and isinstance(items, Sized):
+        total = len(items)
+    with progress_bar(what, total, unit) as bar:
         for item in items:
             yield item
             bar.update()

@@ -21,36 +21,31 @@ def command_line() -> str:
     return shlex.join([_PROGRAM, *sys.argv[1:]])
 
 
-def portable(record: Any, project: Path | None = None) -> Any:
-    """Return a JSON-able record without folders of this machine.
+def portable(record: Any) -> Any:
+    """Return strings, paths, and containers of them without folders of this machine.
 
-    Absolute paths, also those in commands, become relative to the project, or lose their folders if
-    they lie elsewhere.
-
-    Args:
-        record: Strings, paths, and containers of them.
-        project: Folder that paths become relative to; default: the working directory.
+    Absolute paths, also those in commands, become relative to the working directory, or lose their
+    folders if they lie elsewhere.
     """
-    project = project or Path.cwd()
     match record:
         case dict():
-            return {key: portable(value, project) for key, value in record.items()}
+            return {key: portable(value) for key, value in record.items()}
         case list() | tuple():
-            return [portable(value, project) for value in record]
+            return [portable(value) for value in record]
         case Path():
-            return portable(str(record), project)
+            return portable(str(record))
         case str() if record.startswith(f"{_PROGRAM} "):
-            return shlex.join(_portable_path(word, project) for word in shlex.split(record))
+            return shlex.join(map(_portable_path, shlex.split(record)))
         case str():
-            return _portable_path(record, project)
+            return _portable_path(record)
         case _:
             return record
 
 
-def _portable_path(text: str, project: Path) -> str:
+def _portable_path(text: str) -> str:
     """Shorten an absolute path, or the one after an option's `=`."""
     option, equals, value = text.rpartition("=") if text.startswith("-") else ("", "", text)
-    path = Path(value)
+    path, project = Path(value), Path.cwd()
     if not path.is_absolute():
         return text
     shorter = path.relative_to(project) if path.is_relative_to(project) else Path(path.name)
@@ -60,9 +55,8 @@ def _portable_path(text: str, project: Path) -> str:
 def provenance() -> dict[str, Any]:
     """Return what every checkpoint and every folder of results records beside its numbers.
 
-    Returns:
-        `command`, without folders of this machine; `commit` and `dirty` (whether files differ from
-        it), None for an installed package; version `touchgoal`; `date`, local time.
+    `dirty` tells whether files differ from `commit`; both are None for an installed package. The
+    command is without folders of this machine, the date is local time.
     """
     commit, dirty = _commit()
     return {
@@ -114,11 +108,8 @@ def _commit() -> tuple[str | None, bool | None]:
 
 def _git(*arguments: str) -> str | None:
     """Return git's output; None if it fails or is missing."""
-    folder = Path(__file__).resolve().parent
+    command = ["git", "-C", str(Path(__file__).resolve().parent), *arguments]
     try:
-        answer = subprocess.run(
-            ["git", "-C", str(folder), *arguments], capture_output=True, text=True
-        )
-    except OSError:
+        return subprocess.check_output(command, stderr=subprocess.DEVNULL, text=True).strip()
+    except (OSError, subprocess.CalledProcessError):
         return None
-    return answer.stdout.strip() if answer.returncode == 0 else None

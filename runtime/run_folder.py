@@ -17,11 +17,7 @@ _held: dict[Path, FolderLock] = {}
 
 
 def check_writable(out: Path | None) -> None:
-    """Try to write where the folder of a run is to be, and leave nothing.
-
-    Raises:
-        UserError: It is a file or a broken link, its name is too long, or it cannot be written to.
-    """
+    """Raise UserError unless the folder of a run can be made and written to; leave nothing."""
     folder = out if out is not None else Path("runs")
     try:
         while not folder.exists():
@@ -44,7 +40,7 @@ def open_run(out: Path | None, command: str, config: Any, adds: bool = False) ->
     Args:
         out: Folder that the user named; None for `runs/<date>_<command>`.
         command: Name of the command.
-        config: Its frozen dataclass.
+        config: Its dataclass.
         adds: Whether the run continues what the folder holds: it appends episodes, or resumes.
 
     Raises:

@@ -12,12 +12,7 @@ from touchgoal.runtime.errors import UserError
 
 @dataclass(frozen=True)
 class SeedRange:
-    """Consecutive seeds.
-
-    Attributes:
-        start: first seed.
-        count: number of seeds.
-    """
+    """Consecutive seeds."""
 
     start: int
     count: int
@@ -28,15 +23,7 @@ class SeedRange:
         return self.start + self.count
 
     def first(self, episodes: int, option: str) -> int:
-        """Return the first seed for a number of episodes.
-
-        Args:
-            episodes: number of episodes, one seed each.
-            option: name of the option that sets it, for the message.
-
-        Raises:
-            UserError: the range holds fewer seeds.
-        """
+        """Return the first seed; UserError, which names the option, if there are fewer seeds."""
         if episodes > self.count:
             raise UserError(f"{option} is {episodes}; at most {self.count} have seeds of their own")
         return self.start
@@ -47,14 +34,11 @@ class SeedRange:
 
 
 _STEP = 100_000
-MAX_CORRECTION_ROUNDS = 5
 
 TRAINING = SeedRange(0, _STEP)  # demonstrations to learn from
 VALIDATION = SeedRange(1 * _STEP, _STEP)  # demonstrations to judge a training by
 DISTURBED = SeedRange(2 * _STEP, _STEP)  # demonstrations during which the arm is pushed
-CORRECTIONS = tuple(  # one range a round of DAgger
-    SeedRange((3 + k) * _STEP, _STEP) for k in range(MAX_CORRECTION_ROUNDS)
-)
+CORRECTIONS = tuple(SeedRange((3 + k) * _STEP, _STEP) for k in range(5))  # by round of DAgger
 EVALUATION = SeedRange(1_000_000, 1_000_000)  # default of run-policy, evaluate, twin
 MODEL_SELECTION = SeedRange(2_000_000, 1_000_000)  # trials that choose a snapshot
 REWARD_GOALS = SeedRange(3_000_000, _STEP)  # goal episodes of benchmark reward-quality
@@ -65,23 +49,6 @@ POLICY_TEST = SeedRange(5_000_000, 1_000_000)  # benchmark policy-delay, bead-ma
 DEPLOY_TEST = SeedRange(6_000_000, 2_000_000)  # benchmark deploy
 REPLAY = SeedRange(8_000_000, 1_000_000)  # benchmark replay
 DEMO = SeedRange(9_000_000, 1_000_000)
-
-EPISODE_RANGES: dict[str, SeedRange] = {
-    "training": TRAINING,
-    "validation": VALIDATION,
-    "disturbed": DISTURBED,
-    **{f"corrections {k}": seeds for k, seeds in enumerate(CORRECTIONS, 1)},
-    "evaluation": EVALUATION,
-    "model selection": MODEL_SELECTION,
-    "reward goals": REWARD_GOALS,
-    "reward test": REWARD_TEST,
-    "pose training": POSE_TRAINING,
-    "pose validation": POSE_VALIDATION,
-    "policy test": POLICY_TEST,
-    "deploy test": DEPLOY_TEST,
-    "replay": REPLAY,
-    "demo": DEMO,
-}
 
 # Shapes of the bead maze's wires have seeds of their own, apart from the episodes'.
 WIRES: dict[str, SeedRange] = {

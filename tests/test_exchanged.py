@@ -24,7 +24,7 @@ from touchgoal.control.safety.limits import FR3
 from touchgoal.control.sensors.exchanged import cameras_exchanged, fingertips_exchanged
 from touchgoal.control.sensors.tactile_camera import NO_CROP, TactileCamera
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, find_sensor
-from touchgoal.runtime.checks import CheckResult
+from touchgoal.runtime.errors import CheckResult
 from touchgoal.sim_envs.config import PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.tactile.optics import render_untouched

@@ -6,16 +6,20 @@ from pathlib import Path
 
 import pytest
 
+from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import UserError
-from touchgoal.runtime.seeds import EPISODE_RANGES, TRAINING, WIRES
+from touchgoal.runtime.seeds import CORRECTIONS, TRAINING, WIRES, SeedRange
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("control", "sim_envs", "episodes", "encoders", "rewards", "policies", "benchmarks")
 
 
-@pytest.mark.parametrize("ranges", [EPISODE_RANGES, WIRES], ids=["episodes", "wires"])
-def test_no_two_ranges_overlap(ranges: dict) -> None:
-    ordered = sorted(ranges.values(), key=lambda r: r.start)
+EPISODES = [*CORRECTIONS, *(r for r in vars(seeds).values() if isinstance(r, SeedRange))]
+
+
+@pytest.mark.parametrize("ranges", [EPISODES, list(WIRES.values())], ids=["episodes", "wires"])
+def test_no_two_ranges_overlap(ranges: list[SeedRange]) -> None:
+    ordered = sorted(ranges, key=lambda r: r.start)
     assert all(a.stop <= b.start for a, b in pairwise(ordered))
     assert all(r.count > 0 for r in ordered)
 

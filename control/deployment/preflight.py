@@ -22,8 +22,7 @@ from touchgoal.control.tactile.markers import find_markers, without_markers
 from touchgoal.control.tactile.picture_guard import check_untouched
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import find_sensor
-from touchgoal.runtime.checks import CheckResult
-from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.errors import CheckResult, UserError
 
 _MIN_RATE_SHARE = 0.8  # of what the cell says of a camera
 # Counts by which a fingertip may differ from its sensor file's. Simulated units differ by 1 to 2, a
