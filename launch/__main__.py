@@ -41,17 +41,10 @@ COMMANDS = {
     "completion": "print a script that completes commands and options in a shell",
 }
 
-_FREE_SPACE = ": free some space and run the command again"
 _WRITE_ERRORS = {  # errno -> advice
-    errno.ENOSPC: _FREE_SPACE,
-    errno.EDQUOT: _FREE_SPACE,
-    errno.EFBIG: "",
-    errno.EIO: "",
-    errno.EROFS: "",
-    errno.EACCES: "",
-    errno.EPERM: "",
-    errno.ENAMETOOLONG: "",
-    errno.ELOOP: "",
+    **dict.fromkeys((errno.EFBIG, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM), ""),
+    **dict.fromkeys((errno.ENAMETOOLONG, errno.ELOOP), ""),
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), ": free some space and run the command again"),
     errno.EMFILE: ": raise the limit with ulimit -n",
 }
 
@@ -140,13 +133,8 @@ def read_options(name: str, options: list[str]) -> tuple[Any, Any]:
     if hasattr(module, "choose"):  # a command of commands: benchmark NAME
         prog = " ".join([prog, *options[:1]])
         chosen, options = module.choose(options)
-    config = parse(
-        chosen.Config,
-        options,
-        prog=prog,
-        description=chosen.__doc__ or "",
-        envs=getattr(chosen, "ENVS", None),
-    )
+    envs = getattr(chosen, "ENVS", None)
+    config = parse(chosen.Config, options, prog, chosen.__doc__ or "", envs)
     if hasattr(config, "out"):
         check_writable(config.out)
     return module, config

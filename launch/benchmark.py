@@ -2,7 +2,6 @@
 
 import sys
 from importlib import import_module
-from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, Literal
 
@@ -50,10 +49,7 @@ class Config:
 def choose(arguments: list[str]) -> tuple[ModuleType, list[str]]:
     """Return the module of the named benchmark and the options that follow the name.
 
-    `--recorded` after the name prints the records instead and exits.
-
-    Raises:
-        UserError: there is no such benchmark or record.
+    `--recorded` prints the records instead and exits. UserError if there is no such benchmark.
     """
     name, *options = arguments or ["--help"]
     if name in ("-h", "--help"):
@@ -71,6 +67,8 @@ def choose(arguments: list[str]) -> tuple[ModuleType, list[str]]:
 
 def main(config: Any) -> None:
     """Run the benchmark whose `Config` this is."""
+    import cv2
+
     module = sys.modules[type(config).__module__]
     path = module.__name__.removeprefix("touchgoal.benchmarks.").removesuffix(".config")
     name = next(n for n, (p, _) in BENCHMARKS.items() if p.startswith(path))
@@ -79,7 +77,8 @@ def main(config: Any) -> None:
     result = benchmark.run(config)
     print(result.pop("table"))
     for title, picture in result.pop("pictures", {}).items():
-        _draw(picture, out / f"{title}.png")
+        cv2.imwrite(str(out / f"{title}.png"), picture[..., ::-1])
+        print(f"picture: {out / title}.png")
     print(f"hardware: {hardware()}")
     write_json(out / "metrics.json", {**provenance(), "hardware": hardware(), **result})
     print(f"numbers: {out / 'metrics.json'}; the record: touchgoal benchmark {name} --recorded")
@@ -92,10 +91,3 @@ def _usage() -> str:
         "       touchgoal benchmark NAME --recorded   (print the table on record)\n\n"
         + "\n".join(lines)
     )
-
-
-def _draw(picture: Any, path: Path) -> None:
-    import cv2
-
-    cv2.imwrite(str(path), picture[..., ::-1])
-    print(f"picture: {path}")

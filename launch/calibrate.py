@@ -76,17 +76,15 @@ def main(config: Config) -> None:
             "and give --ball-mm, or ball_mm in presses.csv (two balls of different size are best)"
         )
     if config.check_lamps:
-        check_untouched(presses.background, model, f"{config.presses}/background.png")
-        check_presses(
-            presses.background, list(presses.images), model, f"the pictures in {config.presses}"
-        )
+        background, where = presses.background, config.presses
+        check_untouched(background, model, f"{where}/background.png")
+        check_presses(background, list(presses.images), model, f"the pictures in {where}")
     out = open_run(config.out, "calibrate", config)
     train, test = split(presses, round(config.held_out * len(presses)), config.seed)
     power = config.illumination_exponent
     if power is None:
-        with progress_bar(
-            "finding how the light varies", len(ILLUMINATION_EXPONENTS), "fit"
-        ) as bar:
+        fits = len(ILLUMINATION_EXPONENTS)
+        with progress_bar("finding how the light varies", fits, "fit") as bar:
             power = select_illumination_exponent(train, pitch, config.sensor, bar.update)
     with progress_bar("fitting", 2 * STEPS, "step") as bar:
         judged = fit(train, pitch, config.sensor, bar.update, illumination_exponent=power)

@@ -46,14 +46,13 @@ def main(config: Config) -> None:
     from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.run_folder import open_run
 
-    sensor = find_sensor(config.sensor)
+    sensor, seconds = find_sensor(config.sensor), config.seconds
+    ball = config.ball_mm and config.ball_mm * 1e-3
     out = open_run(config.out, "check-sensor", config)
     if not is_recorded(config.source):
-        print(f"leave the gel untouched for a second, then press; {config.seconds:g} s", flush=True)
-    frames = open_frames(
-        config.source, sensor, config.corners, config.exposure, seconds=config.seconds
-    )
-    check = check_sensor(frames, sensor, config.ball_mm and config.ball_mm * 1e-3)
+        print(f"leave the gel untouched for a second, then press; {seconds:g} s", flush=True)
+    frames = open_frames(config.source, sensor, config.corners, config.exposure, seconds=seconds)
+    check = check_sensor(frames, sensor, ball)
     figures = check_report.figures(check, config.ball_mm, config.weight_g)
     print("\n".join(check_report.lines(check, figures)))
     write_json(out / "metrics.json", figures)

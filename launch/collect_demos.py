@@ -69,9 +69,8 @@ def main(config: Config) -> None:
     roles, acts = expert_alone, config.policy not in (None, "expert")
     if config.feedback or config.policy is not None:
         if config.outcomes != ("success",):
-            raise UserError(
-                "--outcomes needs the planned expert: leave out --feedback and --policy"
-            )
+            message = "--outcomes needs the planned expert: leave out --feedback and --policy"
+            raise UserError(message)
         roles = dagger_roles(config.policy, config.env, config.feedback)
     specs = episode_specs(config.env, config.outcomes, config.episodes, config.seed)
     out = open_run(config.out, "collect-demos", config, adds=True)
@@ -83,12 +82,11 @@ def main(config: Config) -> None:
         next_seed = specs[-1].seed + 1
         print(f"nothing left to record: {len(EpisodeSet(root))} episodes; more: --seed {next_seed}")
         return
-    again = f"the same line with --out {out} continues"
+    most = None if acts else _MAX_FAILURES
+    kept = f"finished episodes are in {root}; the same line with --out {out} continues"
     try:
-        with on_interruption(lambda: f"finished episodes are in {root}; {again}"):
-            metas = collect(
-                root, config.env, missing, config.workers, roles, None if acts else _MAX_FAILURES
-            )
+        with on_interruption(lambda: kept):
+            metas = collect(root, config.env, missing, config.workers, roles, most)
     except NoSuccessError as error:
         print(f"{error}; look at one: touchgoal run-policy --task {config.task}", file=sys.stderr)
         sys.exit(NO_SUCCESS)

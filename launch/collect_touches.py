@@ -40,11 +40,9 @@ def main(config: Any) -> None:
     root = out / "episodes"
     recorded = (root / INFO).exists() and len(EpisodeSet(root)) >= config.episodes
     rig = RigConfig(sensor=config.sensor, seed=config.seed)
-    with on_interruption(
-        lambda: f"finished episodes are in {root}; the same line with --out {out} continues"
-    ):
-        count, workers = config.episodes, config.workers
-        episodes = record_bench("catalogue slides", root, rig, count, workers)
+    kept = f"finished episodes are in {root}; the same line with --out {out} continues"
+    with on_interruption(lambda: kept):
+        episodes = record_bench("catalogue slides", root, rig, config.episodes, config.workers)
     if recorded:
         print("nothing left to record:", end=" ")
     print(f"{len(episodes)} episodes, {sum(episodes.lengths)} images in {root}")

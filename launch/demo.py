@@ -72,10 +72,7 @@ def main(config: Config) -> None:
 
 
 def until_release(episode: "Episode") -> "Episode":
-    """Return the episode up to the tick at which the hand opens around an object.
-
-    There the object is placed and still touched, so that this tick is the goal of the touch, too.
-    """
+    """Return the episode up to the tick at which the hand opens: placed, and still touched."""
     width = episode.frames[ACTION][:, -1]
     touched = episode.frames[TRUTH_CONTACT].max(axis=1)
     opens = [t for t in range(1, len(episode)) if width[t] > width[t - 1] and touched[t]]
@@ -85,12 +82,10 @@ def until_release(episode: "Episode") -> "Episode":
 
 def what_next(out: Path) -> str:
     """Return commands to try after the demo."""
-    commands = {
-        f'touchgoal reward-curves {out / "episodes"} --goal "text:a soft woven ball"': (
-            "the same episode, distance to another sentence"
-        ),
-        "touchgoal run-policy --episodes 4": "the learned policy: success rate and films",
-        "touchgoal collect-demos --episodes 4 --out data": "episodes of your own to learn from",
-    }
-    lines = [f"  {command}\n      {meaning}" for command, meaning in commands.items()]
-    return "\n".join(["next:", *lines])
+    return f"""next:
+  touchgoal reward-curves {out / "episodes"} --goal "text:a soft woven ball"
+      the same episode, distance to another sentence
+  touchgoal run-policy --episodes 4
+      the learned policy: success rate and films
+  touchgoal collect-demos --episodes 4 --out data
+      episodes of your own to learn from"""

@@ -134,16 +134,16 @@ def _deploy(
     from touchgoal.episodes.schema import Episode
     from touchgoal.episodes.store import EpisodeWriter
 
-    def count_episodes() -> int:
-        return len(EpisodeWriter(episodes, ft.CONTROL_HZ))
+    def writer() -> EpisodeWriter:
+        return EpisodeWriter(episodes, ft.CONTROL_HZ)
 
     def record(frames: dict[str, np.ndarray], task: str, meta: dict[str, Any]) -> int:
-        return EpisodeWriter(episodes, ft.CONTROL_HZ).append(Episode(frames, task, meta))
+        return writer().append(Episode(frames, task, meta))
 
     safety = ActionFilter(connection.robot, ft.CONTROL_HZ, cell_watchdogs(cell))
     print("checks before anything moves:", flush=True)
-    results = preflight(cell, connection, safety, episodes, count_episodes)
-    print("\n".join(str(f) for f in results), flush=True)
+    results = preflight(cell, connection, safety, episodes, lambda: len(writer()))
+    print("\n".join(map(str, results)), flush=True)
     require_all_ok(results)
     if config.execute and not config.yes:
         _confirm(cell)
@@ -176,7 +176,6 @@ def _confirm(cell: "CellConfig") -> None:
 
 
 def _report(result: "Result", out: Path) -> None:
-    """Write the numbers, print the report, exit with the status."""
     from touchgoal.control.deployment.report import metrics, report
     from touchgoal.control.deployment.terminal import say
     from touchgoal.runtime.json_file import write_json

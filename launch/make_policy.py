@@ -143,11 +143,9 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
 
 
 def _bead_maze(config: Config, out: Path) -> list[list[str]]:
-    """Return the steps: regression of the expert that knows the wire, corrected likewise.
-
-    It observes four ticks: with two it led the bead less often on validation wires.
-    """
+    """Return the steps: regression of the expert that knows the wire, corrected likewise."""
     touch = out / "touch" if config.learn_touch else config.touch
+    # Observing two ticks it led the bead less often on validation wires.
     learn = shlex.split(
         "--representation body_twist --arm-state commanded --train.lr 1e-3 --env.start-angle 10 "
         "--task bead-maze --head regression --observation-horizon 4 "

@@ -83,10 +83,7 @@ def main(config: Config) -> None:
 def _record_attempt(
     env: "BeadMaze", spec: "EpisodeSpec", keyboard: "Keyboard", config: TeleoperatorConfig
 ) -> "Episode | None":
-    """Return the episode that a person leads to its end, good or bad; None if they give it up.
-
-    KeyboardInterrupt if they type Ctrl-C.
-    """
+    """Return the episode that a person leads to its end, good or bad; None if they give it up."""
     import numpy as np
 
     from touchgoal.control import features as ft
@@ -103,9 +100,8 @@ def _record_attempt(
             return None
         hand.press(keys)
         progress, force = tick[ft.TRUTH_PROGRESS][0], np.linalg.norm(tick[ft.WRENCH][:3])
-        _show(
-            f"{progress:4.0%} of the way  {force:4.1f} N on the hand  {hand.held or 'still':<6}{HELP}"
-        )
+        felt = f"{progress:4.0%} of the way  {force:4.1f} N on the hand"
+        _show(f"{felt}  {hand.held or 'still':<6}{HELP}")
         now = time.monotonic()
         due = max(due + 1 / env.config.control_hz, now)  # lost time is not made up for
         time.sleep(due - now)

@@ -102,7 +102,6 @@ class Mae(_Unlabelled):
     PRESETS: ClassVar = _presets("mae", MAE_PRESETS)
 
     frames: Count = 40
-    """Time steps drawn from each episode, with both fingertips of each."""
     stride: Count = 2
     """Control ticks between the two frames of a sample, with --mae.stacked."""
     mae: MaeConfig = MAE_PRESETS["default"]
@@ -136,7 +135,6 @@ class VJepa(_Unlabelled):
     PRESETS: ClassVar = _presets("vjepa", VJEPA_PRESETS)
 
     frames: Count = 10
-    """Time steps drawn from each episode, with both fingertips of each."""
     stride: Count = 1
     """Control ticks between the frames of a clip: 1 tick is 0.05 s at 20 Hz. Sparsh uses 0.03 s (2 frames
     of a sensor at 60 Hz)."""
@@ -260,11 +258,9 @@ def _train_unlabelled(config: Mae | Dino | IJepa | VJepa) -> None:
     method = type(config).__name__.lower()
     single = isinstance(config, Mae) and not config.mae.stacked
     offsets = None if single else frame_offsets(SPARSH_BASE[method], config.stride)
-    train, val = (
-        draw(config.frames, config.seed, offsets) for draw in (touch.train, touch.validation)
-    )
-    settings = getattr(config, method)
-    train_unlabelled(train, val, settings, out, config, touch.recipe)
+    drawn = config.frames, config.seed, offsets
+    train, val = touch.train(*drawn), touch.validation(*drawn)
+    train_unlabelled(train, val, getattr(config, method), out, config, touch.recipe)
     print(f"encoder: {out / 'encoder'}")
 
 
@@ -305,11 +301,10 @@ def _adapt(config: Adapt) -> None:
 
     encoder = load_encoder(config.encoder)
     if not isinstance(encoder, PooledEncoder):
-        raise UserError(
-            f"{config.encoder} was not trained by `train-encoder surfaces`: adapt one that was"
-        )
-    splits = "train", "unlabelled"
-    videos = [v for v in read_labelled_videos(config.data) if v.split in splits]
+        made = "was not trained by `train-encoder surfaces`"
+        raise UserError(f"{config.encoder} {made}: adapt one that was")
+    every = read_labelled_videos(config.data)
+    videos = [video for video in every if video.split in ("train", "unlabelled")]
     towers = load_towers(config.towers)
     out = open_run(config.out, "train-encoder", config)
     adapted = adapt(encoder, videos, config.share, towers)

@@ -71,9 +71,8 @@ def main(config: Config) -> None:
     encoder = config.encoder or pretrained.DEFAULT_ENCODER
     touch = load_touch(encoder)
     if touch.reach:
-        raise UserError(
-            f"{encoder} reads several frames; a state estimator needs one of single frames"
-        )
+        wanted = "a state estimator needs one of single frames"
+        raise UserError(f"{encoder} reads several frames; {wanted}")
     first_seed = seeds.POSE_TRAINING.first(config.objects, "--objects")
     out = open_training(config, "train-estimators")
     reused = load_network(config.pose) if config.pose else None
@@ -82,28 +81,24 @@ def main(config: Config) -> None:
     network = StateEstimatorNetwork(StateEstimatorConfig(touch.name, touch.dim, pose_config))
     provenance = recipe(*sets)
     rows, validation = (training.embed_touch_and_contact(s, touch, config.workers) for s in sets)
-    training.train_contact_estimator(
-        network, *rows, config.train, out / _CONTACT, config, provenance
-    )
+    learn_contact = training.train_contact_estimator
+    learn_contact(network, *rows, config.train, out / _CONTACT, config, provenance)
     errors: dict = {"contact": training.contact_error_rate(network, *validation)}
     cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key, _ in pose_config.crops)
     env = replace(config.env, tactile=False, cameras=cameras, camera_size=pose_config.size)
     if reused:
         network.pose_estimator = reused.pose_estimator
     else:
+        placements = config.objects, config.placements, first_seed, config.workers
+        rendered = render_placements(env, *placements)
+        options = replace(config, resume=config.resume and has_checkpoint(out / _POSE))
         training.train_pose_estimator(
-            network.pose_estimator,
-            render_placements(env, config.objects, config.placements, first_seed, config.workers),
-            config.train,
-            out / _POSE,
-            replace(config, resume=config.resume and has_checkpoint(out / _POSE)),
-            provenance,
+            network.pose_estimator, rendered, config.train, out / _POSE, options, provenance
         )
     if not is_first_process():
         return
-    others = render_placements(
-        env, max(1, config.objects // 8), 5, seeds.POSE_VALIDATION.start, config.workers
-    )
+    few = max(1, config.objects // 8)
+    others = render_placements(env, few, 5, seeds.POSE_VALIDATION.start, config.workers)
     errors |= training.pose_errors(network.pose_estimator, others)
     save_estimator(network, out / "estimator", provenance | {"errors": errors})
     if encoder.resolve() != pretrained.DEFAULT_ENCODER.resolve():

@@ -66,18 +66,8 @@ def main(config: Config) -> None:
     from touchgoal.sim_envs.twin.serve import Twin, TwinConfig
 
     out = open_run(config.out, "twin", config, adds=True).resolve()
-    twin = Twin(
-        TwinConfig(
-            task=config.env,
-            arm=config.arm,
-            seed=config.seed,
-            host=config.host,
-            port=config.port,
-            lock_step=config.lock_step,
-            folder=out,
-            wrench_error=config.wrench_error,
-        )
-    )
+    served = config.host, config.port, config.lock_step, out, config.wrench_error
+    twin = Twin(TwinConfig(config.env, config.arm, config.seed, *served))
 
     def stop(*_: object) -> None:
         twin.stopped = True
@@ -122,7 +112,6 @@ def open_to_network(host: str) -> str:
 
 
 def _table(cell: "CellConfig") -> str:
-    """List every address."""
     assert cell.load_cell is not None
     lines = {"task": cell.task.instruction, f"arm ({cell.arm})": cell.address}
     lines["gripper"] = cell.gripper.port or cell.gripper.address
