@@ -11,7 +11,7 @@ import torch
 
 from touchgoal.benchmarks.real_touch import forces, markers
 from touchgoal.benchmarks.real_touch.embedders import find_embedder
-from touchgoal.benchmarks.real_touch.force_onset import EmbeddedGrasp, cost_table, judge_cost
+from touchgoal.benchmarks.real_touch.forces import EmbeddedGrasp, cost_table, judge_cost
 from touchgoal.benchmarks.real_touch.videos import Config, embed_touch, read_touch, run
 from touchgoal.control.tactile.force import calibrate_force, change_statistics, resized
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder

@@ -1,17 +1,23 @@
-"""One deployment by `touchgoal deploy --execute`, with its result."""
+"""One deployment by `touchgoal deploy --execute`, with its result; a `touchgoal twin` to deploy on."""
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from touchgoal.control import features as ft
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 
 _TIMEOUT = 1800.0  # s for one deployment on a loaded machine
+_START_TIMEOUT, _END_TIMEOUT = 300.0, 60.0  # s for a twin, on a loaded machine
 _SHUT = 0.01  # m that fingers must have closed for an attempted grasp
 
 
@@ -97,3 +103,43 @@ def _phase(episodes: Path, holding: bool) -> str:
         return "not begun"
     width = found.read(len(found) - 1).frames[ft.STATE][:, -1]
     return "let go or missed" if width.max() - width.min() > _SHUT else "reaching"
+
+
+@contextmanager
+def deployed_twin(
+    scene: Scene, lock_step: bool, folder: Path, number: int, exact: bool = False
+) -> Iterator[Path]:
+    """Run a twin with a scene and yield the cell file that it wrote.
+
+    Twins of different numbers run side by side. An exact one reports true forces, without an arm's
+    estimation error.
+
+    Raises:
+        UserError: The twin does not start.
+    """
+    kind = "--env.wires" if scene.task == "bead-maze" else "--env.objects"
+    command = [sys.executable, "-m", "touchgoal.launch", "twin", "--task", scene.task]
+    command += [kind, scene.item, "--seed", str(scene.seed), "--port", "0", "--out", str(folder)]
+    command += ["--host", own_address(100 + number % 100)]
+    command += [*["--lock-step"] * lock_step, *["--no-wrench-error"] * exact]
+    cell_file, end = folder / "cell.json", time.monotonic() + _START_TIMEOUT
+    with (folder / "twin.log").open("w") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=log)
+        try:
+            while not cell_file.exists():
+                if process.poll() is not None or time.monotonic() > end:
+                    raise UserError(f"no twin: {(folder / 'twin.log').read_text()[-500:]}")
+                time.sleep(0.05)
+            yield cell_file
+        finally:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(_END_TIMEOUT)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def own_address(number: int) -> str:
+    """Return a loopback address that only this process uses, one a number."""
+    pid = os.getpid()
+    return f"127.{number}.{pid // 250 % 250}.{1 + pid % 250}"

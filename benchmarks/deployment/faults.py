@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from touchgoal.benchmarks.deployment.deployed_twin import own_address
+from touchgoal.benchmarks.deployment.deployed_episode import own_address
 from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.benchmarks.deployment.deployed_episode import Scene
-from touchgoal.benchmarks.deployment.deployed_twin import deployed_twin
+from touchgoal.benchmarks.deployment.deployed_episode import Scene, deployed_twin
 from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
