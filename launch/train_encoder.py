@@ -225,10 +225,8 @@ def _align(config: Align) -> None:
         )
     towers = load_towers(config.towers)
     out = open_training(config, "train-encoder")
-    train, val = (
-        collect_touches(episodes, config.contact_frames, config.no_contact_frames, config.seed)
-        for episodes in (data, validation)
-    )
+    drawn = config.contact_frames, config.no_contact_frames, config.seed
+    train, val = (collect_touches(episodes, *drawn) for episodes in (data, validation))
     print(f"{len(train)} touches of {len(train.descriptions)} objects; {len(val)} for validation")
     made_from = recipe(data, validation)
     encoder = align(train, val, towers, config.align, sensor, out, config, made_from)

@@ -155,15 +155,12 @@ def main(config: Config) -> None:
     out = open_training(config, "train-policy")
     print(f"{task}: {found[0]} for training, {found[1]} for validation")
     training_data.report_pauses(pauses[0], sets[0].fps, config.trim_pauses)
-    windows, validation = (
-        SequenceDataset(
-            load_recordings(
-                s, r, policy, touch, config.workers, skip=skip if config.trim_pauses else None
-            ),
-            policy,
-        )
-        for (s, r), skip in zip(chosen, pauses, strict=True)
+    skipped = pauses if config.trim_pauses else [None, None]
+    recordings = (
+        load_recordings(s, r, policy, touch, config.workers, skip=skip)
+        for (s, r), skip in zip(chosen, skipped, strict=True)
     )
+    windows, validation = (SequenceDataset(own, policy) for own in recordings)
     print(f"{len(windows)} windows of {len(rows[0])} episodes; {len(validation)} for validation")
     provenance = recipe(*sets) | {"episodes": len(rows[0])}
     train(policy, windows, validation, config.train, out, config, provenance)
@@ -209,7 +206,6 @@ def _policy_config(
 
 
 def _env(config: Config, task: TaskName) -> TaskConfig:
-    """Return the options of the task in which snapshots are tried."""
     from touchgoal.runtime.errors import UserError
 
     if type(config.env) is type(ENVS[task]):

@@ -88,11 +88,9 @@ def main(config: Config) -> None:
         twin.run()
     finally:
         twin.close()
-    numbers: dict[str, float] = {
-        **twin.pace.summary(),
-        "pictures_taken": twin.pictures.taken,
-        "pictures_left_out": twin.pictures.left_out,
-    }
+    pictures = twin.pictures
+    numbers: dict[str, float] = dict(twin.pace.summary())
+    numbers |= {"pictures_taken": pictures.taken, "pictures_left_out": pictures.left_out}
     write_json(out / "metrics.json", numbers)
     print("\n" + "\n".join(_pace_lines(numbers)) + "stopped")
 

@@ -21,7 +21,6 @@ from touchgoal.benchmarks.deployment.deployed_episode import (
     Scene,
     deploy,
     deployed_twin,
-    limited,
 )
 from touchgoal.benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.control.cell.cell_file import cell_table, read_cell_file
@@ -107,7 +106,7 @@ def _deploy(scene: Scene, policy: str, arm: str, number: int, seconds: float) ->
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with _cell(scene, arm, folder, number) as cell:
-            return deploy(limited(cell, seconds), scene, policy, arm, folder / "run")
+            return deploy(cell, scene, policy, arm, seconds, folder / "run")
 
 
 @contextmanager

@@ -56,24 +56,17 @@ class Deployment:
     pace: float = 1.0  # arm clock over wall clock in the median second; 1 in lock-step
 
 
-def limited(cell: Path, seconds: float) -> Path:
-    """Set the time limit of a cell file (JSON)."""
+def deploy(
+    cell: Path, scene: Scene, policy: str, arm: str, seconds: float, out: Path
+) -> Deployment:
+    """Run `touchgoal deploy --execute` on a cell file in its own process, for some time at most."""
     table = json.loads(cell.read_text())
     table["task"]["seconds"] = seconds
     cell.write_text(json.dumps(table))
-    return cell
-
-
-def deploy(cell: Path, scene: Scene, policy: str, arm: str, out: Path) -> Deployment:
-    """Run `touchgoal deploy --execute` on a cell file in its own process."""
     command = [sys.executable, "-m", "touchgoal.launch", "deploy", str(cell), "--policy", policy]
-    done = subprocess.run(
-        [*command, "--execute", "--yes", "--seed", str(scene.seed), "--out", str(out)],
-        capture_output=True,
-        text=True,
-        timeout=_TIMEOUT,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
+    command += ["--execute", "--yes", "--seed", str(scene.seed), "--out", str(out)]
+    env = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT, env=env)
     kind = (scene.task, policy, arm, scene.seed, scene.item)
     report = out / "metrics.json"
     if not report.exists():  # refused, or crashed
@@ -96,7 +89,6 @@ def deploy(cell: Path, scene: Scene, policy: str, arm: str, out: Path) -> Deploy
 
 
 def _phase(episodes: Path, holding: bool) -> str:
-    """Return the state of the fingers at the end of the episode."""
     if holding:
         return "holding"
     if not episodes.exists() or not len(found := EpisodeSet(episodes)):

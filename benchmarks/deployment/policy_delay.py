@@ -43,29 +43,20 @@ _PARTS = {
 
 def run(config: Config) -> dict[str, Any]:
     """Return success by delay, jitter and image rate, or by cause, with the trials."""
-    task = ENVS[config.task]
+    env = ENVS[config.task]
     cases = _causes() if config.causes else _delays(config)
-    return try_cases(
-        config,
-        (
-            (what, replace(task, as_deployed=as_deployed, deployment=between))
-            for what, as_deployed, between in cases
-        ),
-    )
+    envs = ((what, replace(env, as_deployed=d, deployment=between)) for what, d, between in cases)
+    return try_cases(config, envs)
 
 
 def _delays(config: Config) -> Iterator[tuple[str, bool, DeploymentConfig]]:
     for rate in config.rates:
         for jitter in config.jitter:
             for delay in config.delay:
-                half = delay / 2000, delay / 2000  # s: before the policy, and after it
-                between = DeploymentConfig(
-                    state_delay=half,
-                    picture_delay=half,
-                    command_delay=half,
-                    jitter=(jitter / 1000, jitter / 1000),
-                    picture_rate=rate,
-                )
+                half = (delay / 2000, delay / 2000)  # s: before the policy, and after it
+                more = (jitter / 1000, jitter / 1000)
+                late = DeploymentConfig(state_delay=half, picture_delay=half, command_delay=half)
+                between = replace(late, jitter=more, picture_rate=rate)
                 what = f"{delay:.0f} ms, jitter {jitter:.0f} ms, pictures {rate:.0f} Hz"
                 yield what, True, between
 

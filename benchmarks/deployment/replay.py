@@ -97,11 +97,9 @@ def replay_both(seed: int, number: int = 0) -> Iterator[dict[str, Any]]:
 
 
 def _environment() -> PickPlace:
+    none, delay = (0.0, 0.0), (_DELAY, _DELAY)
     between = DeploymentConfig(
-        command_delay=(_DELAY, _DELAY),
-        state_delay=(0.0, 0.0),
-        jitter=(0.0, 0.0),
-        estimated_wrench=False,
+        command_delay=delay, state_delay=none, jitter=none, estimated_wrench=False
     )
     # fingertips as the twin's, drawn by the same seed, so that arm and object begin alike
     config = PickPlaceConfig(objects=(_OBJECT,), cameras=(), as_deployed=True, deployment=between)

@@ -1,6 +1,7 @@
 """Commands to the arm against the workspace box and every limit, under wild policies."""
 
 from collections.abc import Iterator, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -88,13 +89,9 @@ def shares_of_limits(limits: JointLimits, q: Path) -> tuple[float, float, float]
 
 def run(config: Config) -> dict[str, Any]:
     """Push both arms at three rates, with commands in time and late."""
-    cases = [
-        (robot, hz, late) for robot in (FR3, UR5E) for hz in (20, 50, 125) for late in (False, True)
-    ]
-    rows = [
-        _row(robot, hz, late, config.seconds / len(cases), config.seed)
-        for robot, hz, late in track(cases, "pushing", "case")
-    ]
+    cases = list(product((FR3, UR5E), (20, 50, 125), (False, True)))
+    seconds = config.seconds / len(cases)
+    rows = [_row(*case, seconds, config.seed) for case in track(cases, "pushing", "case")]
     lines = [f"{'arm, rate, commands':<26}{'outside mm':>12}{'speed':>8}{'accel.':>8}{'jerk':>8}"]
     lines += [
         f"{row['what']:<26}{1e3 * row['outside']:>12.3f}{row['speed']:>8.3f}"

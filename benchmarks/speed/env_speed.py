@@ -38,10 +38,8 @@ def run(config: Config) -> dict[str, Any]:
     os.environ["LP_NUM_THREADS"] = "0"  # software OpenGL draws in this thread
     with one_core():
         rows = [*_physics(config), *_env(config), *_maze(config)]
-    return {
-        "rows": [vars(row) for row in rows],
-        "table": table("on one core, wall clock", "per second", rows),
-    }
+    printed = table("on one core, wall clock", "per second", rows)
+    return {"rows": [vars(row) for row in rows], "table": printed}
 
 
 def _physics(config: Config) -> list[Row]:
@@ -98,7 +96,6 @@ def _step_rate(what: str, config: Config, env: PickPlace | BeadMaze) -> Row:
 
 
 def _reset_and_run_expert(env: PickPlace, ticks: int, name: str = "soda_can") -> None:
-    """Reset and run the expert for some ticks."""
     env.reset(seed=1, options={"object": name, "mass": 0.1, "grasp_force": 15.0})
     expert = PickPlaceExpert(env)
     for _ in range(ticks):

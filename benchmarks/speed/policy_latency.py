@@ -6,6 +6,7 @@ Warm-up is left out. Networks of published sizes carry random weights.
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -79,14 +80,14 @@ def _stages(config: Config) -> list[Stage]:
         both = np.concatenate([encoder.preprocess(frame[None], frame)] * 2)
         alike = [torch.from_numpy(both)] * len(encoder.offsets)
         touch = encoder.stack(torch.stack(alike, 1))
-        stages += [
-            _time(
-                "preprocess both fingertips",
-                config.repeats,
-                lambda: [encoder.preprocess(ticks[1][k][None], ticks[0][k]) for k in ft.TACTILE],
-            ),
-            _time("touch encoder, both", config.repeats, lambda: encoder.embed_touch(touch)),
-        ]
+
+        def preprocess() -> None:
+            for key in ft.TACTILE:
+                encoder.preprocess(ticks[1][key][None], ticks[0][key])
+
+        stages.append(_time("preprocess both fingertips", config.repeats, preprocess))
+        embed = partial(encoder.embed_touch, touch)
+        stages.append(_time("touch encoder, both", config.repeats, embed))
     look = policy.end_to_end_encoder
     if policy.config.end_to_end is not None and look is not None:
         size = policy.config.end_to_end.size
@@ -95,9 +96,8 @@ def _stages(config: Config) -> list[Stage]:
         stages.append(_time("end-to-end encoder", config.repeats, lambda: look(images)))
     condition = torch.zeros(1, policy.condition_dim)
     generator = torch.Generator().manual_seed(0)
-    stages.append(
-        _time("denoising", config.repeats, lambda: policy.head.sample(condition, generator))
-    )
+    denoise = partial(policy.head.sample, condition, generator)
+    stages.append(_time("denoising", config.repeats, denoise))
     turn, horizon = iter(range(10**9)), planner.history_ticks
 
     def tick() -> None:
@@ -128,9 +128,8 @@ def _published(config: Config) -> list[Stage]:
 def _observations(config: PolicyConfig, camera: tuple[int, int]) -> list[dict[str, np.ndarray]]:
     rng = np.random.default_rng(0)
     keys = [key for key in config.proprioception if key not in config.estimated]
-    pictures = dict.fromkeys(ft.CAMERAS, (*camera, 3)) | {
-        key: ft.FEATURES[key].shape for key in ft.TACTILE
-    }
+    pictures = dict.fromkeys(ft.CAMERAS, (*camera, 3))
+    pictures |= {key: ft.FEATURES[key].shape for key in ft.TACTILE}
     return [
         {key: rng.normal(size=ft.FEATURES[key].shape).astype(np.float32) for key in keys}
         | {key: rng.integers(90, 110, shape, np.uint8) for key, shape in pictures.items()}

@@ -24,11 +24,8 @@ class Row:
 @contextmanager
 def one_core() -> Iterator[None]:
     """Keep this process on one core (Linux), torch and OpenCV on one thread."""
-    threads, cv_threads, cores = (
-        torch.get_num_threads(),
-        cv2.getNumThreads(),
-        os.sched_getaffinity(0),
-    )
+    threads, cv_threads = torch.get_num_threads(), cv2.getNumThreads()
+    cores = os.sched_getaffinity(0)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     os.sched_setaffinity(0, {min(cores)})

@@ -32,17 +32,10 @@ def parse(
     description: str,
     envs: Mapping[str, EnvConfig] | None = None,
 ) -> Any:
-    """Parse a command's arguments into its Config.
+    """Parse the arguments after a command's name into its Config, or that of a subcommand.
 
-    A Config with an option `--preset` has the defaults of each of its values in `PRESETS`.
-
-    Args:
-        config_type: Dataclass, or a union of the subcommands' dataclasses.
-        arguments: Arguments after the command's name.
-        prog: Name of the command for messages.
-        description: Description of the command for its help.
-        envs: For a command with `--task`, each task's default environment options; `--env.*` are
-            those of the typed task.
+    A Config with an option `--preset` has the defaults of each of its values in `PRESETS`. A command
+    with `--task` has each task's default environment options; `--env.*` are those of the typed task.
 
     Raises:
         UserError: A value is out of range.
@@ -58,13 +51,8 @@ def parse(
     preset = next(reversed(list(_values(typed, "--preset"))), "")
     registry.struct_rule(partial(_as_options, env=env, hidden=hidden, preset=preset))
     try:
-        return tyro.cli(
-            config_type,
-            args=typed,
-            prog=prog,
-            description=description,
-            registry=registry,
-        )
+        named = {"prog": prog, "description": description, "registry": registry}
+        return tyro.cli(config_type, args=typed, **named)
     except _OutOfRange as wrong:
         raise UserError(_one_line(wrong.error, typed)) from None
     except SystemExit as stop:
@@ -260,12 +248,8 @@ def print_completion(config_type: Any, shell: str) -> None:
     registry = ConstructorRegistry()
     registry.struct_rule(partial(_as_options, env=None, hidden=set()))
     try:
-        tyro.cli(
-            config_type,
-            args=["--tyro-write-completion", shell, "-"],
-            prog="touchgoal",
-            registry=registry,
-        )
+        written = ["--tyro-write-completion", shell, "-"]
+        tyro.cli(config_type, args=written, prog="touchgoal", registry=registry)
     except SystemExit as stop:
         if stop.code:
             raise

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -75,6 +76,30 @@ class RigFrames:
         return (self.before != torch.arange(len(self.before))).numpy()
 
 
+def assemble(
+    touch: list[Float16[Tensor, "_ 3 h w"]],
+    names: list[str],
+    lengths: list[int],
+    force: Float[Tensor, "n 3"] | None = None,
+    slip: Bool[Tensor, " n"] | None = None,
+    moments: int = 0,
+    **labels: Any,
+) -> RigFrames:
+    """Return frames of recordings one after the other; forces and slip are 0 where unknown."""
+    n = sum(lengths)
+    before = rows_before([moments] * (n // moments), 1) if moments else rows_before(lengths, STRIDE)
+    return RigFrames(
+        torch.cat(touch),
+        before,
+        torch.zeros(n, 3) if force is None else force,
+        torch.zeros(n, dtype=torch.bool) if slip is None else slip,
+        np.repeat(np.arange(len(names)), lengths),
+        np.repeat(names, lengths),
+        moments=moments,
+        **labels,
+    )
+
+
 def read_strokes(strokes: EpisodeSet, count: int, preprocess: Preprocessor) -> RigFrames:
     """Read the first strokes or slides; a stroke's background is its first frame."""
     keys = [TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP]
@@ -82,21 +107,14 @@ def read_strokes(strokes: EpisodeSet, count: int, preprocess: Preprocessor) -> R
     touch, force, slip, pose = [], [], [], []
     for i in track(range(count), "strokes", "stroke"):
         frames = strokes.read(i, keys).frames
-        touch.append(_preprocessed(frames[TACTILE_LEFT], preprocess))
+        touch.append(preprocessed(frames[TACTILE_LEFT], preprocess))
         force.append(torch.from_numpy(frames[TRUTH_PAD_WRENCH][:, :3] * _PRESSED_IS_POSITIVE))
         slip.append(torch.from_numpy(frames[TRUTH_SLIP][:, 0]))
         if TRUTH_OBJECT_POSE in frames:
             pose.append(torch.from_numpy(_planar(frames[TRUTH_OBJECT_POSE])))
-    lengths = [len(f) for f in force]
-    return RigFrames(
-        torch.cat(touch),
-        rows_before(lengths, STRIDE),
-        torch.cat(force),
-        torch.cat(slip),
-        np.repeat(np.arange(count), lengths),
-        np.repeat(_names(strokes, count), lengths),
-        torch.cat(pose) if pose else None,
-    )
+    names, lengths = _names(strokes, count), [len(f) for f in force]
+    poses = torch.cat(pose) if pose else None
+    return assemble(touch, names, lengths, torch.cat(force), torch.cat(slip), pose=poses)
 
 
 def read_grasps(grasps: EpisodeSet, count: int, preprocess: Preprocessor) -> RigFrames:
@@ -106,41 +124,25 @@ def read_grasps(grasps: EpisodeSet, count: int, preprocess: Preprocessor) -> Rig
         keys = [TACTILE_LEFT, TACTILE_RIGHT, TRUTH_PAD_WRENCH, TRUTH_SUCCESS]
         frames = grasps.read(i, keys).frames
         for side, key in enumerate((TACTILE_LEFT, TACTILE_RIGHT)):
-            touch.append(_preprocessed(frames[key], preprocess))
+            touch.append(preprocessed(frames[key], preprocess))
             wrench = frames[TRUTH_PAD_WRENCH][:, 6 * side : 6 * side + 3]
             force.append(torch.from_numpy(wrench * _PRESSED_IS_POSITIVE))
             label += [int(frames[TRUTH_SUCCESS][-1, 0])] * len(wrench)
-    length = len(touch[0])
-    return RigFrames(
-        torch.cat(touch),
-        rows_before([length] * len(touch), 1),
-        torch.cat(force),
-        torch.zeros(len(label), dtype=torch.bool),
-        np.repeat(np.arange(count), 2 * length),
-        np.repeat(_names(grasps, count), 2 * length),
-        label=torch.tensor(label),
-        moments=length,
-    )
+    moments, names, labels = len(touch[0]), _names(grasps, count), torch.tensor(label)
+    lengths = [2 * moments] * count
+    return assemble(touch, names, lengths, torch.cat(force), moments=moments, label=labels)
 
 
 def read_cloths(clips: EpisodeSet, count: int, preprocess: Preprocessor) -> RigFrames:
     """Read the first presses of cloth."""
     numbers = {cloth.name: i for i, cloth in enumerate(CLOTHS)}
     touch = [
-        _preprocessed(clips.read(i, [TACTILE_LEFT]).frames[TACTILE_LEFT], preprocess)
+        preprocessed(clips.read(i, [TACTILE_LEFT]).frames[TACTILE_LEFT], preprocess)
         for i in track(range(count), "cloths", "press")
     ]
-    lengths = [len(frames) for frames in touch]
-    names, n = np.repeat(_names(clips, count), lengths), sum(lengths)
-    return RigFrames(
-        torch.cat(touch),
-        rows_before(lengths, STRIDE),
-        torch.zeros(n, 3),
-        torch.zeros(n, dtype=torch.bool),
-        np.repeat(np.arange(count), lengths),
-        names,
-        label=torch.tensor([numbers[name] for name in names]),
-    )
+    names, lengths = _names(clips, count), [len(frames) for frames in touch]
+    label = torch.tensor(np.repeat([numbers[name] for name in names], lengths))
+    return assemble(touch, names, lengths, label=label)
 
 
 def with_fields(frames: RigFrames, rig: RigConfig, workers: int) -> RigFrames:
@@ -156,11 +158,14 @@ def _field(rig: RigConfig, index: int) -> Float32[np.ndarray, "t 3 24 24"]:
     return simulate(rig, index).field
 
 
-def _preprocessed(
-    pictures: UInt8[np.ndarray, "t h w 3"], preprocess: Preprocessor
+def preprocessed(
+    pictures: UInt8[np.ndarray, "t h w 3"],
+    preprocess: Preprocessor,
+    background: UInt8[np.ndarray, "h w 3"] | None = None,
 ) -> Float16[Tensor, "t 3 H W"]:
-    """Preprocess with the first image as background."""
-    return torch.from_numpy(preprocess(pictures, pictures[0])).half()
+    """Preprocess pictures; their background is the first one if none is given."""
+    untouched = pictures[0] if background is None else background
+    return torch.from_numpy(preprocess(pictures, untouched)).half()
 
 
 def rows_before(lengths: list[int], stride: int) -> Rows:

@@ -16,7 +16,7 @@ from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
 from touchgoal.benchmarks.papers.tacbench.config import RECORDED_AS, Recording
-from touchgoal.benchmarks.papers.tacbench.data import STRIDE, RigFrames, rows_before
+from touchgoal.benchmarks.papers.tacbench.data import STRIDE, RigFrames, assemble, preprocessed
 from touchgoal.benchmarks.papers.tacbench.task import TEST, VALIDATION
 from touchgoal.encoders.preprocess import Preprocessor
 from touchgoal.episodes.importers.feeling_of_success import MOMENTS, is_grasp_set, read_grasps
@@ -72,18 +72,12 @@ def read_published_strokes(
     for stroke in track(chosen, "strokes", "stroke"):
         part = _middle(len(stroke.rows))
         frames = stroke.clip.frames(stroke.rows[part])
-        touch.append(torch.from_numpy(preprocess(frames, stroke.background())).half())
+        touch.append(preprocessed(frames, preprocess, stroke.background()))
         force.append(stroke.force[part])
         slip.append(stroke.slip[part])
-    lengths = [len(labels) for labels in slip]
-    return RigFrames(
-        torch.cat(touch),
-        rows_before(lengths, STRIDE),
-        torch.from_numpy(np.concatenate(force)).float(),
-        torch.from_numpy(np.concatenate(slip)),
-        np.repeat(np.arange(len(chosen)), lengths),
-        np.repeat([stroke.probe for stroke in chosen], lengths),
-    )
+    names, lengths = [stroke.probe for stroke in chosen], [len(labels) for labels in slip]
+    forces, slips = (torch.from_numpy(np.concatenate(parts)) for parts in (force, slip))
+    return assemble(touch, names, lengths, forces.float(), slips)
 
 
 def read_published_bags(folder: Path, count: int, preprocess: Preprocessor) -> RigFrames:
@@ -97,21 +91,13 @@ def read_published_bags(folder: Path, count: int, preprocess: Preprocessor) -> R
     for bag in track(chosen, "bags", "bag"):
         part = _middle(len(bag.clip))
         frames = bag.clip.frames(np.arange(len(bag.clip))[part])
-        touch.append(torch.from_numpy(preprocess(frames, bag.background())).half())
+        touch.append(preprocessed(frames, preprocess, bag.background()))
         pose.append(_poses(bag.change)[part])
         force.append(np.outer(np.arange(len(frames)) >= STRIDE, (0, 0, 1)))
-    lengths = [len(poses) for poses in pose]
-    n = sum(lengths)
-    return RigFrames(
-        torch.cat(touch),
-        rows_before(lengths, STRIDE),
-        torch.from_numpy(np.concatenate(force)).float(),
-        torch.zeros(n, dtype=torch.bool),
-        np.repeat(np.arange(len(chosen)), lengths),
-        np.repeat([bag.object for bag in chosen], lengths),
-        pose=torch.from_numpy(np.concatenate(pose)),
-        use=np.repeat(_uses([bag.held_out for bag in chosen]), lengths),
-    )
+    names, lengths = [bag.object for bag in chosen], [len(poses) for poses in pose]
+    forces, poses = (torch.from_numpy(np.concatenate(parts)) for parts in (force, pose))
+    use = np.repeat(_uses([bag.held_out for bag in chosen]), lengths)
+    return assemble(touch, names, lengths, forces.float(), pose=poses, use=use)
 
 
 def read_published_grasps(
@@ -124,20 +110,13 @@ def read_published_grasps(
     for trial in track(chosen, "grasps", "attempt"):
         for finger in trial.fingers:
             frames = finger.frames(range(len(MOMENTS)))
-            touch.append(torch.from_numpy(preprocess(frames, frames[0])).half())
-    each = 2 * len(MOMENTS)
-    n = each * len(chosen)
-    return RigFrames(
-        torch.cat(touch),
-        rows_before([len(MOMENTS)] * len(touch), 1),
-        torch.zeros(n, 3),
-        torch.zeros(n, dtype=torch.bool),
-        np.repeat(np.arange(len(chosen)), each),
-        np.repeat([trial.object for trial in chosen], each),
-        label=torch.tensor([int(trial.held) for trial in chosen]).repeat_interleave(each),
-        moments=len(MOMENTS),
-        use=np.repeat(_uses([trial.held_out for trial in chosen]), each),
-    )
+            touch.append(preprocessed(frames, preprocess))
+    moments, names = len(MOMENTS), [trial.object for trial in chosen]
+    each = 2 * moments
+    label = torch.tensor([int(trial.held) for trial in chosen]).repeat_interleave(each)
+    use = np.repeat(_uses([trial.held_out for trial in chosen]), each)
+    lengths = [each] * len(chosen)
+    return assemble(touch, names, lengths, moments=moments, label=label, use=use)
 
 
 def _first(items: Iterable[Item], folder: Path) -> Item:

@@ -22,9 +22,9 @@ class Layout:
 
     title: str
     measure: str  # key of the main number
-    digits: int
-    less_is_better: bool
     others: dict[str, Callable[[Row], str]]  # further numbers by header
+    digits: int = 3
+    less_is_better: bool = False
 
 
 def _axis(key: str, k: int, digits: int) -> Callable[[Row], str]:
@@ -39,17 +39,15 @@ LAYOUTS: dict[str, Layout] = {
     "force": Layout(
         "T1, force on the pad, mN: mean absolute error; root mean square error, by axis and of all",
         "mae_mn",
-        0,
-        True,
         {axis: _axis("rmse_mn_by_axis", k, 0) for k, axis in enumerate("xyz")}
         | {"RMSE": _number("rmse_mn", 0)},
+        digits=0,
+        less_is_better=True,
     ),
     "field": Layout(
         "T1A, force field where the pad is touched: share of the shear's variation explained, and of the "
         "pressure's; root mean square errors, kPa",
         "shear_explained",
-        3,
-        False,
         {
             "pressure": _number("pressure_explained", 3),
             "shear": _number("shear_rmse_kpa", 2),
@@ -59,30 +57,22 @@ LAYOUTS: dict[str, Layout] = {
     "slip": Layout(
         "T2, whether the sphere slips: F1; mean absolute error of the change of force, mN",
         "f1",
-        3,
-        False,
         {"change": _number("change_mae_mn", 0)},
     ),
     "pose": Layout(
         "T3, change of the pose of a bar and a can in 11 classes: accuracy; by axis; within one class",
         "accuracy",
-        3,
-        False,
         {name: _axis("accuracy_by_axis", k, 3) for k, name in enumerate(("x", "y", "turn"))}
         | {"within": _number("within_one_class", 3)},
     ),
     "grasp": Layout(
         "T4, whether a grasp holds: accuracy; mean of both outcomes' accuracies",
         "accuracy",
-        3,
-        False,
         {"balanced": _number("balanced_accuracy", 3)},
     ),
     "textile": Layout(
         "T6, which of 20 cloths: accuracy; mean of all cloths' accuracies",
         "accuracy",
-        3,
-        False,
         {"balanced": _number("balanced_accuracy", 3)},
     ),
 }
@@ -115,10 +105,9 @@ def _task_lines(rows: list[Row], task: str) -> list[str]:
     for row in rows:
         low, high = (f"{end:.{layout.digits}f}" for end in row[f"{layout.measure}_interval"])
         others = "".join(f"{print_(row):>9}" for print_ in layout.others.values())
-        lines.append(
-            f"{row['encoder']:<36}{row['test']:<20}{row['samples']:>7}"
-            f"{row[layout.measure]:>16.{layout.digits}f}{f'[{low}, {high}]':>16}{others}"
-        )
+        value = f"{row[layout.measure]:.{layout.digits}f}"
+        about = f"{row['encoder']:<36}{row['test']:<20}{row['samples']:>7}"
+        lines.append(f"{about}{value:>16}{f'[{low}, {high}]':>16}{others}")
     return lines
 
 
