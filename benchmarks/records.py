@@ -3,8 +3,7 @@
     python -m touchgoal.benchmarks.records measure NAME ...   # run the command of a record, write it
     python -m touchgoal.benchmarks.records                    # rewrite the tables of README and docs
 
-A record is `benchmarks/results/NAME.json`. This module is the only one that writes them. It needs a
-clone; an installed package has the records but no pages.
+A record is `benchmarks/results/NAME.json`. An installed package has the records but no pages.
 """
 
 import json

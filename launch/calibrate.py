@@ -1,9 +1,8 @@
 """Fit a sensor's light, gel and noise to ball presses, and write its sensor file.
 
-PRESSES holds background.png (the untouched sensor), the pictures of the presses, and presses.csv
-with the columns file and ball_mm (the ball's radius). Contact circles are found in the pictures
-unless the columns x_px, y_px and radius_px give them (the first pixel is 0, 0). Use two balls of
-different size. `touchgoal record-presses` makes such a folder.
+PRESSES, as `touchgoal record-presses` makes it, holds background.png (the untouched sensor), pictures
+of the presses, and presses.csv with the columns file and ball_mm (the ball's radius). Contact circles
+are found, unless x_px, y_px and radius_px give them (the first pixel is 0, 0). Use two sizes of ball.
 """
 
 import math

@@ -37,8 +37,7 @@ class Config:
     outcomes: tuple[Outcome, ...] = ("success",)
     """Outcomes to ask the expert for: success, or (pick-place) one of four failures."""
     feedback: bool = False
-    """pick-place: the expert plans anew at every tick instead of following one path; policies learn
-    better from that."""
+    """pick-place: the expert plans anew at every tick; policies learn better from that."""
     policy: str | None = None
     """Policy that acts while the expert's actions are recorded (DAgger), named as for run-policy."""
     seed: Seed = 0

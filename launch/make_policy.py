@@ -46,20 +46,16 @@ class Config:
     corrections: Count | None = None
     """Episodes in each round of corrections; default: 200 for pick-place, 80 for the maze."""
     rounds: CountOrNone | None = None
-    """Rounds of DAgger after the first training: the policy acts, the expert's actions are
-    recorded, and the policy is trained again; default and most: 5 for pick-place, 3 for the
-    maze."""
+    """Rounds of DAgger: the policy acts, the expert's actions are recorded, the policy is trained again;
+    default and most: 5 for pick-place, 3 for the maze."""
     epochs: Count | None = None
     """Passes over the data in each training; default: 16 for pick-place, 5 for the maze."""
     trials: CountOrNone = 24
-    """Number of validation episodes in which every snapshot of the last training is tried; 0 takes
-    the last snapshot."""
+    """Validation episodes in which every snapshot of the last training is tried; 0 takes the last."""
     touch: Annotated[Path | None, RARE] = None
-    """Run folder of a new touch encoder (the maze), or of a new state estimator (pick-place),
-    instead of the shipped one; for new pads."""
+    """For new pads: run folder of a touch encoder (the maze) or a state estimator (pick-place)."""
     learn_touch: bool = False
-    """The maze: first train a touch encoder without labels on the demonstrations, instead of using
-    the shipped one; for new pads."""
+    """For new pads, the maze: first train a touch encoder without labels on the demonstrations."""
     resume: bool = False
     """Continue an interrupted run in `out`."""
     workers: Count = os.cpu_count() or 1

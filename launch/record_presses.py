@@ -2,8 +2,7 @@
 
 SOURCE is a USB serial number, a device (/dev/video2), a stream's address, or a recording: a video
 or a folder of pictures. Leave the gel untouched for a second. Then press the ball where the live
-picture shows, hold still until the press is recorded, and lift. Ctrl-C ends; recorded presses are
-written.
+picture shows, hold still until the press is recorded, and lift. Ctrl-C ends and keeps the presses.
 """
 
 from pathlib import Path

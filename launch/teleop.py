@@ -1,7 +1,6 @@
 """Lead the bead along the wire with keys, and record it as an episode like any other demonstration.
 
-The arm is compliant: a key pushes the hand, and the wire guides it. Ctrl-C ends; finished episodes are
-on disk.
+A key pushes the compliant hand, and the wire guides it. Ctrl-C ends; finished episodes are on disk.
 """
 
 import shutil
@@ -38,8 +37,7 @@ class Config:
     hand: TeleoperatorConfig = field(default_factory=TeleoperatorConfig)
     """Response of the hand to keys."""
     env: BeadMazeConfig = BeadMazeConfig(max_seconds=300.0, stall_seconds=60.0)
-    """Options of the task; time limits suit a person. The straightest of the first wires is
-    arc-2000009."""
+    """Options of the task; time limits suit a person. A straight wire is arc-2000009."""
 
 
 def main(config: Config) -> None:

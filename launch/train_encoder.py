@@ -91,8 +91,7 @@ class _Unlabelled(TrainerOptions, _UnlabelledData):
     frames: Count = 20
     """Time steps drawn from each episode, with both fingertips of each."""
     stride: Count = 2
-    """Control ticks between the two frames of a sample: 2 ticks are 0.1 s at 20 Hz. Sparsh uses 0.08 s
-    (5 frames of a sensor at 60 Hz)."""
+    """Control ticks between the two frames of a sample: 2 are 0.1 s at 20 Hz; Sparsh uses 0.08 s."""
 
 
 @checked_dataclass
@@ -136,8 +135,7 @@ class VJepa(_Unlabelled):
 
     frames: Count = 10
     stride: Count = 1
-    """Control ticks between the frames of a clip: 1 tick is 0.05 s at 20 Hz. Sparsh uses 0.03 s (2 frames
-    of a sensor at 60 Hz)."""
+    """Control ticks between the frames of a clip: 1 is 0.05 s at 20 Hz; Sparsh uses 0.03 s."""
     vjepa: VJepaConfig = VJEPA_PRESETS["default"]
     """Hyperparameters."""
 

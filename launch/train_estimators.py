@@ -27,8 +27,7 @@ class Config(TrainingOptions):
     """Frozen touch encoder: a folder (train-encoder), which is copied beside the estimator;
     default: the shipped one, which is not copied."""
     pose: Annotated[Path | None, RARE] = None
-    """Folder of a state estimator whose pose estimator is reused: only contact is learned. For new
-    pads with the same cameras."""
+    """For new pads with the same cameras: state estimator whose pose estimator is reused."""
     objects: Count = 1200
     """Number of objects, of random shape and size, to render."""
     placements: Count = 12

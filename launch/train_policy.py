@@ -73,9 +73,8 @@ class Config(TrainingOptions):
     end_to_end: bool = False
     """Train a touch ViT jointly with the policy, instead of a frozen encoder."""
     estimator: Path | None = None
-    """Folder of a state estimator (train-estimators). The policy is trained on the simulator's
-    contacts and object poses, so its episodes need no images; when it acts, the estimator supplies
-    both."""
+    """Folder of a state estimator (train-estimators). The policy is trained on the simulator's contacts
+    and object poses, without images; when it acts, the estimator supplies both."""
     out: Path | None = None
     """Folder of the run; the policy goes to its `policy/`."""
     share: Annotated[Fraction, RARE] = 1.0

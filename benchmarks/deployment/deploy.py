@@ -46,9 +46,8 @@ class Config(BenchmarkOptions):
     policies: tuple[str, ...] = ("scripted", "shipped")
     """Policies, named as for deploy; scripted: the task's own, the expert or the follower."""
     arms: tuple[Arm, ...] = get_args(Arm)
-    """Ways to act. environment: the task's environment; in-process: a simulated arm from the
-    example cell file; lock-step: a fresh twin over libfranka whose time waits for the client;
-    real-time: the same against the wall clock."""
+    """Ways to act: the task's environment; a simulated arm in process, from the example cell file; a
+    fresh twin over libfranka, whose time waits for the client (lock-step) or not (real-time)."""
     episodes: Count = 10
     """Episodes of each row."""
     seconds: Positive = 40.0

@@ -1,8 +1,7 @@
 """Every fault that a deployment must survive, on the twin through the makers' own client libraries.
 
-Each row is one deployment of the pick-and-place expert (or of a broken policy) on an FR3's twin. A
-process of its own runs it, as `deploy --execute` does, the fault comes while the arm moves, and the
-twin's truth says what the arm did.
+Each row is one deployment of the pick-and-place expert (or of a broken policy) on an FR3's twin, in
+its own process. The fault comes while the arm moves; the twin's truth says what the arm did.
 """
 
 import json

@@ -1,7 +1,6 @@
 """Success in the environment under late observations, plans and commands, or by cause.
 
-The arm is as deployed otherwise. With `causes`, each part of `--env.as-deployed` is added alone and
-left out alone.
+The arm is as deployed otherwise. By cause: each part of `--env.as-deployed` alone, and all but it.
 """
 
 from collections.abc import Iterator
@@ -22,8 +21,7 @@ class Config(TrialOptions):
     causes: bool = False
     """Run an ablation instead of delays: each effect of a deployment alone, then all but it."""
     delay: tuple[NotNegative, ...] = (0.0, 50.0, 100.0, 150.0)
-    """Total delay from sensing to command, ms, half before the policy and half after; planning
-    adds a tick."""
+    """Delay from sensing to command, ms, half before the policy, half after; planning adds a tick."""
     jitter: tuple[NotNegative, ...] = (0.0, 50.0)
     """Largest extra delay of each half, drawn each tick, ms."""
     rates: tuple[Positive, ...] = (30.0, 15.0)

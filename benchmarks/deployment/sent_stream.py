@@ -22,8 +22,7 @@ class Config(BenchmarkOptions):
     """Options of benchmark sent-stream."""
 
     seconds: Positive = 3600.0
-    """Simulated seconds of motion over both arms at 20, 50 and 125 Hz; an hour takes about 8
-    minutes."""
+    """Simulated seconds of motion over both arms at 20, 50 and 125 Hz; an hour takes 8 minutes."""
     seed: Seed = 0
     """Random seed of the policy's wishes."""
 

@@ -26,8 +26,7 @@ class Config(BenchmarkOptions):
     """Options of benchmark task-ceilings."""
 
     data: Path = field(kw_only=True)
-    """Folder of episodes of the expert or of a teleoperator; with tactile images for the ceiling
-    of touch."""
+    """Folder of episodes of the expert or a teleoperator; the ceiling of touch needs its images."""
 
 
 def peak_force(episode: Episode) -> float:

@@ -50,8 +50,7 @@ class Config(BenchmarkOptions):
     """Options of benchmark bead-maze."""
 
     policies: tuple[Path, ...] = ()
-    """Folders of policies from train-policy; policies of one recipe count as training seeds.
-    Default: the shipped policy."""
+    """Folders of policies from train-policy; default: the shipped policy."""
     wires: Count = 100
     """Test wires of the trained families."""
     held_out: CountOrNone = 20

@@ -1,8 +1,7 @@
 """MMWand's claims about dense costs (section V-E, Figures 8 and 9), on expert episodes and failures.
 
 Definitions were fixed before the first result: a curve "drops" at the first frame by which half of
-its net drop has fallen; peaks of an episode's curves are counted above one common noise level, the
-largest of theirs.
+its net drop has fallen; peaks of an episode's curves count above the largest of their noise levels.
 """
 
 import tempfile

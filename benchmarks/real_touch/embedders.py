@@ -18,9 +18,6 @@ from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_pixels
 from touchgoal.runtime.errors import UserError, install_extra
 
-CONTRAST = 4
-"""Factor on the colour change, drawn about grey for networks of plain images."""
-
 Frames = UInt8[np.ndarray, "n h w 3"]
 Embeddings = Float32[np.ndarray, "_ d"]
 Untouched = UInt8[np.ndarray, "h w 3"]
@@ -41,6 +38,7 @@ class Embedder(Protocol):
 
 
 _PIXELS = 20, 15  # width and height
+_CONTRAST = 4  # factor on the colour change, for networks of plain images
 
 
 def find_embedder(name: str, seed: int) -> Embedder:
@@ -86,12 +84,6 @@ def vit_of(encoder: BaseTouchEncoder) -> ViT:
     )
 
 
-def difference_pictures(frames: Frames, background: Untouched) -> Frames:
-    """Return the change against the untouched image as an image about grey."""
-    change = frames.astype(np.float32) - background
-    return np.clip(128 + CONTRAST * change, 0, 255).astype(np.uint8)
-
-
 def _one_by_one(embed_all: Callable[[Frames, Untouched], Embeddings]) -> Embedder:
     """Return an embedder from a function of single frames."""
 
@@ -112,7 +104,9 @@ def _embed_pixels(frames: Frames, background: Untouched) -> Embeddings:
 def _of_pictures(network: Callable[[Frames], torch.Tensor]) -> Embedder:
     @torch.no_grad()
     def embed(frames: Frames, background: Untouched) -> Embeddings:
-        return network(difference_pictures(frames, background)).float().numpy()
+        change = frames.astype(np.float32) - background
+        about_grey = np.clip(128 + _CONTRAST * change, 0, 255).astype(np.uint8)
+        return network(about_grey).float().numpy()
 
     return _one_by_one(embed)
 

@@ -46,9 +46,8 @@ class Config(BenchmarkOptions):
     data: Path = field(kw_only=True)
     """Folder with labels.csv and videos/, laid out as PhysiCLeAR's."""
     encoders: tuple[str, ...] = ("gelsight_mini", "random:gelsight_mini", "pixels", "efficientnet")
-    """Touch encoders: a name, a folder, a published Sparsh file or id (facebook/sparsh-dino-base),
-    `random:NAME` (the same network untrained), `pixels`, `efficientnet` (ImageNet), or the id or
-    folder of a Hugging Face vision model."""
+    """Touch encoders: a name, a folder, a published Sparsh file or id, `random:NAME` (untrained), `pixels`,
+    `efficientnet` (ImageNet), or the id or folder of a Hugging Face vision model."""
     every: Annotated[Count, RARE] = 1
     """Use every n-th video."""
     seed: Seed = 0

@@ -1,8 +1,7 @@
 """Touch embeddings a second on one core (Sparsh, Table 3).
 
-The peer of each ViT is `torch.nn.TransformerEncoder` of the same size, timed in turn with it, with
-and without torch's fused inference; the faster counts. A tick goes from a raw frame to its
-embedding, with earlier frames' preprocessing cached, as policies do it, and without the cache.
+The peer of each ViT is `torch.nn.TransformerEncoder` of the same size, timed in turn with it, with and
+without torch's fused inference; the faster counts. A tick goes from a raw frame to its embedding.
 """
 
 import copy

@@ -1,8 +1,7 @@
 """TacBench (Sparsh, Higuera et al. 2024) on a simulated bench: T1, T1A, T2, T3, T4 and T6.
 
-A probe reads each encoder's tokens of two frames 83 ms apart. Encoders are frozen, or trained with the
-probe from random weights. Snapshots and thresholds are chosen on validation recordings; intervals are
-a bootstrap over test recordings of the mean over seeds.
+A probe reads each encoder's tokens of two frames 83 ms apart. Snapshots and thresholds are chosen on
+validation recordings; intervals are a bootstrap over test recordings of the mean over seeds.
 """
 
 import tempfile

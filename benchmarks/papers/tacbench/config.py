@@ -35,16 +35,14 @@ class Config(BenchmarkOptions):
         "random:gelsight_mini_markers_mae",
         "end-to-end:compact",
     )
-    """Touch encoders with a ViT, frozen: a name, a folder, or a published Sparsh file or id.
-    `random:NAME` has random weights; `end-to-end:NAME`, or `end-to-end:PRESET` of
-    train-encoder, is trained with the probe."""
+    """Touch encoders with a ViT, frozen: a name, a folder, or a published Sparsh file or id. `random:NAME`
+    has random weights; `end-to-end:NAME`, or a preset's name there, is trained with the probe."""
     shares: Annotated[tuple[Share, ...], Field(min_length=1)] = (1.0, 0.33, 0.1, 0.01)
     """Shares of the training labels."""
     rig: RigConfig = RigConfig()
     """Sensor and loads of the simulated bench."""
     strokes: Annotated[int, Field(ge=15)] = 180
-    """Presses and slides to simulate for T1 and T2. Of every five, three train, one validates,
-    one tests."""
+    """Presses and slides to simulate for T1 and T2: of five, three train, one validates, one tests."""
     slides: Annotated[int, Field(ge=10)] = 60
     """Slides of held objects to simulate for T3."""
     grasps: Annotated[int, Field(ge=10)] = 400

@@ -1,7 +1,7 @@
 """Published recordings as samples of TacBench: force and slip, pose, grasps.
 
-A recording is what the publisher made in one go: a stroke, a bag, a grasp. Of recordings above 180
-images the middle is read. Images are decoded one recording at a time.
+A recording is what the publisher made in one go: a stroke, a bag, a grasp. Of long ones the middle is
+read.
 """
 
 from collections.abc import Callable, Hashable, Iterable, Sequence
