@@ -8,16 +8,7 @@ import tyro
 from pydantic import Field
 
 from touchgoal.encoders.alignment.config import ALIGN_PRESETS, AlignConfig
-from touchgoal.encoders.ssl.config import (
-    DINO_PRESETS,
-    IJEPA_PRESETS,
-    MAE_PRESETS,
-    VJEPA_PRESETS,
-    DinoConfig,
-    IJepaConfig,
-    MaeConfig,
-    VJepaConfig,
-)
+from touchgoal.encoders.ssl import config as ssl
 from touchgoal.encoders.training.options import TrainerOptions, TrainingOptions
 from touchgoal.runtime.option_types import (
     RARE,
@@ -98,12 +89,12 @@ class _Unlabelled(TrainerOptions, _UnlabelledData):
 class Mae(_Unlabelled):
     """Train without labels by masked autoencoding (MAE)."""
 
-    PRESETS: ClassVar = _presets("mae", MAE_PRESETS)
+    PRESETS: ClassVar = _presets("mae", ssl.MAE_PRESETS)
 
     frames: Count = 40
     stride: Count = 2
     """Control ticks between the two frames of a sample, with --mae.stacked."""
-    mae: MaeConfig = MAE_PRESETS["default"]
+    mae: ssl.MaeConfig = ssl.MAE_PRESETS["default"]
     """Hyperparameters."""
 
 
@@ -111,9 +102,9 @@ class Mae(_Unlabelled):
 class Dino(_Unlabelled):
     """Train without labels by self-distillation of two frames (DINO)."""
 
-    PRESETS: ClassVar = _presets("dino", DINO_PRESETS)
+    PRESETS: ClassVar = _presets("dino", ssl.DINO_PRESETS)
 
-    dino: DinoConfig = DINO_PRESETS["default"]
+    dino: ssl.DinoConfig = ssl.DINO_PRESETS["default"]
     """Hyperparameters."""
 
 
@@ -121,9 +112,9 @@ class Dino(_Unlabelled):
 class IJepa(_Unlabelled):
     """Train without labels by predicting hidden blocks of two frames (I-JEPA)."""
 
-    PRESETS: ClassVar = _presets("ijepa", IJEPA_PRESETS)
+    PRESETS: ClassVar = _presets("ijepa", ssl.IJEPA_PRESETS)
 
-    ijepa: IJepaConfig = IJEPA_PRESETS["default"]
+    ijepa: ssl.IJepaConfig = ssl.IJEPA_PRESETS["default"]
     """Hyperparameters."""
 
 
@@ -131,12 +122,12 @@ class IJepa(_Unlabelled):
 class VJepa(_Unlabelled):
     """Train without labels by predicting hidden tubes of four-frame clips (V-JEPA)."""
 
-    PRESETS: ClassVar = _presets("vjepa", VJEPA_PRESETS)
+    PRESETS: ClassVar = _presets("vjepa", ssl.VJEPA_PRESETS)
 
     frames: Count = 10
     stride: Count = 1
     """Control ticks between the frames of a clip: 1 is 0.05 s at 20 Hz; Sparsh uses 0.03 s."""
-    vjepa: VJepaConfig = VJEPA_PRESETS["default"]
+    vjepa: ssl.VJepaConfig = ssl.VJEPA_PRESETS["default"]
     """Hyperparameters."""
 
 

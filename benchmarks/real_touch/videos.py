@@ -15,15 +15,7 @@ from jaxtyping import Float, Int, UInt8
 from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.benchmarks.real_touch.embedders import Embedder, find_embedder
 from touchgoal.control.tactile.contact import contact_strength, threshold_for
-from touchgoal.encoders.probes.property_probe import (
-    adapted_nearest_is_same,
-    interval,
-    most_of_three,
-    nearest_is_same,
-    pair_accuracy,
-    predict_properties,
-    sentences_right,
-)
+from touchgoal.encoders.probes import property_probe as probe
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.whitening.text_head import EmbedTexts
 from touchgoal.episodes.importers.labelled_videos import (
@@ -130,28 +122,29 @@ def judge(
     objects = np.array([touch.video.object for touch in touches])[ranked]
     ranks = np.array([touch.video.ranks for touch in touches if touch.video.ranks is not None])
     embeddings = every[ranked]
-    sentences = sentences_right(embeddings, ranks, objects, embed_texts)
-    predicted = predict_properties(embeddings, ranks, objects)
+    sentences = probe.sentences_right(embeddings, ranks, objects, embed_texts)
+    predicted = probe.predict_properties(embeddings, ranks, objects)
     right = predicted.ranks == ranks
     rng = np.random.default_rng(0)
     frequent = [np.bincount(column).max() / len(column) for column in ranks.T]
     return {
         "videos": len(objects),
         "objects": len(set(objects)),
-        **_with_interval("nearest", nearest_is_same(embeddings, objects), objects),
-        **_with_interval("adapted", adapted_nearest_is_same(embeddings, objects), objects),
+        **_with_interval("nearest", probe.nearest_is_same(embeddings, objects), objects),
+        **_with_interval("adapted", probe.adapted_nearest_is_same(embeddings, objects), objects),
         **_with_interval("all_right", np.asarray(right.all(1)), objects),
         "properties": _by_property(right.mean(0)),
         "pc": _by_property(
-            pair_accuracy(*own, objects) for own in zip(predicted.ranks.T, ranks.T, strict=True)
+            probe.pair_accuracy(*own, objects)
+            for own in zip(predicted.ranks.T, ranks.T, strict=True)
         ),
         "pss": _by_property(
-            most_of_three(*own, objects, rng)
+            probe.most_of_three(*own, objects, rng)
             for own in zip(predicted.scores.T, ranks.T, strict=True)
         ),
         "sentences": _by_property(sentences.mean(0)),
         "sentences_intervals": {
-            name: interval(column, objects)
+            name: probe.interval(column, objects)
             for name, column in zip(PROPERTIES, sentences.T, strict=True)
         },
         "most_frequent": _by_property(frequent),
@@ -160,7 +153,7 @@ def judge(
 
 
 def _with_interval(name: str, right: np.ndarray, objects: np.ndarray) -> dict[str, Any]:
-    return {name: float(right.mean()), f"{name}_interval": interval(right, objects)}
+    return {name: float(right.mean()), f"{name}_interval": probe.interval(right, objects)}
 
 
 def _by_property(values: Iterable[float]) -> dict[str, float]:

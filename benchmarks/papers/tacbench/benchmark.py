@@ -14,20 +14,8 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from touchgoal.benchmarks.papers.tacbench import data, probes
 from touchgoal.benchmarks.papers.tacbench.config import RECORDED_AS, Config, Recording
-from touchgoal.benchmarks.papers.tacbench.data import (
-    RigFrames,
-    read_cloths,
-    read_grasps,
-    read_strokes,
-    with_fields,
-)
-from touchgoal.benchmarks.papers.tacbench.probes import (
-    END_TO_END,
-    PairTokens,
-    find_encoder_of,
-    frozen_tokens,
-)
 from touchgoal.benchmarks.papers.tacbench.published_recordings import check_tasks, find_published
 from touchgoal.benchmarks.papers.tacbench.task import Task
 from touchgoal.benchmarks.papers.tacbench.trainings import TASKS, Answers, Job, Subject, work
@@ -44,13 +32,13 @@ from touchgoal.runtime.progress import progress_bar
 from touchgoal.runtime.worker_pool import one_core_workers
 
 _LOG = "training.log"
-_READERS: dict[Recording, Callable[[EpisodeSet, int, Preprocessor], RigFrames]] = {
-    "strokes": read_strokes,
-    "slides": read_strokes,
-    "grasps": read_grasps,
-    "cloths": read_cloths,
+_READERS: dict[Recording, Callable[[EpisodeSet, int, Preprocessor], data.RigFrames]] = {
+    "strokes": data.read_strokes,
+    "slides": data.read_strokes,
+    "grasps": data.read_grasps,
+    "cloths": data.read_cloths,
 }
-Reading = Callable[[Preprocessor], RigFrames]
+Reading = Callable[[Preprocessor], data.RigFrames]
 """Reads the recordings with an encoder's preprocessor."""
 
 
@@ -108,8 +96,8 @@ def _record(what: Recording, folder: Path, config: Config) -> Reading:
 
 def _encoder(name: str, sensor: str, config: Config) -> BaseTouchEncoder:
     """Return an encoder of the rig's sensor; UserError for another sensor."""
-    encoder = find_encoder_of(name, sensor, config.seed)
-    PairTokens(encoder)  # refuses one without tokens
+    encoder = probes.find_encoder_of(name, sensor, config.seed)
+    probes.PairTokens(encoder)  # refuses one without tokens
     if encoder.preprocess.sensor not in (None, sensor):
         raise UserError(
             f"the encoder {name} is for {encoder.preprocess.sensor}, the rig has {sensor}: choose "
@@ -149,28 +137,28 @@ def _share(
     reading: Reading,
     encoders: dict[str, BaseTouchEncoder],
     files: Path,
-) -> list[tuple[Subject, RigFrames]]:
+) -> list[tuple[Subject, data.RigFrames]]:
     """Write each encoder's frames and tokens into files for the workers."""
-    shared_frames: dict[str, tuple[Path, RigFrames]] = {}
+    shared_frames: dict[str, tuple[Path, data.RigFrames]] = {}
     shared = []
     for i, (name, encoder) in enumerate(encoders.items()):
         key = encoder.preprocess.id
         if key not in shared_frames:
             frames = reading(encoder.preprocess)
             if "field" in tasks:
-                frames = with_fields(frames, bench.config.rig, bench.config.workers)
+                frames = data.with_fields(frames, bench.config.rig, bench.config.workers)
             shared_frames[key] = files / f"frames_{i}.pt", frames
             torch.save(frames, shared_frames[key][0])
         path, frames = shared_frames[key]
         tokens = None
-        if not name.startswith(END_TO_END):
+        if not name.startswith(probes.END_TO_END):
             tokens = files / f"tokens_{i}.pt"
-            torch.save(frozen_tokens(encoder, frames), tokens)
+            torch.save(probes.frozen_tokens(encoder, frames), tokens)
         shared.append((Subject(name, bench.sensor, path, tokens), frames))
     return shared
 
 
-def _judge(bench: Bench, job: Job, frames: RigFrames, answers: Answers) -> None:
+def _judge(bench: Bench, job: Job, frames: data.RigFrames, answers: Answers) -> None:
     """Add the rows of one encoder, task and share, one for each test set."""
     task, name = TASKS[job.task](frames), job.subject.name
     validation = [torch.from_numpy(outputs) for outputs in answers.validation]

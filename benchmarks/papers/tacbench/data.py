@@ -9,14 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Float16, Float32, Int, UInt8
 from torch import Tensor
 
-from touchgoal.control.features import (
-    TACTILE_LEFT,
-    TACTILE_RIGHT,
-    TRUTH_OBJECT_POSE,
-    TRUTH_PAD_WRENCH,
-    TRUTH_SLIP,
-    TRUTH_SUCCESS,
-)
+from touchgoal.control import features as ft
 from touchgoal.encoders.backbones.frame_history import past_rows
 from touchgoal.encoders.preprocess import Preprocessor
 from touchgoal.episodes.store import EpisodeSet
@@ -102,16 +95,16 @@ def assemble(
 
 def read_strokes(strokes: EpisodeSet, count: int, preprocess: Preprocessor) -> RigFrames:
     """Read the first strokes or slides; a stroke's background is its first frame."""
-    keys = [TACTILE_LEFT, TRUTH_PAD_WRENCH, TRUTH_SLIP]
-    keys += [TRUTH_OBJECT_POSE] if TRUTH_OBJECT_POSE in strokes.features else []
+    keys = [ft.TACTILE_LEFT, ft.TRUTH_PAD_WRENCH, ft.TRUTH_SLIP]
+    keys += [ft.TRUTH_OBJECT_POSE] if ft.TRUTH_OBJECT_POSE in strokes.features else []
     touch, force, slip, pose = [], [], [], []
     for i in track(range(count), "strokes", "stroke"):
         frames = strokes.read(i, keys).frames
-        touch.append(preprocessed(frames[TACTILE_LEFT], preprocess))
-        force.append(torch.from_numpy(frames[TRUTH_PAD_WRENCH][:, :3] * _PRESSED_IS_POSITIVE))
-        slip.append(torch.from_numpy(frames[TRUTH_SLIP][:, 0]))
-        if TRUTH_OBJECT_POSE in frames:
-            pose.append(torch.from_numpy(_planar(frames[TRUTH_OBJECT_POSE])))
+        touch.append(preprocessed(frames[ft.TACTILE_LEFT], preprocess))
+        force.append(torch.from_numpy(frames[ft.TRUTH_PAD_WRENCH][:, :3] * _PRESSED_IS_POSITIVE))
+        slip.append(torch.from_numpy(frames[ft.TRUTH_SLIP][:, 0]))
+        if ft.TRUTH_OBJECT_POSE in frames:
+            pose.append(torch.from_numpy(_planar(frames[ft.TRUTH_OBJECT_POSE])))
     names, lengths = _names(strokes, count), [len(f) for f in force]
     poses = torch.cat(pose) if pose else None
     return assemble(touch, names, lengths, torch.cat(force), torch.cat(slip), pose=poses)
@@ -121,13 +114,13 @@ def read_grasps(grasps: EpisodeSet, count: int, preprocess: Preprocessor) -> Rig
     """Read the first grasps, finger by finger: before, gripped, lifted."""
     touch, force, label = [], [], []
     for i in track(range(count), "grasps", "attempt"):
-        keys = [TACTILE_LEFT, TACTILE_RIGHT, TRUTH_PAD_WRENCH, TRUTH_SUCCESS]
+        keys = [ft.TACTILE_LEFT, ft.TACTILE_RIGHT, ft.TRUTH_PAD_WRENCH, ft.TRUTH_SUCCESS]
         frames = grasps.read(i, keys).frames
-        for side, key in enumerate((TACTILE_LEFT, TACTILE_RIGHT)):
+        for side, key in enumerate((ft.TACTILE_LEFT, ft.TACTILE_RIGHT)):
             touch.append(preprocessed(frames[key], preprocess))
-            wrench = frames[TRUTH_PAD_WRENCH][:, 6 * side : 6 * side + 3]
+            wrench = frames[ft.TRUTH_PAD_WRENCH][:, 6 * side : 6 * side + 3]
             force.append(torch.from_numpy(wrench * _PRESSED_IS_POSITIVE))
-            label += [int(frames[TRUTH_SUCCESS][-1, 0])] * len(wrench)
+            label += [int(frames[ft.TRUTH_SUCCESS][-1, 0])] * len(wrench)
     moments, names, labels = len(touch[0]), _names(grasps, count), torch.tensor(label)
     lengths = [2 * moments] * count
     return assemble(touch, names, lengths, torch.cat(force), moments=moments, label=labels)
@@ -137,7 +130,7 @@ def read_cloths(clips: EpisodeSet, count: int, preprocess: Preprocessor) -> RigF
     """Read the first presses of cloth."""
     numbers = {cloth.name: i for i, cloth in enumerate(CLOTHS)}
     touch = [
-        preprocessed(clips.read(i, [TACTILE_LEFT]).frames[TACTILE_LEFT], preprocess)
+        preprocessed(clips.read(i, [ft.TACTILE_LEFT]).frames[ft.TACTILE_LEFT], preprocess)
         for i in track(range(count), "cloths", "press")
     ]
     names, lengths = _names(clips, count), [len(frames) for frames in touch]

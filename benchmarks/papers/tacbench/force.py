@@ -7,13 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from touchgoal.benchmarks.papers.tacbench.data import RigFrames, Rows
-from touchgoal.benchmarks.papers.tacbench.task import (
-    Metrics,
-    Outputs,
-    Targets,
-    ValidationOutputs,
-    split_force,
-)
+from touchgoal.benchmarks.papers.tacbench.task import Metrics, Outputs, Targets, split_force
 from touchgoal.encoders.probes.attentive import AttentiveProbe
 from touchgoal.encoders.probes.dense import DenseProbe
 from touchgoal.encoders.probes.property_probe import interval
@@ -55,9 +49,7 @@ class ForceTask:
         """Return the root mean square error over frames and axes, N."""
         return float((self.read(outputs) - self._frames.force[rows]).square().mean().sqrt())
 
-    def judge(
-        self, predicted: list[Outputs], validation: list[ValidationOutputs], rows: Rows
-    ) -> Metrics:
+    def judge(self, predicted: list[Outputs], validation: list[Outputs], rows: Rows) -> Metrics:
         """See `force_metrics`."""
         truth = self._frames.force[rows]
         errors = np.stack([(self.read(o) - truth).double().numpy() for o in predicted])
@@ -134,9 +126,7 @@ class FieldTask:
         wrong = (self.read(outputs) - self._field[rows]) / self._scale
         return float(wrong.square().mean().sqrt())
 
-    def judge(
-        self, predicted: list[Outputs], validation: list[ValidationOutputs], rows: Rows
-    ) -> Metrics:
+    def judge(self, predicted: list[Outputs], validation: list[Outputs], rows: Rows) -> Metrics:
         """See `field_metrics`."""
         truth = self._field[rows].numpy()
         read = np.stack([self.read(outputs).numpy() for outputs in predicted])

@@ -14,7 +14,6 @@ from touchgoal.benchmarks.papers.tacbench.task import (
     Outputs,
     Split,
     Targets,
-    ValidationOutputs,
     split_grasp,
     split_textile,
 )
@@ -62,9 +61,7 @@ class LabelTask:
         loss = float(self.loss(outputs, self.targets(rows)))
         return float((self.read(outputs) != self.truth(rows)).mean()) + 0.01 * loss
 
-    def judge(
-        self, predicted: list[Outputs], validation: list[ValidationOutputs], rows: Rows
-    ) -> Metrics:
+    def judge(self, predicted: list[Outputs], validation: list[Outputs], rows: Rows) -> Metrics:
         """See `label_metrics`."""
         read = np.stack([self.read(outputs) for outputs in predicted])
         return label_metrics(read, self.truth(rows), self._stroke[rows.numpy()])

@@ -7,13 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from touchgoal.benchmarks.papers.tacbench.data import RigFrames, Rows
-from touchgoal.benchmarks.papers.tacbench.task import (
-    Metrics,
-    Outputs,
-    Targets,
-    ValidationOutputs,
-    split_pose,
-)
+from touchgoal.benchmarks.papers.tacbench.task import Metrics, Outputs, Targets, split_pose
 from touchgoal.encoders.probes.attentive import AttentiveProbe
 from touchgoal.encoders.probes.property_probe import interval
 
@@ -64,9 +58,7 @@ class PoseTask:
         """Return 1 - accuracy, mean over axes."""
         return float((self.read(outputs) != self.classes[rows]).float().mean())
 
-    def judge(
-        self, predicted: list[Outputs], validation: list[ValidationOutputs], rows: Rows
-    ) -> Metrics:
+    def judge(self, predicted: list[Outputs], validation: list[Outputs], rows: Rows) -> Metrics:
         """See `pose_metrics`."""
         read = np.stack([self.read(outputs).numpy() for outputs in predicted])
         return pose_metrics(read, self.classes[rows].numpy(), self._frames.stroke[rows.numpy()])

@@ -7,13 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from touchgoal.benchmarks.papers.tacbench.data import RigFrames, Rows
-from touchgoal.benchmarks.papers.tacbench.task import (
-    Metrics,
-    Outputs,
-    Targets,
-    ValidationOutputs,
-    split_slip,
-)
+from touchgoal.benchmarks.papers.tacbench.task import Metrics, Outputs, Targets, split_slip
 from touchgoal.encoders.probes.attentive import AttentiveProbe
 from touchgoal.encoders.probes.property_probe import interval
 from touchgoal.sim_envs.indenter_rig import FRICTION
@@ -63,9 +57,7 @@ class SlipTask:
         """Return whether frames slip."""
         return self._frames.slip[rows].numpy()
 
-    def judge(
-        self, predicted: list[Outputs], validation: list[ValidationOutputs], rows: Rows
-    ) -> Metrics:
+    def judge(self, predicted: list[Outputs], validation: list[Outputs], rows: Rows) -> Metrics:
         """Return F1 at validation thresholds, and the mean absolute force change error, mN."""
         cuts = [self.threshold(outputs, self.split.validation) for outputs in validation]
         slips = np.stack([o[:, 0].numpy() > t for o, t in zip(predicted, cuts, strict=True)])

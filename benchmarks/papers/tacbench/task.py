@@ -24,9 +24,8 @@ class Split:
     tests: dict[str, Rows]
 
 
-Outputs = Float[Tensor, "b k"]
-ValidationOutputs = Float[Tensor, "v k"]
-Targets = Float[Tensor, "b _"]
+Outputs = Float[Tensor, "_ k"]
+Targets = Float[Tensor, "_ _"]
 Metrics = dict[str, Any]
 """Numbers by name; NAME_interval is the 95 % interval of NAME over recordings."""
 
@@ -56,9 +55,7 @@ class Task(Protocol):
         """Return the validation error by which snapshots are compared; lower is better."""
         ...
 
-    def judge(
-        self, predicted: list[Outputs], validation: list[ValidationOutputs], rows: Rows
-    ) -> Metrics:
+    def judge(self, predicted: list[Outputs], validation: list[Outputs], rows: Rows) -> Metrics:
         """Return the metrics of all training seeds together, from each seed's outputs.
 
         Thresholds are chosen by the outputs on validation frames.

@@ -10,20 +10,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from touchgoal.benchmarks.papers.tacbench import probes
 from touchgoal.benchmarks.papers.tacbench.config import Config
 from touchgoal.benchmarks.papers.tacbench.data import RigFrames, Rows
 from touchgoal.benchmarks.papers.tacbench.force import FieldTask, ForceTask
 from touchgoal.benchmarks.papers.tacbench.labels import grasp_task, textile_task
 from touchgoal.benchmarks.papers.tacbench.pose import PoseTask
-from touchgoal.benchmarks.papers.tacbench.probes import (
-    Inputs,
-    PairTokens,
-    Reader,
-    find_encoder_of,
-    inputs_of_tokens,
-    read,
-    train_reader,
-)
 from touchgoal.benchmarks.papers.tacbench.slip import SlipTask
 from touchgoal.benchmarks.papers.tacbench.task import Task, thinned
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
@@ -86,10 +78,12 @@ def work(job: Job) -> Answers:
         reader = _reader(subject, encoder, task, seed)
         train = thinned(task.split.train, count, seed)
         with job.log.open("a") as log:
-            train_reader(reader, task, inputs_of, train, config, seed, subject.frames.parent, log)
-        validation.append(read(reader, inputs_of, task.split.validation).numpy())
+            probes.train_reader(
+                reader, task, inputs_of, train, config, seed, subject.frames.parent, log
+            )
+        validation.append(probes.read(reader, inputs_of, task.split.validation).numpy())
         for test, rows in task.split.tests.items():
-            predicted[test].append(read(reader, inputs_of, rows).numpy())
+            predicted[test].append(probes.read(reader, inputs_of, rows).numpy())
     return Answers(predicted, validation, count, (time.monotonic() - began) / config.seeds)
 
 
@@ -100,24 +94,24 @@ def _mapped(path: Path) -> RigFrames:
 
 @lru_cache(maxsize=1)
 def _encoder(name: str, sensor: str, seed: int) -> BaseTouchEncoder:
-    return find_encoder_of(name, sensor, seed)
+    return probes.find_encoder_of(name, sensor, seed)
 
 
 def _inputs_of(
     subject: Subject, encoder: BaseTouchEncoder, frames: RigFrames
-) -> Callable[[Rows], Inputs]:
+) -> Callable[[Rows], probes.Inputs]:
     """Return the map from rows to a probe's input."""
-    pairs = PairTokens(encoder)
+    pairs = probes.PairTokens(encoder)
     if subject.tokens is None:
         return partial(frames.stacked, offsets=pairs.offsets)
-    return inputs_of_tokens(pairs, torch.load(subject.tokens, mmap=True), frames)
+    return probes.inputs_of_tokens(pairs, torch.load(subject.tokens, mmap=True), frames)
 
 
-def _reader(subject: Subject, encoder: BaseTouchEncoder, task: Task, seed: int) -> Reader:
+def _reader(subject: Subject, encoder: BaseTouchEncoder, task: Task, seed: int) -> probes.Reader:
     """Return a probe with random weights, with an encoder if that is trained."""
     trained = subject.tokens is None
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         if trained:
-            encoder = find_encoder_of(subject.name, subject.sensor, seed)
-        return Reader(task, PairTokens(encoder), trained)
+            encoder = probes.find_encoder_of(subject.name, subject.sensor, seed)
+        return probes.Reader(task, probes.PairTokens(encoder), trained)
