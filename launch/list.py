@@ -45,15 +45,13 @@ def main(config: Config) -> None:
         print(f"{name:<{width}}{meaning}")
 
 
-def objects() -> dict[str, str]:
-    """Return the object catalogue of pick-place."""
+def _objects() -> dict[str, str]:
     from touchgoal.sim_envs.scene.objects import CATALOGUE
 
     return {name: f"{kind.shape}: {kind.descriptions[0]}" for name, kind in CATALOGUE.items()}
 
 
-def sensors() -> dict[str, str]:
-    """Return the models of fingertip sensors."""
+def _sensors() -> dict[str, str]:
     from touchgoal.control.tactile.sensor_models import SENSORS
 
     found = {}
@@ -64,8 +62,7 @@ def sensors() -> dict[str, str]:
     return found
 
 
-def encoders() -> dict[str, str]:
-    """Return the shipped touch encoders."""
+def _encoders() -> dict[str, str]:
     found = {}
     for path in sorted(_WEIGHTS.glob("*/encoder.json")):
         made = json.loads(path.read_text())["config"]
@@ -74,18 +71,17 @@ def encoders() -> dict[str, str]:
     return found
 
 
-def benchmarks() -> dict[str, str]:
-    """Return the benchmarks."""
+def _benchmarks() -> dict[str, str]:
     from touchgoal.launch.benchmark import BENCHMARKS
 
     return {name: meaning for name, (_, meaning) in BENCHMARKS.items()}
 
 
 KINDS: dict[Kind, tuple[Callable[[], dict[str, str]], str]] = {
-    "objects": (objects, "--env.objects NAME"),
-    "sensors": (sensors, "--env.sensor NAME"),
+    "objects": (_objects, "--env.objects NAME"),
+    "sensors": (_sensors, "--env.sensor NAME"),
     "tasks": (lambda: TASKS, "--task NAME"),
     "policies": (lambda: POLICIES, "--policy NAME"),
-    "encoders": (encoders, "--encoder NAME"),
-    "benchmarks": (benchmarks, "touchgoal benchmark NAME"),
+    "encoders": (_encoders, "--encoder NAME"),
+    "benchmarks": (_benchmarks, "touchgoal benchmark NAME"),
 }

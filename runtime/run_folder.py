@@ -35,13 +35,8 @@ def check_writable(out: Path | None) -> None:
 def open_run(out: Path | None, command: str, config: Any, adds: bool = False) -> Path:
     """Make the folder of a run, hold it until `release_runs`, and write the run's record into it.
 
-    The first run's record is `config.json`; later ones add `config_2.json` and so on.
-
-    Args:
-        out: Folder that the user named; None for `runs/<date>_<command>`.
-        command: Name of the command.
-        config: Its dataclass.
-        adds: Whether the run continues what the folder holds: it appends episodes, or resumes.
+    The folder is `runs/<date>_<command>` where the user named none. The first run's record is
+    `config.json`; later ones, which add to what the folder holds, are `config_2.json` and so on.
 
     Raises:
         UserError: Another process writes into the folder, it holds the results of another run, or

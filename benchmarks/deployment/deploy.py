@@ -8,8 +8,8 @@ import json
 import sys
 import tempfile
 from collections.abc import Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -71,7 +71,9 @@ def run(config: Config) -> dict[str, Any]:
         for name in config.policies:
             policy = scripted(task) if name == "scripted" else name
             for arm in config.arms:
-                with _side_by_side(arm, len(scenes), config.workers) as pool:
+                open_pool = one_core_workers if arm == "environment" else ThreadPoolExecutor
+                # Deployments are processes, and real-time ones run alone.
+                with open_pool(1 if arm == "real-time" else config.workers) as pool:
                     begun = [
                         pool.submit(_deploy, scene, policy, arm, i, config.seconds)
                         for i, scene in enumerate(scenes)
@@ -82,13 +84,6 @@ def run(config: Config) -> dict[str, Any]:
                 print("\n".join(own), file=sys.stderr)
                 done += rows
     return {"table": "\n".join(lines), "deployments": [asdict(row) for row in done]}
-
-
-def _side_by_side(arm: str, count: int, workers: int) -> AbstractContextManager[Executor]:
-    """Return a pool; deployments are processes, and real-time ones run alone."""
-    if arm == "environment":
-        return one_core_workers(min(count, workers))
-    return ThreadPoolExecutor(1 if arm == "real-time" else workers)
 
 
 def _scenes(task: TaskName, config: Config) -> Iterator[Scene]:

@@ -94,6 +94,7 @@ def run(config: Config) -> dict[str, Any]:
         tests = record_and_measure(config, sensor, embedder, normalizer, Path(folder))
     successes = [t for t in tests if t.outcome == "success"]
     claims = judge_claims(successes, [t for t in tests if t.outcome == "never_touch"])
+    auc = {outcome: failure_auc(tests, outcome) for outcome in OUTCOMES if outcome != "success"}
     parts = [
         "Figure 8: goal = own last frame, held-out successful episodes",
         metrics_table([t.own for t in successes], legend=False),
@@ -102,12 +103,12 @@ def run(config: Config) -> dict[str, Any]:
         "\nclaims",
         *(c.line for c in claims),
         "\nsuccess or not, from the last cost to another episode's end (area under ROC)",
-        failure_table(tests),
+        failure_table(auc),
     ]
     return {
         "table": "\n".join(parts),
         "claims": [vars(c) for c in claims],
-        "auc": {o: failure_auc(tests, o) for o in OUTCOMES if o != "success"},
+        "auc": auc,
         "episodes": [
             {"outcome": t.outcome}
             | {
@@ -268,22 +269,21 @@ def _fall_after_contact(curves: Curves) -> float:
 
 def failure_auc(tests: Sequence[HeldOutEpisode], outcome: str) -> dict[str, float]:
     """Return the AUC of the last cost, success against each failure, by kind of curve."""
+    last = {
+        kind: [t.other.unclipped for t in tests if t.outcome == kind]
+        for kind in ("success", outcome)
+    }
     return {
-        name: _auc(
-            [t.other.unclipped[name][-1] for t in tests if t.outcome == "success"],
-            [t.other.unclipped[name][-1] for t in tests if t.outcome == outcome],
-        )
+        name: _auc(*([costs[name][-1] for costs in own] for own in last.values()))
         for name in tests[0].other.unclipped
     }
 
 
-def failure_table(tests: Sequence[HeldOutEpisode]) -> str:
+def failure_table(auc: dict[str, dict[str, float]]) -> str:
     """Return the AUC table as text; 0.5 is chance."""
-    names = list(tests[0].other.unclipped)
-    lines = [f"{'failure':<15}" + "".join(f"{n:>15}" for n in names)]
-    for outcome in OUTCOMES[1:]:
-        cells = failure_auc(tests, outcome)
-        lines.append(f"{outcome:<15}" + "".join(f"{cells[n]:>15.2f}" for n in names))
+    lines = [f"{'failure':<15}" + "".join(f"{name:>15}" for name in next(iter(auc.values())))]
+    for outcome, cells in auc.items():
+        lines.append(f"{outcome:<15}" + "".join(f"{value:>15.2f}" for value in cells.values()))
     return "\n".join(lines)
 
 

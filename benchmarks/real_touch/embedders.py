@@ -42,13 +42,11 @@ _CONTRAST = 4  # factor on the colour change, for networks of plain images
 
 
 def find_embedder(name: str, seed: int) -> Embedder:
-    """Find an embedder by name; UserError if there is none.
+    """Find an embedder by name; UserError if there is none. The seed is of random weights.
 
-    Args:
-        name: a shipped touch encoder, a folder, or a published Sparsh file or id; `random:NAME` for the
-            same network untrained; `pixels` for 20 x 15 pixels of change; `efficientnet` for the offline
-            towers' ImageNet network; or the id or folder of a Hugging Face vision model.
-        seed: seed of random weights.
+    Names: a shipped touch encoder, a folder, or a published Sparsh file or id; `random:NAME` for the
+    same network untrained; `pixels` for 20 x 15 pixels of change; `efficientnet` for the offline
+    towers' ImageNet network; or the id or folder of a Hugging Face vision model.
     """
     if name == "pixels":
         return _one_by_one(_embed_pixels)

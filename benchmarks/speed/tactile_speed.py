@@ -4,6 +4,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, no_type_check
 
 import numpy as np
@@ -151,7 +152,8 @@ def _limits(config: Config) -> dict[str, float]:
     """Return the core's own limits and the frame rate that they would allow."""
     # Alignment of the two arrays changes it tenfold on some machines.
     copied = max(_copy_rate(config, offset) for offset in (0, 16, 1024))
-    flop = _measure("fma", replace(config, frames=20), _multiply_and_add).median * _FMA_FLOP
+    chain = partial(_chain, _LANES, _FMA_STEPS)
+    flop = _measure("fma", replace(config, frames=20), chain).median * _FMA_FLOP
     return {
         "copy_gb_per_s": copied / 1e9,
         "gflop_per_s": flop / 1e9,
@@ -179,10 +181,6 @@ def _chain(lanes, steps):
     for _ in range(steps):
         for k in range(128):
             lanes[k] = lanes[k] * np.float32(0.999) + np.float32(0.0005)
-
-
-def _multiply_and_add() -> None:
-    _chain(_LANES, _FMA_STEPS)
 
 
 def _table(rows: list[Row], limits: dict[str, float]) -> str:

@@ -81,7 +81,7 @@ def find_encoder_of(name: str, sensor: str, seed: int) -> BaseTouchEncoder:
 def frozen_tokens(encoder: BaseTouchEncoder, frames: RigFrames) -> Float16[Tensor, "n t f"]:
     """Return a frozen encoder's tokens of every frame, each computed once."""
     tokens = PairTokens(encoder).eval()
-    every = _batches(torch.arange(len(frames.before)))
+    every = track(torch.arange(len(frames.before)).split(BATCH), "embedding", "batch")
     if tokens.looks_back:
         batches = (frames.stacked(rows, tokens.offsets) for rows in every)
         return torch.cat([tokens(batch).half() for batch in batches])
@@ -95,10 +95,6 @@ def inputs_of_tokens(
     if pairs.looks_back:
         return lambda rows: tokens[rows].float()
     return lambda rows: torch.cat([tokens[rows], tokens[frames.before[rows]]], 2).float()
-
-
-def _batches(rows: Rows) -> list[Rows]:
-    return list(track(rows.split(BATCH), "embedding", "batch"))
 
 
 class Reader(nn.Module):

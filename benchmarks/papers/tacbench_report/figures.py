@@ -38,12 +38,12 @@ def draw_by_labels(rows: list[dict[str, Any]], sensor: str) -> UInt8[np.ndarray,
         _draw_bars(axis, own, task, test, sensor)
     for axis in axes.flat[len(shown) :]:
         axis.axis("off")
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    for axis in axes.flat[1 : len(shown)]:
+    handles: dict[str, Any] = {}
+    for axis in axes.flat[: len(shown)]:
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
-            if label not in labels:
-                handles, labels = [*handles, handle], [*labels, label]
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9)
+            handles.setdefault(label, handle)
+    legend = list(handles.values()), list(handles)
+    figure.legend(*legend, loc="outside lower center", ncols=3, fontsize=9)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
@@ -76,7 +76,8 @@ def _draw_bars(axis: Axes, rows: list[dict[str, Any]], task: str, test: str, sen
     if not LAYOUTS[task].less_is_better:  # an explained share may be far below 0
         axis.set_ylim(max(axis.get_ylim()[0], -0.5), 1.02)
     _draw_published(axis, shares, task, sensor)
-    axis.set_xticks(range(len(shares)), [_share_name(share) for share in shares])
+    names = ["all" if share == 1 else f"1/{round(1 / share)}" for share in shares]
+    axis.set_xticks(range(len(shares)), names)
     axis.set(xlabel="share of the labels", title=f"{_TITLES[task]}\n{test}")
     axis.title.set_fontsize(10)
 
@@ -103,7 +104,3 @@ def _of_paper(share: float) -> int | None:
     """Return which of the paper's shares this is."""
     near = [i for i, own in enumerate(SHARES) if abs(share / own - 1) < 0.05]
     return near[0] if near else None
-
-
-def _share_name(share: float) -> str:
-    return "all" if share == 1 else f"1/{round(1 / share)}"
