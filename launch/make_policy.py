@@ -101,7 +101,6 @@ def _task_of(command: str) -> str:
 
 
 def _run(step: list[str]) -> None:
-    """Run a command, or continue it after its last finished epoch or episode."""
     from touchgoal.encoders.training.checkpoint import has_checkpoint
     from touchgoal.launch.__main__ import read_options
 

@@ -107,7 +107,6 @@ def _record_attempt(
 
 
 def _show(line: str) -> None:
-    """Write the status line over the last one."""
     if sys.stdout.isatty():
         width = shutil.get_terminal_size().columns - 1
         print(f"\r{line[:width]:<{width}}", end="", flush=True)

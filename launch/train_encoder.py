@@ -23,7 +23,6 @@ Preset = Literal["default", "paper"]
 
 
 def _presets(option: str, presets: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the option's default for each value of --preset."""
     return {name: {option: config} for name, config in presets.items()}
 
 
@@ -190,7 +189,6 @@ def main(config: Align | Mae | Dino | IJepa | VJepa | Surfaces | Adapt) -> None:
 
 
 def _align(config: Align) -> None:
-    """Align touch with images and texts, then fit the normalizer of reward curves."""
     from touchgoal.encoders.alignment.align import align
     from touchgoal.encoders.ssl.frames import find_sensor_name
     from touchgoal.encoders.towers.towers import load_towers
@@ -232,7 +230,6 @@ def _align(config: Align) -> None:
 
 
 def _train_unlabelled(config: Mae | Dino | IJepa | VJepa) -> None:
-    """Draw touches, train, save the encoder."""
     from touchgoal.encoders.backbones.frame_history import frame_offsets
     from touchgoal.encoders.backbones.sparsh import SPARSH_BASE
     from touchgoal.encoders.ssl.train import train_unlabelled
@@ -252,7 +249,6 @@ def _train_unlabelled(config: Mae | Dino | IJepa | VJepa) -> None:
 
 
 def _fit_to_surfaces(config: Surfaces) -> None:
-    """Whiten an ImageNet network by simulated presses, and save it."""
     from touchgoal.control.tactile.sensor_calibration import load
     from touchgoal.control.tactile.sensor_models import find_sensor
     from touchgoal.encoders.pretrained import save

@@ -121,7 +121,6 @@ def _table(cell: "CellConfig") -> str:
 
 
 def _pace_lines(numbers: dict[str, float]) -> list[str]:
-    """Say how well the twin kept up with real time."""
     if not numbers["seconds"]:
         return [""]
     return [

@@ -248,7 +248,7 @@ def test_the_cost_falls_with_the_touch_and_tells_the_wrong_thing() -> None:
 
     def grasp(trial: int) -> EmbeddedGrasp:
         seen = strength[:, None] * np.eye(2)[trial // 2] + 0.01 * trial
-        return EmbeddedGrasp(f"trial {trial}", f"thing {trial // 2}", seen, 8, 5)
+        return EmbeddedGrasp(f"thing {trial // 2}", seen, 8, 5)
 
     result = judge_cost([grasp(trial) for trial in range(4)])
     assert result["delays"] == [0] * 4 and result["near"] == 1

@@ -119,7 +119,9 @@ def _cell(scene: Scene, arm: str, folder: Path, number: int) -> Iterator[Path]:
 
 
 def _in_environment(scene: Scene, policy: str) -> Deployment:
-    maker, task = prepare_policy(policy, scene.config())
+    maze = scene.task == "bead-maze"
+    env = BeadMazeConfig(wires=(scene.item,)) if maze else PickPlaceConfig(objects=(scene.item,))
+    maker, task = prepare_policy(policy, env)
     trial = run_trial(task, maker, EpisodeSpec(scene.seed))
     ending, peak = trial.failure or "done", trial.peak_force
     result = trial.success, trial.progress, ending, "", trial.seconds, peak, {}, 0.0
@@ -127,7 +129,6 @@ def _in_environment(scene: Scene, policy: str) -> Deployment:
 
 
 def _lines(rows: list[Deployment]) -> list[str]:
-    """Return one line for the row and one for each failure."""
     first = rows[0]
     rate = SuccessRate(sum(row.success for row in rows), len(rows))
     peaks = [row.peak_force for row in rows]

@@ -14,7 +14,7 @@ from pathlib import Path
 from touchgoal.control import features as ft
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
+from touchgoal.sim_envs.config import TaskName
 
 _TIMEOUT = 1800.0  # s for one deployment on a loaded machine
 _START_TIMEOUT, _END_TIMEOUT = 300.0, 60.0  # s for a twin, on a loaded machine
@@ -28,12 +28,6 @@ class Scene:
     task: TaskName
     seed: int
     item: str  # object or wire
-
-    def config(self) -> TaskConfig:
-        """Return the environment's options."""
-        if self.task == "bead-maze":
-            return BeadMazeConfig(wires=(self.item,))
-        return PickPlaceConfig(objects=(self.item,))
 
 
 @dataclass(frozen=True)

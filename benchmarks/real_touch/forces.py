@@ -79,10 +79,8 @@ def judge_grasps(grasps: list[ForceGrasp], embedders: dict[str, Embedder]) -> di
         firmest = int(np.where(force < _IMPOSSIBLE, force, 0).argmax())
         for name, embed in embedders.items():
             embeddings = embed(frames, untouched).astype(np.float64)
-            one = EmbeddedGrasp(
-                grasp.trial, grasp.object, embeddings, firmest, begins if open_hand else None
-            )
-            embedded[name].append(one)
+            start = begins if open_hand else None
+            embedded[name].append(EmbeddedGrasp(grasp.object, embeddings, firmest, start))
     every, force, frame_objects = map(np.concatenate, (rows, forces, objects))
     judged = (force <= RANGE) & (force > -1)
     error, names = np.full(len(force), np.nan), np.unique(frame_objects)
@@ -133,7 +131,6 @@ def force_table(result: dict[str, Any]) -> str:
 class EmbeddedGrasp:
     """One grasp with one encoder's embeddings."""
 
-    trial: str
     object: str
     embeddings: Float[np.ndarray, "n d"]
     firmest: int  # frame of the largest force

@@ -166,8 +166,6 @@ class _Peer(nn.Module):
 
 
 class _Stream:
-    """A stream of sensor frames as an encoder's input."""
-
     def __init__(self, encoder: BaseTouchEncoder, dtype: torch.dtype) -> None:
         drawn = np.random.default_rng(0).integers(90, 130, (_STREAM, *_FRAME, 3), np.uint8)
         self._frames = [frame.copy() for frame in drawn]

@@ -73,7 +73,6 @@ def _env(config: Config) -> list[Row]:
 
 
 def _maze(config: Config) -> list[Row]:
-    """Return the maze with the bead held on a wire."""
     rows = []
     for what, tactile in (("physics alone", False), ("two tactile images", True)):
         env = BeadMaze(BeadMazeConfig(tactile=tactile, max_seconds=1e6))

@@ -149,7 +149,6 @@ def _measure(
 
 
 def _limits(config: Config) -> dict[str, float]:
-    """Return the core's own limits and the frame rate that they would allow."""
     # Alignment of the two arrays changes it tenfold on some machines.
     copied = max(_copy_rate(config, offset) for offset in (0, 16, 1024))
     chain = partial(_chain, _LANES, _FMA_STEPS)

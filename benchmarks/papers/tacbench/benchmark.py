@@ -8,17 +8,17 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from touchgoal.benchmarks.papers.tacbench import data, probes
 from touchgoal.benchmarks.papers.tacbench.config import RECORDED_AS, Config, Recording
 from touchgoal.benchmarks.papers.tacbench.published_recordings import check_tasks, find_published
 from touchgoal.benchmarks.papers.tacbench.task import Task
-from touchgoal.benchmarks.papers.tacbench.trainings import TASKS, Answers, Job, Subject, work
+from touchgoal.benchmarks.papers.tacbench.trainings import TASKS, Job, Subject, work
 from touchgoal.benchmarks.papers.tacbench_report.figures import draw_by_labels
 from touchgoal.benchmarks.papers.tacbench_report.tables import table
 from touchgoal.control.tactile.sensor_models import find_sensor
@@ -28,10 +28,9 @@ from touchgoal.episodes.bench_recording import record_bench
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.interruption import on_interruption
-from touchgoal.runtime.progress import progress_bar
+from touchgoal.runtime.progress import track
 from touchgoal.runtime.worker_pool import one_core_workers
 
-_LOG = "training.log"
 _READERS: dict[Recording, Callable[[EpisodeSet, int, Preprocessor], data.RigFrames]] = {
     "strokes": data.read_strokes,
     "slides": data.read_strokes,
@@ -44,13 +43,12 @@ Reading = Callable[[Preprocessor], data.RigFrames]
 
 @dataclass(frozen=True)
 class Bench:
-    """State shared by all trainings."""
+    """What all trainings share."""
 
     config: Config
     sensor: str
     folder: Path
-    bar: tqdm
-    rows: list[dict[str, Any]]
+    encoders: dict[str, BaseTouchEncoder]
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -71,24 +69,19 @@ def run(config: Config) -> dict[str, Any]:
     else:
         folder.mkdir(parents=True, exist_ok=True)
         readings = {published.what: partial(published.read, getattr(config, published.what))}
-    trainings = len(encoders) * len(config.tasks) * len(config.shares) * config.seeds
-    with (
-        on_interruption(lambda: f"recordings are in {config.data or folder}; probes are not saved"),
-        progress_bar("probes", trainings, "training") as bar,
-    ):
-        bench = Bench(config, sensor, folder, bar, [])
-        for what, reading in readings.items():
-            _run_recording(bench, what, reading, encoders)
-    bench.rows.sort(key=lambda row: config.tasks.index(row["task"]))
+    bench = Bench(config, sensor, folder, encoders)
+    kept = f"recordings are in {config.data or folder}; probes are not saved"
+    with on_interruption(lambda: kept):
+        rows = [row for what, how in readings.items() for row in _run_recording(bench, what, how)]
+    rows.sort(key=lambda row: config.tasks.index(row["task"]))
     return {
-        "table": table(bench.rows, sensor, config, config.data if published else None),
-        "rows": bench.rows,
-        "pictures": {"by_labels": draw_by_labels(bench.rows, sensor)},
+        "table": table(rows, sensor, config, config.data if published else None),
+        "rows": rows,
+        "pictures": {"by_labels": draw_by_labels(rows, sensor)},
     }
 
 
 def _record(what: Recording, folder: Path, config: Config) -> Reading:
-    """Record what is missing and return its reader."""
     count = getattr(config, what)
     episodes = record_bench(what, folder / what, config.rig, count, config.workers)
     return partial(_READERS[what], episodes, count)
@@ -106,42 +99,34 @@ def _encoder(name: str, sensor: str, config: Config) -> BaseTouchEncoder:
     return encoder
 
 
-def _run_recording(
-    bench: Bench, what: Recording, reading: Reading, encoders: dict[str, BaseTouchEncoder]
-) -> None:
+def _run_recording(bench: Bench, what: Recording, reading: Reading) -> list[dict[str, Any]]:
     """Run all tasks on one kind of recordings; frames and tokens are freed afterwards."""
     tasks = [name for name in bench.config.tasks if RECORDED_AS[name] == what]
     with (
         tempfile.TemporaryDirectory(dir=bench.folder) as files,
         one_core_workers(bench.config.workers) as workers,
     ):
-        shared = _share(bench, tasks, reading, encoders, Path(files))
+        subjects, frames = _share(bench, tasks, reading, Path(files))
         jobs = [
-            (Job(subject, task, share, bench.config, bench.folder / _LOG), frames)
-            for subject, frames in shared
+            Job(subject, task, share, bench.config, bench.folder / "training.log")
+            for subject in subjects
             for task in tasks
             for share in bench.config.shares
         ]
-        answered = workers.map(work, [job for job, _ in jobs])
-        for (job, frames), answers in zip(jobs, answered, strict=True):
-            _judge(bench, job, frames, answers)
-            bench.bar.update(bench.config.seeds)
-    frames = shared[0][1]
+        judged = track(workers.map(work, jobs), "probes", "probe", total=len(jobs))
+        rows = list(chain.from_iterable(judged))
     for name in tasks:
-        bench.rows.extend(_references(name, TASKS[name](frames)))
+        rows += _references(name, TASKS[name](frames))
+    return rows
 
 
 def _share(
-    bench: Bench,
-    tasks: list[str],
-    reading: Reading,
-    encoders: dict[str, BaseTouchEncoder],
-    files: Path,
-) -> list[tuple[Subject, data.RigFrames]]:
-    """Write each encoder's frames and tokens into files for the workers."""
+    bench: Bench, tasks: list[str], reading: Reading, files: Path
+) -> tuple[list[Subject], data.RigFrames]:
+    """Write each encoder's frames and tokens into files for the workers; return the first frames."""
     shared_frames: dict[str, tuple[Path, data.RigFrames]] = {}
-    shared = []
-    for i, (name, encoder) in enumerate(encoders.items()):
+    subjects = []
+    for i, (name, encoder) in enumerate(bench.encoders.items()):
         key = encoder.preprocess.id
         if key not in shared_frames:
             frames = reading(encoder.preprocess)
@@ -154,24 +139,11 @@ def _share(
         if not name.startswith(probes.END_TO_END):
             tokens = files / f"tokens_{i}.pt"
             torch.save(probes.frozen_tokens(encoder, frames), tokens)
-        shared.append((Subject(name, bench.sensor, path, tokens), frames))
-    return shared
-
-
-def _judge(bench: Bench, job: Job, frames: data.RigFrames, answers: Answers) -> None:
-    """Add the rows of one encoder, task and share, one for each test set."""
-    task, name = TASKS[job.task](frames), job.subject.name
-    validation = [torch.from_numpy(outputs) for outputs in answers.validation]
-    facts = {"task": job.task, "encoder": name, "share": job.share, "samples": answers.samples}
-    facts["seconds"] = round(answers.seconds, 1)
-    for test, rows in task.split.tests.items():
-        predicted = [torch.from_numpy(outputs) for outputs in answers.predicted[test]]
-        about = facts | {"test": test, "test_samples": len(rows)}
-        bench.rows.append(about | task.judge(predicted, validation, rows))
+        subjects.append(Subject(name, bench.sensor, path, tokens))
+    return subjects, next(iter(shared_frames.values()))[1]
 
 
 def _references(name: str, task: Task) -> list[dict[str, Any]]:
-    """Return the rows of references that need no encoder."""
     rows = []
     for test, chosen in task.split.tests.items():
         facts = {"task": name, "test": test, "share": 1.0, "samples": 0}

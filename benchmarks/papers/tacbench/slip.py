@@ -77,7 +77,6 @@ class SlipTask:
 
 
 def _cuts(outputs: Outputs) -> list[float]:
-    """Return thresholds between raw outputs."""
     return torch.quantile(outputs[:, 0], torch.linspace(0, 1, _THRESHOLDS)[:-1]).tolist()
 
 

@@ -5,10 +5,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Float
 
 from touchgoal.benchmarks.papers.tacbench import probes
 from touchgoal.benchmarks.papers.tacbench.config import Config
@@ -29,7 +28,6 @@ TASKS: dict[str, Callable[[RigFrames], Task]] = {
     "textile": textile_task,
 }
 _LEAST_SAMPLES = 8
-_BySeed = list[Float[np.ndarray, "_ _"]]  # outputs of frames
 
 
 @dataclass(frozen=True)
@@ -53,18 +51,8 @@ class Job:
     log: Path  # for the trainer's lines
 
 
-@dataclass(frozen=True)
-class Answers:
-    """Outputs of a job's probes on each test set and on the validation frames."""
-
-    predicted: dict[str, _BySeed]
-    validation: _BySeed
-    samples: int  # training labels
-    seconds: float  # of each training
-
-
-def work(job: Job) -> Answers:
-    """Train a job's probes, one a seed, and read the test frames; on one core."""
+def work(job: Job) -> list[dict[str, Any]]:
+    """Train a job's probes, one a seed, and judge them on each test set; on one core."""
     torch.set_num_threads(1)
     config, subject, began = job.config, job.subject, time.monotonic()
     frames = _mapped(subject.frames)
@@ -72,19 +60,22 @@ def work(job: Job) -> Answers:
     encoder = _encoder(subject.name, subject.sensor, config.seed)
     inputs_of = _inputs_of(subject, encoder, frames)
     count = max(round(job.share * len(task.split.train)), _LEAST_SAMPLES)
-    predicted: dict[str, _BySeed] = {test: [] for test in task.split.tests}
-    validation: _BySeed = []
+    readers, scratch = [], subject.frames.parent
     for seed in range(config.seed, config.seed + config.seeds):
         reader = _reader(subject, encoder, task, seed)
         train = thinned(task.split.train, count, seed)
         with job.log.open("a") as log:
-            probes.train_reader(
-                reader, task, inputs_of, train, config, seed, subject.frames.parent, log
-            )
-        validation.append(probes.read(reader, inputs_of, task.split.validation).numpy())
-        for test, rows in task.split.tests.items():
-            predicted[test].append(probes.read(reader, inputs_of, rows).numpy())
-    return Answers(predicted, validation, count, (time.monotonic() - began) / config.seeds)
+            probes.train_reader(reader, task, inputs_of, train, config, seed, scratch, log)
+        readers.append(reader)
+    seconds = round((time.monotonic() - began) / config.seeds, 1)
+    facts = {"task": job.task, "encoder": subject.name, "share": job.share, "samples": count}
+    validation = [probes.read(reader, inputs_of, task.split.validation) for reader in readers]
+    rows = []
+    for test, chosen in task.split.tests.items():
+        about = facts | {"seconds": seconds, "test": test, "test_samples": len(chosen)}
+        predicted = [probes.read(reader, inputs_of, chosen) for reader in readers]
+        rows.append(about | task.judge(predicted, validation, chosen))
+    return rows
 
 
 @lru_cache(maxsize=2)
@@ -100,7 +91,6 @@ def _encoder(name: str, sensor: str, seed: int) -> BaseTouchEncoder:
 def _inputs_of(
     subject: Subject, encoder: BaseTouchEncoder, frames: RigFrames
 ) -> Callable[[Rows], probes.Inputs]:
-    """Return the map from rows to a probe's input."""
     pairs = probes.PairTokens(encoder)
     if subject.tokens is None:
         return partial(frames.stacked, offsets=pairs.offsets)

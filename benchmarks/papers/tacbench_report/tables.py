@@ -112,7 +112,6 @@ def _task_lines(rows: list[Row], task: str) -> list[str]:
 
 
 def _published_lines(task: str, sensor: str) -> list[str]:
-    """Return the paper's rows of a task."""
     known = published(task, sensor)
     if known is None:
         return []
