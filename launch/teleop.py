@@ -37,7 +37,7 @@ class Config:
     hand: TeleoperatorConfig = field(default_factory=TeleoperatorConfig)
     """Response of the hand to keys."""
     env: BeadMazeConfig = BeadMazeConfig(max_seconds=300.0, stall_seconds=60.0)
-    """Options of the task; time limits suit a person. A straight wire is arc-2000009."""
+    """Options of the task; time limits suit a person. The wire arc-2000009 is nearly straight."""
 
 
 def main(config: Config) -> None:

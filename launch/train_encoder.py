@@ -284,8 +284,9 @@ def _adapt(config: Adapt) -> None:
 
     encoder = load_encoder(config.encoder)
     if not isinstance(encoder, PooledEncoder):
-        made = "was not trained by `train-encoder surfaces`"
-        raise UserError(f"{config.encoder} {made}: adapt one that was")
+        raise UserError(
+            f"{config.encoder} was not trained by `train-encoder surfaces`: adapt one that was"
+        )
     every = read_labelled_videos(config.data)
     videos = [video for video in every if video.split in ("train", "unlabelled")]
     towers = load_towers(config.towers)

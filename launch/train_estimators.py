@@ -70,8 +70,9 @@ def main(config: Config) -> None:
     encoder = config.encoder or pretrained.DEFAULT_ENCODER
     touch = load_touch(encoder)
     if touch.reach:
-        wanted = "a state estimator needs one of single frames"
-        raise UserError(f"{encoder} reads several frames; {wanted}")
+        raise UserError(
+            f"{encoder} reads several frames; a state estimator needs one of single frames"
+        )
     first_seed = seeds.POSE_TRAINING.first(config.objects, "--objects")
     out = open_training(config, "train-estimators")
     reused = load_network(config.pose) if config.pose else None
@@ -80,8 +81,9 @@ def main(config: Config) -> None:
     network = StateEstimatorNetwork(StateEstimatorConfig(touch.name, touch.dim, pose_config))
     provenance = recipe(*sets)
     rows, validation = (training.embed_touch_and_contact(s, touch, config.workers) for s in sets)
-    learn_contact = training.train_contact_estimator
-    learn_contact(network, *rows, config.train, out / _CONTACT, config, provenance)
+    training.train_contact_estimator(
+        network, *rows, config.train, out / _CONTACT, config, provenance
+    )
     errors: dict = {"contact": training.contact_error_rate(network, *validation)}
     cameras = tuple(key.removeprefix(ft.IMAGE_PREFIX) for key, _ in pose_config.crops)
     env = replace(config.env, tactile=False, cameras=cameras, camera_size=pose_config.size)

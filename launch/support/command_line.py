@@ -51,8 +51,9 @@ def parse(
     preset = next(reversed(list(_values(typed, "--preset"))), "")
     registry.struct_rule(partial(_as_options, env=env, hidden=hidden, preset=preset))
     try:
-        named = {"prog": prog, "description": description, "registry": registry}
-        return tyro.cli(config_type, args=typed, **named)
+        return tyro.cli(
+            config_type, prog=prog, args=typed, description=description, registry=registry
+        )
     except _OutOfRange as wrong:
         raise UserError(_one_line(wrong.error, typed)) from None
     except SystemExit as stop:
