@@ -40,7 +40,6 @@ def save(
     """Save an encoder; an older one in the folder is replaced.
 
     Args:
-        encoder: The encoder.
         directory: Folder, made if needed.
         provenance: JSON-able data, command, seed and metrics of the training.
         half: Store weights as float16, which turns embeddings by a cosine distance below 1e-3.

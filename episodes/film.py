@@ -35,9 +35,7 @@ def write_film(
     """Write an MP4 that plays in real time: pictures, curves up to now, object, outcome, seed, time.
 
     Args:
-        path: of the file.
         pictures: of `record_with_film`, one every `TICKS_PER_PICTURE` ticks.
-        episode: the episode, for the caption.
         control_hz: ticks per second.
         curves: values at each tick, which may end before the episode; default: the simulator's
             progress.

@@ -67,8 +67,6 @@ def episode_specs(
     """Return specs that take the objects (or wires) in turn, each with every outcome once.
 
     Args:
-        env: Options of the task.
-        outcomes: Outcomes to ask the expert for.
         episodes: Number of episodes of each outcome.
         first_seed: Seed of the first episode; each further one adds one.
     """
@@ -89,8 +87,6 @@ def missing_specs(
     """Return the specs whose seeds a set does not hold; all of them where nothing is recorded yet.
 
     Args:
-        root: Folder of the set.
-        specs: Episodes to record.
         corrected: Whether they are recorded while a policy acts: such an episode does not replace
             the expert's with the same seed.
     """
@@ -113,9 +109,6 @@ def run(
 
     Args:
         env: Environment after its reset.
-        actor: Chooses the actions.
-        observation: First observation, from the reset.
-        info: First ground truth, from the reset.
         expert: Its actions are recorded in place of the actor's, if given.
     """
     while True:
@@ -151,8 +144,6 @@ def record_with_film(
     """Record and film an episode, tick by tick.
 
     Args:
-        env: Environment.
-        spec: Episode to record.
         policy: Makes the actor for the environment after its reset; None for the expert.
         meshes: see `SceneRecorder`.
 
@@ -204,10 +195,6 @@ def collect(
     the episodes in progress. The progress bar counts successes and names the commonest failure.
 
     Args:
-        root: Folder of the set.
-        config: Options of the task.
-        specs: Episodes to record.
-        workers: Number of processes.
         roles: Actor and expert; must pickle.
         max_failures: Stop after so many first episodes without a success; None for never.
 

@@ -210,7 +210,6 @@ class EpisodeSet:
         """Read episode i; only the keys and frames asked for are decoded.
 
         Args:
-            i: Index of the episode.
             keys: Keys to read; None for all.
             frames: Indices of the frames to read, in any order; None for all.
 

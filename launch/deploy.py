@@ -56,7 +56,7 @@ def main(config: Config) -> None:
     policy = load_policy(cell)
     cost = None
     if cell.task.rewards:
-        from touchgoal.rewards.cell_cost import load_cell_cost
+        from touchgoal.rewards.online import load_cell_cost
 
         cost = load_cell_cost(cell)
     check_client(cell)
@@ -82,7 +82,7 @@ def load_policy(cell: "CellConfig") -> "CellPolicy | None":
     options = env_config_of(cell)
     if (policy := load_user_policy(cell, options)) is not None:
         return policy
-    from touchgoal.policies.deployed import load_saved_policy
+    from touchgoal.policies.by_name import load_saved_policy
 
     return load_saved_policy(cell, options)
 

@@ -8,6 +8,8 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from touchgoal.control.cell.config import CellConfig
+from touchgoal.control.deployment.actors import CellPolicy
 from touchgoal.control.deployment.follower import WireFollower
 from touchgoal.control.deployment.user_policy import Policy, UserPolicy, find_user_policy
 from touchgoal.episodes.recording import Actor
@@ -113,3 +115,11 @@ def env_config_for(maker: PolicyMaker, task: TaskConfig) -> TaskConfig:
 def follower(env: FrankaTactileEnv) -> WireFollower:
     """Return the bead maze's classical policy."""
     return WireFollower(env.config.control_hz)
+
+
+def load_saved_policy(cell: CellConfig, task: TaskConfig) -> CellPolicy:
+    """Return the policy on disk that the cell names; UserError if it does not fit."""
+    shipped = cell.task.policy == "shipped"
+    directory = SHIPPED_POLICIES[cell.task.name] if shipped else find_policy(cell.task.policy)
+    policy = SavedPolicy(directory)()
+    return CellPolicy.fitting(cell, policy, policy.env_config(task))

@@ -43,7 +43,6 @@ def save(policy: PolicyNetwork, directory: Path, provenance: dict[str, Any]) -> 
     would move the hand by a millimetre.
 
     Args:
-        policy: the network.
         directory: made if needed.
         provenance: JSON-able: data, command, seed, metrics of the training.
     """

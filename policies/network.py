@@ -197,9 +197,6 @@ class PolicyNetwork(nn.Module):
         """Return the training loss on windows.
 
         Args:
-            batch: observations.
-            actions: recorded actions.
-            noise: random numbers of the batch.
             wrench: on both pads, with `reads_wrench`.
             action_is_pad: ticks after the episode's end, which do not count.
         """

@@ -117,23 +117,10 @@ class Curves:
         return {name: measure_curve(d, self.contact.frame) for name, d in self.costs.items()}
 
     def plot(self, gamma: float = GAMMA) -> "Figure":
-        """Return a figure of costs and rewards over time; `.savefig("curves.png")` writes it.
+        """Return a figure of costs and rewards over time; `.savefig("curves.png")` writes it."""
+        from touchgoal.rewards.report.plot import draw
 
-        Args:
-            gamma: discount of the potential-based reward.
-        """
-        from touchgoal.rewards.report.plot import PlotText, draw
-
-        cost = "distance to goal (cost, normalised)" if self.normalised else "cost: " + self.unit
-        rewards = "state reward\n= -cost", f"potential-based\nreward, γ = {gamma:g}"
-        text = PlotText(
-            self.source,
-            " and ".join(dict.fromkeys(self.goal.values())),
-            (cost, *rewards),
-            f"contact ({self.contact.label_source})",
-        )
-        panels = self.costs, self.rewards, self.potential_rewards(gamma)
-        return draw(panels, self.fps, self.contact.frame, bool(self.normalised), text)
+        return draw(self, gamma)
 
 
 def add_fused_curves(

@@ -112,7 +112,6 @@ class EpisodeEmbedder:
         """Take the encoders.
 
         Args:
-            towers: frozen image and text towers.
             encoder: touch encoder (put into evaluation mode), which takes sentences if it was aligned
                 with these towers; None to measure images alone.
             camera: key of the camera whose images are measured; "" for a plain video's.
@@ -153,8 +152,6 @@ class EpisodeEmbedder:
         """Embed the camera and every fingertip of an episode.
 
         Args:
-            episode: from the simulator, an arm or a set on disk.
-            fps: its frames per second.
             source: its name, for people.
             descriptions: whether to embed the sentences about its object too.
 

@@ -40,7 +40,6 @@ def fit_normalizer(
 
     Args:
         episodes: at least two that end in the goal state, embedded alike.
-        modalities: what to fit.
         scene: where they were recorded, see `scene_of`.
 
     Raises:

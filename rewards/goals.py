@@ -229,8 +229,6 @@ def assign_goals(
     """Give each available modality the first goal that applies to it.
 
     Args:
-        specs: goals in the order given.
-        available: modalities of the measured trajectory.
         picture_words: whether the towers compare images with sentences; then a sentence is a goal
             for images where there is no touch.
 

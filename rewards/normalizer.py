@@ -83,8 +83,6 @@ class DistanceNormalizer:
         A plain video counts as taken by the camera that the normalizer was fitted on.
 
         Args:
-            source: encoders, camera and sensor of the embeddings.
-            modalities: those that have a goal.
             same_episode: those whose goal is a frame of the measured episode itself.
         """
         mine, names = self.source, set(modalities)
@@ -110,11 +108,9 @@ class DistanceNormalizer:
         source: EmbeddingSource,
         same_episode: frozenset[str],
     ) -> dict[str, Float[np.ndarray, " n"]]:
-        """Return normalised distances by modality.
+        """Return normalised distances by modality, from raw cosine distances.
 
         Args:
-            raw: cosine distances by modality.
-            source: encoders, camera and sensor of the embeddings.
             same_episode: modalities whose goal is a frame of the measured episode itself.
 
         Raises:

@@ -6,13 +6,16 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from touchgoal.control.features import CONTROL_HZ, FRONT, TACTILE, Observation
+from touchgoal.control.cell.config import CellConfig
+from touchgoal.control.features import CONTROL_HZ, FRONT, IMAGE_PREFIX, TACTILE, Observation
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EmbeddedGoal, compute_curves
+from touchgoal.rewards.goals import Inputs, parse_goal
 from touchgoal.rewards.metrics import START_FRAMES
-from touchgoal.rewards.reward_model import RewardModel
+from touchgoal.rewards.normalizer import REAL_SCENE
+from touchgoal.rewards.reward_model import RewardModel, load_reward_model
 from touchgoal.runtime.errors import UserError
 
 _FIRST_COST_TIMEOUT = 30.0  # s for the first cost, which warms up the networks
@@ -108,3 +111,24 @@ class OnlineCost:
             return None
         torch.set_num_threads(1)  # of this thread: the control loop needs the other core
         return self._meter.measure(*newest)
+
+
+def load_cell_cost(cell: CellConfig) -> OnlineCost:
+    """Return the distance to the cell's goals, measured in a thread; `close` ends it.
+
+    UserError: a goal, encoder or normalizer that does not fit the cell.
+    """
+    simulated = cell.arm == "sim" or bool(cell.task.twin)
+    inputs = Inputs(
+        name="the cell",
+        camera=FRONT if FRONT.removeprefix(IMAGE_PREFIX) in cell.cameras else None,
+        sides=TACTILE if cell.fingertips is not None else (),
+        sensor=cell.sensor,
+        scene=f"simulated {cell.task.name}" if simulated else REAL_SCENE,
+    )
+    goals = [parse_goal(text) for text in cell.task.rewards]
+    task = cell.task
+    model = load_reward_model(
+        inputs, goals, task.encoder or None, normalizer=task.normalizer or None
+    )
+    return OnlineCost(CostMeter(model))

@@ -53,14 +53,11 @@ def load_reward_model(
     """Check the goals, load the encoders, and choose the normalizer.
 
     Args:
-        inputs: what is known of the trajectories.
-        goals: each modality takes the first that applies to it.
         encoder: see `load_embedder`.
         towers: see `load_embedder`.
         normalizer: a file of `fit-normalizer`, one already read, "encoder" for the one in the touch
             encoder's folder, "none" for raw distances, or None for the encoder's one if it was
             fitted on trajectories of this scene, else raw distances.
-        device: torch device of the encoders.
 
     Raises:
         UserError: whatever would stop the measurement.
@@ -124,12 +121,10 @@ def load_embedder(
     """Load the encoders for trajectories.
 
     Args:
-        inputs: what is known of the trajectories.
         encoder: name or folder of a touch encoder of any kind, or one already loaded; None for the
             one that ships for the sensor.
         towers: "offline", a CLIP, or loaded ones; None for those that the touch encoder was aligned
             with, else "offline".
-        device: torch device of the encoders.
 
     Returns:
         The encoders, and the folder that may hold their normalizer.

@@ -152,7 +152,6 @@ def open_source(
             a folder of images.
         camera: the episodes' camera, by its key or its last word ("front"); unused for a video.
         index: which episodes of the set; none for all.
-        with_touch: whether the episodes' touch is measured.
         fps: frames per second of a folder of images; None for 20.
 
     Raises:
@@ -201,8 +200,6 @@ def open_successes(
 
     Args:
         paths: one set of episodes, or several videos or folders of images.
-        camera: see `open_source`.
-        with_touch: see `open_source`.
         assume_success: whether episodes without a recorded outcome count as successes.
 
     Raises:

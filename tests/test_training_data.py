@@ -8,9 +8,9 @@ from toy_episodes import FPS, make_episode
 
 from touchgoal.control import features as ft
 from touchgoal.episodes.overlap import require_no_shared_frames
-from touchgoal.episodes.pauses import leading_pause
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.policies.training.training_data import leading_pause
 from touchgoal.runtime.errors import UserError
 
 

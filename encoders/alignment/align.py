@@ -60,13 +60,8 @@ def align(
     uninterrupted.
 
     Args:
-        train: Training touches.
         val: Touches of other episodes.
-        towers: Frozen towers, run once over all images and sentences.
-        config: Hyperparameters.
-        sensor: Name of the fingertip sensor.
         out_dir: A new run's folder, or one to resume.
-        options: Seed, device, precision, whether to resume.
         recipe: JSON-able provenance of the touches, stored with the weights.
 
     Returns:

@@ -49,9 +49,6 @@ def prepare_touch_data(
     """Run the preprocessor and the towers once over all data.
 
     Args:
-        touches: Raw frames.
-        towers: Frozen towers.
-        sensor: Name of the fingertip sensor.
         no_contact_texts: Sentences for touches without contact; with none, these are left out.
 
     Raises:

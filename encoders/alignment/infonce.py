@@ -16,7 +16,6 @@ def info_nce(
     Args:
         anchor: L2-normalised embeddings.
         target: L2-normalised embeddings, row by row the anchors' partners.
-        temperature: Divides the cosines.
         positives: Whether target j is right for anchor i, the diagonal included; the loss is then
             the mean over the right answers (SupCon's L_out, Khosla et al. 2020). With None only the
             partner is right, and another touch of the same object counts as wrong: in the paper's

@@ -29,12 +29,9 @@ class TouchEncoderConfig:
     def for_towers(
         cls, vit: ViTConfig, towers: Towers, sensor: str, embedding_dim: int
     ) -> "TouchEncoderConfig":
-        """Return the config that fits these towers.
+        """Return the config that fits these towers; UserError for an unknown sensor.
 
         Args:
-            vit: Touch backbone.
-            towers: Frozen towers.
-            sensor: Name of the fingertip sensor; UserError for an unknown one.
             embedding_dim: Width of the shared space; towers pretrained together bring their own.
         """
         preprocess = preprocessor_for(sensor)

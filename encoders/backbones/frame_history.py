@@ -26,7 +26,6 @@ def past_rows(
 
     Args:
         rows: Rows of the newest frames, in the order of recording.
-        offsets: Offsets of the encoder.
         first: Row at which each recording begins; it stands for frames before it.
     """
     return np.maximum(rows[:, None] - np.array(offsets), np.reshape(first, (-1, 1)))
@@ -54,7 +53,6 @@ class RecentFrames:
         Args:
             history: Frames of the last ticks, oldest first; the same objects from tick to tick. The
                 oldest stands for frames before it.
-            untouched: Frame of the untouched sensor.
         """
         if untouched is not self._untouched:
             self._untouched, self._known = untouched, []

@@ -67,7 +67,6 @@ def vit_for(method: Method, size: str, image_size: tuple[int, int]) -> ViTConfig
     """Return the network of a method: Sparsh's own, or a smaller one with its input and registers.
 
     Args:
-        method: Decides on the input: two stacked frames, or a clip.
         size: tiny, compact, small or base, which is Sparsh's.
         image_size: Height and width of the preprocessor's output, px.
     """

@@ -153,7 +153,6 @@ class BaseTouchEncoder(nn.Module):
 
         Args:
             frames: Frames in the order of recording; the first stands for frames before it.
-            background: Frame of the untouched sensor.
             rows: Rows to embed; all when None.
 
         Raises:

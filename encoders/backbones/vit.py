@@ -67,8 +67,6 @@ def sinusoidal_positions(
     """Return fixed position codes, one half for the row, one for the column (MAE, He et al. 2022).
 
     Args:
-        rows: Patches from top to bottom.
-        columns: Patches from left to right.
         width: Width of a code, a multiple of 4, or of 6 for clips.
         times: Tubelets in time; their codes are then the first of three thirds.
     """

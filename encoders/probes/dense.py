@@ -20,10 +20,8 @@ class DenseProbe(nn.Module):
         """Build a randomly initialised probe.
 
         Args:
-            features: Width of the tokens.
             grid: Rows and columns of the patches. Tokens before them (a class token) are dropped;
                 several times as many (clips) are averaged over time.
-            planes: Planes of the output.
             side: Rows and columns of the output.
             width: Channels in between.
         """

@@ -89,13 +89,7 @@ def predict_properties(
 def pair_accuracy(
     predicted: Int[np.ndarray, " n"], ranks: Int[np.ndarray, " n"], objects: Objects
 ) -> float:
-    """Return how often a pair of objects is rightly called more, less or equal (PC of Octopi).
-
-    Args:
-        predicted: most probable rank of each video.
-        ranks: true ranks.
-        objects: object of each video.
-    """
+    """Return how often a pair of objects is rightly called more, less or equal (PC of Octopi)."""
     one, other = np.triu_indices(len(ranks), 1)
     different = objects[one] != objects[other]
     one, other = one[different], other[different]

@@ -72,8 +72,6 @@ def sample_frames(
     for frames before it, as it does when a policy acts.
 
     Args:
-        episodes: A set with touch.
-        sensor: Name of the fingertip sensor.
         per_episode: Ticks drawn from each episode; all of a shorter one.
         seed: Random seed; an episode's draw does not depend on the other episodes.
         offsets: Ticks from the drawn frame back to each frame of a sample, 0 first; None for single

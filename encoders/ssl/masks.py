@@ -22,10 +22,8 @@ def draw_size(
     """Draw the rows and columns of a block.
 
     Args:
-        grid: Rows and columns of patches.
         scale: Least and greatest share of the patches.
         aspect: Least and greatest height over width.
-        generator: Random generator on the CPU.
     """
     share, ratio = (
         low + (high - low) * torch.rand((), generator=generator).item()

@@ -74,13 +74,7 @@ class JointEmbeddingPrediction(SelfDistillation):
         context_ids: Int[Tensor, "b k"],
         target_ids: Int[Tensor, "b m j"],
     ) -> Float[Tensor, "b m j d"]:
-        """Return tokens of m sets of patches, each set predicted by itself.
-
-        Args:
-            patches: All embedded patches.
-            context_ids: Patches that the backbone reads.
-            target_ids: Patches to predict.
-        """
+        """Return tokens of m sets of patches, each set predicted by itself."""
         tokens = self.backbone.vit.encode(patches, context_ids)
         tokens = tokens[:, self.backbone.config.vit.registers :]
         sets = target_ids.shape[1]

@@ -45,11 +45,9 @@ def train_unlabelled(
     uninterrupted.
 
     Args:
-        train: Training touches.
         val: Touches of other episodes.
         config: Hyperparameters; their class chooses the objective.
         out_dir: A new run's folder, or one to resume.
-        options: Seed, device, precision, whether to resume.
         recipe: JSON-able provenance of the touches, stored with the weights.
 
     Returns:

@@ -51,7 +51,6 @@ def load_towers(name: str, device: str = "cpu") -> Towers:
     Args:
         name: "offline", a CLIP's Hugging Face id or folder, or the `name` of loaded towers, which
             also has a hash of their weights.
-        device: Device to run on.
 
     Raises:
         UserError: Not found, not a CLIP, or weights with another hash.

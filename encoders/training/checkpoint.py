@@ -53,9 +53,7 @@ class Record:
         """Open the folder, made if needed.
 
         Args:
-            out_dir: Folder of the run.
             identity: JSON-able; must be the same when the training resumes.
-            provenance: JSON-able.
         """
         from torch.utils.tensorboard import SummaryWriter  # slow to import
 
@@ -68,7 +66,6 @@ class Record:
 
         Args:
             history: Metrics of every epoch so far.
-            state: Modules, optimizers and the like, by name.
         """
         states = {name: part.state_dict() for name, part in state.items()}
         with atomic_write(self._dir / _CHECKPOINT) as unfinished:
@@ -94,8 +91,6 @@ def load(
     """Load what `Record.write` wrote into `state`.
 
     Args:
-        out_dir: Folder of the run.
-        identity: Identity of the training to resume.
         state: Modules, optimizers and the like, by name; loaded to the device of each.
         provenance: Provenance of the resumption, added if it differs.
 

@@ -18,8 +18,6 @@ def check_training(options: TrainerOptions, out: Path | None, first: str = "") -
     """Check what can be checked before any data are read.
 
     Args:
-        options: Options of the training.
-        out: Folder of the run.
         first: Subfolder of the run's first training, if it has several.
 
     Raises:

@@ -143,7 +143,6 @@ def fit(
     Args:
         training: What to train; its modules are moved to the device, and changed.
         out_dir: A new run's folder, or with `options.resume` the one to resume.
-        options: Seed, device, precision.
         recipe: JSON-able provenance: command, commit, data and their checksum.
 
     Returns:

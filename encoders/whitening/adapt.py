@@ -29,10 +29,8 @@ def adapt(
     """Return an adapted encoder, with a text head for these towers if some videos have ranks.
 
     Args:
-        encoder: Encoder fitted to simulated surfaces.
         videos: Videos of pressed objects, several of each.
         share: Weight of the videos in the covariance that is whitened; 0 only centres.
-        towers: Towers for the sentences.
 
     Raises:
         UserError: No object has two videos.

@@ -48,8 +48,6 @@ def fit_text_head(
 
     Args:
         touches: Centred touch embeddings.
-        ranks: Ranks of the touched objects.
-        embed_texts: A text tower's embedding function.
     """
     sentences, places, weights = [], [], []
     for property_ in range(ranks.shape[1]):

@@ -121,9 +121,7 @@ def index_columns(
     """Return LeRobot's index columns of an episode at its place in a set.
 
     Args:
-        length: Number of frames.
         fps: Frames per second; time stamps are exactly frame_index / fps seconds.
-        episode_index: Position of the episode in the set.
         first_index: Number of frames in all episodes before it.
         task_index: Row of its task in meta/tasks.parquet.
     """
@@ -206,7 +204,6 @@ def read_columns(
     """Read some columns of some frames of a data file; nothing else is decoded.
 
     Args:
-        file: Open data file.
         features: Features to read, as in meta/info.json.
         frames: Frame indices, in any order.
     """

@@ -143,8 +143,6 @@ def refuse_other_writers(root: Path, features: dict[str, Any], episodes: pa.Tabl
     its footer; lerobot puts several episodes into a file and begins further files.
 
     Args:
-        root: Folder of the set.
-        features: As in info.json.
         episodes: Table meta/episodes; None if it cannot be read.
     """
     listed = (root / "meta/episodes").rglob("*.parquet")
@@ -167,7 +165,6 @@ def refuse_foreign_data_files(root: Path, if_none: Path | None = None) -> None:
     """Raise UserError if touchgoal did not write one of the data files that can be read.
 
     Args:
-        root: Folder of the set.
         if_none: File that is blamed where no data file can be read; None to allow that.
     """
     own = False

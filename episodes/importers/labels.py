@@ -25,7 +25,6 @@ def numbers(
         value: Array, or list of numbers or of arrays.
         shape: Expected shape, None for any length.
         most: Largest magnitude.
-        name: Name for the message.
     """
     array = np.asarray(_array(value, name), np.float64)
     fits = array.ndim == len(shape) and all(

@@ -77,7 +77,6 @@ def read_recordings(folder: Path, sensor: str | None = None) -> list[Recording]:
     """List the recordings of a published folder.
 
     Args:
-        folder: Folder in one of the layouts.
         sensor: Sensor model, where a layout leaves a choice.
 
     Raises:

@@ -131,9 +131,7 @@ def run_trials(
     """Run a policy in each episode; yield the trials in order as they end.
 
     Args:
-        config: of the task.
         policy: makes the policy for an episode; must pickle if there are several workers.
-        specs: the episodes.
         workers: processes; with one, all runs in this process.
     """
     if workers == 1:

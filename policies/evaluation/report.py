@@ -25,8 +25,6 @@ def record_trials(out: Path, trials: Iterator[Trial], count: int) -> list[Trial]
     After Ctrl-C the trials that have ended are reported, and the interruption goes on.
 
     Args:
-        out: folder of the run.
-        trials: of `run_trials`.
         count: number of trials that were asked for.
     """
     ended: list[Trial] = []

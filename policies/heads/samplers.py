@@ -62,7 +62,6 @@ def denoise(
     """Draw samples.
 
     Args:
-        config: the sampler that the network was trained for.
         network: from noisy samples and step to its prediction.
         noise: standard normal.
         generator: of the noise that "ddpm" adds, on the CPU.

@@ -92,7 +92,6 @@ class UNet(nn.Module):
         Args:
             noisy: chunks; h is a multiple of `UNetConfig.tick_multiple`.
             step: of the diffusion, 0 to about 100.
-            condition: encoded observations.
         """
         given = torch.cat(
             [self.step(sinusoidal_embedding(step, self.config.step_embedding_dim)), condition], 1

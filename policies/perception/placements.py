@@ -34,9 +34,6 @@ def render_placements(
     Args:
         config: of the task, with the cameras to render.
         objects: number of objects of random shape and size, one a seed from `seed` on.
-        placements_each: number of places of each.
-        seed: of the first object.
-        workers: processes that render.
     """
     seeds = range(seed, seed + objects)
     with one_core_workers(workers) as pool:

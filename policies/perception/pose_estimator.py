@@ -32,12 +32,7 @@ class PoseEstimator(nn.Module):
     def forward(
         self, pictures: dict[str, UInt8[Tensor, "b h w 3"]], tcp: Float[Tensor, "b 7"]
     ) -> Float[Tensor, "b 7"]:
-        """Return the estimate: m, base frame.
-
-        Args:
-            pictures: camera images by column.
-            tcp: pose of the hand, which carries a camera.
-        """
+        """Return the estimate: m, base frame."""
         return self.start_normalizer.inverse(self.scaled(pictures, tcp))
 
     def scaled(

@@ -84,7 +84,6 @@ class StateEstimator:
         """Return the contact of each pad (1 or 0), and the poses at the start.
 
         Args:
-            observation: of a tick.
             first: the episode's first one, untouched and with all of the table in view.
         """
         if self._start[0] is not first:

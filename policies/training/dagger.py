@@ -49,8 +49,6 @@ def dagger_roles(policy: str | None, task: TaskConfig, feedback: bool) -> Dagger
 
     Args:
         policy: Name of the policy that acts; None for the expert itself.
-        task: Options of the task.
-        feedback: Whether the feedback expert was asked for.
 
     Raises:
         UserError: The policy or the expert cannot act in the task.

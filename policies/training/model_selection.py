@@ -20,7 +20,6 @@ def select(
     """Try every snapshot of a run and make the best one its policy.
 
     Args:
-        run: folder of a finished training.
         parts: what goes beside every policy, see `add_parts`.
         trial: scores a policy's folder, on validation tasks.
 

@@ -51,11 +51,7 @@ def load_recordings(
     """Read episodes, and embed those that are not yet; a kill loses those in progress.
 
     Args:
-        episodes: the set.
-        chosen: which of them, e.g. the successful ones.
-        config: says which columns are read.
         embedder: of touch; None for a policy without.
-        workers: processes that embed.
         skip: ticks of each chosen episode to leave out at its start. Images and forces stay
             relative to its very first tick.
 

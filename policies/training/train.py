@@ -40,12 +40,8 @@ def train(
     uninterrupted one.
 
     Args:
-        policy: inputs and outputs.
-        windows: training data.
         validation: windows of other episodes.
-        config: epochs, learning rate, batches.
         out_dir: folder of a new run, or of the one to resume.
-        options: seed, device, precision, resumption.
         recipe: JSON-able provenance of the episodes, written beside the weights.
 
     Returns:

@@ -4,15 +4,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
+import numpy as np
+
 from touchgoal.control import features as ft
 from touchgoal.control.tactile.sensor_models import find_sensor
-from touchgoal.episodes.pauses import leading_pause
 from touchgoal.episodes.recording import CORRECTED
+from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.config import TASKS, TaskName
 
 _PAUSE = 0.5  # s
+_JOINT_MOTION = 2e-3  # rad since the first frame, or commanded since then
+_WIDTH_MOTION = 5e-4  # m of gripper width, measured or commanded
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,6 @@ def choose_episodes(episodes: EpisodeSet, include_unknown: bool = False) -> Chos
     """Return the episodes that succeeded, and those in which an expert corrected a policy.
 
     Args:
-        episodes: the set.
         include_unknown: also take those that do not say whether they succeeded, such as recordings
             of an arm.
 
@@ -53,6 +56,21 @@ def choose_episodes(episodes: EpisodeSet, include_unknown: bool = False) -> Chos
             f"unknown success): {remedy}"
         )
     return chosen
+
+
+def leading_pause(episode: Episode) -> int:
+    """Return how many frames pass before an episode's arm or gripper moves or is commanded to.
+
+    An episode without motion has no start to trim to: 0. Needs state and action.
+    """
+    state, action = episode.frames[ft.STATE], episode.frames[ft.ACTION]
+    joints = action.shape[1] - 1
+    commanded = np.abs(np.cumsum(action[:, :joints], axis=0)).max(1) > _JOINT_MOTION
+    commanded |= np.abs(action[:, -1] - action[0, -1]) > _WIDTH_MOTION
+    moved = np.abs(state[:, :joints] - state[0, :joints]).max(1) > _JOINT_MOTION
+    moved |= np.abs(state[:, -1] - state[0, -1]) > _WIDTH_MOTION
+    moving = np.flatnonzero(commanded | moved)
+    return int(moving[0]) if len(moving) else 0
 
 
 def find_pauses(episodes: EpisodeSet, rows: Sequence[int]) -> list[int]:

@@ -1,13 +1,13 @@
 """Plots of cost and reward curves, one panel under another."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from touchgoal.episodes.film import COLORS
+from touchgoal.rewards.curves import Curves
 
 # Colours that colour-blind readers can tell apart; the dashes distinguish them in grey.
 COLOR: dict[str, str] = dict(
@@ -25,52 +25,40 @@ _PANELS = ((0.53, 0.345), (0.275, 0.17), (0.06, 0.15))  # bottom and height of e
 _LABEL_GAP = 0.06  # least distance between two curve labels, share of the first panel's height
 
 
-@dataclass(frozen=True)
-class PlotText:
-    """Texts of a plot."""
-
-    heading: str  # name of the trajectory
-    goal: str  # its goal
-    axes: tuple[str, str, str]  # label of the vertical axis of each panel
-    contact: str  # label of the first contact
-
-
-def draw(
-    panels: tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray], Mapping[str, np.ndarray]],
-    fps: float,
-    contact: int | None,
-    normalised: bool,
-    text: PlotText,
-) -> Figure:
+def draw(curves: Curves, gamma: float) -> Figure:
     """Return a figure of costs, state rewards and potential-based rewards over time.
 
-    Args:
-        panels: costs, state rewards and potential-based rewards, by name of the curve.
-        fps: frames per second.
-        contact: first frame in contact, which is marked.
-        normalised: whether the costs are; then the usual start and end of successes are marked.
-        text: texts of the plot.
+    The first contact is marked, and on normalised costs the usual start and end of successes.
     """
+    panels = (
+        (
+            "distance to goal (cost, normalised)" if curves.normalised else f"cost: {curves.unit}",
+            curves.costs,
+        ),
+        ("state reward\n= -cost", curves.rewards),
+        (f"potential-based\nreward, γ = {gamma:g}", curves.potential_rewards(gamma)),
+    )
+    fps, contact = curves.fps, curves.contact
     figure = Figure(figsize=_SIZE, dpi=100)
-    length = len(next(iter(panels[0].values())))
-    for k, (curves, (bottom, height), label) in enumerate(
-        zip(panels, _PANELS, text.axes, strict=True)
-    ):
+    length = len(curves)
+    for k, ((label, lines), (bottom, height)) in enumerate(zip(panels, _PANELS, strict=True)):
         axes = figure.add_axes((0.095, bottom, 0.725, height))
-        for name, line in curves.items():
+        for name, line in lines.items():
             width = 2.6 if "+" in name else 1.8
             style = {"color": COLOR[name], "linestyle": DASHES[name], "linewidth": width}
             axes.plot(np.arange(length) / fps, line, **style)
         _frame_axes(axes, label, (length - 1) / fps)
         if k == 0:
-            _frame_costs(axes, normalised)
-        if contact is not None:
-            _mark_contact(axes, contact / fps, text.contact if k == 0 else "")
+            _frame_costs(axes, bool(curves.normalised))
+        if contact.frame is not None:
+            name = f"contact ({contact.label_source})" if k == 0 else ""
+            _mark_contact(axes, contact.frame / fps, name)
         if k < 2:  # in the last panel all curves end near 0: colours and dashes distinguish them
-            _label_lines(axes, curves, _LABEL_GAP * _PANELS[0][1] / height)
+            _label_lines(axes, lines, _LABEL_GAP * _PANELS[0][1] / height)
             axes.tick_params(labelbottom=k == 0)
     figure.axes[-1].set_xlabel("time (s)", fontsize=12)
-    heading, goal = _elide_middle(text.heading, 85), _elide_middle(f"goal: {text.goal}", 125)
+    goals = " and ".join(dict.fromkeys(curves.goal.values()))
+    heading, goal = _elide_middle(curves.source, 85), _elide_middle(f"goal: {goals}", 125)
     figure.text(0.095, 0.95, heading, fontsize=15, fontweight="bold", parse_math=False)
     figure.text(0.095, 0.915, goal, fontsize=12, color="0.35", parse_math=False)
     return figure

@@ -22,11 +22,7 @@ def write_report(
     """Write NAME.png, NAME.csv and NAME.json, each atomically.
 
     Args:
-        curves: the curves.
-        folder: made if missing.
-        name: file name without ending.
         provenance: what the curves were made with (encoder, towers, command, ...), for the JSON.
-        gamma: discount of the potential-based reward.
 
     Returns:
         The paths by kind: "png", "csv", "json".

@@ -1,47 +1,31 @@
 """Table of metrics over the curves of many episodes, by modality."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from statistics import mean, median_low
 
 from touchgoal.rewards.curves import Curves
-from touchgoal.rewards.metrics import CurveMetrics
 
-
-@dataclass(frozen=True)
-class _Column:
-    """One column: its header, its value, and its line of the legend."""
-
-    header: str
-    value: Callable[[CurveMetrics], float | int | None]
-    legend: str
-
-
-_COLUMNS = (
-    _Column("first", lambda m: m.start, "median cost of the first 5 frames"),
-    _Column("last", lambda m: m.end, "cost of the last frame"),
-    _Column(
-        "half at", lambda m: m.t_drop_50, "first frame by which half of that fall has happened"
-    ),
-    _Column(
-        "lag",
-        lambda m: m.contact_lag,
+_COLUMNS = {
+    "first": ("start", "median cost of the first 5 frames"),
+    "last": ("end", "cost of the last frame"),
+    "half at": ("t_drop_50", "first frame by which half of that fall has happened"),
+    "lag": (
+        "contact_lag",
         "the same in frames after the first contact; negative if the cost fell before",
     ),
-    _Column("mean", lambda m: m.area, "mean cost of all frames: the earlier it falls, the lower"),
-    _Column("bumps", lambda m: m.peaks, "number of peaks above the noise"),
-    _Column("climb", lambda m: m.largest_rebound, "largest rise above the lowest cost before it"),
-    _Column(
-        "Spearman",
-        lambda m: m.spearman,
+    "mean": ("area", "mean cost of all frames: the earlier it falls, the lower"),
+    "bumps": ("peaks", "number of peaks above the noise"),
+    "climb": ("largest_rebound", "largest rise above the lowest cost before it"),
+    "Spearman": (
+        "spearman",
         "rank correlation of -cost with time: 1 if it always falls, -1 if it always rises",
     ),
-    _Column(
-        "Kendall",
-        lambda m: m.kendall_tau_b,
+    "Kendall": (
+        "kendall_tau_b",
         "tau-b: pairs of frames in falling less those in rising order, as a share of all",
     ),
-)
+}
+"""Header -> field of `CurveMetrics`, and line of the legend."""
 
 
 def metrics_table(curves: Sequence[Curves], legend: bool = True) -> str:
@@ -53,10 +37,10 @@ def metrics_table(curves: Sequence[Curves], legend: bool = True) -> str:
     """
     metrics = [c.metrics() for c in curves]
     names = list(dict.fromkeys(name for m in metrics for name in m))
-    rows = [["curve", *(column.header for column in _COLUMNS)]]
+    rows = [["curve", *_COLUMNS]]
     for name in names:
         some = [m[name] for m in metrics if name in m]
-        rows.append([name, *(_cell([column.value(m) for m in some]) for column in _COLUMNS)])
+        rows.append([name, *(_cell([getattr(m, f) for m in some]) for f, _ in _COLUMNS.values())])
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     n = len(curves)
     lines = [f"{n} {'trajectory' if n == 1 else 'trajectories'}; cost: {curves[0].unit}"]
@@ -66,7 +50,7 @@ def metrics_table(curves: Sequence[Curves], legend: bool = True) -> str:
         cells = (f"{cell:>{width + 2}}" for cell, width in zip(row[1:], widths[1:], strict=True))
         lines.append(f"{row[0]:<{widths[0]}}" + "".join(cells))
     if legend:
-        lines += [f"  {column.header:<10}{column.legend}" for column in _COLUMNS]
+        lines += [f"  {header:<10}{legend}" for header, (_, legend) in _COLUMNS.items()]
         lines.append("  -         undefined: the cost does not fall, or there is no contact")
     return "\n".join(lines)
 
