@@ -1,7 +1,6 @@
 """Recording of the simulated touch bench as sets of episodes, on all cores.
 
-Indenter strokes, slides of objects, grasp attempts and presses of cloth. A single sensor is the left
-fingertip; the right one then has no images, and its ground truth is zero.
+A single sensor is the left fingertip; the right one then has no images, and its truth is zero.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,4 @@
-"""Training and validation data that share frames, recognised by content.
-
-Names, order and stride do not matter: a validation set of every second training frame is refused.
-"""
+"""Training and validation data that share frames, recognised by content, whatever the order."""
 
 from collections import Counter
 from collections.abc import Iterable

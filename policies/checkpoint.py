@@ -1,13 +1,4 @@
-"""Policies on disk.
-
-From Python::
-
-    policy = load_policy("pick-place")
-    env = make_env(policy.env_config())
-    observation, info = env.reset(seed=0)
-    policy.reset()
-    action = policy.act(observation)
-"""
+"""Policies on disk."""
 
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches

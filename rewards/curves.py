@@ -1,21 +1,8 @@
 """Cost and reward curves of one trajectory: per frame and modality, a distance to the goal.
 
-Names of curves: "image", "tactile" and "text" are single modalities (`rewards/goals.py`);
-"image+tactile" and "image+text" are fused, each the mean of two normalised costs. Raw cosine
-distances are not averaged, because the modality with the larger range would dominate.
-
-Every curve has these properties:
-
-- cost: small at the goal and at least 0. Normalised (`rewards/normalizer.py`), 1 is the usual start
-  and 0 the usual end of successful episodes; a frame nearer than that costs 0, too. Without a
-  normalizer it is the cosine distance, between 0 and 2.
-- state reward: -cost. At most 0, at the goal; about -1 at the usual start if normalised.
-- potential-based reward of the step into frame t: F_t = gamma Phi_t - Phi_{t-1} with the state
-  reward as potential Phi (Ng, Harada and Russell 1999). Added to a task's own reward with the same
-  gamma, it leaves the best policy unchanged. F_0 = 0.
-- causal: the values of frame t depend only on frames up to t, with two exceptions: the background of
-  a fingertip is the median of the first 5 frames, and a goal that is a frame of the trajectory itself
-  (`Curves.same_episode`, `goal_is_own_frame` in the JSON) is known only when that frame is recorded.
+"image+tactile" and "image+text" are fused: the mean of two normalised costs. The value of frame t
+depends only on frames up to t, but for the background of a fingertip (the median of the first 5
+frames) and a goal that is a frame of the trajectory itself (`Curves.same_episode`).
 """
 
 from collections.abc import Mapping

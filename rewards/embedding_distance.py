@@ -1,14 +1,6 @@
 """Distance of a trajectory to a goal in embedding space (MMWand, section V-E, with touch).
 
-All distances are cosine distances, 1 - cos, in [0, 2]:
-
-- image: frozen tower's embedding of the camera image to that of the goal image, or, with towers
-  that were trained together (a CLIP), to that of a sentence;
-- tactile: touch embedding of each fingertip to the goal's same fingertip, mean over the fingertips;
-- text: touch embedding of each fingertip to the projected goal sentence, mean over the fingertips;
-  only for encoders that were aligned with texts.
-
-Raw distances of different modalities are not comparable; `rewards/normalizer.py` makes them so.
+All distances are cosine distances, 1 - cos, in [0, 2]; touch is averaged over the fingertips.
 """
 
 import hashlib
@@ -122,29 +114,20 @@ class EpisodeEmbedder:
         self._towers = towers
         self.encoder = encoder
         self._aligned = encoder if encoder is not None and encoder.towers else None
+        self.knows_words = self._aligned is not None  # touch can be compared with sentences
         self._camera = camera
         # A CLIP's name ends in "#" and a hash of its weights; the folder before it may differ.
         self._pictures_with = EmbeddingSource(towers.name.rpartition("#")[2], camera)
-        self._made_with = self._pictures_with
+        self.made_with = self._pictures_with  # of episodes with touch, if there is an encoder
         if encoder is not None:
             if self._aligned is not None:
                 self._aligned.check_towers(towers)
             encoder.eval()
-            self._made_with = replace(
+            self.made_with = replace(
                 self._pictures_with,
                 encoder=_weights_hash(encoder),
                 sensor=encoder.config.sensor or "",
             )
-
-    @property
-    def made_with(self) -> EmbeddingSource:
-        """Encoders and sensors of the embeddings of episodes with touch."""
-        return self._made_with
-
-    @property
-    def knows_words(self) -> bool:
-        """Whether touch can be compared with sentences."""
-        return self._aligned is not None
 
     def embed_episode(
         self, episode: Episode, fps: float, source: str, descriptions: bool = False
@@ -165,7 +148,7 @@ class EpisodeEmbedder:
             source=source,
             fps=fps,
             contact=first_contact(episode),
-            made_with=self._made_with if sides else self._pictures_with,
+            made_with=self.made_with if sides else self._pictures_with,
             image=self._episode_pictures(episode, source, touch_alone=bool(sides)),
             sides=sides,
             touch=self._episode_touch(episode, sides, source) if sides else None,
@@ -268,7 +251,7 @@ class EpisodeEmbedder:
             )
         pictures = [episode.frames[side] for side in sides]
         backgrounds = [touch_background(p) for p in pictures]
-        if (sensor := SENSORS.get(self._made_with.sensor)) is not None:
+        if (sensor := SENSORS.get(self.made_with.sensor)) is not None:
             for side, background in zip(sides, backgrounds, strict=True):
                 check_untouched(background, sensor, f"{side} of {source}")
         return np.stack(

@@ -1,23 +1,8 @@
-"""Goals of a trajectory, and the modality that each one applies to.
+"""Goals of a trajectory, and the modality that each one applies to; docs/rewards.md has the forms.
 
-A goal is written in one of five forms:
-
-    last                the last frame of the trajectory itself (MMWand, Figure 8)
-    frame:K             frame K of the trajectory itself, counted from 0
-    image:PATH          an image
-    episode:ROOT#K      the last frame of episode K of the episode set in ROOT
-    text:SENTENCE       how the object feels, in words (MMWand, Figure 9)
-
-There are three modalities, each with a distance of its own: "image" (camera image to goal image),
-"tactile" (touch to goal touch) and "text" (touch to goal sentence). A frame or an episode applies
-to image and tactile, an image to image, a sentence to text. Several goals may be given: each
-modality takes the first that applies, and a goal that no modality takes is an error. `last` and
-`text:a hard smooth ball` together give all curves of Figures 8 and 9. Without touch, and with
-towers that were trained together (a CLIP), a sentence is a goal for the camera image and describes
-the scene.
-
-With `last` every trajectory, a failed one too, ends at distance 0. To judge episodes, give the end
-of another, successful one.
+Three modalities: "image" (camera image to goal image), "tactile" (touch to goal touch) and "text"
+(touch to goal sentence). Each takes the first goal that applies; one that none takes is an error.
+Without touch, and with towers that were trained together (a CLIP), a sentence is a goal for images.
 """
 
 import re
@@ -203,7 +188,7 @@ class Goal:
 
 
 def parse_goal(text: str) -> GoalSpec:
-    """Read a goal in one of the five forms of this module.
+    """Read a goal in one of `FORMS`.
 
     UserError: any other text; the message lists the forms.
     """

@@ -1,14 +1,7 @@
-"""Metrics of a cost curve: order, bumps, earliness and size.
+"""Metrics of a cost curve d (n,), the distance to a goal at each frame; in the unit of the curve.
 
-A curve d (n,) is the distance to a goal at each frame. "A perfect dense cost function would be
-monotonically and smoothly decreasing for a successful trajectory" (MMWand, section V-E). Three
-cares that published reward metrics lack:
-
-- a curve that does not change has no order: its correlations are None, never 0 or 1;
-- ties share a rank (ranks by `argsort` give a constant curve a perfect score);
-- a bump counts only above the noise, eps = 3 sigma, with sigma measured before the contact.
-
-The unit "curve" is the unit of the curve that was given.
+Undefined is None: a curve that does not change has no order. Ties share a rank. A bump counts only
+above the noise, eps = 3 sigma, with sigma measured before the contact.
 """
 
 from dataclasses import asdict, dataclass

@@ -1,13 +1,7 @@
 """Normalizer that makes the distances of different modalities comparable.
 
-Raw cosine distances of an image, a touch and a sentence have different ranges (a modality gap keeps
-touch and text far apart even at the goal). A `DistanceNormalizer`, fitted once on successful
-episodes (`rewards/fit_normalizer.py`), maps each to 1 at the usual start and 0 at the usual end.
-Scaling each episode by its own extremes instead would turn the noise of an episode that never
-touches anything into a perfect curve.
-
 It holds only for the towers, camera, fingertip sensor, touch encoder and scene that it was fitted
-on. In commands it is `--normalizer PATH`, a file `normalizer.json`.
+on. Scaling each episode by its own extremes would make a perfect curve of noise.
 """
 
 import json

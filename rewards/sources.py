@@ -1,7 +1,4 @@
-"""Sources of trajectories: episodes of a set, or a plain video or folder of images.
-
-Opening a source reports every mistake that can be found without a network.
-"""
+"""Sources of trajectories: episodes of a set, or a plain video or folder of images."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -81,11 +81,11 @@ def align(
                 VIT_PRESETS[config.vit], towers, sensor, config.embedding_dim
             )
         )
-    loss, best = AlignmentLoss(encoder, config), BestEpoch()
+    loss, best = AlignmentLoss(encoder, config), copy.deepcopy(encoder)
 
     def keep_best(history: list[dict[str, Any]], _: dict[str, Any]) -> None:
         if max(history, key=_score) is history[-1]:
-            best.weights = copy.deepcopy(encoder.state_dict())
+            best.load_state_dict(encoder.state_dict())
 
     training = Training(
         loss=loss,
@@ -111,7 +111,7 @@ def align(
         extra_state={"best": best},
     )
     history, provenance = fit(training, out_dir, options, recipe)
-    encoder.load_state_dict(best.weights)
+    encoder.load_state_dict(best.state_dict())
     provenance |= {
         "align": asdict(config),
         "touches": {"train": len(data), "val": len(val_data), "objects": list(data.names)},
@@ -125,21 +125,6 @@ def align(
 def _checksum(touches: Touches) -> str:
     sentences = [s for name in sorted(touches.descriptions) for s in touches.descriptions[name]]
     return checksum(touches.frames, touches.view, touches.object, sentences)
-
-
-class BestEpoch:
-    """The weights of the best epoch so far."""
-
-    def __init__(self) -> None:
-        self.weights: dict[str, Tensor] = {}
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return the weights for the checkpoint."""
-        return self.weights
-
-    def load_state_dict(self, weights: dict[str, Tensor]) -> None:
-        """Take the weights of a checkpoint."""
-        self.weights = weights
 
 
 @dataclass(frozen=True, eq=False)

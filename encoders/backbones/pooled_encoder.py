@@ -1,11 +1,7 @@
 """Touch encoder from the features of an ImageNet network, whitened against nuisance variation.
 
-Means and standard deviations over the image of four stages describe a surface wherever and however
-it is touched. Whitening shrinks directions that vary between presses of one surface (place,
-rotation, depth, sensor instance, light), as estimated by `whitening.simulated_surfaces`.
-
-Whitened noise is as long as a whitened touch. So the direction of an embedding describes the
-surface, and its length, 0 to 1, the strength of the contact at the strongest spot of the image.
+The direction of an embedding describes the surface, wherever and however it is touched; its length,
+0 to 1, the strength of the contact at the strongest spot of the image.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,4 @@
-"""Object identity and material properties read from touch embeddings.
-
-Samples are videos; results generalise over objects, so folds and intervals are over objects.
-"""
+"""Object identity and material properties read from touch embeddings, by folds over objects."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

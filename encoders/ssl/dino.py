@@ -1,8 +1,6 @@
 """Self-distillation without labels (DINO: Caron et al. 2021; Sparsh) for touch.
 
-Views are blocks of patches of the same touch, as in Sparsh's code, and are never scaled: the size
-of a contact must stay as it is. From each view the student predicts the prototypes that the teacher
-gives the other, larger views.
+Views are blocks of patches of the same touch, never scaled: a contact's size must stay as it is.
 """
 
 import math

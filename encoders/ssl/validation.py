@@ -1,8 +1,4 @@
-"""Validation of a self-supervised backbone after every epoch, for its loss says little.
-
-Collapse, linear reconstruction of the image from the tokens, and forces read by a ridge. Nothing
-here changes the training.
-"""
+"""Validation of a self-supervised backbone after every epoch, for its loss says little."""
 
 import math
 from collections.abc import Callable

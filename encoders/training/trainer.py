@@ -1,12 +1,7 @@
 """The one loop by which all networks here are trained, on Accelerate.
 
-A training is a module that computes the loss, a function that makes a batch, an optimizer's settings
-and a few callbacks. The loop adds devices, bfloat16, several GPUs (`torchrun`), gradient clipping,
-learning rate schedules, checkpoints, `metrics.jsonl` and TensorBoard.
-
-An epoch's randomness depends on the seed and the epoch alone, so a resumed training ends with the same
-weights, bit for bit, as an uninterrupted one. Several processes share each batch and its noise, so
-their curve is that of one process, up to rounding.
+An epoch's randomness depends on the seed and the epoch alone, so a resumed training ends with the
+same weights, bit for bit. Several processes share each batch and its noise.
 """
 
 import math

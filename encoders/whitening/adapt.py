@@ -1,9 +1,4 @@
-"""Adaptation of a whitened encoder to real videos.
-
-`simulated_surfaces` estimates the within-object covariance in simulation. Here that of real videos
-is blended in, and features are centred on the videos. Where objects have ranks, the encoder also
-learns sentences.
-"""
+"""Adaptation of a whitened encoder to real videos: their covariance blended in, and sentences."""
 
 from dataclasses import replace
 

@@ -1,9 +1,7 @@
 """Within-surface covariance of touch features, estimated on simulated presses.
 
-Each surface is pressed several times, at another place, rotation and depth, on another sensor
-instance, in other light and through other compression. What differs between these presses does not
-matter; the inverse square root of its covariance makes distances that ignore it (Hatch et al.
-2006). The solution is in closed form.
+What differs between presses of one surface does not matter; the inverse square root of its
+covariance makes distances that ignore it (Hatch et al. 2006).
 """
 
 from collections.abc import Iterator

@@ -1,10 +1,4 @@
-"""Success rate of a policy over many episodes of a task, judged by the simulator.
-
-From Python::
-
-    result = evaluate("shipped", "bead-maze", episodes=20)
-    print(result.rate)  # 19/20 [0.76, 0.99]
-"""
+"""Success rate of a policy over many episodes of a task, judged by the simulator."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

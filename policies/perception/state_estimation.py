@@ -1,7 +1,6 @@
 """State estimation from touch and camera images: contact, and the poses at the start.
 
-A policy is trained on the simulator's truth and acts on the estimates. So the estimator can be
-trained on far more than demonstrations, and the policy on demonstrations without images.
+A policy is trained on the simulator's truth and acts on the estimates.
 """
 
 from collections.abc import Mapping

@@ -1,7 +1,4 @@
-"""Training windows over episodes: observations of the last ticks, actions of the next ones.
-
-Touch is embedded once, by a frozen encoder, and cached inside the episode set.
-"""
+"""Training windows over episodes: observations of the last ticks, actions of the next ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
