@@ -38,8 +38,6 @@ class Touches:
     # catalogue id of the object that each frame touches; "" without contact
     object: tuple[str, ...]
     descriptions: dict[str, list[str]]  # catalogue id -> sentences on how the object feels
-    side: Int[np.ndarray, " n"]  # index into `features.TACTILE` of each frame: 0 left, 1 right
-    episode_index: Int[np.ndarray, " n"]  # index in the set of each frame's episode
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -102,8 +100,6 @@ def collect_touches(
         view_index=episode_index,
         object=tuple(names[i] if f else "" for i, f in zip(episode_index, in_contact, strict=True)),
         descriptions=_descriptions(episodes),
-        side=np.asarray(sides)[column],
-        episode_index=episode_index,
     )
 
 

@@ -105,7 +105,6 @@ class Normalizer(nn.Module):
     scale: Tensor
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        """Start as the identity."""
         super().__init__()
         self.register_buffer("offset", torch.zeros(shape))
         self.register_buffer("scale", torch.ones(shape))

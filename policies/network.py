@@ -101,11 +101,6 @@ class PolicyConfig:
         return tuple(key for key in self.proprioception if not key.startswith("observation."))
 
     @property
-    def state_dim(self) -> int:
-        """Width of the proprioception of one tick."""
-        return sum(ft.FEATURES[key].shape[0] for key in self.proprioception)
-
-    @property
     def proprioception_dim(self) -> int:
         """Width of `proprioception.network_input`."""
         return sum(input_widths(self.proprioception, self.representation))

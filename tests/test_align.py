@@ -106,8 +106,6 @@ def make_touches(per_episode: int, seed: int, per_object: int = 1) -> Touches:
         view_index=np.array(episode),
         object=tuple(objects),
         descriptions=DESCRIPTIONS,
-        side=np.zeros(len(frames), int),
-        episode_index=np.array(episode),
     )
 
 

@@ -27,7 +27,8 @@ def toy_dataset(
 ) -> SequenceDataset:
     n, generator = sum(lengths), torch_rng(seed)
     touch = torch.randn(n, config.touch_dim, generator=generator).half()
-    state = 0.02 * torch.randn(n, config.state_dim, generator=generator)
+    width = sum(ft.FEATURES[key].shape[0] for key in config.proprioception)
+    state = 0.02 * torch.randn(n, width, generator=generator)
     actions = 0.01 * torch.randn(n, 8, generator=generator)
     actions[:, 7] = 0.0  # a gripper that stays, as in the bead maze
     wrench = touch.float().sum(1, keepdim=True).repeat(1, WRENCH_DIM)

@@ -163,7 +163,6 @@ class AlignmentLoss(nn.Module):
     """A touch encoder and its contrastive loss over the batches of all processes."""
 
     def __init__(self, encoder: TouchEncoder, config: AlignConfig) -> None:
-        """Take the encoder to train."""
         super().__init__()
         self.encoder, self.config = encoder, config
 

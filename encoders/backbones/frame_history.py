@@ -42,7 +42,6 @@ class RecentFrames:
     """Cache of the last preprocessed frames of one sensor, so that a tick preprocesses only one."""
 
     def __init__(self, preprocess: Preprocessor, offsets: tuple[int, ...]) -> None:
-        """Start empty, for an encoder with this preprocessor and these offsets."""
         self._preprocess, self._offsets = preprocess, offsets
         self._untouched: Frame | None = None
         self._known: list[tuple[Frame, Float[Tensor, "1 3 H W"]]] = []

@@ -14,39 +14,18 @@ Method = Literal["mae", "dino", "ijepa", "vjepa"]
 
 # Pictures there stand upright; the LayerNorm's epsilon is in no file of weights.
 UPRIGHT, SQUARE, NORM_EPSILON = (320, 240), (224, 224), 1e-6
-CLIP_FRAMES = 4
 
 
-def _base(
-    image_size: tuple[int, int],
-    channels: int = 6,  # two frames on top of each other, the newer first
-    registers: int = 0,
-    layer_scale: float | None = None,
-    tubelet: int = 1,
-    frames: int = 1,
-    learned_positions: bool = False,
-) -> ViTConfig:
-    return ViTConfig(
-        image_size=image_size,
-        patch_size=16,
-        channels=channels,
-        width=768,
-        depth=12,
-        heads=12,
-        registers=registers,
-        layer_scale=layer_scale,
-        tubelet=tubelet,
-        frames=frames,
-        learned_positions=learned_positions,
-        norm_epsilon=NORM_EPSILON,
-    )
-
-
+# Two frames on top of each other, the newer first.
+_BASE = ViTConfig(
+    patch_size=16, channels=6, width=768, depth=12, heads=12, norm_epsilon=NORM_EPSILON
+)
+_SQUARE_BASE = replace(_BASE, image_size=SQUARE, learned_positions=True)
 SPARSH_BASE: dict[str, ViTConfig] = {
-    "mae": _base(UPRIGHT, layer_scale=1.0),
-    "dino": _base(UPRIGHT, layer_scale=1.0, registers=1),
-    "ijepa": _base(SQUARE, learned_positions=True),
-    "vjepa": _base(SQUARE, channels=3, tubelet=2, frames=CLIP_FRAMES, learned_positions=True),
+    "mae": replace(_BASE, image_size=UPRIGHT, layer_scale=1.0),
+    "dino": replace(_BASE, image_size=UPRIGHT, layer_scale=1.0, registers=1),
+    "ijepa": _SQUARE_BASE,
+    "vjepa": replace(_SQUARE_BASE, channels=3, tubelet=2, frames=4),
 }
 _PUBLISHED_SIZES = {"tiny": (192, 3), "small": (384, 6), "base": (768, 12)}  # width, heads
 # Our presets of these names, with widths that three axes divide, for clips.

@@ -58,7 +58,6 @@ class BaseTouchEncoder(nn.Module):
     def __init__(
         self, preprocess: Preprocessor, embedding_dim: int, offsets: tuple[int, ...] = (0,)
     ) -> None:
-        """Store preprocessor, width and offsets."""
         super().__init__()
         self.preprocess, self.offsets = preprocess, offsets
         self._width = embedding_dim

@@ -98,7 +98,6 @@ class Block(nn.Module):
         norm_epsilon: float = 1e-5,
         layer_scale: float | None = None,
     ) -> None:
-        """Build the two residual branches; see `ViTConfig`."""
         super().__init__()
         self.heads = heads
         self.norm1 = nn.LayerNorm(width, norm_epsilon)
@@ -134,7 +133,6 @@ class ViT(nn.Module):
     """
 
     def __init__(self, config: ViTConfig) -> None:
-        """Build a randomly initialised backbone."""
         super().__init__()
         self.config = config
         c = config

@@ -56,7 +56,6 @@ class AttentiveProbe(nn.Module):
     """Probe of an attentive pooler and a hidden layer of a quarter of its width."""
 
     def __init__(self, features: int, outputs: int, width: int = 128, heads: int = 4) -> None:
-        """Build a randomly initialised probe; see AttentivePooler."""
         super().__init__()
         self.pooler = AttentivePooler(features, width, heads)
         self.hidden = nn.Linear(width, width // _NARROWER)

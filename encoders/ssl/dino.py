@@ -28,7 +28,6 @@ class DinoHead(nn.Module):
     """Three layers to a unit vector, then its cosine with every prototype."""
 
     def __init__(self, width: int, config: DinoConfig) -> None:
-        """Build a randomly initialised head."""
         super().__init__()
         hidden = config.head_width
         layers: list[nn.Module] = []
@@ -62,7 +61,6 @@ class Dino(SelfDistillation):
     center: Float[Tensor, " p"]
 
     def __init__(self, config: DinoConfig, backbone: TouchBackbone, steps: int) -> None:
-        """Build randomly initialised heads; see `SelfDistillation`."""
         super().__init__(config, backbone, steps)
         self.config = config
         self.head = DinoHead(backbone.config.vit.width, config)

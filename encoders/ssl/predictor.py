@@ -17,7 +17,6 @@ class Predictor(nn.Module):
     places: Float[Tensor, "n w"]
 
     def __init__(self, vit: ViTConfig, config: PredictorConfig) -> None:
-        """Build a randomly initialised predictor for a backbone."""
         super().__init__()
         width = config.predictor_width
         self.embed = nn.Linear(vit.width, width)
@@ -51,7 +50,6 @@ class JointEmbeddingPrediction(SelfDistillation):
     """Backbone of partial input, predictor, and teacher of the whole; subclasses draw the parts."""
 
     def __init__(self, config: PredictorConfig, backbone: TouchBackbone, steps: int) -> None:
-        """Build a randomly initialised predictor; see `SelfDistillation`."""
         super().__init__(config, backbone, steps)
         self.config = config
         self.predictor = Predictor(backbone.config.vit, config)

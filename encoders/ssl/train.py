@@ -40,9 +40,8 @@ def train_unlabelled(
 ) -> TouchBackbone:
     """Train a backbone by the objective of `config`.
 
-    Writes what `trainer.fit` does, images reconstructed from the tokens (but for MAE), and at the end
-    the backbone, or its teacher, to `encoder/`. Killed and resumed, it ends with the same weights as
-    uninterrupted.
+    Writes what `trainer.fit` does, and at the end the backbone, or its teacher, to `encoder/`. Killed
+    and resumed, it ends with the same weights as uninterrupted.
 
     Args:
         val: Touches of other episodes.
@@ -69,11 +68,8 @@ def train_unlabelled(
             backbone = backbone_for(method, config.vit, train.sensor, train.stride)
             model = objective(config, backbone, optimizer.steps(len(train)))
             encoder = model.teacher
-            validation = Validation(model, train, val, out_dir, config.epochs)
-            callbacks = {
-                "after_step": model.update_teacher,
-                "after_epoch": lambda history, _: validation.draw(len(history)),
-            }
+            validation = Validation(model, train, val)
+            callbacks = {"after_step": model.update_teacher}
     training = Training(
         loss=model,
         n_samples=len(train),

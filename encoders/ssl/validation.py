@@ -1,45 +1,30 @@
 """Validation of a self-supervised backbone after every epoch, for its loss says little."""
 
-import math
 from collections.abc import Callable
-from pathlib import Path
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from touchgoal.encoders.backbones.frame_history import stack_frames
 from touchgoal.encoders.backbones.touch_backbone import BATCH
-from touchgoal.encoders.backbones.vit import ViTConfig, patch_grid, patchify
+from touchgoal.encoders.backbones.vit import patchify
 from touchgoal.encoders.probes.ridge import ridge_r2
 from touchgoal.encoders.ssl.frames import TouchFrames
 from touchgoal.encoders.ssl.self_distillation import SelfDistillation
-from touchgoal.encoders.training.trainer import is_first_process
 
 _PROBE_SAMPLES, _TOKEN_SAMPLES = 2048, 128
 _STRENGTH = 1e-3  # of the decoder's ridge
 _LEAST_SPREAD, _LEAST_RANK = 0.01, 0.05  # shares of the untrained spread, and rank above 1
 _LEAST_INFORMATION = 0.01  # nats
-_PICTURES, _SHOWN = 4, 6
-_CONTRAST = 32.0  # grey levels that 1.0 is drawn as
 
 
 class Validation:
     """Metrics of a training's teacher on touches of other episodes."""
 
-    def __init__(
-        self,
-        model: SelfDistillation,
-        train: TouchFrames,
-        val: TouchFrames,
-        out_dir: Path,
-        epochs: int,
-    ) -> None:
+    def __init__(self, model: SelfDistillation, train: TouchFrames, val: TouchFrames) -> None:
         """Measure the untrained backbone, to which collapse is relative."""
         self._model, self._train, self._val = model, train, val
-        self._out_dir, self._epochs = out_dir, epochs
         self._untrained = token_statistics(self._tokens(val))
 
     def metrics(self) -> dict[str, float]:
@@ -77,19 +62,6 @@ class Validation:
         )
         warning = "  WARNING: the embeddings have collapsed, all touches have the same one"
         return text + warning if self.has_collapsed(metrics) else text
-
-    def draw(self, epoch: int) -> None:
-        """Write `reconstruction_EPOCH.png` a few times: touches above their reconstructions."""
-        due = {math.ceil(self._epochs * (k + 1) / _PICTURES) for k in range(_PICTURES)}
-        if epoch not in due or not is_first_process():
-            return
-        vit = self._model.teacher.config.vit
-        pixels = self._pixels(self._val)
-        shown = pixels.square().mean((1, 2)).argsort(descending=True, stable=True)[:_SHOWN]
-        read = self._decode(self._tokens(self._val)[shown])
-        rows = [np.hstack([_picture(p, vit) for p in part]) for part in (pixels[shown], read)]
-        picture = cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR)
-        cv2.imwrite(str(self._out_dir / f"reconstruction_{epoch:04d}.png"), picture)
 
     @torch.no_grad()
     def _loss(self) -> float:
@@ -184,13 +156,3 @@ def _sample(data: TouchFrames) -> Tensor:
 
 def _to(value: Tensor | list[Tensor], device: torch.device) -> Tensor | list[Tensor]:
     return [v.to(device) for v in value] if isinstance(value, list) else value.to(device)
-
-
-def _picture(patches: Float[Tensor, "p c"], vit: ViTConfig) -> np.ndarray:
-    """Invert `patchify`, as RGB about grey."""
-    rows, columns = patch_grid(vit)
-    size = vit.patch_size
-    image = patches.view(rows, columns, 3, size, size).permute(0, 3, 1, 4, 2)
-    grey = 128 + _CONTRAST * image.reshape(rows * size, columns * size, 3)
-    height, width = vit.image_size
-    return grey.clamp(0, 255).byte().numpy()[:height, :width]

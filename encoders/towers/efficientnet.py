@@ -36,7 +36,6 @@ class ConvNorm(nn.Module):
     def __init__(
         self, inputs: int, outputs: int, kernel: int, stride: int, groups: int, activate: bool
     ) -> None:
-        """Build the layer."""
         super().__init__()
         padding = kernel // 2 if stride == 1 else 0
         self.conv = nn.Conv2d(inputs, outputs, kernel, stride, padding, groups=groups, bias=False)
@@ -67,7 +66,6 @@ class InvertedResidual(nn.Module):
     """Expansion, depthwise filter and projection, with a skip where the shape stays."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expand: int) -> None:
-        """Build the block."""
         super().__init__()
         hidden = inputs * expand
         layers = [ConvNorm(inputs, hidden, 1, 1, 1, True)] if expand > 1 else []
@@ -85,7 +83,6 @@ class EfficientNetLite0(nn.Module):
     """ImageNet classifier of 4.65 M parameters; its pooled 1280 features are the embedding."""
 
     def __init__(self) -> None:
-        """Build the network with random weights."""
         super().__init__()
         self.stem = ConvNorm(3, 32, 3, 2, 1, True)
         blocks, channels = [], 32

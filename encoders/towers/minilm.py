@@ -28,7 +28,6 @@ class MiniLM(nn.Module):
     """Sentence encoder of 22.7 M parameters: the mean of the word embeddings."""
 
     def __init__(self) -> None:
-        """Build the network with random weights."""
         super().__init__()
         self.words = nn.Embedding(_VOCABULARY, WIDTH)
         self.positions = nn.Embedding(_POSITIONS, WIDTH)

@@ -53,7 +53,6 @@ class UNet(nn.Module):
     """
 
     def __init__(self, config: UNetConfig, action_dim: int, condition_dim: int) -> None:
-        """Initialise at random."""
         super().__init__()
         self.config = config
         w = config.step_embedding_dim

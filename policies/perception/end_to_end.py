@@ -40,7 +40,6 @@ class EndToEndEncoder(nn.Module):
     """Network from both tactile images to one vector; both sides share its weights."""
 
     def __init__(self, config: EndToEndConfig) -> None:
-        """Initialise at random."""
         super().__init__()
         vit = ViTConfig(image_size=config.size, width=128, depth=4, heads=4)
         self.vit, self.projection = ViT(vit), nn.Linear(vit.width, config.width)

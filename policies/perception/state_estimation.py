@@ -41,7 +41,6 @@ class StateEstimatorNetwork(nn.Module):
     """Networks for the contact of each fingertip, and for poses from the first camera images."""
 
     def __init__(self, config: StateEstimatorConfig) -> None:
-        """Initialise at random."""
         super().__init__()
         self.config = config
         side_dim = config.touch_dim // len(ft.TACTILE)

@@ -183,7 +183,6 @@ class SequenceDataset:
     """
 
     def __init__(self, recorded: Recordings, config: PolicyConfig) -> None:
-        """Make windows of the config's horizons."""
         self.recorded = recorded
         ends = np.cumsum(recorded.lengths)
         first = np.repeat(ends - recorded.lengths, recorded.lengths)[:, None]
