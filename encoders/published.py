@@ -18,11 +18,8 @@ STRIDES = {"pair": 5, "clip": 2}
 def find_published(name: str | Path) -> Path | None:
     """Return the file of published weights, fetched if need be; None if the name means no such.
 
-    Args:
-        name: A file of weights, a folder with one, or a Hugging Face id.
-
-    Raises:
-        UserError: Several files, or an id that cannot be fetched.
+    It is named by a file, a folder or a Hugging Face id. UserError: several files, or an id that
+    cannot be fetched.
     """
     path = Path(name)
     if path.suffix in _FILES:

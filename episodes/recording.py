@@ -86,9 +86,8 @@ def missing_specs(
 ) -> list[EpisodeSpec]:
     """Return the specs whose seeds a set does not hold; all of them where nothing is recorded yet.
 
-    Args:
-        corrected: Whether they are recorded while a policy acts: such an episode does not replace
-            the expert's with the same seed.
+    An episode that is `corrected`, recorded while a policy acts, does not replace the expert's with
+    the same seed.
     """
     if not (root / set_files.INFO).exists():
         return list(specs)

@@ -93,11 +93,7 @@ class LearnedPolicy:
         return f"LearnedPolicy({str(self.directory or '')!r}, task={self.config.task!r})"
 
     def reset(self, seed: int = 0) -> None:
-        """Begin an episode: the next observation is its first one, with nothing touched yet.
-
-        Args:
-            seed: of the plans' noise.
-        """
+        """Begin an episode with the next observation, untouched; `seed` is of the plans' noise."""
         self._generator = torch.Generator().manual_seed(seed)
         self._first: Observation = {}
         self._embedded: list[tuple[Observation, np.ndarray, np.ndarray]] = []
@@ -125,11 +121,9 @@ class LearnedPolicy:
             self._todo, self._next = self._next, []
 
     def plan(self, history: Sequence[Observation]) -> Float32[np.ndarray, "h 8"]:
-        """Return actions from the latest observation on.
+        """Return actions from the latest of the last `history_ticks` observations on, oldest first.
 
-        Args:
-            history: the last `history_ticks` observations, oldest first. The oldest one of an
-                episode's first call is its first observation, untouched.
+        The oldest one of an episode's first call is its first observation, untouched.
         """
         with one_thread():
             self.embed(history)
@@ -177,11 +171,8 @@ class LearnedPolicy:
     def env_config(self, task: Task | None = None) -> Task:
         """Return a task's options with the images that the policy reads, and no others.
 
-        Args:
-            task: the options otherwise; default: those of the policy's task, with its sensor.
-
-        Raises:
-            UserError: the policy cannot act in the task.
+        Default: the options of the policy's task, with its sensor. UserError: it cannot act in the
+        task.
         """
         config = self.config
         if task is None:

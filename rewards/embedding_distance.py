@@ -22,15 +22,15 @@ from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import Contact, Curves, first_contact
 from touchgoal.rewards.goals import (
     EpisodeEnd,
-    FrameNumber,
     Goal,
     GoalSpec,
-    LastFrame,
     Modality,
     PictureArray,
     PictureFile,
+    PictureGoal,
     Sentence,
     TouchArrays,
+    TouchGoal,
     frame_index,
 )
 from touchgoal.rewards.metrics import START_FRAMES
@@ -204,11 +204,7 @@ class EpisodeEmbedder:
         assert self._aligned is not None  # without it no modality takes a sentence
         return self._aligned.embed_text_goal(list(sentences), self._towers)
 
-    def _goal_picture(
-        self,
-        spec: LastFrame | FrameNumber | PictureFile | PictureArray | EpisodeEnd | Sentence,
-        own: EmbeddedEpisode,
-    ) -> Float32[np.ndarray, " d"]:
+    def _goal_picture(self, spec: PictureGoal, own: EmbeddedEpisode) -> Float32[np.ndarray, " d"]:
         if isinstance(spec, Sentence):
             assert self._towers.pretrained_together  # or a sentence is no goal for pictures
             return _unit(self._towers.embed_texts([spec.text]))[0]
@@ -219,9 +215,7 @@ class EpisodeEmbedder:
             return self.embed_pictures(spec.read([camera]).frames[camera][-1:])[0]
         return own.pictures()[frame_index(spec, len(own), own.source)]
 
-    def _goal_touch(
-        self, spec: LastFrame | FrameNumber | TouchArrays | EpisodeEnd, own: EmbeddedEpisode
-    ) -> Float32[np.ndarray, "sides k"]:
+    def _goal_touch(self, spec: TouchGoal, own: EmbeddedEpisode) -> Float32[np.ndarray, "sides k"]:
         if isinstance(spec, TouchArrays):
             return np.concatenate(
                 [self.embed_touch(spec.pictures[k][None], spec.backgrounds[k]) for k in own.sides]

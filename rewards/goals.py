@@ -131,11 +131,8 @@ class EpisodeEnd:
     def read(self, keys: Sequence[str]) -> Episode:
         """Return the first frames (for the background of touch) and, last, the last frame.
 
-        Args:
-            keys: keys to read; the simulator's contact is added where it is recorded.
-
-        Raises:
-            UserError: no such set, episode or key.
+        The simulator's contact is added where it is recorded. UserError: no such set, episode or
+        key.
         """
         episodes = EpisodeSet(self.root)
         if self.index >= len(episodes):
@@ -159,27 +156,24 @@ class Sentence:
         return f"text:{self.text}"
 
 
-GoalSpec = (
-    LastFrame | FrameNumber | PictureFile | PictureArray | TouchArrays | EpisodeEnd | Sentence
-)
+OwnFrame = LastFrame | FrameNumber
+PictureGoal = OwnFrame | PictureFile | PictureArray | EpisodeEnd | Sentence
+TouchGoal = OwnFrame | TouchArrays | EpisodeEnd
+GoalSpec = PictureGoal | TouchGoal
 
 
 @dataclass(frozen=True)
 class Goal:
     """The goal of each modality; None without one."""
 
-    image: LastFrame | FrameNumber | PictureFile | PictureArray | EpisodeEnd | Sentence | None = (
-        None
-    )
-    tactile: LastFrame | FrameNumber | TouchArrays | EpisodeEnd | None = None
+    image: PictureGoal | None = None
+    tactile: TouchGoal | None = None
     text: Sentence | None = None
 
     @property
     def same_episode(self) -> frozenset[str]:
         """Modalities whose goal is a frame of the measured trajectory itself."""
-        return frozenset(
-            m for m in MODALITIES if isinstance(getattr(self, m), LastFrame | FrameNumber)
-        )
+        return frozenset(m for m in MODALITIES if isinstance(getattr(self, m), OwnFrame))
 
     def as_dict(self) -> dict[str, str]:
         """Return the goal of each modality that has one, in the form that a user writes."""
@@ -213,12 +207,8 @@ def assign_goals(
 ) -> Goal:
     """Give each available modality the first goal that applies to it.
 
-    Args:
-        picture_words: whether the towers compare images with sentences; then a sentence is a goal
-            for images where there is no touch.
-
-    Raises:
-        UserError: no goal, or one that no modality takes.
+    With `picture_words`, of towers that compare images with sentences, a sentence is a goal for
+    images where there is no touch. UserError: no goal, or one that no modality takes.
     """
     if not specs:
         raise UserError(f"no goal was given; write {FORMS}")
@@ -250,7 +240,7 @@ def check_goal(goal: Goal, inputs: Inputs) -> None:
     UserError: a frame beyond the trajectory; no such image, set, episode, camera or fingertip.
     """
     for spec in (goal.image, goal.tactile):
-        if isinstance(spec, LastFrame | FrameNumber) and inputs.length is not None:
+        if isinstance(spec, OwnFrame) and inputs.length is not None:
             frame_index(spec, inputs.length, inputs.name)
     if isinstance(goal.image, PictureFile | PictureArray):
         goal.image.read()
@@ -260,7 +250,7 @@ def check_goal(goal: Goal, inputs: Inputs) -> None:
         goal.tactile.read(inputs.sides)
 
 
-def frame_index(spec: LastFrame | FrameNumber, length: int, source: str) -> int:
+def frame_index(spec: OwnFrame, length: int, source: str) -> int:
     """Return the frame of the trajectory that is its goal; UserError if it has no such frame."""
     if isinstance(spec, LastFrame):
         return length - 1

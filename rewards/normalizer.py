@@ -74,10 +74,8 @@ class DistanceNormalizer:
     ) -> str | None:
         """Return why such distances cannot be normalised by this; None if they can.
 
-        A plain video counts as taken by the camera that the normalizer was fitted on.
-
-        Args:
-            same_episode: those whose goal is a frame of the measured episode itself.
+        A plain video counts as taken by the camera that the normalizer was fitted on. The goal of a
+        modality in `same_episode` is a frame of the measured episode itself.
         """
         mine, names = self.source, set(modalities)
         for m in sorted(names):
@@ -102,13 +100,9 @@ class DistanceNormalizer:
         source: EmbeddingSource,
         same_episode: frozenset[str],
     ) -> dict[str, Float[np.ndarray, " n"]]:
-        """Return normalised distances by modality, from raw cosine distances.
+        """Return normalised distances by modality, from raw cosine distances; see `mismatch`.
 
-        Args:
-            same_episode: modalities whose goal is a frame of the measured episode itself.
-
-        Raises:
-            UserError: a modality that was not fitted, or was fitted for something else.
+        UserError: a modality that was not fitted, or was fitted for something else.
         """
         reason = self.mismatch(source, raw, same_episode)
         if reason:

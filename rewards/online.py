@@ -30,13 +30,9 @@ class CostMeter:
     """
 
     def __init__(self, model: RewardModel) -> None:
-        """Prepare for one run.
+        """Prepare for one run, to goals from outside it; without a normalizer, of one modality.
 
-        Args:
-            model: with goals from outside the run; without a normalizer, of one modality.
-
-        Raises:
-            UserError: a goal that is known only at the end, or raw distances of several modalities.
+        UserError: a goal that is known only at the end, or raw distances of several modalities.
         """
         if model.goal.same_episode:
             raise UserError("task.rewards: last and frame:K are not known before the end")

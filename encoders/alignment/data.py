@@ -48,11 +48,8 @@ def prepare_touch_data(
 ) -> TouchData:
     """Run the preprocessor and the towers once over all data.
 
-    Args:
-        no_contact_texts: Sentences for touches without contact; with none, these are left out.
-
-    Raises:
-        UserError: Frames of another sensor, an object without descriptions, or no contact.
+    Without `no_contact_texts` touches without contact are left out. UserError: frames of another
+    sensor, an object without descriptions, or no contact.
     """
     objects = np.asarray(touches.object)
     used = np.flatnonzero((objects != NO_CONTACT) | bool(no_contact_texts))

@@ -31,8 +31,7 @@ class TouchEncoderConfig:
     ) -> "TouchEncoderConfig":
         """Return the config that fits these towers; UserError for an unknown sensor.
 
-        Args:
-            embedding_dim: Width of the shared space; towers pretrained together bring their own.
+        Towers pretrained together bring their own width of the shared space.
         """
         preprocess = preprocessor_for(sensor)
         return cls(

@@ -49,9 +49,8 @@ class RecentFrames:
     def latest(self, history: Sequence[Frame], untouched: Frame) -> Float[Tensor, "1 t 3 H W"]:
         """Return the newest frame and those at the offsets before it, for an encoder's `stack`.
 
-        Args:
-            history: Frames of the last ticks, oldest first; the same objects from tick to tick. The
-                oldest stands for frames before it.
+        The history holds the same objects from tick to tick, the oldest first, which also stands
+        for frames before it.
         """
         if untouched is not self._untouched:
             self._untouched, self._known = untouched, []

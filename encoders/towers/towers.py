@@ -46,14 +46,9 @@ class Towers(Protocol):
 
 
 def load_towers(name: str, device: str = "cpu") -> Towers:
-    """Load towers by name.
+    """Load towers: "offline", a CLIP's Hugging Face id or folder, or the `name` of loaded ones.
 
-    Args:
-        name: "offline", a CLIP's Hugging Face id or folder, or the `name` of loaded towers, which
-            also has a hash of their weights.
-
-    Raises:
-        UserError: Not found, not a CLIP, or weights with another hash.
+    UserError: not found, not a CLIP, or weights with another hash than the name's.
     """
     if name == OfflineTowers.name:
         return OfflineTowers(device)

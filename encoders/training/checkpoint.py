@@ -62,11 +62,7 @@ class Record:
         self._tensorboard = SummaryWriter(str(out_dir))
 
     def write(self, history: list[dict[str, float]], state: Mapping[str, Any]) -> None:
-        """Write the state after an epoch; if killed, the older or these files remain.
-
-        Args:
-            history: Metrics of every epoch so far.
-        """
+        """Write the state after an epoch; if killed, the older or these files remain."""
         states = {name: part.state_dict() for name, part in state.items()}
         with atomic_write(self._dir / _CHECKPOINT) as unfinished:
             torch.save({**self._head, "history": history, **states}, unfinished)

@@ -15,13 +15,9 @@ from touchgoal.runtime.run_folder import open_run
 
 
 def check_training(options: TrainerOptions, out: Path | None, first: str = "") -> None:
-    """Check what can be checked before any data are read.
+    """Check what can be checked before data are read; `first`: the first training's subfolder.
 
-    Args:
-        first: Subfolder of the run's first training, if it has several.
-
-    Raises:
-        UserError: No such device, an unfit folder, or no folder where one is needed.
+    UserError: no such device, an unfit folder, or no folder where one is needed.
     """
     check_device(options.device)
     if out is None and options.resume:

@@ -44,11 +44,7 @@ def rank_sentences(property_: int) -> list[str]:
 def fit_text_head(
     touches: Float[Tensor, "n d"], ranks: Int[Tensor, "n 3"], embed_texts: EmbedTexts
 ) -> TextHead:
-    """Fit a ridge from sentences to the mean touch that each describes.
-
-    Args:
-        touches: Centred touch embeddings.
-    """
+    """Fit a ridge from sentences to the mean of the centred touches that each describes."""
     sentences, places, weights = [], [], []
     for property_ in range(ranks.shape[1]):
         for rank, sentence in enumerate(rank_sentences(property_)):

@@ -139,11 +139,9 @@ def unreadable(root: Path, name: str, error: Exception) -> UserError:
 def refuse_other_writers(root: Path, features: dict[str, Any], episodes: pa.Table | None) -> None:
     """Raise UserError if lerobot wrote the set or added episodes to it.
 
-    touchgoal writes one file under meta/episodes, and one data file an episode with a description in
-    its footer; lerobot puts several episodes into a file and begins further files.
-
-    Args:
-        episodes: Table meta/episodes; None if it cannot be read.
+    touchgoal writes one file under meta/episodes, and one data file an episode with a description
+    in its footer; lerobot puts several episodes into a file and begins further files. `episodes` is
+    None if it cannot be read.
     """
     listed = (root / "meta/episodes").rglob("*.parquet")
     if others := sorted(path for path in listed if path != root / EPISODES):
@@ -164,8 +162,7 @@ def refuse_other_writers(root: Path, features: dict[str, Any], episodes: pa.Tabl
 def refuse_foreign_data_files(root: Path, if_none: Path | None = None) -> None:
     """Raise UserError if touchgoal did not write one of the data files that can be read.
 
-    Args:
-        if_none: File that is blamed where no data file can be read; None to allow that.
+    Where none can be read, the file `if_none` is blamed; without it that is allowed.
     """
     own = False
     for path in sorted((root / "data").rglob("*.parquet")):

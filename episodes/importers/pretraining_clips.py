@@ -74,13 +74,9 @@ class Recording:
 
 
 def read_recordings(folder: Path, sensor: str | None = None) -> list[Recording]:
-    """List the recordings of a published folder.
+    """List the recordings of a published folder; `sensor` where the layout leaves a choice.
 
-    Args:
-        sensor: Sensor model, where a layout leaves a choice.
-
-    Raises:
-        UserError: The folder has none of the layouts or another sensor, or a file is damaged.
+    UserError: the folder has none of the layouts or another sensor, or a file is damaged.
     """
     if not folder.is_dir():
         raise UserError(f"{folder} is no folder")

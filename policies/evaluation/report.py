@@ -22,10 +22,8 @@ TRIALS, METRICS = "trials.jsonl", "metrics.json"
 def record_trials(out: Path, trials: Iterator[Trial], count: int) -> list[Trial]:
     """Write each trial as it ends, then the metrics; print the table.
 
-    After Ctrl-C the trials that have ended are reported, and the interruption goes on.
-
-    Args:
-        count: number of trials that were asked for.
+    After Ctrl-C those of the `count` trials that have ended are reported, and the interruption goes
+    on.
     """
     ended: list[Trial] = []
     try:

@@ -81,8 +81,7 @@ class StateEstimator:
     ) -> dict[str, Float32[np.ndarray, " n"]]:
         """Return the contact of each pad (1 or 0), and the poses at the start.
 
-        Args:
-            first: the episode's first one, untouched and with all of the table in view.
+        The episode's first observation is untouched and has all of the table in view.
         """
         if self._start[0] is not first:
             pictures = {key: self._picture(key, first[key]) for key in self.cameras}

@@ -45,13 +45,9 @@ class DaggerRoles:
 
 
 def dagger_roles(policy: str | None, task: TaskConfig, feedback: bool) -> DaggerRoles:
-    """Return the roles of a recording by an expert that is asked at every tick.
+    """Return the roles of a recording by an expert that is asked at every tick, also while it acts.
 
-    Args:
-        policy: Name of the policy that acts; None for the expert itself.
-
-    Raises:
-        UserError: The policy or the expert cannot act in the task.
+    UserError: the policy or the expert cannot act in the task.
     """
     if feedback and isinstance(task, BeadMazeConfig):
         raise UserError("--feedback is for pick-place: the bead maze's expert always has feedback")

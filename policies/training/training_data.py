@@ -36,12 +36,8 @@ class ChosenEpisodes:
 def choose_episodes(episodes: EpisodeSet, include_unknown: bool = False) -> ChosenEpisodes:
     """Return the episodes that succeeded, and those in which an expert corrected a policy.
 
-    Args:
-        include_unknown: also take those that do not say whether they succeeded, such as recordings
-            of an arm.
-
-    Raises:
-        UserError: none is left.
+    `include_unknown` also takes those that do not say whether they succeeded, such as recordings of
+    an arm. UserError: none is left.
     """
     known = [succeeded(episodes.meta(i)) for i in range(len(episodes))]
     rows = [i for i, good in enumerate(known) if good or (good is None and include_unknown)]

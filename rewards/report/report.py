@@ -19,13 +19,9 @@ from touchgoal.runtime.json_file import write_json
 def write_report(
     curves: Curves, folder: Path, name: str, provenance: Mapping[str, Any], gamma: float = GAMMA
 ) -> dict[str, Path]:
-    """Write NAME.png, NAME.csv and NAME.json, each atomically.
+    """Write NAME.png, NAME.csv and NAME.json, each atomically; return the paths by kind.
 
-    Args:
-        provenance: what the curves were made with (encoder, towers, command, ...), for the JSON.
-
-    Returns:
-        The paths by kind: "png", "csv", "json".
+    The JSON also holds what the curves were made with (encoder, towers, command).
     """
     png = io.BytesIO()
     FigureCanvasAgg(curves.plot(gamma)).print_png(png, metadata={"Software": None})
