@@ -66,9 +66,7 @@ def episode_specs(
 ) -> list[EpisodeSpec]:
     """Return specs that take the objects (or wires) in turn, each with every outcome once.
 
-    Args:
-        episodes: Number of episodes of each outcome.
-        first_seed: Seed of the first episode; each further one adds one.
+    There are `episodes` of each outcome; seeds count up from the first one.
     """
     if isinstance(env, BeadMazeConfig):
         options = [{"wire": wire.name} for wire in env.chosen_wires()]
@@ -106,9 +104,8 @@ def run(
 ) -> Iterator[dict[str, np.ndarray]]:
     """Act until the episode ends; yield each tick's observation, action and ground truth.
 
-    Args:
-        env: Environment after its reset.
-        expert: Its actions are recorded in place of the actor's, if given.
+    The environment was just reset. An expert's actions, if given, are recorded in place of the
+    actor's.
     """
     while True:
         action = np.asarray(actor.act(observation), np.float32)
@@ -140,14 +137,9 @@ def record_with_film(
     policy: Callable[[Any], Actor] | None = None,
     meshes: Literal["fast", "full"] = "full",
 ) -> tuple[Episode, UInt8[np.ndarray, "n h w 3"]]:
-    """Record and film an episode, tick by tick.
+    """Record and film an episode, tick by tick; the images are for `episodes.film.write_film`.
 
-    Args:
-        policy: Makes the actor for the environment after its reset; None for the expert.
-        meshes: see `SceneRecorder`.
-
-    Returns:
-        The episode, and images for `episodes.film.write_film`.
+    Without a maker of the actor, which gets the environment after its reset, the expert acts.
     """
     observation, info = env.reset(seed=spec.seed, options=spec.options)
     actor = policy(env) if policy else make_expert(env, spec.outcome)

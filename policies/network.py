@@ -189,11 +189,9 @@ class PolicyNetwork(nn.Module):
         wrench: Float[Tensor, "b o 12"] | None = None,
         action_is_pad: Bool[Tensor, "b h"] | None = None,
     ) -> Float[Tensor, ""]:
-        """Return the training loss on windows.
+        """Return the training loss on windows, without ticks after the episode's end.
 
-        Args:
-            wrench: on both pads, with `reads_wrench`.
-            action_is_pad: ticks after the episode's end, which do not count.
+        With `reads_wrench` it needs the wrenches on both pads.
         """
         chunk = to_representation(actions, batch.joints, self.config.representation)
         touch = self._encode_touch(batch, noise)

@@ -132,15 +132,10 @@ class EpisodeEmbedder:
     def embed_episode(
         self, episode: Episode, fps: float, source: str, descriptions: bool = False
     ) -> EmbeddedEpisode:
-        """Embed the camera and every fingertip of an episode.
+        """Embed an episode's camera and fingertips; on request the sentences about it, too.
 
-        Args:
-            source: its name, for people.
-            descriptions: whether to embed the sentences about its object too.
-
-        Raises:
-            UserError: the episode lacks the camera, starts in contact, or has descriptions that are
-                no list of sentences.
+        UserError: the episode lacks the camera, starts in contact, or has descriptions that are no
+        list of sentences.
         """
         sides = tuple(k for k in TACTILE if k in episode.frames) if self.encoder else ()
         success = episode.meta.get("success")

@@ -118,20 +118,11 @@ def load_embedder(
     towers: str | Towers | None = None,
     device: str = "cpu",
 ) -> tuple[EpisodeEmbedder, Path | None]:
-    """Load the encoders for trajectories.
+    """Load the encoders for trajectories; return them, and the folder that may have a normalizer.
 
-    Args:
-        encoder: name or folder of a touch encoder of any kind, or one already loaded; None for the
-            one that ships for the sensor.
-        towers: "offline", a CLIP, or loaded ones; None for those that the touch encoder was aligned
-            with, else "offline".
-
-    Returns:
-        The encoders, and the folder that may hold their normalizer.
-
-    Raises:
-        UserError: no encoder ships for the sensor, it is for another one, or it was aligned with
-            other towers.
+    Default: the touch encoder that ships for the sensor, and the towers that it was aligned with,
+    else "offline". UserError: no encoder ships for the sensor, it is for another one, or it was
+    aligned with other towers.
     """
     _check_device(device)
     touch, folder = _load_touch(inputs, encoder)

@@ -193,15 +193,10 @@ def _open_episodes(
 def open_successes(
     paths: Sequence[Path], camera: str, with_touch: bool, assume_success: bool
 ) -> list[EpisodeSource] | list[VideoSource]:
-    """Open the successful episodes of one set, or plain videos of successes.
+    """Open the successful episodes of one set, or several plain videos of successes.
 
-    Args:
-        paths: one set of episodes, or several videos or folders of images.
-        assume_success: whether episodes without a recorded outcome count as successes.
-
-    Raises:
-        UserError: as `open_source`; no source, several sets, or sets and videos; fewer than two
-            successes.
+    With `assume_success` episodes without a recorded outcome count. UserError: as `open_source`; no
+    source, several sets, or sets and videos; fewer than two successes.
     """
     sources = [open_source(path, camera, with_touch=with_touch) for path in paths]
     videos = [source for source in sources if isinstance(source, VideoSource)]

@@ -24,9 +24,7 @@ def past_rows(
 ) -> Int[np.ndarray, "k t"]:
     """Return the rows of all input frames for each newest frame, newest first.
 
-    Args:
-        rows: Rows of the newest frames, in the order of recording.
-        first: Row at which each recording begins; it stands for frames before it.
+    The row `first`, at which each recording begins, stands for frames before it.
     """
     return np.maximum(rows[:, None] - np.array(offsets), np.reshape(first, (-1, 1)))
 

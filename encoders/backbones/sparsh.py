@@ -45,9 +45,7 @@ def sparsh_vit(method: str, size: str) -> ViTConfig:
 def vit_for(method: Method, size: str, image_size: tuple[int, int]) -> ViTConfig:
     """Return the network of a method: Sparsh's own, or a smaller one with its input and registers.
 
-    Args:
-        size: tiny, compact, small or base, which is Sparsh's.
-        image_size: Height and width of the preprocessor's output, px.
+    Sizes are tiny, compact, small and base, which is Sparsh's; the image's are px.
     """
     published = replace(SPARSH_BASE[method], image_size=image_size)
     if size == "base":

@@ -148,14 +148,10 @@ class BaseTouchEncoder(nn.Module):
         background: UInt8[np.ndarray, "h w 3"],
         rows: Int[np.ndarray, " k"] | None = None,
     ) -> Float32[np.ndarray, "k d"]:
-        """Embed raw frames of one sensor.
+        """Embed raw frames of one sensor, in the order of recording, or only those at `rows`.
 
-        Args:
-            frames: Frames in the order of recording; the first stands for frames before it.
-            rows: Rows to embed; all when None.
-
-        Raises:
-            UserError: The frames are not of this encoder's sensor.
+        The first frame stands for frames before it. UserError: the frames are not of this encoder's
+        sensor.
         """
         rows = np.arange(len(frames)) if rows is None else rows
         embedded = np.empty((len(rows), self._width), np.float32)

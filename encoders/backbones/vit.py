@@ -66,9 +66,8 @@ def sinusoidal_positions(
 ) -> Float[Tensor, "n {width}"]:
     """Return fixed position codes, one half for the row, one for the column (MAE, He et al. 2022).
 
-    Args:
-        width: Width of a code, a multiple of 4, or of 6 for clips.
-        times: Tubelets in time; their codes are then the first of three thirds.
+    With tubelets in time, `times`, their codes are the first of three thirds. The width is a
+    multiple of 4, or of 6 for clips.
     """
     sides = [rows, columns] if times is None else [times, rows, columns]
     bands = width // (2 * len(sides))

@@ -137,9 +137,7 @@ def cross_entropy_of_views(
 ) -> Float[Tensor, ""]:
     """Return the mean over all pairs of a teacher's and another student's view (DINO's equation 3).
 
-    Args:
-        targets: The teacher's distributions for the first g views.
-        logits: The student's for all views.
+    The teacher has distributions for the first g views, the student for all.
     """
     pairs = -torch.einsum("gbp,vbp->gv", targets, logits.log_softmax(2)) / targets.shape[1]
     same = torch.eye(*pairs.shape, dtype=torch.bool, device=pairs.device)

@@ -19,12 +19,7 @@ def draw_size(
     aspect: tuple[float, float],
     generator: torch.Generator,
 ) -> tuple[int, int]:
-    """Draw the rows and columns of a block.
-
-    Args:
-        scale: Least and greatest share of the patches.
-        aspect: Least and greatest height over width.
-    """
+    """Draw a block's rows and columns: its share of the patches, and its height over width."""
     share, ratio = (
         low + (high - low) * torch.rand((), generator=generator).item()
         for low, high in (scale, aspect)

@@ -23,12 +23,8 @@ def adapt(
 ) -> PooledEncoder:
     """Return an adapted encoder, with a text head for these towers if some videos have ranks.
 
-    Args:
-        videos: Videos of pressed objects, several of each.
-        share: Weight of the videos in the covariance that is whitened; 0 only centres.
-
-    Raises:
-        UserError: No object has two videos.
+    The videos have the weight `share` in the covariance that is whitened; 0 only centres.
+    UserError: no object has two videos.
     """
     objects = np.array([video.object for video in videos])
     if not videos or np.unique(objects, return_counts=True)[1].max() < 2:

@@ -201,12 +201,7 @@ def _to_arrow(key: str, column: Shaped[np.ndarray, "n d"] | list[bytes]) -> pa.A
 def read_columns(
     file: pq.ParquetFile, features: dict[str, dict[str, Any]], frames: Int[np.ndarray, " n"]
 ) -> dict[str, Shaped[np.ndarray, "n ..."]]:
-    """Read some columns of some frames of a data file; nothing else is decoded.
-
-    Args:
-        features: Features to read, as in meta/info.json.
-        frames: Frame indices, in any order.
-    """
+    """Read some columns of some frames of a data file, in any order; nothing else is decoded."""
     out = {
         key: np.empty((len(frames), *feature["shape"]), FEATURES[key].dtype)
         for key, feature in features.items()

@@ -60,14 +60,9 @@ class ForceStroke:
 
 
 def read_strokes(folder: Path, sensor: str | None = None) -> Iterator[ForceStroke]:
-    """Read the strokes of a published folder, one batch at a time.
+    """Read the strokes of a published set, of one probe or of one batch, one batch at a time.
 
-    Args:
-        folder: Folder of a set, of one probe or of one batch.
-        sensor: Sensor model, where the files leave a choice.
-
-    Raises:
-        UserError: No such files, another sensor's, or a content that is not as published.
+    UserError: no such files, another sensor's, or a content that is not as published.
     """
     depths = ("", "*/", "*/*/")
     found = {p.parent for depth in depths for p in folder.glob(f"{depth}dataset_*.pkl")}

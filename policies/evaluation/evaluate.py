@@ -124,9 +124,7 @@ def run_trials(
 ) -> Iterator[Trial]:
     """Run a policy in each episode; yield the trials in order as they end.
 
-    Args:
-        policy: makes the policy for an episode; must pickle if there are several workers.
-        workers: processes; with one, all runs in this process.
+    With one worker all runs in this process; for several the policy's maker must pickle.
     """
     if workers == 1:
         for spec in track(specs, "trials", "episode"):

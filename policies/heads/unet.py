@@ -86,11 +86,9 @@ class UNet(nn.Module):
         step: Float[Tensor, " b"],
         condition: Float[Tensor, "b c"],
     ) -> Float[Tensor, "b h a"]:
-        """Return the network's prediction.
+        """Return the network's prediction for diffusion steps of 0 to about 100.
 
-        Args:
-            noisy: chunks; h is a multiple of `UNetConfig.tick_multiple`.
-            step: of the diffusion, 0 to about 100.
+        The number of ticks is a multiple of `UNetConfig.tick_multiple`.
         """
         given = torch.cat(
             [self.step(sinusoidal_embedding(step, self.config.step_embedding_dim)), condition], 1

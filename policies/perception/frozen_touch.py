@@ -50,12 +50,10 @@ class TouchEmbedder:
     def embed_tick(
         self, observations: Sequence[Mapping[str, np.ndarray]], untouched: Mapping[str, np.ndarray]
     ) -> Float32[np.ndarray, " e"]:
-        """Embed the latest tick, with the same result as `embed`.
+        """Embed the latest of the last `1 + reach` ticks, with the same result as `embed`.
 
-        Args:
-            observations: the last `1 + reach`, oldest first; if fewer, the oldest is repeated.
-                Frames of an object that was passed before are not preprocessed again.
-            untouched: an observation without contact.
+        If there are fewer, the oldest is repeated. Frames of an object that was passed before are
+        not preprocessed again.
         """
         sides = [
             self._recent[key].latest([tick[key] for tick in observations], untouched[key])
@@ -79,12 +77,7 @@ def load_touch(name_or_path: str | Path) -> TouchEmbedder:
 def load_touch_of(directory: Path, name: str) -> TouchEmbedder:
     """Load the embedder of a policy's training, from its folder or else the shipped one by name.
 
-    Args:
-        directory: `touch/` of the policy's folder; it need not exist.
-        name: `PolicyConfig.touch`.
-
-    Raises:
-        UserError: there is none.
+    UserError: there is none.
     """
     if directory.is_dir():
         return load_touch(directory)

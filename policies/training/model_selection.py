@@ -17,14 +17,10 @@ Score = tuple[float, float]
 def select(
     run: Path, parts: Mapping[str, Path], trial: Callable[[Path], Score]
 ) -> dict[str, Score]:
-    """Try every snapshot of a run and make the best one its policy.
+    """Try every snapshot of a run on validation tasks, and make the best one its policy.
 
-    Args:
-        parts: what goes beside every policy, see `add_parts`.
-        trial: scores a policy's folder, on validation tasks.
-
-    Returns:
-        The score of every snapshot; the best is in `run/policy`. Among equals the later one wins.
+    What goes beside every policy is in `parts`, see `add_parts`. Returns the score of every
+    snapshot; among equals the later one wins.
     """
     scores: dict[str, Score] = {}
     for snapshot in sorted((run / SNAPSHOTS).iterdir()):

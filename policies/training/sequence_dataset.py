@@ -47,14 +47,9 @@ def load_recordings(
 ) -> Recordings:
     """Read episodes, and embed those that are not yet; a kill loses those in progress.
 
-    Args:
-        embedder: of touch; None for a policy without.
-        skip: ticks of each chosen episode to leave out at its start. Images and forces stay
-            relative to its very first tick.
-
-    Raises:
-        UserError: nothing chosen, a missing column, another rate or embedder than the config's, or
-            embeddings of other episodes.
+    At the start of each chosen episode `skip` ticks are left out; images and forces stay relative
+    to its very first tick. UserError: nothing chosen, a missing column, another rate or embedder
+    than the config's, or embeddings of other episodes.
     """
     _check(episodes, chosen, config, embedder)
     embedded = embed_episodes(episodes, chosen, embedder, workers) if embedder else None
