@@ -10,8 +10,13 @@ os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["LP_NUM_THREADS"] = "0"
 
+import jaxtyping  # noqa: E402
 import pytest  # noqa: E402
 import torch  # noqa: E402
+from checked_types import jaxtyped  # noqa: E402
+
+jaxtyping.jaxtyped = jaxtyped  # what --jaxtyping-packages decorates with
+from in_process import in_process_workers  # noqa: E402
 from running_twin import RunningTwin  # noqa: E402
 from toy_episodes import record  # noqa: E402
 
@@ -25,6 +30,12 @@ _CELL = ["--env.objects", "wooden_block", "--seed", "3", "--no-wrench-error"]
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The slow ones first: at the end one of them would keep a single core busy for minutes."""
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+
+
+@pytest.fixture
+def in_process() -> Iterator[None]:
+    with in_process_workers():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from in_process import in_process_workers
+
 from touchgoal.launch.__main__ import main
 
 ROOT = Path(__file__).parents[1]
@@ -97,7 +99,8 @@ def exit_status(words: list[str]) -> int:
     """What a command ends with, in a process that stays for the next one."""
     print("touchgoal", shlex.join(words), flush=True)
     try:
-        main(words)
+        with in_process_workers():
+            main(words)
     except SystemExit as end:
         if isinstance(end.code, str):
             print(end.code, file=sys.stderr)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from in_process import in_process_workers
 from safetensors.torch import load_file
 
 from touchgoal.control.features import STATE
@@ -18,6 +19,8 @@ from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import COMMANDS, main, usage
 from touchgoal.policies import checkpoint
+
+pytestmark = pytest.mark.usefixtures("in_process")
 
 
 def run(*arguments: object) -> None:
@@ -38,7 +41,8 @@ def refused(capsys: pytest.CaptureFixture, *arguments: object) -> str:
 def episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two picks of a ball."""
     out = tmp_path_factory.mktemp("demos")
-    run(*"collect-demos --episodes 2 --env.objects glass_ball --workers 2".split(), "--out", out)
+    with in_process_workers():
+        run(*"collect-demos --episodes 2 --env.objects glass_ball".split(), "--out", out)
     return out / "episodes"
 
 

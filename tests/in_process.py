@@ -1,0 +1,31 @@
+"""Workers that are no processes: what a pool would be given is done here, one after the other."""
+
+import pickle
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
+from contextlib import contextmanager
+from functools import partial
+
+import pytest
+
+from touchgoal.runtime import worker_pool
+
+
+class _InProcess(Executor):
+    """Work and results are pickled, as on their way to a process."""
+
+    def submit(self, function: Callable, /, *args: object, **kwargs: object) -> Future:
+        future, work = Future(), pickle.dumps(partial(function, *args, **kwargs))
+        try:
+            future.set_result(pickle.loads(pickle.dumps(pickle.loads(work)())))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@contextmanager
+def in_process_workers() -> Iterator[None]:
+    """A process takes seconds to start; where its isolation is not the subject, none does."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(worker_pool, "ProcessPoolExecutor", lambda *_, **__: _InProcess())
+        yield
