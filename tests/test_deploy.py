@@ -65,14 +65,6 @@ def deploying(twin: RunningTwin, out: Path) -> "subprocess.Popen[str]":
     return subprocess.Popen([*command, "--execute", "--yes", "--out", str(out / "run")], **pipes)
 
 
-def touch_comes_nearer(out: Path) -> bool:
-    """Whether `touchgoal reward-curves` says so of the deployed episode."""
-    curves = ["reward-curves", str(out / "run" / "episodes"), "--out", str(out / "curves")]
-    subprocess.run([sys.executable, "-m", "touchgoal.launch", *curves], check=True)
-    report = json.loads((out / "curves" / "episode_000.json").read_text())
-    return report["metrics"]["tactile"]["end"] < report["metrics"]["tactile"]["start"]
-
-
 def write_cell_file(folder: Path, text: str) -> Path:
     path = folder / "cell.toml"
     path.write_text(text)
@@ -89,7 +81,6 @@ def test_the_shipped_policy_leads_a_bead_on_the_twin(tmp_path: Path) -> None:
         worst = twin.ask("truth")["worst"]
     assert complaint == "" and worst["excess"] == 0 and worst["speed"] < 1
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["success"]
-    assert touch_comes_nearer(tmp_path)
 
 
 @pytest.mark.slow

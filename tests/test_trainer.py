@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from torch import nn
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.encoders.ssl.config import MaeConfig
 from touchgoal.encoders.ssl.mae import MaskedAutoencoder
+from touchgoal.encoders.ssl.train import train_unlabelled
 from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.encoders.training.trainer import (
     OptimizerConfig,
@@ -20,6 +22,8 @@ from touchgoal.encoders.training.trainer import (
     fit,
     parameter_groups,
 )
+from touchgoal.policies.config import TrainConfig
+from touchgoal.policies.training.train import train
 from touchgoal.runtime.errors import UserError
 
 OPTIMIZER = OptimizerConfig(epochs=2, batch_size=4, lr=1e-2, weight_decay=0.0)
@@ -98,52 +102,54 @@ def test_devices_that_are_not_there_are_refused() -> None:
 
 WORKER = """
 import sys
-from dataclasses import replace
 from pathlib import Path
-import torch
 sys.path.insert(0, {tests!r})
-import test_align, test_mae, test_self_distillation, toy_policies
-from touchgoal.encoders.ssl.train import train_unlabelled
-from touchgoal.encoders.training.options import TrainerOptions
-from touchgoal.encoders.training.trainer import OptimizerConfig
-from touchgoal.policies.config import TrainConfig
-from touchgoal.policies.training.train import train
-
-# plain gradient descent: Adam would not show gradients that are twice too large
-OptimizerConfig.build = lambda self, module: torch.optim.SGD(module.parameters(), self.lr)
-out, options = Path(sys.argv[1]), TrainerOptions()
-data = test_mae.blobs(32, 0)
-train_unlabelled(data, data, replace(test_mae.TOY, epochs=2, lr=0.1), out / "mae", options, {{}})
-config = replace(test_align.CONFIG, lr=0.1)
-test_align.run_align(test_align.TRAIN, test_align.VAL, test_align.FakeTowers(), config, out / "align", {{}})
-data = test_self_distillation.moving_blobs(32)
-config = replace(test_self_distillation.TOY, epochs=2, lr=0.1, batch_norm=True)
-train_unlabelled(data, data, config, out / "dino", options, {{}})
-windows, config = toy_policies.toy_dataset(toy_policies.TOY), TrainConfig(epochs=2, batch_size=8)
-train(toy_policies.TOY, windows, windows, config, out / "policy", options, {{}})
+import test_trainer
+test_trainer.train_everything(Path(sys.argv[1]))
 """
+
+
+def train_everything(out: Path) -> None:
+    """By plain gradient descent: Adam would not show gradients that are twice too large."""
+    import test_align
+    import test_mae
+    import test_self_distillation
+    import toy_policies
+
+    def build(self: OptimizerConfig, module: nn.Module) -> torch.optim.Optimizer:
+        return torch.optim.SGD(module.parameters(), self.lr)
+
+    options, blobs = TrainerOptions(), test_mae.blobs(32, 0)
+    moving = test_self_distillation.moving_blobs(32)
+    windows, toy = toy_policies.toy_dataset(toy_policies.TOY), toy_policies.TOY
+    mae = replace(test_mae.TOY, epochs=2, lr=0.1)
+    dino = replace(test_self_distillation.TOY, epochs=2, lr=0.1, batch_norm=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OptimizerConfig, "build", build)
+        train_unlabelled(blobs, blobs, mae, out / "mae", options, {})
+        test_align.run_align(test_align.TRAIN, test_align.VAL, test_align.FakeTowers(),
+                             replace(test_align.CONFIG, lr=0.1), out / "align", {})  # fmt: skip
+        train_unlabelled(moving, moving, dino, out / "dino", options, {})
+        policy = TrainConfig(epochs=2, batch_size=8)
+        train(toy, windows, windows, policy, out / "policy", options, {})
 
 
 @pytest.mark.slow
 def test_two_processes_train_as_one(tmp_path: Path) -> None:
     script, tests = tmp_path / "worker.py", Path(__file__).parent
     script.write_text(WORKER.format(tests=str(tests)))
-    names = ("mae", "align", "dino", "policy")
-    runs = {}
-    for n in (1, 2):
-        torchrun = "-W error::FutureWarning -m torch.distributed.run --standalone".split()
-        command = [sys.executable, *torchrun, f"--nproc-per-node={n}", script, tmp_path / str(n)]
-        done = subprocess.run(
-            [str(word) for word in command],
-            env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "error::FutureWarning"},
-            capture_output=True,
+    train_everything(tmp_path / "1")
+    torchrun = "-W error::FutureWarning -m torch.distributed.run --standalone".split()
+    done = subprocess.run(
+        [sys.executable, *torchrun, "--nproc-per-node=2", str(script), str(tmp_path / "2")],
+        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "error::FutureWarning"},
+        capture_output=True,
+    )
+    assert done.returncode == 0, done.stderr.decode()[-3000:]
+    for name in ("mae", "align", "dino", "policy"):
+        one, two = (
+            torch.load(tmp_path / n / name / "checkpoint.pt", weights_only=True) for n in "12"
         )
-        assert done.returncode == 0, done.stderr.decode()[-3000:]
-        for name in names:
-            path = tmp_path / str(n) / name / "checkpoint.pt"
-            runs[name, n] = torch.load(path, weights_only=True)
-    for name in names:
-        one, two = runs[name, 1], runs[name, 2]
         for a, b in zip(one["history"], two["history"], strict=True):
             assert a["loss"] == pytest.approx(b["loss"], rel=1e-3), name
         for key, weight in one["model"].items():
