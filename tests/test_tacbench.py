@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from in_process import in_process_workers
 
 from touchgoal.benchmarks.papers.tacbench.benchmark import run
 from touchgoal.benchmarks.papers.tacbench.config import Config
@@ -47,8 +48,9 @@ STROKES = 15
 def strokes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five strokes of each probe, the last two of them after an interruption."""
     folder = tmp_path_factory.mktemp("rig") / "strokes"
-    record_bench("strokes", folder, RIG, STROKES - 2, workers=1)
-    record_bench("strokes", folder, RIG, STROKES, workers=1)
+    with in_process_workers():
+        record_bench("strokes", folder, RIG, STROKES - 2, workers=1)
+        record_bench("strokes", folder, RIG, STROKES, workers=1)
     return folder
 
 
@@ -294,7 +296,8 @@ def test_the_benchmark_judges_every_encoder(
         encoders=(name, "end-to-end:tiny"), shares=(1.0, 0.1), rig=RIG, strokes=STROKES, slides=10,
         grasps=10, cloths=10, data=strokes.parent, seeds=1, steps=3, end_to_end_steps=2, workers=1,
     )  # fmt: skip
-    result = run(options)
+    with in_process_workers():
+        result = run(options)
     force = [row for row in result["rows"] if row["task"] == "force"]
     tests = {"force": 2, "field": 2, "slip": 1, "pose": 1, "grasp": 2, "textile": 1}
     references = {"field": 2, "slip": 2}
