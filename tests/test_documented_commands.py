@@ -104,7 +104,7 @@ DEPLOYING = [
     c for c in TYPED if c.words[0] == "launch/deploy.sh" or c.words[1] in ("twin", "deploy")
 ]
 THE_JOB = "touchgoal deploy runs/twin/cell.json --execute"  # what the package is for
-CUT = 3.0  # s, of a run whose end is not the subject
+CUT = 1.0  # s, of a run whose end is not the subject
 
 
 @pytest.fixture(scope="module")
