@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
 import pytest
 
@@ -14,8 +15,8 @@ from touchgoal.runtime import worker_pool
 class _InProcess(Executor):
     """Work and results are pickled, as on their way to a process."""
 
-    def submit(self, function: Callable, /, *args: object, **kwargs: object) -> Future:
-        future, work = Future(), pickle.dumps(partial(function, *args, **kwargs))
+    def submit(self, fn: Callable, /, *args: Any, **kwargs: Any) -> Future:  # pyright: ignore
+        future, work = Future(), pickle.dumps(partial(fn, *args, **kwargs))
         try:
             future.set_result(pickle.loads(pickle.dumps(pickle.loads(work)())))
         except Exception as error:
