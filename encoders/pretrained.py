@@ -32,10 +32,7 @@ _CONFIGS: dict[str, Any] = {
 
 
 def save(
-    encoder: AnyTouchEncoder,
-    directory: Path,
-    provenance: dict[str, Any],
-    half: bool = True,
+    encoder: AnyTouchEncoder, directory: Path, provenance: dict[str, Any], half: bool = True
 ) -> None:
     """Save an encoder; an older one in the folder is replaced.
 

@@ -30,12 +30,7 @@ from touchgoal.sim_envs.cloths import CLOTHS, press_cloth
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.grasp_rig import attempt_grasp
 from touchgoal.sim_envs.indenter_rig import FPS, simulate
-from touchgoal.sim_envs.object_slides import (
-    HELD,
-    Slide,
-    simulate_catalogue_slide,
-    simulate_slide,
-)
+from touchgoal.sim_envs.object_slides import HELD, Slide, simulate_catalogue_slide, simulate_slide
 
 Recording = Literal["strokes", "slides", "catalogue slides", "grasps", "cloths"]
 """Content of a set: indenter strokes; slides of held shapes, or of pick-and-place's objects, each on another

@@ -20,12 +20,7 @@ import pyarrow.parquet as pq
 from jaxtyping import UInt8
 
 from touchgoal.episodes.format import set_files
-from touchgoal.episodes.format.encoding import (
-    EncodedEpisode,
-    data_file,
-    encode,
-    read_columns,
-)
+from touchgoal.episodes.format.encoding import EncodedEpisode, data_file, encode, read_columns
 from touchgoal.episodes.format.metadata import SetMetadata
 from touchgoal.episodes.format.repair import unlisted_files
 from touchgoal.episodes.format.set_files import Row

@@ -15,10 +15,7 @@ from touchgoal.encoders.backbones.touch_backbone import TouchBackbone
 from touchgoal.encoders.backbones.vit import patch_grid
 from touchgoal.encoders.ssl.config import DinoConfig
 from touchgoal.encoders.ssl.masks import draw_blocks
-from touchgoal.encoders.ssl.self_distillation import (
-    SelfDistillation,
-    frozen_copy,
-)
+from touchgoal.encoders.ssl.self_distillation import SelfDistillation, frozen_copy
 from touchgoal.encoders.training.trainer import gather_batch, own_rows
 
 _GLOBAL_VIEWS = 2

@@ -73,10 +73,7 @@ def train_unlabelled(
     training = Training(
         loss=model,
         n_samples=len(train),
-        batch=lambda rows, noise: {
-            "touch": train.touch[rows],
-            **noise.draw(len(rows), model.draw),
-        },
+        batch=lambda rows, noise: {"touch": train.touch[rows], **noise.draw(len(rows), model.draw)},
         optimizer=optimizer,
         identity={
             method: asdict(config),

@@ -13,11 +13,7 @@ import torch
 from jaxtyping import Float32, UInt8
 
 from touchgoal.control.tactile.sensor_models import SensorModel
-from touchgoal.encoders.backbones.pooled_encoder import (
-    FEATURES,
-    PooledEncoder,
-    PooledEncoderConfig,
-)
+from touchgoal.encoders.backbones.pooled_encoder import FEATURES, PooledEncoder, PooledEncoderConfig
 from touchgoal.encoders.whitening.covariance import inverse_square_root
 from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.tactile.rig.surface_press import press, random_pose, untouched

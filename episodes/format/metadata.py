@@ -13,24 +13,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from touchgoal.episodes.format import set_files
 from touchgoal.episodes.format.encoding import Description, index_columns
-from touchgoal.episodes.format.set_files import (
-    CHUNK,
-    DATA_PATH,
-    EPISODES,
-    INFO,
-    META_PREFIX,
-    STATS,
-    TASKS,
-    VERSION,
-    VIDEO_PATH,
-    Row,
-    file_number_of,
-    last_row,
-    load_info,
-    load_json,
-    load_table,
-)
+from touchgoal.episodes.format.set_files import Row
 from touchgoal.episodes.format.statistics import Stats, array_statistics, merge
 from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
@@ -55,7 +40,8 @@ class SetMetadata:
     @property
     def next_file_number(self) -> int:
         """Number of the next episode's files."""
-        return file_number_of(last_row(self.episodes)) + 1 if self.episodes is not None else 0
+        last = set_files.last_row(self.episodes)
+        return set_files.file_number_of(last) + 1 if last else 0
 
     def with_episode(self, description: Description, file_number: int) -> "SetMetadata":
         """Return this metadata with one more episode, whose files have number `file_number`.
@@ -84,7 +70,7 @@ class SetMetadata:
 
     def index_columns_for(self, description: Description) -> dict[str, Any]:
         """Return the index columns of an episode that would come next."""
-        before = last_row(self.episodes)
+        before = set_files.last_row(self.episodes)
         tasks = list(dict.fromkeys((*self.tasks, description.task)))
         return index_columns(
             description.length,
@@ -113,9 +99,10 @@ class SetMetadata:
             )
 
     def _row(self, description: Description, file_number: int, stats: dict[str, Stats]) -> Row:
-        before = last_row(self.episodes)
+        before = set_files.last_row(self.episodes)
         first = before["dataset_to_index"] if before else 0
-        place = {"chunk_index": file_number // CHUNK, "file_index": file_number % CHUNK}
+        chunk, file = divmod(file_number, set_files.CHUNK)
+        place = {"chunk_index": chunk, "file_index": file}
         row: Row = {
             "episode_index": before["episode_index"] + 1 if before else 0,
             "tasks": [description.task],
@@ -130,35 +117,35 @@ class SetMetadata:
             times = {"from_timestamp": 0.0, "to_timestamp": description.length / self.fps}
             values = {**place, **times, "crc32": crc32}
             row |= {f"videos/{key}/{name}": value for name, value in values.items()}
-        row |= {META_PREFIX + name: value for name, value in description.meta.items()}
+        row |= {set_files.META_PREFIX + name: value for name, value in description.meta.items()}
         for key, values in stats.items():
             row |= {f"stats/{key}/{name}": value for name, value in values.items()}
         return row
 
     def write(self, root: Path) -> None:
         """Write all of meta/, each file atomically and info.json, which commits, last."""
-        write_file(root / EPISODES, _parquet(self.episodes))
-        write_file(root / STATS, _json(self.stats))
-        write_file(root / TASKS, _parquet(_tasks_table(self.tasks)))
-        write_file(root / INFO, _json(self.info()))
+        write_file(root / set_files.EPISODES, _parquet(self.episodes))
+        write_file(root / set_files.STATS, _json(self.stats))
+        write_file(root / set_files.TASKS, _parquet(_tasks_table(self.tasks)))
+        write_file(root / set_files.INFO, _json(self.info()))
 
     def info(self) -> dict[str, Any]:
         """Return the content of info.json."""
-        last = last_row(self.episodes)
+        last = set_files.last_row(self.episodes)
         videos = any(feature["dtype"] == "video" for feature in self.features.values())
         return {
-            "codebase_version": VERSION,
+            "codebase_version": set_files.VERSION,
             "robot_type": None,
             "fps": self.fps,
             "features": self.features,
             "total_episodes": last["episode_index"] + 1,
             "total_frames": last["dataset_to_index"],
             "total_tasks": len(self.tasks),
-            "chunks_size": CHUNK,
+            "chunks_size": set_files.CHUNK,
             "data_files_size_in_mb": 100,
             "video_files_size_in_mb": 200,
-            "data_path": DATA_PATH,
-            "video_path": VIDEO_PATH if videos else None,
+            "data_path": set_files.DATA_PATH,
+            "video_path": set_files.VIDEO_PATH if videos else None,
             "splits": {"train": f"0:{last['episode_index'] + 1}"},
         }
 
@@ -168,13 +155,13 @@ class SetMetadata:
 
         UserError: no set, an unknown version, or a file that cannot be read.
         """
-        info = load_info(root)
+        info = set_files.load_info(root)
         return cls(
             fps=info["fps"],
             features=info["features"],
-            tasks=tuple(load_table(root, TASKS)["task"].to_pylist()),
-            stats=load_json(root, STATS),
-            episodes=load_table(root, EPISODES),
+            tasks=tuple(set_files.load_table(root, set_files.TASKS)["task"].to_pylist()),
+            stats=set_files.load_json(root, set_files.STATS),
+            episodes=set_files.load_table(root, set_files.EPISODES),
         )
 
 
@@ -199,7 +186,7 @@ def _differing_meta(row: Row, schema: pa.Schema) -> list[str]:
     same = {
         n for n in {*ours.names} & {*schema.names} if ours.field(n).type == schema.field(n).type
     }
-    return sorted(name.removeprefix(META_PREFIX) for name in names - same)
+    return sorted(name.removeprefix(set_files.META_PREFIX) for name in names - same)
 
 
 def _schema(row: Row) -> pa.Schema:

@@ -112,11 +112,7 @@ def _start_from_hand(
     cos, sin = turned[..., 0], turned[..., 1]
     cos, sin = cos * cos - sin * sin, 2 * cos * sin  # of twice the hand's yaw
     yaw = torch.stack(
-        [
-            start[..., 3] * cos + start[..., 4] * sin,
-            start[..., 4] * cos - start[..., 3] * sin,
-        ],
-        -1,
+        [start[..., 3] * cos + start[..., 4] * sin, start[..., 4] * cos - start[..., 3] * sin], -1
     )
     there, height = (start[..., :2] - hand[..., :2]) * (1 - held), start[..., 2:3] - hand[..., 2:]
     goal, yaw = (start[..., 5:] - hand[..., :2]) * held, yaw * (1 - held)
