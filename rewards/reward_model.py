@@ -53,8 +53,6 @@ def load_reward_model(
     """Check the goals, load the encoders, and choose the normalizer.
 
     Args:
-        encoder: see `load_embedder`.
-        towers: see `load_embedder`.
         normalizer: a file of `fit-normalizer`, one already read, "encoder" for the one in the touch
             encoder's folder, "none" for raw distances, or None for the encoder's one if it was
             fitted on trajectories of this scene, else raw distances.

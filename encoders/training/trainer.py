@@ -53,12 +53,6 @@ class OptimizerConfig:
     # weight decay at the end, reached by a cosine; None keeps it constant
     final_weight_decay: float | None = None
 
-    def __post_init__(self) -> None:
-        if self.epochs < 1 or self.batch_size < 1:
-            raise UserError("training needs at least 1 epoch and a batch size of at least 1")
-        if not (math.isfinite(self.lr) and self.lr > 0 and self.weight_decay >= 0):
-            raise UserError("training needs a learning rate above 0 and weight decay of at least 0")
-
     def build(self, module: nn.Module) -> torch.optim.Optimizer:
         """Return the optimizer of a module's parameters."""
         kind = torch.optim.AdamW if self.decoupled_weight_decay else torch.optim.Adam
