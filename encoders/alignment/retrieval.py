@@ -69,11 +69,7 @@ def _retrieve(
     belongs: Bool[Tensor, "k m"],
     own: Int[Tensor, " n"],
 ) -> dict[str, float]:
-    """Return both metrics of one modality.
-
-    `belongs` says which candidates of the gallery belong to which object; `own` is the candidate
-    that a touch must not find, -1 for none.
-    """
+    """Return both metrics of one modality; a touch must not find the candidate `own` (or -1)."""
     relevant = belongs[label] & (torch.arange(len(gallery)) != own[:, None])
     asked = relevant.any(1)
     touch, label, own, relevant = touch[asked], label[asked], own[asked], relevant[asked]

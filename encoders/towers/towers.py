@@ -192,11 +192,7 @@ def _normalised(pixels: Tensor, mean: tuple[float, ...], std: tuple[float, ...])
 def _on_all_cores(
     embed: Callable[[np.ndarray], Tensor], images: np.ndarray, width: int, size: int
 ) -> Tensor:
-    """Embed batches in parallel, each on one core.
-
-    A network of many small layers on several torch threads waits for the slowest at each layer: on
-    a shared machine 8 times as long as on one thread.
-    """
+    """Embed batches each on one core: torch's threads would wait for the slowest at each layer."""
     threads = torch.get_num_threads()
     if threads == 1 or len(images) <= size:
         return _in_batches(embed, images, width, size)
