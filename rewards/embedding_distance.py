@@ -334,10 +334,7 @@ def _unit(embeddings: torch.Tensor) -> Float32[np.ndarray, "n d"]:
 
 
 def _weights_hash(encoder: AnyTouchEncoder) -> str:
-    """Return a short hash of weights and preprocessor, equal wherever the encoder was loaded from.
-
-    Saving rounds the weights, so a normalizer is fitted with an encoder loaded from disk.
-    """
+    """Return a short hash of weights and preprocessor, whatever folder they were loaded from."""
     digest = hashlib.sha256(encoder.config.preprocessor.encode())
     for name, weight in sorted(encoder.state_dict().items()):
         digest.update(name.encode())

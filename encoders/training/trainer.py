@@ -293,10 +293,7 @@ def check_device(device: str) -> None:
 
 
 def _accelerator(device: str) -> Accelerator:
-    """Return an Accelerator for a device.
-
-    Accelerate fixes device and precision for the life of a process, so bfloat16 is left to autocast.
-    """
+    """Return an Accelerator; it fixes a process's precision, so autocast sees to bfloat16."""
     check_device(device)
     kind, _, index = device.partition(":")
     if index:

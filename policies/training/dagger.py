@@ -69,11 +69,7 @@ def dagger_roles(policy: str | None, task: TaskConfig, feedback: bool) -> Dagger
 
 
 class _NearlyTrueState:
-    """The simulator's truth, with an error that stays for an episode as a pose estimator's does.
-
-    A policy that acts on the exact truth never reaches the states to which its estimates will lead
-    it.
-    """
+    """The simulator's truth, with an error that stays for an episode as a pose estimator's does."""
 
     def __init__(self, env: PickPlace) -> None:
         self._env = env

@@ -19,11 +19,7 @@ __version__ = "0.1.0"
 
 
 def _headless_opengl() -> str:
-    """Return MuJoCo's platform without a screen: EGL, or none if its libraries are not installed.
-
-    Otherwise `import mujoco` itself fails on such a machine. With "disable" only rendering fails,
-    with a message that names the packages to install (`sim_envs/scene/rendering.py`).
-    """
+    """Return MuJoCo's platform without a screen: EGL, or without its libraries no rendering."""
     try:
         ctypes.CDLL("libEGL.so.1")
         ctypes.CDLL("libGL.so.1")
