@@ -71,8 +71,8 @@ def _draw_bars(axis: Axes, rows: list[dict[str, Any]], task: str, test: str, sen
         axis.axhline(row[measure], color="0.3", linewidth=0.9, linestyle=":")
         place, side = ((len(shares) - 0.55, "right"), (-0.45, "left"))[k % 2]
         box = {"facecolor": "w", "alpha": 0.7, "edgecolor": "none", "pad": 0.5}
-        style = {"fontsize": 7, "ha": side, "va": "bottom", "bbox": box, "zorder": 5}
-        axis.text(place, row[measure], row["encoder"], **style)
+        style: dict[str, Any] = {"fontsize": 7, "ha": side, "va": "bottom", "zorder": 5}
+        axis.text(place, row[measure], row["encoder"], bbox=box, **style)
     if not LAYOUTS[task].less_is_better:  # an explained share may be far below 0
         axis.set_ylim(max(axis.get_ylim()[0], -0.5), 1.02)
     _draw_published(axis, shares, task, sensor)
