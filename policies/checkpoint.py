@@ -66,7 +66,7 @@ class SavedPolicy:
 
     def __call__(self, env: FrankaTactileEnv | None = None) -> LearnedPolicy:
         """Return the policy at an episode's beginning; its plans come as late as `env` says."""
-        network, touch, estimator = self._parts()
+        network, touch, estimator = _load_parts(self.directory, _stamp(self.directory))
         plan_ticks = max(self.plan_ticks, env.plan_ticks if env else 0)
         return LearnedPolicy(network, touch, estimator, plan_ticks, self.directory)
 
@@ -76,10 +76,7 @@ class SavedPolicy:
 
     def network(self) -> PolicyNetwork:
         """Return the network alone."""
-        return self._parts()[0]
-
-    def _parts(self) -> tuple[PolicyNetwork, TouchEmbedder | None, StateEstimator | None]:
-        return _load_parts(self.directory, _stamp(self.directory))
+        return _load_network(self.directory, _stamp(self.directory))
 
 
 _Stamp = tuple[tuple[str, int, int], ...]
@@ -92,10 +89,15 @@ def _stamp(directory: Path) -> _Stamp:
 
 
 @lru_cache(maxsize=4)
+def _load_network(directory: Path, stamp: _Stamp) -> PolicyNetwork:
+    return load(directory)
+
+
+@lru_cache(maxsize=4)
 def _load_parts(
     directory: Path, stamp: _Stamp
 ) -> tuple[PolicyNetwork, TouchEmbedder | None, StateEstimator | None]:
-    network = load(directory)
+    network = _load_network(directory, stamp)
     config = network.config
     with torch.random.fork_rng(devices=[]):
         touch = load_touch_of(directory / TOUCH, config.touch) if config.touch_dim else None

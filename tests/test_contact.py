@@ -1,7 +1,13 @@
+"""Contact on gels, touches picked from episodes, and MuJoCo's own contact forces as the oracle."""
+
+from pathlib import Path
+
 import cv2
+import mujoco
 import numpy as np
 import pytest
 
+from touchgoal.control import features as ft
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import (
     THRESHOLD,
@@ -10,6 +16,13 @@ from touchgoal.control.tactile.contact import (
     detect_contact,
     threshold_for,
 )
+from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.episodes.touches import collect_touches
+from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.bead_maze import BeadMaze
+from touchgoal.sim_envs.config import BeadMazeConfig
+from touchgoal.sim_envs.scene.build import SIDES
 
 HEIGHT, WIDTH = 240, 320
 Y, X = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
@@ -114,3 +127,100 @@ def test_two_touched_frames_among_the_first_five_leave_the_threshold() -> None:
     background = background_of(frames)
     threshold = threshold_for(frames, background)
     assert detect_contact(frames, background, threshold).tolist() == (height > 0).tolist()
+
+
+def test_wrenches_and_slip_are_mujocos() -> None:
+    env = BeadMaze(BeadMazeConfig(cameras=(), tactile=False))
+    env.reset(seed=3)
+    for turn in [0.0] * 11 + [
+        0.004
+    ] * 4:  # rad a tick: across the wire, until the bead slips in the fingers
+        env.step(np.append(np.full(env.n_joints, turn), 0.0))
+    model, data = env.model, env.data
+    external = np.zeros(6)
+    tcp = data.site("tcp").xpos
+    for pad, side in zip(env.pad_contacts(), SIDES, strict=True):
+        site, geom = data.site(f"{side}_sensor"), model.geom(f"{side}_pad").id
+        wrench, fastest, others = np.zeros(6), 0.0, set()
+        for i in range(data.ncon):
+            contact = data.contact[i]
+            if geom not in contact.geom or contact.efc_address < 0:
+                continue
+            towards = 1.0 if contact.geom[1] == geom else -1.0
+            felt = np.zeros(6)
+            mujoco.mj_contactForce(model, data, i, felt)
+            force, torque = towards * felt.reshape(2, 3) @ contact.frame.reshape(3, 3)
+            wrench[:3] += force
+            wrench[3:] += torque + np.cross(contact.pos - site.xpos, force)
+            external[:3] += force
+            external[3:] += torque + np.cross(contact.pos - tcp, force)
+            sliding = np.diff([_velocity(env, g, contact.pos) for g in contact.geom], axis=0)[0]
+            normal = contact.frame[:3]
+            fastest = max(fastest, float(np.linalg.norm(sliding - normal * (normal @ sliding))))
+            others |= set(contact.geom.tolist()) - {geom}
+        local = wrench.reshape(2, 3) @ site.xmat.reshape(3, 3)
+        np.testing.assert_allclose([pad.force, pad.torque], local, atol=1e-9)
+        assert pad.slip_speed == pytest.approx(fastest, abs=1e-9)
+        assert pad.geoms == others and others
+    assert max(pad.slip_speed for pad in env.pad_contacts()) > 1e-3  # m/s
+    # The wire touches no more of the robot than its bead.
+    np.testing.assert_allclose(env.external_wrench(), external, atol=1e-9)
+
+
+def _velocity(env: BeadMaze, geom: int, point: np.ndarray) -> np.ndarray:
+    """Of a point (m, world frame) fixed to a geom, m/s."""
+    twist, body = np.zeros(6), env.model.geom_bodyid[geom]
+    mujoco.mj_objectVelocity(env.model, env.data, mujoco.mjtObj.mjOBJ_XBODY, body, twist, 0)
+    return twist[3:] + np.cross(twist[:3], point - env.data.xpos[body])
+
+
+def touch_episode(seed: int, truth: bool) -> Episode:
+    """Contact from frame 20 on the left and 25 on the right; none at all in episode 2."""
+    n, rng = 40, np.random.default_rng(seed)
+    y, x = np.mgrid[:96, :128]
+    bump = np.exp(-((x - 60) ** 2 + (y - 50) ** 2) / 200)[..., None] * [30, -20, 10]
+    contact = np.arange(n)[:, None] >= [20, 25] if seed != 2 else np.zeros((n, 2), bool)
+    frames: dict[str, np.ndarray] = {}
+    frames[ft.WRIST] = np.tile(np.arange(n, dtype=np.uint8)[:, None, None, None] * 6, (16, 16, 3))
+    for side, key in enumerate(ft.TACTILE):
+        gel = 100 + 20 * seed + 5 * side + rng.normal(0, 1, (n, 96, 128, 3))
+        frames[key] = (gel + contact[:, side, None, None, None] * bump).astype(np.uint8)
+    if truth:
+        frames[ft.TRUTH_CONTACT] = contact
+    descriptions = [f"feels like {seed}", "hard"]
+    return Episode(frames, "touch", {"object": f"thing_{seed}", "descriptions": descriptions})
+
+
+@pytest.mark.parametrize("truth", [True, False])
+def test_touches(tmp_path: Path, truth: bool) -> None:
+    writer = EpisodeWriter(tmp_path)
+    for seed in range(3):
+        writer.append(touch_episode(seed, truth))
+    episodes = EpisodeSet(tmp_path)
+    touches = collect_touches(
+        episodes, contact_frames_per_episode=8, no_contact_frames_per_episode=3, seed=0
+    )
+    assert len(touches) == 2 * (8 + 3) + 3
+    assert [touches.object.count(name) for name in ("thing_0", "thing_1", "")] == [8, 8, 9]
+    assert len(touches.background) == 2 * len(touches.view) == 6
+    assert touches.descriptions["thing_1"] == ["feels like 1", "hard"]
+    bumped = touches.frames.astype(int) - touches.background[touches.background_index]
+    touched = bumped[:, 50, 60, 0] > 15
+    assert touched.tolist() == [name != "" for name in touches.object]
+    assert np.abs(bumped[~touched].mean(axis=(1, 2, 3))).max() < 2, "the background is its own"
+    # the last frame before contact is 19; five frames earlier the wrist picture is 14 * 6 bright
+    assert touches.view[:2].mean(axis=(1, 2, 3)) == pytest.approx(14 * 6, abs=3)
+    np.testing.assert_array_equal(touches.view_index, touches.background_index // 2)
+    again = collect_touches(episodes, 8, 3, seed=0)
+    np.testing.assert_array_equal(again.frames, touches.frames)
+    assert (collect_touches(episodes, 8, 3, seed=1).frames != touches.frames).any()
+
+
+def test_touches_need_touch_and_names(tmp_path: Path) -> None:
+    episode = touch_episode(2, truth=True)
+    EpisodeWriter(tmp_path / "untouched").append(episode)
+    with pytest.raises(UserError, match="has no contact"):
+        collect_touches(EpisodeSet(tmp_path / "untouched"), 8, 3, seed=0)
+    EpisodeWriter(tmp_path / "unnamed").append(Episode(episode.frames, "touch", {}))
+    with pytest.raises(UserError, match="lacks meta descriptions, object"):
+        collect_touches(EpisodeSet(tmp_path / "unnamed"), 8, 3, seed=0)

@@ -266,6 +266,7 @@ def test_the_policy_is_loaded_once_and_before_anything_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loaded, load = [], checkpoint.load
+    checkpoint._load_network.cache_clear()
     checkpoint._load_parts.cache_clear()
     monkeypatch.setattr(checkpoint, "load", lambda *a, **k: loaded.append(a) or load(*a, **k))
     tips = 'fingertips = { sensor = "gelsight_mini", left = "", right = "" }\n'

@@ -180,6 +180,7 @@ def test_evaluation_leaves_torch_alone_and_reads_weights_once(
     monkeypatch.setattr(
         WeightsFormat, "load_weights", lambda f, *a: read.append(f.stem) or load_weights(f, *a)
     )
+    checkpoint._load_network.cache_clear()
     checkpoint._load_parts.cache_clear()
     threads, state = torch.get_num_threads(), torch.get_rng_state()
     torch.set_num_threads(threads + 1)

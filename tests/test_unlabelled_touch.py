@@ -1,4 +1,4 @@
-"""What trainings without labels learn from: several folders of several kinds, none of it held out."""
+"""What trainings read: folders of touch without labels, none of it held out; what makes data unfit."""
 
 import csv
 from dataclasses import replace
@@ -8,11 +8,26 @@ import numpy as np
 import pytest
 import torch
 from published_files import encoded, gel, write, write_slides
+from toy_episodes import FPS, make_episode
+from toy_policies import TOY, toy_observations
 
+from touchgoal.control import features as ft
+from touchgoal.control.deployment.realtime import RealTimeActor
+from touchgoal.encoders.backbones.touch_backbone import BATCH, TouchBackbone, TouchBackboneConfig
+from touchgoal.encoders.backbones.vit import PRESETS, ViTConfig
+from touchgoal.encoders.preprocess import preprocessor_for
+from touchgoal.encoders.pretrained import load_encoder, save
 from touchgoal.encoders.ssl.config import DINO_PRESETS
 from touchgoal.encoders.ssl.unlabelled_touch import open_touch
 from touchgoal.episodes.media import write_video
+from touchgoal.episodes.overlap import require_no_shared_frames
+from touchgoal.episodes.schema import Episode
+from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.launch.__main__ import read_options
+from touchgoal.policies.acting import LearnedPolicy
+from touchgoal.policies.network import PolicyNetwork
+from touchgoal.policies.perception.frozen_touch import TouchEmbedder
+from touchgoal.policies.training.training_data import leading_pause
 from touchgoal.runtime.errors import UserError
 
 SPLITS = "train", "unlabelled", "val", "test"
@@ -104,3 +119,125 @@ def test_a_preset_sets_defaults_that_options_override() -> None:
     assert config.dino == replace(DINO_PRESETS["paper"], epochs=3)
     _, config = read_options("train-encoder", ["dino", "--data", "x"])
     assert config.dino == DINO_PRESETS["default"]
+
+
+def write_set(root: Path, episodes: list[Episode]) -> EpisodeSet:
+    writer = EpisodeWriter(root, FPS)
+    for episode in episodes:
+        writer.append(episode)
+    return EpisodeSet(root)
+
+
+def part(episode: Episode, keys: tuple[str, ...], rows: slice = slice(None)) -> Episode:
+    return Episode({key: episode.frames[key][rows] for key in keys}, episode.task)
+
+
+@pytest.mark.parametrize(
+    "keys", [(ft.STATE, ft.ACTION), (ft.TACTILE_LEFT,)], ids=["state", "touch"]
+)
+def test_validation_frames_that_are_trained_on_are_refused(tmp_path: Path, keys) -> None:
+    whole = [part(make_episode(seed, 20), keys) for seed in range(4)]
+    train = write_set(tmp_path / "a", whole[:3])
+    require_no_shared_frames(train, write_set(tmp_path / "b", whole[3:]))
+    reordered = [whole[3], part(make_episode(1, 20), keys, slice(None, None, -2))]
+    with pytest.raises(UserError, match="episode 1 of .* shares 10 frames with episode 1 of"):
+        require_no_shared_frames(train, write_set(tmp_path / "c", reordered))
+
+
+def test_a_common_resting_start_is_no_overlap(tmp_path: Path) -> None:
+    episodes = [part(make_episode(seed, 40), (ft.STATE, ft.ACTION)) for seed in range(2)]
+    for episode in episodes:
+        episode.frames[ft.STATE][:15] = 0.5
+    train, validation = (write_set(tmp_path / str(i), [e]) for i, e in enumerate(episodes))
+    require_no_shared_frames(train, validation)
+
+
+def test_a_pause_at_the_start_is_found() -> None:
+    state, action = np.zeros((30, 15), np.float32), np.zeros((30, 8), np.float32)
+    action[:, 7], state[:, 14] = 0.08, 0.08
+    state[:, 0] += np.random.default_rng(0).normal(0, 1e-4, 30)  # encoder noise is no motion
+    still = Episode({ft.STATE: state, ft.ACTION: action}, "wait")
+    moving = Episode({ft.STATE: state.copy(), ft.ACTION: action.copy()}, "wait, then go")
+    moving.frames[ft.ACTION][12:, 1] = 0.01
+    closing = Episode({ft.STATE: state, ft.ACTION: action.copy()}, "wait, then close")
+    closing.frames[ft.ACTION][5:, 7] = 0.0
+    assert [leading_pause(episode) for episode in (still, moving, closing)] == [0, 12, 5]
+
+
+STRIDE = 3
+PAIR = replace(PRESETS["tiny"], channels=6)
+CLIP = replace(PRESETS["tiny"], width=48, tubelet=2, frames=4)
+
+
+def backbone(vit: ViTConfig) -> TouchBackbone:
+    torch.manual_seed(0)
+    return TouchBackbone(TouchBackboneConfig.for_sensor(vit, "gelsight_mini", STRIDE)).eval()
+
+
+def pictures(n: int) -> np.ndarray:
+    return np.random.default_rng(0).integers(80, 120, (n, 6, 8, 3), np.uint8)
+
+
+@torch.no_grad()
+def by_hand(encoder: TouchBackbone, frames: np.ndarray, i: int) -> np.ndarray:
+    """What is felt at frame i, the newest frame first; the first frame stands for those before it."""
+    preprocess, clip = preprocessor_for("gelsight_mini"), encoder.config.vit.tubelet > 1
+    seen = [preprocess(frames[max(i - STRIDE * k, 0)][None], frames[0])[0] for k in range(4)]
+    touch = np.stack(seen, 1) if clip else np.concatenate(seen[:2])
+    return encoder.vit(torch.from_numpy(touch)[None])[0].mean(0).numpy()
+
+
+@pytest.mark.parametrize("vit", [PAIR, CLIP], ids=["two frames", "clip of four"])
+def test_recorded_frames_are_embedded_with_their_past(vit: ViTConfig, tmp_path: Path) -> None:
+    encoder, frames = backbone(vit), pictures(BATCH + 4)
+    found = encoder.embed_frames(frames, frames[0])
+    for i in (0, 2, 5, BATCH - 1, BATCH, BATCH + 3):
+        np.testing.assert_allclose(found[i], by_hand(encoder, frames, i), atol=1e-5)
+    some = encoder.embed_frames(frames, frames[0], np.array([40, 7, 7]))
+    np.testing.assert_allclose(some, found[[40, 7, 7]], atol=1e-5)
+    save(encoder, tmp_path, {}, half=False)
+    np.testing.assert_allclose(load_encoder(tmp_path).embed(frames), found, atol=1e-5)
+
+
+@pytest.mark.parametrize("vit", [PRESETS["tiny"], PAIR, CLIP], ids=["one", "two", "clip"])
+@pytest.mark.parametrize("real_time", [False, True])
+def test_a_policy_feels_what_its_training_did(vit: ViTConfig, real_time: bool) -> None:
+    """Also between plans, when nobody asks: the past is what was observed, not what was embedded."""
+    touch, ticks = TouchEmbedder(backbone(vit), "toy"), toy_observations(14)
+    config = replace(TOY, touch_dim=touch.dim, execution_horizon=4)
+    planner, felt = LearnedPolicy(PolicyNetwork(config).eval(), touch), {}
+    embed = planner._embed_touch
+
+    def watched(history):
+        rows = embed(history)
+        felt[float(history[-1][ft.STATE][0])] = rows
+        return rows
+
+    planner._embed_touch = watched
+    actor = RealTimeActor(planner, timeout=10.0) if real_time else planner
+    for tick in ticks:
+        actor.act(dict(tick))
+    if isinstance(actor, RealTimeActor):
+        actor.close()
+    frames = {key: np.stack([tick[key] for tick in ticks]) for key in ft.TACTILE}
+    sides = [touch.encoder.embed_frames(frames[key], frames[key][0]) for key in ft.TACTILE]
+    recorded = np.concatenate(sides, 1)
+    known = {float(tick[ft.STATE][0]): i for i, tick in enumerate(ticks)}
+    assert len(felt) >= 6 and max(known[key] for key in felt) > 2 * STRIDE
+    for key, rows in felt.items():
+        np.testing.assert_allclose(rows, recorded[known[key]], atol=1e-5)
+
+
+def test_no_frame_is_preprocessed_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    touch, ticks = TouchEmbedder(backbone(CLIP), "toy"), toy_observations(12)
+    made, preprocess = [], touch._recent[ft.TACTILE_LEFT]._preprocess
+
+    def counted(frames, background):
+        made.append(frames)
+        return preprocess(frames, background)
+
+    for recent in touch._recent.values():
+        monkeypatch.setattr(recent, "_preprocess", counted)
+    for i in range(len(ticks)):
+        touch.embed_tick(ticks[max(i - touch.reach, 0) : i + 1], ticks[0])
+    assert len(made) == 2 * len(ticks)
