@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from touchgoal.control.tactile.sensor_calibration import load, shade
 from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT, GELSIGHT_MINI, SensorModel
@@ -20,7 +19,6 @@ from touchgoal.sim_envs.config import NO_RANDOMIZATION, PickPlaceConfig, SensorR
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.scene.objects import CATALOGUE, Body
-from touchgoal.sim_envs.tactile import batched
 from touchgoal.sim_envs.tactile.geometry import (
     BOX,
     CAPSULE,
@@ -166,33 +164,6 @@ def test_fast_picture_is_the_reference_formula_s() -> None:
     assert np.abs(slow - INSTANCE.calibration.background).max() > 40
     error = np.abs(fast - slow)
     assert error.mean() < 0.6 and np.quantile(error, 0.999) < 6
-
-
-@pytest.mark.parametrize("sensor", [MINI, DIGIT])
-def test_torch_gives_the_same_picture_and_its_gradient(sensor: SensorModel) -> None:
-    instance = sample_instance(sensor, np.random.default_rng(0))
-    instance = replace(instance, noise=np.zeros_like(instance.noise))
-    bench = PressBench(Body(CATALOGUE["golf_ball"], (0.01,), 0.1), sensor, instance)
-    bench.place(np.array([1e-3, 0, 0.01]))
-    frame = bench.sense(8.0, np.random.default_rng(0))
-    overlap = torch.tensor(frame.overlap[None], requires_grad=True)
-    batched_surface = batched.deform(
-        overlap, 2 * instance.pixel_pitch, instance.calibration.blur_sigmas
-    )
-    assert np.abs(batched_surface.detach().numpy()[0] - frame.surface).max() < 1e-7  # 0.1 um
-    picture = batched.render(overlap, instance)
-    planes = np.moveaxis(frame.image, -1, 0)
-    assert np.abs(picture.detach().numpy()[0] - planes).max() < 0.7  # counts
-    picture[0, :, 80:160, 60:180].sum().backward()
-    assert overlap.grad is not None and torch.isfinite(overlap.grad).all()
-    # Pushing one point of the object deeper changes the picture as the gradient says.
-    exact = overlap.detach().double()
-    place = tuple(int(i) for i in np.unravel_index(frame.overlap.argmax(), frame.overlap.shape))
-    step = torch.zeros_like(exact)
-    step[0, place[0], place[1]] = 1e-8
-    up, down = (batched.render(exact + s * step, instance)[0, :, 80:160, 60:180] for s in (1, -1))
-    slope = float((up - down).sum()) / 2e-8
-    assert float(overlap.grad[0][place]) == pytest.approx(slope, rel=0.02)
 
 
 def test_softer_objects_press_wider_and_shallower() -> None:
