@@ -14,7 +14,6 @@ from touchgoal.control.cell import twin_client
 from touchgoal.control.sensors.load_cell import parse
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze
-from touchgoal.sim_envs.cell.in_process import SimulatedArm
 from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig
 from touchgoal.sim_envs.pick_place import PickPlace
@@ -64,10 +63,10 @@ def test_the_estimate_of_force_errs_as_a_real_arms_and_repeats() -> None:
     def felt(wrench_error: bool, seed: int) -> np.ndarray:
         env = PickPlace(PickPlaceConfig(cameras=(), tactile=False))
         cell = SimulatedCell(env, seed, wrench_error)
-        arm, wrenches = SimulatedArm(cell, 20), []
+        wrenches = []
         for _ in range(100):
             cell.step()
-            wrenches.append(arm.read().wrench)
+            wrenches.append(cell.env.external_wrench() + cell.wrench_error)
         return np.array(wrenches)
 
     seeds = [felt(True, seed) for seed in range(6)]

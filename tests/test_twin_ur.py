@@ -48,18 +48,9 @@ def drives(address: str) -> dict:
     time.sleep(0.5)
     control.speedStop()
     said["speed"] = (at() - start).tolist()
-    above, pose = at(), receive.getActualTCPPose()
+    pose = receive.getActualTCPPose()
     control.moveL([*pose[:2], pose[2] - 0.05, *pose[3:]], 0.2, 0.5)
     said["line"] = (np.array(receive.getActualTCPPose())[:3] - pose[:3]).tolist()
-    control.moveJ_IK(pose, 1.0, 2.0)
-    said["back"] = float(np.abs(at() - above).max())
-    inverse = control.getInverseKinematics(pose, start.tolist())
-    said["inverse"] = float(np.abs(np.array(inverse) - above).max())
-    forward = control.getForwardKinematics(at().tolist(), control.getTCPOffset())
-    said["forward"] = float(np.abs(np.array(forward) - receive.getActualTCPPose())[:3].max())
-    said["inside"] = [
-        control.isJointsWithinSafetyLimits(q) for q in ([0.0] * 6, [0, 0, 4, 0, 0, 0])
-    ]
     control.setWatchdog(10)
     for _ in range(10):
         control.kickWatchdog()
@@ -77,8 +68,6 @@ def test_ur_moves_servoes_and_watches(ur5e: RunningTwin) -> None:
         assert taken and worst < 0.1  # rad behind a goal at 0.2 rad/s, on a loaded machine
     assert said["speed"][0] > 0.05 and np.abs(said["speed"][1:]).max() < 2e-3
     np.testing.assert_allclose(said["line"], [0, 0, -0.05], atol=2e-3)
-    assert said["back"] < 2e-3 and said["inverse"] < 2e-3
-    assert said["forward"] < 1e-3 and said["inside"] == [True, False]
     assert said["kicked"] and not said["silent"]
     assert ur5e.ask("truth")["worst"]["excess"] <= 0
 

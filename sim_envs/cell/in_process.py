@@ -34,35 +34,31 @@ from touchgoal.sim_envs.twin.cell_task import env_config_of
 _HELD_FORCE = 0.5  # N on both pads that mean something is held
 
 
-class SimulatedClock:
-    """Clock of a simulated cell; waiting advances the cell and its arm."""
+class _Clock:
+    """Waiting advances the cell and its arm."""
 
-    def __init__(self, cell: SimulatedCell, arm: "SimulatedArm") -> None:
+    def __init__(self, cell: SimulatedCell, arm: "_Arm") -> None:
         self._cell, self._arm = cell, arm
         self._next_step_at = time.monotonic()
 
     def now(self) -> float:
-        """Return simulated time, s."""
         return self._cell.time
 
     def age(self, stamp: float) -> float:
-        """See Clock."""
         return self._cell.time - stamp
 
     def wait(self, until: float) -> None:
-        """Let the cell go on until then."""
         begin = self._cell.time
         while self._cell.time < until - DT / 2:
             self._arm.step()
             self._cell.step()
         self._cell.env.update_contacts()
-        self._next_step_at = (
-            max(self._next_step_at, time.monotonic() - 1.0) + self._cell.time - begin
-        )
+        earliest = time.monotonic() - 1.0
+        self._next_step_at = max(self._next_step_at, earliest) + self._cell.time - begin
         time.sleep(max(0.0, self._next_step_at - time.monotonic()))
 
 
-class SimulatedArm:
+class _Arm:
     """Arm interface of the cell; targets pass the tracker, as with the real drivers."""
 
     def __init__(self, cell: SimulatedCell, hz: float) -> None:
@@ -72,7 +68,6 @@ class SimulatedArm:
         self._refused_because = ""
 
     def read(self) -> ArmReading:
-        """See Arm."""
         cell = self._cell
         return ArmReading(
             q=cell.q.copy(),
@@ -85,7 +80,6 @@ class SimulatedArm:
         )
 
     def command(self, q: Joints) -> None:
-        """See Arm."""
         if self._refused_because:
             raise DriverError(f"no command is taken: {self._refused_because}")
         limits = self._limits
@@ -96,19 +90,15 @@ class SimulatedArm:
         self._state = self._tracker.set_target(self._state, q)
 
     def stop(self) -> None:
-        """See Arm."""
         self._state = None
-        self._refused_because = (
-            self._refused_because or f"{STOPPED_ON_REQUEST}; recover the arm to go on"
-        )
+        if not self._refused_because:
+            self._refused_because = f"{STOPPED_ON_REQUEST}; recover the arm to go on"
         self._cell.brake(self._limits.acceleration)
 
     def recover(self) -> None:
-        """See Arm."""
         self._refused_because = ""
 
     def close(self) -> None:
-        """See Arm."""
         self.stop()
 
     def step(self) -> None:
@@ -120,7 +110,7 @@ class SimulatedArm:
         self._cell.set_target(self._state.q, (self._state.q - before) / DT)
 
 
-class SimulatedGripper:
+class _Gripper:
     """Gripper interface of the cell; it closes with `force` (N)."""
 
     def __init__(self, cell: SimulatedCell, force: float) -> None:
@@ -128,19 +118,17 @@ class SimulatedGripper:
         self._stopped = False
 
     def read(self) -> GripperReading:
-        """See Gripper."""
         env = self._cell.env
         held = min(pad.normal_force for pad in env.pad_contacts()) > _HELD_FORCE
         return GripperReading(env.width(), held, "", self._cell.time)
 
     def command(self, width: float) -> None:
-        """See Gripper."""
         if self._stopped:
             raise DriverError("no command is taken: the gripper was stopped")
         self._go(width)
 
     def stop(self, release_to: float | None = None) -> None:
-        """See Gripper; a held object stays pressed."""
+        # A held object stays pressed.
         cell = self._cell
         if release_to is not None:
             self._go(release_to)
@@ -149,45 +137,34 @@ class SimulatedGripper:
         self._stopped = True
 
     def close(self) -> None:
-        """See Gripper."""
+        pass
 
     def _go(self, width: float) -> None:
         self._cell.command_gripper(width, self._cell.env.robot.tool.speed, self._force)
 
 
-class SimulatedCamera:
+class _Camera:
     """Camera interface of the cell; an image is rendered when it is read."""
 
     def __init__(self, cell: SimulatedCell, name: str, rate: float) -> None:
-        self._cell, self._name, self._rate = cell, name, rate
+        self._cell, self._name, self.rate, self.problem = cell, name, rate, ""
         self._frame: Frame | None = None
 
-    @property
-    def rate(self) -> float:
-        """See Camera."""
-        return self._rate
-
-    @property
-    def problem(self) -> str:
-        """See Camera."""
-        return ""
-
     def read(self) -> Frame:
-        """See Camera."""
         now, last = self._cell.time, self._frame
-        number = int((now + DT / 2) * self._rate)
+        number = int((now + DT / 2) * self.rate)
         if last is None or number > last.sequence:
             last = self._frame = Frame(self._take(), number, now)
         return last
 
     def close(self) -> None:
-        """See Camera."""
+        pass
 
     def _take(self) -> np.ndarray:
         return self._cell.env.render_camera(self._name)
 
 
-class SimulatedTactileCamera(SimulatedCamera):
+class _TactileCamera(_Camera):
     """TactileSensor interface of the cell."""
 
     def __init__(self, cell: SimulatedCell, side: int, model: SensorModel) -> None:
@@ -198,18 +175,17 @@ class SimulatedTactileCamera(SimulatedCamera):
         return self._cell.env.read_tactile(self._side).image
 
 
-class SimulatedLoadCell:
+class _LoadCell:
     """LoadCell interface of the cell: the force on the table."""
 
     def __init__(self, cell: SimulatedCell) -> None:
         self._cell = cell
 
     def read(self) -> LoadReading:
-        """See LoadCell."""
         return LoadReading(self._cell.env.table_load(), 0, self._cell.time)
 
     def close(self) -> None:
-        """See LoadCell."""
+        pass
 
 
 def simulate_cell(config: CellConfig, hz: float) -> CellConnection:
@@ -217,20 +193,20 @@ def simulate_cell(config: CellConfig, hz: float) -> CellConnection:
     env = make_env(replace(env_config_of(config), camera_size=STREAM_SIZE))
     cell = SimulatedCell(env, config.task.seed, wrench_error=True)
     env.update_contacts()
-    arm = SimulatedArm(cell, hz)
+    arm = _Arm(cell, hz)
     cameras: dict[str, Camera] = {
-        ft.IMAGE_PREFIX + name: SimulatedCamera(cell, name, camera.rate)
+        ft.IMAGE_PREFIX + name: _Camera(cell, name, camera.rate)
         for name, camera in config.cameras.items()
     }
     if config.fingertips:
         model = find_sensor(config.sensor)
-        cameras |= {key: SimulatedTactileCamera(cell, i, model) for i, key in enumerate(ft.TACTILE)}
+        cameras |= {key: _TactileCamera(cell, i, model) for i, key in enumerate(ft.TACTILE)}
     return CellConnection(
         cell_limits(config),
         arm,
-        SimulatedGripper(cell, config.gripper.force),
+        _Gripper(cell, config.gripper.force),
         cameras,
-        SimulatedLoadCell(cell) if config.load_cell else None,
-        SimulatedClock(cell, arm),
+        _LoadCell(cell) if config.load_cell else None,
+        _Clock(cell, arm),
         cell.truth,
     )

@@ -28,7 +28,7 @@ _YIELD_TIME = 0.02  # s, likewise: how fast an arm that was hit gives way; our c
 _REFLEX_DECELERATION = 40.0
 
 _ERROR_STREAM = 1  # random stream of the wrench error, beside the seed
-_NO_FORCE = np.zeros(3)
+_NO_FORCE = _NO_OFFSET = np.zeros(3)
 
 Joints = Float[np.ndarray, " n"]
 
@@ -214,7 +214,7 @@ class SimulatedCell:
         return driven + data.qfrc_gravcomp[dofs]
 
     def kinematics(
-        self, q: Joints, offset: Float[np.ndarray, "3"]
+        self, q: Joints, offset: Float[np.ndarray, "3"] = _NO_OFFSET
     ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], Float[np.ndarray, "6 n"]]:
         """Return position (m), rotation and Jacobian of a point `offset` m from the TCP."""
         env, data = self.env, self._scratch

@@ -1,18 +1,37 @@
 """The arm's state in its wire format, updated in place every millisecond."""
 
+from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
 from numba import njit
 
+from touchgoal.control.safety.limits import FR3
 from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
 from touchgoal.sim_envs.twin.franka import limits, messages
-from touchgoal.sim_envs.twin.franka.hand_frames import Pose
 from touchgoal.sim_envs.twin.franka.messages import RobotMode
-from touchgoal.sim_envs.twin.franka.motion import Motion
 
 OTHER = 3  # controller of a motion that is not the client's own
+
+Pose = Float[np.ndarray, "4 4"]
+
+
+@dataclass
+class Motion:
+    """A client's motion, from its Move command to the answer that ends it.
+
+    Attributes:
+        generator, controller: numbers of the interface.
+        begun: whether the client has sent a set-point.
+        lost: milliseconds since the last one.
+    """
+
+    request: messages.Request
+    generator: int
+    controller: int
+    begun: bool = False
+    lost: int = 0
 
 
 class ArmState:
@@ -32,6 +51,18 @@ class ArmState:
         }
         self.fields["O_ddP_O"][:] = 0.0, 0.0, -9.81  # robot_state.h: "hard-coded for now"
         self._error = ""
+
+    def write_hand(self, ee: Pose, k: Pose) -> None:
+        """Write the frames of hand, end effector (NE_T_EE) and K (EE_T_K)."""
+        flange = np.eye(4)  # F_T_NE
+        c, s = np.cos(FR3.arm.hand_yaw), np.sin(FR3.arm.hand_yaw)
+        flange[:2, :2] = [[c, -s], [s, c]]
+        flange[2, 3] = FR3.tool.tcp_offset
+        record = self.record
+        record["F_T_NE"], record["F_T_EE"] = flange.T.ravel(), (flange @ ee).T.ravel()
+        record["NE_T_EE"], record["EE_T_K"] = ee.T.ravel(), k.T.ravel()
+        record["m_ee"], record["I_ee"] = 0.73, np.diag([0.001, 0.0025, 0.0017]).ravel()  # fr3.xml
+        record["F_x_Cee"] = [-0.01, 0.0, 0.03]
 
     def write_joints(
         self, cell: SimulatedCell, ddq_d: limits.Joints, torque: limits.Joints, nonsense: bool

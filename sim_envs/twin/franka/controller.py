@@ -16,11 +16,9 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 from touchgoal.sim_envs.scene.build import robot_model
 from touchgoal.sim_envs.twin.franka import limits, messages
-from touchgoal.sim_envs.twin.franka.arm_state import OTHER, ArmState, end_effector
-from touchgoal.sim_envs.twin.franka.hand_frames import describe_hand
-from touchgoal.sim_envs.twin.franka.limits import Setpoint, Thresholds
+from touchgoal.sim_envs.twin.franka.arm_state import OTHER, ArmState, Motion, end_effector
+from touchgoal.sim_envs.twin.franka.limits import Setpoint
 from touchgoal.sim_envs.twin.franka.messages import MoveStatus, RobotCommand, RobotMode
-from touchgoal.sim_envs.twin.franka.motion import Motion
 from touchgoal.sim_envs.twin.service import Service
 
 _MAX_LOST_PACKETS = 20  # packets in a row after which the arm stops: Franka's documentation
@@ -55,11 +53,11 @@ class FrankaArm(Service):
         self._nonsense = False
         self._sent_at = 0.0  # monotonic s
         self._success_rate = 1.0
-        self._thresholds = Thresholds.default()
+        self._thresholds = limits.THRESHOLDS
         self._ee, self._k = np.eye(4), np.eye(4)  # NE_T_EE and EE_T_K
         self._state = ArmState()
         self._reset_setpoint()
-        describe_hand(self._state.record, self._ee, self._k)
+        self._state.write_hand(self._ee, self._k)
         self._load_code()
         self.link = messages.Link(host, messages.ROBOT_PORT, messages.ROBOT_VERSION, wide=True)
 
@@ -206,15 +204,13 @@ class FrankaArm(Service):
         payload = request.payload
         if request.command == RobotCommand.SET_COLLISION_BEHAVIOUR:
             asked = np.frombuffer(payload, messages.COLLISION_BEHAVIOUR, 1)[0]
-            self._thresholds = Thresholds(
-                **{name: asked[name].copy() for name in asked.dtype.names}
-            )
+            self._thresholds = {name: asked[name].copy() for name in asked.dtype.names}
         elif request.command == RobotCommand.SET_NE_TO_EE:
             self._ee = np.frombuffer(payload, "<f8", 16).reshape(4, 4).T
-            describe_hand(self._state.record, self._ee, self._k)
+            self._state.write_hand(self._ee, self._k)
         elif request.command == RobotCommand.SET_EE_TO_K:
             self._k = np.frombuffer(payload, "<f8", 16).reshape(4, 4).T
-            describe_hand(self._state.record, self._ee, self._k)
+            self._state.write_hand(self._ee, self._k)
         elif request.command == RobotCommand.SET_LOAD:
             load = np.frombuffer(payload, "<f8", 13)
             record = self._state.record
@@ -274,17 +270,13 @@ class FrankaArm(Service):
     def _take_requests_and_orders(self) -> None:
         for request in self.link.requests():
             self._handle(request)
-        self._take_orders()
-
-    def _take_orders(self) -> None:
         for datagram in self.link.orders():
             if len(datagram) != messages.ROBOT_ORDER.itemsize:
                 continue
             order = np.frombuffer(datagram, messages.ROBOT_ORDER, 1)[0]
-            if (
-                self._echoed < int(order["message_id"]) < max(self._sent, 1)
-            ):  # answers a state that was sent
-                self._echoed = int(order["message_id"])
+            answered = int(order["message_id"])
+            if self._echoed < answered < max(self._sent, 1):
+                self._echoed = answered
                 # Set-points that come after the arm has gone on without them are too old.
                 late = self._motion is not None and self._motion.lost > 0
                 if self._motion is not None and not (late and self._echoed < self._sent - 1):
@@ -328,9 +320,7 @@ class FrankaArm(Service):
             if not np.isfinite(target).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3:
                 self.abort("cartesian_position_motion_generator_invalid_frame")
                 return
-            error = np.concatenate(
-                [target[:3, 3] - now[:3, 3], rotation_vector(target[:3, :3] @ now[:3, :3].T)]
-            )
+            error = np.concatenate([target[:3, 3] - now[:3, 3], rotation_vector(R @ now[:3, :3].T)])
             twist = error / DT
         else:
             twist = order["O_dP_EE_c"]
@@ -365,7 +355,8 @@ class FrankaArm(Service):
         self._pose, jacobian = end_effector(self.cell, self._ee, self.cell.q)
         known = limits.wrench_behind(self.cell.tau_ext, jacobian)
         self._wrench = known + self.cell.wrench_error
-        return self._thresholds.judge(self.cell.tau_ext, self._wrench, self._setpoint.ddq)
+        thresholds, ddq = self._thresholds, self._setpoint.ddq
+        return limits.judge_contact(thresholds, self.cell.tau_ext, self._wrench, ddq)
 
     def _send_state(self, contact: limits.Contact) -> None:
         state = self._state

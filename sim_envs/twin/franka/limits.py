@@ -9,6 +9,7 @@ from numba import njit
 
 from touchgoal.control.safety.limits import FR3
 from touchgoal.sim_envs.cell.simulated_cell import DT
+from touchgoal.sim_envs.twin.franka.messages import COLLISION_BEHAVIOUR
 
 Joints = Float[np.ndarray, "7"]
 Wrench = Float[np.ndarray, "6"]
@@ -160,34 +161,24 @@ class Contact:
         return "cartesian_reflex" if self.cartesian_collision.any() else None
 
 
-@dataclass(frozen=True)
-class Thresholds:
-    """A client's collision behaviour: contact above `lower`, collision above `upper`."""
+# A client's collision behaviour, N and Nm: contact above `lower`, collision above `upper`. Until it
+# sends one: as in libfranka's examples.
+THRESHOLDS: dict[str, Joints | Wrench] = {
+    name: np.full(COLLISION_BEHAVIOUR[name].shape, 20.0) for name in COLLISION_BEHAVIOUR.names or ()
+}
 
-    lower_torque_acceleration: Joints
-    upper_torque_acceleration: Joints
-    lower_torque_nominal: Joints
-    upper_torque_nominal: Joints
-    lower_force_acceleration: Wrench
-    upper_force_acceleration: Wrench
-    lower_force_nominal: Wrench
-    upper_force_nominal: Wrench
 
-    @classmethod
-    def default(cls) -> "Thresholds":
-        """Return 20 N and 20 Nm, as in libfranka's examples."""
-        return cls(*(np.full(n, 20.0) for n in (7, 7, 7, 7, 6, 6, 6, 6)))
-
-    def judge(self, torque: Joints, wrench: Wrench, ddq: Joints) -> Contact:
-        """Compare external torques (Nm) and a wrench (N, Nm) with the thresholds."""
-        steady = max(ddq.max(), -ddq.min()) < _STEADY
-        lower = self.lower_torque_nominal if steady else self.lower_torque_acceleration
-        upper = self.upper_torque_nominal if steady else self.upper_torque_acceleration
-        low = self.lower_force_nominal if steady else self.lower_force_acceleration
-        high = self.upper_force_nominal if steady else self.upper_force_acceleration
-        touched, hit = _above(torque, lower, upper)
-        pressed, pushed = _above(wrench, low, high)
-        return Contact(touched, hit, pressed, pushed)
+def judge_contact(
+    thresholds: dict[str, Joints | Wrench], torque: Joints, wrench: Wrench, ddq: Joints
+) -> Contact:
+    """Compare external torques (Nm) and a wrench (N, Nm) with thresholds like `THRESHOLDS`."""
+    phase = "nominal" if max(ddq.max(), -ddq.min()) < _STEADY else "acceleration"
+    found = [
+        _above(values, thresholds[f"lower_{kind}_{phase}"], thresholds[f"upper_{kind}_{phase}"])
+        for kind, values in (("torque", torque), ("force", wrench))
+    ]
+    (touched, hit), (pressed, pushed) = found
+    return Contact(touched, hit, pressed, pushed)
 
 
 @njit(cache=True)

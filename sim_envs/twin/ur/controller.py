@@ -298,7 +298,7 @@ class UrController(Service):
 
     def _estimate_wrench(self) -> None:
         """Estimate the wrench on the TCP from joint torques, base frame, less the sensor's zero."""
-        _, _, J = self.cell.kinematics(self.cell.q, np.zeros(3))
+        _, _, J = self.cell.kinematics(self.cell.q)
         known = np.linalg.solve(J @ J.T + 1e-8 * np.eye(6), J @ self.cell.tau_ext)
         self._estimate = known + self.cell.wrench_error
         self._wrench = self._estimate - self._zero
@@ -316,8 +316,6 @@ class UrController(Service):
         program, cell = self._program, self.cell
         if name.startswith("output_int"):
             return program.ints[int(name.rpartition("_")[2])]
-        if name.startswith("output_double"):
-            return program.doubles[int(name.rpartition("_")[2])]
         if name in _CONSTANTS:
             return _CONSTANTS[name]
         found = _VARIABLES.get(name)
@@ -343,8 +341,8 @@ _VARIABLES = {
     "target_moment": lambda c, p, cell: cell.joint_torque,
     "actual_TCP_pose": lambda c, p, cell: p.pose(cell.q),
     "target_TCP_pose": lambda c, p, cell: p.pose(cell.q_d),
-    "actual_TCP_speed": lambda c, p, cell: cell.kinematics(cell.q, np.zeros(3))[2] @ cell.dq,
-    "target_TCP_speed": lambda c, p, cell: cell.kinematics(cell.q_d, np.zeros(3))[2] @ cell.dq_d,
+    "actual_TCP_speed": lambda c, p, cell: cell.kinematics(cell.q)[2] @ cell.dq,
+    "target_TCP_speed": lambda c, p, cell: cell.kinematics(cell.q_d)[2] @ cell.dq_d,
     "actual_TCP_force": lambda c, p, cell: c._wrench,
     "ft_raw_wrench": lambda c, p, cell: c._wrench,
     "tcp_force_scalar": lambda c, p, cell: float(np.linalg.norm(c._wrench[:3])),

@@ -14,7 +14,6 @@ _SERVO_ACCELERATION = 40.0  # rad/s^2, the most that ur-rtde lets a client ask f
 _STILL = 1e-3  # rad/s
 _DAMPING = 1e-6  # m^2: keeps joint speeds finite near singular poses
 
-Vector3 = Float[np.ndarray, "3"]
 Joints = Float[np.ndarray, "6"]
 Target = tuple[Joints, Joints]  # rad, rad/s
 
@@ -77,27 +76,27 @@ class LineMove:
     def __init__(
         self,
         cell: SimulatedCell,
-        offset: Vector3,
-        position: Vector3,
-        rotation: Float[np.ndarray, "3 3"],
+        pose: Float[np.ndarray, "6"],
         speed: float,
         acceleration: float,
     ) -> None:
-        self._cell, self._offset = cell, offset
-        self._from, self._R, _ = cell.kinematics(cell.q_d, offset)
-        self._way, self._turn = position - self._from, rotation_vector(rotation @ self._R.T)
+        """`pose`: m and rotation vector (rad), base frame."""
+        self._cell = cell
+        self._from, self._R, _ = cell.kinematics(cell.q_d)
+        self._way = pose[:3] - self._from
+        self._turn = rotation_vector(rotation_matrix(pose[3:]) @ self._R.T)
         length = max(float(np.linalg.norm(self._way)), float(np.linalg.norm(self._turn)))
         self._profile = _Trapezoid(length, speed, acceleration)
 
     def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
         """Return the next target; differential inverse kinematics that corrects its own drift."""
         share, _ = self._profile.advance(speed_fraction * DT)
-        position, R, _ = self._cell.kinematics(q, self._offset)
+        position, R, J = self._cell.kinematics(q)
         target = rotation_matrix(share * self._turn) @ self._R
         error = np.concatenate(
             [self._from + share * self._way - position, rotation_vector(target @ R.T)]
         )
-        dq = _joint_velocity(self._cell, q, error / DT, self._offset)
+        dq = J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(6), error / DT)
         return q + DT * dq, dq * (not self.done)
 
     @property
@@ -125,19 +124,15 @@ class Servo:
 
 @dataclass
 class Speed:
-    """`speedj` or, with a cell, `speedl`: constant joint speed (rad/s) or twist (m/s, rad/s)."""
+    """`speedj`: constant joint speed (rad/s)."""
 
     goal: Joints
     acceleration: float
-    cell: SimulatedCell | None = None
     done: bool = field(default=False, init=False)
 
     def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
         """Return the next target."""
-        goal = self.goal
-        if self.cell is not None:
-            goal = _joint_velocity(self.cell, q, self.goal, np.zeros(3))
-        missing = goal - dq
+        missing = self.goal - dq
         most = np.abs(missing).max()
         dq = dq + missing * min(1.0, self.acceleration * DT / max(most, 1e-12))
         return q + DT * dq, dq
@@ -160,11 +155,3 @@ class Stop:
 
 
 Activity = JointMove | LineMove | Servo | Speed | Stop
-
-
-def _joint_velocity(
-    cell: SimulatedCell, q: Joints, twist: Float[np.ndarray, "6"], offset: Vector3
-) -> Joints:
-    """Return the joint velocity (rad/s) for a twist of the point `offset` m from the TCP."""
-    _, _, J = cell.kinematics(q, offset)
-    return J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(6), twist)

@@ -2,10 +2,8 @@
 
 The URScript itself is not interpreted. Arguments of a command lie in the input registers, answers
 in the output registers; output register 0 is 1 (ready for a command) or 2 (done). Simulated: moveJ,
-moveL, servoJ, servoL, speedJ, speedL, their stops, the watchdog, the TCP, kinematics, zeroFtSensor
-and protective stops. Payload and gains are accepted without effect. All else is refused: servoC,
-paths, force mode, freedrive, jogging, contact detection, joint torques, pose arithmetic, digital
-and analog outputs.
+moveL, servoJ, speedJ, their stops, the watchdog, zeroFtSensor and protective stops. Payload and
+gains are accepted without effect. All else is refused.
 """
 
 from collections.abc import Callable
@@ -13,8 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.motion.kinematics import Kinematics
-from touchgoal.control.motion.rotations import rotation_matrix, rotation_vector
+from touchgoal.control.motion.rotations import rotation_vector
 from touchgoal.control.safety.limits import UR5E
 from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
 from touchgoal.sim_envs.twin.ur.motion import Activity, JointMove, LineMove, Servo, Speed, Stop
@@ -26,10 +23,7 @@ _WITHOUT_EFFECT = {0, 13, 14, 17, 20, 21, 48, 59, 65, 99}  # payload, gains, a k
 _UNANSWERED = {25, 66}  # toolContact, directTorque: clients do not read an answer
 _REFUSAL_CYCLES = 250  # 0.5 s at most; a client that waits for an answer has given up long before
 _STOP_SCRIPT = 255
-_LONGEST_TOOL = 10.0  # m and rad
 _PACE = 1e-3, 40.0  # rad/s or m/s, and those per s: least and most that ur-rtde lets through
-_REACH = 0.85  # m, UR5e data sheet
-_FLANGE_TO_TCP = np.array([0.0, 0.0, UR5E.tool.tcp_offset])
 
 Pose = Float[np.ndarray, "6"]  # m, rotation vector (rad)
 
@@ -39,7 +33,7 @@ class UrProgram:
 
     Attributes:
         activity: the motion in progress.
-        ints, doubles: output registers.
+        ints: integer output registers.
         inputs: the client's input registers by name.
         running: false once the program has ended.
         watchdog: s without a command after which the program ends.
@@ -56,14 +50,11 @@ class UrProgram:
         self.cell, self.inputs = cell, inputs
         self._protective_stop, self._zero_force = protective_stop, zero_force
         self.activity: Activity | None = None
-        self.ints, self.doubles = [0] * 48, [0.0] * 48
-        self.ints[0], self.running = _READY, True
+        self.ints, self.running = [_READY] + [0] * 47, True
         self._refused = self._cycles_refused = 0
         self.watchdog = np.inf
-        self.tcp = np.concatenate([_FLANGE_TO_TCP, np.zeros(3)])
         self._executing = self._waiting = self._asynchronous = False
         self._started = 0
-        self._kinematics = Kinematics(UR5E.arm, UR5E.tool.tcp_offset)
 
     def cycle(self) -> None:
         """Look at the command register once: every 2 ms, and when a package arrives."""
@@ -98,38 +89,25 @@ class UrProgram:
         return self.running and not refusing
 
     def pose(self, q: Float[np.ndarray, "6"]) -> Pose:
-        """Return the pose of the configured TCP at joint positions (rad), base frame."""
-        position, R, _ = self.cell.kinematics(q, self._offset())
-        return np.concatenate([position, rotation_vector(R @ rotation_matrix(self.tcp[3:]))])
+        """Return the TCP's pose at joint positions (rad), base frame."""
+        position, R, _ = self.cell.kinematics(q)
+        return np.concatenate([position, rotation_vector(R)])
 
     # Commands.
 
     def _execute(self, command: int) -> None:
         actions = {
             1: lambda: self._move(JointMove(self._doubles(0), *self._pace())),
-            2: lambda: self._move(JointMove(self._inverse(self.cell.q_d), *self._pace())),
-            3: lambda: self._move(self._line(self._doubles(0))),
-            4: lambda: self._move(self._line(self.pose(self._doubles(0)))),
+            3: lambda: self._move(LineMove(self.cell, self._doubles(0), *self._pace())),
             8: self._zero_force,
             9: lambda: self._go(Speed(self._doubles(0), self._double(6))),
-            10: lambda: self._go(Speed(self._doubles(0), self._double(6), self.cell)),
-            11: lambda: self._servo(self._doubles(0)),
+            11: self._servo,
             15: lambda: self._stop(asynchronous=False),
             16: lambda: self._stop(asynchronous=False),
-            24: lambda: self._servo(self._inverse(self.cell.q_d)),
-            28: lambda: self._answer(self.pose(self.cell.q_d)),
-            29: self._set_tcp,
-            30: lambda: self._answer(self._inverse(self._doubles(6))),
             31: self._protective_stop,
             33: lambda: self._stop(asynchronous=self._int(1) == 1),
             34: lambda: self._stop(asynchronous=self._int(1) == 1),
             35: self._set_watchdog,
-            37: self._answer_joints_inside,
-            40: lambda: self._answer(self.tcp),
-            43: lambda: self._answer(self.pose(self.cell.q)),
-            44: self._forward,
-            46: lambda: self._answer(self._inverse(self.cell.q)),
-            47: self._answer_steady,
             _STOP_SCRIPT: self.end,
         }
         if command in actions:
@@ -166,7 +144,8 @@ class UrProgram:
     def _go(self, activity: Activity) -> None:
         self.activity = activity
 
-    def _servo(self, goal: np.ndarray) -> None:
+    def _servo(self) -> None:
+        goal = self._doubles(0)
         if not np.isfinite(goal).all():
             self._protective_stop()
             return
@@ -190,48 +169,6 @@ class UrProgram:
     def _set_watchdog(self) -> None:
         self.watchdog = 1 / self._double(0) if self._double(0) > 0 else np.inf
 
-    def _set_tcp(self) -> None:
-        if (np.abs(self._doubles(0)) < _LONGEST_TOOL).all():
-            self.tcp = self._doubles(0)
-
-    def _forward(self) -> None:
-        own, self.tcp = self.tcp, self._doubles(6)
-        self._answer(self.pose(self._doubles(0)))
-        self.tcp = own
-
-    def _answer_joints_inside(self) -> None:
-        q, hardware = self._doubles(0), UR5E.hardware
-        self.ints[1] = int(((q >= hardware.lower) & (q <= hardware.upper)).all())
-
-    def _answer_steady(self) -> None:
-        self.ints[1] = int(not self.cell.moving)
-
-    # Geometry.
-
-    def _offset(self) -> Float[np.ndarray, "3"]:
-        """Offset of the configured TCP from the hand's own, in the hand frame, m."""
-        return self.tcp[:3] - _FLANGE_TO_TCP
-
-    def _target(self, pose: Pose) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-        """Pose of the hand's own TCP that brings the configured one to `pose`."""
-        R = rotation_matrix(pose[3:]) @ rotation_matrix(self.tcp[3:]).T
-        return pose[:3] - R @ self._offset(), R
-
-    def _line(self, pose: Pose) -> LineMove:
-        _, R = self._target(pose)
-        return LineMove(self.cell, self._offset(), pose[:3], R, *self._pace())
-
-    def _inverse(self, near: np.ndarray) -> Float[np.ndarray, "6"]:
-        """Solve for the pose in the registers; without a solution a UR stops its program."""
-        position, R = self._target(self._doubles(0))
-        if (np.abs(position) < 2 * _REACH).all() and np.isfinite(R).all():
-            solution = self._kinematics.solve_ik_near(position, R, near, posture=0.0)
-            if solution.reached:
-                return solution.q
-        print("the twin's UR found no inverse kinematics; protective stop")
-        self._protective_stop()
-        return self.cell.q_d.copy()
-
     # Registers.
 
     def _pace(self) -> tuple[float, float]:
@@ -246,6 +183,3 @@ class UrProgram:
 
     def _doubles(self, index: int) -> Float[np.ndarray, "6"]:
         return np.array([self._double(index + i) for i in range(6)])
-
-    def _answer(self, numbers: Float[np.ndarray, " n"]) -> None:
-        self.doubles[: len(numbers)] = numbers.tolist()
