@@ -10,7 +10,6 @@ goes along and its shear force grows; at the friction cone the probe slides.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,53 +63,25 @@ class Stroke:
     friction: float
 
 
-@dataclass(frozen=True, eq=False)
-class Path:
-    """Load and motion of the rig in one stroke, frame by frame.
-
-    Attributes:
-        load: normal force, N; 0 is untouched.
-        moved: how far the probe has been drawn since it touched, m.
-        start: where it touches, m in the sensor's frame.
-        direction: unit vector of the slide.
-    """
-
-    load: Float[np.ndarray, " t"]
-    moved: Float[np.ndarray, " t"]
-    start: Float[np.ndarray, "2"]
-    direction: Float[np.ndarray, "2"]
-
-
 def simulate(config: RigConfig, index: int) -> Stroke:
     """Simulate one stroke; the same config and index always give the same one."""
     sensor, rng = find_sensor(config.sensor), np.random.default_rng([config.seed, index, 1])
     indenter = config.indenters[index % len(config.indenters)]
     friction = FRICTION * (1 + FRICTION_SPREAD * rng.uniform(-1, 1))
-    path = _draw_path(config, sensor, friction, rng)
+    load, moved, start, direction = _draw_path(config, sensor, friction, rng)
+    pulled, slip = shear_force(moved, load, sensor.shear_stiffness, friction)
     unit = rig_unit(config)
     bench = PressBench(_probe(indenter, friction), sensor, unit, config.shear_relief)
-    frames, wrenches, slips, fields = [], [], [], []
-    for load, shear, place, slip in _loads(path, sensor, friction):
-        bench.place(np.array([*place, 0.0]))
-        depth = -load / sensor.normal_stiffness
-        pull = float(shear[0]), float(shear[1])
-        centre = float(place[0]), float(place[1])
-        sensed = bench.sense(load, rng, pull, centre, depth)
+    frames, wrenches, fields = [], [], []
+    for pressed, way, pull in zip(load.tolist(), moved, pulled, strict=True):
+        (x, y), (fx, fy) = (start + way * direction).tolist(), (pull * direction).tolist()
+        bench.place(np.array([x, y, 0.0]))
+        sensed = bench.sense(pressed, rng, (fx, fy), (x, y), -pressed / sensor.normal_stiffness)
         frames.append(sensed.image)
         fields.append(tractions(sensed.field, sensor.image_shape, unit.pixel_pitch))
-        contact = bench.contact(load, pull, centre, depth)
-        wrenches.append(np.concatenate([contact.force, contact.torque]))
-        slips.append(slip)
+        wrenches.append(np.concatenate([bench.contact.force, bench.contact.torque]))
     wrench = np.array(wrenches, np.float32)
-    return Stroke(
-        np.stack(frames),
-        wrench,
-        np.array(slips),
-        np.stack(fields),
-        indenter,
-        path.load.max(),
-        friction,
-    )
+    return Stroke(np.stack(frames), wrench, slip, np.stack(fields), indenter, load.max(), friction)
 
 
 def rig_unit(config: RigConfig) -> SensorInstance:
@@ -140,18 +111,10 @@ def shear_force(
     return force, slides
 
 
-def _loads(
-    path: Path, sensor: SensorModel, friction: float
-) -> Iterator[tuple[float, np.ndarray, np.ndarray, bool]]:
-    """Yield each frame's load (N), shear (N, 2), probe position (m, 2), and whether it slides."""
-    force, slides = shear_force(path.moved, path.load, sensor.shear_stiffness, friction)
-    for load, moved, pull, slip in zip(path.load, path.moved, force, slides, strict=True):
-        yield float(load), pull * path.direction, path.start + moved * path.direction, bool(slip)
-
-
 def _draw_path(
     config: RigConfig, sensor: SensorModel, friction: float, rng: np.random.Generator
-) -> Path:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Draw load (N) and way (m) by frame, where the probe touches (m), direction of the slide."""
     load = rng.uniform(*config.load)
     pressing, sliding = int(rng.integers(*_PRESS_FRAMES)), int(rng.integers(*_SLIDE_FRAMES))
     held = friction * load / sensor.shear_stiffness
@@ -161,12 +124,10 @@ def _draw_path(
     phase, turns = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 2)
     wobble = 1 + _WOBBLE * (np.sin(phase + 2 * np.pi * turns * slide) - np.sin(phase))
     way = rng.uniform(0, 2 * np.pi)
-    return Path(
-        load=load * np.concatenate([np.zeros(REST), press, wobble]),
-        moved=length * np.concatenate([np.zeros(REST + pressing), slide]),
-        start=rng.uniform(-_PLACES, _PLACES, 2),
-        direction=np.array([np.cos(way), np.sin(way)]),
-    )
+    loads = load * np.concatenate([np.zeros(REST), press, wobble])
+    moved = length * np.concatenate([np.zeros(REST + pressing), slide])
+    start = rng.uniform(-_PLACES, _PLACES, 2)
+    return loads, moved, start, np.array([np.cos(way), np.sin(way)])
 
 
 def _probe(indenter: Indenter, friction: float) -> Body:

@@ -113,8 +113,7 @@ def _slide(
     for at, (fx, fy, torsion) in zip(pose, pull, strict=True):
         acting = (float(fx), float(fy)), place(at), depth, float(torsion)
         frames.append(bench.sense(load, rng, *acting).image)
-        contact = bench.contact(load, *acting)
-        wrenches.append(np.concatenate([contact.force, contact.torque]))
+        wrenches.append(np.concatenate([bench.contact.force, bench.contact.torque]))
     wrench = np.array(wrenches, np.float32)
     whole = np.vstack([np.repeat(pose[:1], REST, 0), pose]).astype(np.float32)
     slides = np.concatenate([np.zeros(REST, bool), slip])

@@ -28,15 +28,6 @@ Picture = UInt8[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True)
-class Address:
-    """Host, port (0: any that is free) and names of the streams."""
-
-    host: str
-    port: int
-    names: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class Scene:
     """Scene to render from now on.
 
@@ -69,21 +60,8 @@ class Moment:
     held: bool
 
 
-@dataclass(frozen=True)
-class Progress:
-    """Images sent on each stream, and processor time (s), so far."""
-
-    sent: dict[str, int]
-    processor_time: float
-
-
-@dataclass(frozen=True)
-class Fault:
-    """Fault of a stream until a time (s, time.monotonic); `kind` is an attribute of Stream."""
-
-    name: str
-    kind: str
-    until: float
+Fault = tuple[str, str, float]
+"""Name of a stream, which fault (an attribute of `Stream`), until when (s, time.monotonic)."""
 
 
 class PictureTaker:
@@ -125,16 +103,15 @@ class PictureTaker:
             self._renderer.close()
 
 
-def serve(pipe: Connection) -> None:
+def serve(pipe: Connection, host: str, port: int, names: list[str]) -> None:
     """Render images on request until the twin has gone.
 
-    The first message is an Address, answered by the port or an OSError. Each Moment is answered by
-    a Progress.
+    First answers with the port (`port` 0: any that is free) or an OSError; then each Moment with
+    the number of images sent on each stream and the processor time (s), so far.
     """
-    at: Address = pipe.recv()
-    streams = {name: Stream() for name in at.names}
+    streams = {name: Stream() for name in names}
     try:
-        server = StreamServer(streams, at.host, at.port)
+        server = StreamServer(streams, host, port)
     except OSError as error:
         pipe.send(error)
         return
@@ -142,8 +119,9 @@ def serve(pipe: Connection) -> None:
     taker: PictureTaker | None = None
     while True:
         message: Scene | Moment | Fault = pipe.recv()
-        if isinstance(message, Fault):
-            setattr(streams[message.name], message.kind, message.until)
+        if isinstance(message, tuple):
+            name, kind, until = message
+            setattr(streams[name], kind, until)
         elif isinstance(message, Scene):
             if taker is not None:
                 taker.close()
@@ -152,7 +130,7 @@ def serve(pipe: Connection) -> None:
             assert taker is not None
             _publish(taker, message, streams)
             sent = {name: stream.sent for name, stream in streams.items()}
-            pipe.send(Progress(sent, time.process_time()))
+            pipe.send((sent, time.process_time()))
 
 
 def _publish(taker: PictureTaker, moment: Moment, streams: dict[str, Stream]) -> None:
@@ -169,9 +147,10 @@ def _publish(taker: PictureTaker, moment: Moment, streams: dict[str, Stream]) ->
 
 
 def main() -> None:
-    """Serve the twin at the pipe whose number is the first argument."""
+    """Serve with the arguments: number of the pipe to the twin, host, port, names of streams."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    pipe, host, port, *names = sys.argv[1:]
     try:
-        serve(Connection(int(sys.argv[1])))
+        serve(Connection(int(pipe)), host, int(port), names)
     except (EOFError, OSError):  # the twin has ended
         pass

@@ -11,14 +11,7 @@ import numpy as np
 from touchgoal.control import features as ft
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
-from touchgoal.sim_envs.twin.picture_process import (
-    STATE,
-    Address,
-    Fault,
-    Moment,
-    Progress,
-    Scene,
-)
+from touchgoal.sim_envs.twin.picture_process import STATE, Fault, Moment, Scene
 from touchgoal.sim_envs.twin.service import Service
 
 CAMERA_RATE = 25  # Hz, as fingertips: more than a policy looks
@@ -34,6 +27,7 @@ class Pictures(Service):
     Attributes:
         rates: Hz, simulated, of each stream by its name, such as tactile_left.
         held: whether a client lets time go on, which must get a picture before it does.
+        processor_time: of the rendering process, s, as last reported.
         taken, left_out: pictures that were due and taken, or not taken for the process was behind.
     """
 
@@ -49,20 +43,20 @@ class Pictures(Service):
             self.rates |= dict.fromkeys(names, round(env.sensor.frame_rate))
         self.rates |= dict.fromkeys(env.config.cameras, CAMERA_RATE)
         self._due = [
-            tuple(name for name, rate in self.rates.items() if _is_due(step, rate))
-            for step in range(1000)
+            tuple(name for name, rate in self.rates.items() if ms * rate % 1000 < rate)
+            for ms in range(1000)
         ]
-        self._progress = Progress(dict.fromkeys(self.rates, 0), 0.0)
+        self._sent, self.processor_time = dict.fromkeys(self.rates, 0), 0.0
         self._unanswered = 0
         self._pipe, theirs = Pipe()
         # Its own session: Ctrl-C is for the twin, which then ends it.
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _PROGRAM, str(theirs.fileno())],
+            [sys.executable, "-c", _PROGRAM, str(theirs.fileno()), host, str(port), *self.rates],
             pass_fds=[theirs.fileno()],
             start_new_session=True,
         )
         theirs.close()
-        self._port = self._open(Address(host, port, tuple(self.rates)))
+        self._port = self._await_port()
         self.reset()
 
     def addresses(self) -> dict[str, str]:
@@ -89,18 +83,13 @@ class Pictures(Service):
         """Return the number of images sent on each stream, once all due ones are."""
         while self._unanswered:
             self._hear(_ANSWER_TIMEOUT)
-        return self._progress.sent
-
-    @property
-    def processor_time(self) -> float:
-        """Processor time of the rendering process, s, as last reported."""
-        return self._progress.processor_time
+        return self._sent
 
     def set_fault(self, name: str, kind: str, seconds: float) -> None:
         """Make a stream stalled, frozen, lost, broken or halved; KeyError if there is none."""
         if name not in self.rates or kind not in _FAULTS:
             raise KeyError(name)
-        self._tell(Fault(name, kind, time.monotonic() + seconds))
+        self._tell((name, kind, time.monotonic() + seconds))
 
     def reset(self) -> None:
         """Follow a new episode; the cameras' noise begins anew."""
@@ -116,8 +105,7 @@ class Pictures(Service):
             self._process.kill()
             self._process.wait()
 
-    def _open(self, at: Address) -> int:
-        self._tell(at)
+    def _await_port(self) -> int:
         try:
             answer = self._pipe.recv() if self._pipe.poll(_START_TIMEOUT) else None
         except EOFError:
@@ -127,7 +115,7 @@ class Pictures(Service):
         self.close()
         raise answer or UserError("the process for the twin's pictures did not start")
 
-    def _tell(self, message: Address | Scene | Moment | Fault) -> None:
+    def _tell(self, message: Scene | Moment | Fault) -> None:
         try:
             self._pipe.send(message)
         except OSError as error:
@@ -139,7 +127,7 @@ class Pictures(Service):
             if timeout and not self._pipe.poll(timeout):
                 raise TimeoutError
             while self._unanswered and self._pipe.poll():
-                self._progress = self._pipe.recv()
+                self._sent, self.processor_time = self._pipe.recv()
                 self._unanswered -= 1
         except (OSError, EOFError) as error:
             raise _ended() from error
@@ -147,7 +135,3 @@ class Pictures(Service):
 
 def _ended() -> UserError:
     return UserError("the process that renders the twin's images has ended; its messages are above")
-
-
-def _is_due(steps: int, rate: int) -> bool:
-    return steps * rate % 1000 < rate

@@ -16,7 +16,12 @@ class PressBench:
     """Presses a body into the left sensor at a given place with a given force.
 
     Forces are prescribed, not solved for; an impossible press can be asked for, too.
+
+    Attributes:
+        contact: the pad's with the body in the last reading.
     """
+
+    contact: PadContact
 
     def __init__(
         self, body: Body, sensor: SensorModel, instance: SensorInstance, relief: bool = False
@@ -60,21 +65,11 @@ class PressBench:
             depth: how far below the gel's rest plane, m.
             torsion: torque about the sensor's z at `centre`, Nm.
         """
-        return self._pad.sense(self._data, self.contact(force, shear, centre, depth, torsion), rng)
-
-    def contact(
-        self,
-        force: float,
-        shear: tuple[float, float],
-        centre: tuple[float, float],
-        depth: float,
-        torsion: float = 0.0,
-    ) -> PadContact:
-        """Return the pad's contact with the body; see `sense`."""
         (x, y), (sx, sy) = centre, shear
         turning = x * sy - y * sx + torsion
         torque = np.array([-y * force + depth * sy, x * force - depth * sx, turning])
-        return PadContact(np.array([sx, sy, -force]), torque, 0.0, self._geoms)
+        self.contact = PadContact(np.array([sx, sy, -force]), torque, 0.0, self._geoms)
+        return self._pad.sense(self._data, self.contact, rng)
 
 
 def _scene(body: Body) -> mujoco.MjModel:
