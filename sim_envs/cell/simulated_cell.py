@@ -19,10 +19,9 @@ from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE
 DT = 1e-3  # s, of the Franka control interface and of the physics
 AT_REST = 0.01  # rad/s
 _ASIDE = 0.25, 0.4  # m, where on the table an object is put that is taken away
-_TORQUE_FILTER_TIME = (
-    0.02  # s, first order: how fast the arm's estimate of external torque follows; our choice
-)
-_YIELD_TIME = 0.02  # s, likewise: how fast an arm that was hit gives way; our choice
+# s, first order, our choice: how fast the arm's estimate of external torque follows, and how fast
+# an arm that was hit gives way.
+_TORQUE_FILTER_TIME = _YIELD_TIME = 0.02
 # rad/s^2 of a reflex, four times that of motions. An instant stop would saturate a wrist's
 # torque and make it chatter.
 _REFLEX_DECELERATION = 40.0
@@ -64,7 +63,7 @@ class SimulatedCell:
     without the servo's lag, or torque controlled, without friction, as a Franka's torque loop is.
 
     Attributes:
-        time: s since the episode began, simulated.
+        time, steps: s and ms since the episode began, simulated.
         q, dq: measured joint positions (rad) and velocities (rad/s).
         q_d, dq_d: their set-points.
         tau_ext: torque (N m) on each joint from outside, filtered.
@@ -93,7 +92,7 @@ class SimulatedCell:
         self._braking: Joints | None = None
         self._yielding = False
         self._nudge_force, self._nudged_until = np.zeros(3), 0.0
-        self.time, self._steps = 0.0, 0
+        self.time, self.steps = 0.0, 0
         self.q_d, self.dq_d, self.tau_ext = env.command.copy(), np.zeros(n), np.zeros(n)
         self.q, self.dq = env.joints()
         # Nothing else of an episode depends on it.
@@ -162,44 +161,38 @@ class SimulatedCell:
     def step(self) -> None:
         """Advance by a millisecond."""
         env = self.env
-        tick = self._tick_steps
-        if self._steps % tick == 0:
+        tick = round(1 / (env.config.control_hz * DT))
+        if self.steps % tick == 0:
             env.begin_tick()
         if self._braking is not None:
             self.dq_d = braked_velocity(self.dq_d, self._braking, DT)
             self.q_d = self.q_d + DT * self.dq_d
         if self._yielding:
-            self.dq_d = braked_velocity(
-                self.dq_d, np.full_like(self.dq_d, _REFLEX_DECELERATION), DT
-            )
+            deceleration = np.full_like(self.dq_d, _REFLEX_DECELERATION)
+            self.dq_d = braked_velocity(self.dq_d, deceleration, DT)
             self.q_d = self.q_d + DT * self.dq_d + (DT / _YIELD_TIME) * (self.q - self.q_d)
         pushed = self._apply_nudge()
         env.grasp_force = self.gripper_command.force
         if self._torque is not None:
             env.data.qfrc_applied[env.arm_dofs] = self._torque
             self.q_d, self.dq_d = self.q, self.dq
-        env.step_physics(
-            self.q_d + SERVO_DAMPING * self.dq_d,
-            self.gripper_command.width,
-            self.gripper_command.speed,
-        )
-        self._steps += 1
-        self.time = self._steps * DT
-        self._update_measurements(pushed)
+        joints, gripper = self.q_d + SERVO_DAMPING * self.dq_d, self.gripper_command
+        env.step_physics(joints, gripper.width, gripper.speed)
+        self.steps += 1
+        self.time = self.steps * DT
+        self.q, self.dq = env.joints()
+        now = env.joint_contact_torque() + pushed
+        self.tau_ext = self.tau_ext + (DT / _TORQUE_FILTER_TIME) * (now - self.tau_ext)
+        self._note_extremes()
         if self._error:
             self._error.update(DT)
             self.wrench_error = self._error.read()
-        if self._steps % tick == 0:
+        if self.steps % tick == 0:
             env.update_contacts()
             self.progress, self.success = env.end_tick(self._grasp_begun)
             self.failures.update(env.failures())
             force = float(np.linalg.norm(env.external_wrench()[:3]))
             self.worst.force = max(self.worst.force, force)
-
-    @property
-    def steps(self) -> int:
-        """Milliseconds since the episode began."""
-        return self._steps
 
     @property
     def moving(self) -> bool:
@@ -248,10 +241,6 @@ class SimulatedCell:
 
     # Insides.
 
-    @property
-    def _tick_steps(self) -> int:
-        return round(1 / (self.env.config.control_hz * DT))
-
     def _apply_nudge(self) -> Joints:
         """Apply the nudge; its torque (N m) on each joint."""
         env = self.env
@@ -262,13 +251,6 @@ class SimulatedCell:
         jacobian = np.zeros((3, env.model.nv))
         mujoco.mj_jac(env.model, env.data, jacobian, None, env.data.xipos[self._hand], self._hand)
         return force @ jacobian[:, env.arm_dofs]
-
-    def _update_measurements(self, pushed: Joints) -> None:
-        env = self.env
-        self.q, self.dq = env.joints()
-        now = env.joint_contact_torque() + pushed
-        self.tau_ext = self.tau_ext + (DT / _TORQUE_FILTER_TIME) * (now - self.tau_ext)
-        self._note_extremes()
 
     def _note_extremes(self) -> None:
         limits, worst = self.env.robot.hardware, self.worst

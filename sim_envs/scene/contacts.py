@@ -61,10 +61,9 @@ class ContactReader:
     def read(
         self, data: mujoco.MjData
     ) -> tuple[tuple[PadContact, PadContact], Float[np.ndarray, "6"]]:
-        """Return contacts of the left and right pad, and the external wrench.
+        """Return the pads' contacts, and the wrench (N, Nm) of all outside on the robot at the TCP.
 
-        The wrench is the force (N) and torque (Nm) of everything outside on the robot, at the TCP,
-        in the base frame.
+        The wrench is in the base frame.
         """
         contacts, model = data.contact, self._model
         pads = self._pad_of[contacts.geom]
@@ -97,25 +96,18 @@ class ContactReader:
 
     def load(self, data: mujoco.MjData, geom: int) -> float:
         """Return the force (N) that presses down on a geom."""
-        force = 0.0
+        force, wrench = 0.0, np.zeros(6)
         for i in range(data.ncon):
             contact = data.contact[i]
             if geom in contact.geom and contact.efc_address >= 0:
-                f, _ = self._wrench(data, i, contact)
+                mujoco.mj_contactForce(self._model, data, i, wrench)
+                f = contact.frame.reshape(3, 3).T @ wrench[:3]
                 force += -f[2] if contact.geom[1] == geom else f[2]
         return float(force)
 
     def touches(self, data: mujoco.MjData, one: int, other: int) -> bool:
         """Return whether two geoms are in contact."""
         return any({int(g) for g in pair} == {one, other} for pair in data.contact.geom)
-
-    def _wrench(
-        self, data: mujoco.MjData, index: int, contact: mujoco.MjContact
-    ) -> tuple[np.ndarray, np.ndarray]:
-        wrench = np.zeros(6)
-        mujoco.mj_contactForce(self._model, data, index, wrench)
-        frame = contact.frame.reshape(3, 3)
-        return frame.T @ wrench[:3], frame.T @ wrench[3:]
 
 
 class Contacts(NamedTuple):
@@ -140,11 +132,7 @@ class Moving(NamedTuple):
 @njit(cache=True)
 @no_type_check
 def _read_contacts(contacts, forces, is_robot, pads, origins, moving):
-    """Sum wrenches on left pad, right pad and robot; find the slip speed over each pad.
-
-    Returns:
-        forces (N) and torques (Nm) about the three origins, world frame (3, 6); m/s (2).
-    """
+    """Wrenches (N, Nm, world frame) on both pads and robot about their origins; m/s of slip."""
     wrenches, slip = np.zeros((3, 6)), np.zeros(2)
     for i in range(contacts.addresses.size):
         first, second = contacts.geoms[i]
