@@ -91,7 +91,6 @@ def _dotted(image: np.ndarray, unit: SensorInstance) -> np.ndarray:
 
 
 def _piece(cloth: Cloth, rng: np.random.Generator) -> Surface:
-    """Draw one piece of a cloth, on a flat object or on a finger."""
     pattern = _height(cloth, rng)
     relief = cloth.relief * rng.uniform(0.85, 1.15)
     body = "flat" if rng.random() < 0.5 else "cylinder"

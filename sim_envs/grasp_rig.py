@@ -79,8 +79,6 @@ def attempt_grasp(config: RigConfig, index: int) -> GraspAttempt:
 
 
 class _Hand:
-    """Scene of one attempt, with its images and wrenches."""
-
     def __init__(
         self,
         body: Body,
@@ -104,7 +102,6 @@ class _Hand:
         self.wrenches: list[np.ndarray] = []
 
     def place(self, rng: np.random.Generator) -> None:
-        """Put the object on the table and the open hand around it, a little off."""
         body, data = self._body, self.data
         aside, above = rng.uniform(-_ASIDE, _ASIDE), rng.uniform(*_ABOVE)
         turn = rng.uniform(-_TURN, _TURN)
@@ -163,7 +160,6 @@ class _Hand:
 
 
 def _scene(body: Body, sensor: SensorModel) -> mujoco.MjSpec:
-    """Build the hand on its servos with fingertips, table and object."""
     spec = mujoco.MjSpec.from_file(str(Path(__file__).parent / "scene" / "grasp_rig.xml"))
     set_options(spec, SceneConfig())
     for side in SIDES:

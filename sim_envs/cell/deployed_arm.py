@@ -46,7 +46,6 @@ class _DirectDrive:
         return self.command
 
     def set_target(self, target: Joints) -> None:
-        """Let a target arrive at the arm."""
         self._target, self._left = target, self._ticks
 
     def step(self) -> Joints:
@@ -164,7 +163,6 @@ class DeployedArm:
         return {**state, **pictures}
 
     def _measure(self, read: bool, shoot: bool) -> None:
-        """Read the state and take images, where they are due in this millisecond."""
         env = self._env
         wrench = self._wrench if self._ms % _WRENCH_PERIOD == 0 else None
         if not (read or shoot or wrench):

@@ -73,7 +73,6 @@ class SimulatedCell:
     """
 
     def __init__(self, env: FrankaTactileEnv, seed: int, wrench_error: bool = False) -> None:
-        """`wrench_error`: give the force estimate the error of a real arm's."""
         self.env, self._errs = env, wrench_error
         self.reset(seed)
 

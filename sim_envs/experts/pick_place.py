@@ -122,7 +122,6 @@ class PickPlaceExpert:
         return "distractor_1" if self._outcome == "wrong_object" else "object"
 
     def _freeze_tick(self) -> float:
-        """Draw the tick from which the expert stands still."""
         if self._outcome != "freeze":
             return np.inf
         return float(self._env.np_random.integers(15, 85))

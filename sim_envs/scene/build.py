@@ -118,7 +118,6 @@ def _strip(spec: mujoco.MjSpec, config: SceneConfig) -> None:
 
 
 def _compensate_gravity(body: mujoco.MjsBody) -> None:
-    """Compensate the weight of arm and tool, as libfranka does."""
     body.gravcomp = 1
     for child in body.bodies:
         _compensate_gravity(child)

@@ -54,7 +54,6 @@ class SceneRecorder:
 
 
 def _beside(scene: np.ndarray, tactile: list[np.ndarray]) -> np.ndarray:
-    """Return the scene with the tactile images, labelled, in a column right of it."""
     column = []
     for name, image in zip(("left", "right"), tactile, strict=False):
         small = cv2.resize(image, (2 * _HEIGHT // 3, _HEIGHT // 2), interpolation=cv2.INTER_AREA)

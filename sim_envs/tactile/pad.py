@@ -154,7 +154,6 @@ class TactilePad:
         return max(float(self._model.geom_friction[geom, 0]) for geom in contact.geoms)
 
     def _modulus(self, material: Material) -> float:
-        """Return the modulus of gel and object in series."""
         return 1 / (1 / self._sensor.foundation_modulus + 1 / material.foundation_modulus)
 
     def _press(self, data: mujoco.MjData, contact: PadContact, touched: list[int]) -> Press:
@@ -194,13 +193,11 @@ class TactilePad:
         position: Float[np.ndarray, "3"],
         matrix: Float[np.ndarray, "9"],
     ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-        """Transform a world pose into the sensor's frame."""
         R = data.site_xmat[self._site].reshape(3, 3)
         return (position - data.site_xpos[self._site]) @ R, R.T @ matrix.reshape(3, 3)
 
 
 def _solid_geoms(model: mujoco.MjModel, body: int) -> list[int]:
-    """Return the geoms of a body that press into gels."""
     first, count = int(model.body_geomadr[body]), int(model.body_geomnum[body])
     return [g for g in range(first, first + count) if model.geom_group[g] == OBJECT_GROUP]
 

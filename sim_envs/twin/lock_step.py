@@ -94,7 +94,6 @@ class LockStep:
         select.select([*links, *sockets], [], [], _POLL_INTERVAL)
 
     def _ready(self) -> bool:
-        """Return whether all expected messages have arrived, or waiting is over."""
         if self._arm.link.frozen or self._impatient:
             return True
         commanded = self._hand.commands - self._commands_before >= self._issued

@@ -84,7 +84,6 @@ class StreamServer:
 
 
 def _with_random_bytes(jpeg: UInt8[np.ndarray, " n"]) -> UInt8[np.ndarray, " n"]:
-    """Replace 20 bytes after the header."""
     rng, damaged = np.random.default_rng(), jpeg.copy()
     places = rng.integers(_JPEG_HEADER, len(jpeg) - 2, 20)
     damaged[places] = rng.integers(0, 256, 20)
@@ -97,7 +96,6 @@ class _Handler(BaseHTTPRequestHandler):
     streams: dict[str, Stream]
 
     def do_GET(self) -> None:  # noqa: N802, the base class's name
-        """Serve a stream."""
         stream = self.streams.get(self.path.strip("/"))
         if stream is None:
             self.send_error(404, "there are: " + ", ".join(self.streams))
@@ -141,4 +139,4 @@ class _Handler(BaseHTTPRequestHandler):
                 stream.condition.notify_all()
 
     def log_message(self, format: str, *args: object) -> None:
-        """Log nothing."""
+        pass

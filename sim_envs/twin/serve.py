@@ -140,7 +140,6 @@ class Twin:
             time.sleep(self._next_step_at - now)
 
     def _open(self, config: TwinConfig) -> CellConfig:
-        """Open every service; return the cell file's content."""
         cell, host, folder = self.cell, config.host, config.folder
         folder.mkdir(parents=True, exist_ok=True)
         services = self._services

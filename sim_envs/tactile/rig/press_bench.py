@@ -26,7 +26,6 @@ class PressBench:
     def __init__(
         self, body: Body, sensor: SensorModel, instance: SensorInstance, relief: bool = False
     ) -> None:
-        """`relief`: see TactilePad."""
         self._model = _scene(body)
         self._data = mujoco.MjData(self._model)
         mujoco.mj_forward(self._model, self._data)

@@ -159,7 +159,6 @@ class FrankaArm(Service):
             self.mode = RobotMode.IDLE
 
     def _end(self, status: MoveStatus | None) -> None:
-        """End the motion, if any; report to the client, and brake."""
         motion, self._motion = self._motion, None
         self.cell.brake(_BRAKING)
         self._reset_setpoint()
@@ -236,7 +235,6 @@ class FrankaArm(Service):
     # Set-points.
 
     def _wait_for_client(self, motion: Motion) -> None:
-        """Wait for the client's answer to the last state, up to a time-out."""
         deadline = time.monotonic() + self.timeout
         while (
             self._motion is motion
@@ -339,7 +337,6 @@ class FrankaArm(Service):
     # State.
 
     def _load_code(self) -> None:
-        """Compile or load compiled code before a client waits for it."""
         contact = self._estimate_wrench()
         self._state.write_tcp(self.cell, self._ee, self._pose, self._wrench, contact)
         limits.joint_fault(self._setpoint, self._setpoint, cartesian=False)
@@ -351,7 +348,6 @@ class FrankaArm(Service):
         self._torque = zero
 
     def _estimate_wrench(self) -> limits.Contact:
-        """Estimate the external wrench from joint torques, and judge it."""
         self._pose, jacobian = end_effector(self.cell, self._ee, self.cell.q)
         known = limits.wrench_behind(self.cell.tau_ext, jacobian)
         self._wrench = known + self.cell.wrench_error

@@ -332,7 +332,6 @@ class Link:
                 yield request
 
     def _well_formed(self, request: Request) -> bool:
-        """Return whether the arguments have the right size and possible values."""
         n = len(request.payload)
         if self._wide and request.command == RobotCommand.MOVE:
             return n >= _LEAST_OF_MOVE

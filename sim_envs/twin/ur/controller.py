@@ -246,7 +246,6 @@ class UrController(Service):
         return UrProgram(self.cell, self._inputs, self.protective_stop, self._zero_force)
 
     def _zero_force(self) -> None:
-        """Take the present wrench as zero, as URScript's zero_ftsensor does."""
         self._zero = self._estimate.copy()
 
     def _dashboard_answer(self, line: str) -> str:

@@ -37,7 +37,6 @@ class _Trapezoid:
 
     @property
     def done(self) -> bool:
-        """Whether the end is reached."""
         return self._time >= self._trajectory.duration
 
 

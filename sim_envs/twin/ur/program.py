@@ -172,7 +172,6 @@ class UrProgram:
     # Registers.
 
     def _pace(self) -> tuple[float, float]:
-        """Speed and acceleration of a move."""
         return float(np.clip(self._double(6), *_PACE)), float(np.clip(self._double(7), *_PACE))
 
     def _int(self, index: int) -> int:
