@@ -5,8 +5,6 @@ the image's resolution and blended onto the sensor's background and noise. Heigh
 the gel.
 """
 
-from typing import no_type_check
-
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -19,7 +17,6 @@ HeightField = Float32[np.ndarray, "h w"]
 
 
 @njit(inline="always", fastmath=True, error_model="numpy")
-@no_type_check
 def _response(x, y, depth, k):
     """Evaluate the response to a normal and a depth (`sensor_calibration.shape_features`)."""
     xx, xy, yy = x * x, x * y, y * y
@@ -29,7 +26,6 @@ def _response(x, y, depth, k):
 
 
 @njit(inline="always")
-@no_type_check
 def _along(k, slope, v):
     """Return one channel's coefficients at height v, as a tuple: an array might alias the output,
     which would prevent vectorisation.
@@ -49,7 +45,6 @@ def _along(k, slope, v):
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-@no_type_check
 def _colours(surface, per_pitch, response, limits, dark, shadow, gain, out):
     """Compute `sensor_calibration.shade` less the background, at half its resolution, planar."""
     h, w = surface.shape
@@ -100,7 +95,6 @@ def colour_change(surface: HeightField, instance: SensorInstance) -> Float32[np.
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-@no_type_check
 def _blend(change, background, noise, oy, ox, out):
     """Double the change bilinearly, add background and noise, clip to bytes."""
     _, h, w = change.shape

@@ -1,7 +1,6 @@
 """The arm's state in its wire format, updated in place every millisecond."""
 
 from dataclasses import dataclass
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -123,7 +122,6 @@ def end_effector(
 
 
 @njit(cache=True)
-@no_type_check
 def _pose(position, R, ee):
     T = np.zeros((4, 4))
     for i in range(3):
