@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from touchgoal.control.tactile.sensor_models import SensorModel, find_sensor
 from touchgoal.sim_envs.config import Indenter, RigConfig
 from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Shape, Texture
-from touchgoal.sim_envs.tactile.field_on_picture import tractions
+from touchgoal.sim_envs.tactile.forces import tractions
 from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
@@ -47,7 +47,7 @@ class Stroke:
         frames: the sensor's pictures, RGB, of which the first `REST` are untouched.
         wrench: force (N) and torque (Nm) of the probe on the pad, sensor frame; pressed is -z.
         slip: whether the probe slides over the gel.
-        field: tractions over the picture, kPa; see `field_on_picture.tractions`. Recordings of
+        field: tractions over the picture, kPa; see `forces.tractions`. Recordings of
             strokes leave it out; simulate the stroke again for it.
         indenter: which probe.
         load: largest normal load, N.

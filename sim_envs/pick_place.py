@@ -157,30 +157,16 @@ class PickPlace(FrankaTactileEnv):
         placed = there and (let_go or not self.config.release)
         self._still_ticks = self._still_ticks + 1 if placed else 0
         success = self._still_ticks >= self.config.control_hz // 2
-        return self._progress_at(position, height, away, held, there, success), success
-
-    def _progress_at(
-        self,
-        position: np.ndarray,
-        height: float,
-        away: float,
-        held: bool,
-        there: bool,
-        success: bool,
-    ) -> float:
-        if success:
-            return 1.0
         if there:
-            return 0.95
+            return 1.0 if success else 0.95, success
         if not held:
-            return 0.25 * float(
-                np.clip(1 - self._tcp_distance(position) / self._initial_distance, 0, 1)
-            )
+            nearer = 1 - self._tcp_distance(position) / self._initial_distance
+            return 0.25 * float(np.clip(nearer, 0, 1)), False
         travelled = 1 - away / float(np.linalg.norm(self.start[:2] - self.goal))
         carried = 0.35 + 0.5 * float(np.clip(travelled, 0, 1))
         if away < self.config.tolerance:
             carried += 0.1 * float(np.clip(1 - height / 0.1, 0, 1))
-        return carried
+        return carried, False
 
     def _tcp_distance(self, position: np.ndarray) -> float:
         return float(np.linalg.norm(self.data.site("tcp").xpos - position))

@@ -237,7 +237,7 @@ def test_untouched_sensor_shows_only_noise() -> None:
     seen = (images[1] - images[0]).std() / np.sqrt(2)
     noise = load(MINI.sensor_file).noise  # of which the darkest colours lose some, cut off at 0
     assert 0.7 * noise < seen < 1.1 * noise
-    assert not env.tactile_frames()[0].mask.any()
+    assert not env.tactile_frames[0].mask.any()
     env.close()
 
 
@@ -247,7 +247,7 @@ def test_grasp_shows_on_both_pads_with_the_commanded_force() -> None:
     expert = PickPlaceExpert(env)
     for _ in range(60):
         env.step(expert.act({}))
-    for frame in env.tactile_frames():
+    for frame in env.tactile_frames:
         assert frame.mask.mean() > 0.05
         pressed = MINI.foundation_modulus * frame.depth[frame.mask].sum() * MINI.pixel_pitch**2
         assert pressed == pytest.approx(10.0, rel=0.25)  # the gel's smoothing moves some outside

@@ -16,9 +16,9 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.deployed_arm import DeployedArm
 from touchgoal.sim_envs.cell.estimated_wrench import ForceMonitor
 from touchgoal.sim_envs.cell.hardware import SimulatedHardware
-from touchgoal.sim_envs.cell.spaces import action_space, observation_space
 from touchgoal.sim_envs.config import IDEAL_DEPLOYMENT, SETPOINT_PERIOD, EnvConfig
 from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, PadContact
+from touchgoal.sim_envs.scene.rendering import open_renderer
 from touchgoal.sim_envs.tactile.pad import TactileFrame
 
 DISTURBANCE_SECONDS = 0.5  # for which a disturbance keeps its direction
@@ -80,10 +80,28 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
             raise UserError(f"render_mode is 'rgb_array' or none, not {render_mode!r}")
         super().__init__(config)
         self.render_mode = render_mode
-        self.action_space = self._limits = action_space(self.robot, config.control_hz)
-        self.observation_space = observation_space(config, self.n_joints, self.sensor)
+        step = self.robot.hardware.velocity / config.control_hz
+        self.action_space = self._limits = gym.spaces.Box(
+            np.append(-step, 0.0).astype(np.float32),
+            np.append(step, self.robot.tool.stroke[1]).astype(np.float32),
+            dtype=np.float32,
+        )
+        self.observation_space = self._observation_space()
         forces = TASK_FORCES.get(self.task)
         self._force = ForceMonitor(forces.force_ceiling if forces else np.inf)
+
+    def _observation_space(self) -> gym.spaces.Dict:
+        features, config = ft.features_of(self.n_joints), self.config
+        spaces: dict[str, gym.Space[Any]] = {
+            key: gym.spaces.Box(-np.inf, np.inf, features[key].shape, np.float32)
+            for key in (ft.STATE, ft.COMMAND, ft.TCP_POSE, ft.WRENCH)
+        }
+        sizes = {ft.IMAGE_PREFIX + camera: config.camera_size for camera in config.cameras}
+        if config.tactile:
+            sizes |= dict.fromkeys(ft.TACTILE, self.sensor.image_shape)
+        for key, size in sizes.items():
+            spaces[key] = gym.spaces.Box(0, 255, (*size, 3), np.uint8)
+        return gym.spaces.Dict(spaces)
 
     # What a task defines.
 
@@ -159,7 +177,10 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
     def render(self) -> UInt8[np.ndarray, "h w 3"]:
         """Render the side camera, 480 x 640 RGB; raises ResetNeeded before the first episode."""
         self._require_episode("render")
-        return self.render_view()
+        if self._view_renderer is None:
+            self._view_renderer = open_renderer(self.model, 480, 640)
+        self._view_renderer.update_scene(self.data, "side")
+        return self._view_renderer.render()
 
     # For experts and drivers.
 
@@ -226,15 +247,10 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
         """Draw a joint change (rad): a random walk of the hand's velocity."""
         tick = 1 / self.config.control_hz
         keep = np.exp(-tick / DISTURBANCE_SECONDS)
-        self._disturbance_state = keep * self._disturbance_state + np.sqrt(
-            1 - keep**2
-        ) * self.np_random.normal(size=6)
-        twist = (
-            self.config.disturbance
-            * np.repeat([1.0, self.disturbance_rotation], 3)
-            * self._disturbance_state
-        )
-        return self.kinematics.joint_change(self.command, twist * tick)
+        noise, state = self.np_random.normal(size=6), self._disturbance_state
+        self._disturbance_state = keep * state + np.sqrt(1 - keep**2) * noise
+        size = self.config.disturbance * np.repeat([1.0, self.disturbance_rotation], 3)
+        return self.kinematics.joint_change(self.command, size * self._disturbance_state * tick)
 
     def _run_tick(self, delta: np.ndarray, width: float, seconds: float) -> None:
         """Run a tick with interpolated set-points; end it where the force is too high."""

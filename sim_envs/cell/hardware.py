@@ -32,6 +32,8 @@ class SimulatedHardware(ABC):
     Attributes:
         grasp_force: N of each finger.
         bodies: objects of the scene, the task's first.
+        pads: left and right sensor; empty without `tactile`.
+        tactile_frames: their last readings, with depth and contact mask.
     """
 
     def __init__(self, config: EnvConfig) -> None:
@@ -44,7 +46,7 @@ class SimulatedHardware(ABC):
         self.bodies: list[Body] = []
         self._renderer: Renderer | None = None
         self._view_renderer: Renderer | None = None
-        self._pads: list[TactilePad] = []
+        self.pads: list[TactilePad] = []
 
     @abstractmethod
     def add_task_objects(self, spec: mujoco.MjSpec) -> None:
@@ -129,15 +131,7 @@ class SimulatedHardware(ABC):
 
     def read_tactile(self, side: int) -> TactileFrame:
         """Read the left (0) or right (1) sensor; `update_contacts` first, in order of time."""
-        return self._pads[side].sense(self.data, self._contacts[side], self._noise_rng)
-
-    def tactile_frames(self) -> list[TactileFrame]:
-        """Return the last readings of the left and right sensor, with depth and contact mask."""
-        return self._frames
-
-    def tactile_pads(self) -> list[TactilePad]:
-        """Return the left and the right sensor; empty without `tactile`."""
-        return self._pads
+        return self.pads[side].sense(self.data, self._contacts[side], self._noise_rng)
 
     def read_proprioception(self) -> Observation:
         """Return state, TCP pose and wrench without delay; `update_contacts` first."""
@@ -156,18 +150,11 @@ class SimulatedHardware(ABC):
         pictures = {
             ft.IMAGE_PREFIX + camera: self.render_camera(camera) for camera in self.config.cameras
         }
-        if self._pads:
-            self._frames = [self.read_tactile(side) for side in range(2)]
-            for key, frame in zip(ft.TACTILE, self._frames, strict=True):
+        if self.pads:
+            self.tactile_frames = [self.read_tactile(side) for side in range(2)]
+            for key, frame in zip(ft.TACTILE, self.tactile_frames, strict=True):
                 pictures[key] = frame.image
         return pictures
-
-    def render_view(self) -> UInt8[np.ndarray, "h w 3"]:
-        """Render the side camera, 480 x 640 RGB."""
-        if self._view_renderer is None:
-            self._view_renderer = open_renderer(self.model, 480, 640)
-        self._view_renderer.update_scene(self.data, "side")
-        return self._view_renderer.render()
 
     def close(self) -> None:
         """Free the OpenGL contexts."""
@@ -190,9 +177,9 @@ class SimulatedHardware(ABC):
         self._finger_stiffness = float(model.actuator_gainprm[self._gripper, 0])
         self._tcp = model.site("tcp").id
         self._reader = ContactReader(model)
-        self._frames: list[TactileFrame] = []
+        self.tactile_frames: list[TactileFrame] = []
         sensor, randomization = self.sensor, self.config.randomization
-        self._pads = [
+        self.pads = [
             TactilePad(
                 model, side, sensor, sample_instance(sensor, rng, randomization), self.bodies
             )

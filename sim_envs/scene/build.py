@@ -84,10 +84,8 @@ def set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     visual.map.znear, visual.map.zfar = 0.01, 10.0  # m: the wrist camera is near the fingers
     visual.global_.offheight = visual.global_.offwidth = MAX_CAMERA_SIDE
     visual.headlight.active = 1
-    visual.headlight.ambient, visual.headlight.diffuse = (
-        np.full(3, 0.3, np.float32),
-        np.full(3, 0.3, np.float32),
-    )
+    visual.headlight.ambient = np.full(3, 0.3, np.float32)
+    visual.headlight.diffuse = np.full(3, 0.3, np.float32)
     visual.headlight.specular = np.zeros(3, np.float32)
     visual.quality.shadowsize = 0 if config.meshes == "fast" else 2048
     visual.quality.offsamples = 0 if config.meshes == "fast" else 4
@@ -205,10 +203,7 @@ def arm_joints(arm: str) -> list[str]:
 
 
 def _add_actuators(spec: mujoco.MjSpec, arm: str) -> None:
-    affine = {
-        "gaintype": mujoco.mjtGain.mjGAIN_FIXED,
-        "biastype": mujoco.mjtBias.mjBIAS_AFFINE,
-    }
+    affine = {"gaintype": mujoco.mjtGain.mjGAIN_FIXED, "biastype": mujoco.mjtBias.mjBIAS_AFFINE}
     for i, (name, stiffness) in enumerate(zip(arm_joints(arm), _STIFFNESS[arm], strict=True), 1):
         joint = spec.joint(name)
         spec.add_actuator(

@@ -40,7 +40,7 @@ class SceneRecorder:
         self._data.qpos[:] = self._env.data.qpos
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, "front")
-        touch = [frame.image for frame in self._env.tactile_frames()]
+        touch = [frame.image for frame in self._env.tactile_frames]
         self._pictures.append(_beside(self._renderer.render(), touch))
 
     @property

@@ -11,23 +11,24 @@ import math
 from dataclasses import dataclass
 from typing import no_type_check
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numba import njit
 
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.sim_envs.scene.contacts import PadContact
+from touchgoal.sim_envs.tactile.geometry import Grid
 from touchgoal.sim_envs.tactile.press import Press, solve3
 
-INCIPIENT = 0.25  # share of the normal force whose cells slip
-# Not all: cells that a sliding object has just reached are not loaded yet, and carry up to 1 %.
-GROSS = 0.98
 _ON_CONE = 0.99  # share of the friction limit that counts as slip
 _MAX_CORRECTION = 0.9  # share of a cell's normal force
 # What beyond friction's reach keeps the bristles' motion finite, as a share of their stiffness. The
 # force comes first: torsion gives way where the patch cannot bear both.
 _REGULARIZATION, _REGULARIZATION_TORSION = 1e-5, 1e-3
 _FORCE_TOLERANCE = 1e-4  # share of the friction limit
+_SQUARES = 24  # rows and columns of a picture's tractions
+_FINE = 4  # samples along each side of such a square
 
 
 @dataclass(frozen=True)
@@ -52,16 +53,6 @@ class ForceField:
     slip_fraction: float
     pitch: float
     displacement: tuple[float, float, float]
-
-    @property
-    def incipient(self) -> bool:
-        """Whether slip has begun at the contact's rim: a quarter of the load slips."""
-        return self.slip_fraction >= INCIPIENT
-
-    @property
-    def gross(self) -> bool:
-        """Whether everything slips: the object slides."""
-        return self.slip_fraction >= GROSS
 
     def wrench(self) -> Float[np.ndarray, "6"]:
         """Sum of the field: force (N) and torque (Nm) on the pad about the sensor's origin."""
@@ -315,3 +306,36 @@ def force_field(
         slipping,
     )
     return ForceField(normal, tangential, slipping, slip_fraction, pitch, press.displacement)
+
+
+def over_picture(
+    values: Float[np.ndarray, "h w"], field: ForceField, picture: Grid
+) -> Float32[np.ndarray, "h2 w2"]:
+    """Interpolate values on a field's cells onto a grid centred on the image; 0 beyond the gel."""
+    cells = field.pitch / picture.pitch  # image cells per gel cell
+    middle = np.array(values.shape[::-1]) / 2 - 0.5 - np.array(field.displacement[:2]) / field.pitch
+    shift = middle - (np.array([picture.columns, picture.rows]) / 2 - 0.5) / cells
+    to_cells = np.column_stack([np.eye(2) / cells, shift])
+    size = picture.columns, picture.rows
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(values.astype(np.float32), to_cells, size, flags=flags)
+
+
+def tractions(
+    field: ForceField | None, shape: tuple[int, int], pitch: float
+) -> Float32[np.ndarray, "3 24 24"]:
+    """Return shear along x and y and pressure over an image, kPa, averaged over 24 x 24 cells.
+
+    Args:
+        field: the contact's forces; None without contact.
+        shape: rows and columns of the picture.
+        pitch: m per pixel.
+    """
+    if field is None:
+        return np.zeros((3, _SQUARES, _SQUARES), np.float32)
+    step = max(shape) * pitch / (_SQUARES * _FINE)
+    fine = Grid(round(shape[0] * pitch / step), round(shape[1] * pitch / step), step)
+    stress = np.stack([*field.tangential, field.normal]) / (1e3 * field.pitch**2)
+    planes = (over_picture(plane, field, fine) for plane in stress)
+    size = _SQUARES, _SQUARES
+    return np.stack([cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in planes])

@@ -8,6 +8,7 @@ above the undeformed surface, into the gel: positive where it penetrates.
 import math
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 from numba import njit
@@ -15,7 +16,8 @@ from numba import njit
 NO_SURFACE = np.float32(-0.95)  # m: nothing there
 HeightField = Float32[np.ndarray, "h w"]
 
-BOX, CYLINDER, SPHERE, CAPSULE = range(4)
+BOX, CYLINDER = int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
+SPHERE, CAPSULE = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)
 
 
 @dataclass(frozen=True)

@@ -14,16 +14,7 @@ from touchgoal.sim_envs.scene.build import OBJECT_GROUP
 from touchgoal.sim_envs.scene.contacts import PadContact
 from touchgoal.sim_envs.scene.objects import Body, Material
 from touchgoal.sim_envs.tactile.forces import ForceField, force_field
-from touchgoal.sim_envs.tactile.geometry import (
-    BOX,
-    CAPSULE,
-    CYLINDER,
-    SPHERE,
-    Grid,
-    HeightField,
-    add_mesh,
-    add_primitive,
-)
+from touchgoal.sim_envs.tactile.geometry import Grid, HeightField, add_mesh, add_primitive
 from touchgoal.sim_envs.tactile.markers import GelMotion, draw
 from touchgoal.sim_envs.tactile.optics import render, render_untouched
 from touchgoal.sim_envs.tactile.press import Press, press_until_balanced
@@ -31,12 +22,6 @@ from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance
 from touchgoal.sim_envs.tactile.shear_relief import ShearRelief
 from touchgoal.sim_envs.tactile.texture import add_texture
 
-_PRIMITIVES = {
-    int(mujoco.mjtGeom.mjGEOM_BOX): BOX,
-    int(mujoco.mjtGeom.mjGEOM_CYLINDER): CYLINDER,
-    int(mujoco.mjtGeom.mjGEOM_SPHERE): SPHERE,
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE): CAPSULE,
-}
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 # Surfaces at half the image's resolution: between two of its rays a 20 mm ball deviates from a
 # straight line by 0.09 um. The force balance, over the whole gel, needs a quarter.
@@ -105,9 +90,14 @@ class TactilePad:
         rows, columns = sensor.image_shape
         pitch = instance.pixel_pitch
         self._image_grid = Grid(rows // _FINE, columns // _FINE, pitch * _FINE)
-        self._gel_grid = _gel_grid(sensor, pitch * _COARSE)
+        # Over the whole gel; its sizes are multiples of four.
+        gel_columns, gel_rows = (4 * round(size / pitch / _COARSE / 4) for size in sensor.gel_size)
+        self._gel_grid = Grid(gel_rows, gel_columns, pitch * _COARSE)
         self._field: ForceField | None = None
-        self._motion = self._gel_motion() if len(instance.markers) else None
+        self._motion = None
+        if len(instance.markers):
+            points = (instance.markers - np.array([columns - 1, rows - 1]) / 2) * pitch
+            self._motion = GelMotion(sensor, self._gel_grid, points)
         self._relief = ShearRelief(sensor, self._gel_grid, self._image_grid) if relief else None
 
     def sense(
@@ -137,12 +127,6 @@ class TactilePad:
         draw(image, self._instance.markers, self._instance.marker_radius)
         flat = np.zeros((self._image_grid.rows, self._image_grid.columns), np.float32)
         return TactileFrame(image, flat, flat, None)
-
-    def _gel_motion(self) -> GelMotion:
-        h, w = self._sensor.image_shape
-        centre = np.array([w - 1, h - 1]) / 2
-        points = (self._instance.markers - centre) * self._instance.pixel_pitch
-        return GelMotion(self._sensor, self._gel_grid, points)
 
     def _touched(self, contact: PadContact) -> list[int]:
         """Return bodies on the pad; the scene's own parts (table, case) leave no image."""
@@ -183,8 +167,8 @@ class TactilePad:
             if geom in self._meshes:
                 add_mesh(height, grid.pitch, *self._meshes[geom], *pose)
             else:
-                kind = _PRIMITIVES[int(model.geom_type[geom])]
-                add_primitive(height, grid.pitch, kind, *pose, model.geom_size[geom])
+                kind, size = int(model.geom_type[geom]), model.geom_size[geom]
+                add_primitive(height, grid.pitch, kind, *pose, size)
         return height
 
     def _pose(
@@ -210,9 +194,3 @@ def _triangles(
     vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
     vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]]
     return vertices, model.mesh_face[face : face + model.mesh_facenum[mesh]]
-
-
-def _gel_grid(sensor: SensorModel, pitch: float) -> Grid:
-    """Return a grid over the whole gel; its sizes are multiples of four."""
-    columns, rows = (4 * round(size / pitch / 4) for size in sensor.gel_size)
-    return Grid(rows, columns, pitch)

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from touchgoal.control.tactile.sensor_models import SensorModel
-from touchgoal.sim_envs.tactile.field_on_picture import over_picture
-from touchgoal.sim_envs.tactile.forces import ForceField
+from touchgoal.sim_envs.tactile.forces import ForceField, over_picture
 from touchgoal.sim_envs.tactile.geometry import Grid
 from touchgoal.sim_envs.tactile.markers import layer_compliance
 

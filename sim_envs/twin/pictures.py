@@ -94,7 +94,7 @@ class Pictures(Service):
     def reset(self) -> None:
         """Follow a new episode; the cameras' noise begins anew."""
         env = self._cell.env
-        self._tell(Scene(env.model, env.config.camera_size, env.tactile_pads(), env.np_random))
+        self._tell(Scene(env.model, env.config.camera_size, env.pads, env.np_random))
 
     def close(self) -> None:
         """Close all streams and end the process."""
