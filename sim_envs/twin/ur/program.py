@@ -7,14 +7,16 @@ gains are accepted without effect. All else is refused.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from ruckig import InputParameter, Ruckig, Trajectory
 
-from touchgoal.control.motion.rotations import rotation_vector
+from touchgoal.control.motion.rotations import rotation_matrix, rotation_vector
+from touchgoal.control.safety.braking import braked_velocity
 from touchgoal.control.safety.limits import UR5E
-from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
-from touchgoal.sim_envs.twin.ur.motion import Activity, JointMove, LineMove, Servo, Speed, Stop
+from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 
 _READY, _DONE = 1, 2
 # Numbers of ur-rtde's commands. Streamed ones are acknowledged at once.
@@ -25,7 +27,140 @@ _REFUSAL_CYCLES = 250  # 0.5 s at most; a client that waits for an answer has gi
 _STOP_SCRIPT = 255
 _PACE = 1e-3, 40.0  # rad/s or m/s, and those per s: least and most that ur-rtde lets through
 
-Pose = Float[np.ndarray, "6"]  # m, rotation vector (rad)
+_SERVO_ACCELERATION = 40.0  # rad/s^2, the most that ur-rtde lets a client ask for
+_STILL = 1e-3  # rad/s
+_DAMPING = 1e-6  # m^2: keeps joint speeds finite near singular poses
+
+Joints = Float[np.ndarray, "6"]
+Pose = Float[np.ndarray, "6"]
+"""m, rotation vector (rad)."""
+Target = tuple[Joints, Joints]
+"""rad, rad/s."""
+
+
+# How a UR moves between commands. Each motion's `step` returns the target a millisecond later.
+
+
+class _Trapezoid:
+    """Distance covered from rest to rest, at most at a speed and an acceleration."""
+
+    def __init__(self, length: float, speed: float, acceleration: float) -> None:
+        self._length, self._time = max(length, 1e-9), 0.0
+        limits = InputParameter(1)
+        limits.target_position = [self._length]
+        limits.max_velocity, limits.max_acceleration = [speed], [acceleration]
+        self._trajectory = Trajectory(1)
+        Ruckig(1).calculate(limits, self._trajectory)
+
+    def advance(self, dt: float) -> tuple[float, float]:
+        """Return the share of the way after another `dt` s, and its rate (1/s)."""
+        self._time += dt
+        (way,), (rate,), _ = self._trajectory.at_time(self._time)
+        return way / self._length, rate / self._length
+
+    @property
+    def done(self) -> bool:
+        return self._time >= self._trajectory.duration
+
+
+class _JointMove:
+    """`movej`: linear in joint space; speed (rad/s) and acceleration (rad/s^2) of the leading axis.
+
+    A moving arm is brought to rest first.
+    """
+
+    def __init__(self, goal: Joints, speed: float, acceleration: float) -> None:
+        self._goal, self._speed, self._acceleration = goal, speed, acceleration
+        self._profile: _Trapezoid | None = None
+
+    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
+        if self._profile is None:
+            if np.abs(dq).max() > _STILL:
+                dq = braked_velocity(dq, np.full(6, self._acceleration), DT)
+                return q + DT * dq, dq
+            self._start = q
+            length = float(np.abs(self._goal - q).max())
+            self._profile = _Trapezoid(length, self._speed, self._acceleration)
+        share, rate = self._profile.advance(speed_fraction * DT)
+        way = self._goal - self._start
+        return self._start + share * way, speed_fraction * rate * way * (not self.done)
+
+    @property
+    def done(self) -> bool:
+        return self._profile is not None and self._profile.done
+
+
+class _LineMove:
+    """`movel`: the TCP on a straight line from rest; m/s and m/s^2, or rad if it mostly turns."""
+
+    def __init__(self, cell: SimulatedCell, pose: Pose, speed: float, acceleration: float) -> None:
+        self._cell = cell
+        self._from, self._R, _ = cell.kinematics(cell.q_d)
+        self._way = pose[:3] - self._from
+        self._turn = rotation_vector(rotation_matrix(pose[3:]) @ self._R.T)
+        length = max(float(np.linalg.norm(self._way)), float(np.linalg.norm(self._turn)))
+        self._profile = _Trapezoid(length, speed, acceleration)
+
+    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
+        # Differential inverse kinematics that corrects its own drift.
+        share, _ = self._profile.advance(speed_fraction * DT)
+        position, R, J = self._cell.kinematics(q)
+        target = rotation_matrix(share * self._turn) @ self._R
+        error = np.concatenate(
+            [self._from + share * self._way - position, rotation_vector(target @ R.T)]
+        )
+        dq = J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(6), error / DT)
+        return q + DT * dq, dq * (not self.done)
+
+    @property
+    def done(self) -> bool:
+        return self._profile.done
+
+
+@dataclass
+class _Servo:
+    """`servoj`: follow a goal (rad) that changes all the time, about `lookahead` s behind it."""
+
+    speed: Joints
+    goal: Joints
+    lookahead: float
+    done = False
+
+    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
+        desired = np.clip((self.goal - q) / self.lookahead, -self.speed, self.speed)
+        change = _SERVO_ACCELERATION * DT
+        dq = dq + np.clip(desired - dq, -change, change)
+        return q + DT * dq, dq
+
+
+@dataclass
+class _Speed:
+    """`speedj`: constant joint speed (rad/s)."""
+
+    goal: Joints
+    acceleration: float
+    done = False
+
+    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
+        missing = self.goal - dq
+        most = np.abs(missing).max()
+        dq = dq + missing * min(1.0, self.acceleration * DT / max(most, 1e-12))
+        return q + DT * dq, dq
+
+
+@dataclass
+class _Stop:
+    """`stopj`: slow down (rad/s^2, leading axis) along the way, then rest."""
+
+    deceleration: float
+    done = False
+
+    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
+        fastest = float(np.abs(dq).max())
+        left = max(0.0, fastest - self.deceleration * DT)
+        dq = dq * (left / fastest if fastest > 0 else 0.0)
+        self.done = left == 0.0
+        return q + DT * dq, dq
 
 
 class UrProgram:
@@ -49,7 +184,7 @@ class UrProgram:
         """`protective_stop` stops the arm; `zero_force` zeroes the force sensor."""
         self.cell, self.inputs = cell, inputs
         self._protective_stop, self._zero_force = protective_stop, zero_force
-        self.activity: Activity | None = None
+        self.activity: _JointMove | _LineMove | _Servo | _Speed | _Stop | None = None
         self.ints, self.running = [_READY] + [0] * 47, True
         self._refused = self._cycles_refused = 0
         self.watchdog = np.inf
@@ -97,10 +232,10 @@ class UrProgram:
 
     def _execute(self, command: int) -> None:
         actions = {
-            1: lambda: self._move(JointMove(self._doubles(0), *self._pace())),
-            3: lambda: self._move(LineMove(self.cell, self._doubles(0), *self._pace())),
+            1: lambda: self._move(_JointMove(self._doubles(0), *self._pace())),
+            3: lambda: self._move(_LineMove(self.cell, self._doubles(0), *self._pace())),
             8: self._zero_force,
-            9: lambda: self._go(Speed(self._doubles(0), self._double(6))),
+            9: self._speed,
             11: self._servo,
             15: lambda: self._stop(asynchronous=False),
             16: lambda: self._stop(asynchronous=False),
@@ -116,11 +251,7 @@ class UrProgram:
             self._refuse(command)
 
     def _refuse(self, command: int) -> None:
-        """Let ur-rtde's call fail while the program goes on.
-
-        The client gives up on a command when the program is reported as stopped. A call that reads
-        no answer gets a protective stop.
-        """
+        """Let ur-rtde's call fail: report the program as stopped, or stop if it reads no answer."""
         print(f"REFUSED: the twin does not simulate ur-rtde's command {command}", flush=True)
         if command in _UNANSWERED:
             self._protective_stop()
@@ -134,15 +265,11 @@ class UrProgram:
         self.cell.brake(UR5E.hardware.acceleration)
 
     def report_done(self) -> None:
-        """Report a client's own script, for which it would wait 300 s, as done.
-
-        The client then uploads the control program again; because that does not run within 5 s, its
-        call raises. A protective stop is what a UR does to a script that it cannot go on with.
-        """
+        """Report a client's own script, for which it would wait 300 s, as done; its call raises."""
         self.ints[0] = _DONE
 
-    def _go(self, activity: Activity) -> None:
-        self.activity = activity
+    def _speed(self) -> None:
+        self.activity = _Speed(self._doubles(0), self._double(6))
 
     def _servo(self) -> None:
         goal = self._doubles(0)
@@ -150,9 +277,9 @@ class UrProgram:
             self._protective_stop()
             return
         lookahead = min(max(self._double(9), 0.03), 0.2)
-        self._go(Servo(UR5E.hardware.velocity, goal, lookahead))
+        self.activity = _Servo(UR5E.hardware.velocity, goal, lookahead)
 
-    def _move(self, activity: Activity) -> None:
+    def _move(self, activity: _JointMove | _LineMove) -> None:
         self.activity = activity
         if self._int(1) == 1:
             self._asynchronous = True
@@ -163,7 +290,7 @@ class UrProgram:
 
     def _stop(self, asynchronous: bool) -> None:
         self._asynchronous, self.ints[2] = False, self._started << 24
-        self.activity = Stop(max(0.1, self._double(0)))
+        self.activity = _Stop(max(0.1, self._double(0)))
         self._waiting = not asynchronous
 
     def _set_watchdog(self) -> None:
