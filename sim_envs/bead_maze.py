@@ -199,8 +199,7 @@ def add_wire(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
 def add_bead_on_wire(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
     """Give the bead its hole, a ring of capsules along its axis (z), and put it on the wire.
 
-    The hole's clearance, friction and binding then follow from contacts. Eight capsules drag 8 %
-    more than Coulomb's law, for two of them wedge the wire; twelve drag 5 % more and cost more.
+    Eight capsules drag 8 % more than Coulomb's law; twelve drag 5 % more and cost more.
     """
     bead = spec.body("object")
     bead.pos, tangent = wire.at(START)

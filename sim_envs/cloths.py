@@ -1,8 +1,6 @@
 """Twenty cloths pressed into a fingertip sensor by hand, for TacBench T6 (textile).
 
-A cloth is woven, knitted or napped by a rule; every clip takes another piece of it, its yarn a
-little thicker or thinner and not quite even, on another body at another angle. As with GelSight
-recordings of textiles, a clip is one press that deepens and drifts.
+Every clip is one press that deepens and drifts, on another piece of its cloth and another body.
 """
 
 from collections.abc import Callable
@@ -51,12 +49,7 @@ class Cloth:
 
 @dataclass(frozen=True, eq=False)
 class ClothClip:
-    """One press on one piece of a cloth.
-
-    Attributes:
-        frames: the sensor's pictures, RGB, of which the first is untouched.
-        cloth: its number in `CLOTHS`.
-    """
+    """Frames of one press, RGB, the first untouched, and the cloth's number in `CLOTHS`."""
 
     frames: UInt8[np.ndarray, "t h w 3"]
     cloth: int
@@ -122,14 +115,7 @@ def _round(phase: np.ndarray) -> np.ndarray:
 
 
 def _woven(over: int, under: int, step: int, bundle: int = 1, turn_after: int = 0) -> Pattern:
-    """Return a weave: warp over `over` wefts and under `under`, shifted by `step` from row to row.
-
-    Args:
-        over, under: wefts.
-        step: shift of the rule from one warp to the next.
-        bundle: yarns that go together.
-        turn_after: wefts after which the diagonal turns back (herringbone); 0: never.
-    """
+    """Return a weave: warp over `over` wefts, under `under`; each row shifted by `step`."""
 
     def height(u: Tile, v: Tile) -> Tile:
         i, j = np.floor(u / bundle).astype(int), np.floor(v / bundle).astype(int)

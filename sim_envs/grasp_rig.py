@@ -1,9 +1,7 @@
 """Grasp attempts for TacBench T4: a hand without an arm that grasps, lifts and shakes objects.
 
-After the Feeling of Success (Calandra et al. 2017), whose recordings Sparsh's appendix C.6 uses:
-tactile images before the grasp, with the object gripped, and just lifted; and whether the hand
-still holds the object in the end. Physics, objects and fingertips are those of the scenes. Grip,
-mass and place of the grasp are drawn so widely that about half of the attempts fail.
+After the Feeling of Success (Calandra et al. 2017), which Sparsh's appendix C.6 uses. Grip, mass
+and place are drawn so widely that about half of the attempts fail.
 """
 
 import math

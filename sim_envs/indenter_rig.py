@@ -1,12 +1,9 @@
 """An indenter rig: a probe pressed into one fingertip sensor and drawn over it, without a robot.
 
-Follows the normal and shear load test of Sparsh (Higuera et al. 2024, appendix C.4): a press up to
-a random load of at most 5 N, then a slide of at most 2 mm in a random direction. What differs: a
-slide is about as long as friction holds, so that sticking and slipping are both common, and there
-is no dynamics. Pictures are the pad simulator's.
-
-Stick and slip are the pad's own. The gel is one plate on springs: while the probe sticks, the gel
-goes along and its shear force grows; at the friction cone the probe slides.
+After the load test of Sparsh (Higuera et al. 2024, appendix C.4): a press of at most 5 N, a slide
+of at most 2 mm. What differs: a slide is about as long as friction holds, so that sticking and
+slipping are both common, and there is no dynamics. While the probe sticks, the gel goes along and
+its shear force grows; at the friction cone the probe slides.
 """
 
 import math
@@ -47,9 +44,7 @@ class Stroke:
         frames: the sensor's pictures, RGB, of which the first `REST` are untouched.
         wrench: force (N) and torque (Nm) of the probe on the pad, sensor frame; pressed is -z.
         slip: whether the probe slides over the gel.
-        field: tractions over the picture, kPa; see `forces.tractions`. Recordings of
-            strokes leave it out; simulate the stroke again for it.
-        indenter: which probe.
+        field: tractions (kPa, `forces.tractions`); recordings of strokes leave it out.
         load: largest normal load, N.
         friction: coefficient of this stroke.
     """
@@ -99,8 +94,6 @@ def shear_force(
     Args:
         moved: how far the probe has been drawn, m.
         load: normal force, N.
-        stiffness: shear stiffness of the gel, N/m.
-        friction: coefficient.
     """
     force, slides, slid = np.zeros(len(moved)), np.zeros(len(moved), bool), 0.0
     for i, (way, normal) in enumerate(zip(moved, load, strict=True)):

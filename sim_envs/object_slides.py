@@ -1,12 +1,8 @@
-"""Objects held against one fingertip sensor and slid and turned under it.
+"""Objects held against one fingertip sensor and slid and turned under it by hand.
 
-As in Sparsh's appendix C.5, the load holds and the object is moved by hand: every fraction of a
-second with another velocity. Changes of the pose over five frames are drawn log-uniformly, so that
-small and large ones are as common. The gel's stick and slip are those of the indenter rig, with
-torsion: a patch is turned in the gel as a ring of its mean radius is drawn along it.
-
-For TacBench T3 (pose): the face of a bar and a can on its side. For self-supervised learning, as
-Sparsh does from Touch-Slide: the objects of pick-and-place, any side of them.
+As in Sparsh's appendix C.5 the load holds and the velocity changes every fraction of a second.
+Changes of the pose over five frames are drawn log-uniformly. Stick and slip are the indenter rig's,
+with torsion: a patch is turned in the gel as a ring of its mean radius is drawn along it.
 """
 
 import math
@@ -130,8 +126,6 @@ def pulled(
     Args:
         places: x, y and, if it turns, the way along a ring of the patch's mean radius; its force is
             torsion over that radius.
-        stiffness: shear stiffness of the gel, N/m.
-        limit: largest friction force, N.
     """
     rest = places[0].astype(float)
     force, slip = np.zeros(places.shape), np.zeros(len(places), bool)

@@ -66,8 +66,7 @@ class PickPlace(FrankaTactileEnv):
     def rearrange(self) -> tuple[Observation, dict[str, Any]]:
         """Start a new episode with the same objects, without the cost of a reset.
 
-        Objects are moved over the table as they lie, at rest, to places that a reset could draw; so
-        are the goal and the hand.
+        Objects, goal and hand are moved to places that a reset could draw, the objects as they lie.
         """
         rng, data = self.np_random, self.data
         *positions, self.goal = _random_positions(rng, len(self.bodies) + 1)

@@ -1,8 +1,6 @@
 """The environment's arm as `deploy` drives it, a millisecond at a time.
 
-Joint changes pass deploy's lag, the safety layer and the 1 kHz tracker, as on the wire;
-observations are as old as they are there. The twin's own arm (`simulated_cell.py`) follows its
-set-points in the same way.
+Joint changes pass its lag, safety layer and 1 kHz tracker; observations are as old as on the wire.
 """
 
 from collections import deque
@@ -29,11 +27,7 @@ Value = TypeVar("Value")
 
 
 class _DirectDrive:
-    """Set-points without deployment: a straight line to each target, within one tick.
-
-    Attributes:
-        command: commanded joint positions, rad: the sum of all accepted changes.
-    """
+    """Set-points without deployment: a straight line to each target, within one tick."""
 
     def __init__(self, start: Joints, limits: Float[np.ndarray, "n 2"], ticks: int) -> None:
         self.command, self._limits, self._ticks = start, limits, ticks
@@ -223,10 +217,7 @@ def _read_times(
     tick_ms: int,
     period: float = 1.0,
 ) -> Int[np.ndarray, " t"]:
-    """Draw when (ms) each tick's measurement was taken, every `period` ms.
-
-    Never before the start, and in order of time.
-    """
+    """Draw when (ms), in order of time, each tick's measurement was taken, every `period` ms."""
     at = np.arange(ticks) * tick_ms - _delays(rng, delay, jitter, ticks)
     if period > 1:
         phase = rng.uniform(0, period)

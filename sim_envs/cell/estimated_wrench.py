@@ -15,10 +15,7 @@ Wrench = Float[np.ndarray, "6"]
 
 
 class WrenchError:
-    """Noise, bias and drift of the estimate, drawn for one episode.
-
-    The sizes are guesses, not checked against an arm.
-    """
+    """Noise, bias and drift of the estimate in one episode; guesses, not checked against an arm."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng

@@ -59,9 +59,10 @@ class SimulatedHardware(ABC):
         return spec
 
     def step_physics(self, joints: np.ndarray, width: float, speed: float, steps: int = 1) -> None:
-        """Run physics steps under a servo set-point (rad), while the gripper goes to `width` (m).
+        """Run physics steps under a servo set-point (rad).
 
-        The gripper moves at `speed` (m/s of width) and presses with `grasp_force` at most.
+        The gripper goes to `width` (m) at `speed` (m/s of width), pressing with `grasp_force` at
+        most.
         """
         travel = speed / 2 * steps * self.model.opt.timestep  # m of one finger
         self._finger_target += min(max(width / 2 - self._finger_target, -travel), travel)
@@ -103,8 +104,7 @@ class SimulatedHardware(ABC):
     def contact_force(self) -> Float[np.ndarray, "3"]:
         """Return the robot's contact force (N) in the last step, base frame; 0 if small.
 
-        Reading contacts takes as long as a physics step, so they are read only where some joint
-        bears more than `_QUIET`.
+        Reading takes as long as a physics step: only where some joint bears more than `_QUIET`.
         """
         if np.abs(self.data.qfrc_constraint[self.arm_dofs]).max() < _QUIET:
             return np.zeros(3)

@@ -1,7 +1,6 @@
 """The simulated cell behind the drivers' interfaces, for cell files with `arm = "sim"`.
 
-The cell advances only while the control loop waits for its next tick, and stamps are simulated
-time: a run repeats exactly, on however slow a machine. It never runs faster than the wall clock.
+It advances only while the control loop waits, no faster than the clock: a run repeats exactly.
 """
 
 import time

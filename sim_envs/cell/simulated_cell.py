@@ -43,12 +43,9 @@ class GripperCommand:
 
 @dataclass
 class WorstCase:
-    """Extremes since the episode began, for fault-injection tests.
+    """Extremes since the episode began: rad beyond range, share of joint speed, N from outside.
 
-    Attributes:
-        excess: rad beyond the maker's joint range.
-        speed: share of the maker's joint speed.
-        force: N on the robot from outside, checked once a control tick.
+    The force is checked once a control tick.
     """
 
     excess: float = 0.0

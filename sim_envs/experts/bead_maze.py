@@ -16,9 +16,9 @@ _LEVER = 0.02  # m by which a turn counts as a displacement: the size of the bea
 class BeadMazeExpert:
     """Leads the bead along the wire at `speed` m/s, the hand turned with the wire.
 
-    It acts on the commanded pose, of which it makes a point on the course, a step ahead, so that
-    the arm's compliance does not add up. Where the bead sits in the hand is measured at each tick
-    without the gels' deflection: a bead that slipped is led from where it is.
+    It acts on the commanded pose, so that the arm's compliance does not add up; a bead that slipped
+    in
+    the hand is led from where it is.
     """
 
     def __init__(self, env: BeadMaze, speed: float = 0.025) -> None:

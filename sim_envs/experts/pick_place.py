@@ -42,8 +42,8 @@ class Waypoint:
 class PickPlaceExpert:
     """Picks and places, or fails as `outcome` says.
 
-    never_touch closes the hand 8 cm above the object; drop lets go on the way; wrong_object takes
-    the first distractor; freeze stops moving somewhere between the start and the goal.
+    never_touch closes 8 cm above the object; drop lets go on the way; wrong_object takes the first
+    distractor; freeze stops somewhere between the start and the goal.
     """
 
     def __init__(self, env: PickPlace, outcome: Outcome = "success") -> None:

@@ -34,10 +34,11 @@ _TURN = 1.0  # rad/s
 class FeedbackExpert:
     """Picks and places from any state of arm and object.
 
-    It follows a funnel over the object, and once it holds it, over the goal: the farther beside,
-    the higher. It yields to contact. Its action depends on the start of the episode
-    and on the sensed state of this tick and the last, so a policy with these observations can do
-    the same. It does not follow a displaced object, and never lets go.
+    It follows a funnel over the object, then over the goal: the farther beside, the higher. It acts
+    on
+    the start of the episode and the sensed state of this tick and the last, as a policy can. It
+    yields
+    to contact, does not follow a displaced object, and never lets go.
     """
 
     def __init__(self, env: PickPlace) -> None:
@@ -104,10 +105,7 @@ class FeedbackExpert:
 def _righted(
     R: Float[np.ndarray, "3 3"], yaw: float, turn: float, share: float
 ) -> Float[np.ndarray, "3 3"]:
-    """Return the hand turned by `turn` (rad), with `share` of its tilt removed.
-
-    Not all at once: a policy with plans two ticks late, taught so, oscillates.
-    """
+    """Return the hand turned by `turn` (rad), with `share` of its tilt removed."""
     tilt = rotation_vector(fingers_down(yaw).T @ R)
     return fingers_down(yaw + turn) @ rotation_matrix((1 - share) * tilt)
 

@@ -1,7 +1,6 @@
 """Keyboard teleoperation of the bead, as if guiding a compliant arm by hand.
 
-A key pushes the hand; the arm yields to the wire's forces on the bead. A person gives the
-direction, the wire the exact path.
+A key pushes the hand; the arm yields to the wire's forces on the bead.
 """
 
 import numpy as np

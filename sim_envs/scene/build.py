@@ -1,7 +1,6 @@
 """The MuJoCo scene: an arm with two fingertip sensors, a table, cameras, objects.
 
-Solver settings and their measured effects (creep of a held object, speed) are explained where they
-are set. World frame = the robot's base frame, table top at z = 0.
+World frame = the robot's base frame, table top at z = 0.
 """
 
 import importlib.util
@@ -124,9 +123,9 @@ def _compensate_gravity(body: mujoco.MjsBody) -> None:
 def add_fingertip(spec: mujoco.MjSpec, side: str, sensor: SensorModel) -> None:
     """Add carriage, adapter, sensor case and gel of one finger.
 
-    The gel is one rigid plate on three springs (normal, two shear): the pad's force then is exact,
-    and its displacement is what shear does to the image. The plate's collision box reaches 12 mm
-    into the case, because a thin box flips its contact normals when squeezed.
+    The gel is a rigid plate on three springs (normal, two shear). Its collision box reaches 12 mm
+    into
+    the case, because a thin box flips its contact normals when squeezed.
     """
     finger = spec.body(f"{side}_finger")
     box = mujoco.mjtGeom.mjGEOM_BOX

@@ -18,8 +18,7 @@ _HEIGHT = 240  # px
 class SceneRecorder:
     """Films an environment after its reset: front camera left, both tactile images right.
 
-    The scene is drawn in a model of its own, so that the environment, its observations and its
-    speed do not change.
+    The scene is drawn in a model of its own: the environment does not change.
     """
 
     def __init__(self, env: FrankaTactileEnv, meshes: Literal["fast", "full"] = "full") -> None:

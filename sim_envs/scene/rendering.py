@@ -13,11 +13,7 @@ _opened_in: int | None = None  # the process that first rendered; its forked chi
 
 
 class Renderer(mujoco.Renderer):
-    """MuJoCo's renderer for one process; in a forked child it refuses to render.
-
-    Mesa draws with threads, which a fork does not copy: a lock that one of them held would stay
-    locked.
-    """
+    """MuJoCo's renderer for one process: Mesa's threads and their locks survive no fork."""
 
     def __init__(self, model: mujoco.MjModel, height: int, width: int) -> None:
         check_process_may_render()
@@ -59,11 +55,7 @@ def open_renderer(model: mujoco.MjModel, rows: int, columns: int) -> Renderer:
 
 
 def check_process_may_render() -> None:
-    """Refuse to render in a process that was forked after its parent had rendered.
-
-    Raises:
-        UserError: it was; OpenGL would wait for ever there.
-    """
+    """Raise UserError in a process forked after its parent had rendered: it would wait for ever."""
     if _opened_in not in (None, os.getpid()):
         raise UserError(
             "this process was forked after its parent had rendered, and OpenGL does not survive a "

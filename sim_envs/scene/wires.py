@@ -1,7 +1,6 @@
 """Bent wires for the bead maze: five families, three disjoint splits, made from seeds.
 
-A wire is a curve of constant length, integrated from heading and pitch over arc length, so that its
-curvature is what its family defines. Metres and radians.
+A wire of constant length is integrated from heading and pitch (rad) over arc length (m).
 """
 
 from collections.abc import Callable
@@ -138,10 +137,9 @@ def find(name: str) -> Wire:
 
 
 def choose(split: Split, count: int, families: tuple[Family, ...] = TRAINED) -> list[Wire]:
-    """Return the first `count` wires of a split, families in turn.
+    """Return the first `count` wires of a split, families in turn; more begin with the same ones.
 
-    Within a family no two wires of any split are closer than `APART`. More wires of a split begin
-    with the same ones.
+    Within a family no two wires of any split are closer than `APART`.
     """
     if split not in seeds.WIRES:
         raise UserError(f"unknown split {split!r}; choose from: {', '.join(seeds.WIRES)}")

@@ -1,10 +1,8 @@
 """Forces between a gel and an object, cell by cell: pressure, shear, stick and slip.
 
-Pressure follows from how the object sits in the gel (`press`). Shear is a brush model: every cell
-of the gel is a bristle whose tip sticks to the object until friction releases it; the object moves
-over the gel until the bristles carry the tangential force and torsion of MuJoCo's solver.
-
-Sensor frame as in `geometry`: x along columns, y along rows, z out of the gel; m, N, Nm, Pa.
+Shear is a brush model: every cell is a bristle whose tip sticks to the object until friction
+releases it; the object moves until the bristles carry the solver's tangential force and torsion.
+Sensor frame as in `geometry`; m, N, Nm, Pa.
 """
 
 import math
@@ -33,15 +31,12 @@ _FINE = 4  # samples along each side of such a square
 
 @dataclass(frozen=True)
 class ForceField:
-    """Forces of an object on the cells of a gel.
-
-    The cells are the gel's own: they move with it when it shears, and rest on a grid centred on
-    the sensor frame.
+    """Forces of an object on the cells of a gel, which move with it when it shears.
 
     Attributes:
-        normal: N per cell, positive where pressed.
+        normal: N per cell, positive where pressed; the grid is centred on the sensor frame.
         tangential: N per cell, along the sensor's x and y.
-        slipping: cells where the object slides: their traction lies on the friction cone.
+        slipping: cells whose traction lies on the friction cone.
         slip_fraction: share of the normal force that slipping cells carry.
         pitch: size of a cell, m.
         displacement: (x, y, z) of the whole gel from rest, m.
@@ -120,10 +115,7 @@ def _match_moments(normal, pitch, place, mx, my):
 
 @njit(cache=True, fastmath=True)
 def _bristles(normal, before, pitch, place, friction):
-    """Return pressed cells: x, y from the centre of pressure, last traction, friction limit.
-
-    Returns them with the centre of pressure and the load.
-    """
+    """Return pressed cells (x, y from the centre, traction, friction limit), centre and load."""
     rows, columns = normal.shape
     found = np.empty((5, rows * columns), np.float32)
     load = cx = cy = 0.0
@@ -273,16 +265,14 @@ def force_field(
 ) -> ForceField:
     """Spread the solver's wrench on a pad over the gel's cells; each is 2 x 2 of the pressure's.
 
-    A bristle is as stiff as the gel under it in shear: shear_modulus / gel_thickness, Pa/m.
-
-    Force and torsion are met exactly, the moments about x and y as far as the patch reaches. MuJoCo
-    gives each contact point a friction against torsion; where that bears more than the patch can,
-    all cells slip, and what is missing is added to them in proportion to their pressure.
+    Force and torsion are met exactly, the moments about x and y as far as the patch reaches. Where
+    MuJoCo's friction against torsion bears more than the patch can, all cells slip, and what is
+    missing
+    is added in proportion to their pressure.
 
     Args:
         press: how the object sits in the gel, with an even number of pressure cells each way.
         before: this pad's field of the frame before; None if nothing touched it.
-        contact: the solver's.
         friction: coefficient that the solver used.
     """
     rows, columns = (n // 2 for n in press.pressure.shape)
@@ -328,8 +318,7 @@ def tractions(
 
     Args:
         field: the contact's forces; None without contact.
-        shape: rows and columns of the picture.
-        pitch: m per pixel.
+        shape: rows and columns of the image of `pitch` m per pixel.
     """
     if field is None:
         return np.zeros((3, _SQUARES, _SQUARES), np.float32)

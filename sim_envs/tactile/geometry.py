@@ -1,8 +1,8 @@
 """Height fields of objects over a gel: primitives by analytic rays, meshes by scan lines.
 
 Sensor frame: x along image columns, y along rows, z out of the gel, origin on the undeformed
-surface in the middle of the image; metres. A height field is the height of an object's near side
-above the undeformed surface, into the gel: positive where it penetrates.
+surface in the middle of the image; metres. Height: of an object's near side above that surface,
+into the gel.
 """
 
 import math
@@ -166,9 +166,7 @@ def add_primitive(
     rotation: Float[np.ndarray, "3 3"],
     size: Float[np.ndarray, "3"],
 ) -> None:
-    """Raise a height field, in place, to the near side of one primitive.
-
-    float32: at fingertip distances its rounding is 4 nm.
+    """Raise a height field, in place, to the near side of one primitive (float32: 4 nm).
 
     Args:
         kind: BOX, CYLINDER, SPHERE or CAPSULE.
@@ -236,9 +234,6 @@ def add_mesh(
     rotation: Float[np.ndarray, "3 3"],
 ) -> None:
     """Raise a height field, in place, to the near side of a closed triangle mesh.
-
-    An orthographic z-buffer of our own: software OpenGL takes several times as long, and needs
-    OpenGL.
 
     Args:
         vertices: in the mesh's frame, m.

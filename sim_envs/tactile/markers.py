@@ -20,12 +20,10 @@ _FREE = 0.8
 def rest_positions(
     grid: MarkerGrid, shape: tuple[int, int], pitch: float
 ) -> Float32[np.ndarray, "n 2"]:
-    """Return resting dots of an untouched gel, row by row: (x, y) in px, pixel centres at integers.
-
-    Dots that do not lie fully inside the image are left out.
+    """Return dots of a resting gel that lie fully inside the image: (x, y) in px, row by row.
 
     Args:
-        shape: (rows, columns) of the image.
+        shape: (rows, columns) of the image, whose pixel centres are at integers.
         pitch: m of gel per pixel.
     """
     size = np.array(shape[::-1])
@@ -44,8 +42,7 @@ def layer_compliance(
 ) -> tuple[Float[np.ndarray, "*shape"], Float[np.ndarray, "*shape"], Float[np.ndarray, "*shape"]]:
     """Return the surface compliance of a gel to loads that are waves of number k (1/m).
 
-    The gel is an incompressible elastic layer bonded to a rigid base; the formulas solve the
-    equations of plane and antiplane strain, as the test does numerically.
+    The gel is an incompressible elastic layer bonded to a rigid base (plane and antiplane strain).
 
     Returns:
         Displacement per traction along the wave and across it, m/Pa, and minus the displacement
@@ -62,11 +59,7 @@ def layer_compliance(
 def _responses(
     sensor: SensorModel, step: float, size: float, offset: Float[np.ndarray, "n m 2"]
 ) -> Float32[np.ndarray, "5 n m"]:
-    """Return displacements (m) per N on a square of `size` m, averaged over one at an offset.
-
-    Of x per traction x; of x per traction y, which is that of y per traction x; of y per traction
-    y; of x and of y per pressure. Sampled from a Fourier transform at `step` m.
-    """
+    """Displacements (m) per N on a square of `size` m, averaged over one at an offset."""
     n = 1 << int(np.ceil(np.log2(2.2 * max(sensor.gel_size) / step)))
     k = 2 * np.pi * np.fft.fftfreq(n, step)
     kx, ky = k[None], k[:, None]
@@ -133,9 +126,9 @@ def _move(normal, tangential, responses, patch, stiffness, here, out):
 class GelMotion:
     """Displacement of points on a gel's surface under the forces of a contact.
 
-    MuJoCo's gel shears as one plate under any object. So that the image's markers move
-    with the picture's contact, shear is scaled: a traction shaped like the pressure moves the
-    patch, on the average over the pressure, as far as it moves the plate.
+    MuJoCo's gel shears as one plate. Shear is scaled so that a traction shaped like the pressure
+    moves
+    the patch, on the average over the pressure, as far as it moves the plate.
     """
 
     def __init__(self, sensor: SensorModel, grid: Grid, points: Float[np.ndarray, "n 2"]) -> None:
@@ -198,7 +191,7 @@ def draw(
     Args:
         centres: (x, y) in px, pixel centres at integers.
         radius: px, at least 1.
-        darkness: share of the light that a dot takes, 0 to 1.
+        darkness: share of the light that a dot takes.
     """
     h, w, _ = image.shape
     columns = np.repeat(np.arange(w, dtype=np.float32), 3)

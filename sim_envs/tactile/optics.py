@@ -1,8 +1,6 @@
-"""Colours of a gel's surface in the sensor's camera.
+"""Colours of a gel's surface (heights in m into the gel) in the sensor's camera.
 
-The colours follow from slopes and shadows by the sensor's calibration. They are computed at half
-the image's resolution and blended onto the sensor's background and noise. Heights are metres into
-the gel.
+They are computed at half the image's resolution and blended onto background and noise.
 """
 
 import cv2
@@ -27,9 +25,7 @@ def _response(x, y, depth, k):
 
 @njit(inline="always")
 def _along(k, slope, v):
-    """Return one channel's coefficients at height v, as a tuple: an array might alias the output,
-    which would prevent vectorisation.
-    """
+    """One channel's coefficients at height v, in a tuple: an array might alias the output."""
     return (
         k[0] + v * slope[0],
         k[1] + v * slope[1],

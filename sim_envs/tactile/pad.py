@@ -35,8 +35,7 @@ class TactileFrame:
     Attributes:
         image: camera image, RGB.
         surface: depth of the gel below its rest plane at half the image's resolution, m.
-        overlap: how deep the object itself lies in the undeformed gel, m; zero where it does not
-            touch.
+        overlap: how deep the object itself lies in the undeformed gel, m, there; 0 beside it.
         field: forces over the whole gel; None where nothing touches.
     """
 
@@ -61,10 +60,10 @@ class TactileFrame:
 class TactilePad:
     """One fingertip's sensor in a compiled model.
 
-    The solver gives the pad's force and its place, geometry the contact's shape: objects are pushed
-    into the gel until an elastic foundation carries that force. Geometry is in the sensor's frame,
-    which the case carries, so that shear moves the contact in the image. Stick and slip have a
-    memory: read frames in order of time.
+    The solver gives the pad's force and its place, geometry the contact's shape, in the frame of
+    the
+    sensor's case, so that shear moves the contact in the image. Stick and slip have a memory: read
+    frames in order of time.
     """
 
     def __init__(

@@ -1,7 +1,6 @@
 """How an object sits in a gel: pushed in and tilted until pressure balances the solver's force.
 
-MuJoCo gives the force on a pad and its place; the object's height field gives the shape. Sensor
-frame as in `geometry`: x along columns, y along rows, z out of the gel; m, N, Nm, Pa.
+Sensor frame as in `geometry`; m, N, Nm, Pa.
 """
 
 import math
@@ -35,8 +34,7 @@ class Press:
         tilt: its slope along x and y: `shift + tilt[0] x + tilt[1] y` is added to its height.
         pressure: on the gel's own cells, Pa; zero where nothing touches.
         pitch: size of a cell, m.
-        displacement: of the cells from rest, centred on the sensor frame: (x, y, z) in
-            m. The whole gel shears and sinks under the solver's force, as its plate does.
+        displacement: (x, y, z) of the cells from rest, m: as the solver's plate.
     """
 
     shift: float
@@ -225,10 +223,10 @@ def press_until_balanced(
 ) -> Press:
     """Push an object into the gel, and tilt it, until the pressure balances the solver's force.
 
-    The gel and the object's own give act as an elastic foundation: pressure = modulus x overlap.
-    MuJoCo's penetration is no such measure: it depends on solver settings and the object's mass.
-    The normal force is met exactly; its moments as far as the patch, `MAX_TILT` and
-    `TILT_STIFFNESS` let them.
+    Pressure = modulus x overlap. MuJoCo's penetration is no such measure: it depends on solver
+    settings
+    and mass. The normal force is met exactly, its moments as far as the patch and `MAX_TILT` let
+    them.
 
     Args:
         height: object height over the whole gel, m; all NO_SURFACE: nothing presses.

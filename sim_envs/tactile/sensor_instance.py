@@ -25,7 +25,6 @@ class SensorInstance:
     """One simulated sensor: its sensor file, varied as two of a model differ.
 
     Attributes:
-        calibration: colours of its gel's shapes.
         background: the untouched frame, RGB in STEPs.
         illumination: how strongly the light falls, per channel, at half the image's resolution.
         noise: tile of camera noise in STEPs, larger than the image by NOISE_MARGIN.
@@ -103,11 +102,7 @@ def _planar(image: Shaped[np.ndarray, "h w 3"], kind: type) -> Shaped[np.ndarray
 def _turned(
     response: Float32[np.ndarray, "3 k 3"], turns: Float[np.ndarray, "3"]
 ) -> Float32[np.ndarray, "3 k 3"]:
-    """Turn the lights of a response about the sensor's axis, rad from x towards y.
-
-    A turned light sees a normal as the light itself saw it turned back: the coefficients that do
-    so are found by least squares, which is exact.
-    """
+    """Turn the lights of a response about the sensor's axis, rad from x towards y (exactly)."""
     x, y = np.random.default_rng(0).uniform(-1, 1, (2, 64))
     basis = monomials(x, y).T
     n = basis.shape[1]

@@ -1,9 +1,7 @@
-"""Rise and fall of a gel's surface where friction pulls along it.
+"""Rise and fall of a gel's surface where friction pulls along it: the trace of shear without dots.
 
-In front of an object drawn over a gel the surface piles up, behind it sinks: the trace of shear in
-images of a gel without printed dots. The gel is the elastic layer of `markers.layer_compliance`. A
-load there squeezes the surface aside by minus S times the pressure's gradient; by Betti's
-reciprocity the surface sinks by S times the traction's divergence.
+The gel is the layer of `markers.layer_compliance`: a load squeezes the surface aside by minus S
+times the pressure's gradient; by Betti's reciprocity it sinks by S times the traction's divergence.
 """
 
 import cv2
@@ -19,11 +17,7 @@ _RIM = 0.3e-3  # m: how softly the relief ends where an object holds the surface
 
 
 class ShearRelief:
-    """Depth that a contact's shear adds to a gel's surface.
-
-    As in `markers.GelMotion` shear is scaled so that the patch moves, on the average over the
-    pressure, as far as MuJoCo's plate.
-    """
+    """Depth that a contact's shear, scaled as in `markers.GelMotion`, adds to a gel's surface."""
 
     def __init__(self, sensor: SensorModel, gel: Grid, image: Grid) -> None:
         """Prepare for forces on the gel's cells, two by two of `gel`, and surfaces on `image`."""
@@ -44,7 +38,6 @@ class ShearRelief:
         """Return the depth (m) to add to the surface; none where the object itself holds it.
 
         Args:
-            field: the contact's forces.
             overlap: object's overlap with the undeformed gel, on the image's grid.
         """
         relief = over_picture(self.depth(field), field, self._image)

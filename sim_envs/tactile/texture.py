@@ -99,8 +99,7 @@ def add_texture(
 ) -> None:
     """Add a material's pattern to a height field, in place, where it may touch the gel.
 
-    The patterns are solid, functions of the point in the object's frame, so that they stick to any
-    shape without seams.
+    Patterns are functions of the point in the object's frame, so that they stick to any shape.
 
     Args:
         position, rotation: pose of the object in the sensor frame.

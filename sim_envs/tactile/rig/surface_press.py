@@ -1,6 +1,6 @@
-"""Presses of random surfaces, by the pad simulator alone: no robot, no physics, a millisecond each.
+"""Presses of random surfaces by the pad simulator alone, a millisecond each.
 
-For representation learning. The depth is drawn, not solved for; `press_bench` presses with a force.
+The depth is drawn, not solved for; `press_bench` presses with a force.
 """
 
 import math
@@ -55,8 +55,6 @@ def overlap(
     """Return the depth of the surface in the undeformed gel, m; zero where it does not reach it.
 
     Args:
-        surface: the pressed surface.
-        pose: how.
         shape: rows and columns of the grid, centred on the image.
         pitch: size of a cell, m.
     """

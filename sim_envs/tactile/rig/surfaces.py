@@ -1,7 +1,6 @@
-"""Random surfaces: bodies and textures as height maps in metres.
+"""Random surfaces: bodies (flat, round, edged) with textures as height maps in metres.
 
-A surface is a body (flat, round, edged) with one or two textures. Textures are tiles that repeat; a
-press takes them anywhere, at any angle (`surface_press`).
+Textures are tiles that repeat; a press takes them anywhere, at any angle (`surface_press`).
 """
 
 from collections.abc import Callable
