@@ -71,10 +71,7 @@ def _pool(pressure, area, out):
 
 @njit(cache=True, fastmath=True)
 def _match_moments(normal, pitch, place, mx, my):
-    """Weight the forces, linearly across the patch, so that their first moments become mx and my.
-
-    That neither moves nor spreads the patch; no cell loses or gains more than `_MAX_CORRECTION`.
-    """
+    """Weight the forces, linearly across the patch, so that their moments become mx and my."""
     rows, columns = normal.shape
     load = sx = sy = sxx = sxy = syy = 0.0
     for i in range(rows):

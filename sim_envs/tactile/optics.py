@@ -119,10 +119,7 @@ def _blend(change, background, noise, oy, ox, out):
 def render(
     surface: HeightField, instance: SensorInstance, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Render the RGB frame of a gel surface given at half the frame's resolution.
-
-    `rng` picks which part of the noise tile this frame gets.
-    """
+    """Render the RGB frame of a surface of half its resolution; `rng` shifts the noise."""
     change = colour_change(surface, instance)
     oy, ox = rng.integers(0, NOISE_MARGIN, 2)
     planes = np.empty(instance.background.shape, np.uint8)

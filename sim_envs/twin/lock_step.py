@@ -22,9 +22,9 @@ _PATIENCE = 3.0  # s on the wall for what a holder says is on its way
 class LockStep:
     """Time that advances only as its holder asks.
 
-    Advancing begins once the arm's client drives it, if the holder says that it will, and once the
-    hand has received as many commands as were sent. It ends once the arm's client has answered the
-    last state. Images are taken meanwhile, and waited for when a client asks for their number.
+    Advancing begins once the arm's client drives it (if the holder says so) and the hand has
+    received
+    what was sent, and ends once the arm's client has answered the last state.
     """
 
     def __init__(

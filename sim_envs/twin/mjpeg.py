@@ -60,11 +60,7 @@ class Stream:
 
 
 class StreamServer:
-    """Serves streams at `http://host:port/NAME`.
-
-    Attributes:
-        port: at which they are.
-    """
+    """Serves streams at `http://host:port/NAME`; `port` 0: any that is free."""
 
     def __init__(self, streams: dict[str, Stream], host: str, port: int) -> None:
         """`port` 0: any that is free. Raises OSError if it is taken."""

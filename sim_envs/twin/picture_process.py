@@ -1,7 +1,6 @@
-"""The process that renders and serves a twin's images; physics and clients do not wait for it.
+"""The process that renders and serves a twin's images, so that physics does not wait for it.
 
-It has a copy of the scene's model and follows the physics by its state. It ends when the twin
-closes its end of the pipe.
+It follows the physics by its state, and ends when the twin closes its end of the pipe.
 """
 
 import signal

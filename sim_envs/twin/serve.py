@@ -49,7 +49,6 @@ class TwinConfig:
     Attributes:
         task: task of the cell; its `arm` is replaced by `arm`.
         arm: an FR3 with the Franka Hand, or a UR5e whose gripper talks as a Robotiq does.
-        seed: random seed of the first episode.
         host: loopback address of everything; twins at different ones run side by side.
         port: image port; the next one is the control port. 0: any that are free.
         lock_step: wait for the client that drives the arm, so that runs repeat.
@@ -70,13 +69,10 @@ class TwinConfig:
 class Twin:
     """The cell with its services, in one thread.
 
-    In real time the cell catches up with the clock. In lock-step it waits for the client that
-    drives the arm, and while a client holds the time (`lock_step.py`), for that.
+    In lock-step it waits for the client that drives the arm or holds the time (`lock_step.py`).
 
     Attributes:
         cell_config: content of the cell file.
-        pace: speed against the wall clock.
-        pictures: its cameras and fingertips.
         stopped: set it to end `run`.
     """
 

@@ -37,8 +37,7 @@ class ArmState:
     """State message (`messages.ROBOT_STATE`).
 
     Attributes:
-        record: its one element.
-        fields: a view of each field by name; writing there is ten times as fast as by the record.
+        fields: views of the record's fields by name, ten times as fast to write.
     """
 
     def __init__(self) -> None:

@@ -1,8 +1,7 @@
 """The arm's side of the Franka control interface, in front of the cell, for any libfranka client.
 
-Joint and Cartesian position and velocity motions, and torques; reflexes, limits and lost packets
-abort them with a real arm's errors. Not simulated: impedances set by the client (the servo keeps
-Franka's default), self-collision, guiding.
+Reflexes, limits and lost packets abort motions with a real arm's errors. Not simulated: impedances
+set by the client (the servo keeps Franka's default), self-collision, guiding.
 """
 
 import time
@@ -35,8 +34,7 @@ class FrankaArm(Service):
     """Serves an arm at `host`, port 1337.
 
     Attributes:
-        timeout: s to wait for a client's answer to each state before the cell goes on without it.
-            Long: lock-step; the packet counts as lost only then.
+        timeout: s to wait for a client's answer to each state; the packet counts as lost only then.
         mode: idle, moving, in a reflex, or user-stopped.
         error: the error in force.
     """
@@ -83,9 +81,7 @@ class FrankaArm(Service):
     def hold(self) -> None:
         """Take the client's messages while time stands, and keep its connection alive.
 
-        A client that drives the arm is sent the last state again, which it has answered: to it,
-        too, no time passes. One that does not looks for new states; so does one whose motion
-        begins.
+        A client that drives the arm is sent the last state again; others look for new ones.
         """
         motion = self._take_messages()
         interval = _HELD_INTERVALS[0 if motion is None else 1 + motion.begun]

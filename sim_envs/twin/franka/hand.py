@@ -39,9 +39,7 @@ class Job:
 
 
 class FrankaHand(Service):
-    """Serves the hand at `host`, port 1338.
-
-    A grasp closes until something resists; closing on air fails for every expected width.
+    """Serves the hand at `host`, port 1338; a grasp closes until something resists.
 
     Attributes:
         commands, answers: how many commands have come, and how many were answered.

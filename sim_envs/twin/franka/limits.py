@@ -51,8 +51,7 @@ def next_setpoint(before: Setpoint, q: Joints) -> Setpoint:
 def joint_fault(before: Setpoint, now: Setpoint, cartesian: bool) -> str | None:
     """Return libfranka's name of the limit that a set-point breaks; None if none.
 
-    A client that moves in Cartesian space is held to joint range and speed only, for its set-points
-    pass through the twin's own inverse kinematics.
+    Cartesian ones, through the twin's own inverse kinematics, are held to range and speed only.
     """
     name = "cartesian_motion_generator_joint" if cartesian else "joint_motion_generator"
     broken = _broken_limit(now.q, now.dq, now.ddq, before.ddq, *_HARDWARE)
@@ -131,11 +130,7 @@ def _worst_of_arm(q, dq, lower, upper, velocity):
 
 
 def estimate_sent(wrench: Wrench, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
-    """Return O_F_ext_hat_K for a wrench (N, Nm) of the environment on the robot.
-
-    libfranka, robot_state.h: the robot's wrench on the environment is positive; all is 0
-    near or in a singularity.
-    """
+    """Return O_F_ext_hat_K: the robot's wrench (N, Nm) on the environment; 0 at a singularity."""
     if _is_singular(jacobian):
         return np.zeros(6)
     return -wrench + _NEVER_ZERO

@@ -1,8 +1,7 @@
 """The Franka control interface's bytes: messages of server version 10, one client's connection.
 
-Layouts are those of libfranka's public headers (service types of robot and gripper), as franky-sim
-documents them. They are written as numpy records, so that a state is packed by copying it: 20 us
-instead of the 0.3 ms that franky-sim's tuples and pinocchio take of every millisecond.
+Layouts are those of libfranka's public headers, as franky-sim documents them. As numpy records a
+state is packed in 20 us instead of franky-sim's 0.3 ms.
 """
 
 import select
@@ -208,11 +207,10 @@ class Request:
 class Link:
     """One client's connection: commands over TCP, states and set-points over UDP.
 
-    There is one slot, as on the robot: a second client waits until the first has gone.
+    A second client waits until the first has gone.
 
     Attributes:
         frozen: nothing gets through in either direction.
-        connected: whether a client is connected and has shaken hands.
     """
 
     def __init__(self, host: str, port: int, version: int, wide: bool) -> None:

@@ -74,8 +74,7 @@ class SerialPort:
 class LoadCell(Service):
     """A load cell under the table: lines `milliseconds,counts*CRC`, 80 a second.
 
-    Force in N is `NEWTONS_PER_COUNT * (counts - ZERO)`; CRC is Modbus' CRC-16 of all bytes before
-    the star, as four hexadecimal digits.
+    Force in N is `NEWTONS_PER_COUNT * (counts - ZERO)`; CRC: Modbus' CRC-16, hexadecimal.
 
     Attributes:
         sent: milliseconds of the last line.
@@ -109,10 +108,7 @@ class LoadCell(Service):
 
 
 class Robotiq(Service):
-    """A 2F gripper's Modbus registers in front of the cell's gripper; it begins activated.
-
-    Position 3 is the tool's stroke between the pads, 230 is closed.
-    """
+    """A 2F gripper's Modbus registers, activated; position 3 is the pads' stroke, 230 is closed."""
 
     def __init__(self, cell: SimulatedCell, path: Path) -> None:
         self.cell, self.port = cell, SerialPort(path)

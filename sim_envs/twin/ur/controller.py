@@ -1,9 +1,7 @@
 """A UR controller in front of the cell, for ur-rtde's control, receive and dashboard clients.
 
-Simulated: RTDE, the dashboard's state, power and stop commands, the script port for ur-rtde's own
-control program (`program.py` lists its commands). Not simulated: other URScript, rtde_io, force
-mode, freedrive, speed scaling by safety, the primary and secondary interface (their ports accept
-and say nothing).
+Simulated: RTDE, the dashboard's state, power and stop commands, and ur-rtde's own control program
+(`program.py`). The primary and secondary ports accept and say nothing.
 """
 
 import re
@@ -46,7 +44,6 @@ class UrController(Service):
 
     Attributes:
         frozen: nothing gets through in either direction.
-        safety: normal, protective stop or emergency stop.
     """
 
     def __init__(self, cell: SimulatedCell, host: str) -> None:

@@ -88,11 +88,7 @@ class MalformedError(ValueError):
 
 
 def split(unread: bytes) -> tuple[list[tuple[int, bytes]], bytes]:
-    """Split off whole packages (kind, payload); return them and the rest.
-
-    Raises:
-        MalformedError: a length is impossible.
-    """
+    """Split off whole packages (kind, payload); return them and the rest; or MalformedError."""
     found = []
     while len(unread) >= 3:
         length, kind = struct.unpack_from(">HB", unread)
