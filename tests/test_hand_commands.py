@@ -8,7 +8,7 @@ import pytest
 
 from touchgoal.control.grippers.franka_hand import FrankaHandClient
 from touchgoal.control.safety.limits import FR3
-from touchgoal.sim_envs.cell.deployed_hand import DeployedHand
+from touchgoal.sim_envs.cell.deployed_arm import DeployedHand
 
 LOOK = 50  # ms
 OPEN = 0.08  # m

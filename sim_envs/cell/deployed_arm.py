@@ -10,16 +10,20 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from touchgoal.control import features as ft
+from touchgoal.control.grippers.hand_commands import PERIOD, SHUT, HandCommands, LastCommand
 from touchgoal.control.motion.servo_lag import SERVO_DAMPING, ServoLag
 from touchgoal.control.motion.tracker import Tracker
 from touchgoal.control.safety.action_filter import ActionFilter, Measurements
-from touchgoal.sim_envs.cell.deployed_hand import DeployedHand
 from touchgoal.sim_envs.cell.estimated_wrench import EstimatedWrench
 from touchgoal.sim_envs.config import DeploymentConfig
 
 _DT = 1e-3  # s
 _WRENCH_PERIOD = 10  # ms between estimates of the force on the hand
 _FORCE_PERIOD = 2  # ms between looks at the true force
+_HAND_PERIOD = round(1000 * PERIOD)  # ms
+_ARRIVED = 1e-3  # m
+_STILL = 2e-4  # m by which fingers move between two looks, and count as stopped
+_LEAST = 2  # looks for which any command runs
 _AHEAD = 10  # ticks for which delays are drawn beyond an episode's end
 
 Joints = Float[np.ndarray, " n"]
@@ -78,6 +82,44 @@ class _TrackedDrive:
         before = self._track.q
         self._track = self._tracker.step(self._track)
         return self._track.q + SERVO_DAMPING * (self._track.q - before) / _DT
+
+
+class DeployedHand:
+    """A Franka Hand behind its driver in one episode, open and at rest at first.
+
+    Attributes:
+        width: last reading, m.
+    """
+
+    def __init__(self, env: Any, rng: np.random.Generator) -> None:
+        self._env = env
+        self._phase = int(rng.integers(_HAND_PERIOD))
+        self._goal = self.width = env.width()
+        self._commands = HandCommands(self.width)
+        self._last: LastCommand = "arrived"
+        self._grasps, self._age = False, 0
+
+    def step(self, ms: int, target_width: float) -> float:
+        """Return the width (m) that the fingers go to now, given the latest target."""
+        if ms % _HAND_PERIOD == self._phase:
+            self._look(target_width)
+        return self._goal
+
+    def _look(self, target_width: float) -> None:
+        before, self.width = self.width, self._env.width()
+        self._age += 1
+        if self._last == "runs" and self._age > _LEAST:
+            if abs(self.width - self._goal) < _ARRIVED:
+                self._last = "arrived"
+            elif abs(self.width - before) < _STILL:
+                self._last = "stopped short"
+        grasped = self._grasps and self._last != "runs" and self.width > SHUT
+        target = min(max(target_width, 0.0), self._env.robot.tool.stroke[1])
+        command = self._commands.next(target, self.width, grasped, self._last)
+        if command is not None:
+            self._grasps = command.grasp
+            self._goal = 0.0 if command.grasp else command.width
+            self._last, self._age = "runs", 0
 
 
 class DeployedArm:

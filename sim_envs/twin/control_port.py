@@ -122,7 +122,7 @@ class ControlPort(Service):
             "truth": self._cell.truth,
             "hold": lambda: self._held_time().hold(client),
             "advance": None,
-            "pictures": lambda: self._held_time().pictures(),
+            "pictures": lambda: self._held_time() and self._pictures.sent(),
             "reset": lambda: self._reset(*rest.split(" ", 1)),
             "freeze": lambda: self._freeze(float(rest)),
             "drop": self._arm.drop,

@@ -50,11 +50,7 @@ class LockStep:
         self._holder, self._left, self._asked = client, 0, False
         self._commands_before, self._answers_before = self._hand.commands, self._hand.answers
         self._pictures.held = True
-        return self._report() | {"pictures": self.pictures()}
-
-    def pictures(self) -> dict[str, int]:
-        """Return the number of images sent on each stream, once all due ones are."""
-        return self._pictures.sent()
+        return self._report() | {"pictures": self._pictures.sent()}
 
     def advance(self, client: ClientConnection, steps: int, driven: bool, issued: int) -> None:
         """Advance by a number of steps; the answer follows when they are made."""
@@ -68,8 +64,8 @@ class LockStep:
     @property
     def held(self) -> bool:
         """Whether a client holds the time."""
-        held = self._pictures.held = self._holder is not None and self._holder.open
-        return held
+        self._pictures.held = self._holder is not None and self._holder.open
+        return self._pictures.held
 
     @property
     def standing(self) -> bool:

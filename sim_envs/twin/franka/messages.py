@@ -103,8 +103,6 @@ class MoveStatus(IntEnum):
     NOT_POSSIBLE = 5
     INVALID_ARGUMENT = 7
     REFLEX_ABORTED = 8
-    INPUT_ERROR_ABORTED = 10
-    ABORTED = 11
 
 
 class RobotMode(IntEnum):

@@ -2,7 +2,7 @@
 
 The URScript itself is not interpreted. Arguments of a command lie in the input registers, answers
 in the output registers; output register 0 is 1 (ready for a command) or 2 (done). Simulated: moveJ,
-moveL, servoJ, speedJ, their stops, the watchdog, zeroFtSensor and protective stops. Payload and
+moveL, servoJ, their stops, the watchdog, zeroFtSensor and protective stops. Payload and
 gains are accepted without effect. All else is refused.
 """
 
@@ -134,21 +134,6 @@ class _Servo:
 
 
 @dataclass
-class _Speed:
-    """`speedj`: constant joint speed (rad/s)."""
-
-    goal: Joints
-    acceleration: float
-    done = False
-
-    def step(self, q: Joints, dq: Joints, speed_fraction: float) -> Target:
-        missing = self.goal - dq
-        most = np.abs(missing).max()
-        dq = dq + missing * min(1.0, self.acceleration * DT / max(most, 1e-12))
-        return q + DT * dq, dq
-
-
-@dataclass
 class _Stop:
     """`stopj`: slow down (rad/s^2, leading axis) along the way, then rest."""
 
@@ -184,7 +169,7 @@ class UrProgram:
         """`protective_stop` stops the arm; `zero_force` zeroes the force sensor."""
         self.cell, self.inputs = cell, inputs
         self._protective_stop, self._zero_force = protective_stop, zero_force
-        self.activity: _JointMove | _LineMove | _Servo | _Speed | _Stop | None = None
+        self.activity: _JointMove | _LineMove | _Servo | _Stop | None = None
         self.ints, self.running = [_READY] + [0] * 47, True
         self._refused = self._cycles_refused = 0
         self.watchdog = np.inf
@@ -235,7 +220,6 @@ class UrProgram:
             1: lambda: self._move(_JointMove(self._doubles(0), *self._pace())),
             3: lambda: self._move(_LineMove(self.cell, self._doubles(0), *self._pace())),
             8: self._zero_force,
-            9: self._speed,
             11: self._servo,
             15: lambda: self._stop(asynchronous=False),
             16: lambda: self._stop(asynchronous=False),
@@ -267,9 +251,6 @@ class UrProgram:
     def report_done(self) -> None:
         """Report a client's own script, for which it would wait 300 s, as done; its call raises."""
         self.ints[0] = _DONE
-
-    def _speed(self) -> None:
-        self.activity = _Speed(self._doubles(0), self._double(6))
 
     def _servo(self) -> None:
         goal = self._doubles(0)
