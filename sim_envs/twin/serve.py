@@ -16,11 +16,9 @@ from touchgoal.control.cell.config import (
     TaskSection,
     ToolSection,
 )
-from touchgoal.control.safety.limits import FR3, UR5E
 from touchgoal.control.sensors.load_cell import LoadCellConfig
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.bead_maze import BeadMaze
-from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 from touchgoal.sim_envs.config import TaskConfig
 from touchgoal.sim_envs.tactile.rig.press_bench import warm_up
@@ -177,67 +175,46 @@ class Twin:
             cell, arm, pictures, ports, host, control, self._lock_step, reset
         )
         services.append(self._commands)
-        return _cell_config(
-            config,
-            gripper,
-            pictures.addresses(),
-            LoadCellConfig(
-                str(load_cell.port.path), serial_ports.NEWTONS_PER_COUNT, serial_ports.ZERO
+        return self._describe(config, gripper, str(load_cell.port.path))
+
+    def _describe(self, config: TwinConfig, gripper: GripperSection, load_cell: str) -> CellConfig:
+        """Return the cell file; the link of a lock-step twin may be silent for longer."""
+        env, streams = self.cell.env, self.pictures.addresses()
+        cameras: dict[CameraName, CameraSection] = {
+            name: CameraSection(streams[name], CAMERA_RATE)
+            for name in get_args(CameraName)
+            if name in streams
+        }
+        fingertips = None
+        if "tactile_left" in streams:
+            sides = streams["tactile_left"], streams["tactile_right"]
+            fingertips = FingertipsSection(config.task.sensor, *sides)
+        limits, maze = env.robot, isinstance(env, BeadMaze)
+        tool = limits.tool
+        return CellConfig(
+            arm=config.arm,
+            address=config.host,
+            gripper=gripper,
+            task=TaskSection(
+                name="bead-maze" if maze else "pick-place",
+                policy="shipped" if maze else "expert",
+                instruction=env.instruction(),
+                seconds=_RUN_SECONDS,
+                twin=self._commands.address,
+                seed=config.seed,
+                objects=() if maze else (env.bodies[0].kind.name,),
+                wires=(env.wire.name,) if isinstance(env, BeadMaze) else (),
             ),
-            _task_section(config, cell.env, self._commands.address),
+            tool=ToolSection(
+                tool.tcp_offset, tool.mass, tool.centre_of_mass, tuple(tool.finger_corners)
+            ),
+            fingertips=fingertips,
+            cameras=cameras,
+            load_cell=LoadCellConfig(load_cell, serial_ports.NEWTONS_PER_COUNT, serial_ports.ZERO),
+            safety=SafetySection(
+                # Objects are grasped 2 mm above the table, which a simulated one survives.
+                fingertips_lower=(*limits.fingertips.lower[:2].tolist(), 0.0),
+                state_timeout=_LOCK_STEP_TIMEOUT if config.lock_step else None,
+            ),
+            lock_step=config.lock_step,
         )
-
-
-def _cell_config(
-    config: TwinConfig,
-    gripper: GripperSection,
-    streams: dict[str, str],
-    load_cell: LoadCellConfig,
-    task: TaskSection,
-) -> CellConfig:
-    """Return the cell file's content for this twin.
-
-    In lock-step time goes as slowly as the machine needs: by the clock on the wall, which drivers
-    go by, the link may be silent for longer.
-    """
-    cameras: dict[CameraName, CameraSection] = {}
-    for name in get_args(CameraName):
-        if name in streams:
-            cameras[name] = CameraSection(streams[name], CAMERA_RATE)
-    limits = UR5E if config.arm == "ur5e" else FR3
-    tool, fingertips = limits.tool, None
-    if "tactile_left" in streams:
-        sides = streams["tactile_left"], streams["tactile_right"]
-        fingertips = FingertipsSection(config.task.sensor, *sides)
-    return CellConfig(
-        arm=config.arm,
-        address=config.host,
-        gripper=gripper,
-        task=task,
-        tool=ToolSection(
-            tool.tcp_offset, tool.mass, tool.centre_of_mass, tuple(tool.finger_corners)
-        ),
-        fingertips=fingertips,
-        cameras=cameras,
-        load_cell=load_cell,
-        safety=SafetySection(
-            # The tasks' objects are grasped 2 mm above the table, which a simulated one survives.
-            fingertips_lower=(*limits.fingertips.lower[:2].tolist(), 0.0),
-            state_timeout=_LOCK_STEP_TIMEOUT if config.lock_step else None,
-        ),
-        lock_step=config.lock_step,
-    )
-
-
-def _task_section(config: TwinConfig, env: FrankaTactileEnv, control_port: str) -> TaskSection:
-    maze = isinstance(env, BeadMaze)
-    return TaskSection(
-        name="bead-maze" if maze else "pick-place",
-        policy="shipped" if maze else "expert",
-        instruction=env.instruction(),
-        seconds=_RUN_SECONDS,
-        twin=control_port,
-        seed=config.seed,
-        objects=() if maze else (env.bodies[0].kind.name,),
-        wires=(env.wire.name,) if maze else (),
-    )

@@ -6,6 +6,7 @@ Simulated: RTDE, the dashboard's state, power and stop commands, and ur-rtde's o
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -26,17 +27,18 @@ _FASTEST = 500.0  # Hz of an e-Series' data; also rad/s that no joint comes near
 _MOST_RECIPES = 255
 _STOPPED, _PLAYING = 1, 2  # runtime_state
 _POWER_OFF, _IDLE, _RUNNING = 3, 5, 7  # robot_mode
+_MODES = {_POWER_OFF: "POWER_OFF", _IDLE: "IDLE", _RUNNING: "RUNNING"}
 
 
+@dataclass(eq=False)
 class Client:
-    """One RTDE client: its recipes, and how often it wants data."""
+    """One RTDE client: its recipes, and how often (ms) it wants data."""
 
-    def __init__(self, connection: ClientConnection) -> None:
-        self.connection = connection
-        self.outputs: list[str] = []
-        self.inputs: list[list[str]] = []
-        self.period = _CYCLE  # ms
-        self.started = False
+    connection: ClientConnection
+    outputs: list[str] = field(default_factory=list)
+    inputs: list[list[str]] = field(default_factory=list)
+    period: int = _CYCLE
+    started: bool = False
 
 
 class UrController(Service):
@@ -52,10 +54,8 @@ class UrController(Service):
         self._dashboard = ListeningPort(host, messages.DASHBOARD, hello)
         self._script = ListeningPort(host, messages.SCRIPT)
         self._rtde = ListeningPort(host, messages.RTDE)
-        self._unused_ports = [
-            ListeningPort(host, messages.PRIMARY),
-            ListeningPort(host, messages.SECONDARY),
-        ]
+        unused = messages.PRIMARY, messages.SECONDARY
+        self._unused_ports = [ListeningPort(host, port) for port in unused]
         self._clients: dict[ClientConnection, Client] = {}
         # Values of this millisecond, shared by all clients.
         self._values_sent: dict[str, float | Sequence[float]] = {}
@@ -253,8 +253,7 @@ class UrController(Service):
             "get serial number": "20265500001",
             "get robot model": "UR5",
             "is in remote control": "true",
-            "robotmode": "Robotmode: "
-            + {_POWER_OFF: "POWER_OFF", _IDLE: "IDLE", _RUNNING: "RUNNING"}[self._mode],
+            "robotmode": f"Robotmode: {_MODES[self._mode]}",
             "safetymode": f"Safetymode: {safety}",
             "safetystatus": f"Safetystatus: {safety}",
             "running": f"Program running: {str(running).lower()}",
@@ -312,23 +311,18 @@ class UrController(Service):
         program, cell = self._program, self.cell
         if name.startswith("output_int"):
             return program.ints[int(name.rpartition("_")[2])]
-        if name in _CONSTANTS:
-            return _CONSTANTS[name]
-        found = _VARIABLES.get(name)
-        if found is not None:
-            value = found(self, program, cell)
+        if name in _VARIABLES:
+            value = _VARIABLES[name](self, program, cell)
             return value.tolist() if isinstance(value, np.ndarray) else value
         size = {"VECTOR3D": 3, "VECTOR6D": 6, "VECTOR6INT32": 6}.get(messages.OUTPUTS[name])
         return 0 if size is None else [0] * size
 
 
-_CONSTANTS: dict[str, float | Sequence[float]] = {
-    "actual_main_voltage": 48.0,
-    "actual_robot_voltage": 48.0,
-    "joint_mode": [255] * 6,  # running
-    "joint_temperatures": [30.0] * 6,
-}
 _VARIABLES = {
+    "actual_main_voltage": lambda c, p, cell: 48.0,
+    "actual_robot_voltage": lambda c, p, cell: 48.0,
+    "joint_mode": lambda c, p, cell: [255] * 6,  # running
+    "joint_temperatures": lambda c, p, cell: [30.0] * 6,
     "timestamp": lambda c, p, cell: c._clock,
     "target_q": lambda c, p, cell: cell.q_d,
     "target_qd": lambda c, p, cell: cell.dq_d,
