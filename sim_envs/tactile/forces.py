@@ -191,25 +191,15 @@ def _balance(bristles, stiffness, area, force_x, force_y, torsion):
         g2 = total[2] - torsion + damping_turn * turn
         if max(abs(g0), abs(g1), abs(g2) / radius) < _FORCE_TOLERANCE * most:
             break
-        s0, s1, s2 = solve3(
-            total[3] + damping,
-            total[4],
-            total[5],
-            total[6] + damping,
-            total[7],
-            total[8] + damping_turn,
-            -g0,
-            -g1,
-            -g2,
-        )
+        xx, yy, tt = total[3] + damping, total[6] + damping, total[8] + damping_turn
+        s0, s1, s2 = solve3(xx, total[4], total[5], yy, total[7], tt, -g0, -g1, -g2)
         start = g0 * s0 + g1 * s1 + g2 * s2
         step = 1.0
         for _ in range(12):
             t0, t1, t2 = ux + step * s0, uy + step * s1, turn + step * s2
             _brush_sums(bristles, stiffness, t0, t1, t2, trial)
-            end = (trial[0] - force_x + damping * t0) * s0 + (
-                trial[1] - force_y + damping * t1
-            ) * s1
+            h0, h1 = trial[0] - force_x + damping * t0, trial[1] - force_y + damping * t1
+            end = h0 * s0 + h1 * s1
             end += (trial[2] - torsion + damping_turn * t2) * s2
             if end <= -0.2 * start:
                 break

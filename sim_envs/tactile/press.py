@@ -175,17 +175,9 @@ def _balance_press(height, xs, pitch, volume, mx, my, stiffness, limit):
         g1, g2 = g1 * free1, g2 * free2
         if abs(g0) < 1e-3 * volume and max(abs(g1), abs(g2)) < _CENTRE_TOLERANCE * volume:
             break
-        s0, s1, s2 = solve3(
-            max(total[0], 1.0),
-            total[1] * free1,
-            total[2] * free2,
-            total[3] + stiffness,
-            total[4] * (free1 and free2),
-            total[5] + stiffness,
-            -g0,
-            -g1,
-            -g2,
-        )
+        n, x, y = max(total[0], 1.0), total[1] * free1, total[2] * free2
+        xx, xy, yy = total[3] + stiffness, total[4] * (free1 and free2), total[5] + stiffness
+        s0, s1, s2 = solve3(n, x, y, xx, xy, yy, -g0, -g1, -g2)
         start = g0 * s0 + g1 * s1 + g2 * s2
         step = min(1.0, _room(a, s1, limit), _room(b, s2, limit))
         # Along a convex energy's descent the slope rises: a step that ends well uphill is too long.
