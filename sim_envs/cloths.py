@@ -31,20 +31,13 @@ Pattern = Callable[[Tile, Tile], Tile]
 
 @dataclass(frozen=True)
 class Cloth:
-    """One kind of cloth.
-
-    Attributes:
-        yarns: along and across the 25.6 mm of a tile.
-        relief: from the lowest to the highest point, m.
-        pattern: how its yarns lie.
-        fuzz: share of the relief that is loose fibre.
-    """
+    """One kind of cloth."""
 
     name: str
-    yarns: tuple[int, int]
-    relief: float
-    pattern: Pattern
-    fuzz: float = 0.0
+    yarns: tuple[int, int]  # along and across the 25.6 mm of a tile
+    relief: float  # from the lowest to the highest point, m
+    pattern: Pattern  # how its yarns lie
+    fuzz: float = 0.0  # share of the relief that is loose fibre
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,22 +34,16 @@ _LOWEST = 0.018  # m: lowest height of the pads' middle above the table
 
 @dataclass(frozen=True, eq=False)
 class GraspAttempt:
-    """One attempt.
+    """One attempt."""
 
-    Attributes:
-        left, right: the fingertips' pictures at `MOMENTS`, RGB.
-        wrench: force (N) and torque (Nm) of the object on the left pad, then the right one, then.
-        held: whether the object is still in the hand after the shake.
-        body: the object.
-        grip: force of each finger, N.
-    """
-
+    # left, right: the fingertips' pictures at `MOMENTS`, RGB
     left: UInt8[np.ndarray, "3 h w 3"]
     right: UInt8[np.ndarray, "3 h w 3"]
+    # force (N) and torque (Nm) of the object on the left pad, then the right one, then
     wrench: Float32[np.ndarray, "3 12"]
-    held: bool
-    body: Body
-    grip: float
+    held: bool  # whether the object is still in the hand after the shake
+    body: Body  # the object
+    grip: float  # force of each finger, N
 
 
 def attempt_grasp(config: RigConfig, index: int) -> GraspAttempt:

@@ -38,24 +38,18 @@ _TIP, _CONE, _OPENING = 0.3e-3, 4e-3, math.radians(120)  # sharp probe: m, m, ra
 
 @dataclass(frozen=True, eq=False)
 class Stroke:
-    """One press and slide.
+    """One press and slide."""
 
-    Attributes:
-        frames: the sensor's pictures, RGB, of which the first `REST` are untouched.
-        wrench: force (N) and torque (Nm) of the probe on the pad, sensor frame; pressed is -z.
-        slip: whether the probe slides over the gel.
-        field: tractions (kPa, `forces.tractions`); recordings of strokes leave it out.
-        load: largest normal load, N.
-        friction: coefficient of this stroke.
-    """
-
+    # the sensor's pictures, RGB, of which the first `REST` are untouched
     frames: UInt8[np.ndarray, "t h w 3"]
+    # force (N) and torque (Nm) of the probe on the pad, sensor frame; pressed is -z
     wrench: Float32[np.ndarray, "t 6"]
-    slip: Bool[np.ndarray, " t"]
+    slip: Bool[np.ndarray, " t"]  # whether the probe slides over the gel
+    # tractions (kPa, `forces.tractions`); recordings of strokes leave it out
     field: Float32[np.ndarray, "t 3 24 24"]
     indenter: Indenter
-    load: float
-    friction: float
+    load: float  # largest normal load, N
+    friction: float  # coefficient of this stroke
 
 
 def simulate(config: RigConfig, index: int) -> Stroke:

@@ -41,23 +41,17 @@ _FIELD, _TURN = 3.5e-3, math.radians(30)  # m and rad from the middle, at most
 
 @dataclass(frozen=True, eq=False)
 class Slide:
-    """One object moved over the sensor.
+    """One object moved over the sensor."""
 
-    Attributes:
-        frames: the sensor's pictures, RGB, of which the first `REST` are untouched.
-        wrench: force (N) and torque (Nm) of the object on the pad, sensor frame.
-        slip: whether it slides over the gel.
-        pose: x and y (m) of the object in the sensor frame, and its turn about z (rad).
-        held: name of the object.
-        load: normal load, N.
-    """
-
+    # the sensor's pictures, RGB, of which the first `REST` are untouched
     frames: UInt8[np.ndarray, "t h w 3"]
+    # force (N) and torque (Nm) of the object on the pad, sensor frame
     wrench: Float32[np.ndarray, "t 6"]
-    slip: Bool[np.ndarray, " t"]
+    slip: Bool[np.ndarray, " t"]  # whether it slides over the gel
+    # x and y (m) of the object in the sensor frame, and its turn about z (rad)
     pose: Float32[np.ndarray, "t 3"]
-    held: str
-    load: float
+    held: str  # name of the object
+    load: float  # normal load, N
 
 
 def simulate_slide(config: RigConfig, index: int) -> Slide:

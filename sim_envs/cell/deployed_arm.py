@@ -85,15 +85,12 @@ class _TrackedDrive:
 
 
 class DeployedHand:
-    """A Franka Hand behind its driver in one episode, open and at rest at first.
-
-    Attributes:
-        width: last reading, m.
-    """
+    """A Franka Hand behind its driver in one episode, open and at rest at first."""
 
     def __init__(self, env: Any, rng: np.random.Generator) -> None:
         self._env = env
         self._phase = int(rng.integers(_HAND_PERIOD))
+        # width: last reading, m
         self._goal = self.width = env.width()
         self._commands = HandCommands(self.width)
         self._last: LastCommand = "arrived"
@@ -123,12 +120,7 @@ class DeployedHand:
 
 
 class DeployedArm:
-    """One episode, from where the arm rests.
-
-    Attributes:
-        plan_ticks: control ticks by which a learned policy's plans are late.
-        contacts: the pads' contacts at the time of the last observation's images.
-    """
+    """One episode, from where the arm rests."""
 
     def __init__(self, env: Any, between: DeploymentConfig, rng: np.random.Generator) -> None:
         """Draw delays of an environment's episode from a resolved config."""
@@ -149,6 +141,7 @@ class DeployedArm:
             self._drive = _DirectDrive(start, limits, self._tick_ms)
         self._hand = DeployedHand(env, rng) if between.franka_hand else None
         self._wrench = EstimatedWrench(rng) if between.estimated_wrench else None
+        # control ticks by which a learned policy's plans are late
         self.plan_ticks = int(rng.choice(between.plan_ticks))
         ticks = round(env.config.max_seconds * hz) + _AHEAD
         jitter = rng.uniform(*_range(between.jitter))
@@ -166,6 +159,7 @@ class DeployedArm:
         self._width = env.width_target()
         self._states = {0: self._read_state()}
         self._pictures = {0: (env.take_pictures(), env.pad_contacts())}
+        # the pads' contacts at the time of the last observation's images
         self.contacts = env.pad_contacts()
 
     def run_tick(self, delta: Joints, width: float) -> None:

@@ -51,11 +51,7 @@ class EstimatedWrench:
 
 
 class ForceMonitor:
-    """The force on the hand, filtered as an arm filters it, against a ceiling.
-
-    Attributes:
-        exceeded: whether it has been above the ceiling in this episode.
-    """
+    """The force on the hand, filtered as an arm filters it, against a ceiling."""
 
     def __init__(self, ceiling: float) -> None:
         """`ceiling`: N."""
@@ -64,6 +60,7 @@ class ForceMonitor:
 
     def reset(self) -> None:
         """Begin an episode."""
+        # exceeded: whether it has been above the ceiling in this episode
         self._filtered, self.exceeded = np.zeros(3), False
 
     def update(self, force: Float[np.ndarray, "3"], seconds: float) -> None:

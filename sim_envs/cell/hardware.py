@@ -27,14 +27,7 @@ _QUIET = 2.0  # Nm: 20 N on a hand over the table, from any side, put more on so
 
 
 class SimulatedHardware(ABC):
-    """Physics and sensors of the cell, a physics step at a time.
-
-    Attributes:
-        grasp_force: N of each finger.
-        bodies: objects of the scene, the task's first.
-        pads: left and right sensor; empty without `tactile`.
-        tactile_frames: their last readings, with depth and contact mask.
-    """
+    """Physics and sensors of the cell, a physics step at a time."""
 
     def __init__(self, config: EnvConfig) -> None:
         self.config = config
@@ -42,11 +35,11 @@ class SimulatedHardware(ABC):
         self.robot = ROBOTS[config.arm]
         self.n_joints = self.robot.arm.home.size
         self.kinematics = Kinematics(self.robot.arm, self.robot.tool.tcp_offset)
-        self.grasp_force = 15.0
-        self.bodies: list[Body] = []
+        self.grasp_force = 15.0  # N of each finger
+        self.bodies: list[Body] = []  # objects of the scene, the task's first
         self._renderer: Renderer | None = None
         self._view_renderer: Renderer | None = None
-        self.pads: list[TactilePad] = []
+        self.pads: list[TactilePad] = []  # left and right sensor; empty without `tactile`
 
     @abstractmethod
     def add_task_objects(self, spec: mujoco.MjSpec) -> None:
@@ -151,6 +144,7 @@ class SimulatedHardware(ABC):
             ft.IMAGE_PREFIX + camera: self.render_camera(camera) for camera in self.config.cameras
         }
         if self.pads:
+            # their last readings, with depth and contact mask
             self.tactile_frames = [self.read_tactile(side) for side in range(2)]
             for key, frame in zip(ft.TACTILE, self.tactile_frames, strict=True):
                 pictures[key] = frame.image

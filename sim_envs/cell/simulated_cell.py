@@ -58,15 +58,6 @@ class SimulatedCell:
 
     The arm is position controlled with velocity feed-forward, so that it follows its set-point
     without the servo's lag, or torque controlled, without friction, as a Franka's torque loop is.
-
-    Attributes:
-        time, steps: s and ms since the episode began, simulated.
-        q, dq: measured joint positions (rad) and velocities (rad/s).
-        q_d, dq_d: their set-points.
-        tau_ext: torque (N m) on each joint from outside, filtered.
-        wrench_error: N, N m, by which the arm's estimate of the wrench on the hand is wrong.
-        gripper_command: the gripper's orders.
-        least_width: width (m) below which the fingers jam; 0: none.
     """
 
     def __init__(self, env: FrankaTactileEnv, seed: int, wrench_error: bool = False) -> None:
@@ -88,18 +79,23 @@ class SimulatedCell:
         self._braking: Joints | None = None
         self._yielding = False
         self._nudge_force, self._nudged_until = np.zeros(3), 0.0
+        # time, steps: s and ms since the episode began, simulated
         self.time, self.steps = 0.0, 0
+        # q_d, dq_d: their set-points; tau_ext: torque (N m) on each joint from outside, filtered
         self.q_d, self.dq_d, self.tau_ext = env.command.copy(), np.zeros(n), np.zeros(n)
+        # q, dq: measured joint positions (rad) and velocities (rad/s)
         self.q, self.dq = env.joints()
         # Nothing else of an episode depends on it.
         error_rng = np.random.default_rng([seed, _ERROR_STREAM])
         self._error = WrenchError(error_rng) if self._errs else None
+        # N, N m, by which the arm's estimate of the wrench on the hand is wrong
         self.wrench_error = self._error.read() if self._error else np.zeros(6)
+        # the gripper's orders
         self.gripper_command = GripperCommand(
             env.width_target(), env.robot.tool.speed, env.grasp_force
         )
         self.worst = WorstCase()
-        self.least_width = 0.0
+        self.least_width = 0.0  # width (m) below which the fingers jam; 0: none
         self.progress, self.success, self.failures = 0.0, False, set[str]()
         self._grasp_begun = False  # the episode's clock waits for the first grasp
         self._rest_since = 0.0

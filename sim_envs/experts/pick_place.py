@@ -23,20 +23,13 @@ TOUCHDOWN_DEPTH = 0.010  # m below the grasp's height to look for the table when
 
 @dataclass(frozen=True)
 class Waypoint:
-    """Target of a straight minimum-jerk move, fingers down, with the gripper at `width`.
-
-    Attributes:
-        position: TCP position at the end, m, base frame; None: stay.
-        width: gripper target throughout, m.
-        seconds: duration.
-        until_supported: end early once the table carries the object.
-    """
+    """Target of a straight minimum-jerk move, fingers down, with the gripper at `width`."""
 
     name: str
-    position: np.ndarray | None
-    width: float
-    seconds: float
-    until_supported: bool = False
+    position: np.ndarray | None  # TCP position at the end, m, base frame; None: stay
+    width: float  # gripper target throughout, m
+    seconds: float  # duration
+    until_supported: bool = False  # end early once the table carries the object
 
 
 class PickPlaceExpert:

@@ -19,19 +19,14 @@ SLIP_SPEED = 1e-3  # m/s of sliding between pad and object that counts as slip
 
 @dataclass(frozen=True)
 class PadContact:
-    """One pad's contact.
+    """One pad's contact."""
 
-    Attributes:
-        force, torque: on the pad, N and Nm, in the sensor frame about its origin;
-            a squeeze is a negative z force.
-        slip_speed: speed of the fastest contact point over the pad, m/s.
-        geoms: ids of the geoms that touch the pad.
-    """
-
+    # force, torque: on the pad, N and Nm, in the sensor frame about its origin; a squeeze is a
+    # negative z force
     force: Float[np.ndarray, "3"]
     torque: Float[np.ndarray, "3"]
-    slip_speed: float
-    geoms: frozenset[int]
+    slip_speed: float  # speed of the fastest contact point over the pad, m/s
+    geoms: frozenset[int]  # ids of the geoms that touch the pad
 
     @property
     def touching(self) -> bool:

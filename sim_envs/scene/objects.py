@@ -27,23 +27,14 @@ class Texture(IntEnum):
 
 @dataclass(frozen=True)
 class Material:
-    """Touch properties of a surface.
+    """Touch properties of a surface."""
 
-    Attributes:
-        texture: its pattern.
-        amplitude: amplitude of the pattern, m.
-        wavelength: wavelength of the pattern, m.
-        foundation_modulus: pressure per indentation, Pa/m; the gel's own is 3e8.
-        friction: sliding friction coefficient against gel and table.
-        rgba: colour.
-    """
-
-    texture: Texture
-    amplitude: float
-    wavelength: float
-    foundation_modulus: float
-    friction: float
-    rgba: tuple[float, float, float, float]
+    texture: Texture  # its pattern
+    amplitude: float  # amplitude of the pattern, m
+    wavelength: float  # wavelength of the pattern, m
+    foundation_modulus: float  # pressure per indentation, Pa/m; the gel's own is 3e8
+    friction: float  # sliding friction coefficient against gel and table
+    rgba: tuple[float, float, float, float]  # colour
 
 
 HARD, FIRM, SOFT = 1e11, 6e8, 1.2e8  # Pa/m: far stiffer than the gel, twice as stiff, softer
@@ -61,18 +52,13 @@ class ObjectKind:
 
 @dataclass(frozen=True)
 class Body:
-    """One object to put into a scene.
+    """One object to put into a scene."""
 
-    Attributes:
-        kind: entry of the catalogue.
-        size: half extents as MuJoCo takes them (box: xyz; cylinder and capsule: radius, half
-            length; sphere: radius; mesh: scale of the unit hull), m.
-        mass: kg.
-    """
-
-    kind: ObjectKind
+    kind: ObjectKind  # entry of the catalogue
+    # half extents as MuJoCo takes them (box: xyz; cylinder and capsule: radius, half length;
+    # sphere: radius; mesh: scale of the unit hull), m
     size: tuple[float, ...]
-    mass: float
+    mass: float  # kg
     name: str = "object"
     hull: Float[np.ndarray, "n 3"] | None = field(default=None, compare=False)
 

@@ -39,14 +39,11 @@ class Wire:
 
     As made, its main direction is +y, the middle of its bounding box lies above the origin, and
     its lowest point at z = 0.
-
-    Attributes:
-        points: every `STEP` m of arc, from the end where the bead starts.
     """
 
     family: Family
     seed: int
-    points: Float[np.ndarray, "n 3"]
+    points: Float[np.ndarray, "n 3"]  # every `STEP` m of arc, from the end where the bead starts
 
     @property
     def name(self) -> str:

@@ -31,23 +31,15 @@ _FINE = 4  # samples along each side of such a square
 
 @dataclass(frozen=True)
 class ForceField:
-    """Forces of an object on the cells of a gel, which move with it when it shears.
+    """Forces of an object on the cells of a gel, which move with it when it shears."""
 
-    Attributes:
-        normal: N per cell, positive where pressed; the grid is centred on the sensor frame.
-        tangential: N per cell, along the sensor's x and y.
-        slipping: cells whose traction lies on the friction cone.
-        slip_fraction: share of the normal force that slipping cells carry.
-        pitch: size of a cell, m.
-        displacement: (x, y, z) of the whole gel from rest, m.
-    """
-
+    # N per cell, positive where pressed; the grid is centred on the sensor frame
     normal: Float32[np.ndarray, "h w"]
-    tangential: Float32[np.ndarray, "2 h w"]
-    slipping: Bool[np.ndarray, "h w"]
-    slip_fraction: float
-    pitch: float
-    displacement: tuple[float, float, float]
+    tangential: Float32[np.ndarray, "2 h w"]  # N per cell, along the sensor's x and y
+    slipping: Bool[np.ndarray, "h w"]  # cells whose traction lies on the friction cone
+    slip_fraction: float  # share of the normal force that slipping cells carry
+    pitch: float  # size of a cell, m
+    displacement: tuple[float, float, float]  # (x, y, z) of the whole gel from rest, m
 
     def wrench(self) -> Float[np.ndarray, "6"]:
         """Sum of the field: force (N) and torque (Nm) on the pad about the sensor's origin."""

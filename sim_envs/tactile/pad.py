@@ -30,19 +30,14 @@ _FINE, _COARSE = 2, 4
 
 @dataclass(frozen=True)
 class TactileFrame:
-    """One sensor reading.
+    """One sensor reading."""
 
-    Attributes:
-        image: camera image, RGB.
-        surface: depth of the gel below its rest plane at half the image's resolution, m.
-        overlap: how deep the object itself lies in the undeformed gel, m, there; 0 beside it.
-        field: forces over the whole gel; None where nothing touches.
-    """
-
-    image: UInt8[np.ndarray, "h w 3"]
+    image: UInt8[np.ndarray, "h w 3"]  # camera image, RGB
+    # depth of the gel below its rest plane at half the image's resolution, m
     surface: Float32[np.ndarray, "h2 w2"]
+    # how deep the object itself lies in the undeformed gel, m, there; 0 beside it
     overlap: Float32[np.ndarray, "h2 w2"]
-    field: ForceField | None
+    field: ForceField | None  # forces over the whole gel; None where nothing touches
 
     @property
     def depth(self) -> Float32[np.ndarray, "h w"]:

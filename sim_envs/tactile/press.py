@@ -27,20 +27,14 @@ _CENTRE_TOLERANCE = 5e-6  # m
 
 @dataclass(frozen=True)
 class Press:
-    """Pose of an object in a gel, with the pressure under it.
+    """Pose of an object in a gel, with the pressure under it."""
 
-    Attributes:
-        shift: how far it is pushed in, m, and
-        tilt: its slope along x and y: `shift + tilt[0] x + tilt[1] y` is added to its height.
-        pressure: on the gel's own cells, Pa; zero where nothing touches.
-        pitch: size of a cell, m.
-        displacement: (x, y, z) of the cells from rest, m: as the solver's plate.
-    """
-
-    shift: float
+    shift: float  # how far it is pushed in, m
+    # its slope along x and y: `shift + tilt[0] x + tilt[1] y` is added to its height
     tilt: tuple[float, float]
-    pressure: Float32[np.ndarray, "h w"]
-    pitch: float
+    pressure: Float32[np.ndarray, "h w"]  # on the gel's own cells, Pa; zero where nothing touches
+    pitch: float  # size of a cell, m
+    # (x, y, z) of the cells from rest, m: as the solver's plate
     displacement: tuple[float, float, float]
 
     def push_in(self, height: HeightField, pitch: float) -> None:

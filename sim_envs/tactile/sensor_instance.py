@@ -22,22 +22,17 @@ COUNT_STEP = 1 / 16  # counts: fine enough, and small enough numbers for the pro
 
 @dataclass(frozen=True)
 class SensorInstance:
-    """One simulated sensor: its sensor file, varied as two of a model differ.
-
-    Attributes:
-        background: the untouched frame, RGB in STEPs.
-        illumination: how strongly the light falls, per channel, at half the image's resolution.
-        noise: tile of camera noise in STEPs, larger than the image by NOISE_MARGIN.
-        markers: resting (x, y) of the gel's printed dots, px; none on a plain gel.
-        marker_radius: px.
-    """
+    """One simulated sensor: its sensor file, varied as two of a model differ."""
 
     calibration: SensorCalibration
-    background: Int16[np.ndarray, "3 h w"]
+    background: Int16[np.ndarray, "3 h w"]  # the untouched frame, RGB in STEPs
+    # how strongly the light falls, per channel, at half the image's resolution
     illumination: Float32[np.ndarray, "3 h3 w3"]
+    # tile of camera noise in STEPs, larger than the image by NOISE_MARGIN
     noise: Int8[np.ndarray, "3 h2 w2"]
+    # resting (x, y) of the gel's printed dots, px; none on a plain gel
     markers: Float32[np.ndarray, "n 2"]
-    marker_radius: float
+    marker_radius: float  # px
 
     @property
     def pixel_pitch(self) -> float:

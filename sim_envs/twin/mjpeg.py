@@ -19,19 +19,16 @@ Picture = UInt8[np.ndarray, "h w 3"]
 
 @dataclass(eq=False)
 class Stream:
-    """One stream of images.
+    """One stream of images."""
 
-    Attributes:
-        stalled, frozen, lost, broken, halved: until when (time.monotonic) nothing comes, one image
-            repeats, clients are cut off and turned away, JPEGs have wrong bytes or are cut in half.
-        clients, count, sent: who watches; pictures published; pictures sent to the last who came.
-    """
-
+    # stalled, frozen, lost, broken, halved: until when (time.monotonic) nothing comes, one image
+    # repeats, clients are cut off and turned away, JPEGs have wrong bytes or are cut in half
     stalled: float = 0.0
     frozen: float = 0.0
     lost: float = 0.0
     broken: float = 0.0
     halved: float = 0.0
+    # clients, count, sent: who watches; pictures published; pictures sent to the last who came
     clients: int = 0
     count: int = 0
     sent: int = 0

@@ -28,35 +28,22 @@ Picture = UInt8[np.ndarray, "h w 3"]
 
 @dataclass(frozen=True)
 class Scene:
-    """Scene to render from now on.
-
-    Attributes:
-        camera_size: rows and columns, px.
-        pads: left and right fingertip; empty without them.
-        rng: draws the fingertips' noise.
-    """
+    """Scene to render from now on."""
 
     model: mujoco.MjModel
-    camera_size: tuple[int, int]
-    pads: list[TactilePad]
-    rng: np.random.Generator
+    camera_size: tuple[int, int]  # rows and columns, px
+    pads: list[TactilePad]  # left and right fingertip; empty without them
+    rng: np.random.Generator  # draws the fingertips' noise
 
 
 @dataclass(frozen=True)
 class Moment:
-    """Images to take.
+    """Images to take."""
 
-    Attributes:
-        due: names of the streams that are to have one.
-        state: physics state (`STATE`).
-        contacts: left and right pad.
-        held: whether to answer only once the images are sent.
-    """
-
-    due: tuple[str, ...]
-    state: Float[np.ndarray, " n"]
-    contacts: tuple[PadContact, PadContact]
-    held: bool
+    due: tuple[str, ...]  # names of the streams that are to have one
+    state: Float[np.ndarray, " n"]  # physics state (`STATE`)
+    contacts: tuple[PadContact, PadContact]  # left and right pad
+    held: bool  # whether to answer only once the images are sent
 
 
 Fault = tuple[str, str, float]

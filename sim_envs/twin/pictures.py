@@ -22,21 +22,17 @@ _FAULTS = ("stalled", "frozen", "lost", "broken", "halved")
 
 
 class Pictures(Service):
-    """Streams every camera and sensor of the cell at `http://host:port/NAME`, by `picture_process`.
-
-    Attributes:
-        rates: Hz, simulated, of each stream by its name, such as tactile_left.
-        held: whether a client lets time go on, which must get a picture before it does.
-        processor_time: of the rendering process, s, as last reported.
-        taken, left_out: pictures that were due and taken, or not taken for the process was behind.
-    """
+    """Streams every camera and sensor of the cell at `http://host:port/NAME`, by `picture_process`."""
 
     def __init__(self, cell: SimulatedCell, host: str, port: int) -> None:
         """Start the process; raises OSError if it cannot serve there."""
         self._cell, self._host = cell, host
+        # whether a client lets time go on, which must get a picture before it does
         self.held = False
+        # taken, left_out: pictures that were due and taken, or not taken for the process was behind
         self.taken = self.left_out = 0
         env = cell.env
+        # Hz, simulated, of each stream by its name, such as tactile_left
         self.rates: dict[str, int] = {}
         if env.config.tactile:  # first, because later images are sent later
             names = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.TACTILE]
@@ -46,6 +42,7 @@ class Pictures(Service):
             tuple(name for name, rate in self.rates.items() if ms * rate % 1000 < rate)
             for ms in range(1000)
         ]
+        # processor_time: of the rendering process, s, as last reported
         self._sent, self.processor_time = dict.fromkeys(self.rates, 0), 0.0
         self._unanswered = 0
         self._pipe, theirs = Pipe()

@@ -42,36 +42,23 @@ _RUN_SECONDS = 40.0
 
 @dataclass(frozen=True)
 class TwinConfig:
-    """Options of a twin.
+    """Options of a twin."""
 
-    Attributes:
-        task: task of the cell; its `arm` is replaced by `arm`.
-        arm: an FR3 with the Franka Hand, or a UR5e whose gripper talks as a Robotiq does.
-        host: loopback address of everything; twins at different ones run side by side.
-        port: image port; the next one is the control port. 0: any that are free.
-        lock_step: wait for the client that drives the arm, so that runs repeat.
-        folder: where serial devices appear.
-        wrench_error: the arm's estimate of force is as wrong as a real arm's.
-    """
-
-    task: TaskConfig
+    task: TaskConfig  # task of the cell; its `arm` is replaced by `arm`
+    # an FR3 with the Franka Hand, or a UR5e whose gripper talks as a Robotiq does
     arm: Literal["fr3", "ur5e"]
     seed: int
-    host: str
-    port: int
-    lock_step: bool
-    folder: Path
-    wrench_error: bool = True
+    host: str  # loopback address of everything; twins at different ones run side by side
+    port: int  # image port; the next one is the control port. 0: any that are free
+    lock_step: bool  # wait for the client that drives the arm, so that runs repeat
+    folder: Path  # where serial devices appear
+    wrench_error: bool = True  # the arm's estimate of force is as wrong as a real arm's
 
 
 class Twin:
     """The cell with its services, in one thread.
 
     In lock-step it waits for the client that drives the arm or holds the time (`lock_step.py`).
-
-    Attributes:
-        cell_config: content of the cell file.
-        stopped: set it to end `run`.
     """
 
     def __init__(self, config: TwinConfig) -> None:
@@ -82,13 +69,13 @@ class Twin:
             warm_up(env.bodies, env.sensor)
         self._lock_step: LockStep | None = None
         self._next_step_at = time.monotonic()
-        self.stopped = False
+        self.stopped = False  # set it to end `run`
         self.pace = Pace()
         self._services: list[Service] = []
         with ExitStack() as undo:
             undo.callback(self.close)
             try:
-                self.cell_config = self._open(config)
+                self.cell_config = self._open(config)  # content of the cell file
             except OSError as error:
                 raise UserError(
                     f"cannot serve at {config.host} ({error.strerror}); if another twin is there, "

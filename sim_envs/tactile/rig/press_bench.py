@@ -16,12 +16,9 @@ class PressBench:
     """Presses a body into the left sensor at a given place with a given force.
 
     Forces are prescribed, not solved for; an impossible press can be asked for, too.
-
-    Attributes:
-        contact: the pad's with the body in the last reading.
     """
 
-    contact: PadContact
+    contact: PadContact  # the pad's with the body in the last reading
 
     def __init__(
         self, body: Body, sensor: SensorModel, instance: SensorInstance, relief: bool = False

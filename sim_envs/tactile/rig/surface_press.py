@@ -22,21 +22,14 @@ _NOTHING = -5e-3  # m: far below the gel
 
 @dataclass(frozen=True)
 class SurfacePose:
-    """Pose of a surface against the gel.
+    """Pose of a surface against the gel."""
 
-    Attributes:
-        centre: where the body's middle lies on the gel, m along x and y from the image's middle.
-        turn: about the gel's normal, rad.
-        tilt: slopes along x and y, m per m.
-        texture_at: which cell of the texture lies in the body's middle.
-        depth: depth of the highest point in the undeformed gel, m.
-    """
-
+    # where the body's middle lies on the gel, m along x and y from the image's middle
     centre: tuple[float, float]
-    turn: float
-    tilt: tuple[float, float]
-    texture_at: tuple[float, float]
-    depth: float
+    turn: float  # about the gel's normal, rad
+    tilt: tuple[float, float]  # slopes along x and y, m per m
+    texture_at: tuple[float, float]  # which cell of the texture lies in the body's middle
+    depth: float  # depth of the highest point in the undeformed gel, m
 
 
 def random_pose(rng: np.random.Generator) -> SurfacePose:

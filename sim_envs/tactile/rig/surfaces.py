@@ -23,21 +23,14 @@ BODIES: tuple[Body, ...] = ("flat", "ball", "cylinder", "edge", "bar", "corner")
 
 @dataclass(frozen=True)
 class Surface:
-    """One surface.
+    """One surface."""
 
-    Attributes:
-        body: its coarse shape where it meets the gel.
-        size: radius of a ball or cylinder, half the width of a bar, m; of no meaning to the others.
-        slope: slope beside an edge, bar or corner, m per m.
-        texture: height added to the body, m.
-        firmness: share of the overlap that indents the gel; the object takes the rest.
-    """
-
-    body: Body
+    body: Body  # its coarse shape where it meets the gel
+    # radius of a ball or cylinder, half the width of a bar, m; of no meaning to the others
     size: float
-    slope: float
-    texture: Tile
-    firmness: float
+    slope: float  # slope beside an edge, bar or corner, m per m
+    texture: Tile  # height added to the body, m
+    firmness: float  # share of the overlap that indents the gel; the object takes the rest
 
 
 def random_surface(rng: np.random.Generator) -> Surface:

@@ -18,32 +18,24 @@ Pose = Float[np.ndarray, "4 4"]
 
 @dataclass
 class Motion:
-    """A client's motion, from its Move command to the answer that ends it.
-
-    Attributes:
-        generator, controller: numbers of the interface.
-        begun: whether the client has sent a set-point.
-        lost: milliseconds since the last one.
-    """
+    """A client's motion, from its Move command to the answer that ends it."""
 
     request: messages.Request
+    # generator, controller: numbers of the interface
     generator: int
     controller: int
-    begun: bool = False
-    lost: int = 0
+    begun: bool = False  # whether the client has sent a set-point
+    lost: int = 0  # milliseconds since the last one
 
 
 class ArmState:
-    """State message (`messages.ROBOT_STATE`).
-
-    Attributes:
-        fields: views of the record's fields by name, ten times as fast to write.
-    """
+    """State message (`messages.ROBOT_STATE`)."""
 
     def __init__(self) -> None:
         records = np.zeros(1, messages.ROBOT_STATE)
         self.record = records.reshape(())
         names = records.dtype.names or ()
+        # views of the record's fields by name, ten times as fast to write
         self.fields = {
             name: records[name][0] if records[name].ndim > 1 else records[name] for name in names
         }

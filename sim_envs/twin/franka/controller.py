@@ -31,17 +31,14 @@ _BRAKING = FR3.hardware.acceleration  # rad/s^2 of braking; a real reflex brakes
 
 
 class FrankaArm(Service):
-    """Serves an arm at `host`, port 1337.
-
-    Attributes:
-        timeout: s to wait for a client's answer to each state; the packet counts as lost only then.
-        mode: idle, moving, in a reflex, or user-stopped.
-        error: the error in force.
-    """
+    """Serves an arm at `host`, port 1337."""
 
     def __init__(self, cell: SimulatedCell, host: str, timeout: float, hand: messages.Link) -> None:
         """`hand`: the hand's link, which shares the arm's cable."""
+        # timeout: s to wait for a client's answer to each state; the packet counts as lost only
+        # then
         self.cell, self.timeout = cell, timeout
+        # mode: idle, moving, in a reflex, or user-stopped; error: the error in force
         self.mode, self.error = RobotMode.IDLE, ""
         self._hand = hand
         self._motion: Motion | None = None

@@ -23,31 +23,23 @@ _GRASP_TOLERANCE = 2e-3  # m by which the width may change while something is he
 
 @dataclass
 class Job:
-    """Command in progress.
+    """Command in progress."""
 
-    Attributes:
-        request: answered when the job ends.
-        targets: widths (m) still to go to, one after the other.
-        accepted: for a grasp, the open range of widths (m) that count.
-    """
-
-    request: messages.Request
-    targets: list[float]
+    request: messages.Request  # answered when the job ends
+    targets: list[float]  # widths (m) still to go to, one after the other
+    # for a grasp, the open range of widths (m) that count
     accepted: tuple[float, float] | None = None
     width: float = np.inf
     still: float = 0.0
 
 
 class FrankaHand(Service):
-    """Serves the hand at `host`, port 1338; a grasp closes until something resists.
-
-    Attributes:
-        commands, answers: how many commands have come, and how many were answered.
-    """
+    """Serves the hand at `host`, port 1338; a grasp closes until something resists."""
 
     def __init__(self, cell: SimulatedCell, host: str) -> None:
         self.cell = cell
         self.link = messages.Link(host, messages.HAND_PORT, messages.HAND_VERSION, wide=False)
+        # commands, answers: how many commands have come, and how many were answered
         self.commands = self.answers = 0
         self._milliseconds = 0
         self._held_at = 0.0  # monotonic s, of the last state while time stands

@@ -206,9 +206,6 @@ class Link:
     """One client's connection: commands over TCP, states and set-points over UDP.
 
     A second client waits until the first has gone.
-
-    Attributes:
-        frozen: nothing gets through in either direction.
     """
 
     def __init__(self, host: str, port: int, version: int, wide: bool) -> None:
@@ -227,7 +224,7 @@ class Link:
         self._tcp: socket.socket | None = None
         self._peer: tuple[str, int] | None = None
         self._unread = self._unsent = b""
-        self.frozen = False
+        self.frozen = False  # nothing gets through in either direction
 
     @property
     def connected(self) -> bool:

@@ -21,13 +21,10 @@ _STILL, _SETTLED = 1e-3, 0.05  # m/s, s
 
 
 class SerialPort:
-    """A pseudo-terminal behind a path that survives unplugging.
-
-    Attributes:
-        garble: share of messages that lose a byte on their way to the client.
-    """
+    """A pseudo-terminal behind a path that survives unplugging."""
 
     def __init__(self, path: Path) -> None:
+        # garble: share of messages that lose a byte on their way to the client
         self.path, self.garble = path, 0.0
         self._rng = np.random.default_rng(0)
         self._ends: tuple[int, int] | None = None
@@ -75,14 +72,12 @@ class LoadCell(Service):
     """A load cell under the table: lines `milliseconds,counts*CRC`, 80 a second.
 
     Force in N is `NEWTONS_PER_COUNT * (counts - ZERO)`; CRC: Modbus' CRC-16, hexadecimal.
-
-    Attributes:
-        sent: milliseconds of the last line.
     """
 
     def __init__(self, cell: SimulatedCell, path: Path) -> None:
         self.cell, self.port = cell, SerialPort(path)
         self._rng = np.random.default_rng(1)
+        # sent: milliseconds of the last line
         self._milliseconds = self.sent = 0
 
     def reset(self) -> None:

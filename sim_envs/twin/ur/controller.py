@@ -42,11 +42,7 @@ class Client:
 
 
 class UrController(Service):
-    """Serves a UR at `host`; without lock-step, because its clients answer no states.
-
-    Attributes:
-        frozen: nothing gets through in either direction.
-    """
+    """Serves a UR at `host`; without lock-step, because its clients answer no states."""
 
     def __init__(self, cell: SimulatedCell, host: str) -> None:
         self.cell = cell
@@ -60,7 +56,7 @@ class UrController(Service):
         # Values of this millisecond, shared by all clients.
         self._values_sent: dict[str, float | Sequence[float]] = {}
         self._inputs: dict[str, float] = dict.fromkeys(messages.INPUTS, 0)
-        self.frozen = False
+        self.frozen = False  # nothing gets through in either direction
         self.safety, self._mode = Safety.NORMAL, _RUNNING
         self._stopped_at = self._last_input_at = 0.0
         self._clock = 0.0

@@ -149,15 +149,7 @@ class _Stop:
 
 
 class UrProgram:
-    """One run of the control program.
-
-    Attributes:
-        activity: the motion in progress.
-        ints: integer output registers.
-        inputs: the client's input registers by name.
-        running: false once the program has ended.
-        watchdog: s without a command after which the program ends.
-    """
+    """One run of the control program."""
 
     def __init__(
         self,
@@ -167,12 +159,15 @@ class UrProgram:
         zero_force: Callable[[], None],
     ) -> None:
         """`protective_stop` stops the arm; `zero_force` zeroes the force sensor."""
+        # inputs: the client's input registers by name
         self.cell, self.inputs = cell, inputs
         self._protective_stop, self._zero_force = protective_stop, zero_force
+        # the motion in progress
         self.activity: _JointMove | _LineMove | _Servo | _Stop | None = None
+        # ints: integer output registers; running: false once the program has ended
         self.ints, self.running = [_READY] + [0] * 47, True
         self._refused = self._cycles_refused = 0
-        self.watchdog = np.inf
+        self.watchdog = np.inf  # s without a command after which the program ends
         self._executing = self._waiting = self._asynchronous = False
         self._started = 0
 
