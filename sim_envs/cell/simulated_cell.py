@@ -43,14 +43,11 @@ class GripperCommand:
 
 @dataclass
 class WorstCase:
-    """Extremes since the episode began: rad beyond range, share of joint speed, N from outside.
+    """Extremes since the episode began, for tests that inject faults."""
 
-    The force is checked once a control tick.
-    """
-
-    excess: float = 0.0
-    speed: float = 0.0
-    force: float = 0.0
+    excess: float = 0.0  # rad beyond the maker's joint range
+    speed: float = 0.0  # share of the maker's joint speed
+    force: float = 0.0  # N on the robot from outside, checked once a control tick
 
 
 class SimulatedCell:
@@ -85,12 +82,12 @@ class SimulatedCell:
         self.q_d, self.dq_d, self.tau_ext = env.command.copy(), np.zeros(n), np.zeros(n)
         # q, dq: measured joint positions (rad) and velocities (rad/s)
         self.q, self.dq = env.joints()
-        # Nothing else of an episode depends on it.
-        error_rng = np.random.default_rng([seed, _ERROR_STREAM])
+        error_rng = np.random.default_rng(
+            [seed, _ERROR_STREAM]
+        )  # the episode's draws stay the same
         self._error = WrenchError(error_rng) if self._errs else None
         # N, N m, by which the arm's estimate of the wrench on the hand is wrong
         self.wrench_error = self._error.read() if self._error else np.zeros(6)
-        # the gripper's orders
         self.gripper_command = GripperCommand(
             env.width_target(), env.robot.tool.speed, env.grasp_force
         )

@@ -22,7 +22,7 @@ _FAULTS = ("stalled", "frozen", "lost", "broken", "halved")
 
 
 class Pictures(Service):
-    """Streams every camera and sensor of the cell at `http://host:port/NAME`, by `picture_process`."""
+    """Streams cameras and sensors of the cell at `http://host:port/NAME`, by `picture_process`."""
 
     def __init__(self, cell: SimulatedCell, host: str, port: int) -> None:
         """Start the process; raises OSError if it cannot serve there."""
