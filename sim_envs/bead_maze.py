@@ -45,10 +45,7 @@ class BeadMaze(FrankaTactileEnv):
     The first frames of the fingertips are untouched, as every task's. A fixture holds the bead
     for `GRASP_SECONDS`: on a slope it would slide off while the fingers close.
 
-    | reset option | meaning |
-    |---|---|
-    | `wire` | name of a wire, such as helix-1 |
-    | `grasp_force` | N of each finger |
+    `reset` takes the options of `BeadMazeReset`.
 
     Progress: the fraction of the wire between start and end, 30 mm from the posts. An episode also
     ends when the bead is dropped, jams, or the hand presses too hard: `truth.failure`.
@@ -153,7 +150,8 @@ class BeadMaze(FrankaTactileEnv):
             self._furthest, self._stalled_ticks = self.arc_length, 0
         else:
             self._stalled_ticks += 1
-        self.failure = np.array([self._dropped(bead), self._jammed(), self._force.exceeded])
+        jammed = self._stalled_ticks > self.config.stall_seconds * self.config.control_hz
+        self.failure = np.array([self._dropped(bead), jammed, self._force.exceeded])
         progress = float(np.clip((self.arc_length - START) / (END - START), 0.0, 1.0))
         return progress, progress == 1.0 and not self.failure.any()
 
@@ -164,9 +162,6 @@ class BeadMaze(FrankaTactileEnv):
         held = any(geom in pad.geoms for pad in self.pad_contacts())
         point, _ = self.wire.at(self.arc_length)
         return not held or bool(np.linalg.norm(bead - point) > 0.003)
-
-    def _jammed(self) -> bool:
-        return self._stalled_ticks > self.config.stall_seconds * self.config.control_hz
 
     def _info(self, progress: float, success: bool) -> dict[str, Any]:
         return super()._info(progress, success) | {ft.TRUTH_FAILURE: self.failure}

@@ -74,9 +74,7 @@ class FeedbackExpert:
             here + (pace + change) / hz, _righted(R, yaw, turn, _RETURN / hz), env.command
         )
         delta = solution.q - env.command
-        if (
-            env.max_joint_step is not None
-        ):  # the whole of it slower, not bent by a clamp of single joints
+        if env.max_joint_step is not None:  # all of it slower, not bent by a clamp of single joints
             delta *= min(1.0, float((env.max_joint_step / np.maximum(np.abs(delta), 1e-9)).min()))
         return np.append(delta, grip)
 

@@ -54,6 +54,10 @@ from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort
 from touchgoal.sim_envs.twin.ur.controller import UrController
 
 _HTTP = re.compile(r" HTTP/\d")  # end of a browser's first line
+# What orders make of a stream: attributes of `mjpeg.Stream`.
+_STREAM_FAULTS = {"stall": "stalled", "repeat": "frozen", "lose": "lost"}
+_STREAM_FAULTS |= {"break": "broken", "halve": "halved"}
+_SWITCH = {"on": True, "off": False}
 _STRONGEST_NUDGE = 500.0  # N
 
 
@@ -74,9 +78,8 @@ class ControlPort(Service):
         self._lock_step, self._on_reset = lock_step, on_reset
         self._cell, self._arm, self._pictures, self._ports = cell, arm, pictures, ports
         self._listener = ListeningPort(host, port)
-        self._frozen_seconds = (
-            0.0  # s left, simulated: a slow machine would end it before a packet is lost
-        )
+        # s left, simulated: a slow machine would end it before a packet is lost
+        self._frozen_seconds = 0.0
         self._token = secrets.token_hex(8)
         self.address = f"{self._token}@{host}:{self._listener.port}"
 
@@ -124,20 +127,16 @@ class ControlPort(Service):
             "advance": None,
             "pictures": lambda: self._held_time() and self._pictures.sent(),
             "reset": lambda: self._reset(*rest.split(" ", 1)),
-            "freeze": lambda: self._freeze(float(rest)),
+            "freeze": lambda: self._freeze(*_finite(rest)),
             "drop": self._arm.drop,
-            "stop-button": lambda: self._arm.stop_button({"on": True, "off": False}[rest]),
+            "stop-button": lambda: self._arm.stop_button(_SWITCH[rest]),
             "error": lambda: self._arm.abort(rest),
-            "nudge": lambda: self._nudge(*(float(number) for number in rest.split())),
-            "stall": lambda: self._set_stream_fault("stalled", *rest.split()),
-            "repeat": lambda: self._set_stream_fault("frozen", *rest.split()),
-            "lose": lambda: self._set_stream_fault("lost", *rest.split()),
-            "break": lambda: self._set_stream_fault("broken", *rest.split()),
-            "halve": lambda: self._set_stream_fault("halved", *rest.split()),
-            "silence-gripper": lambda: self._arm.silence_gripper({"on": True, "off": False}[rest]),
-            "jam-gripper": lambda: self._jam_gripper(float(rest)),
+            "nudge": lambda: self._nudge(*_finite(rest)),
+            **dict.fromkeys(_STREAM_FAULTS, lambda: self._fault_stream(command, *rest.split())),
+            "silence-gripper": lambda: self._arm.silence_gripper(_SWITCH[rest]),
+            "jam-gripper": lambda: self._jam_gripper(*_finite(rest)),
             "take-object": self._cell.take_object,
-            "nonsense": lambda: self._arm.set_nonsense({"on": True, "off": False}[rest]),
+            "nonsense": lambda: self._arm.set_nonsense(_SWITCH[rest]),
             "garble": lambda: self._garble(*rest.split()),
             "unplug": lambda: self._ports[rest].unplug(),
             "plug": lambda: self._ports[rest].plug(),
@@ -172,38 +171,34 @@ class ControlPort(Service):
         self._on_reset()
 
     def _freeze(self, seconds: float) -> None:
-        _require_finite(seconds)
         self._arm.freeze(True)
         self._frozen_seconds = seconds
 
     def _nudge(self, x: float, y: float, z: float, seconds: float) -> None:
-        _require_finite(x, y, z, seconds)
         if max(abs(x), abs(y), abs(z)) > _STRONGEST_NUDGE:
             raise UserError(f"a nudge has at most {_STRONGEST_NUDGE:g} N")
         self._cell.nudge(np.array([x, y, z]), seconds)
 
-    def _set_stream_fault(self, fault: str, name: str, seconds: str) -> None:
-        self._pictures.set_fault(name, fault, float(seconds))
+    def _fault_stream(self, command: str, name: str, seconds: str) -> None:
+        self._pictures.set_fault(name, _STREAM_FAULTS[command], float(seconds))
 
     def _jam_gripper(self, width: float) -> None:
-        _require_finite(width)
         self._cell.least_width = width
 
     def _garble(self, name: str, share: str) -> None:
         self._ports[name].garble = float(share)
 
 
-def _require_finite(*numbers: float) -> None:
+def _finite(text: str) -> list[float]:
+    numbers = [float(number) for number in text.split()]
     if not np.isfinite(numbers).all():
         raise UserError("numbers must be finite")
+    return numbers
 
 
 if __name__ == "__main__":
     try:
-        print(
-            json.dumps(
-                ask_twin(read_cell_file(Path(sys.argv[1])).task.twin, " ".join(sys.argv[2:]))
-            )
-        )
+        port = read_cell_file(Path(sys.argv[1])).task.twin
+        print(json.dumps(ask_twin(port, " ".join(sys.argv[2:]))))
     except (UserError, IndexError) as mistake:
         sys.exit(f"{mistake}; usage: control_port CELL_FILE ORDER")

@@ -319,7 +319,7 @@ class FrankaArm(Service):
         if fault is not None:
             self.abort(fault)
             return
-        inverse = limits.pseudo_inverse(jacobian).T
+        inverse = np.linalg.solve(jacobian @ jacobian.T + limits.DAMPING * np.eye(6), jacobian).T
         step = inverse @ (DT * twist)
         if order["valid_elbow"]:
             null = np.eye(7) - inverse @ jacobian

@@ -20,7 +20,7 @@ _SLACK = 1.01  # for the wire's rounding
 _STEADY = 0.1  # rad/s^2: below it the thresholds for nominal motion hold
 # Singular value of the Jacobian below which the arm gives no wrench; our choice.
 _SINGULAR = 0.02
-_DAMPING = 1e-8  # m^2: makes the wrench at a singular pose finite
+DAMPING = 1e-8  # m^2: makes the wrench at a singular pose finite
 _NEVER_ZERO = 1e-6  # N: a measured estimate is never exactly 0
 
 
@@ -185,15 +185,10 @@ def _above(values, lower, upper):
     return beyond_lower, beyond_upper
 
 
-def pseudo_inverse(jacobian: Float[np.ndarray, "6 7"]) -> Float[np.ndarray, "6 7"]:
-    """Return the damped pseudo-inverse of J^T, which maps joint torques to a wrench."""
-    return np.linalg.solve(jacobian @ jacobian.T + _DAMPING * np.eye(6), jacobian)
-
-
 @njit(cache=True)
 def wrench_behind(torque: Joints, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
     """Return the wrench (N, Nm) that best explains joint torques (Nm)."""
-    return np.linalg.solve(jacobian @ jacobian.T + _DAMPING * np.eye(6), jacobian @ torque)
+    return np.linalg.solve(jacobian @ jacobian.T + DAMPING * np.eye(6), jacobian @ torque)
 
 
 @njit(cache=True)

@@ -263,17 +263,14 @@ class UrController(Service):
             self._program.end()
             return "Stopped"
         if command == "unlock protective stop":
-            return self._unlock()
+            if self.safety is Safety.PROTECTIVE_STOP:
+                if self._clock - self._stopped_at < _UNLOCK_DELAY:
+                    return "Cannot unlock protective stop until 5s after occurrence"
+                self.safety = Safety.NORMAL
+            return "Protective stop releasing"
         if command in ("power on", "power off", "brake release"):
             return self._power(command)
         return f"could not understand: '{line}'"
-
-    def _unlock(self) -> str:
-        if self.safety is Safety.PROTECTIVE_STOP:
-            if self._clock - self._stopped_at < _UNLOCK_DELAY:
-                return "Cannot unlock protective stop until 5s after occurrence"
-            self.safety = Safety.NORMAL
-        return "Protective stop releasing"
 
     def _power(self, command: str) -> str:
         if self.safety is Safety.NORMAL:
