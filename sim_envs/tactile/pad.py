@@ -102,10 +102,10 @@ class TactilePad:
         if not touched or contact.normal_force <= 0:
             return self._untouched(rng)
         press = self._press(data, contact, touched)
-        overlap = self._overlap(data, press, touched)
-        self._field = force_field(
-            press, self._field, contact, self._friction(contact), self._sensor
-        )
+        overlap = reduce(np.maximum, (self._overlap(data, press, body) for body in touched))
+        # The solver's coefficient: the object's, which has priority over the gel's.
+        friction = max(float(self._model.geom_friction[geom, 0]) for geom in contact.geoms)
+        self._field = force_field(press, self._field, contact, friction, self._sensor)
         surface = deform(overlap, self._image_grid.pitch, self._instance.calibration.blur_sigmas)
         if self._relief is not None:
             surface += self._relief(self._field, overlap)
@@ -127,10 +127,6 @@ class TactilePad:
         bodies = {int(self._model.geom_bodyid[geom]) for geom in contact.geoms}
         return sorted(bodies & self._geoms.keys())
 
-    def _friction(self, contact: PadContact) -> float:
-        """Return the solver's coefficient: the object's, which has priority over the gel's."""
-        return max(float(self._model.geom_friction[geom, 0]) for geom in contact.geoms)
-
     def _modulus(self, material: Material) -> float:
         return 1 / (1 / self._sensor.foundation_modulus + 1 / material.foundation_modulus)
 
@@ -139,10 +135,7 @@ class TactilePad:
         modulus = min(self._modulus(self._materials[body]) for body in touched)
         return press_until_balanced(height, self._gel_grid.pitch, contact, modulus, self._sensor)
 
-    def _overlap(self, data: mujoco.MjData, press: Press, touched: list[int]) -> HeightField:
-        return reduce(np.maximum, (self._one_overlap(data, press, body) for body in touched))
-
-    def _one_overlap(self, data: mujoco.MjData, press: Press, body: int) -> HeightField:
+    def _overlap(self, data: mujoco.MjData, press: Press, body: int) -> HeightField:
         grid, material = self._image_grid, self._materials[body]
         height = self._height(data, body, grid)
         press.push_in(height, grid.pitch)

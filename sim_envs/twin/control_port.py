@@ -49,8 +49,7 @@ from touchgoal.sim_envs.twin.franka.controller import FrankaArm
 from touchgoal.sim_envs.twin.lock_step import LockStep
 from touchgoal.sim_envs.twin.pictures import Pictures
 from touchgoal.sim_envs.twin.serial.devices import SerialPort
-from touchgoal.sim_envs.twin.service import Service
-from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort
+from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort, Service
 from touchgoal.sim_envs.twin.ur.controller import UrController
 
 _HTTP = re.compile(r" HTTP/\d")  # end of a browser's first line

@@ -12,7 +12,7 @@ from touchgoal.control import features as ft
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.simulated_cell import SimulatedCell
 from touchgoal.sim_envs.twin.picture_process import STATE, Fault, Moment, Scene
-from touchgoal.sim_envs.twin.service import Service
+from touchgoal.sim_envs.twin.tcp_ports import Service
 
 CAMERA_RATE = 25  # Hz, as fingertips: more than a policy looks
 _START_TIMEOUT, _ANSWER_TIMEOUT, _END_TIMEOUT = 120.0, 60.0, 5.0  # s, on a machine however loaded

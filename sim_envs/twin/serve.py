@@ -30,7 +30,7 @@ from touchgoal.sim_envs.twin.lock_step import LockStep
 from touchgoal.sim_envs.twin.pace import Pace
 from touchgoal.sim_envs.twin.pictures import CAMERA_RATE, Pictures
 from touchgoal.sim_envs.twin.serial import devices as serial_ports
-from touchgoal.sim_envs.twin.service import Service
+from touchgoal.sim_envs.twin.tcp_ports import Service
 from touchgoal.sim_envs.twin.ur.controller import UrController
 
 _MAX_BACKLOG = 0.1  # s behind real time beyond which the twin stops trying to catch up

@@ -1,9 +1,25 @@
-"""Non-blocking TCP ports, polled between two physics steps."""
+"""What the twin's services are, and their TCP ports, polled between two physics steps."""
 
 import socket
 
 _MOST_UNSENT = 1_000_000  # bytes a client may leave unread before it is cut off
 _MOST_UNREAD = 300_000  # bytes it may send without making sense; a control script has 42,000
+
+
+class Service:
+    """A service for clients; its methods never block, and do nothing unless overridden."""
+
+    def receive(self) -> None:
+        """Take client messages, before a physics step."""
+
+    def hold(self) -> None:
+        """Serve clients in place of a step, while a lock-step twin's time stands."""
+
+    def send(self) -> None:
+        """Answer clients, after a physics step."""
+
+    def close(self) -> None:
+        """Free ports and files."""
 
 
 class ClientConnection:

@@ -18,7 +18,7 @@ from touchgoal.sim_envs.twin.franka import limits, messages
 from touchgoal.sim_envs.twin.franka.arm_state import OTHER, ArmState, Motion, end_effector
 from touchgoal.sim_envs.twin.franka.limits import Setpoint
 from touchgoal.sim_envs.twin.franka.messages import MoveStatus, RobotCommand, RobotMode
-from touchgoal.sim_envs.twin.service import Service
+from touchgoal.sim_envs.twin.tcp_ports import Service
 
 _MAX_LOST_PACKETS = 20  # packets in a row after which the arm stops: Franka's documentation
 _POSITION, _VELOCITY, _POSE, _TWIST, _TORQUE = range(5)  # motion generators; 4 is none

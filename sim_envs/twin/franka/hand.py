@@ -10,7 +10,7 @@ from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 from touchgoal.sim_envs.scene.build import GRIPPER_MAX_FORCE
 from touchgoal.sim_envs.twin.franka import messages
 from touchgoal.sim_envs.twin.franka.messages import HandCommand, HandStatus
-from touchgoal.sim_envs.twin.service import Service
+from touchgoal.sim_envs.twin.tcp_ports import Service
 
 _STILL = 1e-3  # m/s of width
 _SETTLED = 0.1  # s without motion after which a move is over

@@ -11,7 +11,7 @@ from touchgoal.control.grippers import robotiq_registers as registers
 from touchgoal.control.sensors.load_cell import with_checksum
 from touchgoal.control.sensors.serial_port import modbus_crc
 from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
-from touchgoal.sim_envs.twin.service import Service
+from touchgoal.sim_envs.twin.tcp_ports import Service
 
 _LOAD_RATE = 80  # Hz, an HX711's faster rate
 NEWTONS_PER_COUNT, ZERO = 2e-4, 84_213  # load cell; a bridge is never balanced

@@ -13,8 +13,7 @@ import numpy as np
 from touchgoal.control.safety.limits import UR5E
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
-from touchgoal.sim_envs.twin.service import Service
-from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort
+from touchgoal.sim_envs.twin.tcp_ports import ClientConnection, ListeningPort, Service
 from touchgoal.sim_envs.twin.ur import messages
 from touchgoal.sim_envs.twin.ur.messages import Package, Safety
 from touchgoal.sim_envs.twin.ur.program import UrProgram
