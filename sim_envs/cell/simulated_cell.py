@@ -1,7 +1,7 @@
 """The simulated cell in 1 kHz steps, with set-points and gripper commands from outside."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, no_type_check
 
 import mujoco
 import numpy as np
@@ -266,6 +266,7 @@ class SimulatedCell:
 
 
 @njit(cache=True)
+@no_type_check
 def _extremes(q, dq, lower, upper, velocity):
     """Return the largest excess over a joint's range (rad), share of its speed, speed (rad/s)."""
     excess, share, fastest = -np.inf, 0.0, 0.0

@@ -1,7 +1,7 @@
 """Contacts of the solver: wrenches and slip at the fingertips, external force."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import mujoco
 import numpy as np
@@ -125,6 +125,7 @@ class Moving(NamedTuple):
 
 
 @njit(cache=True)
+@no_type_check
 def _read_contacts(contacts, forces, is_robot, pads, origins, moving):
     """Wrenches (N, Nm, world frame) on both pads and robot about their origins; m/s of slip."""
     wrenches, slip = np.zeros((3, 6)), np.zeros(2)
@@ -155,12 +156,14 @@ def _read_contacts(contacts, forces, is_robot, pads, origins, moving):
 
 
 @njit(inline="always")
+@no_type_check
 def _add_wrench(total, sign, force, torque, arm):
     total[:3] += sign * force
     total[3:] += sign * (np.cross(arm, force) + torque)
 
 
 @njit(inline="always")
+@no_type_check
 def _velocity(moving, geom, point):
     """Return the velocity (m/s) of a point (m, world frame) fixed to a geom."""
     body = moving.bodies[geom]

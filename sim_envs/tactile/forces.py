@@ -52,6 +52,7 @@ class ForceField:
 
 
 @njit(cache=True, fastmath=True)
+@no_type_check
 def _pool(pressure, area, out):
     """Sum Pa per pressure cell of `area` m^2 to N per force cell, two by two."""
     for i in range(out.shape[0]):
@@ -62,6 +63,7 @@ def _pool(pressure, area, out):
 
 
 @njit(cache=True, fastmath=True)
+@no_type_check
 def _match_moments(normal, pitch, place, mx, my):
     """Weight the forces, linearly across the patch, so that their moments become mx and my."""
     rows, columns = normal.shape
@@ -103,6 +105,7 @@ def _match_moments(normal, pitch, place, mx, my):
 
 
 @njit(cache=True, fastmath=True)
+@no_type_check
 def _bristles(normal, before, pitch, place, friction):
     """Return pressed cells (x, y from the centre, traction, friction limit), centre and load."""
     rows, columns = normal.shape
@@ -135,6 +138,7 @@ def _bristles(normal, before, pitch, place, friction):
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")  # a check for zero is no vector code
+@no_type_check
 def _brush_sums(bristles, stiffness, ux, uy, turn, total):
     """Sum force, torsion, and their derivatives, of bristles with moved tips."""
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -202,6 +206,7 @@ def _balance(bristles, stiffness, area, force_x, force_y, torsion):
 
 
 @njit(cache=True, fastmath=True)
+@no_type_check
 def _brush(normal, before, pitch, place, friction, stiffness, force, torque, out, slip):
     """Find tractions that balance force and torque; return the share of the load that slips."""
     bristles, cx, cy, load = _bristles(normal, before, pitch, place, friction)

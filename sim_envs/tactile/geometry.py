@@ -7,6 +7,7 @@ into the gel.
 
 import math
 from dataclasses import dataclass
+from typing import no_type_check
 
 import mujoco
 import numpy as np
@@ -41,6 +42,7 @@ _TINY = np.float32(1e-9)
 
 
 @njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
 def _sphere(ox, oy, oz, d, radius):
     b = ox * d[0] + oy * d[1] + oz * d[2]
     disc = b * b - (ox * ox + oy * oy + oz * oz - radius * radius)
@@ -49,12 +51,14 @@ def _sphere(ox, oy, oz, d, radius):
 
 
 @njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
 def _slab(o, inverse, half):
     t0, t1 = (-half - o) * inverse, (half - o) * inverse
     return min(t0, t1), max(t0, t1)
 
 
 @njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
 def _box(ox, oy, oz, inverse, size):
     x0, x1 = _slab(ox, inverse[0], size[0])
     y0, y1 = _slab(oy, inverse[1], size[1])
@@ -64,6 +68,7 @@ def _box(ox, oy, oz, inverse, size):
 
 
 @njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
 def _side(ox, oy, oz, d, across, radius, half):
     """Intersect the curved side of a cylinder along z; `across` is 1 / (dx^2 + dy^2)."""
     b = (ox * d[0] + oy * d[1]) * across
@@ -74,6 +79,7 @@ def _side(ox, oy, oz, d, across, radius, half):
 
 
 @njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
 def _cap(ox, oy, oz, d, inverse_z, radius, end):
     t = (end - oz) * inverse_z
     x, y = ox + t * d[0], oy + t * d[1]
@@ -81,12 +87,14 @@ def _cap(ox, oy, oz, d, inverse_z, radius, end):
 
 
 @njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
 def _cylinder(ox, oy, oz, d, across, inverse_z, size, near_end):
     cap = _cap(ox, oy, oz, d, inverse_z, size[0], near_end)
     return min(_side(ox, oy, oz, d, across, size[0], size[1]), cap)
 
 
 @njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
 def _capsule(ox, oy, oz, d, across, size):
     half = size[1]
     ends = min(_sphere(ox, oy, oz - half, d, size[0]), _sphere(ox, oy, oz + half, d, size[0]))
@@ -94,16 +102,19 @@ def _capsule(ox, oy, oz, d, across, size):
 
 
 @njit(inline="always")
+@no_type_check
 def _inverse(value):
     return np.float32(1.0) / (value if abs(value) > _TINY else _TINY)
 
 
 @njit(inline="always")
+@no_type_check
 def _span(centre, reach, cells):
     return max(int(centre - reach), 0), min(int(centre + reach) + 2, cells)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
+@no_type_check
 def _add_primitive(out, pitch, kind, position, rotation, size, bound):
     rows, columns = out.shape
     y0, x0 = np.float32(0.5 * (rows - 1)), np.float32(0.5 * (columns - 1))
@@ -179,6 +190,7 @@ def add_primitive(
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
+@no_type_check
 def _add_mesh(out, pitch, vertices, faces, position, rotation):
     rows, columns = out.shape
     zero, scale = np.float32(0.0), np.float32(1.0) / pitch

@@ -1,5 +1,7 @@
 """Dots printed on a gel: rest positions, motion with the gel, drawing."""
 
+from typing import no_type_check
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -82,6 +84,7 @@ def _responses(
 
 
 @njit(cache=True, fastmath=True)
+@no_type_check
 def _move(normal, tangential, responses, patch, stiffness, here, out):
     rows, columns = normal.shape
     zero = np.float32(0.0)
@@ -158,6 +161,7 @@ class GelMotion:
 
 
 @njit(cache=True, fastmath=True)
+@no_type_check
 def _draw(image, columns, centres, radius, darkness):
     h, w = image.shape  # three channels a pixel
     half, one, zero = np.float32(0.5), np.float32(1.0), np.float32(0.0)

@@ -3,6 +3,8 @@
 They are computed at half the image's resolution and blended onto background and noise.
 """
 
+from typing import no_type_check
+
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -15,6 +17,7 @@ HeightField = Float32[np.ndarray, "h w"]
 
 
 @njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
 def _response(x, y, depth, k):
     """Evaluate the response to a normal and a depth (`sensor_calibration.shape_features`)."""
     xx, xy, yy = x * x, x * y, y * y
@@ -24,6 +27,7 @@ def _response(x, y, depth, k):
 
 
 @njit(inline="always")
+@no_type_check
 def _along(k, slope, v):
     """One channel's coefficients at height v, in a tuple: an array might alias the output."""
     return (
@@ -41,6 +45,7 @@ def _along(k, slope, v):
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
+@no_type_check
 def _colours(surface, per_pitch, response, limits, dark, shadow, gain, out):
     """Compute `sensor_calibration.shade` less the background, at half its resolution, planar."""
     h, w = surface.shape
@@ -91,6 +96,7 @@ def colour_change(surface: HeightField, instance: SensorInstance) -> Float32[np.
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
+@no_type_check
 def _blend(change, background, noise, oy, ox, out):
     """Double the change bilinearly, add background and noise, clip to bytes."""
     _, h, w = change.shape

@@ -49,6 +49,7 @@ def _columns(height: HeightField, pitch: float) -> Float32[np.ndarray, " w"]:
 
 
 @njit(cache=True, fastmath=True)
+@no_type_check
 def _add_plane(height, xs, pitch, shift, a, b):
     slope = np.float32(a)
     for i in range(height.shape[0]):
@@ -58,6 +59,7 @@ def _add_plane(height, xs, pitch, shift, a, b):
 
 
 @njit(inline="always", fastmath=True)
+@no_type_check
 def solve3(a, b, c, d, e, f, u, v, w):
     """Solve the symmetric positive [[a, b, c], [b, d, e], [c, e, f]] against (u, v, w)."""
     ba, ca = b / a, c / a
@@ -70,6 +72,7 @@ def solve3(a, b, c, d, e, f, u, v, w):
 
 
 @njit(cache=True, fastmath=True)
+@no_type_check
 def _shear(height, shift_x, shift_y, out):
     """Shift the height field by cells, interpolated; at outlines the nearest cell."""
     rows, columns = height.shape
@@ -97,6 +100,7 @@ def _shear(height, shift_x, shift_y, out):
 
 
 @njit(cache=True, fastmath=True)
+@no_type_check
 def _overlap_sums(height, top, xs, pitch, shift, a, b, total):
     """Sum over the contact: 1, x, y, xx, xy, yy of its cells; overlap times 1, x, y."""
     rows, columns = height.shape
@@ -131,6 +135,7 @@ def _overlap_sums(height, top, xs, pitch, shift, a, b, total):
 
 
 @njit(cache=True, fastmath=True)
+@no_type_check
 def _push(height, top, xs, pitch, volume, shift, a, b, most, tolerance, total):
     """Find the shift at which the overlap sums to `volume`, by Newton's method."""
     for _ in range(60):
@@ -143,6 +148,7 @@ def _push(height, top, xs, pitch, volume, shift, a, b, most, tolerance, total):
 
 
 @njit(inline="always", fastmath=True)
+@no_type_check
 def _room(value, step, limit):
     return (math.copysign(limit, step) - value) / step if step != 0.0 else 1.0
 
@@ -189,6 +195,7 @@ def _balance_press(height, xs, pitch, volume, mx, my, stiffness, limit):
 
 
 @njit(cache=True, fastmath=True)
+@no_type_check
 def _pressure(height, xs, pitch, shift, a, b, modulus, force, out):
     rows, columns = height.shape
     zero, slope, stiffness = np.float32(0.0), np.float32(a), np.float32(modulus)

@@ -1,5 +1,7 @@
 """Fine structure of surfaces: height patterns in micrometres on any shape."""
 
+from typing import no_type_check
+
 import numpy as np
 from jaxtyping import Float, Float32
 from numba import njit
@@ -19,6 +21,7 @@ _ROUGH = (
 
 
 @njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
 def _wave(cycles):
     """Approximate sin(2 pi cycles) to 0.1 % by two parabolas, which the compiler vectorises."""
     t = cycles - np.floor(cycles + np.float32(0.5))
@@ -27,17 +30,20 @@ def _wave(cycles):
 
 
 @njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
 def _ribs(x, y, z):
     """Planes across the x + y diagonal, so that every side of an object shows some."""
     return _wave(np.float32(0.7071) * (x + y))
 
 
 @njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
 def _dots(x, y, z):
     return _wave(y) * (_wave(x) + _wave(z))
 
 
 @njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
 def _rough(x, y, z):
     total = np.float32(0.0)
     for a, b, c in _ROUGH:
@@ -46,6 +52,7 @@ def _rough(x, y, z):
 
 
 @njit(inline="always", fastmath=True, error_model="numpy")
+@no_type_check
 def _weave(x, y, z):
     """Two crossed sets of threads, alternately above each other."""
     half = np.float32(0.5)
@@ -55,6 +62,7 @@ def _weave(x, y, z):
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
+@no_type_check
 def _add(height, below, pitch, texture, amplitude, frequency, position, rotation):
     rows, columns = height.shape
     scale = pitch * frequency

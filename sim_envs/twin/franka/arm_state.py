@@ -1,6 +1,7 @@
 """The arm's state in its wire format, updated in place every millisecond."""
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -113,6 +114,7 @@ def end_effector(
 
 
 @njit(cache=True)
+@no_type_check
 def _pose(position, R, ee):
     T = np.zeros((4, 4))
     for i in range(3):

@@ -1,6 +1,7 @@
 """Limits of the Franka control interface: set-points, arm, contact."""
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -70,6 +71,7 @@ _SPEED = 1  # place of the last of them that holds for set-points in Cartesian s
 
 
 @njit(cache=True)
+@no_type_check
 def _broken_limit(
     q, dq, ddq, ddq_before, lower, upper, velocity, acceleration, jerk, gain, below, above, offset
 ):
@@ -119,6 +121,7 @@ _ARM_FAULTS = None, "joint_velocity_violation", "joint_position_limits_violation
 
 
 @njit(cache=True)
+@no_type_check
 def _worst_of_arm(q, dq, lower, upper, velocity):
     worst = 0
     for i in range(len(q)):
@@ -174,6 +177,7 @@ def judge_contact(
 
 
 @njit(cache=True)
+@no_type_check
 def _above(values, lower, upper):
     n = len(values)
     beyond_lower, beyond_upper = np.zeros(n), np.zeros(n)
@@ -186,11 +190,13 @@ def _above(values, lower, upper):
 
 
 @njit(cache=True)
+@no_type_check
 def wrench_behind(torque: Joints, jacobian: Float[np.ndarray, "6 7"]) -> Wrench:
     """Return the wrench (N, Nm) that best explains joint torques (Nm)."""
     return np.linalg.solve(jacobian @ jacobian.T + DAMPING * np.eye(6), jacobian @ torque)
 
 
 @njit(cache=True)
+@no_type_check
 def _is_singular(jacobian):
     return np.linalg.eigvalsh(jacobian @ jacobian.T)[0] < _SINGULAR**2
