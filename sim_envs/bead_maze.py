@@ -53,16 +53,8 @@ class BeadMaze(FrankaTactileEnv):
 
     task = "bead-maze"
     config: BeadMazeConfig
+    default_config = BeadMazeConfig()
     disturbance_rotation = 20.0  # rad of disturbance per m of it: the hole turns with the hand
-
-    def __init__(
-        self,
-        config: BeadMazeConfig | None = None,
-        render_mode: str | None = None,
-        **options: Any,
-    ) -> None:
-        """Take a config, options by name that override its fields, or both."""
-        super().__init__(with_options(config or BeadMazeConfig(), options), render_mode)
 
     @property
     def grasping(self) -> bool:

@@ -32,16 +32,7 @@ class PickPlace(FrankaTactileEnv):
 
     task = "pick-place"
     config: PickPlaceConfig
-
-    def __init__(
-        self,
-        config: PickPlaceConfig | None = None,
-        render_mode: str | None = None,
-        **options: Any,
-    ) -> None:
-        """Take a config, options by name that override its fields, or both."""
-        super().__init__(with_options(config or PickPlaceConfig(), options), render_mode)
-        self.kinds = [find(name) for name in self.config.objects] or list(CATALOGUE.values())
+    default_config = PickPlaceConfig()
 
     def instruction(self) -> str:
         """Return the episode's task in words."""
@@ -89,7 +80,8 @@ class PickPlace(FrankaTactileEnv):
         """Draw the object, its mass, the grasp force, the distractors, and where all of them go."""
         config = self.config
         chosen = with_options(PickPlaceReset(), options)
-        kind = self.kinds[rng.integers(len(self.kinds))]
+        kinds = [find(name) for name in config.objects] or list(CATALOGUE.values())
+        kind = kinds[rng.integers(len(kinds))]
         if chosen.object is not None:
             kind = find(chosen.object)
         mass, force = rng.uniform(*config.mass), rng.uniform(*config.grasp_force)

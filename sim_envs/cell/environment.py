@@ -17,6 +17,7 @@ from touchgoal.sim_envs.cell.deployed_arm import DeployedArm
 from touchgoal.sim_envs.cell.estimated_wrench import ForceMonitor
 from touchgoal.sim_envs.cell.hardware import SimulatedHardware
 from touchgoal.sim_envs.config import IDEAL_DEPLOYMENT, SETPOINT_PERIOD, EnvConfig
+from touchgoal.sim_envs.options import with_options
 from touchgoal.sim_envs.scene.contacts import SLIP_SPEED, PadContact
 from touchgoal.sim_envs.scene.rendering import open_renderer
 from touchgoal.sim_envs.tactile.pad import TactileFrame
@@ -74,10 +75,15 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
     task: str  # its name in commands and episodes
     disturbance_rotation = 2.0  # rad of disturbance per m
     metadata = {"render_modes": ["rgb_array"], "render_fps": ft.CONTROL_HZ}  # noqa: RUF012
+    default_config: EnvConfig = EnvConfig()
 
-    def __init__(self, config: EnvConfig, render_mode: str | None = None) -> None:
+    def __init__(
+        self, config: EnvConfig | None = None, render_mode: str | None = None, **options: Any
+    ) -> None:
+        """Take a config, options by name that override its fields, or both."""
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UserError(f"render_mode is 'rgb_array' or none, not {render_mode!r}")
+        config = with_options(config or self.default_config, options)
         super().__init__(config)
         self.render_mode = render_mode
         step = self.robot.hardware.velocity / config.control_hz
