@@ -153,6 +153,12 @@ def add_fingertip(spec: mujoco.MjSpec, side: str, sensor: SensorModel) -> None:
     finger.add_site(
         name=f"{side}_sensor", pos=[0, 0, z], quat=_quaternion(x, y, out), group=HIDDEN_GROUP
     )
+    _add_gel(spec, finger, side, sensor, z)
+
+
+def _add_gel(
+    spec: mujoco.MjSpec, finger: mujoco.MjsBody, side: str, sensor: SensorModel, z: float
+) -> None:
     mass, damping_ratio = 0.005, 0.7  # kg of gel; critically enough damped to not ring
     gel = finger.add_body(name=f"{side}_gel", pos=[0, 0, z], gravcomp=1)
     gel.explicitinertial = True
