@@ -60,35 +60,25 @@ class Feature:
 _IMAGE_NAMES = ("height", "width", "channels")
 
 
-def _of_joints(joints: int) -> dict[str, Feature]:
-    """Return the columns that depend on the number of joints."""
+def features_of(joints: int) -> dict[str, Feature]:
+    """Return every feature of an arm with this many joints: 7 for an FR3, 6 for a UR5e."""
     names = [f"joint_{i}" for i in range(1, joints + 1)]
+    moving = *(f"{j}.pos" for j in names), *(f"{j}.vel" for j in names)
+    state = "joint positions (rad), joint velocities (rad/s), gripper width (m)"
+    command = "commanded joint positions (rad) and their change in the last tick (rad/s)"
+    command += ", without delay or contact"
+    action = "joint change for this control tick (rad), gripper width target (m)"
+    targets = *(f"{j}.delta" for j in names), "gripper.target"
     return {
-        STATE: Feature(
-            "float32",
-            (2 * joints + 1,),
-            (*(f"{j}.pos" for j in names), *(f"{j}.vel" for j in names), "gripper.pos"),
-            "joint positions (rad), joint velocities (rad/s), gripper width (m)",
-        ),
-        COMMAND: Feature(
-            "float32",
-            (2 * joints,),
-            (*(f"{j}.pos" for j in names), *(f"{j}.vel" for j in names)),
-            "commanded joint positions (rad) and their change in the last tick (rad/s), without delay "
-            "or contact",
-        ),
-        ACTION: Feature(
-            "float32",
-            (joints + 1,),
-            (*(f"{j}.delta" for j in names), "gripper.target"),
-            "joint change for this control tick (rad), gripper width target (m)",
-        ),
+        STATE: Feature("float32", (2 * joints + 1,), (*moving, "gripper.pos"), state),
+        COMMAND: Feature("float32", (2 * joints,), moving, command),
+        **_BEFORE_ACTION,
+        ACTION: Feature("float32", (joints + 1,), targets, action),
+        **_AFTER_ACTION,
     }
 
 
-FEATURES: dict[str, Feature] = {
-    STATE: _of_joints(N_JOINTS)[STATE],
-    COMMAND: _of_joints(N_JOINTS)[COMMAND],
+_BEFORE_ACTION = {
     TCP_POSE: Feature("float32", (7,), _POSE, "tool centre point in the base frame: m, wxyz"),
     WRENCH: Feature(
         "float32", (6,), _WRENCH, "external force (N) and torque (Nm) at the TCP, base frame"
@@ -100,7 +90,8 @@ FEATURES: dict[str, Feature] = {
     WRIST: Feature("uint8", CAMERA_SHAPE, _IMAGE_NAMES, "camera on the hand, RGB"),
     TACTILE_LEFT: Feature("uint8", TACTILE_SHAPE, _IMAGE_NAMES, "left fingertip sensor, RGB"),
     TACTILE_RIGHT: Feature("uint8", TACTILE_SHAPE, _IMAGE_NAMES, "right fingertip sensor, RGB"),
-    ACTION: _of_joints(N_JOINTS)[ACTION],
+}
+_AFTER_ACTION = {
     COST: Feature(
         "float32",
         (1,),
@@ -130,7 +121,4 @@ FEATURES: dict[str, Feature] = {
     ),
 }
 
-
-def features_of(joints: int) -> dict[str, Feature]:
-    """Return `FEATURES` for an arm with this many joints: 7 for an FR3, 6 for a UR5e."""
-    return FEATURES | _of_joints(joints)
+FEATURES = features_of(N_JOINTS)

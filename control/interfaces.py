@@ -1,17 +1,17 @@
 """Interfaces of arm, gripper, camera, fingertip, load cell and actor.
 
-Every reading is a frozen snapshot with `stamp`, the monotonic time (s, `time.monotonic`) at which its
-content was new. A driver without news returns the old reading with its old stamp, so that its age shows.
-`read` and `command` wait for hardware no longer than a time-out; a device that is broken for good raises
-DriverError.
+Every reading is a frozen snapshot with `stamp`, the monotonic time (s) at which its content was
+new: a driver without news returns the old reading, so that its age shows. `read` and `command` wait
+for hardware no longer than a time-out; a device that is broken for good raises DriverError.
 """
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
+from touchgoal.control.arrays import Picture
 from touchgoal.control.features import Observation
 from touchgoal.control.tactile.sensor_models import SensorModel
 
@@ -27,26 +27,17 @@ class DriverError(RuntimeError):
 
 @dataclass(frozen=True)
 class ArmReading:
-    """An arm's state.
+    """An arm's state."""
 
-    Attributes:
-        q: joint positions, rad.
-        velocity: of the joints, rad/s.
-        wrench: force (N) and torque (Nm) of the environment on the robot at the TCP, base frame; NaN
-            where the arm measures none, as an FR3 near a singularity.
-        torque: external torque on each joint, Nm.
-        fault: why the arm refuses commands until a person recovers it; empty if it takes them.
-        stamp: s, when the controller's clock last advanced.
-        time: s, that clock.
-    """
-
-    q: Joints
-    velocity: Joints
+    q: Joints  #: positions, rad
+    velocity: Joints  #: of the joints, rad/s
+    #: force (N) and torque (Nm) of the environment on the robot at the TCP, base frame; NaN where the
+    #: arm measures none, as an FR3 near a singularity
     wrench: Float[np.ndarray, "6"]
-    torque: Joints
-    fault: str
-    stamp: float
-    time: float
+    torque: Joints  #: external, on each joint, Nm
+    fault: str  #: why the arm refuses commands until a person recovers it; empty if it takes them
+    stamp: float  #: s, when the controller's clock last advanced
+    time: float  #: s, that clock
 
 
 @dataclass(frozen=True)
@@ -61,17 +52,11 @@ class GripperReading:
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture.
+    """An RGB picture."""
 
-    Attributes:
-        image: RGB.
-        sequence: number of frames taken, unread ones included.
-        stamp: s, right after the grab; for a frozen camera, when its picture last changed.
-    """
-
-    image: UInt8[np.ndarray, "h w 3"]
-    sequence: int
-    stamp: float
+    image: Picture
+    sequence: int  #: number of frames taken, unread ones included
+    stamp: float  #: s, right after the grab; for a frozen camera, when its picture last changed
 
 
 @dataclass(frozen=True)
@@ -97,19 +82,15 @@ class Arm(Protocol):
 
     def command(self, q: Joints) -> None:
         """Move on to `q` (rad); DriverError if stopped or at fault, UserError if beyond the range."""
-        ...
 
     def stop(self) -> None:
         """Brake as fast as the limits allow, and stay; returns at once."""
-        ...
 
     def recover(self) -> None:
         """Clear `stop` or a fault. Call it only when a person asked for it."""
-        ...
 
     def close(self) -> None:
         """Bring the arm to rest, then disconnect."""
-        ...
 
 
 @runtime_checkable
@@ -125,29 +106,20 @@ class Gripper(Protocol):
 
         DriverError at fault or after `stop`, which only a new connection ends.
         """
-        ...
 
     def stop(self, release_to: float | None = None) -> None:
         """Stop moving and take no command any more; what is held stays held.
 
-        Args:
-            release_to: let go instead: open to this width (m) and stay there.
+        With `release_to`, let go instead: open to this width (m) and stay there.
         """
-        ...
 
     def close(self) -> None:
         """Disconnect; the fingers stay."""
-        ...
 
 
 @runtime_checkable
 class Camera(Protocol):
     """A stream of images; only the newest counts."""
-
-    @property
-    def rate(self) -> float:
-        """Measured frames per second."""
-        ...
 
     @property
     def problem(self) -> str:
@@ -160,7 +132,6 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Release the device."""
-        ...
 
 
 @runtime_checkable
@@ -183,19 +154,13 @@ class LoadCell(Protocol):
 
     def close(self) -> None:
         """Release the port."""
-        ...
 
 
 class Actor:
-    """Whatever acts in the control loop; `act` never waits for as long as a tick.
+    """Whatever acts in the control loop; `act` never waits for as long as a tick."""
 
-    Attributes:
-        done: whether its plan has ended.
-        action_age: s for which it has had no new answer.
-    """
-
-    done = False
-    action_age = 0.0
+    done = False  #: whether its plan has ended
+    action_age = 0.0  #: s for which it has had no new answer
 
     def start(self, observation: Observation) -> None:
         """Prepare for the first tick, while the arm is still at rest."""

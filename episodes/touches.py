@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
+from touchgoal.control.arrays import Picture
 from touchgoal.control.features import TACTILE, TRUTH_CONTACT, WRIST
-from touchgoal.control.sensors.exchanged import Picture, fingertips_exchanged
+from touchgoal.control.sensors.exchanged import fingertips_exchanged
 from touchgoal.control.tactile.background import local_change
 from touchgoal.control.tactile.contact import detect_contact, threshold_for
 from touchgoal.control.tactile.picture_guard import check_untouched

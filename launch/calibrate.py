@@ -12,7 +12,6 @@ from typing import Annotated
 import tyro
 from pydantic import Field
 
-from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Positive, Seed, checked_dataclass
 
 
@@ -46,18 +45,16 @@ class Config:
 
 def main(config: Config) -> None:
     """Fit without the held-out presses and measure errors on them, then fit all."""
-    import numpy as np
-
     from touchgoal.control.calibration import report
     from touchgoal.control.calibration.calibrate import (
         ILLUMINATION_EXPONENTS,
         STEPS,
+        depth_errors,
         fit,
         select_illumination_exponent,
     )
-    from touchgoal.control.calibration.held_out_depth import depth_errors, median_by_ball
-    from touchgoal.control.calibration.pictures import light_compass
     from touchgoal.control.calibration.press_set import read_presses, split
+    from touchgoal.control.calibration.report import light_compass
     from touchgoal.control.tactile.picture_guard import check_presses, check_untouched
     from touchgoal.control.tactile.sensor_calibration import save
     from touchgoal.control.tactile.sensor_models import find_model
@@ -69,11 +66,6 @@ def main(config: Config) -> None:
     model = find_model(config.sensor)
     pitch = config.mm_per_pixel * 1e-3
     presses = read_presses(config.presses, pitch, config.ball_mm or math.nan)
-    if np.isnan(presses.ball_radius).any():
-        raise UserError(
-            "the ball's radius is missing, and every depth in mm depends on it: measure the ball "
-            "and give --ball-mm, or ball_mm in presses.csv (two balls of different size are best)"
-        )
     if config.check_lamps:
         background, where = presses.background, config.presses
         check_untouched(background, model, f"{where}/background.png")
@@ -91,10 +83,10 @@ def main(config: Config) -> None:
     errors = report.held_out_errors(judged, test)
     print(report.errors_table(errors, len(test)))
     report.refuse_useless(errors)
-    circles, balls = judged.fit_circles(test), judged.ball_radii(test)
-    depths = median_by_ball(depth_errors(judged.calibration, test, circles, balls), balls)
+    depth = depth_errors(judged.calibration, test, judged.fit_circles(test))
+    depths = report.median_by_ball(depth, test.ball_radius)
     print(report.depth_table(depths))
-    for line in [*report.warnings(fitted), *report.at_limits(fitted, presses)]:
+    for line in report.warnings(fitted, presses):
         print(line)
     record = report.record(fitted, presses, errors, depths, len(test))
     source = {"source": config.source or str(config.presses), **provenance()}

@@ -175,7 +175,7 @@ def _confirm(cell: "CellConfig") -> None:
 
 
 def _report(result: "Result", out: Path) -> None:
-    from touchgoal.control.deployment.report import metrics, report
+    from touchgoal.control.deployment.session import metrics, report
     from touchgoal.control.deployment.terminal import say
     from touchgoal.runtime.json_file import write_json
 

@@ -57,7 +57,7 @@ def to_actions(
 
 def _base_jacobian_and_elbow(joints: Float[Tensor, "b 7"]) -> Float[Tensor, "b 7 7"]:
     """Return the Jacobian of the hand's displacement and rotation, with the third joint as a row."""
-    rows, _ = _kinematics().jacobians(joints.cpu().numpy().astype(np.float64))
+    _, _, rows = _kinematics().forward_many(joints.cpu().numpy().astype(np.float64))
     elbow = torch.eye(N_JOINTS)[2].expand(len(rows), 1, -1)
     return torch.cat([torch.from_numpy(rows).float(), elbow], 1).to(joints)
 
@@ -70,14 +70,15 @@ def nearest(widths: Float[Tensor, "b h"], allowed: tuple[float, ...]) -> Float[T
 
 def body_jacobian(joints: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 6 7"]:
     """Return the Jacobian of the TCP's displacement and rotation along its own axes."""
-    J, R = _kinematics().jacobians(joints.reshape(-1, N_JOINTS).cpu().numpy().astype(np.float64))
+    columns = joints.reshape(-1, N_JOINTS).cpu().numpy().astype(np.float64)
+    _, R, J = _kinematics().forward_many(columns)
     own = R.mT[:, None] @ J.reshape(-1, 2, 3, N_JOINTS)
     return torch.from_numpy(own).float().to(joints).reshape(*joints.shape[:-1], 6, N_JOINTS)
 
 
 def tcp_poses(joints: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7"]:
     """Return `features.TCP_POSE` at joint positions (rad)."""
-    position, R = _kinematics().forward_many(
+    position, R, _ = _kinematics().forward_many(
         joints.reshape(-1, N_JOINTS).cpu().numpy().astype(np.float64)
     )
     quaternions = Rotation.from_matrix(R).as_quat(scalar_first=True)

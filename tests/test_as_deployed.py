@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from touchgoal.control import features as ft
-from touchgoal.control.safety.task_ceilings import TASK_FORCES
+from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.policies.perception.proprioception import network_input, tare
 from touchgoal.sim_envs.bead_maze import BeadMaze
 from touchgoal.sim_envs.cell.estimated_wrench import EstimatedWrench

@@ -7,7 +7,7 @@ import pytest
 
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.follower import WireFollower
-from touchgoal.control.safety.task_ceilings import TASK_FORCES
+from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.control.tactile.contact import detect_contact
 from touchgoal.episodes.recording import run
 from touchgoal.policies.evaluation.evaluate import run_trials, trial_specs

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from touchgoal.control.calibration.ball import ball_overlap, press_surface
+from touchgoal.control.calibration.ball import ball_overlap, press_surface, sphere_in
 from touchgoal.control.calibration.calibrate import fit, median_background
-from touchgoal.control.calibration.held_out_depth import sphere_in
 from touchgoal.control.calibration.press_set import (
     PressSet,
     read_presses,
@@ -119,7 +118,7 @@ def test_calibrate_finds_known_lights(
     assert record["held_out"]["fit, circles moved to the picture"]["l1_near"] < 1.35 * floor
     labelled = record["held_out"]["fit, circles as labelled"]["l1_near"]
     assert labelled < 0.6 * record["held_out"]["background alone"]["l1_near"]
-    assert record["response_varies_over_image"] and not record["ball_fitted"]
+    assert record["response_varies_over_image"]
     depth = record["held_out_depth"]["3"]
     assert depth["radius_mm"] == pytest.approx(3, rel=0.1) and depth["residual_um"] < 30
     for name in ("held_out.png", "lights.png"):
@@ -134,7 +133,7 @@ def test_presses_in_one_place_say_nothing_about_the_rest(presses: Path) -> None:
     middle = together.take(np.argsort(spread)[:8])
     unknown = replace(middle, ball_radius=np.full(8, np.nan))
     found = fit(unknown, PITCH, "gelsight_mini", trust_labels=True)
-    assert not found.varies_over_image and found.ball_fitted
+    assert not found.varies_over_image and not np.isnan(found.ball_radius).any()
     assert np.abs(found.calibration.response[..., 0]).max() > 10
     assert not found.calibration.response[..., 1:].any()
     for azimuth, true in zip(found.calibration.light_azimuths, AZIMUTHS, strict=True):
@@ -186,7 +185,7 @@ def no_contact(folder: Path) -> None:
         (set_row(1, "170"), "lies outside the 160 x 120 picture"),
         (set_row(3, "30"), "does not fit a ball of radius 3 mm"),
         (set_row(3, "1"), "too small"),
-        (set_row(4, ""), "for some presses only"),
+        (set_row(4, ""), "the ball's radius is missing"),
         (set_row(4, "-2"), "ball_mm"),
         (other_size, "100 x 100 pixels, background.png 160 x 120"),
         (no_contact, "shows no contact"),
@@ -215,7 +214,7 @@ def test_sensor_file_comes_back(tmp_path: Path) -> None:
             assert before == after
         else:
             np.testing.assert_allclose(np.array(after), np.array(before), rtol=1e-6)
-    assert sensor_calibration.read_provenance(tmp_path)["source"] == "made up"
+    assert json.loads((tmp_path / "sensor.json").read_text())["provenance"]["source"] == "made up"
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,8 @@ import pytest
 
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.connection import _tactile_camera
-from touchgoal.control.sensors.fingertip_source import fingertip_view, recorded_frames
-from touchgoal.control.sensors.gel_corners import rectify
-from touchgoal.control.sensors.tactile_camera import NO_CROP
+from touchgoal.control.sensors.fingertip_source import recorded_frames
+from touchgoal.control.sensors.tactile_camera import NO_CROP, fingertip_view, rectify
 from touchgoal.control.tactile.sensor_models import GELSIGHT_WEDGE
 from touchgoal.runtime.errors import UserError
 

@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from touchgoal.control.motion.arm_models import FR3_ARM
-from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics, Ur5eKinematics
+from touchgoal.control.motion.arm_models import FR3_ARM, UR5E_ARM
+from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
 from touchgoal.control.motion.self_collision import (
     SelfDistance,
     require_no_self_collision,
     segment_distance,
 )
+from touchgoal.control.motion.tool import ROBOTIQ_2F85
 from touchgoal.control.motion.trajectories import joint_move
 from touchgoal.control.safety import limits as robots
 from touchgoal.runtime.errors import UserError
@@ -32,7 +33,7 @@ def near_tasks(
     kinematics: Kinematics, count: int, rng: np.random.Generator
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Goals (rad) anywhere, near limits and near singularities in turn, and starts near them."""
-    lower, upper = kinematics.arm.lower + 1e-3, kinematics.arm.upper - 1e-3
+    lower, upper = kinematics.arm.limits.lower + 1e-3, kinematics.arm.limits.upper - 1e-3
     for k in range(count):
         q = rng.uniform(lower, upper)
         if k % 3 == 1:
@@ -41,7 +42,7 @@ def near_tasks(
             q[at] = np.where(low, lower[at] + inwards, upper[at] - inwards)
         elif k % 3 == 2:
             candidates = rng.uniform(lower, upper, (_CANDIDATES, q.size))
-            jacobians, _ = kinematics.jacobians(candidates)
+            _, _, jacobians = kinematics.forward_many(candidates)
             least = np.linalg.svd(jacobians, compute_uv=False)[:, -1]
             q = candidates[np.argmin(least)]
         yield q, np.clip(q + rng.uniform(-NEAR, NEAR, q.size), lower, upper)
@@ -57,7 +58,7 @@ def check_against_mujoco(
     linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
     index = model.site(site).id
     for _ in range(POSES):
-        q = rng.uniform(arm.arm.lower, arm.arm.upper)
+        q = rng.uniform(arm.arm.limits.lower, arm.arm.limits.upper)
         data.qpos[dofs] = q
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
@@ -84,7 +85,7 @@ def test_inverse_reaches_the_workspace_within_limits() -> None:
         position = rng.uniform([0.38, -0.25, 0.017], [0.62, 0.25, 0.35])
         rotation = fingers_down(rng.uniform(-1.5, 1.5))
         q = arm.solve_ik(position, rotation, FR3_ARM.home)
-        assert (q > FR3_ARM.lower).all() and (q < FR3_ARM.upper).all()
+        assert (q > FR3_ARM.limits.lower).all() and (q < FR3_ARM.limits.upper).all()
         reached, turned = arm.forward(q)
         assert np.linalg.norm(reached - position) < 1e-4
         assert np.linalg.norm(rotation_vector(turned @ rotation.T)) < 1e-3
@@ -92,7 +93,7 @@ def test_inverse_reaches_the_workspace_within_limits() -> None:
 
 def test_at_a_singularity_the_joints_change_little() -> None:
     """A UR5e with its wrist stretched, asked for what no change of its joints gives."""
-    arm = Ur5eKinematics()
+    arm = Kinematics(UR5E_ARM, ROBOTIQ_2F85.tcp_offset)
     stretched = arm.arm.home * [1, 1, 1, 1, 0, 1] + [0, 0, 0, 0, 1e-6, 0]
     lost = np.linalg.svd(arm.jacobian(stretched))[0][:, -1]  # direction of the least displacement
     assert np.abs(np.linalg.pinv(arm.jacobian(stretched)) @ (1e-3 * lost)).max() > 100
@@ -162,22 +163,22 @@ def test_the_simulated_ur5e_is_the_makers() -> None:
     assert model.site("tcp").pos[2] == pytest.approx(0.0108 + 0.1628 - 0.01875)
     assert 2 * model.joint("finger_joint1").range[1] == pytest.approx(0.085)
     dofs = [int(model.joint(f"ur5e_joint{i}").dofadr[0]) for i in range(1, 7)]
-    check_against_mujoco(model, Ur5eKinematics(), "tcp", dofs)
+    check_against_mujoco(model, Kinematics(UR5E_ARM, ROBOTIQ_2F85.tcp_offset), "tcp", dofs)
 
 
 def test_ur5e_matches_mujoco() -> None:
-    check_against_mujoco(
-        _ur5e_in_mujoco(), Ur5eKinematics(tcp_offset=0.0), "flange", list(range(6))
-    )
+    check_against_mujoco(_ur5e_in_mujoco(), Kinematics(UR5E_ARM, 0.0), "flange", list(range(6)))
 
 
 @pytest.mark.parametrize("posture", [0.02, 0.0])
-@pytest.mark.parametrize("arm", [Fr3Kinematics(), Ur5eKinematics()], ids=["FR3", "UR5e"])
+@pytest.mark.parametrize(
+    "arm", [Fr3Kinematics(), Kinematics(UR5E_ARM, ROBOTIQ_2F85.tcp_offset)], ids=["FR3", "UR5e"]
+)
 def test_near_poses_are_reached_near_limits_and_singularities_too(
     arm: Kinematics, posture: float
 ) -> None:
     """99 % of 2,000 poses from 0.2 rad off; what is called reached is there, and near."""
-    limits, reached = arm.arm, 0
+    limits, reached = arm.arm.limits, 0
     for q, start in near_tasks(arm, 2000, np.random.default_rng(3)):
         position, rotation = arm.forward(q)
         solution = arm.solve_ik_near(position, rotation, start, posture=posture)
@@ -191,10 +192,12 @@ def test_near_poses_are_reached_near_limits_and_singularities_too(
     assert reached >= 0.99 * 2000
 
 
-@pytest.mark.parametrize("arm", [Fr3Kinematics(), Ur5eKinematics()], ids=["FR3", "UR5e"])
+@pytest.mark.parametrize(
+    "arm", [Fr3Kinematics(), Kinematics(UR5E_ARM, ROBOTIQ_2F85.tcp_offset)], ids=["FR3", "UR5e"]
+)
 def test_what_is_reachable_is_reached_in_any_orientation(arm: Kinematics) -> None:
     """999 of 1000 poses that some joint positions have, inside the box over the table."""
-    rng, limits = np.random.default_rng(7), arm.arm
+    rng, limits, home = np.random.default_rng(7), arm.arm.limits, arm.arm.home
     lower, upper = np.maximum(limits.lower, -np.pi) + 0.05, np.minimum(limits.upper, np.pi) - 0.05
     missed, count = 0, 0
     while count < POSES:
@@ -203,7 +206,7 @@ def test_what_is_reachable_is_reached_in_any_orientation(arm: Kinematics) -> Non
             continue
         count += 1
         try:
-            q = arm.solve_ik(position, rotation, limits.home)
+            q = arm.solve_ik(position, rotation, home)
         except UserError:
             missed += 1
             continue

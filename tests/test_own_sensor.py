@@ -13,9 +13,8 @@ from touchgoal.control.calibration.ball import press_surface
 from touchgoal.control.calibration.press_recorder import PressRecorder
 from touchgoal.control.calibration.press_set import read_presses
 from touchgoal.control.calibration.sensor_check import check_sensor
-from touchgoal.control.sensors.fingertip_source import live_frames, recorded_frames
+from touchgoal.control.sensors.fingertip_source import open_frames, recorded_frames
 from touchgoal.control.sensors.live_picture import LivePicture
-from touchgoal.control.sensors.video import VideoConfig
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.sensor_calibration import load, shade
 from touchgoal.control.tactile.sensor_models import (
@@ -137,7 +136,7 @@ def test_what_is_shown_live_can_be_read_live(session: list[np.ndarray]) -> None:
                 live.show(session[35])
 
         threading.Thread(target=play, daemon=True).start()
-        with closing(live_frames(VideoConfig(live.address), GELSIGHT_MINI)) as frames:
+        with closing(open_frames(live.address, GELSIGHT_MINI)) as frames:
             read = [next(frames) for _ in range(5)]
         ended.set()
     assert read[-1].shape == (240, 320, 3)
@@ -198,7 +197,7 @@ def test_a_sensor_check_counts_markers() -> None:
         frames.append(frame)
     check = check_sensor(frames, GELSIGHT_MINI_MARKERS)
     assert check.markers == pytest.approx(1, abs=0.02)
-    assert check.largest_shift == pytest.approx(3, abs=0.5)
+    assert check.largest_shift_px == pytest.approx(3, abs=0.5)
 
 
 def test_a_darker_picture_has_a_depth(balls: list[np.ndarray]) -> None:

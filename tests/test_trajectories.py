@@ -9,9 +9,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from touchgoal.benchmarks.deployment.sent_stream import late_by, outside_box, send, wild_commands
-from touchgoal.control.motion.arm_models import JointLimits
-from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics, Ur5eKinematics
+from touchgoal.control.motion.arm_models import UR5E_ARM, JointLimits
+from touchgoal.control.motion.kinematics import Fr3Kinematics, Kinematics
 from touchgoal.control.motion.rotations import fingers_down
+from touchgoal.control.motion.tool import ROBOTIQ_2F85
 from touchgoal.control.motion.tracker import Tracker
 from touchgoal.control.motion.trajectories import (
     Trajectory,
@@ -24,7 +25,10 @@ from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3, UR5E, RobotLimits
 from touchgoal.runtime.errors import UserError
 
-ROBOTS = [(robots.FR3, Fr3Kinematics()), (robots.UR5E, Ur5eKinematics())]
+ROBOTS = [
+    (robots.FR3, Fr3Kinematics()),
+    (robots.UR5E, Kinematics(UR5E_ARM, ROBOTIQ_2F85.tcp_offset)),
+]
 
 
 def ruckig_duration(start: np.ndarray, goal: np.ndarray, limits: JointLimits) -> float:

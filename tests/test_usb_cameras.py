@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numbered_pictures import numbered, until
 
-from touchgoal.control.sensors.fingertip_source import fingertip_view
 from touchgoal.control.sensors.tactile_camera import (
     DIGIT_CROP,
     GELSIGHT_MINI_CROP,
     NO_CROP,
+    fingertip_view,
 )
 from touchgoal.control.sensors.usb_cameras import find_sensor_camera, list_cameras
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig

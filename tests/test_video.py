@@ -18,10 +18,9 @@ from numbered_pictures import BITS, numbered, until
 from touchgoal.control.interfaces import DriverError, TactileSensor
 from touchgoal.control.sensors.fingertip_source import fingertip_video
 from touchgoal.control.sensors.picture_integrity import (
+    BrokenBlocks,
     FrozenParts,
     JpegDecoder,
-    gel_picture,
-    is_broken_gel,
 )
 from touchgoal.control.sensors.tactile_camera import (
     DIGIT_CROP,
@@ -103,7 +102,7 @@ def test_a_slow_reader_of_a_stream_sees_the_present(streamer: Streamer) -> None:
     # A queue would still hold the first pictures, 50 behind.
     assert streamer.count - number(frame.image) < 20 < frame.sequence
     assert frame.image[80, 64, 0] > 140 > 60 > frame.image[80, 64, 2], "RGB, not BGR"
-    assert frame.stamp <= time.monotonic() and camera.rate > 10
+    assert frame.stamp <= time.monotonic()
     until(lambda: camera.problem == "")
     camera.close()
 
@@ -187,7 +186,9 @@ def test_broken_jpegs_of_a_gel_are_refused_and_presses_of_a_real_one_are_not() -
 
 
 def is_broken(image: np.ndarray, before: np.ndarray, dots: float = 0.0) -> bool:
-    return is_broken_gel(gel_picture(image, dots), gel_picture(before, dots))
+    blocks = BrokenBlocks(dots)
+    blocks.update(before)
+    return blocks.update(image)
 
 
 def damaged(data: bytes, count: int, rng: np.random.Generator) -> bytes:
@@ -253,27 +254,6 @@ def test_a_lost_stream_is_joined_again(streamer: Streamer) -> None:
     until(lambda: camera.problem == "" and camera.read().sequence > last + 5)
     camera.close()
     again.hang_up()
-
-
-@pytest.mark.parametrize("kind", ["images", "film"])
-def test_files_are_played_at_their_rate_then_said_to_have_ended(tmp_path: Path, kind: str) -> None:
-    bgr = [np.ascontiguousarray(numbered(k)[..., ::-1]) for k in range(1, 13)]
-    if kind == "images":
-        for k, image in enumerate(bgr):
-            cv2.imwrite(str(tmp_path / f"frame_{k:04d}.png"), image)
-        source = str(tmp_path / "frame_%04d.png")
-    else:
-        source = str(tmp_path / "film.avi")
-        writer = cv2.VideoWriter(source, cv2.VideoWriter.fourcc(*"MJPG"), 25, (128, 96))
-        for image in bgr:
-            writer.write(image)
-        writer.release()
-    start = time.monotonic()
-    camera = VideoCamera(VideoConfig(source, rate=50.0))
-    assert camera.read().sequence < 12
-    until(lambda: "ended" in camera.problem)
-    assert time.monotonic() - start > 11 / 50 and number(camera.read().image) == 12
-    camera.close()
 
 
 def test_a_missing_source_is_said_in_a_line(tmp_path: Path) -> None:

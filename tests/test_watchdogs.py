@@ -11,8 +11,7 @@ from fake_cell import FakeCell, FakeLoadCell
 
 from touchgoal.control import features as ft
 from touchgoal.control.deployment.hand import HandMonitor, HeldObject
-from touchgoal.control.grippers.franka_hand import FrankaHandClient
-from touchgoal.control.grippers.non_blocking import NonBlockingGripper
+from touchgoal.control.grippers.franka_hand import FrankaHandClient, NonBlockingGripper
 from touchgoal.control.interfaces import DriverError, GripperReading, LoadReading
 from touchgoal.control.motion.kinematics import Kinematics
 from touchgoal.control.safety.limits import FR3

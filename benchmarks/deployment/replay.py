@@ -18,7 +18,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.cell.cell_file import read_cell_file
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import connect_cell
-from touchgoal.control.motion.servo_lag import ServoLag
+from touchgoal.control.motion.tracker import ServoLag
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import Box, RobotLimits
 from touchgoal.runtime import seeds

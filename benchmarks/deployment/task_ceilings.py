@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.control import features as ft
-from touchgoal.control.safety.task_ceilings import TaskForces
+from touchgoal.control.safety.limits import TaskForces
 from touchgoal.control.tactile.indentation import IndentationMeter
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.recording import CORRECTED

@@ -6,7 +6,7 @@ fitted presses of the first split.
 """
 
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,10 +22,9 @@ from touchgoal.benchmarks.real_touch.taxim_peer import (
     real_presses,
 )
 from touchgoal.control.calibration.calibrate import FittedCalibration, fit
-from touchgoal.control.calibration.picture_errors import mean_errors, picture_errors
-from touchgoal.control.calibration.pictures import side_by_side
 from touchgoal.control.calibration.press_fit import REGION
 from touchgoal.control.calibration.press_set import PressSet, split, write_presses
+from touchgoal.control.calibration.report import mean_errors, picture_errors, side_by_side
 from touchgoal.runtime.errors import install_extra
 from touchgoal.runtime.option_types import Count, checked_dataclass
 from touchgoal.runtime.progress import track
@@ -72,7 +71,7 @@ def run(config: Config) -> dict[str, Any]:
             fitted = fit(train, PIXEL_PITCH, sensor)
             for method, simulated in _methods(sensor, fitted, train, test, taxim):
                 errors = mean_errors([*map(picture_errors, test.images, simulated, test.circles)])
-                rows.append({"sensor": sensor, "method": method, "seed": seed, **asdict(errors)})
+                rows.append({"sensor": sensor, "method": method, "seed": seed, **errors})
                 if method == MAIN_METHOD and seed == 0:
                     examples += _examples(test, simulated)
     lines = [_table(rows), _LEGEND]
@@ -86,19 +85,23 @@ def _methods(
     sensor: str,
     fitted: FittedCalibration,
     train: PressSet,
-    test: PressSet,
+    given: PressSet,
     taxim: TaximRenderer | None,
 ) -> Iterator[tuple[str, list[Colours]]]:
     """Return each method's predictions of the held-out images, by name."""
     background = fitted.calibration.background.astype(np.float32)
-    moved, balls = fitted.fit_circles(test), fitted.ball_radii(test)
+    test = _with_balls(given, fitted)
+    moved = fitted.fit_circles(test)
     yield "background alone", [test.background.astype(np.float32)] * len(test)
     yield "background as the presses leave it", [background] * len(test)
     trusting = fit(train, PIXEL_PITCH, sensor, trust_labels=True)
-    faces = map(trusting.simulate, trusting.correct_labels(test), trusting.ball_radii(test))
-    yield "ours, circles at face value", [*faces]
-    yield MAIN_METHOD, [*map(fitted.simulate, fitted.correct_labels(test), balls)]
-    yield "ours, circles moved", [*map(fitted.simulate, moved, balls)]
+    trusted = _with_balls(given, trusting)
+    yield (
+        "ours, circles at face value",
+        trusting.simulate(trusted, trusting.correct_labels(trusted)),
+    )
+    yield MAIN_METHOD, fitted.simulate(test, fitted.correct_labels(test))
+    yield "ours, circles moved", fitted.simulate(test, moved)
     if taxim is None:
         return
     labelled = [taxim.render(c, *_TAXIM_LABELLED[sensor]) for c in test.circles]
@@ -107,6 +110,12 @@ def _methods(
     yield "taxim table, on our background", [p - taxim.untouched + background for p in labelled]
     better = [taxim.render(c, *_TAXIM_MOVED[sensor]) for c in moved]
     yield "the same, circles moved", [p - taxim.untouched + background for p in better]
+
+
+def _with_balls(presses: PressSet, fitted: FittedCalibration) -> PressSet:
+    """Give presses of an unknown ball the fitted radius."""
+    known = presses.ball_radius
+    return replace(presses, ball_radius=np.where(np.isnan(known), fitted.ball_radius.mean(), known))
 
 
 def _examples(test: PressSet, simulated: list[Colours]) -> list[tuple[Colours, Colours]]:

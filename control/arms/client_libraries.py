@@ -10,12 +10,7 @@ from touchgoal.runtime.errors import UserError, install_extra
 
 @dataclass(frozen=True)
 class ClientLibrary:
-    """A client library.
-
-    Attributes:
-        package: name on PyPI.
-        install: how to install it, for messages.
-    """
+    """A client library: its name on PyPI, and how to install it, for messages."""
 
     package: str
     install: str

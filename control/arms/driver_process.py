@@ -1,9 +1,8 @@
 """A driver in its own process, which may hang, crash or lose its parent, and is ended in time.
 
-Vendors' client libraries hang on a taken robot, ignore Ctrl-C and crash when a link drops. Here they
-run in a fresh interpreter that imports nothing else. It ends when a call is not answered in time, when
-the parent dies (the pipe closes), or by the kernel's alarm when the library hangs. A controller stops
-its arm when its client is gone.
+Vendors' client libraries hang on a taken robot, ignore Ctrl-C and crash when a link drops. The
+process ends when a call is not answered in time, when the parent dies (the pipe closes), or by the
+kernel's alarm when the library hangs. A controller stops its arm when its client is gone.
 """
 
 import os
@@ -35,24 +34,18 @@ class Driver(Protocol):
 
     def tick(self) -> None:
         """Keep the device going; an exception ends the process at once, without `close`."""
-        ...
 
     def close(self) -> None:
         """Bring the device to rest and disconnect."""
-        ...
 
 
 class DriverProcess:
     """Parent's end: it makes `driver(*args)` in a child process and calls its methods.
 
     `driver` is a class at the top of an importable module; arguments and answers are pickled. Calls
-    may come from several threads, not from a signal handler.
-
-    Attributes:
-        exit_reason: why the process ended; empty while it runs.
-
-    Raises:
-        UserError, DriverError: raised by the driver, or it did not connect in time.
+    may come from several threads, not from a signal handler. `exit_reason` says why the process
+    ended; it is empty while it runs. UserError or DriverError: raised by the driver, or it did not
+    connect in time.
     """
 
     def __init__(

@@ -11,12 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.control.arms.client_libraries import FRANKY
-from touchgoal.control.arms.streaming import (
-    ArmClient,
-    ArmConfig,
-    ArmProcess,
-    shift_wrench,
-)
+from touchgoal.control.arms.streaming import ArmClient, shift_wrench
 from touchgoal.control.interfaces import ArmReading, DriverError, Joints
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.kinematics import Kinematics
@@ -34,7 +29,7 @@ _TORQUE_REFLEX, _FORCE_REFLEX = 20.0, 30.0
 
 
 class FrankaClient(ArmClient):
-    """One FR3, in the driver's process."""
+    """One FR3 with FCI switched on in Desk, in the driver's process."""
 
     def _connect(self, recover: bool) -> JointLimits:
         self._franky = client = FRANKY.load("franky")
@@ -139,8 +134,3 @@ def wrench_on_robot(estimate: Float[np.ndarray, "6"]) -> Float[np.ndarray, "6"]:
 def _errors(state: "franky.RobotState") -> str:
     errors = state.current_errors
     return ", ".join(n for n in dir(errors) if getattr(errors, n) is True) or "unnamed"
-
-
-def connect_franka(config: ArmConfig) -> ArmProcess:
-    """Connects to an FR3 with FCI switched on in Desk."""
-    return ArmProcess(FrankaClient, config)

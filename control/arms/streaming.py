@@ -26,24 +26,17 @@ _REST, _LOOK = 0.01, 0.05  # rad/s over so many s that count as rest
 
 @dataclass(frozen=True)
 class ArmConfig:
-    """Address of an arm and rates of its driver.
-
-    Attributes:
-        address: of the controller.
-        robot: geometry, tool and limits.
-        hz: rate of the incoming commands.
-        rate: rate of the outgoing stream, Hz.
-        state_timeout: s without news of the controller after which it is lost. Each driver has its own;
-            a simulator on a loaded machine needs more.
-        lock_step: the twin advances only when `advance` is called.
-    """
+    """Address of an arm's controller, and rates of its driver."""
 
     address: str
-    robot: RobotLimits
+    robot: RobotLimits  # geometry, tool and limits
+    # hz, rate: of the incoming commands and of the outgoing stream, Hz
     hz: float
     rate: float
+    # s without news of the controller after which it is lost; a simulator on a loaded machine needs
+    # more
     state_timeout: float
-    lock_step: bool = False
+    lock_step: bool = False  # the twin advances only when `advance` is called
 
 
 class ArmClient(ABC):
@@ -113,10 +106,7 @@ class ArmClient(ABC):
         self._refuse_from_now_on(f"{STOPPED_ON_REQUEST}; recover the arm to go on")
 
     def tick(self) -> None:
-        """Read the state and stream the next command.
-
-        The stream follows the controller's clock: a simulator may be slower than real time.
-        """
+        """Read the state and stream the next command, by the controller's clock."""
         now = time.monotonic()
         punctual = now - self._ticked < self.config.state_timeout / 2
         self._ticked = now
@@ -159,7 +149,8 @@ class ArmClient(ABC):
                 self.tick()
                 if np.abs(self._reading.q - before).max() < _REST * _LOOK:
                     break
-        self._disconnect_quietly()
+        with suppress(Exception):
+            self._disconnect()
 
     def _refuse_from_now_on(self, reason: str) -> None:
         """Brake; the first reason stays."""
@@ -168,10 +159,6 @@ class ArmClient(ABC):
             self._refusal = reason
             with suppress(Exception):
                 self._halt()
-
-    def _disconnect_quietly(self) -> None:
-        with suppress(Exception):
-            self._disconnect()
 
     def _stamped(self, clock: float) -> float:
         """Return the stamp of a measurement: now if the controller's clock advanced, else as before."""

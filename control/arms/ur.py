@@ -10,12 +10,7 @@ import time
 import numpy as np
 
 from touchgoal.control.arms.client_libraries import UR_RTDE
-from touchgoal.control.arms.streaming import (
-    ArmClient,
-    ArmConfig,
-    ArmProcess,
-    shift_wrench,
-)
+from touchgoal.control.arms.streaming import ArmClient, shift_wrench
 from touchgoal.control.interfaces import ArmReading, DriverError, Joints
 from touchgoal.control.motion.arm_models import JointLimits
 from touchgoal.control.motion.kinematics import Kinematics
@@ -30,7 +25,7 @@ _WATCHDOG = 10.0  # Hz; with fewer commands the controller stops its program, an
 
 
 class UrClient(ArmClient):
-    """One UR, in the driver's process."""
+    """One UR in remote control, in the driver's process."""
 
     def _connect(self, recover: bool) -> JointLimits:
         robot = self.config.robot
@@ -111,8 +106,3 @@ class UrClient(ArmClient):
         self._control.stopScript()
         self._control.disconnect()
         self._receive.disconnect()
-
-
-def connect_ur(config: ArmConfig) -> ArmProcess:
-    """Connect to a UR in remote control."""
-    return ArmProcess(UrClient, config)

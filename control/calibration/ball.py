@@ -1,18 +1,18 @@
-"""A ball pressed into a gel: the contact circle in a picture, and the surface under the ball."""
+"""A ball pressed into a gel: contact circle in a picture, surface below, sphere in a depth map."""
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float
+from scipy.optimize import least_squares
 
+from touchgoal.control.arrays import Circle, Map, Picture
 from touchgoal.control.tactile import gel
 from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.control.tactile.sensor_calibration import SensorCalibration
 from touchgoal.runtime.errors import UserError
-
-Circle = Float[np.ndarray, " 3"]
-"""Centre x (column), centre y (row) and radius of a contact, px; (0, 0) is the first pixel."""
 
 _FIND_BLUR = 2.0  # px
 _DISC_SHARE = 0.3  # of the strongest change, at which the disc is taken to end
@@ -20,21 +20,16 @@ _MIN_CHANGE = 8.0  # counts
 # The gel bulges around the contact: the visible disc is larger. On 46 real presses of two balls the
 # fitted contacts are 0.7 of it.
 _CONTACT_PER_DISC = 0.7
+_INSIDE = 0.9  # of the contact's radius, in which the gel follows the ball
+_OUTLIER = 20e-6  # m
 
 
-def ball_overlap(
-    shape: tuple[int, int], pitch: float, circle: Circle, ball_radius: float
-) -> Float32[np.ndarray, "h w"]:
+def ball_overlap(shape: tuple[int, int], pitch: float, circle: Circle, ball_radius: float) -> Map:
     """Return the overlap (m) of ball and flat gel with which the deformed gel touches in a circle.
 
     The gel touches where the overlap exceeds `gel.CONTACT_SHARE` of its maximum, so the ball's cap
-    over the circle has the remaining share of its depth.
-
-    Args:
-        shape: rows and columns of the picture.
-        pitch: m per pixel.
-        circle: of the contact.
-        ball_radius: m; must exceed the contact's.
+    over the circle has the remaining share of its depth. `pitch` is m per pixel; the ball's radius
+    (m) must exceed the contact's.
     """
     x, y, radius = circle
     rows, cols = np.ogrid[: shape[0], : shape[1]]
@@ -45,26 +40,17 @@ def ball_overlap(
     return np.where(square < ball_radius**2, overlap, 0).astype(np.float32)
 
 
-def press_surface(
-    calibration: SensorCalibration, circle: Circle, ball_radius: float
-) -> Float32[np.ndarray, "h w"]:
+def press_surface(calibration: SensorCalibration, circle: Circle, ball_radius: float) -> Map:
     """Return the gel's surface (m) under a ball, with the sensor file's bulge."""
     rows, cols, _ = calibration.background.shape
     raw = ball_overlap((rows, cols), calibration.pixel_pitch, circle, ball_radius)
     return gel.deform(raw, calibration.pixel_pitch, calibration.blur_sigmas)
 
 
-def find_circle(
-    image: UInt8[np.ndarray, "h w 3"], background: UInt8[np.ndarray, "h w 3"]
-) -> Float[np.ndarray, "3"]:
-    """Find the contact of one ball: centre x, centre y and radius, px, to be moved by the fit.
+def find_circle(image: Picture, background: Picture) -> Circle:
+    """Find a ball's contact in RGB, to be moved by the fit: centre x, y and radius, px.
 
-    Args:
-        image: RGB picture of the press.
-        background: the sensor untouched.
-
-    Raises:
-        UserError: no change stands out.
+    UserError if no change from the untouched sensor stands out.
     """
     change = remove_gain(image, background) - background
     change -= np.median(change, (0, 1))
@@ -82,3 +68,38 @@ def find_circle(
         raise UserError("what changes is no disc: drop the picture, or give its circle")
     (x, y), radius = cv2.minEnclosingCircle(max(outlines, key=cv2.contourArea))
     return np.array([x, y, _CONTACT_PER_DISC * radius])
+
+
+@dataclass(frozen=True)
+class DepthErrors:
+    """Errors of the depth read from one press."""
+
+    radius: float  # of the sphere in the depth map, over the ball's
+    residual: float  # root mean square distance of the depth map from that sphere, m
+    peak_offset: float  # of its deepest point from the contact's centre, m
+
+
+def sphere_in(depth: Map, pitch: float, circle: Circle, ball_radius: float) -> DepthErrors:
+    """Fit a sphere to a depth map (m) within a contact (px), under a ball of that radius (m).
+
+    `pitch` is m per px.
+    """
+    rows, columns = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    x, y, radius = circle
+    inside = (columns - x) ** 2 + (rows - y) ** 2 < (_INSIDE * radius) ** 2
+    px, py, z = columns[inside] * pitch, rows[inside] * pitch, depth[inside].astype(np.float64)
+
+    def residual(at: Float[np.ndarray, "4"]) -> Float[np.ndarray, " n"]:
+        cx, cy, size, top = at
+        square = np.maximum(size**2 - (px - cx) ** 2 - (py - cy) ** 2, 1e-9)
+        return z - (top + np.sqrt(square) - size)
+
+    start = [x * pitch, y * pitch, ball_radius, float(z.max())]
+    found = least_squares(
+        residual, start, x_scale=[1e-4, 1e-4, 1e-3, 1e-4], loss="soft_l1", f_scale=_OUTLIER
+    ).x
+    return DepthErrors(
+        radius=float(found[2] / ball_radius),
+        residual=float(np.sqrt(np.mean(residual(found) ** 2))),
+        peak_offset=float(np.hypot(found[0] - x * pitch, found[1] - y * pitch)),
+    )

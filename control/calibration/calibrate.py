@@ -6,19 +6,13 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float
 
-from touchgoal.control.calibration.ball import Circle, press_surface
-from touchgoal.control.calibration.held_out_depth import depth_errors
-from touchgoal.control.calibration.press_fit import (
-    BLUR_PYRAMID,
-    NARROWEST,
-    WIDEST,
-    FitState,
-    PressFit,
-    move_circles,
-)
+from touchgoal.control.arrays import Circle, Circles, Counts, Map, Picture
+from touchgoal.control.calibration import press_fit
+from touchgoal.control.calibration.ball import DepthErrors, press_surface, sphere_in
 from touchgoal.control.calibration.press_set import PressSet
+from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.sensor_calibration import (
     N_FEATURES,
     SensorCalibration,
@@ -28,7 +22,7 @@ from touchgoal.control.tactile.sensor_calibration import (
 
 ILLUMINATION_EXPONENTS = (1.0, 1.5, 2.0, 2.5)
 """What `select_illumination_exponent` chooses from."""
-STEPS = 7
+STEPS = 5
 """How often `fit` reports progress."""
 
 # Position terms need presses spread over the picture: the standard deviation of the centres, as a
@@ -40,63 +34,42 @@ _FAR = 4.0  # contact radii from which on a press leaves the gel as it was
 
 
 @dataclass(frozen=True)
-class LabelCorrection:
-    """Line from labelled to fitted circles, per coordinate.
-
-    Attributes:
-        offset, slope: true centre x, centre y and radius (px) are about offset + slope x label.
-    """
-
-    offset: Circle
-    slope: Circle
-
-
-@dataclass(frozen=True)
 class FittedCalibration:
-    """Fitted sensor, with the circles and balls of its presses.
+    """Fitted sensor, with the circles of its presses."""
 
-    Attributes:
-        calibration: the sensor file.
-        circles: of the fitted presses, moved to their pictures, px.
-        ball_radius: of the fitted presses, m.
-        ball_fitted: whether the ball's radius was unknown and fitted; slopes and depths are no
-            better known than that radius, which pictures determine poorly.
-        varies_over_image: whether the response varies over the image; not if all presses lie in one
-            place.
-        label_correction: from labels to fitted circles.
-    """
-
-    calibration: SensorCalibration
-    circles: Float[np.ndarray, "n 3"]
+    calibration: SensorCalibration  # the sensor file
+    circles: Circles  # of the fitted presses, moved to their pictures, px
+    # of the fitted presses, m; where unknown, fitted, which pictures determine poorly
     ball_radius: Float[np.ndarray, " n"]
-    ball_fitted: bool
+    # whether the response varies over the image; not if all presses lie in one place
     varies_over_image: bool
-    label_correction: LabelCorrection
+    # label_offset, label_slope: true centre x, centre y and radius (px) are about offset + slope x
+    # label
+    label_offset: Circle
+    label_slope: Circle
 
-    def ball_radii(self, presses: PressSet) -> Float[np.ndarray, " n"]:
-        """Return ball radii (m) of other presses: theirs, or the fitted one."""
-        known = presses.ball_radius
-        return np.where(np.isnan(known), self.ball_radius.mean(), known)
-
-    def correct_labels(self, presses: PressSet) -> Float[np.ndarray, "n 3"]:
+    def correct_labels(self, presses: PressSet) -> Circles:
         """Predict the circles of other presses (px) from their labels alone."""
-        circles = self.label_correction.offset + self.label_correction.slope * presses.circles
-        widest = WIDEST * self.ball_radii(presses) / self.calibration.pixel_pitch
-        circles[:, 2] = circles[:, 2].clip(NARROWEST, widest)
+        circles = self.label_offset + self.label_slope * presses.circles
+        widest = press_fit.WIDEST * presses.ball_radius / self.calibration.pixel_pitch
+        circles[:, 2] = circles[:, 2].clip(press_fit.NARROWEST, widest)
         return circles
 
-    def fit_circles(self, presses: PressSet) -> Float[np.ndarray, "n 3"]:
+    def fit_circles(self, presses: PressSet) -> Circles:
         """Move the circles (px) of other presses from their labels to their pictures.
 
         An error at these circles is the model's alone; an error at `correct_labels` includes the
         labels'.
         """
-        known = replace(presses, ball_radius=self.ball_radii(presses))
-        return move_circles(self.calibration, known, self.correct_labels(presses))
+        return press_fit.move_circles(self.calibration, presses, self.correct_labels(presses))
 
-    def simulate(self, circle: Circle, ball_radius: float) -> Float32[np.ndarray, "h w 3"]:
-        """Render a press (circle in px, radius in m): RGB counts without noise."""
-        return shade(self.calibration, press_surface(self.calibration, circle, ball_radius))
+    def simulate(self, presses: PressSet, circles: Circles) -> list[Counts]:
+        """Render presses of these balls at circles (px): RGB counts without noise."""
+        calibration = self.calibration
+        return [
+            shade(calibration, press_surface(calibration, circle, ball))
+            for circle, ball in zip(circles, presses.ball_radius, strict=True)
+        ]
 
 
 def fit(
@@ -107,39 +80,44 @@ def fit(
     trust_labels: bool = False,
     illumination_exponent: float = 1.0,
 ) -> FittedCalibration:
-    """Fit a sensor file.
+    """Fit a sensor file to presses at a pitch (m per pixel).
 
-    Args:
-        presses: see `read_presses`.
-        pitch: m per pixel.
-        sensor: name of the sensor model.
-        on_progress: called STEPS times.
-        trust_labels: leave the circles as they are, but for one common scale of their radii.
-        illumination_exponent: see `SensorCalibration` and `select_illumination_exponent`.
+    `on_progress` is called STEPS times. With `trust_labels` the circles stay as they are, but for
+    one common scale of their radii. `illumination_exponent`: see `select_illumination_exponent`.
     """
     background, varies_over_image = median_background(presses), _spread_out(presses)
-    steps = PressFit(presses, background, varies_over_image, trust_labels, illumination_exponent)
-    ball_fitted = bool(np.isnan(presses.ball_radius).any())
-    initial = _initial_calibration(background, pitch, sensor, noise(presses))
-    initial = replace(initial, illumination_exponent=illumination_exponent)
+    steps = press_fit.PressFit(
+        presses, background, varies_over_image, illumination_exponent, trust_labels
+    )
+    # A typical gel, still without response and limits.
+    initial = SensorCalibration(
+        sensor=sensor,
+        background=background,
+        pixel_pitch=pitch,
+        response=np.zeros((3, N_FEATURES, 3), np.float32),
+        light_azimuths=(0.0, 0.0, 0.0),
+        shadow_slope=0.1,
+        shadow=np.zeros((3, 3), np.float32),
+        penumbra=0.1e-3,
+        max_slope=math.inf,
+        max_depth=math.inf,
+        blur_sigmas=tuple(0.35 * sigma for sigma in press_fit.BLUR_PYRAMID),
+        noise=_noise(presses),
+        illumination_exponent=illumination_exponent,
+    )
     state = steps.initialise(initial, presses.ball_radius)
     on_progress()
     for _ in range(2):
         state = steps.select_hyperparameters(steps.fit_response(state))
         on_progress()
         state = steps.alternate(state, 3)
-        on_progress()
-        if ball_fitted:
+        if np.isnan(presses.ball_radius).any():
             state = steps.fit_ball_radius(steps.fit_common_scale(state))
         on_progress()
     state = steps.fit_response(steps.alternate(state, 3))
+    calibration, label_line = _with_limits(state), _label_line(presses.circles, state.circles)
     return FittedCalibration(
-        calibration=_with_limits(state),
-        circles=state.circles,
-        ball_radius=state.ball_radius,
-        ball_fitted=ball_fitted,
-        varies_over_image=varies_over_image,
-        label_correction=_label_correction(presses.circles, state.circles),
+        calibration, state.circles, state.ball_radius, varies_over_image, *label_line
     )
 
 
@@ -150,30 +128,35 @@ def select_illumination_exponent(
 
     The error of pictures cannot decide: it is the same within a hundredth of a count.
 
-    Args:
-        presses: with known balls.
-        pitch: m per pixel.
-        sensor: name of the sensor model.
-        on_progress: called once an exponent tried.
+    `pitch` is m per pixel; `on_progress` is called once an exponent tried.
     """
     wrong = {}
     chosen = np.arange(0, len(presses), max(1, len(presses) // _DEPTH_PRESSES))
     for power in ILLUMINATION_EXPONENTS:
         fitted = fit(presses, pitch, sensor, illumination_exponent=power)
-        errors = depth_errors(
-            fitted.calibration,
-            presses.take(chosen),
-            fitted.circles[chosen],
-            fitted.ball_radius[chosen],
-            finest=4,
-        )
+        tried, circles = presses.take(chosen), fitted.circles[chosen]
+        errors = depth_errors(fitted.calibration, tried, circles, finest=4)
         # The median: balls cut by the border are unreliable.
         wrong[power] = float(np.median([abs(math.log(error.radius)) for error in errors]))
         on_progress()
     return min(wrong, key=lambda power: wrong[power])
 
 
-def median_background(presses: PressSet) -> UInt8[np.ndarray, "h w 3"]:
+def depth_errors(
+    calibration: SensorCalibration, presses: PressSet, circles: Circles, finest: int = 2
+) -> list[DepthErrors]:
+    """Return how the depth read at each press's circle (px) differs from its ball.
+
+    `finest` is the `DepthEstimator`'s, px.
+    """
+    estimator = DepthEstimator(calibration, finest)
+    return [
+        sphere_in(estimator.estimate(image), calibration.pixel_pitch, circle, ball)
+        for image, circle, ball in zip(presses.images, circles, presses.ball_radius, strict=True)
+    ]
+
+
+def median_background(presses: PressSet) -> Picture:
     """Return the background as the presses show it away from their contacts.
 
     A gel settles under the first presses: bands of several counts against the picture before them.
@@ -195,9 +178,7 @@ def median_background(presses: PressSet) -> UInt8[np.ndarray, "h w 3"]:
     return settled
 
 
-def _spread(
-    change: Float32[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
-) -> Float32[np.ndarray, "h w"]:
+def _spread(change: Map, known: Bool[np.ndarray, "h w"]) -> Map:
     """Continue a change smoothly to unknown pixels: averages over ever wider windows."""
     spread, covered = np.zeros_like(change), np.zeros(change.shape, bool)
     weight = known.astype(np.float32)
@@ -210,7 +191,7 @@ def _spread(
     return cv2.GaussianBlur(spread, (0, 0), _WINDOWS[0])
 
 
-def noise(presses: PressSet) -> float:
+def _noise(presses: PressSet) -> float:
     """Return the standard deviation (counts) of a pixel from one picture to the next."""
     spreads = []
     for one, other in zip(presses.images[:-1], presses.images[1:], strict=True):
@@ -220,32 +201,12 @@ def noise(presses: PressSet) -> float:
     return float(np.mean(spreads))
 
 
-def _initial_calibration(
-    background: UInt8[np.ndarray, "h w 3"], pitch: float, sensor: str, noise: float
-) -> SensorCalibration:
-    """Return a sensor file without response and limits, with a typical gel."""
-    return SensorCalibration(
-        sensor=sensor,
-        background=background,
-        pixel_pitch=pitch,
-        response=np.zeros((3, N_FEATURES, 3), np.float32),
-        light_azimuths=(0.0, 0.0, 0.0),
-        shadow_slope=0.1,
-        shadow=np.zeros((3, 3), np.float32),
-        penumbra=0.1e-3,
-        max_slope=math.inf,
-        max_depth=math.inf,
-        blur_sigmas=tuple(0.35 * sigma for sigma in BLUR_PYRAMID),
-        noise=noise,
-    )
-
-
 def _spread_out(presses: PressSet) -> bool:
     rows, cols, _ = presses.background.shape
     return bool((presses.circles[:, :2].std(0) > _MIN_SPREAD * np.array([cols, rows])).all())
 
 
-def _with_limits(state: FitState) -> SensorCalibration:
+def _with_limits(state: press_fit.FitState) -> SensorCalibration:
     """Set the model's limits to the steepest slope and the largest depth of the presses."""
     calibration, max_slope, max_depth = state.calibration, 0.0, 0.0
     for circle, ball in zip(state.circles, state.ball_radius, strict=True):
@@ -256,11 +217,10 @@ def _with_limits(state: FitState) -> SensorCalibration:
     return replace(calibration, max_slope=max_slope, max_depth=max_depth)
 
 
-def _label_correction(
-    labels: Float[np.ndarray, "n 3"], found: Float[np.ndarray, "n 3"]
-) -> LabelCorrection:
+def _label_line(labels: Circles, found: Circles) -> tuple[Circle, Circle]:
+    """Return offset and slope of the line from labelled to fitted circles, per coordinate."""
     centred = labels - labels.mean(0)
     variance = (centred**2).mean(0)
     covariance = (centred * (found - found.mean(0))).mean(0)
     slope = np.where(variance > 1e-6, covariance / np.maximum(variance, 1e-6), 0.0)
-    return LabelCorrection(found.mean(0) - slope * labels.mean(0), slope)
+    return found.mean(0) - slope * labels.mean(0), slope

@@ -1,11 +1,13 @@
 """Printed lines, metrics and picture of `check-sensor`."""
 
+from dataclasses import asdict, fields
 from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from touchgoal.control.arrays import Picture
 from touchgoal.control.calibration.sensor_check import PressReading, SensorCheck
 from touchgoal.control.tactile.background import Drift
 from touchgoal.control.tactile.picture_guard import UNEXPLAINED
@@ -32,23 +34,11 @@ def figures(check: SensorCheck, ball_mm: float | None, weight_g: float | None) -
         read["force"] = _quartiles([press.force for press in check.presses])
     if weight_g is not None:
         read["weight"] = weight_g * 1e-3 * _GRAVITY
-    return {
-        "frames": check.frames,
-        "touching": check.touching,
-        "torn": check.torn,
-        "noise": check.noise,
-        "drift": _drift(check.drift),
-        "drift_from_file": _drift(check.drift_from_file),
-        "unlike_file": check.unlike_file,
-        "threshold": check.threshold,
-        "untouched": check.untouched,
-        "touched": check.touched,
-        "markers": check.markers,
-        "largest_shift_px": check.largest_shift,
-        "presses": len(check.presses),
-        "presses_unexplained": check.unexplained,
-        **read,
-    }
+    plain = {field.name: getattr(check, field.name) for field in fields(check)}
+    del plain["background"]
+    for name in ("drift", "drift_from_file"):
+        plain[name] = {part: value.tolist() for part, value in asdict(plain[name]).items()}
+    return {**plain, "presses": len(check.presses), **read}
 
 
 def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
@@ -56,8 +46,7 @@ def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
     printed = [f"frames       {check.frames}, {check.touching} of them touched"]
     if check.torn:
         printed.append(
-            f"             {check.torn} are torn or rolled and left out: check the cable and the "
-            "decoder"
+            f"             {check.torn} are torn or rolled and left out: check the cable and the decoder"
         )
     if check.noise is not None:
         printed.append(f"noise        {check.noise:.2f} counts a pixel")
@@ -68,34 +57,28 @@ def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
     if check.unlike_file > _UNLIKE:
         printed.append(
             "             the untouched gel differs from the sensor file's by "
-            f"{check.unlike_file:.1f} counts "
-            "in one spot: depths and forces are nominal until this sensor is calibrated"
+            f"{check.unlike_file:.1f} counts in one spot: depths and forces are nominal until this "
+            "sensor is calibrated"
         )
     printed.append(_contact(check))
     if check.markers is not None:
+        shift = f"moved by up to {check.largest_shift_px:.1f} px"
+        printed.append(f"markers      {100 * check.markers:.0f} % found, {shift}")
+    if refused := check.presses_unexplained:
         printed.append(
-            f"markers      {100 * check.markers:.0f} % found, moved by up to "
-            f"{check.largest_shift:.1f} px"
-        )
-    if check.unexplained:
-        printed.append(
-            f"refused      {check.unexplained} of {check.unexplained + len(check.presses)} "
-            "presses: the sensor "
-            f"file leaves more than {100 * UNEXPLAINED:.0f} % of their change unexplained; "
-            "calibrate this "
+            f"refused      {refused} of {refused + len(check.presses)} presses: the sensor file "
+            f"leaves more than {100 * UNEXPLAINED:.0f} % of their change unexplained; calibrate this "
             "sensor (touchgoal record-presses)"
         )
     if "radius_mm" in figures:
         printed.append(_ball(figures))
     elif "depth_mm" in figures:
-        printed.append(
-            "deepest      {1:.2f} mm (quartiles {0:.2f} to {2:.2f})".format(*figures["depth_mm"])
-        )
-    if "unexplained" in figures:
+        low, middle, high = figures["depth_mm"]
+        printed.append(f"deepest      {middle:.2f} mm (quartiles {low:.2f} to {high:.2f})")
+    if check.presses:
         printed.append(
             f"simulation   leaves {100 * figures['unexplained'][1]:.0f} % of the change unexplained"
         )
-    if "force" in figures:
         printed.append(_force(figures))
     return printed
 
@@ -103,16 +86,14 @@ def lines(check: SensorCheck, figures: dict[str, Any]) -> list[str]:
 def picture(check: SensorCheck) -> UInt8[np.ndarray, "H W 3"]:
     """Draw a row a press: frame, simulated frame, change of each times 4 about grey, depth."""
     rows = [_row(press, check.background) for press in check.presses[:_SHOWN]]
-    empty = np.hstack([check.background] * 2)
-    return np.vstack(rows or [empty])
+    return np.vstack(rows or [np.hstack([check.background] * 2)])
 
 
 def _ball(figures: dict[str, Any]) -> str:
     low, middle, high = figures["radius_mm"]
     line = (
         f"ball         {figures['ball_mm']:g} mm reads {middle:.2f} mm (quartiles {low:.2f} to "
-        f"{high:.2f}), "
-        f"{1e3 * figures['residual_mm']:.0f} um from a sphere"
+        f"{high:.2f}), {1e3 * figures['residual_mm']:.0f} um from a sphere"
     )
     off = abs(middle / figures["ball_mm"] - 1) > _DEPTH_OFF
     return line + ": calibrate this sensor (touchgoal record-presses)" * off
@@ -129,7 +110,7 @@ def _force(figures: dict[str, Any]) -> str:
     return line
 
 
-def _row(press: PressReading, background: UInt8[np.ndarray, "h w 3"]) -> np.ndarray:
+def _row(press: PressReading, background: Picture) -> np.ndarray:
     drawn, simulated = (
         np.clip(128 + _CONTRAST * (frame.astype(np.float32) - background), 0, 255).astype(np.uint8)
         for frame in (press.frame, press.drawn)
@@ -137,21 +118,17 @@ def _row(press: PressReading, background: UInt8[np.ndarray, "h w 3"]) -> np.ndar
     deepest = max(float(press.depth.max()), 1e-6)
     grey = (255 * np.clip(press.depth / deepest, 0, 1)).astype(np.uint8)
     depth = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)[..., ::-1].copy()
-    text = f"{1e3 * deepest:.2f} mm"
+    white, font = (255, 255, 255), cv2.FONT_HERSHEY_SIMPLEX
     if press.circle is not None and press.ball is not None:
         x, y, radius = press.circle.round().astype(int).tolist()
-        cv2.circle(drawn, (x, y), radius, (255, 255, 255), 1, cv2.LINE_AA)
-    cv2.putText(
-        depth, text, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA
-    )
+        cv2.circle(drawn, (x, y), radius, white, 1, cv2.LINE_AA)
+    cv2.putText(depth, f"{1e3 * deepest:.2f} mm", (8, 20), font, 0.5, white, 1, cv2.LINE_AA)
     return np.hstack([press.frame, press.drawn, drawn, simulated, depth])
 
 
 def _contact(check: SensorCheck) -> str:
-    line = (
-        f"contact      from {check.threshold:.1f} counts on; untouched frames reach "
-        f"{check.untouched:.1f}"
-    )
+    line = f"contact      from {check.threshold:.1f} counts on; untouched frames reach "
+    line += f"{check.untouched:.1f}"
     if not check.touched:
         return line + "; nothing touched"
     line += f", touches {check.touched:.1f}"
@@ -165,14 +142,6 @@ def _light(name: str, drift: Drift, remedy: str) -> str:
     line = f"{name:<13}light {gain.min():+.1f} to {gain.max():+.1f} %, "
     line += f"{drift.pattern.max():.1f} counts of pattern"
     return line + (f": {remedy}" if drift.large else "")
-
-
-def _drift(drift: Drift) -> dict[str, list[float]]:
-    return {
-        "gain": drift.gain.tolist(),
-        "offset": drift.offset.tolist(),
-        "pattern": drift.pattern.tolist(),
-    }
 
 
 def _quartiles(values: list[float]) -> list[float]:

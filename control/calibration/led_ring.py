@@ -6,7 +6,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from touchgoal.control.tactile.sensor_calibration import N_FEATURES, SensorCalibration
 from touchgoal.control.tactile.sensor_models import SensorModel
@@ -14,21 +13,14 @@ from touchgoal.control.tactile.sensor_models import SensorModel
 
 @dataclass(frozen=True)
 class LedRing:
-    """Ring of three lamps, red, green and blue, around the camera's view.
+    """Ring of three lamps, red, green and blue, around the camera's view."""
 
-    Attributes:
-        azimuths: of the lamps, degrees from x (right) towards y (down).
-        radius: of the ring, m.
-        distance: of its plane from the gel's surface, m.
-        brightness: mean of the untouched picture, counts.
-        shadowed: share of a lamp's light that is missing in its full shadow; scattered light fills
-            the rest.
-    """
-
-    azimuths: tuple[float, float, float]
+    azimuths: tuple[float, float, float]  # of the lamps, degrees from x (right) towards y (down)
+    # radius, distance: of the ring, and of its plane from the gel's surface, m
     radius: float
     distance: float
-    brightness: float = 110.0
+    brightness: float = 110.0  # mean of the untouched picture, counts
+    # share of a lamp's light missing in its full shadow; scattered light fills the rest
     shadowed: float = 0.5
 
 
@@ -58,7 +50,8 @@ def from_led_ring(sensor: SensorModel, ring: LedRing) -> SensorCalibration:
         light = (lx**2 + ly**2 + ring.distance**2) ** -1.5
         background[..., channel] = ring.brightness * light / light.mean()
         slopes = np.stack([lx, ly], -1).reshape(-1, 2) / ring.distance
-        response[channel, :2] = ring.brightness * _fit(place, slopes)
+        # Coefficients of (1, u, v), one row per slope.
+        response[channel, :2] = ring.brightness * np.linalg.lstsq(place, slopes, rcond=None)[0].T
         response[channel, [2, 4], 0] = -ring.brightness / 2
     elevation = ring.distance / ring.radius
     return SensorCalibration(
@@ -76,8 +69,3 @@ def from_led_ring(sensor: SensorModel, ring: LedRing) -> SensorCalibration:
         blur_sigmas=(1.05e-3, 0.525e-3, 0.2625e-3, 0.1225e-3),  # as fitted to the Mini's gel
         noise=0.97,
     )
-
-
-def _fit(place: Float[np.ndarray, "n 3"], slopes: Float[np.ndarray, "n 2"]) -> np.ndarray:
-    """Fit coefficients of (1, u, v), one row per slope."""
-    return np.linalg.lstsq(place, slopes, rcond=None)[0].T

@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int, UInt8
+from jaxtyping import Float32, Float64, Int
 
-from touchgoal.control.calibration.ball import Circle, press_surface
+from touchgoal.control.arrays import Circle, Circles, Picture
+from touchgoal.control.calibration.ball import press_surface
 from touchgoal.control.calibration.press_set import PressSet
 from touchgoal.control.tactile.sensor_calibration import (
     N_FEATURES,
@@ -47,16 +48,10 @@ Weights = Float64[np.ndarray, "3 terms"]
 
 @dataclass(frozen=True)
 class FitState:
-    """State of the fit.
-
-    Attributes:
-        calibration: the sensor file so far.
-        circles: of the presses, px.
-        ball_radius: m, one a press.
-    """
+    """Sensor file so far; circle (px) and ball's radius (m) of each press."""
 
     calibration: SensorCalibration
-    circles: Float64[np.ndarray, "n 3"]
+    circles: Circles
     ball_radius: Float64[np.ndarray, " n"]
 
 
@@ -83,23 +78,19 @@ class _NormalEquations:
 
 
 class PressFit:
-    """Steps of the fit; each takes a state and returns a better one.
+    """Steps of the fit to presses; each takes a state and returns a better one.
 
-    Args:
-        presses: to fit.
-        background: the untouched sensor (RGB) that changes are taken against.
-        varies_over_image: whether the response may vary over the image.
-        trust_labels: whether circles stay as they are.
-        illumination_exponent: see `SensorCalibration`.
+    Changes are taken against the untouched `background`. `varies_over_image` says whether the
+    response may vary over the image, `trust_labels` whether circles stay as they are.
     """
 
     def __init__(
         self,
         presses: PressSet,
-        background: UInt8[np.ndarray, "h w 3"],
+        background: Picture,
         varies_over_image: bool,
+        illumination_exponent: float,
         trust_labels: bool = False,
-        illumination_exponent: float = 1.0,
     ) -> None:
         self._labels = presses.circles
         self._trust_labels = trust_labels
@@ -116,9 +107,7 @@ class PressFit:
     ) -> FitState:
         """Start with the common scale of the labelled radii that explains the pictures best.
 
-        Args:
-            initial: a sensor file without response.
-            ball_radius: m, one a press; NaN if unknown, then twice the largest contact's.
+        An unknown ball (NaN) begins at twice the radius of the largest contact.
         """
         starts = []
         for scale in _LABEL_SCALES:
@@ -198,19 +187,16 @@ class PressFit:
 
     def _normal_equations(self, state: FitState) -> list[_NormalEquations]:
         everything = zip(state.circles, state.ball_radius, self._samples, strict=True)
-        return [self._press_normal_equations(state.calibration, *press) for press in everything]
-
-    def _press_normal_equations(
-        self, calibration: SensorCalibration, circle: Circle, ball: float, sample: _Sample
-    ) -> _NormalEquations:
-        terms = design_matrix(calibration, press_surface(calibration, circle, ball), sample.pixels)
-        squares, products = [], []
-        for channel in range(3):
-            lit = terms.astype(np.float64) * self._light[sample.pixels, channel]
-            squares.append(lit @ lit.T)
-            products.append(lit @ sample.change[:, channel])
-        energy = float((sample.change.astype(np.float64) ** 2).sum())
-        return _NormalEquations(np.stack(squares), np.stack(products), energy)
+        normals = []
+        for circle, ball, sample in everything:
+            surface = press_surface(state.calibration, circle, ball)
+            terms = design_matrix(state.calibration, surface, sample.pixels).astype(np.float64)
+            lit = [terms * self._light[sample.pixels, channel] for channel in range(3)]
+            squares = np.stack([x @ x.T for x in lit])
+            products = np.stack([x @ sample.change[:, c] for c, x in enumerate(lit)])
+            energy = float((sample.change.astype(np.float64) ** 2).sum())
+            normals.append(_NormalEquations(squares, products, energy))
+        return normals
 
     def _solve(self, normals: Sequence[_NormalEquations]) -> Weights:
         product = np.sum([n.product for n in normals], 0)
@@ -260,36 +246,22 @@ class PressFit:
         return circle
 
 
-def move_circles(
-    calibration: SensorCalibration,
-    presses: PressSet,
-    start: Float64[np.ndarray, "n 3"] | None = None,
-) -> Float64[np.ndarray, "n 3"]:
-    """Move the circles (px) of presses of known balls to their pictures, by a sensor file.
+def move_circles(calibration: SensorCalibration, presses: PressSet, start: Circles) -> Circles:
+    """Move circles (px) of presses of known balls from a start to their pictures, by a sensor file.
 
-    Args:
-        calibration: the sensor file.
-        presses: in the light of the file's background; their circles bound the search.
-        start: circles to start from; None: the presses' own.
+    The presses are in the light of the file's background; their own circles bound the search.
     """
     widest = WIDEST * presses.ball_radius / calibration.pixel_pitch
-    circles = np.array(presses.circles if start is None else start, np.float64)
+    circles = np.array(start, np.float64)
     circles[:, 2] = circles[:, 2].clip(NARROWEST, widest)
-    steps = PressFit(
-        presses,
-        calibration.background,
-        varies_over_image=True,
-        illumination_exponent=calibration.illumination_exponent,
-    )
+    steps = PressFit(presses, calibration.background, True, calibration.illumination_exponent)
     state = FitState(calibration, circles, presses.ball_radius)
     for _ in range(_MOVES):
         state = steps.fit_circles(state)
     return state.circles
 
 
-def _sample(
-    image: UInt8[np.ndarray, "h w 3"], background: UInt8[np.ndarray, "h w 3"], circle: Circle
-) -> _Sample:
+def _sample(image: Picture, background: Picture, circle: Circle) -> _Sample:
     x, y, radius = circle
     rows, cols = np.mgrid[: image.shape[0], : image.shape[1]]
     reach = REGION * radius

@@ -5,8 +5,9 @@ from collections.abc import Iterable
 
 import cv2
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Int
 
+from touchgoal.control.arrays import Picture
 from touchgoal.control.calibration.ball import find_circle
 from touchgoal.control.calibration.press_set import PressSet
 from touchgoal.control.interfaces import DriverError
@@ -22,36 +23,32 @@ _STILL = 5  # frames in which a press must stand still
 _SETTLED = 1.0  # counts of local change between the medians of the first and of the last five
 _STEADY = 2.5  # counts of local change from frame to frame of a press in a person's hand, at most
 _SMALLEST = 6.0  # px, radius of a contact that shows slopes
-_PLACES = "top", "upper middle", "lower middle", "bottom"
-_SIDES = "left", "left of the middle", "right of the middle", "right"
-
-Frame = UInt8[np.ndarray, "h w 3"]
+# By the number of rows, or of columns, of the map.
+_PLACES = {3: ("top", "middle", "bottom"), 4: ("top", "upper middle", "lower middle", "bottom")}
+_SIDES = {
+    3: ("left", "middle", "right"),
+    4: ("left", "left of the middle", "right of the middle", "right"),
+}
 
 
 class PressRecorder:
     """Recorder of one picture of every press: the first in which it stands still.
 
-    Args:
-        shape: rows and columns of a frame.
-        a_cell: presses wanted in each cell of the map.
-
-    Attributes:
-        images, circles: of the recorded presses; circles as `find_circle` finds them, px.
-        hint: instruction for the person who presses.
+    `a_cell` presses are wanted in each cell of the map of frames of a shape (rows, columns).
     """
 
     def __init__(self, shape: tuple[int, int], a_cell: int = 2) -> None:
         self._shape, self._a_cell = shape, a_cell
         self.grid = GRID if shape[1] >= shape[0] else GRID[::-1]
-        self.images: list[Frame] = []
-        self.circles: list[np.ndarray] = []
-        self.hint = "leave the gel untouched"
-        self._recent = deque[Frame](maxlen=_SETTLING)
+        self.images: list[Picture] = []
+        self.circles: list[np.ndarray] = []  # as `find_circle` finds them, px
+        self.hint = "leave the gel untouched"  # for the person who presses
+        self._recent = deque[Picture](maxlen=_SETTLING)
         self._detector: ContactDetector | None = None
         self._taken = False  # of this contact
 
     @property
-    def background(self) -> Frame:
+    def background(self) -> Picture:
         """Current untouched gel; UserError before it has settled."""
         if self._detector is None:
             raise UserError(
@@ -62,10 +59,9 @@ class PressRecorder:
     @property
     def counts(self) -> Int[np.ndarray, "rows columns"]:
         """Number of presses in each cell of the map."""
-        counts = np.zeros(self.grid, int)
-        for circle in self.circles:
-            counts[self._cell(circle)] += 1
-        return counts
+        x, y, _ = np.reshape(self.circles, (-1, 3)).T
+        height, width = self._shape
+        return np.histogram2d(y, x, self.grid, [[0, height], [0, width]])[0].astype(int)
 
     @property
     def complete(self) -> bool:
@@ -73,19 +69,12 @@ class PressRecorder:
         return bool((self.counts >= self._a_cell).all())
 
     def presses(self, ball_radius: float, first: int = 0) -> PressSet:
-        """Return the recorded presses.
-
-        Args:
-            ball_radius: m.
-            first: number of the first picture.
-        """
+        """Return the recorded presses of a ball (radius, m), numbered from `first`."""
         names = tuple(f"press_{first + i:03d}.png" for i in range(len(self.images)))
-        balls = np.full(len(self.images), ball_radius)
-        return PressSet(
-            self.background, np.stack(self.images), np.stack(self.circles), balls, names
-        )
+        images, circles = np.stack(self.images), np.stack(self.circles)
+        return PressSet(self.background, images, circles, np.full(len(images), ball_radius), names)
 
-    def update(self, frame: Frame) -> bool:
+    def update(self, frame: Picture) -> bool:
         """Process the next frame and return whether it is recorded."""
         self._recent.append(frame)
         if self._detector is None:
@@ -105,7 +94,7 @@ class PressRecorder:
         self._taken = True
         return self._record(frame)
 
-    def draw_map(self, frame: Frame) -> Frame:
+    def draw_map(self, frame: Picture) -> Picture:
         """Draw the recorded circles and the count of each cell on a frame."""
         scale = max(1, round(640 / frame.shape[1]))
         size = frame.shape[1] * scale, frame.shape[0] * scale
@@ -127,18 +116,16 @@ class PressRecorder:
         recent = np.stack(self._recent)
         if len(recent) < _SETTLING:
             return
-        before, after = (np.median(part, 0) for part in (recent[:_STILL], recent[-_STILL:]))
-        if (
-            float(local_change(after.astype(np.float32), before.astype(np.float32)).max())
-            > _SETTLED
-        ):
+        parts = recent[:_STILL], recent[-_STILL:]
+        before, after = (np.median(part, 0).astype(np.float32) for part in parts)
+        if float(local_change(after, before).max()) > _SETTLED:
             self.hint = "leave the gel untouched until it has settled"
             return
         middle = np.median(recent, 0).astype(np.uint8)
         self._detector = ContactDetector(Background(middle[None]))
         self.hint = f"press {self._where_next()}"
 
-    def _record(self, frame: Frame) -> bool:
+    def _record(self, frame: Picture) -> bool:
         """Record a press and return whether it is fit; the hint says why not."""
         try:
             x, y, radius = find_circle(frame, self.background)
@@ -157,21 +144,15 @@ class PressRecorder:
             return True
         return False
 
-    def _cell(self, circle: np.ndarray) -> tuple[int, int]:
-        (h, w), (rows, columns) = self._shape, self.grid
-        row, column = int(circle[1] / h * rows), int(circle[0] / w * columns)
-        return min(row, rows - 1), min(column, columns - 1)
-
     def _where_next(self) -> str:
         if self.complete:
             return "once more, or end with Ctrl-C"
         rows, columns = self.grid
         row, column = np.unravel_index(int(self.counts.argmin()), self.grid)
-        side, place = _name(_SIDES, int(column), columns), _name(_PLACES, int(row), rows)
-        return f"at the {place}, {side}"
+        return f"at the {_PLACES[rows][row]}, {_SIDES[columns][column]}"
 
 
-def record(frames: Iterable[Frame], recorder: PressRecorder, live: LivePicture | None) -> None:
+def record(frames: Iterable[Picture], recorder: PressRecorder, live: LivePicture | None) -> None:
     """Feed the recorder until its map is full, the frames end, the sensor is lost, or Ctrl-C."""
     hint = ""
     try:
@@ -190,13 +171,7 @@ def record(frames: Iterable[Frame], recorder: PressRecorder, live: LivePicture |
         print(f"ended: {error}")
 
 
-def _name(names: tuple[str, ...], index: int, count: int) -> str:
-    if count == 3:
-        return (names[0], "middle", names[-1])[index]
-    return names[index]
-
-
-def _write(picture: Frame, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
+def _write(picture: Picture, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
     (x, y), black = at, (0, 0, 0)
     cv2.rectangle(picture, (x - 3, y - height - 4), (x + width + 3, y + 5), black, cv2.FILLED)

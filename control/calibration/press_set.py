@@ -2,13 +2,14 @@
 
 import csv
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
+from touchgoal.control.arrays import Circle, Circles, Picture, Pictures
 from touchgoal.control.calibration.ball import find_circle
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.picture_file import read_picture
@@ -26,34 +27,29 @@ _LINE_ROUNDS, _LINE_TOLERANCE = 4, 1.0  # of the robust line; counts
 
 @dataclass(frozen=True)
 class PressSet:
-    """Pictures of one ball pressed into one sensor.
+    """Pictures of one ball pressed into one sensor."""
 
-    Attributes:
-        background: the untouched sensor, RGB.
-        images: the presses, RGB.
-        circles: contact circles as given or found: centre x (column), centre y (row) and radius,
-            px; the centre of the first pixel is (0, 0).
-        ball_radius: m, one a press; all NaN if not known.
-        files: name of each picture.
-        labelled: whether the circles were given, not found in the pictures.
-    """
-
-    background: UInt8[np.ndarray, "h w 3"]
-    images: UInt8[np.ndarray, "n h w 3"]
-    circles: Float[np.ndarray, "n 3"]
-    ball_radius: Float[np.ndarray, " n"]
-    files: tuple[str, ...]
-    labelled: bool = True
+    background: Picture  # the untouched sensor, RGB
+    images: Pictures  # the presses, RGB
+    # contact circles as given or found: centre x (column), centre y (row) and radius, px; the
+    # centre of the first pixel is (0, 0)
+    circles: Circles
+    ball_radius: Float[np.ndarray, " n"]  # m, one a press; all NaN if not known
+    files: tuple[str, ...]  # name of each picture
+    labelled: bool = True  # whether the circles were given, not found in the pictures
 
     def __len__(self) -> int:
-        """Number of presses."""
         return len(self.images)
 
     def take(self, chosen: Int[np.ndarray, " m"]) -> "PressSet":
         """Return some of the presses, by index."""
-        circles, balls = self.circles[chosen], self.ball_radius[chosen]
-        files = tuple(self.files[i] for i in chosen)
-        return PressSet(self.background, self.images[chosen], circles, balls, files, self.labelled)
+        return replace(
+            self,
+            images=self.images[chosen],
+            circles=self.circles[chosen],
+            ball_radius=self.ball_radius[chosen],
+            files=tuple(self.files[i] for i in chosen),
+        )
 
 
 def split(presses: PressSet, n_held_out: int, seed: int) -> tuple[PressSet, PressSet]:
@@ -82,82 +78,55 @@ def read_presses(folder: Path, pitch: float, ball_mm: float = math.nan) -> Press
     """Read `background.png`, `presses.csv` and the pictures it names, in the background's light.
 
     Without `presses.csv` every other picture is a press. Circles that the table lacks are found.
-
-    Args:
-        folder: of the pictures.
-        pitch: m per pixel.
-        ball_mm: radius of the ball of presses for which the table gives none, mm.
-
-    Raises:
-        UserError: something is missing, does not fit together, or is too little to calibrate from.
+    `pitch` is m per pixel; `ball_mm` is the radius (mm) of balls that the table does not give.
+    UserError if something is missing, does not fit together, or is too little to calibrate from.
     """
     background = _read_image(folder / "background.png")
     rows = _read_rows(folder, ball_mm)
     if len(rows) < MINIMUM:
         raise UserError(
-            f"{folder} has {len(rows)} presses, calibration needs at least {MINIMUM} (12 to fit "
-            "the "
+            f"{folder} has {len(rows)} presses, calibration needs at least {MINIMUM} (12 to fit the "
             "30 response terms of a colour, 4 to check them): add presses at other places"
         )
-    ball = np.array([row.ball_mm for row in rows]) * 1e-3
+    files, labels, balls = zip(*rows, strict=True)
+    ball, labelled = np.array(balls) * 1e-3, [not np.isnan(circle).any() for circle in labels]
+    if np.isnan(ball).any():
+        raise UserError(
+            "the ball's radius is missing, and every depth in mm depends on it: measure the ball "
+            "and give --ball-mm, or ball_mm in presses.csv (two balls of different size are best)"
+        )
     images, circles = [], []
-    for row, radius in zip(rows, ball, strict=True):
-        image = _read_image(folder / row.file)
+    for file, circle, known, radius in zip(files, labels, labelled, ball, strict=True):
+        image = _read_image(folder / file)
         if image.shape != background.shape:
             raise UserError(
-                f"{folder / row.file} has {image.shape[1]} x {image.shape[0]} pixels, "
-                "background.png "
+                f"{folder / file} has {image.shape[1]} x {image.shape[0]} pixels, background.png "
                 f"{background.shape[1]} x {background.shape[0]}: record them at the same size"
             )
-        circle = row.circle if row.labelled else _find(row.file, image, background)
-        _check_circle(row.file, circle, radius, background.shape, pitch)
-        _check_visible(row.file, circle, image, background)
-        circles.append(circle)
-        images.append(without_drift(image, background, circle))
-    if np.isnan(ball).any() and not np.isnan(ball).all():
-        raise UserError("presses.csv gives ball_mm for some presses only: fill in all, or none")
-    return PressSet(
-        background,
-        np.stack(images),
-        np.stack(circles),
-        ball,
-        tuple(row.file for row in rows),
-        labelled=any(row.labelled for row in rows),
-    )
+        try:
+            found = circle if known else find_circle(image, background)
+        except UserError as error:
+            raise UserError(f"{file}: {error}") from error
+        _check_circle(file, found, radius, background.shape, pitch)
+        _check_visible(file, found, image, background)
+        circles.append(found)
+        images.append(without_drift(image, background, found))
+    pictures, contacts = np.stack(images), np.stack(circles)
+    return PressSet(background, pictures, contacts, ball, files, any(labelled))
 
 
-@dataclass(frozen=True)
-class _Row:
-    """A line of presses.csv; NaN where it says nothing."""
-
-    file: str
-    circle: Float[np.ndarray, "3"]
-    ball_mm: float
-
-    @property
-    def labelled(self) -> bool:
-        return not np.isnan(self.circle).any()
-
-
-def _find(name: str, image: np.ndarray, background: np.ndarray) -> Float[np.ndarray, "3"]:
-    try:
-        return find_circle(image, background)
-    except UserError as error:
-        raise UserError(f"{name}: {error}") from error
-
-
-def _read_rows(folder: Path, ball_mm: float) -> list[_Row]:
+def _read_rows(folder: Path, ball_mm: float) -> list[tuple[str, Circle, float]]:
+    """Return file, circle (px) and ball's radius (mm) of each press; NaN where nothing is said."""
     path = folder / "presses.csv"
     if not path.is_file():
         if math.isnan(ball_mm):
             raise UserError(
-                f"{path} is missing: give --ball-mm if one ball made all presses, or write one "
-                "line a press "
-                "with the columns file,ball_mm (docs/own_sensor.md)"
+                f"{path} is missing: give --ball-mm if one ball made all presses, or write one line "
+                "a press with the columns file,ball_mm (docs/own_sensor.md)"
             )
         pictures = {p.name for p in folder.iterdir() if p.suffix.lower() in (".png", ".jpg")}
         unknown = np.full(3, math.nan)
-        return [_Row(name, unknown, ball_mm) for name in sorted(pictures - {"background.png"})]
+        return [(name, unknown, ball_mm) for name in sorted(pictures - {"background.png"})]
     with path.open(newline="") as file:
         reader = csv.DictReader(file)
         if "file" not in (reader.fieldnames or ()):
@@ -168,27 +137,24 @@ def _read_rows(folder: Path, ball_mm: float) -> list[_Row]:
         return [_read_row(path, line, row, ball_mm) for line, row in enumerate(reader, 2)]
 
 
-def _read_row(path: Path, line: int, row: dict[str, str], ball_mm: float) -> _Row:
+def _read_row(
+    path: Path, line: int, row: dict[str, str], ball_mm: float
+) -> tuple[str, Circle, float]:
     try:
-        x, y, radius, ball = (_number(row.get(name)) for name in COLUMNS[1:])
-    except (TypeError, ValueError) as error:
+        x, y, radius, ball = (float((row.get(name) or "").strip() or "nan") for name in COLUMNS[1:])
+    except ValueError as error:
         raise UserError(
             f"{path}, line {line}: {error}; write numbers, or leave them out"
         ) from error
-    return _Row(row["file"], np.array([x, y, radius]), ball_mm if math.isnan(ball) else ball)
+    return row["file"], np.array([x, y, radius]), ball_mm if math.isnan(ball) else ball
 
 
-def _number(text: str | None) -> float:
-    return float(text) if text and text.strip() else math.nan
-
-
-def _read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+def _read_image(path: Path) -> Picture:
     image = read_picture(path)
     if image is None:
         raise UserError(
             f"{path} is missing or no picture: a folder of presses needs background.png and the "
-            "pictures "
-            "of the presses"
+            "pictures of the presses"
         )
     return image
 
@@ -200,19 +166,16 @@ def _check_circle(
     if not (np.isfinite(circle).all() and radius >= 3):
         raise UserError(
             f"presses.csv, {name}: a contact radius of {radius:g} px is too small to show slopes; "
-            "press "
-            "harder or record at full resolution"
+            "press harder or record at full resolution"
         )
     if not (0 <= x < shape[1] and 0 <= y < shape[0]):
         raise UserError(
             f"presses.csv, {name}: the circle's centre ({x:g}, {y:g}) px lies outside the "
-            f"{shape[1]} x "
-            f"{shape[0]} picture"
+            f"{shape[1]} x {shape[0]} picture"
         )
     if radius * pitch >= ball:
         raise UserError(
-            f"presses.csv, {name}: a contact radius of {radius * pitch * 1e3:.2f} mm ({radius:g} "
-            "px "
+            f"presses.csv, {name}: a contact radius of {radius * pitch * 1e3:.2f} mm ({radius:g} px "
             f"at {pitch * 1e3:g} mm/px) does not fit a ball of radius {ball * 1e3:g} mm: check "
             "ball_mm (a radius, not a diameter) and the scale"
         )
@@ -227,24 +190,15 @@ def _check_visible(
     if np.percentile(np.abs(change), 90) < _VISIBLE:
         raise UserError(
             f"{name} shows no contact in its circle (less than {_VISIBLE:g} counts from "
-            "background.png): "
-            "drop it, or record the background again"
+            "background.png): drop it, or record the background again"
         )
 
 
-def without_drift(
-    image: UInt8[np.ndarray, "h w 3"],
-    background: UInt8[np.ndarray, "h w 3"],
-    circle: Float[np.ndarray, "3"],
-) -> UInt8[np.ndarray, "h w 3"]:
+def without_drift(image: Picture, background: Picture, circle: Circle) -> Picture:
     """Return a press as it would look in the background's light.
 
-    Each channel loses gain and offset of a robust line through the pixels far from the contact.
-
-    Args:
-        image: RGB picture of a press.
-        background: the sensor untouched.
-        circle: of the contact, px.
+    Each channel loses gain and offset of a robust line through the pixels far from the contact's
+    `circle` (px).
     """
     x, y, radius = circle
     rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]

@@ -1,45 +1,78 @@
 """Report of a calibration: held-out errors, warnings, record and pictures."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
 
+from touchgoal.control.arrays import AnyPicture, Circle, Counts, Picture
+from touchgoal.control.calibration import press_fit
+from touchgoal.control.calibration.ball import DepthErrors
 from touchgoal.control.calibration.calibrate import FittedCalibration
-from touchgoal.control.calibration.picture_errors import (
-    PictureErrors,
-    mean_errors,
-    picture_errors,
-)
-from touchgoal.control.calibration.pictures import side_by_side
-from touchgoal.control.calibration.press_fit import (
-    BLUR_PYRAMID,
-    BLUR_SCALES,
-    NARROWEST,
-    WIDEST,
-)
 from touchgoal.control.calibration.press_set import PressSet
+from touchgoal.control.tactile.sensor_calibration import SensorCalibration
 from touchgoal.runtime.errors import UserError
 
 # Errors (L1) above this share of the background's own mean that the fit explains nothing.
 _USELESS = 0.9
 _AT_LIMIT = 0.2  # share of circles at a search limit that is worth a warning
 _MAX_SHOWN = 6  # held-out presses in the picture
+_CONTRAST = 4  # of the difference column
+_PAIRS_A_ROW = 2
+_LIGHTS = {"R": (213, 94, 0), "G": (0, 158, 115), "B": (0, 114, 178)}  # Okabe and Ito
+_GREY, _INK, _PAPER = (150, 150, 150), (40, 40, 40), 255
+
+
+PictureErrors = dict[str, float]
+"""Mean absolute error of the whole picture (`l1`, counts); and within REGION contact radii, where the
+press is: `l1_near`, peak signal-to-noise ratio (`psnr_near`, dB), similarity (`ssim_near`, 1 at best)."""
+
+
+def picture_errors(measured: Picture, simulated: Counts, circle: Circle) -> PictureErrors:
+    """Return the errors of a picture of a press, simulated without noise and not yet clipped."""
+    x, y, radius = circle
+    rows, columns = np.ogrid[: measured.shape[0], : measured.shape[1]]
+    near = (columns - x) ** 2 + (rows - y) ** 2 < (press_fit.REGION * radius) ** 2
+    truth, picture = measured.astype(np.float32), simulated.clip(0, 255)
+    error = np.abs(picture - truth)
+    return {
+        "l1_near": float(error[near].mean()),
+        "psnr_near": float(10 * np.log10(255**2 / (error[near] ** 2).mean())),
+        "ssim_near": float(_structural_similarity(truth, picture)[near].mean()),
+        "l1": float(error.mean()),
+    }
+
+
+def mean_errors(errors: list[PictureErrors]) -> PictureErrors:
+    """Return the mean of each error over several pictures."""
+    return {name: float(np.mean([each[name] for each in errors])) for name in errors[0]}
+
+
+def _structural_similarity(a: Counts, b: Counts) -> Counts:
+    """Return SSIM (Wang et al. 2004): Gaussian window of 1.5 px, K1 = 0.01, K2 = 0.03."""
+
+    def mean(image: np.ndarray) -> np.ndarray:
+        return cv2.GaussianBlur(image, (11, 11), 1.5)
+
+    c1, c2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
+    ma, mb = mean(a), mean(b)
+    va, vb, cov = mean(a * a) - ma * ma, mean(b * b) - mb * mb, mean(a * b) - ma * mb
+    return (2 * ma * mb + c1) * (2 * cov + c2) / ((ma * ma + mb * mb + c1) * (va + vb + c2))
 
 
 def held_out_errors(judged: FittedCalibration, test: PressSet) -> dict[str, PictureErrors]:
     """Return mean errors of the held-out pictures by the predictor."""
     given = "labelled" if test.labelled else "found"
     background = judged.calibration.background.astype(np.float32)
-    balls = judged.ball_radii(test)
     simulated = {
         "background alone": [background] * len(test),
-        f"fit, circles as {given}": [*map(judged.simulate, judged.correct_labels(test), balls)],
-        "fit, circles moved to the picture": [
-            *map(judged.simulate, judged.fit_circles(test), balls)
-        ],
+        f"fit, circles as {given}": judged.simulate(test, judged.correct_labels(test)),
+        "fit, circles moved to the picture": judged.simulate(test, judged.fit_circles(test)),
     }
     return {
         name: mean_errors([*map(picture_errors, test.images, pictures, test.circles)])
@@ -49,78 +82,79 @@ def held_out_errors(judged: FittedCalibration, test: PressSet) -> dict[str, Pict
 
 def errors_table(errors: dict[str, PictureErrors], n: int) -> str:
     """Format the held-out errors."""
-    head = f"{f'{n} held-out presses, around the contact':<42}{'L1':>8}{'PSNR':>10}{'SSIM':>8}"
-    rows = [
-        f"{name:<42}{e.l1_near:>8.2f}{e.psnr_near:>7.1f} dB{e.ssim_near:>8.3f}"
-        for name, e in errors.items()
-    ]
-    return "\n".join([head, *rows])
+    lines = [f"{f'{n} held-out presses, around the contact':<42}{'L1':>8}{'PSNR':>10}{'SSIM':>8}"]
+    for name, e in errors.items():
+        figures = f"{e['l1_near']:>8.2f}{e['psnr_near']:>7.1f} dB{e['ssim_near']:>8.3f}"
+        lines.append(f"{name:<42}{figures}")
+    return "\n".join(lines)
+
+
+def median_by_ball(
+    errors: list[DepthErrors], balls: Float[np.ndarray, " n"]
+) -> dict[str, dict[str, float]]:
+    """Return medians over the presses of each ball, by its radius in mm."""
+    sizes = np.round(balls * 1e3, 3)
+    table = {}
+    for size in np.unique(sizes):
+        own = [list(asdict(e).values()) for e, s in zip(errors, sizes, strict=True) if s == size]
+        radius, residual, offset = np.median(own, 0)
+        table[f"{size:g}"] = {
+            "presses": len(own),
+            "radius_mm": float(radius * size),
+            "residual_um": float(residual * 1e6),
+            "peak_offset_mm": float(offset * 1e3),
+        }
+    return table
 
 
 def depth_table(depths: dict[str, dict[str, float]]) -> str:
     """Format the depth of held-out presses."""
     return "\n".join(
         f"depth: a ball of {size} mm reads {d['radius_mm']:.2f} mm (median of {d['presses']:.0f} "
-        "held-out "
-        f"presses), {d['residual_um']:.0f} um from a sphere, its peak {d['peak_offset_mm']:.2f} "
-        "mm off"
+        f"held-out presses), {d['residual_um']:.0f} um from a sphere, its peak "
+        f"{d['peak_offset_mm']:.2f} mm off"
         for size, d in depths.items()
     )
 
 
 def refuse_useless(errors: dict[str, PictureErrors]) -> None:
     """Raise UserError unless the fit beats the background on held-out pictures."""
-    alone = errors["background alone"].l1_near
-    best = min(e.l1_near for name, e in errors.items() if name != "background alone")
+    alone = errors["background alone"]["l1_near"]
+    best = min(e["l1_near"] for name, e in errors.items() if name != "background alone")
     if best > _USELESS * alone:
         raise UserError(
             f"the fit predicts held-out presses no better ({best:.1f} counts) than the background "
-            f"alone ({alone:.1f}): check that background.png is of this sensor and that the "
-            "circles lie "
-            "on the contacts, or leave them out of presses.csv to have them found"
+            f"alone ({alone:.1f}): check that background.png is of this sensor and that the circles "
+            "lie on the contacts, or leave them out of presses.csv to have them found"
         )
 
 
-def at_limits(fitted: FittedCalibration, presses: PressSet) -> list[str]:
-    """Return warnings about parameters at a limit of their search."""
+def warnings(fitted: FittedCalibration, presses: PressSet) -> list[str]:
+    """Return lines on the lights, on what the presses leave open, and on search limits."""
     calibration, circles = fitted.calibration, fitted.circles
-    moved = np.abs(circles[:, :2] - presses.circles[:, :2]).max(1) > 0.98 * presses.circles[:, 2]
-    widest = WIDEST * fitted.ball_radius / calibration.pixel_pitch
-    most = np.minimum(1.5 * presses.circles[:, 2], widest)
-    size = (circles[:, 2] > 0.99 * most) | (circles[:, 2] <= NARROWEST)
-    lines = []
-    if (stuck := moved | size).mean() > _AT_LIMIT:
-        names = ", ".join(np.array(presses.files)[stuck][:4])
-        lines.append(
-            f"{stuck.sum()} of {len(stuck)} circles stand at their search limit ({names}): check "
-            "ball_mm, "
-            "the scale, and that one ball alone touches"
-        )
-    narrowest, softest = (BLUR_SCALES[i] * BLUR_PYRAMID[0] for i in (0, -1))
-    if calibration.blur_sigmas[0] >= softest or calibration.blur_sigmas[0] <= narrowest:
-        lines.append(
-            "the gel's bulge stands at its search limit: depths beside contacts are uncertain"
-        )
-    return lines
-
-
-def warnings(fitted: FittedCalibration) -> list[str]:
-    """Return lines on the lights and on what the presses leave open."""
-    calibration = fitted.calibration
     azimuths = ", ".join(f"{a:.0f}" for a in calibration.light_azimuths)
     lines = [
-        f"lights (red, green, blue) stand at {azimuths} degrees; noise {calibration.noise:.2f} "
-        "counts"
+        f"lights (red, green, blue) stand at {azimuths} degrees; noise {calibration.noise:.2f} counts"
     ]
     if not fitted.varies_over_image:
         lines.append(
             "all presses lie in one place: how the light changes over the image is taken from the "
             "background alone; press all over the gel to have it fitted"
         )
-    if fitted.ball_fitted:
+    moved = np.abs(circles[:, :2] - presses.circles[:, :2]).max(1) > 0.98 * presses.circles[:, 2]
+    widest = press_fit.WIDEST * presses.ball_radius / calibration.pixel_pitch
+    most = np.minimum(1.5 * presses.circles[:, 2], widest)
+    size = (circles[:, 2] > 0.99 * most) | (circles[:, 2] <= press_fit.NARROWEST)
+    if (stuck := moved | size).mean() > _AT_LIMIT:
+        names = ", ".join(np.array(presses.files)[stuck][:4])
         lines.append(
-            f"the ball's radius is fitted, {fitted.ball_radius[0] * 1e3:.2f} mm; pictures tell it "
-            "poorly, and every depth in mm is only as good: measure the ball"
+            f"{stuck.sum()} of {len(stuck)} circles stand at their search limit ({names}): check "
+            "ball_mm, the scale, and that one ball alone touches"
+        )
+    narrowest, softest = (press_fit.BLUR_SCALES[i] * press_fit.BLUR_PYRAMID[0] for i in (0, -1))
+    if calibration.blur_sigmas[0] >= softest or calibration.blur_sigmas[0] <= narrowest:
+        lines.append(
+            "the gel's bulge stands at its search limit: depths beside contacts are uncertain"
         )
     return lines
 
@@ -136,24 +170,72 @@ def record(
     return {
         "presses": len(presses),
         "held_out_presses": n_test,
-        "held_out": {name: asdict(e) for name, e in errors.items()},
+        "held_out": errors,
         "held_out_depth": depths,
         "illumination_exponent": fitted.calibration.illumination_exponent,
-        "ball_mm": sorted({round(float(r) * 1e3, 3) for r in fitted.ball_radius}),
-        "ball_fitted": fitted.ball_fitted,
+        "ball_mm": sorted({round(float(r) * 1e3, 3) for r in presses.ball_radius}),
         "response_varies_over_image": fitted.varies_over_image,
-        "label_offset_px": fitted.label_correction.offset.tolist(),
-        "label_slope": fitted.label_correction.slope.tolist(),
+        "label_offset_px": fitted.label_offset.tolist(),
+        "label_slope": fitted.label_slope.tolist(),
     }
 
 
 def draw_held_out(judged: FittedCalibration, test: PressSet, path: Path) -> None:
     """Write held-out presses beside their simulation."""
-    circles, balls = judged.fit_circles(test), judged.ball_radii(test)
-    simulated = [*map(judged.simulate, circles, balls)]
-    write_picture(path, side_by_side(list(test.images[:_MAX_SHOWN]), simulated[:_MAX_SHOWN]))
+    shown = test.take(np.arange(min(_MAX_SHOWN, len(test))))
+    simulated = judged.simulate(shown, judged.fit_circles(shown))
+    write_picture(path, side_by_side(list(shown.images), simulated))
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
     """Write an RGB picture."""
     cv2.imwrite(str(path), picture[..., ::-1])
+
+
+def side_by_side(
+    measured: Sequence[AnyPicture], simulated: Sequence[Counts]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw measured | simulated | difference times 4 about grey, RGB, under a heading."""
+    tiles = []
+    for real, made in zip(measured, simulated, strict=True):
+        picture = made.clip(0, 255)
+        difference = (128 + _CONTRAST * (real - picture)).clip(0, 255)
+        tiles.append(np.hstack([real, picture, difference]).astype(np.uint8))
+    tiles += [np.full_like(tiles[0], _PAPER)] * (-len(tiles) % _PAIRS_A_ROW)
+    rows = [np.hstack(tiles[i : i + _PAIRS_A_ROW]) for i in range(0, len(tiles), _PAIRS_A_ROW)]
+    width = tiles[0].shape[1] // 3
+    heading = np.full((24, rows[0].shape[1], 3), _PAPER, np.uint8)
+    for i, text in enumerate(("measured", "simulated", f"difference x{_CONTRAST}") * _PAIRS_A_ROW):
+        _write(heading, text, (i + 0.5) * width, 12, _INK)
+    return np.vstack([heading, *rows])
+
+
+def light_compass(calibration: SensorCalibration) -> UInt8[np.ndarray, "320 320 3"]:
+    """Draw where in the image the lights stand, by channel: x to the right, y down.
+
+    A line's length is the channel's response to slope in the middle of the image, relative to the
+    strongest.
+    """
+    picture = np.full((320, 320, 3), _PAPER, np.uint8)
+    centre, reach = 160, 115.2  # px
+    cv2.circle(picture, (centre, centre), round(reach), _GREY, 1, cv2.LINE_AA)
+    for text, dx, dy in (("0", 1, 0), ("90", 0, 1), ("180", -1, 0), ("-90", 0, -1)):
+        _write(picture, text, centre + dx * 1.18 * reach, centre + dy * 1.18 * reach, _GREY)
+    strength = np.linalg.norm(calibration.response[:, :2, 0], axis=1)
+    lengths = (reach * strength / strength.max()).tolist()
+    for (name, colour), azimuth, length in zip(
+        _LIGHTS.items(), calibration.light_azimuths, lengths, strict=True
+    ):
+        dx, dy = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
+        tip = round(centre + length * dx), round(centre + length * dy)
+        cv2.arrowedLine(picture, (centre, centre), tip, colour, 3, cv2.LINE_AA, tipLength=0.08)
+        beside = centre + 0.62 * length * dx - 28 * dy, centre + 0.62 * length * dy + 28 * dx
+        _write(picture, f"{name} {azimuth:.0f}", *beside, colour)
+    return picture
+
+
+def _write(picture: Picture, text: str, x: float, y: float, colour: tuple[int, int, int]) -> None:
+    """Write text centred at (x, y)."""
+    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
+    at = round(x - width / 2), round(y + height / 2)
+    cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)

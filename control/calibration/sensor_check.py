@@ -1,27 +1,21 @@
 """Noise, drift, contact, markers, depth and force of one sensor, from its own frames."""
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, UInt8
 
-from touchgoal.control.calibration.ball import Circle, find_circle
-from touchgoal.control.calibration.held_out_depth import DepthErrors, sphere_in
+from touchgoal.control.arrays import Circle, Counts, Map, Picture
+from touchgoal.control.calibration.ball import DepthErrors, find_circle, sphere_in
 from touchgoal.control.calibration.press_fit import move_circles
 from touchgoal.control.calibration.press_set import PressSet
+from touchgoal.control.tactile import picture_guard
 from touchgoal.control.tactile.background import Background, Drift, local_change
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.force import estimate_force
-from touchgoal.control.tactile.markers import Markers, MarkerTracker, without_markers
-from touchgoal.control.tactile.picture_guard import (
-    UNEXPLAINED,
-    check_presses,
-    check_untouched,
-    explain,
-    seam,
-)
+from touchgoal.control.tactile.markers import MarkerTracker, without_markers
 from touchgoal.control.tactile.sensor_calibration import SensorCalibration, load
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.runtime.errors import UserError
@@ -29,67 +23,45 @@ from touchgoal.runtime.errors import UserError
 _PRESSES = 12  # presses that are read: the firmest frame of as many stretches of contact
 _FIRM = 0.3  # of the strongest: a ball that only comes or goes has no depth to compare
 
-Frame = UInt8[np.ndarray, "h w 3"]
-FloatFrame = Float32[np.ndarray, "h w 3"]
-
 
 @dataclass(frozen=True, eq=False)
 class PressReading:
-    """Depth, ball and force of one press.
+    """Depth, ball and force of one press."""
 
-    Attributes:
-        frame: the picture.
-        depth: of the gel, m.
-        drawn: the simulator's picture of that depth, RGB.
-        unexplained: share of the strongest tenth of the change that is not in that picture.
-        circle: contact circle of the ball, px; None without a ball.
-        ball: sphere in the depth map there; None without a ball.
-        force: normal to the gel, N.
-    """
-
-    frame: Frame
-    depth: Float32[np.ndarray, "h w"]
-    drawn: Frame
-    unexplained: float
+    frame: Picture
+    depth: Map  # of the gel, m
+    drawn: Picture  # the simulator's picture of that depth, RGB
+    unexplained: float  # share of the strongest tenth of the change that is not in that picture
+    # circle, ball: contact circle (px), and sphere in the depth map there; None without a ball
     circle: Circle | None
     ball: DepthErrors | None
-    force: float
+    force: float  # normal to the gel, N
 
 
 @dataclass(frozen=True, eq=False)
 class SensorCheck:
-    """Findings of `check_sensor`.
+    """Findings of `check_sensor`."""
 
-    Attributes:
-        frames, touching, torn: number of frames, of those in contact, and of those refused as torn.
-        noise: standard deviation of a pixel from one untouched frame to the next, counts; None if
-            no two in a row are untouched.
-        drift, drift_from_file: of the light since the first frame, and against the sensor file.
-        unlike_file: largest local change of the untouched gel against the sensor file, counts.
-        threshold: contact strength from which a touch counts, counts.
-        untouched, touched: largest strength of untouched frames; median of the presses, counts.
-        markers: share of the dots that are found; None without markers.
-        largest_shift: of a marker from its rest position, px.
-        presses: firm ones that the sensor file explains.
-        unexplained: number of firm ones that it does not explain.
-        background: the untouched sensor at the end.
-    """
-
+    # frames, touching, torn: number of frames, of those in contact, and of those refused as torn
     frames: int
     touching: int
     torn: int
+    # standard deviation of a pixel from one untouched frame to the next, counts; None if no two in
+    # a row are untouched
     noise: float | None
+    # drift, drift_from_file: of the light since the first frame, and against the sensor file
     drift: Drift
     drift_from_file: Drift
-    unlike_file: float
-    threshold: float
+    unlike_file: float  # largest local change of the untouched gel against the sensor file, counts
+    threshold: float  # contact strength from which a touch counts, counts
+    # untouched, touched: largest strength of untouched frames; median of the presses, counts
     untouched: float
     touched: float
-    markers: float | None
-    largest_shift: float
-    presses: list[PressReading]
-    unexplained: int
-    background: Frame
+    markers: float | None  # share of the dots that are found; None without markers
+    largest_shift_px: float  # of a marker from its rest position, px
+    presses: list[PressReading]  # firm ones that the sensor file explains
+    presses_unexplained: int  # number of firm ones that it does not explain
+    background: Picture  # the untouched sensor at the end
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,45 +69,39 @@ class _Touch:
     """A frame in contact, and the background at that time; dots painted over."""
 
     strength: float
-    frame: Frame
-    plain: Frame
-    background: FloatFrame
+    frame: Picture
+    plain: Picture
+    background: Counts
 
 
 def check_sensor(
-    frames: Iterable[Frame], sensor: SensorModel, ball_radius: float | None = None
+    frames: Iterable[Picture], sensor: SensorModel, ball_radius: float | None = None
 ) -> SensorCheck:
-    """Check the frames of one sensor, the first of them untouched.
+    """Check the frames of one sensor in order, the first untouched; `ball_radius` (m) if known.
 
-    Args:
-        frames: in order.
-        sensor: its model, or its own file.
-        ball_radius: m, if a ball presses.
-
-    Raises:
-        UserError: there are no frames, they are not this sensor's pictures (`picture_guard`), or
-            they show no marker grid where one should be.
+    UserError if there are no frames, they are not this sensor's (`picture_guard`), or show no
+    marker grid.
     """
     frames = iter(frames)
     first = next(frames, None)
     if first is None:
         raise UserError("no frames came: nothing to check")
-    check_untouched(first, sensor, "the first frame")
+    picture_guard.check_untouched(first, sensor, "the first frame")
     calibration = load(sensor.sensor_file)
     detector = ContactDetector(Background(first[None]))
     dots = _Dots(first, sensor)
     touches: list[_Touch] = []
     untouched, steps, torn = [0.0], [], 0
-    before: Frame | None = first
+    before: Picture | None = first
     background = first.astype(np.float32)
     for frame in frames:
-        if seam(frame):
+        if picture_guard.seam(frame):
             torn += 1
             continue
         dots.follow(frame)
         if detector.update(frame):
             background = detector.background.image.copy() if before is not None else background
-            plain, rest = dots.painted(frame), dots.painted_at_rest(background)
+            plain, rest = dots.painted(frame), dots.painted(background, at_rest=True)
             touches.append(_Touch(detector.strength, frame, plain, rest))
             before = None
             continue
@@ -147,11 +113,14 @@ def check_sensor(
     drift = followed.drift()
     followed.reference = calibration.background.astype(np.float32)
     firm = _firmest(touches)
-    plain = dots.painted_at_rest(np.rint(followed.image).astype(np.uint8))
+    untouched_now = np.rint(followed.image).astype(np.uint8)
+    plain = dots.painted(untouched_now, at_rest=True)
     aligned = [_in_light(touch, plain) for touch in firm]
-    check_presses(plain, aligned, sensor, "the frames in contact")
+    picture_guard.check_presses(plain, aligned, sensor, "the frames in contact")
     readings = _read(firm, sensor, calibration, ball_radius)
-    explained = [reading for reading in readings if reading.unexplained <= UNEXPLAINED]
+    explained = [
+        reading for reading in readings if reading.unexplained <= picture_guard.UNEXPLAINED
+    ]
     return SensorCheck(
         frames=len(untouched) + len(touches) + torn,
         touching=len(touches),
@@ -164,17 +133,17 @@ def check_sensor(
         untouched=max(untouched),
         touched=float(np.median([touch.strength for touch in firm])) if firm else 0.0,
         markers=dots.share_found,
-        largest_shift=dots.largest_shift,
+        largest_shift_px=dots.largest_shift,
         presses=explained,
-        unexplained=len(readings) - len(explained),
-        background=np.rint(followed.image).astype(np.uint8),
+        presses_unexplained=len(readings) - len(explained),
+        background=untouched_now,
     )
 
 
 class _Dots:
     """Printed dots, followed and painted over; does nothing for a plain gel."""
 
-    def __init__(self, first: Frame, sensor: SensorModel) -> None:
+    def __init__(self, first: Picture, sensor: SensorModel) -> None:
         grid, self._tracker, self._radius = sensor.markers, None, 0.0
         self._found: list[float] = [1.0]
         self.largest_shift = 0.0
@@ -186,20 +155,17 @@ class _Dots:
     def share_found(self) -> float | None:
         return None if self._tracker is None else float(np.mean(self._found))
 
-    def follow(self, frame: Frame) -> None:
+    def follow(self, frame: Picture) -> None:
         if self._tracker is not None:
             self._found.append(float(self._tracker.update(frame).found.mean()))
             shift = np.linalg.norm(self._tracker.displacement, axis=-1).max()
             self.largest_shift = max(self.largest_shift, float(shift))
 
-    def painted(self, image: np.ndarray) -> np.ndarray:
-        return self._without(image, self._tracker and self._tracker.now)
-
-    def painted_at_rest(self, image: np.ndarray) -> np.ndarray:
-        return self._without(image, self._tracker and self._tracker.rest)
-
-    def _without(self, image: np.ndarray, dots: Markers | None) -> np.ndarray:
-        return image if dots is None else without_markers(image, dots.positions, self._radius)
+    def painted(self, image: np.ndarray, at_rest: bool = False) -> np.ndarray:
+        if self._tracker is None:
+            return image
+        dots = self._tracker.rest if at_rest else self._tracker.now
+        return without_markers(image, dots.positions, self._radius)
 
 
 def _read(
@@ -209,15 +175,14 @@ def _read(
     ball_radius: float | None,
 ) -> list[PressReading]:
     estimator, pitch = DepthEstimator(calibration), sensor.pixel_pitch
-    circles: list[Circle | None] = [None] * len(touches)
-    if ball_radius is not None:
-        circles = _contact_circles(touches, calibration, ball_radius)
     readings = []
-    for touch, circle in zip(touches, circles, strict=True):
-        read = explain(estimator, calibration, touch.plain, touch.background)
-        ball = None
-        if circle is not None and ball_radius is not None:
-            ball = sphere_in(read.depth, pitch, circle, ball_radius)
+    for touch in touches:
+        read = picture_guard.explain(estimator, calibration, touch.plain, touch.background)
+        circle = ball = None
+        if ball_radius is not None:
+            with suppress(UserError):  # the ball is too faint
+                circle = _contact_circle(touch, calibration, ball_radius)
+                ball = sphere_in(read.depth, pitch, circle, ball_radius)
         drawn = np.rint(touch.plain - read.left).clip(0, 255).astype(np.uint8)
         force = estimate_force(read.depth, pitch, sensor).normal
         readings.append(
@@ -226,30 +191,16 @@ def _read(
     return readings
 
 
-def _contact_circles(
-    touches: list[_Touch], calibration: SensorCalibration, ball_radius: float
-) -> list[Circle | None]:
-    """Find each ball's contact circle and fit it as `calibrate` does; None if too faint."""
+def _contact_circle(touch: _Touch, calibration: SensorCalibration, ball_radius: float) -> Circle:
+    """Find a ball's contact circle and fit it as `calibrate` does; UserError if it is too faint."""
     background = calibration.background
-    images, found, at = [], [], []
-    for i, touch in enumerate(touches):
-        image = _in_light(touch, background)
-        try:
-            found.append(find_circle(image, background))
-        except UserError:
-            continue
-        images.append(image)
-        at.append(i)
-    circles: list[Circle | None] = [None] * len(touches)
-    if at:
-        balls, names = np.full(len(at), ball_radius), tuple(map(str, at))
-        presses = PressSet(background, np.stack(images), np.stack(found), balls, names)
-        for i, circle in zip(at, move_circles(calibration, presses), strict=True):
-            circles[i] = circle
-    return circles
+    image = _in_light(touch, background)
+    found = find_circle(image, background)[None]
+    press = PressSet(background, image[None], found, np.array([ball_radius]), ("",))
+    return move_circles(calibration, press, found)[0]
 
 
-def _in_light(touch: _Touch, background: Frame) -> Frame:
+def _in_light(touch: _Touch, background: Picture) -> Picture:
     """Return the touch as it would look on another untouched picture of its sensor."""
     change = touch.plain - touch.background  # float
     return np.rint(background + change).clip(0, 255).astype(np.uint8)
@@ -265,7 +216,7 @@ def _firmest(touches: list[_Touch]) -> list[_Touch]:
     return [touch for touch in best if touch.strength >= least]
 
 
-def _noise(before: Frame, frame: Frame) -> float:
+def _noise(before: Picture, frame: Picture) -> float:
     """Return the noise of a pixel, counts; the median change counts as drift."""
     change = frame.astype(np.float32) - before
     return float((change - np.median(change, (0, 1))).std() / np.sqrt(2))

@@ -38,14 +38,9 @@ def read_cell_file(
 ) -> CellConfig:
     """Read a cell file: TOML, or the `cell.json` that a twin has written.
 
-    Args:
-        path: of the file.
-        policy, seed: in place of the file's, if given.
-        sim: a simulated arm in place of the file's.
-
-    Raises:
-        UserError: no such file, bad syntax, an unknown key, or a value that is missing or not
-            allowed; one line with file, key, what is allowed and what is meant.
+    `policy` and `seed` replace the file's, `sim` its arm by a simulated one. UserError if there is
+    no such file, bad syntax, an unknown key, or a value that is missing or not allowed; one line
+    with file, key, what is allowed and what is meant.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")  # with or without a byte-order mark

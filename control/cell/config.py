@@ -22,6 +22,7 @@ Rate = Annotated[float, Field(gt=0, le=1000)]  # Hz
 Seconds = Annotated[float, Field(gt=0, le=5)]
 Pixels = Annotated[int, Field(ge=16, le=8192)]
 Exposure = Annotated[float, Field(gt=0, le=100_000)]
+Width = Annotated[float, Field(ge=0, le=0.2)]  # m
 Kelvin = Annotated[int, Field(ge=1000, le=15_000)]
 CameraName = Literal["front", "wrist"]
 
@@ -38,10 +39,7 @@ class GripperSection:
     """Serial port of a Robotiq, such as /dev/ttyUSB0."""
     force: Annotated[float, Field(gt=0)] = 30.0
     """Force of its grasp, N."""
-    widths: tuple[Annotated[float, Field(ge=0, le=0.2)], Annotated[float, Field(ge=0, le=0.2)]] = (
-        0.085,
-        0.0,
-    )
+    widths: tuple[Width, Width] = (0.085, 0.0)
     """Width of a Robotiq open and closed, m: measure them with the fingertips mounted."""
     activate: bool = False
     """Whether a Robotiq may open and close fully once to become active."""

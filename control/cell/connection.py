@@ -15,16 +15,14 @@ from touchgoal.control.arms import franka, ur
 from touchgoal.control.arms.streaming import ArmConfig, ArmProcess
 from touchgoal.control.cell.config import CellConfig, FingertipsSection
 from touchgoal.control.cell.limits import cell_limits
-from touchgoal.control.cell.lock_step import LockStepClock
-from touchgoal.control.cell.twin_client import ask_twin
-from touchgoal.control.grippers.franka_hand import FrankaHand
-from touchgoal.control.grippers.non_blocking import NonBlockingGripper
+from touchgoal.control.cell.twin_client import LockStepClock, ask_twin
+from touchgoal.control.grippers.franka_hand import FrankaHand, NonBlockingGripper
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
 from touchgoal.control.interfaces import Arm, Camera, Gripper, LoadCell
 from touchgoal.control.safety.limits import RobotLimits
-from touchgoal.control.sensors.fingertip_source import fingertip_video, fingertip_view
+from touchgoal.control.sensors.fingertip_source import fingertip_video
 from touchgoal.control.sensors.load_cell import SerialLoadCell
-from touchgoal.control.sensors.tactile_camera import TactileCamera
+from touchgoal.control.sensors.tactile_camera import TactileCamera, fingertip_view
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_models import find_sensor
 
@@ -50,7 +48,6 @@ class Clock(Protocol):
 
     def wait(self, until: float) -> None:
         """Wait until that time, if it lies ahead."""
-        ...
 
 
 class RealClock:
@@ -103,9 +100,8 @@ class ArmClock:
 class CellConnection:
     """Connected devices; `close` brings the arm to rest and releases all of them.
 
-    Attributes:
-        cameras: with the fingertips, by their key in `features`.
-        truth: returns what a simulator knows; None for a real cell. It may take a while.
+    `cameras` are with the fingertips, by their key in `features`. `truth` returns what a simulator
+    knows, and may take a while; None for a real cell.
     """
 
     robot: RobotLimits
@@ -129,8 +125,7 @@ class CellConnection:
 def connect_cell(cell: CellConfig, hz: float) -> CellConnection:
     """Connect to everything in a cell with a real arm or a twin; commands will come at `hz`.
 
-    Raises:
-        UserError, DriverError: a device is missing; the connected ones are released.
+    UserError or DriverError if a device is missing; the connected ones are released.
     """
     robot = cell_limits(cell)
     with ExitStack() as undo:
@@ -168,7 +163,7 @@ def _arm(cell: CellConfig, robot: RobotLimits, hz: float) -> ArmProcess:
     timeout = cell.safety.state_timeout or timeout
     lock_step = cell.lock_step and not ur5e
     config = ArmConfig(cell.address, robot, hz, rate, timeout, lock_step)
-    return ur.connect_ur(config) if ur5e else franka.connect_franka(config)
+    return ArmProcess(ur.UrClient if ur5e else franka.FrankaClient, config)
 
 
 def _gripper(cell: CellConfig) -> Gripper:

@@ -6,8 +6,7 @@ import numpy as np
 
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.safety.action_filter import Deadline, Watchdogs
-from touchgoal.control.safety.limits import FR3, UR5E, Box, RobotLimits
-from touchgoal.control.safety.task_ceilings import TASK_FORCES
+from touchgoal.control.safety.limits import FR3, TASK_FORCES, UR5E, Box, RobotLimits
 from touchgoal.control.tactile.indentation import deepest_readable
 from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.runtime.errors import UserError

@@ -13,7 +13,7 @@ from touchgoal.control.deployment.realtime import ChunkPlanner, RealTimeActor
 from touchgoal.control.deployment.scripted import PickPlacePoses, pick_and_place
 from touchgoal.control.deployment.user_policy import find_user_policy
 from touchgoal.control.interfaces import Actor
-from touchgoal.control.motion.servo_lag import ServoLag
+from touchgoal.control.motion.tracker import ServoLag
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.runtime.errors import UserError
 
@@ -36,12 +36,7 @@ class PolicyNeeds(Protocol):
 
 @dataclass(frozen=True)
 class CellPolicy:
-    """A policy that fits a cell, loaded for one run.
-
-    Attributes:
-        planner: its plans.
-        camera_size: rows and columns of the camera images that it observes.
-    """
+    """A policy that fits a cell, loaded for one run; it sees camera images of (rows, columns)."""
 
     planner: ChunkPlanner
     camera_size: tuple[int, int]
@@ -62,9 +57,9 @@ class CellPolicy:
 
 
 def load_user_policy(cell: CellConfig, options: PolicyNeeds) -> CellPolicy | None:
-    """Return the cell's policy if it is a user's class, with the environment options it may change.
+    """Return the cell's policy if it is a user's class; UserError if it does not fit the cell.
 
-    UserError if it does not fit the cell.
+    It may change the `options` of its environment.
     """
     if (found := find_user_policy(cell.task.policy)) is None:
         return None

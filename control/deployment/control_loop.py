@@ -64,31 +64,20 @@ def _realtime_priority() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run ended.
+    """How a run ended."""
 
-    Attributes:
-        reason: what happened, for a person.
-        done: whether the task is done, as far as this ending tells; None: unknown.
-        stopped: whether the arm was stopped, by a fault or a person.
-        advice: what to do about it.
-        rest_seconds: s from the decision to stop until the arm was at rest; infinite if it never was.
-    """
-
-    reason: str
-    done: bool | None = None
-    stopped: bool = False
-    advice: str = ""
+    reason: str  # what happened, for a person
+    done: bool | None = None  # whether the task is done, as far as this ending tells; None: unknown
+    stopped: bool = False  # whether the arm was stopped, by a fault or a person
+    advice: str = ""  # what to do about it
+    # s from the decision to stop until the arm was at rest; infinite if it never was
     rest_seconds: float = 0.0
 
     def __str__(self) -> str:
-        """Return the fault report, or the reason of an ordinary end."""
         if not self.stopped:
             return self.reason
-        rest = (
-            f"at rest after {self.rest_seconds:.2f} s"
-            if np.isfinite(self.rest_seconds)
-            else "NOT seen at rest"
-        )
+        seen = np.isfinite(self.rest_seconds)
+        rest = f"at rest after {self.rest_seconds:.2f} s" if seen else "NOT seen at rest"
         return f"STOPPED: {self.reason}\n  the arm: {rest}\n  what to do: {self.advice}"
 
 
@@ -104,28 +93,24 @@ _REQUESTED_ENDINGS: dict[Request, Ending] = {
 
 @dataclass
 class RunLog:
-    """Record of a run.
+    """Record of a run."""
 
-    Attributes:
-        rows: observation and command of each tick, by key.
-        lateness: s by which each tick began too late.
-        answer_times: s that each answer of the actor took.
-        limit_counts: how often each limit changed a command.
-        clocks: the loop's and the arm's clock at each tick, s.
-    """
-
+    # observation and command of each tick, by key
     rows: list[dict[str, np.ndarray]] = field(default_factory=list)
+    # lateness, answer_times: s by which each tick began too late, and that the actor took
     lateness: list[float] = field(default_factory=list)
     answer_times: list[float] = field(default_factory=list)
+    # how often each limit changed a command
     limit_counts: dict[str, int] = field(default_factory=dict)
+    # the loop's and the arm's clock at each tick, s
     clocks: list[tuple[float, float]] = field(default_factory=list)
 
     @property
     def arm_pace(self) -> float:
         """Pace of the arm's clock as a share of real time, in the median second; 1 if unknown.
 
-        Below 1 it is a twin on a machine that is too slow for it: everything comes late in its own
-        time, and it looks like an arm that does not follow.
+        Below 1 it is a twin on a machine that is too slow for it, which looks like an arm that does
+        not follow.
         """
         ticks = np.array(self.clocks)
         if len(ticks) < 2 or ticks[-1, 0] - ticks[0, 0] < 1:
@@ -151,12 +136,7 @@ class TickStatus:
 
 
 class ControlLoop:
-    """One connection under one safety layer.
-
-    Attributes:
-        state: the safety layer's.
-        width: commanded to the gripper, m.
-    """
+    """One connection under a safety layer, in `state`, and a gripper commanded to `width` (m)."""
 
     def __init__(
         self,
@@ -168,19 +148,15 @@ class ControlLoop:
         cost: Callable[[Observation], float] | None = None,
         camera_size: tuple[int, int] = ft.CAMERA_SHAPE[:2],
     ) -> None:
-        """Begin with the arm at rest.
+        """Begin with the arm at rest; UserError outside its limits, or for too small images.
 
         Args:
-            connection: devices to read and command.
-            safety: its limits, and the control rate.
+            connection, safety: devices to read and command; their limits and the control rate.
             execute: False: a dry run.
-            operator_request: asked every tick; its answer stops or ends the run.
-            on_tick: called every tick; must not wait.
+            operator_request, on_tick: called every tick: to stop or end the run, and to show it;
+                must not wait.
             cost: measures how far a tick is from its goal, for the display and the record.
             camera_size: rows and columns of the camera images observed and recorded.
-
-        Raises:
-            UserError: the arm rests outside its limits, or a camera's images are too small.
         """
         self._connection, self._safety, self._execute = connection, safety, execute
         self._operator_request, self._on_tick, self._cost = operator_request, on_tick, cost
@@ -234,9 +210,8 @@ class ControlLoop:
     def stop(self, reason: str, advice: str, release_to: float | None = None) -> Ending:
         """Stop arm and gripper for good, and watch the arm come to rest.
 
-        Args:
-            reason, advice: for the operator.
-            release_to: width (m) that the gripper opens to; None: it stays, and holds its object.
+        `reason` and `advice` are for the operator. The gripper opens to `release_to` (m); None: it
+        stays, and holds its object.
         """
         if not self._execute:
             return Ending(reason, False, True, advice)

@@ -1,7 +1,5 @@
 """Classical baseline of the bead maze: yield to the wire's force, go on the way the hand has moved."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from touchgoal.control import features as ft
@@ -11,36 +9,24 @@ from touchgoal.control.motion.kinematics import Fr3Kinematics
 from touchgoal.control.motion.rotations import fingers_across
 
 GRASP_SECONDS = 0.5  # s for which the hand closes on the bead before it moves
-
-
-@dataclass(frozen=True)
-class FollowerConfig:
-    """Gains, chosen on validation wires.
-
-    Attributes:
-        speed: along the wire, m/s.
-        compliance: speed of the hand per force across the wire, m/s per N; above 1/(stiffness x lag)
-            of arm and gel it oscillates.
-        memory: time constant of the averaged direction of motion, s.
-        lead: largest distance between commanded and measured position, m.
-    """
-
-    speed: float = 0.025
-    compliance: float = 2e-3
-    memory: float = 0.25
-    lead: float = 0.006
+# Gains, chosen on validation wires.
+_SPEED = 0.025  # along the wire, m/s
+# Speed of the hand per force across the wire, m/s per N; above 1/(stiffness x lag) of arm and gel it
+# oscillates.
+_COMPLIANCE = 2e-3
+_MEMORY = 0.25  # time constant of the averaged direction of motion, s
+_LEAD = 0.006  # largest distance between commanded and measured position, m
 
 
 class WireFollower(Actor):
     """Actor that follows an unknown wire from force and joint positions; it never ends by itself.
 
-    It waits while the hand closes, and starts along the hand's x axis, which must lie along the wire.
-    Compliance across a constraint and motion along it are Mason's (1981).
+    It waits while the hand closes, and starts along the hand's x axis, which must lie along the
+    wire. Compliance across a constraint and motion along it are Mason's (1981).
     """
 
-    def __init__(self, control_hz: int = ft.CONTROL_HZ, config: FollowerConfig | None = None):
+    def __init__(self, control_hz: int = ft.CONTROL_HZ) -> None:
         self._tick = 1 / control_hz
-        self._config = config or FollowerConfig()
         self._kinematics = Fr3Kinematics()
         self._command: np.ndarray | None = None
         self._grasping = round(GRASP_SECONDS * control_hz)
@@ -50,24 +36,23 @@ class WireFollower(Actor):
         if self._grasping > 0:
             self._grasping -= 1
             return np.zeros(8)
-        config, tick = self._config, self._tick
+        tick = self._tick
         joints = observation[ft.STATE][:7].astype(np.float64)
         position, R = self._kinematics.forward(joints)
         if self._command is None:
             self._command, self._target, self._before = joints, position, position
-            self._velocity = config.speed * R[:, 0]
-        share = tick / config.memory
+            self._velocity = _SPEED * R[:, 0]
+        share = tick / _MEMORY
         self._velocity += share * ((position - self._before) / tick - self._velocity)
         self._before = position
         heading = self._velocity / np.linalg.norm(self._velocity)
         force = observation[ft.WRENCH][:3]
         across = force - heading * (heading @ force)
-        self._target = self._target + tick * (config.speed * heading + config.compliance * across)
+        self._target = self._target + tick * (_SPEED * heading + _COMPLIANCE * across)
         lag = self._target - position
-        self._target = position + lag * min(1.0, config.lead / max(np.linalg.norm(lag), 1e-9))
-        wanted = self._kinematics.solve_ik_near(
-            self._target, fingers_across(heading), self._command
-        ).q
+        self._target = position + lag * min(1.0, _LEAD / max(np.linalg.norm(lag), 1e-9))
+        R = fingers_across(heading)
+        wanted = self._kinematics.solve_ik_near(self._target, R, self._command).q
         action = np.append(wanted - self._command, 0.0)
         self._command = wanted
         return action

@@ -18,16 +18,13 @@ _REACTION_TIME = 0.5  # s from a command to its answer, besides the motion
 
 
 class HeldObject:
-    """Follows the held object tick by tick.
-
-    Attributes:
-        lost: whether an object was held and is gone, though no command opened the hand.
-        carried: whether an object is held above where it was grasped; also if it was held before the
-            first tick, when its height at the grasp is unknown.
-    """
+    """Follows the held object tick by tick."""
 
     def __init__(self) -> None:
-        self.lost = self.carried = False
+        self.lost = False  # an object was held and is gone, though no command opened the hand
+        # An object is held above where it was grasped; also if it was held before the first tick, when
+        # its height at the grasp is unknown.
+        self.carried = False
         self._held_ticks, self._ticks = 0, 0
         self._width = self._height = 0.0  # m, when it was grasped
 
@@ -56,7 +53,6 @@ class HandMonitor:
     """
 
     def __init__(self, tool: Tool) -> None:
-        """Begin at rest."""
         opened = tool.stroke[1] - tool.stroke[0]
         self._timeout = opened / tool.speed + _REACTION_TIME
         self._opening_error = _OPENING_ERROR * opened
@@ -70,13 +66,10 @@ class HandMonitor:
         indentation: Float[np.ndarray, "2"] | None,
         time: float,
     ) -> str:
-        """Return what is wrong; empty if nothing.
+        """Return what is wrong at a time (s); empty if nothing.
 
-        Args:
-            gripper: the newest reading.
-            commanded: width (m) commanded before it.
-            indentation: of the two gels, m; None without fingertips.
-            time: s, of the reading.
+        `commanded` (m) is the width before the reading; `indentation` of both gels in m, None
+        without fingertips.
         """
         if abs(gripper.width - self._width) > _MOVES:
             self._width, self._still_since = gripper.width, time

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from touchgoal.control import features as ft
+from touchgoal.control.arrays import Picture
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.interfaces import (
     ArmReading,
@@ -26,35 +27,22 @@ _MAX_LOAD_CELL_AGE = 0.5  # s without a good line after which a load cell counts
 
 @dataclass(frozen=True)
 class CellReading:
-    """Readings of one tick.
+    """Readings of one tick."""
 
-    Attributes:
-        observation: by the keys of `control/features.py`.
-        arm, gripper: the last ones without NaN, with their own stamps, so that ages tell.
-        load: of the load cell; None without one.
-        age: of the oldest picture, s.
-        oldest_source: source of that picture.
-        indentation: depth in the left and the right gel, m; 0 without fingertips.
-        fault: a device's own report of a fault; empty if none.
-    """
-
-    observation: dict[str, np.ndarray]
+    observation: dict[str, np.ndarray]  # by the keys of `control/features.py`
+    # arm, gripper: the last ones without NaN, with their own stamps, so that ages tell
     arm: ArmReading
     gripper: GripperReading
-    load: LoadReading | None
-    age: float
-    oldest_source: str
+    load: LoadReading | None  # of the load cell; None without one
+    age: float  # of the oldest picture, s
+    oldest_source: str  # source of that picture
+    # depth in the left and the right gel, m; 0 without fingertips
     indentation: Float[np.ndarray, "2"]
-    fault: str
+    fault: str  # a device's own report of a fault; empty if none
 
 
 class ObservationReader:
-    """Reader of a connection whose fingertips are untouched at first; it never waits for a device.
-
-    Attributes:
-        unsound: values of the newest arm and gripper readings that are not numbers; empty if none.
-        has_fingertips: whether `indentation` is measured.
-    """
+    """Reader of a connection whose fingertips are untouched at first; it never waits for a device."""
 
     def __init__(
         self, connection: CellConnection, camera_size: tuple[int, int] = ft.CAMERA_SHAPE[:2]
@@ -75,12 +63,12 @@ class ObservationReader:
             for key, camera in connection.cameras.items()
             if isinstance(camera, TactileSensor)
         }
-        self.has_fingertips = bool(self._meters)
+        self.has_fingertips = bool(self._meters)  # whether `indentation` is measured
         self._indentations: dict[str, tuple[int, float]] = {}  # frame's sequence, depth (m)
         self._arm: ArmReading | None = None
         self._gripper: GripperReading | None = None
         self._first_load: float | None = None
-        self.unsound = ""
+        self.unsound = ""  # values of the newest arm and gripper readings that are not numbers
 
     def read(self) -> CellReading:
         """Return the newest readings; DriverError if a device broke for good."""
@@ -88,11 +76,10 @@ class ObservationReader:
         arm, gripper = self._sound(connection.arm.read(), connection.gripper.read())
         frames = {key: camera.read() for key, camera in connection.cameras.items()}
         load = connection.load_cell.read() if connection.load_cell else None
-        age = connection.clock.age
-        ages = {key: age(frame.stamp) for key, frame in frames.items()}
-        if load and age(load.stamp) > _MAX_LOAD_CELL_AGE:
-            ages["load cell"] = age(load.stamp)
-        oldest_source = max(ages, key=ages.__getitem__) if ages else ""
+        ages = {key: connection.clock.age(frame.stamp) for key, frame in frames.items()}
+        if load and (silent := connection.clock.age(load.stamp)) > _MAX_LOAD_CELL_AGE:
+            ages["load cell"] = silent
+        oldest = max(ages, key=ages.__getitem__) if ages else ""
         fault = f"arm: {arm.fault}" if arm.fault else ""
         fault = fault or (f"gripper: {gripper.fault}" if gripper.fault else "")
         observation = self.proprioception(arm, gripper)
@@ -101,17 +88,8 @@ class ObservationReader:
         for key, frame in frames.items():
             tactile = key in ft.TACTILE
             observation[key] = frame.image if tactile else crop_and_resize(frame.image, self._size)
-        indentation = self._indentation(frames)
-        return CellReading(
-            observation,
-            arm,
-            gripper,
-            load,
-            ages.get(oldest_source, 0.0),
-            oldest_source,
-            indentation,
-            fault,
-        )
+        age, indentation = ages.get(oldest, 0.0), self._indentation(frames)
+        return CellReading(observation, arm, gripper, load, age, oldest, indentation, fault)
 
     def _sound(self, arm: ArmReading, gripper: GripperReading) -> tuple[ArmReading, GripperReading]:
         """Return the newest readings without NaN; faults are always the newest."""
@@ -180,9 +158,7 @@ def quaternion(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
     return q * np.sign(q[np.argmax(np.abs(q))])
 
 
-def crop_and_resize(
-    image: UInt8[np.ndarray, "h w 3"], shape: tuple[int, int]
-) -> UInt8[np.ndarray, "H W 3"]:
+def crop_and_resize(image: Picture, shape: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
     """Return the middle of an image, in the proportions and at the size (rows, columns) of `shape`."""
     rows, columns = shape
     height, width = image.shape[:2]

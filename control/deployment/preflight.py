@@ -1,7 +1,7 @@
 """Checks before an arm moves, one a line; none may fail."""
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -10,12 +10,13 @@ import numpy as np
 
 from touchgoal.control import features as ft
 from touchgoal.control.arms.client_libraries import FRANKY, UR_RTDE, ClientLibrary
+from touchgoal.control.arrays import Picture
 from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.interfaces import Camera, DriverError, Gripper, TactileSensor
 from touchgoal.control.safety.action_filter import ActionFilter
-from touchgoal.control.safety.task_ceilings import TASK_FORCES
-from touchgoal.control.sensors.exchanged import Picture, fingertips_exchanged
+from touchgoal.control.safety.limits import TASK_FORCES
+from touchgoal.control.sensors.exchanged import fingertips_exchanged
 from touchgoal.control.tactile.contact import contact_strength
 from touchgoal.control.tactile.indentation import require_readable
 from touchgoal.control.tactile.markers import find_markers, without_markers
@@ -44,9 +45,8 @@ def preflight(
 ) -> list[CheckResult]:
     """Return every check in the order of the table.
 
-    Args:
-        episodes: folder that the run records into.
-        count_episodes: counts those already in it; UserError if it cannot be continued.
+    `episodes` is the folder that the run records into; `count_episodes` counts those already in it,
+    with a UserError if it cannot be continued.
     """
     rates = measure_rates(connection)
     checks: list[tuple[str, Callable[[], str]]] = [
@@ -56,11 +56,13 @@ def preflight(
         ("ceilings", lambda: _ceilings(cell, safety)),
         ("gripper", lambda: _gripper(connection)),
     ]
+    nominal = {ft.IMAGE_PREFIX + name: camera.rate for name, camera in cell.cameras.items()}
+    if tips := cell.fingertips:
+        nominal |= dict.fromkeys(ft.TACTILE, tips.rate or find_sensor(cell.sensor).frame_rate)
     for key, camera in connection.cameras.items():
-        nominal = _nominal_rate(cell, key)
-        check = partial(_camera, camera, rates[key], nominal, connection.gripper)
+        check = partial(_camera, camera, rates[key], nominal[key], connection.gripper)
         checks.append((key.removeprefix(ft.IMAGE_PREFIX), check))
-    if cell.fingertips and cell.fingertips.sensor_files:
+    if tips and tips.sensor_files:
         checks.append(("fingertips", lambda: _fingertips(connection)))
     if connection.load_cell:
         checks.append(("load cell", lambda: _load_cell(connection)))
@@ -69,7 +71,7 @@ def preflight(
         ("disk", lambda: _disk(episodes)),
         ("episodes", lambda: f"{count_episodes()} recorded in {episodes}"),
     ]
-    return list(_run_checks(checks))
+    return [_run_check(*check) for check in checks]
 
 
 def measure_rates(connection: CellConnection) -> dict[str, float]:
@@ -90,12 +92,11 @@ def _sequences(connection: CellConnection) -> dict[str, int]:
     return counts
 
 
-def _run_checks(checks: list[tuple[str, Callable[[], str]]]) -> Iterator[CheckResult]:
-    for what, check in checks:
-        try:
-            yield CheckResult(what, True, check())
-        except (UserError, DriverError, OSError) as error:  # such as a disk that takes no file
-            yield CheckResult(what, False, "", str(error))
+def _run_check(what: str, check: Callable[[], str]) -> CheckResult:
+    try:
+        return CheckResult(what, True, check())
+    except (UserError, DriverError, OSError) as error:  # such as a disk that takes no file
+        return CheckResult(what, False, "", str(error))
 
 
 def check_client(cell: CellConfig) -> str:
@@ -156,14 +157,6 @@ def _gripper(connection: CellConnection) -> str:
         raise UserError(reading.fault)
     holds = ", it holds something" if reading.grasped else ""
     return f"{1e3 * reading.width:.0f} mm wide{holds}"
-
-
-def _nominal_rate(cell: CellConfig, key: str) -> float:
-    if key in ft.TACTILE:
-        assert cell.fingertips is not None
-        return cell.fingertips.rate or find_sensor(cell.sensor).frame_rate
-    name = key.removeprefix(ft.IMAGE_PREFIX)
-    return next(camera.rate for known, camera in cell.cameras.items() if known == name)
 
 
 def _camera(camera: Camera, rate: float, nominal: float, gripper: Gripper) -> str:

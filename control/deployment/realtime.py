@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.control.interfaces import Actor
-from touchgoal.control.motion.servo_lag import ServoLag
+from touchgoal.control.motion.tracker import ServoLag
 from touchgoal.runtime.errors import UserError
 
 _FIRST_PLAN_TIMEOUT = 20.0  # s for the first plan; it warms everything up
@@ -60,39 +60,27 @@ class ChunkPlanner(Protocol):
 class RealTimeActor(Actor):
     """Actor that answers at once from the newest plan, while a thread makes the next one.
 
-    A plan belongs to the tick of its observation and is used from the tick after it. It is asked for
-    that much earlier, so it has a whole tick to be made, and the actions do not depend on the machine's
-    speed. Action k belongs to the tick k after the observation, so a late plan makes no jump. If plans
-    run out the arm stands still. A plan no longer than its executed part is asked for when needed.
-
-    A policy has learned on an arm whose servo follows with a lag. An arm that follows at once answers
-    its corrections too soon, and in contact the two shake each other. `lag` restores that lag; joint
-    changes that it has not passed on yet count as commanded.
-
-    Attributes:
-        latencies: seconds from an observation to its plan, for every plan but the first.
-        late_plans: ticks at which the plan meant for them was not there.
-        ticks_without_plan: ticks for which no plan at all was ready.
-        action_age: s for which that has been so without a break.
-        failure: exception that ended the planning thread; `act` raises it.
+    A plan is used from the tick after its observation's, and asked for that much earlier: it has a
+    whole tick to be made, and actions do not depend on the machine's speed. Action k belongs to the
+    tick k after the observation, so a late plan makes no jump; if plans run out the arm stands
+    still. A plan no longer than its executed part is asked for when needed. An arm that follows at
+    once, unlike the servo that a policy has learned on, answers its corrections too soon: `lag`
+    restores that delay, and what it has not passed on yet counts as commanded.
     """
 
     def __init__(
         self, planner: ChunkPlanner, timeout: float | None = None, lag: ServoLag | None = None
     ) -> None:
-        """Begin an episode; `close` ends the thread.
+        """Begin an episode of the planner; `close` ends the thread.
 
-        Args:
-            planner: of this episode.
-            timeout: s to wait for a plan that should be there; None: half a tick.
-            lag: of the arm that the policy learned on; None: commands are passed on at once.
+        `timeout` is how long a plan that should be there is waited for, s; None: half a tick.
         """
         self._planner, self._config = planner, planner.config
-        self.latencies: list[float] = []
-        self.late_plans = self.ticks_without_plan = 0
+        self.latencies: list[float] = []  # s from an observation to its plan, but the first's
+        self.late_plans = self.ticks_without_plan = 0  # ticks whose own plan, or any, was not there
         self._lag = lag
         self._before: np.ndarray | None = None  # joints (rad) wanted at the last tick
-        self.failure: BaseException | None = None
+        self.failure: BaseException | None = None  # ended the planning thread; `act` raises it
         half = 0.5 / planner.config.control_hz
         self._timeout = half if timeout is None else timeout
         self._tick = self._embedded = -1
@@ -106,11 +94,7 @@ class RealTimeActor(Actor):
         self._thread = threading.Thread(target=self._work, name="planner", daemon=True)
 
     def start(self, observation: Observation) -> None:
-        """Make the first plan, which warms everything up, before the first tick.
-
-        Raises:
-            UserError: there is none in 20 s.
-        """
+        """Make the first plan, which warms everything up, at rest; UserError if none in 20 s."""
         with self._condition:
             self._history = [observation] * self._planner.history_ticks
             self._request = _Request(0, self._history, time.monotonic())

@@ -35,12 +35,7 @@ _CLOSE_SECONDS, _PROBE_SECONDS, _HOLD_SECONDS = 1.0, 3.0, 0.8  # closing, probin
 
 @dataclass(frozen=True)
 class PickPlacePoses:
-    """Places of the object and the goal in the base frame.
-
-    Attributes:
-        grasp: x, y, z (m) and yaw (rad) of the hand closing on the object.
-        goal: x, y (m) to place it at.
-    """
+    """Places, base frame: x, y, z (m) and yaw (rad) of the closing hand; x, y (m) of the goal."""
 
     grasp: tuple[float, float, float, float]
     goal: tuple[float, float]
@@ -48,36 +43,19 @@ class PickPlacePoses:
 
 @dataclass(frozen=True)
 class PlannedMove:
-    """A move along a path, or a wait, with the gripper's target width.
-
-    Attributes:
-        path: None for a wait.
-        width: of the gripper, m.
-        seconds: duration, at least the path's own.
-        until_supported: end early once the table carries the object.
-    """
+    """A move along a path, or a wait (None), with the gripper's target width (m)."""
 
     path: Trajectory | None
     width: float
-    seconds: float
-    until_supported: bool = False
+    seconds: float  # duration, at least the path's own
+    until_supported: bool = False  # end early once the table carries the object
 
 
 class ScriptedActor(Actor):
-    """Actor that walks through moves; the plan waits while the arm is held.
-
-    Attributes:
-        done: whether the last move is over.
-    """
+    """Actor that walks through moves; the plan waits while the arm is held."""
 
     def __init__(self, moves: list[PlannedMove], commanded: Callable[[], np.ndarray], hz: float):
-        """Begin the plan.
-
-        Args:
-            moves: in order; each begins where the one before ends.
-            commanded: returns the joint positions (rad) commanded now.
-            hz: ticks per second.
-        """
+        """Begin joined moves at `hz`; `commanded` returns the joints (rad) commanded now."""
         self._commanded, self._tick = commanded, 1 / hz
         self._wrench, self._measured = np.zeros(6), commanded()
         self._width, self._gripper_still = np.inf, False

@@ -1,7 +1,8 @@
-"""One deployment: start move, task, recorded episode."""
+"""One deployment: start move, task, recorded episode, report."""
 
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,11 +13,13 @@ from touchgoal.control.cell.config import CellConfig
 from touchgoal.control.cell.connection import CellConnection
 from touchgoal.control.deployment.control_loop import (
     PLAN_ENDED,
+    SLOW_ARM,
     ControlLoop,
     Ending,
     Request,
     RunLog,
     TickStatus,
+    slow_arm,
 )
 from touchgoal.control.deployment.scripted import start_move
 from touchgoal.control.features import Observation
@@ -24,6 +27,7 @@ from touchgoal.control.interfaces import Actor, DriverError
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.sensors.exchanged import Picture, cameras_exchanged
 from touchgoal.control.sensors.latest_value import LatestValue
+from touchgoal.control.tactile.light_gain import LightWatch, light_advice
 from touchgoal.runtime.errors import UserError
 
 _START_TOLERANCE = 0.02  # rad from the start pose after the start move
@@ -31,6 +35,8 @@ _CLOSE_TO_START = 0.1  # rad; nearer than that no start move is made
 _START_TIMEOUT = 60.0  # s for the start move
 _SETTLE_TIME = 2.0  # s that a simulator may take to see that the task is done
 _ASK_INTERVAL = 0.2  # s between questions to a twin
+_LIGHT_TICKS = 10  # from one look at the fingertips' light to the next
+_VERDICTS = {True: "done", False: "not done", None: "unknown whether it is done"}
 
 RecordEpisode = Callable[[dict[str, np.ndarray], str, dict[str, Any]], int]
 """Record frames (key -> (T, ...)), instruction and facts as an episode; return its index."""
@@ -40,44 +46,28 @@ Truth = Callable[[], dict[str, Any]]
 
 @dataclass(frozen=True)
 class Result:
-    """Outcome of a deployment.
+    """Outcome of a deployment."""
 
-    Attributes:
-        ending: how the run ended.
-        log: its record.
-        success: whether the task is done, by the simulator or the ending; None: unknown.
-        progress: of the task in [0, 1], by the simulator; None without one.
-        held_width: width of the object still in the hand, m; None: no object.
-        episode: index of the recorded episode; None without one.
-        recording_error: why there is none, if there should be one.
-    """
-
-    ending: Ending
-    log: RunLog
-    success: bool | None
-    progress: float | None
-    held_width: float | None
-    episode: int | None
-    recording_error: str = ""
+    ending: Ending  # how the run ended
+    log: RunLog  # its record
+    success: bool | None  # whether the task is done, by the simulator or the ending; None: unknown
+    progress: float | None  # of the task in [0, 1], by the simulator; None without one
+    held_width: float | None  # width of the object still in the hand, m; None: no object
+    episode: int | None  # index of the recorded episode; None without one
+    recording_error: str = ""  # why there is none, if there should be one
 
 
 @dataclass(frozen=True)
 class Session:
-    """Parts of a deployment.
-
-    Attributes:
-        record: saves the episode.
-        execute: False: a dry run, which records nothing.
-        make_actor: makes the actor when the arm is at its start.
-        operator_request, on_tick, cost, camera_size: see ControlLoop.
-    """
+    """Parts of a deployment."""
 
     cell: CellConfig
     connection: CellConnection
     safety: ActionFilter
-    record: RecordEpisode
-    execute: bool
-    make_actor: Callable[[ControlLoop], Actor]
+    record: RecordEpisode  # saves the episode
+    execute: bool  # False: a dry run, which records nothing
+    make_actor: Callable[[ControlLoop], Actor]  # makes the actor when the arm is at its start
+    # operator_request, on_tick, cost, camera_size: see ControlLoop
     operator_request: Callable[[], Request]
     on_tick: Callable[[TickStatus], None]
     cost: Callable[[Observation], float] | None = None
@@ -86,15 +76,17 @@ class Session:
     def run(self) -> Result:
         """Run start move, task and recording; at the end the arm rests or holds its last command.
 
-        Raises:
-            UserError, DriverError: it cannot begin; nothing has moved.
+        UserError or DriverError if it cannot begin; nothing has moved then.
         """
-        watch, log = self._success_watch(), RunLog()
+        # Scripts end by themselves; of other actors only a simulator knows when the task is done.
+        scripted = self.cell.task.policy == "expert"
+        truth = None if scripted else self.connection.truth
+        watch, log = _SuccessWatch(truth, self.cell.time_waits), RunLog()
         loop = ControlLoop(
             self.connection,
             self.safety,
             self.execute,
-            lambda: self.operator_request() or (watch.request() if watch else ""),
+            lambda: self.operator_request() or watch.request(),
             self.on_tick,
             self.cost,
             self.camera_size,
@@ -102,9 +94,8 @@ class Session:
         try:
             ending = self._move_to_start(loop) or self._run_actor(loop, log)
         finally:
-            if watch:
-                watch.close()
-        picked = self.execute and self.cell.task.policy == "expert" and ending.reason == PLAN_ENDED
+            watch.close()
+        picked = self.execute and scripted and ending.reason == PLAN_ENDED
         if picked and self._held_width() is None:  # it ends with the object in the hand
             ending = Ending(f"{PLAN_ENDED}, but the hand holds nothing", done=False)
         success = self._success(ending)
@@ -119,13 +110,6 @@ class Session:
         return Result(
             ending, log, success, self._progress(), self._held_width(), episode, recording_error
         )
-
-    def _success_watch(self) -> "_SuccessWatch | None":
-        """Scripts end by themselves; of other actors only a simulator knows when the task is done."""
-        truth = self.connection.truth
-        if truth is None or self.cell.task.policy == "expert":
-            return None
-        return _SuccessWatch(truth, self.cell.time_waits)
 
     def _move_to_start(self, loop: ControlLoop) -> Ending | None:
         """Move to the start pose; the ending if the run cannot go on from there."""
@@ -159,11 +143,8 @@ class Session:
         return {key: cameras[key].read().image for key in ft.CAMERAS if key in cameras}
 
     def _run_actor(self, loop: ControlLoop, log: RunLog) -> Ending:
-        actor = self.make_actor(loop)
-        try:
+        with closing(self.make_actor(loop)) as actor:
             return loop.run(actor, self.cell.task.seconds, log)
-        finally:
-            actor.close()
 
     def _success(self, ending: Ending) -> bool | None:
         """Return the outcome; a run that was stopped is no success, whatever the task looks like."""
@@ -209,13 +190,68 @@ class Session:
         return self.record(log.frames(), cell.task.instruction or cell.task.name, meta)
 
 
-class _SuccessWatch:
-    """Ends a run once the simulator says that the task is done."""
+def metrics(result: Result) -> dict[str, Any]:
+    """Return the numbers of a run, for metrics.json."""
+    ending, log = result.ending, result.log
+    light = LightWatch()
+    for row in log.rows[::_LIGHT_TICKS]:
+        light.update(row)
+    forces = [np.linalg.norm(row[ft.WRENCH][:3]) for row in log.rows]
+    return {
+        "reason": ending.reason,
+        "stopped": ending.stopped,
+        "advice": ending.advice,
+        "rest_seconds": ending.rest_seconds,
+        "success": result.success,
+        "progress": result.progress,
+        "held_width": result.held_width,
+        "episode": result.episode,
+        "recording_error": result.recording_error,
+        "ticks": len(log.rows),
+        "late_p99_ms": 1e3 * float(np.percentile(log.lateness or [0.0], 99)),
+        "answered_p95_ms": 1e3 * float(np.percentile(log.answer_times or [0.0], 95)),
+        "force_max_newtons": float(max(forces, default=0.0)),
+        "clamped": log.limit_counts,
+        "arm_pace": log.arm_pace,
+        "light_change": light.change,
+    }
 
-    def __init__(self, truth: Truth, time_waits: bool) -> None:
-        """Ask in every tick if the simulated time waits for it, else in a thread."""
+
+def report(result: Result, numbers: dict[str, Any], episodes: str) -> str:
+    """Return the lines for the operator; `episodes` is the folder recorded into."""
+    ending, log = result.ending, result.log
+    clamped = ", ".join(f"{name} {n}" for name, n in log.limit_counts.items()) or "never"
+    lines = [
+        f"{len(log.rows)} ticks of the control loop; 99 % began at most {numbers['late_p99_ms']:.1f} ms "
+        f"late, 95 % were answered within {numbers['answered_p95_ms']:.1f} ms",
+        f"largest force on the hand: {numbers['force_max_newtons']:.1f} N; commands limited: {clamped}",
+    ]
+    if log.arm_pace < SLOW_ARM:
+        lines.append(slow_arm(log.arm_pace))
+    if advice := light_advice([numbers["light_change"]]):
+        lines.append(advice)
+    if result.held_width is not None:
+        lines.append(f"the hand still holds something, {1e3 * result.held_width:.0f} mm wide")
+    if result.episode is not None:
+        lines.append(
+            f"episode {result.episode} is in {episodes}; its curves: touchgoal reward-curves {episodes}"
+        )
+    lines.append(str(ending) if ending.stopped else f"ended: {ending}")
+    if not ending.stopped and (result.episode is not None or result.success is not None):
+        lines.append(f"task: {_VERDICTS[result.success]}")
+    return "\n".join(lines)
+
+
+class _SuccessWatch:
+    """Ends a run once the simulator, if there is one, says that the task is done.
+
+    It is asked in every tick if the simulated time waits for it, else in a thread.
+    """
+
+    def __init__(self, truth: Truth | None, time_waits: bool) -> None:
         self._truth = truth
-        self._thread = None if time_waits else LatestValue("simulator", self._ask_now_and_then)
+        threaded = truth is not None and not time_waits
+        self._thread = LatestValue("simulator", self._ask_now_and_then) if threaded else None
 
     def request(self) -> Request:
         return self._thread.read() if self._thread else self._ask()
@@ -225,7 +261,7 @@ class _SuccessWatch:
             self._thread.close()
 
     def _ask(self) -> Request:
-        return "success" if self._truth()["success"] else ""
+        return "success" if self._truth and self._truth()["success"] else ""
 
     def _ask_now_and_then(self) -> Request:
         time.sleep(_ASK_INTERVAL)

@@ -1,15 +1,9 @@
-"""A user's own policy: a class with two methods, named `module:Class` or `path/to/file.py:Class`.
+"""A user's own policy: a class with two methods, `module:Class` or `file.py:Class`
+(docs/own_policy.md).
 
-Nothing needs to be inherited::
-
-    class MyPolicy:
-        def reset(self) -> None: ...  # an episode begins
-        def act(self, observation: dict[str, np.ndarray]) -> np.ndarray: ...
-
-`act` gets the observation of a tick (keys and units: `control/features.py`) and returns the action for
-the next one: the joint change of this tick (rad, one number a joint), then the gripper's target width
-(m). The class is made without arguments, once an episode, in the process that simulates it. An optional
-method `env_config(config)` returns the options of the environment that it needs, such as its cameras.
+The class is made without arguments, once an episode, in the process that simulates it. An optional
+method `env_config(config)` returns the options of the environment that it needs, such as its
+cameras.
 """
 
 import importlib
@@ -38,10 +32,12 @@ class Policy(Protocol):
 
     def reset(self) -> None:
         """Begin an episode."""
-        ...
 
     def act(self, observation: Observation) -> np.ndarray:
-        """Return the action for the next tick."""
+        """Return the action of the next tick: joint change (rad, one a joint), gripper's width (m).
+
+        Keys and units of the observation: `control/features.py`.
+        """
         ...
 
 
@@ -71,11 +67,7 @@ class CheckedPolicy:
         self._policy.reset()
 
     def act(self, observation: Observation) -> Float32[np.ndarray, " a"]:
-        """Return the action for the next tick.
-
-        Raises:
-            UserError: it has another shape than the robot's, or is not finite.
-        """
+        """Return the next action; UserError if not finite or not of the robot's shape."""
         answer = self._policy.act(dict(observation))
         wanted = f"{self._n_joints} joint changes (rad) and the gripper's width (m)"
         try:
@@ -102,15 +94,10 @@ class CheckedPolicy:
 
 @dataclass(frozen=True)
 class UserPolicy:
-    """Maker of a user's policy for one episode, in any process.
+    """Maker of a user's policy for one episode, in any process."""
 
-    Attributes:
-        name: `module:Class` or `file.py:Class`.
-        given: the class or an object of it; None: it is imported by its name.
-    """
-
-    name: str
-    given: Any = None
+    name: str  # `module:Class` or `file.py:Class`
+    given: Any = None  # the class or an object of it; None: it is imported by its name
 
     def __call__(self, env: Any = None) -> CheckedPolicy:
         """Make one at an episode's beginning, for the environment's robot or else an FR3."""
@@ -122,8 +109,7 @@ class UserPolicy:
     def env_config(self, config: Config) -> Config:
         """Return the environment's options as the policy's own `env_config` changes them.
 
-        Raises:
-            UserError: there is no such class, it lacks a method, or it takes arguments.
+        UserError if there is no such class, it lacks a method, or it takes arguments.
         """
         change = getattr(self._make(), "env_config", None)
         return config if change is None else change(config)

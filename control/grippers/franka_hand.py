@@ -1,5 +1,6 @@
 """Franka Hand through franky-control, in a child process; `hand_commands.py` chooses its commands."""
 
+import threading
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -7,13 +8,15 @@ from typing import TYPE_CHECKING
 from touchgoal.control.arms.client_libraries import FRANKY
 from touchgoal.control.arms.driver_process import NEVER, DriverProcess
 from touchgoal.control.grippers.hand_commands import PERIOD, SPEED, HandCommands, LastCommand
-from touchgoal.control.interfaces import DriverError, GripperReading
+from touchgoal.control.interfaces import DriverError, Gripper, GripperReading
+from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.runtime.errors import UserError
 
 if TYPE_CHECKING:
     import franky
 
 _STOP_TIMEOUT = 0.5  # s that a stop may take; 0.06 on the twin
+_PAUSE = 0.01  # s between exchanges
 _ANSWER_TIMEOUT = 1.0  # s for an answer that a twin has sent to arrive
 
 
@@ -136,3 +139,43 @@ class FrankaHand:
     def close(self) -> None:
         """See Gripper."""
         self._process.close()
+
+
+class NonBlockingGripper:
+    """Gripper over another one behind a thread: a Franka Hand takes up to 50 ms to answer."""
+
+    def __init__(self, gripper: Gripper) -> None:
+        self._gripper = gripper
+        self._wanted: float | None = None
+        self._lock, self._stopped = threading.Lock(), False
+        self._latest = LatestValue("gripper", self._take)
+
+    def read(self) -> GripperReading:
+        """See Gripper."""
+        return self._latest.read()
+
+    def command(self, width: float) -> None:
+        """See Gripper; a fault shows in the next reading."""
+        if self._stopped:
+            raise DriverError("no command is taken: the gripper was stopped")
+        self._wanted = width
+
+    def stop(self, release_to: float | None = None) -> None:
+        """See Gripper. No width that was read before is sent after it: both hold the lock."""
+        with self._lock:
+            self._stopped = True
+            self._gripper.stop(release_to)
+
+    def close(self) -> None:
+        """See Gripper."""
+        self._latest.close()
+        self._gripper.close()
+
+    def _take(self) -> GripperReading:
+        time.sleep(_PAUSE)
+        reading = self._gripper.read()
+        with self._lock:
+            wanted = None if self._stopped else self._wanted
+            if wanted is not None and not reading.fault:
+                self._gripper.command(wanted)
+        return reading

@@ -1,10 +1,9 @@
 """Commands of a Franka Hand, shared by its driver and by the environment that trains for it.
 
-The hand takes one slow command at a time, while a policy asks for a width every tick. The newest width
-is sent when the last command has ended, which takes 0.8 s at most. A width that only passes on the way
-to another, changing faster than the hand could follow, is not sent, unless that goes on. A grasp closes
-until it meets an object, whatever its width, so only closing all the way is a grasp. Any other width is
-a move; an inward move that meets an object becomes a grasp of it.
+The hand takes one slow command at a time (0.8 s at most), while a policy asks for a width every
+tick. When one has ended the newest width is sent, unless it only passes on the way to another,
+faster than the hand could follow. Only closing all the way is a grasp, which ends at an object of
+any width; an inward move that meets one becomes a grasp of it.
 """
 
 from dataclasses import dataclass
@@ -39,12 +38,9 @@ class HandCommands:
     def next(
         self, target: float, width: float, grasped: bool, last: LastCommand
     ) -> HandCommand | None:
-        """Return the command to send now, if any.
+        """Return the command to send now, if any, for the newest width asked for (m).
 
-        Args:
-            target: newest width asked for, m.
-            width, grasped: reported by the hand, m, and whether it holds an object.
-            last: state of the last command.
+        `width` (m) and `grasped` are reported by the hand; `last` is the state of the last command.
         """
         passes = self._passes(target)
         if last == "runs":

@@ -7,12 +7,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import minimalmodbus
+import numpy as np
 
-from touchgoal.control.grippers import robotiq_registers as registers
 from touchgoal.control.interfaces import DriverError, GripperReading
+from touchgoal.control.motion.tool import ROBOTIQ_2F85
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.control.sensors.serial_port import open_port
 from touchgoal.runtime.errors import UserError
+
+# Registers, as in its instruction manual (section 4); its twin has the same.
+SLAVE = 9  # Modbus address
+COMMAND, STATUS = 0x03E8, 0x07D0  # first registers written and read; 6 bytes each
+ACTIVATE, GO = 0x01, 0x08  # bits of the first command byte
+ACTIVE = 3  # status of a finished activation: bits 4 and 5 of the first status byte
+MOVING, STOPPED_OPENING, STOPPED_CLOSING, ARRIVED = range(4)  # of an object: bits 6 and 7
+SILENCE = 0x09  # a fault that is over as soon as it can be read: a second without messages
+POSITIONS = 3, 230  # counts fully open and closed, between which the stroke is linear
+SPEEDS = 0.020, ROBOTIQ_2F85.speed  # m/s for 0 to 255
+FORCES = ROBOTIQ_2F85.force  # N for 0 to 255
 
 _PERIOD = 0.02  # s between exchanges; one takes 2 to 10 ms
 _ACTIVATION = 8.0  # s that opening and closing once may take
@@ -32,20 +44,15 @@ _FAULTS = {
 
 @dataclass(frozen=True)
 class RobotiqConfig:
-    """One gripper.
+    """One gripper."""
 
-    Attributes:
-        port: such as /dev/ttyUSB0.
-        activate: activate it if it is not; it then opens and closes fully once.
-        speed, force: m/s and N.
-        widths: m between the fingertips at positions 3 and 230, between which the stroke is linear;
-            measure your own with sensors mounted.
-    """
-
-    port: str
-    activate: bool = False
+    port: str  # such as /dev/ttyUSB0
+    activate: bool = False  # activate it if it is not; it then opens and closes fully once
+    # speed, force: m/s and N
     speed: float = 0.05
     force: float = 20.0
+    # m between the fingertips at positions 3 and 230, between which the stroke is linear; measure
+    # your own with sensors mounted
     widths: tuple[float, float] = (0.085, 0.0)
 
 
@@ -55,11 +62,10 @@ class Robotiq:
     def __init__(self, config: RobotiqConfig) -> None:
         self.config = config
         self._port = open_port(config.port, 115200, timeout=0.1)
-        self._modbus = minimalmodbus.Instrument(self._port, registers.SLAVE)
+        self._modbus = minimalmodbus.Instrument(self._port, SLAVE)
         self._lock = threading.Lock()
         self._wanted: int | None = None
-        self._stopped = False
-        self._misses = 0
+        self._stopped, self._misses = False, 0
         try:
             self._start()
         except Exception:
@@ -86,7 +92,7 @@ class Robotiq:
             self._stopped = True
             self._wanted = None if release_to is None else self._position(release_to)
             if self._wanted is None:
-                self._write(bytes([registers.ACTIVATE, 0, 0, 0, 0, 0]))
+                self._write(bytes([ACTIVATE, 0, 0, 0, 0, 0]))
 
     def close(self) -> None:
         """See Gripper."""
@@ -95,14 +101,11 @@ class Robotiq:
 
     def _position(self, width: float) -> int:
         """Return a width (m) in counts."""
-        opened, closed = self.config.widths
-        share = min(max((opened - width) / (opened - closed), 0.0), 1.0)
-        first, last = registers.POSITIONS
-        return round(first + share * (last - first))
+        return round(float(np.interp(width, self.config.widths[::-1], POSITIONS[::-1])))
 
     def _start(self) -> None:
         """Require an active gripper, or activate it if that is allowed."""
-        if self._status()[0] >> 4 & 3 == registers.ACTIVE:
+        if self._status()[0] >> 4 & 3 == ACTIVE:
             return
         if not self.config.activate:
             raise UserError(
@@ -110,9 +113,9 @@ class Robotiq:
                 "and closes fully"
             )
         self._write(bytes(6))
-        self._write(bytes([registers.ACTIVATE, 0, 0, 0, 0, 0]))
+        self._write(bytes([ACTIVATE, 0, 0, 0, 0, 0]))
         end = time.monotonic() + _ACTIVATION
-        while self._status()[0] >> 4 & 3 != registers.ACTIVE:
+        while self._status()[0] >> 4 & 3 != ACTIVE:
             if time.monotonic() > end:
                 raise DriverError(
                     "the gripper does not become active: clear its fingers, cycle power"
@@ -122,12 +125,12 @@ class Robotiq:
     def _status(self) -> bytes:
         """Return the six bytes of its status."""
         read = self._modbus.read_registers
-        return struct.pack(">3H", *_exchange(lambda: read(registers.STATUS, 3, functioncode=4)))
+        return struct.pack(">3H", *_exchange(lambda: read(STATUS, 3, functioncode=4)))
 
     def _write(self, command: bytes) -> None:
         """Write the six bytes of a command."""
         values = list(struct.unpack(">3H", command))
-        _exchange(lambda: self._modbus.write_registers(registers.COMMAND, values))
+        _exchange(lambda: self._modbus.write_registers(COMMAND, values))
 
     def _take(self) -> GripperReading | None:
         time.sleep(_PERIOD)
@@ -141,17 +144,11 @@ class Robotiq:
                 raise
             return None
         self._misses = 0
-        first, last = self.config.widths
-        share = (status[4] - registers.POSITIONS[0]) / (
-            registers.POSITIONS[1] - registers.POSITIONS[0]
-        )
         code = status[2] & 0x0F
         return GripperReading(
-            width=first + min(max(share, 0.0), 1.0) * (last - first),
-            grasped=status[0] >> 6 in (registers.STOPPED_OPENING, registers.STOPPED_CLOSING),
-            fault=_FAULTS.get(code, f"fault {code:#04x}")
-            if code not in (0, registers.SILENCE)
-            else "",
+            width=float(np.interp(status[4], POSITIONS, self.config.widths)),
+            grasped=status[0] >> 6 in (STOPPED_OPENING, STOPPED_CLOSING),
+            fault=_FAULTS.get(code, f"fault {code:#04x}") if code not in (0, SILENCE) else "",
             stamp=time.monotonic(),
         )
 
@@ -159,16 +156,23 @@ class Robotiq:
         """Repeat the command: after a second of silence the gripper reports a fault."""
         if self._wanted is None:
             return
-        speed = registers.to_count(self.config.speed, registers.SPEEDS)
-        force = registers.to_count(self.config.force, registers.FORCES)
-        self._write(bytes([registers.ACTIVATE | registers.GO, 0, 0, self._wanted, speed, force]))
+        speed = to_count(self.config.speed, SPEEDS)
+        force = to_count(self.config.force, FORCES)
+        self._write(bytes([ACTIVATE | GO, 0, 0, self._wanted, speed, force]))
+
+
+def to_count(value: float, span: tuple[float, float]) -> int:
+    """Return the byte (0 to 255) for a value, clipped to the span."""
+    return round(float(np.interp(value, span, (0, 255))))
+
+
+def from_count(count: int, span: tuple[float, float]) -> float:
+    """Return the value of a byte (0 to 255)."""
+    return span[0] + (span[1] - span[0]) * count / 255
 
 
 def _exchange(call: Callable[[], list[int] | None]) -> list[int]:
-    """Return the answer to a request; a missing or garbled one raises DriverError.
-
-    An unplugged port raises serial.SerialException.
-    """
+    """Return the answer to a request; DriverError if it is missing or garbled."""
     try:
         return call() or []
     except minimalmodbus.NoResponseError as error:

@@ -60,33 +60,16 @@ class JointLimits:
 
 @dataclass(frozen=True)
 class ArmModel:
-    """A serial arm whose joints each turn about their own z axis.
+    """A serial arm whose joints each turn about their own z axis."""
 
-    Attributes:
-        name: for messages.
-        links: origin (m) and rotation about x (rad) of each joint's frame in the one before it.
-        flange_offset: m from the last joint to the flange, along its z axis.
-        hand_yaw: rad by which a hand is turned on the flange.
-        limits: the maker's; beyond them the controller stops the arm.
-        home: joint positions (rad) over the table with the fingers down, elbow where people expect it.
-    """
-
-    name: str
+    name: str  # for messages
+    # origin (m) and rotation about x (rad) of each joint's frame in the one before it
     links: tuple[tuple[tuple[float, float, float], float], ...]
-    flange_offset: float
-    hand_yaw: float
-    limits: JointLimits
+    flange_offset: float  # m from the last joint to the flange, along its z axis
+    hand_yaw: float  # rad by which a hand is turned on the flange
+    limits: JointLimits  # the maker's; beyond them the controller stops the arm
+    # joint positions (rad) over the table with the fingers down, elbow where people expect it
     home: Joints
-
-    @property
-    def lower(self) -> Joints:
-        """Least joint positions, rad."""
-        return self.limits.lower
-
-    @property
-    def upper(self) -> Joints:
-        """Greatest joint positions, rad."""
-        return self.limits.upper
 
 
 FR3_ARM = ArmModel(

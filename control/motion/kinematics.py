@@ -11,9 +11,9 @@ import casadi
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.control.motion.arm_models import FR3_ARM, UR5E_ARM, ArmModel, Joints
+from touchgoal.control.motion.arm_models import FR3_ARM, ArmModel, Joints
 from touchgoal.control.motion.rotations import Matrix3, Vector3
-from touchgoal.control.motion.tool import FRANKA_HAND, ROBOTIQ_2F85
+from touchgoal.control.motion.tool import FRANKA_HAND
 from touchgoal.runtime.errors import UserError
 
 # m^2: makes steps finite at a singularity. The squared error is added to it, so that a step from afar
@@ -57,11 +57,10 @@ def _chain(arm: ArmModel, tcp_offset: float) -> casadi.Function:
 
 
 def _step(arm: ArmModel, tcp_offset: float) -> casadi.Function:
-    """Return the CasADi function of one step of damped least squares, for `solve_ik_near`.
+    """Return the CasADi function of one step of damped least squares; one call takes 6 us.
 
     (q, target position and rotation by rows (12), posture, free, held) -> change of q, pose error
-    of q (6: m, rad). Joints where `free` is 0 change by `held` (rad), the others do the rest. One
-    function makes a step one call of 6 us.
+    of q (6: m, rad). Joints where `free` is 0 change by `held` (rad), the others do the rest.
     """
     n = len(arm.links)
     q, target, posture, free, held = (
@@ -125,7 +124,8 @@ class Kinematics:
         self._step = _step(arm, tcp_offset)
         rng = np.random.default_rng(0)
         size = (_RESTARTS, arm.home.size)
-        self._postures = rng.uniform(arm.lower + _MARGIN, arm.upper - _MARGIN, size)
+        reach = arm.limits.with_margin(_MARGIN)
+        self._postures = rng.uniform(reach.lower, reach.upper, size)
 
     def forward(self, q: Joints) -> tuple[Vector3, Matrix3]:
         """Return the TCP position (m) and rotation in the base frame."""
@@ -137,26 +137,20 @@ class Kinematics:
         return self._chain(q)[2].full()
 
     def joint_change(self, q: Joints, change: Float[np.ndarray, "6"]) -> Joints:
-        """Return the least joint change (rad) for a small displacement (m) and turn (rad) of the TCP.
+        """Return the least joint change (rad) for a small shift (m) and turn (rad) of the TCP.
 
         Base frame; damped at singularities.
         """
         J = self.jacobian(q)
         return J.T @ np.linalg.solve(J @ J.T + DAMPING * np.eye(6), change)
 
-    def jacobians(
-        self, q: Float[np.ndarray, "b n"]
-    ) -> tuple[Float[np.ndarray, "b 6 n"], Float[np.ndarray, "b 3 3"]]:
-        """Return `jacobian` for many joint positions, and the TCP's rotations there."""
-        _, R, J = (side_by_side.full() for side_by_side in self._chain.map(len(q))(q.T))
-        return J.reshape(6, *q.shape).transpose(1, 0, 2), R.reshape(3, len(q), 3).transpose(1, 0, 2)
-
     def forward_many(
         self, q: Float[np.ndarray, "b n"]
-    ) -> tuple[Float[np.ndarray, "b 3"], Float[np.ndarray, "b 3 3"]]:
-        """Return `forward` for many joint positions."""
-        position, R, _ = (side_by_side.full() for side_by_side in self._chain.map(len(q))(q.T))
-        return position.T, R.reshape(3, len(q), 3).transpose(1, 0, 2)
+    ) -> tuple[Float[np.ndarray, "b 3"], Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 6 n"]]:
+        """Return `forward` and `jacobian` for many joint positions."""
+        p, R, J = (side_by_side.full() for side_by_side in self._chain.map(len(q))(q.T))
+        blocks = J.reshape(6, *q.shape).transpose(1, 0, 2)
+        return p.T, R.reshape(3, len(q), 3).transpose(1, 0, 2), blocks
 
     def solve_ik_near(
         self,
@@ -169,12 +163,13 @@ class Kinematics:
     ) -> IkSolution:
         """Solve by damped least squares from `start`, near which the solution lies.
 
-        A joint that would leave its range is held at its end, and the others do the rest. An arm with
-        more than six joints is drawn to its home by `posture` (a share of the way a step), so that the
-        elbow stays where a person expects it; 0 moves the joints least. It stops within `tolerance` m
-        and ten times that in rad, or after the last iteration.
+        A joint that would leave its range is held at its end, and the others do the rest. An arm
+        with more than six joints is drawn to its home by `posture` (a share of the way a step), so
+        that the elbow stays where a person expects it; 0 moves the joints least. It stops within
+        `tolerance` m and ten times that in rad, or after the last iteration.
         """
-        lower, upper = self.arm.lower + _MARGIN, self.arm.upper - _MARGIN
+        reach = self.arm.limits.with_margin(_MARGIN)
+        lower, upper = reach.lower, reach.upper
         q, target = np.array(start, dtype=np.float64), np.concatenate([position, rotation.ravel()])
         change, held = np.empty(q.size), np.zeros(q.size)
         free, pull, error = np.ones(q.size), np.empty(1), np.full(6, np.inf)
@@ -183,7 +178,7 @@ class Kinematics:
         inputs, results = (
             (q, target, pull, free, held),
             (change, error),
-        )  # referenced: the buffer points to them
+        )  # the buffer points to them
         for i, value in enumerate(inputs):
             buffer.set_arg(i, value.data)  # pyright: ignore[reportCallIssue]
         for i, value in enumerate(results):
@@ -224,10 +219,10 @@ class Kinematics:
     def points_on_links(
         self, points: Float[np.ndarray, "k 3"], frames: Sequence[int] | None = None
     ) -> casadi.Function:
-        """Return the CasADi function of joint positions (n, m) -> points (m) fixed to parts of the arm.
+        """Return the CasADi function of joints (n, m) -> points (m) fixed to parts of the arm.
 
-        `frames` names the part and frame of each point: 0 the base, i the link behind joint i, n + 1
-        the hand; None: all on the hand. The result (3, m k) has the k points of the first column
+        `frames` names the part and frame of each point: 0 the base, i the link behind joint i, n +
+        1 the hand; None: all on the hand. The result (3, m k) has the k points of the first column
         first, in the base frame.
         """
         q = casadi.SX.sym("q", self.arm.home.size)
@@ -245,10 +240,3 @@ class Fr3Kinematics(Kinematics):
 
     def __init__(self, tcp_offset: float = FRANKA_HAND.tcp_offset) -> None:
         super().__init__(FR3_ARM, tcp_offset)
-
-
-class Ur5eKinematics(Kinematics):
-    """The UR5e with a Robotiq 2F-85."""
-
-    def __init__(self, tcp_offset: float = ROBOTIQ_2F85.tcp_offset) -> None:
-        super().__init__(UR5E_ARM, tcp_offset)

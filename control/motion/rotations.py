@@ -38,9 +38,9 @@ def fingers_down(yaw: float) -> Matrix3:
 
 
 def fingers_across(direction: Vector3) -> Matrix3:
-    """Return the TCP rotation in the base frame: x along a direction, approach as steep as possible.
+    """Return the TCP rotation, base frame: x along a direction, approach as steep as possible.
 
-    The fingers then close across the direction. It must not be vertical.
+    The fingers then close across the direction, which must not be vertical.
     """
     x = direction / np.linalg.norm(direction)
     z = np.array([0.0, 0.0, -1.0]) + x[2] * x

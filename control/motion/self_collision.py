@@ -91,16 +91,10 @@ class SelfDistance:
 
     def gap(self, q: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " k"]:
         """Return the least distance (m) between parts for each posture; negative where they overlap."""
-        return self.gaps(q).min(axis=1)
-
-    def gaps(self, q: Float[np.ndarray, "k n"]) -> Float[np.ndarray, "k pairs"]:
-        """Return the distance (m) between the two parts of every pair, for each posture."""
         ends = self._ends(q.T).full().T.reshape(len(q), -1, 2, 3)
         first, second = ends[:, self._first], ends[:, self._second]
-        apart = segment_distance(
-            first[..., 0, :], first[..., 1, :], second[..., 0, :], second[..., 1, :]
-        )
-        return apart - self._radii
+        apart = segment_distance(*np.moveaxis(first, -2, 0), *np.moveaxis(second, -2, 0))
+        return (apart - self._radii).min(axis=1)
 
 
 def require_no_self_collision(

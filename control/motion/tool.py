@@ -11,27 +11,18 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Tool:
-    """A gripper with its sensors.
+    """A gripper with its sensors."""
 
-    Attributes:
-        name: for messages.
-        tcp_offset: m from the flange to the tool centre point, midway between the two gels' centres,
-            along the hand's z axis.
-        stroke: m, least and greatest width between the gels.
-        speed: m/s of width, the gripper's fastest.
-        force: N, least and greatest grasp force that can be set.
-        mass: kg, beyond the flange; the sensors' is unpublished and not included.
-        centre_of_mass: m, hand frame.
-        finger_corners: m, hand frame: corners of a box around the fingertips, fully open.
-    """
-
-    name: str
+    name: str  # for messages
+    # m from the flange to the tool centre point, midway between the two gels' centres, along the
+    # hand's z axis
     tcp_offset: float
-    stroke: tuple[float, float]
-    speed: float
-    force: tuple[float, float]
-    mass: float
-    centre_of_mass: Point
+    stroke: tuple[float, float]  # m, least and greatest width between the gels
+    speed: float  # m/s of width, the gripper's fastest
+    force: tuple[float, float]  # N, least and greatest grasp force that can be set
+    mass: float  # kg, beyond the flange; the sensors' is unpublished and not included
+    centre_of_mass: Point  # m, hand frame
+    # m, hand frame: corners of a box around the fingertips, fully open
     finger_corners: tuple[Point, ...]
 
 

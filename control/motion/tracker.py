@@ -1,9 +1,10 @@
-"""From a policy's 10 to 20 Hz to a 1 kHz interface: smooth, inside all limits, near the checked path.
+"""From a policy's 10 to 20 Hz to a 1 kHz interface: smooth, inside all limits, near the checked
+path.
 
-A reference walks in straight lines from target to target, each within the policy's period; the command
-is its mean over a short window. A mean stays in the range of its values and delays all joints alike, so
-the arm stays near the path that the safety layer has checked; it cuts corners, see `touchgoal benchmark
-sent-stream`. Where the reference would turn faster than the limits allow, it walks slower along its path.
+A reference walks in straight lines from target to target, each within the policy's period, or
+slower where it would turn faster than the limits allow. The command is its mean over a short
+window, which keeps its range and delays all joints alike: it cuts corners (`touchgoal benchmark
+sent-stream`), near the path that the safety layer has checked.
 """
 
 from dataclasses import dataclass, replace
@@ -14,9 +15,11 @@ from jaxtyping import Float
 from numba import njit
 
 from touchgoal.control.motion.arm_models import JointLimits
+from touchgoal.control.safety.limits import RobotLimits
 
 Joints = Float[np.ndarray, "n"]
 
+SERVO_DAMPING = 0.1  # s: N m s/rad for each N m/rad of stiffness, as in Franka's fr3.xml
 _RESERVE = 1.1  # times the targets' pace that the reference may reach, to make up for late ones
 _ROUNDING = 1e-12  # rad
 _MOST = 8  # targets on the way; more come from a clock that is not the policy's, and are cut short
@@ -24,29 +27,22 @@ _MOST = 8  # targets on the way; more come from a clock that is not the policy's
 
 @dataclass(frozen=True)
 class TrackerState:
-    """One millisecond of the tracker.
+    """One millisecond of the tracker."""
 
-    Attributes:
-        q: commanded joint positions, rad.
-        targets: of the reference, the next one first, rad.
-        step: of the reference in a millisecond at the targets' pace, rad.
-        window: the reference's last positions, oldest first, rad.
-    """
-
-    q: Joints
+    q: Joints  # commanded joint positions, rad
+    # targets, step: of the reference, the next first, and in a millisecond at the targets' pace,
+    # rad
     targets: Float[np.ndarray, "k n"]
     step: Joints
-    window: Float[np.ndarray, "m n"]
+    window: Float[np.ndarray, "m n"]  # the reference's last positions, oldest first, rad
 
 
 class Tracker:
     """Tracker inside `limits` for targets every `period` s; `dt` s is the interface's tick.
 
     Give it `RobotLimits.interface`, and as `speed` (rad/s) the highest of the targets,
-    `RobotLimits.policy`'s; beyond a tenth above it the reference falls behind.
-
-    Attributes:
-        lag: of the command behind the reference, s.
+    `RobotLimits.policy`'s; beyond a tenth above it the reference falls behind. `lag` is that of the
+    command behind the reference, s.
     """
 
     def __init__(self, limits: JointLimits, speed: Joints, period: float, dt: float = 1e-3) -> None:
@@ -69,9 +65,9 @@ class Tracker:
         return TrackerState(q, np.empty((0, q.size)), np.zeros(q.size), window)
 
     def set_target(self, state: TrackerState, target: Joints) -> TrackerState:
-        """Add a target (rad) from the policy, clamped to the limits; NaN is left out.
+        """Add a target (rad) one period after the last, or as soon after as the limits allow.
 
-        It is reached one period after the last one, or as soon after as the limits allow.
+        It is clamped to the limits; NaN is left out.
         """
         if not np.isfinite(target).all():
             return state
@@ -85,18 +81,27 @@ class Tracker:
 
     def step(self, state: TrackerState) -> TrackerState:
         """Return the state after one tick of the interface; its `q` is the command."""
-        return TrackerState(
-            *_step(
-                state.targets,
-                state.step,
-                state.window,
-                self._weights,
-                self._m,
-                self._reach,
-                self._fastest,
-                self._ticks,
-            )
-        )
+        fixed = self._weights, self._m, self._reach, self._fastest, self._ticks
+        return TrackerState(*_step(state.targets, state.step, state.window, *fixed))
+
+
+class ServoLag:
+    """Delay of the simulated servo that policies learn on, less the tracker's own.
+
+    `remaining` is the joint change asked for and not yet passed on, rad.
+    """
+
+    def __init__(self, robot: RobotLimits, dt: float) -> None:
+        tracker = Tracker(robot.interface, robot.policy.velocity, dt)
+        self._share = 1 - float(np.exp(-dt / (SERVO_DAMPING - tracker.lag)))
+        self.remaining = np.zeros(robot.arm.home.size)
+
+    def update(self, delta: Joints) -> Joints:
+        """Add this tick's joint change (rad) and return the part (rad) to command now."""
+        self.remaining = self.remaining + delta
+        step = self._share * self.remaining
+        self.remaining = self.remaining - step
+        return step
 
 
 @njit(cache=True)

@@ -14,12 +14,7 @@ from numpy.polynomial import chebyshev
 
 from touchgoal.control.motion.arm_models import JointLimits, Joints
 from touchgoal.control.motion.kinematics import Kinematics
-from touchgoal.control.motion.rotations import (
-    Matrix3,
-    Vector3,
-    rotation_matrix,
-    rotation_vector,
-)
+from touchgoal.control.motion.rotations import Matrix3, Vector3, rotation_matrix, rotation_vector
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.runtime.errors import UserError
 
@@ -39,9 +34,8 @@ Times = Float[np.ndarray, " k"]
 class Timing:
     """Share of a path walked over time, in pieces of constant jerk.
 
-    Attributes:
-        starts: of the pieces, then the end, s.
-        rates: share, speed, acceleration and jerk at these, per s^0 to s^3.
+    `starts` are of the pieces, then the end, s; `rates` are share, speed, acceleration and jerk
+    there, per s^0 to s^3.
     """
 
     starts: Float[np.ndarray, " m"]
@@ -69,11 +63,6 @@ class Timing:
         """From rest to rest, s."""
         return float(self.starts[-1])
 
-    @property
-    def corners(self) -> Times:
-        """Times (s) at which the jerk changes, and the moments before."""
-        return np.concatenate([self.starts, self.starts - 1e-9])
-
     def derivatives(self, t: Times) -> tuple[Times, Times, Times, Times]:
         """Return the share of the path and its first three derivatives at times `t` (s)."""
         piece = np.clip(np.searchsorted(self.starts, t, "right") - 1, 0, self.starts.size - 1)
@@ -92,11 +81,9 @@ class Timing:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Joint positions over time.
+    """Joint positions over time: `timing` of the walk along a path of Chebyshev polynomials.
 
-    Attributes:
-        coefficients: of the Chebyshev polynomials over the path, whose ends are -1 and 1; rad.
-        timing: of the walk along the path.
+    Their `coefficients` are in rad; the path's ends are -1 and 1.
     """
 
     coefficients: Float[np.ndarray, "d n"]
@@ -119,19 +106,12 @@ class Trajectory:
 
 
 def joint_move(start: Joints, goal: Joints, limits: JointLimits) -> Trajectory:
-    """Return the move straight in joint space, all joints together, at rest at both ends.
-
-    UserError if an end is outside the limits' range.
-    """
+    """Return all joints' straight move, rest to rest; UserError if an end is out of range."""
     return _timed(np.stack([start + goal, goal - start]) / 2, limits)
 
 
 def straight_line(
-    kinematics: Kinematics,
-    start: Joints,
-    position: Vector3,
-    rotation: Matrix3,
-    limits: JointLimits,
+    kinematics: Kinematics, start: Joints, position: Vector3, rotation: Matrix3, limits: JointLimits
 ) -> Trajectory:
     """Return the TCP's straight line from `start` to a pose in the base frame, turning evenly.
 
@@ -226,7 +206,9 @@ def _excess(coefficients: Float[np.ndarray, "d n"], timing: Timing, limits: Join
 
     Speed, acceleration and jerk fall with the duration to the power of -1, -2 and -3.
     """
-    t = np.append(np.linspace(0, timing.duration, _SAMPLES), timing.corners)
+    # Also where the jerk changes, and the moments before.
+    corners = timing.starts, timing.starts - 1e-9
+    t = np.concatenate([np.linspace(0, timing.duration, _SAMPLES), *corners])
     s, *rates = timing.derivatives(t)
     s1, s2, s3 = (rate[:, None] for rate in rates)
     q, q1, q2, q3 = (_path(coefficients, s, order) for order in range(4))

@@ -5,6 +5,7 @@ braking stops inside every limit. A tick takes the policy's command only as far 
 of the next one; otherwise it brakes along the path already checked.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -12,11 +13,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from touchgoal.control.motion.kinematics import Kinematics
-from touchgoal.control.safety.braking import braked_velocity, max_stoppable_speed
-from touchgoal.control.safety.limits import RobotLimits
+from touchgoal.control.safety.limits import RobotLimits, braked_velocity, max_stoppable_speed
 from touchgoal.runtime.errors import UserError
 
 Joints = Float[np.ndarray, "n"]
+Allows = Callable[[Joints, Float[np.ndarray, "c n"]], Bool[np.ndarray, " c"]]
 
 
 class Mode(StrEnum):
@@ -57,7 +58,6 @@ class Fault:
     ceiling: float
 
     def __str__(self) -> str:
-        """Return the message for the operator."""
         if self.limit == Limit.NOT_A_NUMBER:
             return f"the policy's action was not a number for {self.value:.2f} s"
         if np.isnan(self.value):
@@ -90,47 +90,31 @@ class Watchdogs:
 
 @dataclass(frozen=True)
 class Measurements:
-    """Measurements of one tick.
+    """Measurements of one tick."""
 
-    Attributes:
-        q: measured joint positions, rad.
-        force: external force on the TCP, N.
-        torque: external torque in each joint, Nm.
-        indentation: depth in each fingertip's gel, m.
-        observation_age, action_age, state_age, gripper_age: age of the oldest of each, s.
-        load: change of the load cell's force since the start, N; 0 without one.
-    """
-
-    q: Joints
-    force: Float[np.ndarray, "3"]
-    torque: Joints
-    indentation: Float[np.ndarray, "2"]
+    q: Joints  # measured joint positions, rad
+    force: Float[np.ndarray, "3"]  # external force on the TCP, N
+    torque: Joints  # external torque in each joint, Nm
+    indentation: Float[np.ndarray, "2"]  # depth in each fingertip's gel, m
+    # Age of the oldest of each, s.
     observation_age: float
     action_age: float
     state_age: float
     gripper_age: float
-    load: float = 0.0
+    load: float = 0.0  # change of the load cell's force since the start, N; 0 without one
 
 
 @dataclass(frozen=True)
 class SafetyState:
-    """Safe command of a tick, from which the next one continues.
+    """Safe command of a tick, from which the next one continues."""
 
-    Attributes:
-        q: commanded joint positions, rad.
-        velocity: of the command, rad/s.
-        mode: see Mode.
-        active_limits: limits that changed the command this tick.
-        fault: the first fault; it stays.
-        bad_actions: ticks since the last action of finite numbers.
-    """
-
+    # Commanded joint positions, rad, and their velocity, rad/s.
     q: Joints
     velocity: Joints
     mode: Mode = Mode.HOLD
-    active_limits: tuple[Limit, ...] = ()
-    fault: Fault | None = None
-    bad_actions: int = 0
+    active_limits: tuple[Limit, ...] = ()  # limits that changed the command this tick
+    fault: Fault | None = None  # the first fault; it stays
+    bad_actions: int = 0  # ticks since the last action of finite numbers
 
 
 # Shares of the way from braking to the wanted command that are tried where that is too much.
@@ -139,22 +123,15 @@ _ROUNDING = 1e-12  # rad/s; a smaller change is no clamp
 
 
 class ActionFilter:
-    """The limits of one robot at one control rate (Hz).
-
-    Attributes:
-        limits: of the robot.
-        joints: limits of a policy's joint commands.
-        dt: s, of a control tick.
-        watchdogs: deadlines.
-        fingertips: box for the commanded corners of the fingertips, base frame.
-    """
+    """The limits of one robot at one control rate (Hz)."""
 
     def __init__(self, limits: RobotLimits, hz: float, watchdogs: Watchdogs | None = None) -> None:
-        self.limits, self.joints, self.dt = limits, limits.policy, 1 / hz
+        self.limits, self.joints = limits, limits.policy
+        self.dt = 1 / hz  # s, of a control tick
         self.watchdogs = watchdogs or Watchdogs()
         edges = np.array(((0.0, 0.0, 0.0), *limits.tool.finger_corners))
         self._flange = limits.flange.shrunk(limits.reserve)
-        self.fingertips = limits.fingertips.shrunk(limits.reserve)
+        self.fingertips = limits.fingertips.shrunk(limits.reserve)  # for their corners, base frame
         self._points = Kinematics(limits.arm, 0.0).points_on_links(edges)
         unit = self.joints.acceleration * self.dt
         self._braking_ticks = int(np.ceil(self.joints.velocity / unit).max()) + 1
@@ -196,8 +173,8 @@ class ActionFilter:
     def filter_width(self, state: SafetyState, target: float, last: float) -> float:
         """Return the gripper width (m) to command in the tick that led to `state`.
 
-        It is the target inside the stroke. While the arm holds or is stopped, and for a target that is
-        not finite, it is the last command: no object is dropped or squeezed then.
+        It is the target inside the stroke. While the arm holds or is stopped, and for a target that
+        is not finite, it is the last command: no object is dropped or squeezed then.
         """
         if state.mode is not Mode.MOVE or not np.isfinite(target):
             return last
@@ -276,10 +253,10 @@ class ActionFilter:
         velocity = clamp(
             velocity, state.velocity - reach, state.velocity + reach, Limit.ACCELERATION
         )
-        slower = self._slowed(state, velocity)
+        slower = self._as_much(state, velocity, self._slow_enough)
         if slower is not velocity:
             active_limits.append(Limit.TIP_SPEED)
-        safe = self._into_workspace(state, slower)
+        safe = self._as_much(state, slower, self._stops_inside)
         if safe is not slower:
             active_limits.append(Limit.WORKSPACE)
         q = state.q + safe * dt
@@ -287,33 +264,25 @@ class ActionFilter:
             state, q=q, velocity=safe, mode=Mode.MOVE, active_limits=tuple(active_limits)
         )
 
-    def _slowed(self, state: SafetyState, wanted: Joints) -> Joints:
-        """Return as much of the wanted velocity, beyond braking, as keeps the fingertips slow enough."""
-        if self.tip_speed(state.q, wanted[None])[0] <= self.limits.tip_speed:
+    def _as_much(self, state: SafetyState, wanted: Joints, allows: Allows) -> Joints:
+        """Return as much of the wanted velocity, beyond braking, as is allowed; at least braking."""
+        if allows(state.q, wanted[None])[0]:
             return wanted
         rest = braked_velocity(state.velocity, self.joints.acceleration, self.dt)
         tries = rest + _SHARES[:, None] * (wanted - rest)
-        slow = np.flatnonzero(self.tip_speed(state.q, tries) <= self.limits.tip_speed)
-        return tries[slow[0]] if slow.size else rest
-
-    def _into_workspace(self, state: SafetyState, wanted: Joints) -> Joints:
-        """Return as much of the wanted velocity as lets braking end inside the boxes.
-
-        Braking alone is the path checked a tick ago, computed by the same operations in the same
-        order, hence inside to the last bit. Postures between two ticks are not checked: the joints
-        move by less than 0.03 rad, and a point leaves the chord by less than 0.1 mm.
-        """
-        if self._stops_inside(state.q, wanted[None])[0]:
-            return wanted
-        rest = braked_velocity(state.velocity, self.joints.acceleration, self.dt)
-        tries = rest + _SHARES[:, None] * (wanted - rest)
-        good = np.flatnonzero(self._stops_inside(state.q, tries))
+        good = np.flatnonzero(allows(state.q, tries))
         return tries[good[0]] if good.size else rest
+
+    def _slow_enough(self, q: Joints, velocity: Float[np.ndarray, "c n"]) -> Bool[np.ndarray, " c"]:
+        return self.tip_speed(q, velocity) <= self.limits.tip_speed
 
     def _stops_inside(
         self, q: Joints, velocity: Float[np.ndarray, "c n"]
     ) -> Bool[np.ndarray, " c"]:
         """Return, for each candidate velocity, whether this tick and the braking after it stay inside."""
+        # Braking alone is the path checked a tick ago, computed by the same operations in the same
+        # order, hence inside to the last bit. Postures between two ticks are not checked: the joints
+        # move by less than 0.03 rad, and a point leaves the chord by less than 0.1 mm.
         path = [q + velocity * self.dt]
         for _ in range(self._braking_ticks):
             velocity = braked_velocity(velocity, self.joints.acceleration, self.dt)

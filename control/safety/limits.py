@@ -9,6 +9,9 @@ from touchgoal.control.motion.arm_models import FR3_ARM, UR5E_ARM, ArmModel, Joi
 from touchgoal.control.motion.rotations import Vector3
 from touchgoal.control.motion.tool import FRANKA_HAND, ROBOTIQ_2F85, Tool
 
+Speeds = Float[np.ndarray, "*k joints"]
+PerJoint = Float[np.ndarray, " joints"]
+
 
 @dataclass(frozen=True)
 class Box:
@@ -28,36 +31,27 @@ class Box:
 
 @dataclass(frozen=True)
 class RobotLimits:
-    """One arm with its tool on its table.
+    """One arm with its tool on its table."""
 
-    Attributes:
-        arm: geometry and the maker's limits.
-        tool: gripper and fingertips.
-        velocity_share, acceleration_share: shares of the maker's limits that a policy may use.
-        margin: distance from the ends of the joints' ranges, rad.
-        max_step: rad, largest joint change in one control tick.
-        tracking: rad between commanded and measured joints that mean a blocked or lost arm.
-        flange, fingertips: boxes for the flange and for the corners of the fingertips.
-        reserve: m by which commands stay inside these boxes, because the 1 kHz stream cuts the corners
-            of their path.
-        tip_speed: m/s, of the flange and of each of those corners.
-        force, torque: external force at the TCP (N) and torque in a joint (Nm) that stop the arm.
-        indentation: depth (m) in a gel that stops the arm (`control.tactile.indentation`).
-    """
-
-    arm: ArmModel
-    tool: Tool
+    arm: ArmModel  # geometry and the maker's limits
+    tool: Tool  # gripper and fingertips
+    # Boxes for the flange and for the corners of the fingertips.
     flange: Box
     fingertips: Box
+    # Shares of the maker's limits that a policy may use.
     velocity_share: float = 0.2
     acceleration_share: float = 0.5
-    margin: float = 0.1
-    max_step: float = 0.05
+    margin: float = 0.1  # distance from the ends of the joints' ranges, rad
+    max_step: float = 0.05  # rad, largest joint change in one control tick
+    # rad between commanded and measured joints that mean a blocked or lost arm
     tracking: float = 0.2
-    tip_speed: float = 0.5
+    tip_speed: float = 0.5  # m/s, of the flange and of each corner of the fingertips
+    # m by which commands stay inside the boxes: the 1 kHz stream cuts the corners of their path
     reserve: float = 0.6e-3
+    # External force at the TCP (N) and torque in a joint (Nm) that stop the arm.
     force: float = 15.0
     torque: float = 10.0
+    # depth (m) in a gel that stops the arm (`control.tactile.indentation`)
     indentation: float = 1.5e-3
 
     @property
@@ -96,3 +90,64 @@ _FINGERTIPS = Box(np.array([0.15, -0.5, 0.005]), np.array([0.8, 0.5, 0.75]))
 
 FR3 = RobotLimits(FR3_ARM, FRANKA_HAND, _FLANGE, _FINGERTIPS)
 UR5E = RobotLimits(UR5E_ARM, ROBOTIQ_2F85, _FLANGE, _FINGERTIPS)
+
+
+# Force ceilings of a task lie above what its demonstrations reach, below the arm's reflex.
+_CEILING_MARGIN = 1.5  # by which a ceiling lies above what demonstrations reach
+_MOST = 28.0  # N: the arm is stopped before it stops itself, an FR3 at 30 N (`arms/franka.py`)
+_LEVER = 0.6  # m: farthest that a hand over the table is from the axis of a joint that lifts it
+
+
+@dataclass(frozen=True)
+class TaskForces:
+    """Peaks over a task's successful demonstrations (their number: `episodes`), seeds from 30000.
+
+    `force` is on the hand, N; `indentation` in a gel, m, as `control.tactile.indentation` measures
+    it.
+    """
+
+    force: float
+    indentation: float
+    episodes: int
+
+    @property
+    def force_ceiling(self) -> float:
+        """Force (N) on the hand above which a run of this task is stopped."""
+        return min(_CEILING_MARGIN * self.force, _MOST)
+
+    @property
+    def torque_ceiling(self) -> float:
+        """Torque (Nm) that this force causes in a joint, so that neither limit comes first."""
+        return _LEVER * self.force_ceiling
+
+    @property
+    def indentation_ceiling(self) -> float:
+        """Depth (m) in a gel, likewise; `deepest_readable` bounds it for a sensor."""
+        return _CEILING_MARGIN * self.indentation
+
+
+# By `touchgoal benchmark task-ceilings`: 60 episodes of pick-place, and 60 with --feedback; 29 of the maze with
+# the bead led astray at 4 mm/s, and for its indentation the first six without.
+TASK_FORCES: dict[str, TaskForces] = {
+    "pick-place": TaskForces(force=16.5, indentation=2.1e-3, episodes=120),
+    "bead-maze": TaskForces(force=17.9, indentation=1.15e-3, episodes=29),
+}
+
+
+def max_stoppable_speed(gap: Speeds, acceleration: PerJoint, dt: float) -> Speeds:
+    """Return the highest speed (rad/s) for this tick that still brakes to rest within `gap` (rad).
+
+    Exact for a command that changes once a tick of `dt` s: braking takes `acceleration * dt` off
+    the speed. In these units speed u with n = floor(u) travels (n + 1) u - n (n + 1) / 2; this
+    inverts it. Zero for no gap. Keeping to it is always possible: one tick of braking from an
+    allowed speed is allowed again.
+    """
+    unit = acceleration * dt
+    g = np.maximum(gap, 0) / (unit * dt)
+    n = np.floor((np.sqrt(1 + 8 * g) - 1) / 2)
+    return unit * (g + n * (n + 1) / 2) / (n + 1)
+
+
+def braked_velocity(velocity: Speeds, acceleration: PerJoint, dt: float) -> Speeds:
+    """Return the velocity (rad/s) after one tick of braking, each joint by itself."""
+    return velocity - np.clip(velocity, -acceleration * dt, acceleration * dt)

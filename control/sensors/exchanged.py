@@ -2,18 +2,15 @@
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
 
+from touchgoal.control.arrays import Picture
 from touchgoal.control.tactile.background import local_change
 
 _CLEARLY = 1.5  # times that a fingertip is more like the other's sensor file
 _SMALL = 32  # px of a side at which pictures of cameras are compared
-_MOVED = (
-    2.5  # counts by which half of a picture's pixels change at least, when its camera has moved
-)
+# Counts by which half of a picture's pixels change at least, when its camera has moved.
+_MOVED = 2.5
 _TIMES = 3.0  # that the other one's must change less
-
-Picture = UInt8[np.ndarray, "h w 3"]
 
 
 def fingertips_exchanged(
@@ -21,11 +18,8 @@ def fingertips_exchanged(
 ) -> bool:
     """Return whether two untouched fingertips each look more like the other's sensor file.
 
-    Both must, because light drifts and a file may be old.
-
-    Args:
-        frames: of the left and of the right finger.
-        backgrounds: of the left one's and of the right one's sensor file.
+    Both must, because light drifts and a file may be old. Frames and backgrounds are left, then
+    right.
     """
     unlike = [
         [float(local_change(frame, background).mean()) for background in backgrounds]
@@ -37,16 +31,13 @@ def fingertips_exchanged(
 def cameras_exchanged(front: tuple[Picture, Picture], wrist: tuple[Picture, Picture]) -> bool:
     """Return whether the front camera has moved with the arm and the wrist camera has not.
 
-    False for a view without structure.
-
-    Args:
-        front, wrist: pictures before and after a move of the arm.
+    False for a view without structure; the pictures are from before and after a move of the arm.
     """
-    moved = usual_change(*front)
-    return moved > _MOVED and moved > _TIMES * usual_change(*wrist)
+    moved = _usual_change(*front)
+    return moved > _MOVED and moved > _TIMES * _usual_change(*wrist)
 
 
-def usual_change(before: Picture, after: Picture) -> float:
+def _usual_change(before: Picture, after: Picture) -> float:
     """Return the median change of the pixels, counts, beyond a factor on all (exposure)."""
     size = _SMALL, _SMALL
     small = [cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (before, after)]

@@ -25,7 +25,6 @@ class Keyboard:
         self._terminal = terminal.fileno()
 
     def __enter__(self) -> "Keyboard":
-        """Deliver keys at once, without echo."""
         self._before = termios.tcgetattr(self._terminal)
         tty.setcbreak(self._terminal)
         modes = termios.tcgetattr(self._terminal)
@@ -41,9 +40,7 @@ class Keyboard:
     def read_keys(self) -> str:
         """Return the keys since the last call, in order; "" if there are none.
 
-        Raises:
-            KeyboardInterrupt: Ctrl-C is among them.
-            UserError: the terminal has gone.
+        KeyboardInterrupt if Ctrl-C is among them, UserError if the terminal has gone.
         """
         keys = b""
         while select.select([self._terminal], [], [], 0)[0]:

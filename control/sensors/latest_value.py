@@ -6,6 +6,8 @@ from typing import Generic, TypeVar
 
 from touchgoal.control.interfaces import DriverError
 
+_FIRST_TIMEOUT = 5.0  # s
+
 T = TypeVar("T")
 
 
@@ -16,8 +18,8 @@ class LatestValue(Generic[T]):
     a DriverError with the same text.
     """
 
-    def __init__(self, name: str, poll: Callable[[], T | None], first_timeout: float = 5.0) -> None:
-        self._name, self._poll, self._first_timeout = name, poll, first_timeout
+    def __init__(self, name: str, poll: Callable[[], T | None]) -> None:
+        self._name, self._poll = name, poll
         self._value: T | None = None
         self._error: Exception | None = None
         self._updated, self._stop = threading.Event(), threading.Event()
@@ -25,8 +27,8 @@ class LatestValue(Generic[T]):
         self._thread.start()
 
     def read(self) -> T:
-        """Return the latest reading; wait up to `first_timeout` s for the first one."""
-        self._updated.wait(self._first_timeout)
+        """Return the latest reading; wait up to 5 s for the first one."""
+        self._updated.wait(_FIRST_TIMEOUT)
         if self._error is not None:
             raise DriverError(f"{self._name}: {self._error}") from self._error
         if self._value is None:

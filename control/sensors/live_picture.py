@@ -4,9 +4,8 @@ import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import cv2
-import numpy as np
-from jaxtyping import UInt8
 
+from touchgoal.control.arrays import Picture
 from touchgoal.runtime.errors import UserError
 
 _BOUNDARY = b"picture"
@@ -14,13 +13,9 @@ _PATIENCE = 1.0  # s without a new picture after which the last one is sent agai
 
 
 class LivePicture:
-    """Server of the latest picture at http://127.0.0.1:port/ as an MJPEG stream.
+    """MJPEG server of the latest picture at http://127.0.0.1:port/; port 0 is any free one.
 
-    Args:
-        port: 0 for any free one.
-
-    Raises:
-        UserError: the port is taken.
+    UserError if the port is taken.
     """
 
     def __init__(self, port: int) -> None:
@@ -38,7 +33,7 @@ class LivePicture:
         """Address for a browser."""
         return f"http://127.0.0.1:{self._server.server_address[1]}/"
 
-    def show(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+    def show(self, picture: Picture) -> None:
         """Replace the picture, RGB."""
         with self._changed:
             self._jpeg = cv2.imencode(".jpg", picture[..., ::-1])[1].tobytes()

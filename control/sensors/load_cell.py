@@ -1,8 +1,7 @@
-"""Load cell behind a microcontroller that prints lines of text, with an optional checksum.
+"""Load cell behind a microcontroller that prints lines of text, in a format that is a setting.
 
-Such lines have no standard, so the format is a setting. Garbled lines (bytes or line ends lost,
-bits flipped) pass as wrong readings in 21 % of the cases without a checksum, in 0.45 % with an
-exclusive or, in which like changes cancel, and in none of 32,000 with a CRC
+Of garbled lines (bytes or line ends lost, bits flipped) 21 % pass as wrong readings without a
+checksum, 0.45 % with an exclusive or, in which like changes cancel, and none of 32,000 with a CRC
 (`tests/test_serial.py`).
 """
 

@@ -1,15 +1,13 @@
 """Integrity of a picture: decoded without errors, whole, and new in all its parts."""
 
-from dataclasses import dataclass
-
 import av
 import cv2
 import numpy as np
 from av.error import FFmpegError
 from av.video.reformatter import VideoReformatter
-from jaxtyping import Bool, Float, Int16, UInt8
+from jaxtyping import Bool, Float, Int16
 
-Picture = UInt8[np.ndarray, "h w 3"]
+from touchgoal.control.arrays import Picture
 
 _STRICT = "explode+crccheck+bitstream+buffer"
 _BLOCK = 8  # px of JPEG
@@ -48,41 +46,36 @@ class JpegDecoder:
         return self._reformatter.reformat(frames[0], format="rgb24", threads=1).to_ndarray()
 
 
-@dataclass(frozen=True)
-class GelPicture:
-    """Picture of a gel.
-
-    Attributes:
-        image: RGB.
-        spots: where printed dots and their rims may be; None without dots.
-    """
-
-    image: Picture
-    spots: Bool[np.ndarray, "h w"] | None
-
-
-def gel_picture(image: Picture, dots: float = 0.0) -> GelPicture:
-    """Prepare a picture for `is_broken_gel`.
-
-    Args:
-        image: RGB.
-        dots: diameter of printed dots as a share of the picture's diagonal; 0: none.
-    """
-    return GelPicture(image, _dark_spots(image, dots) if dots > 0 else None)
-
-
-def jumps_at_blocks(now: GelPicture, before: GelPicture) -> float:
-    """Return the extra jump of the change since `before` between JPEG blocks, counts.
+class BrokenBlocks:
+    """Detector of a gel's pictures that came through a broken JPEG, judged by the last good one.
 
     A decoder cannot detect every wrong byte. It shows as blocks of another brightness, which a
     smooth gel never has: real changes ignore block borders. Moving dots do look like such blocks,
-    so pixels near dots do not count.
+    so pixels near dots do not count; `dots` is their diameter as a share of the picture's diagonal,
+    0 without.
     """
-    difference = cv2.subtract(now.image, before.image, dtype=cv2.CV_16S)
-    change = cv2.transform(difference, _ALL_CHANNELS)
-    clear = None
-    if now.spots is not None and before.spots is not None:
-        clear = ~(now.spots | before.spots)
+
+    def __init__(self, dots: float) -> None:
+        self._dots = dots
+        self._before: tuple[Picture, Bool[np.ndarray, "h w"] | None] | None = None
+
+    def update(self, image: Picture) -> bool:
+        """Return whether a picture is broken; a whole one is what the next is compared with."""
+        spots = _dark_spots(image, self._dots) if self._dots > 0 else None
+        if self._before is not None:
+            before, dark = self._before
+            change = cv2.subtract(image, before, dtype=cv2.CV_16S)
+            clear = None if spots is None or dark is None else ~(spots | dark)
+            if _jumps_at_blocks(cv2.transform(change, _ALL_CHANNELS), clear) > _SMOOTH:
+                return True
+        self._before = image, spots
+        return False
+
+
+def _jumps_at_blocks(
+    change: Int16[np.ndarray, "h w"], clear: Bool[np.ndarray, "h w"] | None
+) -> float:
+    """Return the extra jump of a change between JPEG blocks, counts."""
     worst = 0.0
     for turned in (False, True):
         grey = np.ascontiguousarray(change.T) if turned else change
@@ -93,11 +86,6 @@ def jumps_at_blocks(now: GelPicture, before: GelPicture) -> float:
         jump = _largest(between, _JUMPS) - _largest(within, 3 * _JUMPS) - _USUAL * usual
         worst = max(worst, jump)
     return worst / (3 * _BLOCK)
-
-
-def is_broken_gel(now: GelPicture, before: GelPicture) -> bool:
-    """Return whether a gel's picture came through a broken JPEG, judged by the last good one."""
-    return jumps_at_blocks(now, before) > _SMOOTH
 
 
 class FrozenParts:

@@ -8,17 +8,12 @@ from touchgoal.runtime.errors import UserError
 
 
 def open_port(device: str, baud: int, timeout: float) -> serial.Serial:
-    """Open a device such as /dev/ttyUSB0 exclusively; reads wait `timeout` s.
-
-    Raises:
-        UserError: it is missing, in use or not permitted.
-    """
+    """Open a device for itself alone; reads wait `timeout` s. UserError if that fails."""
     try:
         return serial.Serial(device, baud, timeout=timeout, write_timeout=timeout, exclusive=True)
     except serial.SerialException as error:
         raise UserError(
-            f"cannot open {device}: check the cable and that nothing else uses it, and that you "
-            "are "
+            f"cannot open {device}: check the cable and that nothing else uses it, and that you are "
             f"in the group dialout ({error})"
         ) from error
 

@@ -4,29 +4,23 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 
+from touchgoal.control.arrays import Picture
 from touchgoal.control.interfaces import Camera, DriverError, Frame
-from touchgoal.control.sensors.gel_corners import rectify
 from touchgoal.control.tactile.picture_guard import seam
-from touchgoal.control.tactile.sensor_models import SensorModel
+from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT_WEDGE, SensorModel
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Corners
 
 
 @dataclass(frozen=True)
 class Crop:
-    """Position of the gel in its camera's picture.
+    """Position of the gel in its camera's picture."""
 
-    Attributes:
-        border: share cut off at each side; 0 for a stream that is already cut.
-        quarter_turns: counter-clockwise, before cutting; a DIGIT's camera lies on its side.
-        corners: of the gel after the turns, px, in place of a border; for a camera that sees the
-            gel at an angle (GelSight Wedge).
-    """
-
-    border: float = 0.0
-    quarter_turns: int = 0
+    border: float = 0.0  # share cut off at each side; 0 for a stream that is already cut
+    quarter_turns: int = 0  # counter-clockwise, before cutting; a DIGIT's camera lies on its side
+    # of the gel after the turns, px, in place of a border (GelSight Wedge)
     corners: Corners | None = None
 
 
@@ -55,11 +49,6 @@ class TactileCamera:
         return self._model
 
     @property
-    def rate(self) -> float:
-        """See Camera."""
-        return self._camera.rate
-
-    @property
     def problem(self) -> str:
         """See Camera."""
         return self._camera.problem or self._torn
@@ -81,13 +70,29 @@ class TactileCamera:
         self._camera.close()
 
 
-def crop_to_sensor(
-    image: UInt8[np.ndarray, "h w 3"], model: SensorModel, crop: Crop
-) -> UInt8[np.ndarray, "H W 3"]:
+def fingertip_view(
+    model: SensorModel, source: str, border: float | None = None, corners: Corners | None = None
+) -> Crop:
+    """Return the crop of a source; a stream without corners is already cut and turned.
+
+    UserError if the camera sees the gel at an angle and the corners are missing.
+    """
+    if corners is not None:
+        return Crop(corners=corners)
+    if model.name == GELSIGHT_WEDGE.name and "://" not in source:
+        raise UserError(
+            f"the camera of a {model.name} sees its gel at an angle: give the corners of the gel "
+            "in its picture"
+        )
+    view = DIGIT_CROP if model.name == DIGIT.name else GELSIGHT_MINI_CROP
+    view = NO_CROP if "://" in source else view
+    return view if border is None else replace(view, border=border)
+
+
+def crop_to_sensor(image: Picture, model: SensorModel, crop: Crop) -> UInt8[np.ndarray, "H W 3"]:
     """Cut the sensor's picture out of its camera's and scale it to the model's shape.
 
-    Raises:
-        UserError: the picture has other proportions, or the corners are no quadrangle in it.
+    UserError if it has other proportions, or the corners are no quadrangle in it.
     """
     image = np.rot90(image, crop.quarter_turns)
     if crop.corners is not None:
@@ -105,3 +110,39 @@ def crop_to_sensor(
     if image.shape[:2] == (rows, columns):
         return np.ascontiguousarray(image)
     return cv2.resize(np.ascontiguousarray(image), (columns, rows), interpolation=cv2.INTER_AREA)
+
+
+def rectify(image: Picture, shape: tuple[int, int], corners: Corners) -> UInt8[np.ndarray, "H W 3"]:
+    """Return the gel between its corners from above, in a picture of a shape (rows, columns).
+
+    UserError if the corners are no quadrangle in the picture.
+    """
+    given = np.array(corners, np.float32)
+    _check_corners(given, image.shape[:2])
+    rows, columns = shape
+    # Larger than asked for where the camera shows more, so that its pixels are averaged, not left
+    # out.
+    finer = max(1, round(float(np.linalg.norm(given[1] - given[0])) / columns))
+    high, wide = finer * rows, finer * columns
+    # The corners of a picture lie half a pixel out from the middles of its outermost pixels.
+    edges = np.array([(0, 0), (wide, 0), (0, high), (wide, high)], np.float32) - 0.5
+    flat = cv2.warpPerspective(image, cv2.getPerspectiveTransform(given, edges), (wide, high))
+    return cv2.resize(flat, (columns, rows), interpolation=cv2.INTER_AREA) if finer > 1 else flat
+
+
+def _check_corners(corners: Float32[np.ndarray, "4 2"], shape: tuple[int, int]) -> None:
+    """Raise UserError unless these are corners of a gel in a picture of a shape (rows, columns)."""
+    height, width = shape
+    if (corners < -0.5).any() or (corners > np.array([width, height]) - 0.5).any():
+        raise UserError(
+            f"a corner of the gel lies outside its camera's picture, which is {width}x{height}: "
+            "give them in pixels of that picture, top left, top right, bottom left, bottom right"
+        )
+    around = corners[[0, 1, 3, 2]]
+    sides = np.roll(around, -1, 0) - around
+    following = np.roll(sides, -1, 0)
+    if (sides[:, 0] * following[:, 1] <= sides[:, 1] * following[:, 0]).any():
+        raise UserError(
+            "the corners of the gel must be top left, top right, bottom left and bottom right in "
+            "the picture; these are in another order, or no quadrangle"
+        )

@@ -7,21 +7,15 @@ does not change.
 from dataclasses import dataclass
 from pathlib import Path
 
-from touchgoal.control.tactile.sensor_models import (
-    DIGIT,
-    GELSIGHT_MINI,
-    GELSIGHT_MINI_MARKERS,
-    SensorModel,
-)
+from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.runtime.errors import UserError
 
 _ROOT = Path("/sys/class/video4linux")
-# What the USB product names contain: gsrobotics looks for the first, digit-interface for the
-# second.
+# What the USB product names contain, as gsrobotics and digit-interface look for them.
 _PRODUCTS = {
-    GELSIGHT_MINI.name: "GelSight Mini",
-    GELSIGHT_MINI_MARKERS.name: "GelSight Mini",
-    DIGIT.name: "DIGIT",
+    "gelsight_mini": "GelSight Mini",
+    "gelsight_mini_markers": "GelSight Mini",
+    "digit": "DIGIT",
 }
 
 
@@ -40,20 +34,21 @@ def list_cameras(root: Path = _ROOT) -> list[UsbCamera]:
     for node in sorted(root.glob("video*"), key=lambda n: (len(n.name), n.name)):
         if _read_text(node / "index") != "0":
             continue
-        usb = _usb_device(node)
-        serial = _read_text(usb / "serial") if usb else ""
-        product = _read_text(usb / "product") if usb else ""
+        device = (node / "device").resolve()  # of several folders above it the USB device's own
+        usb = next((p for p in (device, *device.parents) if (p / "idProduct").exists()), node)
+        serial, product = _read_text(usb / "serial"), _read_text(usb / "product")
         found.append(UsbCamera(f"/dev/{node.name}", product or _read_text(node / "name"), serial))
     return found
 
 
-def find_camera(product: str, serial: str = "", root: Path = _ROOT) -> UsbCamera:
-    """Return the camera with `product` in its name and, if given, this serial number.
+def find_sensor_camera(model: SensorModel, serial: str = "", root: Path = _ROOT) -> UsbCamera:
+    """Return the camera of a fingertip sensor, of several the one with this serial number.
 
-    Raises:
-        UserError: there is none, or several.
+    UserError if there is none, there are several, or this kind's USB name is not known.
     """
-    cameras = list_cameras(root)
+    if model.name not in _PRODUCTS:
+        raise UserError(f"a {model.name} has no USB name known here: give its device instead")
+    product, cameras = _PRODUCTS[model.name], list_cameras(root)
     found = [c for c in cameras if product in c.product and serial in ("", c.serial)]
     if len(found) == 1:
         return found[0]
@@ -65,19 +60,6 @@ def find_camera(product: str, serial: str = "", root: Path = _ROOT) -> UsbCamera
         )
     present = ", ".join(f"{c.product} ({c.serial})" for c in cameras) or "none"
     raise UserError(f"no {wanted} is plugged in; cameras found: {present}")
-
-
-def find_sensor_camera(model: SensorModel, serial: str = "", root: Path = _ROOT) -> UsbCamera:
-    """Return the camera of a fingertip sensor, as `find_camera`."""
-    if model.name not in _PRODUCTS:
-        raise UserError(f"a {model.name} has no USB name known here: give its device instead")
-    return find_camera(_PRODUCTS[model.name], serial, root)
-
-
-def _usb_device(node: Path) -> Path | None:
-    """Return the folder of the USB device above a video node: the first with a product id."""
-    device = (node / "device").resolve()
-    return next((p for p in (device, *device.parents) if (p / "idProduct").exists()), None)
 
 
 def _read_text(path: Path) -> str:

@@ -1,16 +1,15 @@
-"""Cameras, video files and network streams through OpenCV: always the newest frame.
+"""Cameras and network streams through OpenCV: always the newest frame.
 
-A thread empties the driver's queue into one slot: a slow reader of a queue would lag (measured: by
-2 s after 3 s). Stamps are taken right after the grab; FFmpeg's own are unusable for streams. A
-source that fails is opened again until it comes back; meanwhile frames keep their old stamps.
+A thread empties the driver's queue into one slot: a slow reader would lag (by 2 s after 3 s).
+Stamps are taken right after the grab; FFmpeg's own are unusable. A source that fails is opened
+again until it comes back; meanwhile frames keep their old stamps.
 """
 
 import os
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,18 +18,11 @@ import numpy as np
 
 from touchgoal.control.interfaces import Frame
 from touchgoal.control.sensors.latest_value import LatestValue
-from touchgoal.control.sensors.picture_integrity import (
-    FrozenParts,
-    GelPicture,
-    JpegDecoder,
-    gel_picture,
-    is_broken_gel,
-)
+from touchgoal.control.sensors.picture_integrity import BrokenBlocks, FrozenParts, JpegDecoder
 from touchgoal.runtime.errors import UserError
 
 _OPEN_TIMEOUT = 5.0  # s to open it the first time: the first frame may take longer to come
 _REOPEN_INTERVAL = 0.5  # s between attempts
-_RATE_WINDOW = 2.0  # s that the rate is measured over
 _LATE_PERIODS = 3.0  # periods without a frame that mean a problem
 _MANUAL_EXPOSURE = 1  # V4L2_EXPOSURE_MANUAL
 _FFMPEG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
@@ -39,48 +31,37 @@ _JPEG = b"\xff\xd8"  # what a JPEG begins with
 
 @dataclass(frozen=True)
 class VideoConfig:
-    """Source of pictures and how to read it.
+    """Source of pictures and how to read it."""
 
-    Attributes:
-        source: index of a camera (`0`), a device (`/dev/video2`), a file, an image sequence
-            (`frame_%04d.png`) or the address of an MJPEG stream (`http://...`).
-        size: (width, height) to request from a camera; None: its default.
-        rate: Hz; requested from a camera, played from images, and expected by `problem`.
-        exposure, white_balance: fixed values for a camera, in V4L2's units (`v4l2-ctl
-            --list-ctrls`; usually 0.1 ms, and kelvin); None: unchanged.
-        timeout: s without a frame after which a stream counts as lost and is opened again.
-        frozen_after: s after which an identical picture, or part of one, counts as old; infinity
-            for rendered pictures, which lack the noise of real ones.
-        frozen_pictures: identical pictures in a row required besides, for a lock-step twin, whose
-            time is not wall time.
-        gel: whether the pictures are a fingertip's: smooth but for its dots, so broken ones show.
-        dots: diameter of the printed dots as a share of the picture's diagonal; 0: none.
-        device: looks up the camera's device at each opening, when `source` is a serial number.
-    """
-
+    # index of a camera (`0`), a device (`/dev/video2`) or the address of an MJPEG stream
+    # (`http://...`)
     source: str
+    # (width, height) to request from a camera; None: its default
     size: tuple[int, int] | None = None
-    rate: float = 25.0
+    rate: float = 25.0  # Hz; requested from a camera, and expected by `problem`
+    # exposure, white_balance: fixed values for a camera, in V4L2's units (`v4l2-ctl --list-ctrls`;
+    # usually 0.1 ms, and kelvin); None: unchanged
     exposure: float | None = None
     white_balance: int | None = None
+    # s without a frame after which a stream counts as lost and is opened again
     timeout: float = 1.0
+    # s after which an identical picture, or part of one, counts as old; infinity for rendered
+    # pictures, which lack the noise of real ones
     frozen_after: float = 0.5
+    # identical pictures in a row required besides, for a lock-step twin, whose time is not wall
+    # time
     frozen_pictures: int = 0
+    # whether the pictures are a fingertip's: smooth but for its dots, so broken ones show
     gel: bool = False
-    dots: float = 0.0
+    dots: float = 0.0  # diameter of the printed dots as a share of the picture's diagonal; 0: none
+    # looks up the camera's device at each opening, when `source` is a serial number
     device: Callable[[], str] | None = None
 
     @property
     def is_camera(self) -> bool:
         """Whether it is a camera of this computer."""
-        if self.device is not None:
-            return True
-        return self.source.isdigit() or self.source.startswith("/dev/")
-
-    @property
-    def is_file(self) -> bool:
-        """Whether frames come as fast as they are asked for."""
-        return not self.is_camera and "://" not in self.source
+        known = self.device is not None or self.source.isdigit()
+        return known or self.source.startswith("/dev/")
 
 
 class _Quiet:
@@ -119,11 +100,7 @@ def _quiet_ffmpeg() -> Iterator[None]:
 
 
 class VideoCamera:
-    """The Camera interface over any source.
-
-    Raises:
-        UserError: the source cannot be opened now, or a camera refuses the size.
-    """
+    """The Camera interface; UserError if the source does not open, or a camera not at that size."""
 
     def __init__(self, config: VideoConfig) -> None:
         self.config = config
@@ -133,10 +110,9 @@ class VideoCamera:
         except BaseException:
             _quiet.end()
             raise
-        self._count, self._grab_times = 0, deque[float]()
+        self._count = 0
         self._image: np.ndarray | None = None
-        self._gel: GelPicture | None = None
-        self._next_frame_at = time.monotonic()
+        self._broken_blocks = BrokenBlocks(config.dots) if config.gel else None
         self._frozen_parts, self._decoder = FrozenParts(), JpegDecoder()
         self._same, self._frozen = 0, False  # pictures in a row of which some part was as before
         self._lost = self._refused = ""
@@ -144,20 +120,11 @@ class VideoCamera:
         self._latest = LatestValue(f"camera {config.source}", self._take)
 
     @property
-    def rate(self) -> float:
-        """See Camera: over the last 2 s."""
-        now = time.monotonic()
-        times = [t for t in tuple(self._grab_times) if t > now - _RATE_WINDOW]
-        return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
-
-    @property
     def problem(self) -> str:
         """See Camera."""
         frame, now = self.read(), time.monotonic()
-        if self._lost:
-            return f"{self.config.source} {self._lost}"
-        if self._refused:
-            return f"{self.config.source} {self._refused}"
+        if wrong := self._lost or self._refused:
+            return f"{self.config.source} {wrong}"
         if self._frozen:
             still = now - frame.stamp
             return f"{self.config.source} or a part of it shows one picture for {still:.1f} s"
@@ -178,8 +145,6 @@ class VideoCamera:
             _quiet.end()
 
     def _take(self) -> Frame | None:
-        if self.config.is_file:
-            self._wait_for_turn()
         grabbed = self._capture.grab()
         stamp = time.monotonic()
         read, image = self._capture.retrieve() if grabbed else (False, None)
@@ -191,16 +156,11 @@ class VideoCamera:
         if image is None:
             return None
         self._count += 1
-        self._grab_times.append(stamp)
-        while self._grab_times[0] < stamp - _RATE_WINDOW:
-            self._grab_times.popleft()
         self._image = image
         same_since = self._frozen_parts.update(image, stamp)
         self._same = self._same + 1 if same_since < stamp else 0
-        self._frozen = (
-            stamp - same_since > self.config.frozen_after
-            and self._same > self.config.frozen_pictures
-        )
+        still = stamp - same_since > self.config.frozen_after
+        self._frozen = still and self._same > self.config.frozen_pictures
         return Frame(image, self._count, same_since if self._frozen else stamp)
 
     def _checked(self, image: np.ndarray) -> np.ndarray | None:
@@ -209,46 +169,22 @@ class VideoCamera:
             decoded = self._decoder.decode(image.tobytes())
         else:
             decoded = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-        before = self._image
-        if decoded is None:
-            self._refused = "sends broken pictures: check its cable"
-        elif before is not None and decoded.shape != before.shape:
+        before, broken = self._image, decoded is None
+        refused = ""
+        if decoded is not None and before is not None and decoded.shape != before.shape:
             was, now = (f"{x.shape[1]}x{x.shape[0]}" for x in (before, decoded))
-            self._refused = f"sends {now} pixels instead of {was}: check that it is the same camera"
-            return None
-        elif self.config.gel and self._is_broken_gel(decoded):
-            self._refused = "sends broken pictures: check its cable"
-            return None
-        else:
-            self._refused = ""
-        return decoded
-
-    def _is_broken_gel(self, image: np.ndarray) -> bool:
-        """Compare with the last good picture, and replace that one if this is whole."""
-        now, before = gel_picture(image, self.config.dots), self._gel
-        if before is not None and is_broken_gel(now, before):
-            return True
-        self._gel = now
-        return False
-
-    def _wait_for_turn(self) -> None:
-        self._next_frame_at = max(
-            self._next_frame_at + 1 / self.config.rate, time.monotonic() - 1 / self.config.rate
-        )
-        time.sleep(max(self._next_frame_at - time.monotonic(), 0))
+            refused = f"sends {now} pixels instead of {was}: check that it is the same camera"
+        elif decoded is not None and self._broken_blocks is not None:
+            broken = self._broken_blocks.update(decoded)
+        self._refused = "sends broken pictures: check its cable" if broken else refused
+        return None if self._refused else decoded
 
     def _reopen(self) -> None:
-        if self.config.is_file:
-            self._lost = "has ended"
-            time.sleep(_REOPEN_INTERVAL)
-            return
         self._lost = "is gone: check its cable"
         self._capture.release()
         time.sleep(_REOPEN_INTERVAL)
-        try:
+        with suppress(UserError):  # not back yet
             self._capture = _open(self.config, self.config.timeout)
-        except UserError:
-            pass  # not back yet
 
 
 @_quiet_ffmpeg()
@@ -259,8 +195,6 @@ def _open(config: VideoConfig, timeout: float) -> Any:
         source = config.device()
     if config.is_camera:
         capture = cv2.VideoCapture(source, cv2.CAP_V4L2)
-    elif config.is_file:
-        capture = cv2.VideoCapture(source)
     else:
         opening = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(1e3 * timeout)]
         reading = [cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(1e3 * config.timeout)]
@@ -283,10 +217,8 @@ def _configure_camera(capture: Any, config: VideoConfig) -> None:
         width, height = config.size
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
-        got = (
-            int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
-            int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
-        )
+        size = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
+        got = tuple(int(capture.get(side)) for side in size)
         if got != config.size:
             capture.release()
             raise UserError(
@@ -295,23 +227,23 @@ def _configure_camera(capture: Any, config: VideoConfig) -> None:
             )
     capture.set(cv2.CAP_PROP_FPS, config.rate)
     if config.exposure is not None:
-        _lock(capture, config, "exposure", cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL_EXPOSURE)
+        capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL_EXPOSURE)
+        _lock(capture, config.source, "exposure", cv2.CAP_PROP_EXPOSURE, config.exposure)
     if config.white_balance is not None:
-        _lock(capture, config, "white_balance", cv2.CAP_PROP_AUTO_WB, 0)
+        capture.set(cv2.CAP_PROP_AUTO_WB, 0)
+        value = config.white_balance
+        _lock(capture, config.source, "white_balance", cv2.CAP_PROP_WB_TEMPERATURE, value)
     if int(capture.get(cv2.CAP_PROP_FOURCC)) == cv2.VideoWriter.fourcc(*"MJPG"):
         capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # the JPEGs themselves, see `_sends_jpeg`
 
 
-def _lock(capture: Any, config: VideoConfig, name: str, automatic: int, manual: int) -> None:
-    """Switch an automatic control off and set its value; UserError if it does not take."""
-    prop = {"exposure": cv2.CAP_PROP_EXPOSURE, "white_balance": cv2.CAP_PROP_WB_TEMPERATURE}[name]
-    wanted = getattr(config, name)
-    capture.set(automatic, manual)
+def _lock(capture: Any, source: str, name: str, prop: int, wanted: float) -> None:
+    """Set a control that is no longer automatic; UserError if it does not take."""
     capture.set(prop, wanted)
     if (got := capture.get(prop)) != wanted:
         capture.release()
         raise UserError(
-            f"{config.source} keeps {name} {got:g} instead of {wanted:g}: choose a value that "
+            f"{source} keeps {name} {got:g} instead of {wanted:g}: choose a value that "
             "`v4l2-ctl --list-ctrls` allows"
         )
 

@@ -5,8 +5,9 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32
 
+from touchgoal.control.arrays import AnyPicture, Counts, Picture, Pictures
 from touchgoal.control.tactile.light_gain import GAIN_SPREAD, LARGE_CHANGE, divide_gain, light_gain
 from touchgoal.runtime.errors import UserError
 
@@ -28,17 +29,11 @@ _ANOTHER_SENSOR = 5.0  # counts of local change to a reference; drift of the ful
 
 @dataclass(frozen=True)
 class Drift:
-    """Change of the light since the reference, by channel (R, G, B).
+    """Change of the light since the reference, by channel (R, G, B)."""
 
-    Attributes:
-        gain: factor of the brightness, 1 for none.
-        offset: mean change beyond the gain's, counts.
-        pattern: largest smooth change beyond both, counts.
-    """
-
-    gain: Float[np.ndarray, "3"]
-    offset: Float[np.ndarray, "3"]
-    pattern: Float[np.ndarray, "3"]
+    gain: Float[np.ndarray, "3"]  # factor of the brightness, 1 for none
+    offset: Float[np.ndarray, "3"]  # mean change beyond the gain's, counts
+    pattern: Float[np.ndarray, "3"]  # largest smooth change beyond both, counts
 
     @property
     def large(self) -> bool:
@@ -54,22 +49,12 @@ class Drift:
 class Background:
     """Untouched frame of one sensor as it is now; `update` follows its drift.
 
-    Args:
-        frames: at least one RGB picture of the untouched sensor, better five or more; their median
-            is the first background.
-        reference: picture that drift is measured against, such as the sensor file's background;
-            None: the first background.
-
-    Raises:
-        UserError: the picture changes between the frames, or differs from the reference as by a
-            contact.
+    It begins with the median of RGB frames of the untouched sensor, better five or more. Drift is
+    measured against a reference, such as the sensor file's, or else that median. UserError if the
+    picture changes between the frames, or differs from the reference as by a contact.
     """
 
-    def __init__(
-        self,
-        frames: UInt8[np.ndarray, "n h w 3"],
-        reference: UInt8[np.ndarray, "h w 3"] | None = None,
-    ) -> None:
+    def __init__(self, frames: Pictures, reference: Picture | None = None) -> None:
         first = np.median(frames, axis=0).astype(np.float32)
         if max(float(local_change(frame, first).max()) for frame in frames) > _MOVED:
             raise UserError(
@@ -86,15 +71,12 @@ class Background:
             )
 
     @property
-    def image(self) -> Float32[np.ndarray, "h w 3"]:
+    def image(self) -> Counts:
         """Current background, counts."""
         return self.steady * self._gain
 
-    def update(self, frame: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Follow the drift by one frame in which nothing touches.
-
-        The first 50 frames have equal weight, so that the noise of a single first one fades.
-        """
+    def update(self, frame: Picture) -> None:
+        """Follow the drift by an untouched frame; the first 50 weigh the same."""
         self._frames += 1
         rate = max(_RATE, 1 / self._frames)
         gain = light_gain(frame, self._first)
@@ -116,14 +98,11 @@ class Background:
         return Drift(1 + gain, offset, pattern.astype(np.float64))
 
 
-def local_change(
-    frame: UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"],
-    background: UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"],
-) -> Float32[np.ndarray, "H W"]:
+def local_change(frame: AnyPicture, background: AnyPicture) -> Float32[np.ndarray, "H W"]:
     """Return the change from the background that no drift of the light explains, counts.
 
     Low spatial frequencies and a factor on the background are fitted to each channel of the blurred
-    difference and subtracted. The result is the norm over the channels, at a quarter of the
+    difference and subtracted; what is left is its norm over the channels, at a quarter of the
     resolution.
     """
     reference = _blurred(background)

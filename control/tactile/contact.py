@@ -1,8 +1,9 @@
 """Contact of a fingertip, from its pictures alone."""
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32
 
+from touchgoal.control.arrays import Picture, Pictures
 from touchgoal.control.tactile.background import Background, local_change
 from touchgoal.control.tactile.light_gain import remove_gain
 
@@ -18,21 +19,12 @@ _RELEASE = 0.1  # of a contact's peak strength
 
 
 class ContactDetector:
-    """Contact detector that updates its background while nothing touches.
+    """Contact detector that updates its background, in place, while nothing touches.
 
-    Contact begins when `strength` exceeds the threshold. It ends below half the threshold, so that
-    it does not flicker, or below a tenth of the contact's peak, because the light drifts on during
-    a long contact.
-
-    Args:
-        background: of the sensor; updated in place.
-        threshold: counts; None: from the noise of the first 10 frames, during which only a strong
-            contact (5 counts) counts.
-
-    Attributes:
-        touching: whether the last frame was in contact.
-        strength: of the last frame, see `contact_strength`.
-        threshold: in use, counts.
+    Contact begins when `strength` (see `contact_strength`) exceeds the threshold, counts. It ends
+    below half of it, so that it does not flicker, or below a tenth of the contact's peak, because
+    the light drifts on during a long one. Without a threshold it is learned from the noise of the
+    first 10 frames, during which only a strong contact (5 counts) counts.
     """
 
     def __init__(self, background: Background, threshold: float | int | None = None) -> None:
@@ -43,7 +35,7 @@ class ContactDetector:
         self.touching, self.strength = False, 0.0
         self._peak = 0.0  # strength
 
-    def update(self, frame: UInt8[np.ndarray, "h w 3"]) -> bool:
+    def update(self, frame: Picture) -> bool:
         """Process the next frame and return whether it is in contact."""
         rest = self.background.steady
         self.strength = float(local_change(remove_gain(frame, rest), rest).max())
@@ -68,22 +60,13 @@ class ContactDetector:
             self._untouched = None
 
 
-def contact_strength(
-    frames: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
-) -> Float32[np.ndarray, " n"]:
-    """Return the largest `background.local_change` of each frame, counts.
-
-    Args:
-        frames: RGB pictures of one fingertip sensor.
-        background: the same sensor untouched.
-    """
+def contact_strength(frames: Pictures, background: Picture) -> Float32[np.ndarray, " n"]:
+    """Return the largest `local_change` (counts) of each RGB frame from the same sensor untouched."""
     changes = (local_change(remove_gain(frame, background), background) for frame in frames)
     return np.array([change.max() for change in changes], np.float32)
 
 
-def threshold_for(
-    untouched: UInt8[np.ndarray, "n h w 3"], background: UInt8[np.ndarray, "h w 3"]
-) -> float:
+def threshold_for(untouched: Pictures, background: Picture) -> float:
     """Return the contact threshold (counts) for a sensor with the noise of these frames.
 
     Compressed streams have a strength of 1 to 2. Fewer than half of the frames may be in contact.
@@ -92,16 +75,12 @@ def threshold_for(
 
 
 def detect_contact(
-    frames: UInt8[np.ndarray, "n h w 3"],
-    background: UInt8[np.ndarray, "h w 3"],
-    threshold: float | int = THRESHOLD,
+    frames: Pictures, background: Picture, threshold: float | int = THRESHOLD
 ) -> Bool[np.ndarray, " n"]:
     """Run a `ContactDetector` over a recording and return whether each frame is in contact.
 
-    Args:
-        frames: consecutive RGB pictures of one fingertip sensor.
-        background: the same sensor untouched, such as the median of the first frames.
-        threshold: counts.
+    `background` is the same sensor untouched, such as the median of the first frames; `threshold`
+    in counts.
     """
     detector = ContactDetector(Background(background[None]), threshold)
     return np.array([detector.update(frame) for frame in frames], bool)

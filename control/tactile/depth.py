@@ -1,38 +1,26 @@
 """Depth of a gel from a picture, by inverting the sensor file's model.
 
-One colour may belong to two slopes, to a shadow or to a depth, so pixels are not inverted one by
-one. Gauss-Newton steps find the surface whose picture (`sensor_calibration.shade`) fits the frame.
-A step is a Poisson-like equation with free (Neumann) borders, solved by conjugate gradients that
-the cosine transform preconditions. Coarse grids come first: they cost little.
+One colour may belong to two slopes, to a shadow or to a depth, so Gauss-Newton steps find the
+surface whose picture (`sensor_calibration.shade`) fits the frame. A step is a Poisson-like equation
+with free (Neumann) borders, solved by conjugate gradients that the cosine transform preconditions.
+Coarse grids come first: they cost little.
 """
-
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 
+from touchgoal.control.arrays import Counts, Map, Picture
+from touchgoal.control.tactile import depth_steps
 from touchgoal.control.tactile.background import cosines
-from touchgoal.control.tactile.depth_steps import (
-    add_against_slopes,
-    best_slopes,
-    conjugate_gradients,
-    normal_equations,
-    shading,
-    slopes,
-)
 from touchgoal.control.tactile.light_gain import remove_gain
-from touchgoal.control.tactile.sensor_calibration import (
-    SensorCalibration,
-    illumination,
-    shadows,
-)
+from touchgoal.control.tactile.sensor_calibration import SensorCalibration, illumination, shadows
 
-Map = Float32[np.ndarray, "h w"]
 Colours = Float32[np.ndarray, "3 h w"]
 
-# (pixels to a cell's side, Gauss-Newton steps, of these with a search, conjugate gradient steps)
-_SCHEDULE = ((8, 5, 3, 5), (4, 3, 2, 5), (2, 1, 0, 5))
+# (pixels to a cell's side, Gauss-Newton steps, of these with a search)
+_SCHEDULE = ((8, 5, 3), (4, 3, 2), (2, 1, 0))
+_INNER = 5  # conjugate gradient steps to a Gauss-Newton step
 _MODEL_ERROR = 0.5  # counts by which a perfect calibration still differs from the picture
 _OUTLIER = 4.0  # standard deviations beyond which a pixel counts less
 _DAMPING = 0.01  # of the usual curvature
@@ -53,12 +41,8 @@ class DepthEstimator:
 
     Walls steeper than the file's `max_slope` read too low, unless the depth's own colour (up to
     `max_depth`) shows how deep they go. Otherwise depth counts from the lowest tenth of the
-    surface: too shallow where a contact fills the view.
-
-    Args:
-        calibration: the sensor file.
-        finest: side of the smallest cells, px. 8 takes a third of the time of 2 and finds the
-            deepest point of most contacts as well.
+    surface: too shallow where a contact fills the view. `finest` is the side of the smallest cells,
+    px: 8 takes a third of the time of 2 and finds the deepest point of most contacts as well.
     """
 
     def __init__(self, calibration: SensorCalibration, finest: int = 2) -> None:
@@ -66,37 +50,20 @@ class DepthEstimator:
         self._schedule = [step for step in _SCHEDULE if step[0] >= finest]
         self._levels = [_Level(calibration, cell) for cell, *_ in self._schedule]
 
-    def estimate(
-        self,
-        image: UInt8[np.ndarray, "h w 3"],
-        background: Float32[np.ndarray, "h w 3"] | None = None,
-    ) -> Map:
-        """Return the depth of the gel's surface below its rest plane, m, positive where pressed in.
+    def estimate(self, image: Picture, background: Counts | None = None) -> Map:
+        """Return the depth of the gel below its rest plane in an RGB frame, m, positive inwards.
 
-        Args:
-            image: RGB frame; paint markers over first (`markers.without_markers`).
-            background: the untouched sensor now (`background.Background.image`), markers painted
-                over as well; None: the sensor file's.
+        The background is the untouched sensor now (`Background.image`), or else the sensor file's.
+        Paint markers over in both first (`markers.without_markers`).
         """
         if background is None:
             background = self._calibration.background.astype(np.float32)
         change = remove_gain(image, background) - background
         surface = np.zeros((1, 1), np.float32)
-        for level, (_, steps, searched, inner) in zip(self._levels, self._schedule, strict=True):
-            surface = level.refine(surface, change, steps, searched, inner)
+        for level, (_, steps, searched) in zip(self._levels, self._schedule, strict=True):
+            surface = level.refine(surface, change, steps, searched)
         h, w, _ = image.shape
         return cv2.resize(surface, (w, h), interpolation=cv2.INTER_LINEAR)
-
-
-@dataclass(frozen=True)
-class _Linear:
-    """Linearised picture: error (counts), its derivatives by slopes and depth, weights."""
-
-    error: Colours
-    by_gx: Colours
-    by_gy: Colours
-    by_depth: Colours
-    weight: Map
 
 
 class _Level:
@@ -133,65 +100,55 @@ class _Level:
         change: Float32[np.ndarray, "H W 3"],
         steps: int,
         searched: int,
-        inner: int,
     ) -> Map:
-        """Improve a surface towards the one that causes the change.
-
-        Args:
-            start: of any resolution, m.
-            change: of the picture against the untouched one, counts.
-            steps: of Gauss-Newton.
-            searched: number of last steps that may jump to other slopes.
-            inner: conjugate gradient steps in each.
-        """
+        """Improve a surface (m) by Gauss-Newton; the last `searched` steps may jump."""
         h, w = self._shape
         target = cv2.resize(change, (w, h), interpolation=cv2.INTER_AREA)
         target = np.ascontiguousarray(np.moveaxis(target, 2, 0))
         surface = cv2.resize(start, (w, h), interpolation=cv2.INTER_LINEAR)
         for step in range(steps):
             linear = self._linearise(target, surface, search=step >= steps - searched)
-            surface = surface + self._solve(linear, surface, inner)
+            surface = surface + self._solve(*depth_steps.normal_equations(*linear), surface)
         return surface
 
-    def _linearise(self, target: Colours, surface: Map, search: bool) -> _Linear:
+    def _linearise(
+        self, target: Colours, surface: Map, search: bool
+    ) -> tuple[Colours, Colours, Colours, Colours, Map]:
+        """Return the picture's error (counts), its derivatives by slopes and depth, and weights."""
         p = self._calibration
         gx, gy = np.empty_like(surface), np.empty_like(surface)
-        slopes(surface, self._half, gx, gy)
+        depth_steps.slopes(surface, self._half, gx, gy)
         dark = shadows(p, surface, self._pitch)
         # What shadows and depth leave for the slopes to explain.
         left = target - self._per_depth * np.minimum(surface, np.float32(p.max_depth))
         left -= self._gain * np.tensordot(p.shadow, dark, 1)
-        shading, by_gx, by_gy = self._shading(gx, gy)
+        model = self._gain, self._places, self._coefficients
+        steepest = np.float32(p.max_slope)
+        shading, by_gx, by_gy = depth_steps.shading(gx, gy, *model, steepest)
         error = left - shading
-        moved = self._search(left, error, gx, gy) if search else None
-        if moved is not None:
-            shading, by_gx, by_gy = self._shading(*moved)
+        outlier = np.float32((_OUTLIER * self._noise) ** 2)
+        new_x, new_y, moved = gx, gy, False
+        if search:
+            new_x, new_y, moved = depth_steps.best_slopes(
+                *(left, error, gx, gy, *model, self._lengths, outlier),
+                *(np.float32(_TILTED**2), np.float32(_BETTER)),
+            )
+        if moved:
+            shading, by_gx, by_gy = depth_steps.shading(new_x, new_y, *model, steepest)
             error = left - shading
         size = np.sqrt(np.einsum("chw,chw->hw", error, error)) / self._noise
         weight = self._noise**-2 / np.maximum(size / np.float32(_OUTLIER), 1)
-        if moved is not None:
-            error += by_gx * (moved[0] - gx) + by_gy * (moved[1] - gy)
-        return _Linear(error, by_gx, by_gy, self._per_depth * (surface < p.max_depth), weight)
+        if moved:
+            error += by_gx * (new_x - gx) + by_gy * (new_y - gy)
+        return error, by_gx, by_gy, self._per_depth * (surface < p.max_depth), weight
 
-    def _shading(self, gx: Map, gy: Map) -> tuple[Colours, Colours, Colours]:
-        """Return the colour change by slopes, and its derivatives by gx and gy."""
-        steepest = np.float32(self._calibration.max_slope)
-        return shading(gx, gy, self._gain, self._places, self._coefficients, steepest)
-
-    def _search(self, left: Colours, error: Colours, gx: Map, gy: Map) -> tuple[Map, Map] | None:
-        """Return slopes of another length where they fit much better; None if nowhere."""
-        outlier = np.float32((_OUTLIER * self._noise) ** 2)
-        new_x, new_y, found = best_slopes(
-            *(left, error, gx, gy, self._gain, self._places, self._coefficients, self._lengths),
-            *(outlier, np.float32(_TILTED**2), np.float32(_BETTER)),
-        )
-        return (new_x, new_y) if found else None
-
-    def _solve(self, linear: _Linear, surface: Map, inner: int) -> Map:
+    def _solve(
+        self,
+        curvature: Float32[np.ndarray, "6 h w"],
+        slope: Float32[np.ndarray, "3 h w"],
+        surface: Map,
+    ) -> Map:
         """Return the Gauss-Newton step, by preconditioned conjugate gradients."""
-        curvature, slope = normal_equations(
-            linear.error, linear.by_gx, linear.by_gy, linear.by_depth, linear.weight
-        )
         usual = (curvature[0].mean() + curvature[2].mean()) / 2
         curvature[0] += np.float32(_DAMPING) * usual
         curvature[2] += np.float32(_DAMPING) * usual
@@ -200,18 +157,15 @@ class _Level:
         rest = self._rest / (1 + ((surface - lowest) / np.float32(_FLAT)) ** 2)
         curvature[5] += rest
         residual = slope[2] - rest * surface
-        add_against_slopes(slope[0], slope[1], self._half, residual)
+        depth_steps.add_against_slopes(slope[0], slope[1], self._half, residual)
         smooth = 1 / (usual * self._laplace + curvature[5].mean())
-        return conjugate_gradients(
-            curvature, residual, smooth, self._down, self._across, self._half, inner
+        return depth_steps.conjugate_gradients(
+            curvature, residual, smooth, self._down, self._across, self._half, _INNER
         )
 
 
 def _coefficients(response: Float32[np.ndarray, "3 10 waves"]) -> Float32[np.ndarray, "rows 10"]:
-    """Return the coefficients of 1 and the normal's `monomials`.
-
-    Rows: the colour, its derivative by x, by y; each for R, G, B; each for 1, u, v.
-    """
+    """Return the coefficients of 1 and the normal's `monomials`: by colour, x, y; R, G, B; 1, u, v."""
     r = np.moveaxis(response, 2, 1)  # channel, wave, feature
     out = np.zeros((3, *r.shape[:2], 10), np.float32)
     out[0, ..., 1:] = r[..., :9]

@@ -104,7 +104,7 @@ def normal_equations(error, by_gx, by_gy, by_depth, weight):
 
     Returns:
         gx gx, gx gy, gy gy, gx depth, gy depth, depth depth (6 maps); gx, gy, depth times error (3
-        maps).
+            maps).
     """
     h, w = weight.shape
     curvature, slope = np.empty((6, h, w), np.float32), np.empty((3, h, w), np.float32)

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32
 
+from touchgoal.control.arrays import Counts, Map, Picture
 from touchgoal.control.tactile.background import local_change
 from touchgoal.control.tactile.light_gain import remove_gain
 from touchgoal.control.tactile.sensor_models import SensorModel
@@ -24,39 +25,28 @@ _MIN_FRAMES = 50
 
 @dataclass(frozen=True)
 class TouchForce:
-    """Force of an object on a sensor.
-
-    Attributes:
-        normal: N, positive when pressed.
-        shear: N along the sensor's x and y; None without markers.
-    """
+    """Force of an object on a sensor, N: pressing is positive; along x and y, if it has markers."""
 
     normal: float
     shear: tuple[float, float] | None
 
 
 def estimate_force(
-    depth: Float32[np.ndarray, "h w"],
+    depth: Map,
     pixel_pitch: float,
     sensor: SensorModel,
     markers: Float32[np.ndarray, "*n 2"] | None = None,
     displacement: Float32[np.ndarray, "*n 2"] | None = None,
 ) -> TouchForce:
-    """Estimate the resultant force from one frame's depth and its markers' displacement.
+    """Estimate the resultant force from a depth map (m) and its markers' displacement.
 
     Normal: the gel as an elastic foundation, `foundation_modulus` times the volume in contact. Flat
     faces and edges read too strong because the gel bulges beside them; only the part in view
     counts. The modulus is nominal: compare a real sensor with one known weight.
 
     Shear: `shear_stiffness` times the mean displacement of the markers, weighted by depth. Edges
-    cover few markers and are the least certain.
-
-    Args:
-        depth: of the gel's surface, m (`depth.DepthEstimator`).
-        pixel_pitch: m per px.
-        sensor: its stiffnesses.
-        markers: (x, y) of the dots, px (`MarkerTracker.now.positions`).
-        displacement: from their rest positions, px (`MarkerTracker.displacement`).
+    cover few markers and are the least certain. Both are in px (`MarkerTracker`); `pixel_pitch` is
+    m per px.
     """
     contact = np.where(depth > _CONTACT_SHARE * max(float(depth.max()), 0.0), depth, 0)
     normal = sensor.foundation_modulus * float(contact.sum()) * pixel_pitch**2
@@ -72,12 +62,9 @@ def estimate_force(
 
 @dataclass(frozen=True, eq=False)
 class PictureForce:
-    """Ridge regression from `change_statistics` to force: needs neither gel model nor sensor file.
+    """Ridge regression from `change_statistics` to force (N), without gel model or sensor file.
 
-    Attributes:
-        mean, spread: of the statistics in the calibration grasps.
-        weights: N per spread.
-        offset: N.
+    `mean` and `spread` are of the statistics in the calibration grasps; `weights` are N per spread.
     """
 
     mean: Float[np.ndarray, " k"]
@@ -91,14 +78,10 @@ class PictureForce:
 
 
 def calibrate_force(rows: Float[np.ndarray, "n k"], force: Float[np.ndarray, " n"]) -> PictureForce:
-    """Fit to grasps with a load cell, of objects similar to those to come.
+    """Fit forces (N) to `change_statistics` of grasps on a load cell, untouched frames included.
 
-    Args:
-        rows: `change_statistics` of each frame, untouched frames included.
-        force: measured, N.
-
-    Raises:
-        UserError: too few frames, or no force among them.
+    The objects should be similar to those to come. UserError if there are too few frames, or no
+    force.
     """
     if len(rows) < _MIN_FRAMES or np.ptp(force) < 1:
         raise UserError(
@@ -111,7 +94,7 @@ def calibrate_force(rows: Float[np.ndarray, "n k"], force: Float[np.ndarray, " n
     return PictureForce(mean, spread, np.linalg.solve(square, known.T @ (force - offset)), offset)
 
 
-def resized(picture: np.ndarray) -> Float32[np.ndarray, "h w 3"]:
+def resized(picture: np.ndarray) -> Counts:
     """Return a picture scaled to 320 pixels of width."""
     h, w, _ = picture.shape
     size = _WIDTH, round(h * _WIDTH / w)
@@ -119,7 +102,7 @@ def resized(picture: np.ndarray) -> Float32[np.ndarray, "h w 3"]:
 
 
 def change_statistics(
-    frame: UInt8[np.ndarray, "h w 3"], background: Float32[np.ndarray, "h2 w2 3"]
+    frame: Picture, background: Float32[np.ndarray, "h2 w2 3"]
 ) -> Float[np.ndarray, " k"]:
     """Return strength and extent of the change from the untouched picture (`resized`).
 

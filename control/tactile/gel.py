@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-HeightField = Float32[np.ndarray, "h w"]
+from touchgoal.control.arrays import Map
 
 # Bulge and shadows are smooth: they are computed on cells of about this size, m. In metres, so that
 # a surface gives the same at every resolution.
@@ -20,9 +20,7 @@ SHADOW_CELLS = 16  # how far a shadow reaches at most; on real presses 31 gains 
 # The gel touches the object where the overlap exceeds this share of its maximum nearby; around that
 # it has already come loose and bulges. Taxim's value; on real ball presses 0.3 to 0.4 fit best.
 CONTACT_SHARE = 0.4
-NEARBY_CELLS = (
-    12  # 2.8 mm: a press twice as far away, or the other end of a tilted edge, is another
-)
+NEARBY_CELLS = 12  # 2.8 mm: a press twice as far away, or a tilted edge's other end, is another
 
 
 def pixels_per_cell(pitch: float) -> int:
@@ -30,17 +28,13 @@ def pixels_per_cell(pitch: float) -> int:
     return 2 ** max(round(math.log2(CELL / pitch)), 0)
 
 
-def deform(overlap: HeightField, pitch: float, blur_sigmas: tuple[float, ...]) -> HeightField:
-    """Return the gel's surface under an object's `overlap` (m, 0 where there is none).
+def deform(overlap: Map, pitch: float, blur_sigmas: tuple[float, ...]) -> Map:
+    """Return the gel's surface (m) under an object's overlap (m, 0 without one) with the flat gel.
 
     The gel follows the object in contact and bulges smoothly around it: Taxim's contact-constrained
     pyramid, on coarse cells. (Box blurs would be faster, but their corners show as a cross around a
-    small contact.) Full-resolution detail is added back inside the contact.
-
-    Args:
-        overlap: with the undeformed gel.
-        pitch: m per pixel.
-        blur_sigmas: standard deviations of the pyramid, coarse to fine, m.
+    small contact.) Full-resolution detail is added back inside the contact. `pitch` is m per pixel;
+    `blur_sigmas` are the standard deviations of the pyramid, coarse to fine, m.
     """
     h, w = overlap.shape
     scale = pixels_per_cell(pitch)
@@ -60,18 +54,14 @@ def deform(overlap: HeightField, pitch: float, blur_sigmas: tuple[float, ...]) -
 
 
 def shadow_depth(
-    surface: HeightField, pitch: float, azimuths: tuple[float, ...], slope: float
+    surface: Map, pitch: float, azimuths: tuple[float, ...], slope: float
 ) -> Float32[np.ndarray, "lights h w"]:
-    """Return how far (m) each point lies below the shadow line of each light.
+    """Return how far (m) each point of a surface (m) lies below the shadow line of each light.
 
     Camera and lights look from inside the gel, so an indentation is a hill to them. A point is in
-    shadow if the surface towards the light rises above the light's slope.
-
-    Args:
-        surface: of the gel, m.
-        pitch: m per pixel.
-        azimuths: of the lights in the image, degrees from x towards y.
-        slope: tangent of the lights' height above the gel plane.
+    shadow if the surface towards the light rises above the light's slope, the tangent of its height
+    above the gel plane. `azimuths` are in degrees from the image's x towards y; `pitch` is m per
+    pixel.
     """
     h, w = surface.shape
     scale = pixels_per_cell(pitch)
@@ -89,7 +79,7 @@ def shadow_depth(
 
 
 @lru_cache(maxsize=256)  # a calibration asks for thousands
-def _plane(azimuth: float, rise: float, shape: tuple[int, int]) -> HeightField:
+def _plane(azimuth: float, rise: float, shape: tuple[int, int]) -> Map:
     """Return a plane that climbs by `rise` each cell in a direction, degrees."""
     y, x = (rise * np.arange(n) for n in shape)
     angle = math.radians(azimuth)

@@ -3,8 +3,8 @@
 from functools import cache
 
 import numpy as np
-from jaxtyping import UInt8
 
+from touchgoal.control.arrays import Picture
 from touchgoal.control.tactile.background import Background
 from touchgoal.control.tactile.contact import ContactDetector
 from touchgoal.control.tactile.depth import DepthEstimator
@@ -22,19 +22,14 @@ _READABLE = 0.8  # share of a depth that must be read
 
 
 class IndentationMeter:
-    """Indentation of one fingertip sensor, from its untouched picture on.
+    """Indentation of one fingertip sensor, from an RGB frame of its untouched gel on."""
 
-    Args:
-        sensor: its model.
-        untouched: RGB frame of the untouched gel.
-    """
-
-    def __init__(self, sensor: SensorModel, untouched: UInt8[np.ndarray, "h w 3"]) -> None:
+    def __init__(self, sensor: SensorModel, untouched: Picture) -> None:
         self._detector = ContactDetector(Background(untouched[None]))
         self._depth = DepthEstimator(load(sensor.sensor_file), _CELL)
         self._depth.estimate(untouched)  # compiled code is loaded now, not in a control loop
 
-    def measure(self, frame: UInt8[np.ndarray, "h w 3"]) -> float:
+    def measure(self, frame: Picture) -> float:
         """Return the deepest point of the next frame, m; 0 without contact."""
         if not self._detector.update(frame):
             return 0.0

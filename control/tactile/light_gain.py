@@ -8,11 +8,10 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 
+from touchgoal.control.arrays import AnyPicture, Counts
 from touchgoal.control.features import TACTILE, Observation
-
-Picture = UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"]
 
 GAIN_SPREAD = 0.047
 """Standard deviation of a channel's brightness between 150,000 real touches of Minis (Tactile-MNIST)."""
@@ -24,15 +23,11 @@ _LEAST_CELLS = 0.05  # least share of usable cells for a channel's gain to be me
 _LEAST_GAIN = 0.04  # of a picture that is all but black
 
 
-def light_gain(picture: Picture, untouched: Picture) -> Float32[np.ndarray, "3"]:
-    """Return the factor of each channel's brightness between two pictures of a fingertip.
+def light_gain(picture: AnyPicture, untouched: AnyPicture) -> Float32[np.ndarray, "3"]:
+    """Return the factor of each channel's brightness between two RGB pictures of a fingertip.
 
     It is the median ratio over a grid of cells, which a contact of less than half the gel leaves
     alone. Cells that are dark or clipped do not count; a channel without others keeps 1.
-
-    Args:
-        picture: RGB, touched or not.
-        untouched: the same sensor untouched, RGB, of the same size.
     """
     now, before = _cells(picture), _cells(untouched)
     usable = (before > _DARK) & (before < _BRIGHT) & (now < _BRIGHT)
@@ -46,19 +41,19 @@ def light_gain(picture: Picture, untouched: Picture) -> Float32[np.ndarray, "3"]
     return np.maximum(gain, _LEAST_GAIN)
 
 
-def remove_gain(picture: Picture, untouched: Picture) -> Float32[np.ndarray, "h w 3"]:
+def remove_gain(picture: AnyPicture, untouched: AnyPicture) -> Counts:
     """Return a picture as it would look in the light of the untouched one, counts."""
     return divide_gain(picture, light_gain(picture, untouched))
 
 
-def divide_gain(picture: Picture, gain: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "h w 3"]:
+def divide_gain(picture: AnyPicture, gain: Float32[np.ndarray, "3"]) -> Counts:
     """Return a picture without a known gain."""
     rows, columns, _ = picture.shape
     factors = np.tile(1 / gain, columns)  # whole rows at once: three times faster
     return (picture.reshape(rows, -1) * factors).reshape(picture.shape)
 
 
-def _cells(picture: Picture) -> Float32[np.ndarray, "3 n"]:
+def _cells(picture: AnyPicture) -> Float32[np.ndarray, "3 n"]:
     """Return the means of each channel over parts of every n-th row: a grid of cells, as a list."""
     step = max(picture.shape[0] // _ROWS, 1)
     rows = picture[::step].astype(np.float32)
@@ -69,13 +64,12 @@ def _cells(picture: Picture) -> Float32[np.ndarray, "3 n"]:
 class LightWatch:
     """Largest change of the fingertips' light since the first picture of an episode.
 
-    Attributes:
-        change: of the channel that changed most, as a share; -0.15 is 15 % dimmer.
+    `change` is of the channel that changed most, as a share; -0.15 is 15 % dimmer.
     """
 
     def __init__(self) -> None:
         self.change = 0.0
-        self._first: dict[str, Picture] = {}
+        self._first: dict[str, AnyPicture] = {}
 
     def update(self, observation: Observation) -> None:
         """Take the fingertips' pictures of an observation into account; the first are untouched."""
@@ -89,8 +83,7 @@ class LightWatch:
 def light_advice(changes: Sequence[float]) -> str:
     """Say what a large change of the light means and what to do; empty if there is none.
 
-    Args:
-        changes: largest one of each episode (`LightWatch.change`).
+    `changes` are the largest ones of each episode (`LightWatch.change`).
     """
     large = [change for change in changes if abs(change) > LARGE_CHANGE]
     if not large:

@@ -5,8 +5,9 @@ from functools import cache
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int, UInt8
+from jaxtyping import Bool, Float32, Int
 
+from touchgoal.control.arrays import AnyPicture, Picture
 from touchgoal.control.tactile.sensor_models import MarkerGrid
 from touchgoal.runtime.errors import UserError
 
@@ -16,19 +17,21 @@ _NOISE = 0.02  # darkness of a spot that may be noise
 _RIM = 2.0  # px around a dot's nominal radius that may still be dark
 _LARGER = 1.1  # times a dot's nominal radius: how large those of another gel may be
 
+Dots = Float32[np.ndarray, "rows columns 2"]
+Flags = Bool[np.ndarray, "rows columns"]
+Spots = Float32[np.ndarray, "n 2"]
+Grey = Float32[np.ndarray, "h w 1"]
+
 
 @dataclass(frozen=True)
 class Markers:
-    """Grid of dots in one frame.
+    """Grid of dots in one frame: (x, y) of the centres in px, pixel centres at integers.
 
-    Attributes:
-        positions: (x, y) of the centres in px, pixel centres at integers; expected ones where a dot
-            was not found.
-        found: whether each dot was found.
+    `positions` holds the expected ones where a dot was not `found`.
     """
 
-    positions: Float32[np.ndarray, "rows columns 2"]
-    found: Bool[np.ndarray, "rows columns"]
+    positions: Dots
+    found: Flags
 
     def largest_radius(self, grid: MarkerGrid) -> float:
         """Return the radius (px) that covers such dots on an untouched gel, from their spacing."""
@@ -37,30 +40,17 @@ class Markers:
 
 
 class MarkerTracker:
-    """Tracker of one gel's dots from frame to frame.
+    """Tracker of one gel's dots: at `rest` in an untouched RGB frame, and `now`, in the last one.
 
     A dot takes the spot nearest to its expected place if it is that spot's nearest dot as well and
     lies within half the pitch: dots can get lost, which is flagged, but not swapped. Dots are
     expected either to keep moving or to stay, whichever explains the frame better: a grid that
     jumps and stops would overshoot onto its neighbours. A lost dot is expected where its
-    neighbours' displacement carries it.
-
-    Args:
-        untouched: RGB frame of the untouched gel.
-        grid: printed on the gel; sizes may be off by a fifth.
-        pixel_pitch: m per px.
-
-    Attributes:
-        rest: dots on the untouched gel.
-        now: dots in the last frame.
-
-    Raises:
-        UserError: the frame does not show the grid.
+    neighbours' displacement carries it. The grid's sizes may be off by a fifth; `pixel_pitch` is m
+    per px. UserError if the untouched frame does not show it.
     """
 
-    def __init__(
-        self, untouched: UInt8[np.ndarray, "h w 3"], grid: MarkerGrid, pixel_pitch: float
-    ) -> None:
+    def __init__(self, untouched: Picture, grid: MarkerGrid, pixel_pitch: float) -> None:
         self._size = grid.diameter / pixel_pitch
         self.rest = self.now = find_markers(untouched, grid, pixel_pitch)
         _, darkness = _spots(_grey(untouched), self._size)
@@ -70,11 +60,11 @@ class MarkerTracker:
         self._motion = np.zeros_like(self.rest.positions)
 
     @property
-    def displacement(self) -> Float32[np.ndarray, "rows columns 2"]:
+    def displacement(self) -> Dots:
         """Displacement of each dot from its rest, px."""
         return self.now.positions - self.rest.positions
 
-    def update(self, frame: UInt8[np.ndarray, "h w 3"]) -> Markers:
+    def update(self, frame: Picture) -> Markers:
         """Find the dots in the next frame."""
         before = self.now.positions
         grey = _grey(frame)
@@ -94,13 +84,8 @@ class MarkerTracker:
         return self.now
 
 
-def _match(
-    expected: Float32[np.ndarray, "rows columns 2"], spots: Float32[np.ndarray, "n 2"], reach: float
-) -> tuple[Float32[np.ndarray, "rows columns 2"], Bool[np.ndarray, "rows columns"], float]:
-    """Match dots with spots: positions, whether each was found, and the mean distance, px.
-
-    Every dot without a spot counts as `reach` px.
-    """
+def _match(expected: Dots, spots: Spots, reach: float) -> tuple[Dots, Flags, float]:
+    """Match dots with spots: positions, which were found, mean distance (px; `reach` if lost)."""
     positions, found = expected.copy(), np.zeros(expected.shape[:2], bool)
     if not len(spots):
         return positions, found, reach
@@ -113,20 +98,11 @@ def _match(
     return positions, found, float(np.where(found, distance.min(-1), reach).mean())
 
 
-def find_markers(
-    image: UInt8[np.ndarray, "h w 3"], grid: MarkerGrid, pixel_pitch: float
-) -> Markers:
-    """Find the dots of an untouched gel, ordered by rows (downwards) and columns (rightwards).
+def find_markers(image: Picture, grid: MarkerGrid, pixel_pitch: float) -> Markers:
+    """Find the dots of an untouched gel, by rows (downwards) and columns (rightwards).
 
-    The grid may be rotated by up to 30 degrees, shifted, and scaled by a fifth.
-
-    Args:
-        image: RGB frame.
-        grid: to look for.
-        pixel_pitch: m per px.
-
-    Raises:
-        UserError: less than 70 % of the dots are visible.
+    The grid may be rotated by up to 30 degrees, shifted, and scaled by a fifth; `pixel_pitch` is m
+    per px. UserError if less than 70 % of the dots are visible.
     """
     grey, size = _grey(image), grid.diameter / pixel_pitch
     spots, darkness = _spots(grey, size)
@@ -153,16 +129,12 @@ def find_markers(
     return Markers(positions, found)
 
 
-Image = UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"]
+def without_markers(
+    image: AnyPicture, centres: Float32[np.ndarray, "*n 2"], radius: float
+) -> AnyPicture:
+    """Paint dots of a radius (px), and a rim of 2 px, over with a membrane between their rims.
 
-
-def without_markers(image: Image, centres: Float32[np.ndarray, "*n 2"], radius: float) -> Image:
-    """Paint the dots over with a membrane stretched between their rims.
-
-    Args:
-        image: RGB frame or background.
-        centres: (x, y) of the dots in px, such as `Markers.positions`.
-        radius: of the dots, px; a rim of 2 px more is replaced too.
+    `centres` are (x, y) in px, such as `Markers.positions`.
     """
     h, w, _ = image.shape
     centres = centres.reshape(-1, 2)
@@ -173,7 +145,7 @@ def without_markers(image: Image, centres: Float32[np.ndarray, "*n 2"], radius: 
     return padded[margin : margin + h, margin : margin + w]
 
 
-def _grey(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 1"]:
+def _grey(image: Picture) -> Grey:
     return cv2.transform(image.astype(np.float32), np.full((1, 3), 1 / 3, np.float32))[..., None]
 
 
@@ -183,9 +155,7 @@ def _usual(darkness: Float32[np.ndarray, " n"], grid: MarkerGrid) -> float:
     return float(np.median(darkest)) if len(darkest) else 0.0
 
 
-def _spots(
-    grey: Float32[np.ndarray, "h w 1"], size: float
-) -> tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, " n"]]:
+def _spots(grey: Grey, size: float) -> tuple[Spots, Float32[np.ndarray, " n"]]:
     """Find dark spots of about `size` px: (x, y) of their centres and their darkness, 0 to 1.
 
     Darkness is the share of light missing against the surroundings, blurred to the size of a spot;
@@ -210,9 +180,7 @@ def _spots(
     return centre * scale + np.float32((scale - 1) / 2), dark[y, x]
 
 
-def _refined(
-    grey: Float32[np.ndarray, "h w 1"], spots: Float32[np.ndarray, "n 2"], radius: float
-) -> Float32[np.ndarray, "n 2"]:
+def _refined(grey: Grey, spots: Spots, radius: float) -> Spots:
     """Return each spot's centroid of darkness below its membrane: shading does not shift it."""
     padded, margin = _padded(grey, radius)
     (y, x), membrane = _under_dots(padded, spots + margin, radius)
@@ -221,11 +189,8 @@ def _refined(
     return np.stack([(dark * x).sum(1), (dark * y).sum(1)], 1).astype(np.float32) - margin
 
 
-def _ordered(spots: Float32[np.ndarray, "n 2"], pitch: float) -> Int[np.ndarray, "n 2"]:
-    """Return (column, row) of each spot in the lattice that grows from the middlemost one.
-
-    Spots that no chain of steps reaches get a cell far outside.
-    """
+def _ordered(spots: Spots, pitch: float) -> Int[np.ndarray, "n 2"]:
+    """Return (column, row) of each spot from the middlemost; far outside if cut off from it."""
     cells = np.full((len(spots), 2), -(10**6))
     if not len(spots):
         return cells
@@ -263,9 +228,7 @@ def _fullest(cells: Int[np.ndarray, "n 2"], grid: MarkerGrid) -> Int[np.ndarray,
     return max(corners, key=lambda c: int(((real >= c) & (real < c + size)).all(1).sum()))
 
 
-def _spread(
-    field: Float32[np.ndarray, "rows columns 2"], known: Bool[np.ndarray, "rows columns"]
-) -> Float32[np.ndarray, "rows columns 2"]:
+def _spread(field: Dots, known: Flags) -> Dots:
     """Average a field over known neighbours, the nearest counting most."""
     weight = known.astype(np.float32)
     total = cv2.GaussianBlur(field * weight[..., None], (0, 0), 1.0, borderType=cv2.BORDER_CONSTANT)
@@ -281,7 +244,7 @@ def _padded(image: np.ndarray, radius: float) -> tuple[np.ndarray, int]:
 
 
 def _under_dots(
-    image: np.ndarray, centres: Float32[np.ndarray, "n 2"], radius: float
+    image: np.ndarray, centres: Spots, radius: float
 ) -> tuple[
     tuple[Int[np.ndarray, "n inner"], Int[np.ndarray, "n inner"]],
     Float32[np.ndarray, "n inner channels"],

@@ -1,11 +1,10 @@
 """Check that fingertip pictures are the sensor's: whole, in RGB order, the right way round.
 
 The untouched picture is compared with the sensor file's under other orders of the channels,
-mirrors, scales and shifts; each channel may be brighter or darker as a whole. A hypothesis that
-fits clearly better is the fault. A gel's picture changes smoothly, so a step across half of it is
-the seam of a torn or rolled one. Presses decide what the untouched picture leaves open: a Mini's is
-nearly the same mirrored left to right, but the sensor file then explains no press. Printed dots and
-dust do not count.
+mirrors, scales and shifts, but for a factor on each channel; what fits clearly better is the fault.
+A step across half a row is the seam of a torn picture. Presses decide what is left open: a Mini's
+picture is nearly the same mirrored left to right, but the sensor file then explains no press.
+Printed dots and dust do not count.
 """
 
 from collections.abc import Sequence
@@ -14,8 +13,9 @@ from itertools import permutations, product
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 
+from touchgoal.control.arrays import Counts, Map, Picture
 from touchgoal.control.tactile.background import local_change
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.light_gain import remove_gain
@@ -42,7 +42,6 @@ _DARK = 8.0  # counts added before the logarithm: noise in the dark is no differ
 _MOST = 0.5  # logarithm of light: a spot counts no more
 _COLOURS = "red", "green", "blue"
 
-Picture = UInt8[np.ndarray, "h w 3"]
 Cells = Float32[np.ndarray, "rows columns 3"]
 
 
@@ -61,7 +60,6 @@ class _View:
         return np.ascontiguousarray(image[:, ::-1] if self.columns else image)
 
     def __str__(self) -> str:
-        """Name the fault and its remedy."""
         faults = []
         exchanged = [c for c in range(3) if self.order[c] != c]
         if len(exchanged) == 2:
@@ -86,10 +84,7 @@ _MOVES += [(1, 1, x, y) for x, y in product((-6, -3, 0, 3, 6), repeat=2) if (x, 
 
 
 def seam(picture: Picture) -> str:
-    """Return where a picture is torn or rolled, in words; "" if it is whole.
-
-    Half of a row, or of a column, steps away from the one before it by more than is usual.
-    """
+    """Return where half a row or column steps away, as if torn or rolled; "" if it is whole."""
     for name, lines in (("row", picture), ("column", np.swapaxes(picture, 0, 1))):
         count = lines.shape[0]
         margin = count // _EDGE
@@ -107,16 +102,10 @@ def seam(picture: Picture) -> str:
 
 
 def check_untouched(picture: Picture, sensor: SensorModel, name: str) -> None:
-    """Refuse an untouched picture that contradicts its sensor file.
+    """Refuse an untouched RGB picture that contradicts its sensor file; `name` is for the message.
 
-    Args:
-        picture: RGB, the gel untouched.
-        sensor: its model, or its own sensor file (`find_sensor`).
-        name: of the picture, for the message.
-
-    Raises:
-        UserError: it is torn or rolled, its channels are exchanged, it is mirrored, stretched or
-            shifted.
+    UserError if it is torn or rolled, its channels are exchanged, or it is mirrored, stretched or
+    shifted.
     """
     if fault := seam(picture) or _fault(_compare(picture, sensor)):
         raise UserError(
@@ -129,14 +118,8 @@ def check_presses(
 ) -> None:
     """Refuse presses that the sensor file explains clearly better mirrored or with other channels.
 
-    Args:
-        untouched: RGB, the same gel untouched; `check_untouched` has passed it.
-        presses: RGB, dots painted over; the strongest six are looked at.
-        sensor: its model, or its own sensor file.
-        name: of the pictures, for the message.
-
-    Raises:
-        UserError: channels are exchanged, or the pictures are mirrored.
+    `check_untouched` has passed the RGB picture of the untouched gel; in the presses dots are
+    painted over, and the strongest six are looked at. `name` is for the UserError.
     """
     differences = _compare(untouched, sensor)
     least = differences[_AS_IS]
@@ -164,24 +147,18 @@ def check_presses(
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """A frame as its sensor file explains it.
+    """A frame as its sensor file explains it: depth of the gel (m), change that is left (counts).
 
-    Attributes:
-        depth: of the gel, m.
-        left: change that the depth does not explain, counts.
-        unexplained: the share of that in the strongest tenth of the change.
+    `unexplained` is the share that is left in the strongest tenth of the change.
     """
 
-    depth: Float32[np.ndarray, "h w"]
-    left: Float32[np.ndarray, "h w 3"]
+    depth: Map
+    left: Counts
     unexplained: float
 
 
 def explain(
-    estimator: DepthEstimator,
-    calibration: SensorCalibration,
-    frame: Picture,
-    background: Float32[np.ndarray, "h w 3"],
+    estimator: DepthEstimator, calibration: SensorCalibration, frame: Picture, background: Counts
 ) -> Explanation:
     """Read a frame's depth and compare the frame with the rendering of that depth."""
     depth = estimator.estimate(frame, background)

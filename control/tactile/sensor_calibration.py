@@ -27,8 +27,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, Int
 
+from touchgoal.control.arrays import Counts, Map, Picture
 from touchgoal.control.tactile import gel
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.picture_file import read_picture
@@ -41,43 +42,32 @@ _MAKE = "make one with: touchgoal calibrate PRESSES"
 
 @dataclass(frozen=True)
 class SensorCalibration:
-    """Colours of one sensor, as `touchgoal calibrate` fits them to presses: the sensor file.
+    """Colours of one sensor, as `touchgoal calibrate` fits them to presses: the sensor file."""
 
-    Attributes:
-        sensor: name of the sensor model.
-        background: the untouched sensor, RGB.
-        pixel_pitch: m per pixel.
-        response: counts per channel and feature (`shape_features`); the last axis multiplies (1, u,
-            v), where u and v run from -1 to 1 across columns and rows.
-        light_azimuths: of the lights in the image, degrees from x (right) towards y (down).
-        shadow_slope: tangent of the lights' height above the gel plane.
-        shadow: counts per channel in the deepest shadow of each light.
-        penumbra: shadow depth (`gel.shadow_depth`) of a half-shadow, m.
-        max_slope, max_depth: largest length of (nx, ny), and depth in m, in the presses.
-        blur_sigmas: standard deviations of the gel's bulge, coarse to fine, m (`gel.deform`).
-        noise: standard deviation of the camera's noise, counts.
-        illumination_exponent: power of the background's brightness by which the response varies
-            over the image (`illumination`).
-    """
-
-    sensor: str
-    background: UInt8[np.ndarray, "h w 3"]
-    pixel_pitch: float
+    sensor: str  # name of the sensor model
+    background: Picture  # the untouched sensor, RGB
+    pixel_pitch: float  # m per pixel
+    # counts per channel and feature (`shape_features`); the last axis multiplies (1, u, v), where u
+    # and v run from -1 to 1 across columns and rows
     response: Float32[np.ndarray, "3 10 3"]
+    # of the lights in the image, degrees from x (right) towards y (down)
     light_azimuths: tuple[float, ...]
-    shadow_slope: float
+    shadow_slope: float  # tangent of the lights' height above the gel plane
+    # counts per channel in the deepest shadow of each light
     shadow: Float32[np.ndarray, "3 lights"]
-    penumbra: float
+    penumbra: float  # shadow depth (`gel.shadow_depth`) of a half-shadow, m
+    # max_slope, max_depth: largest length of (nx, ny), and depth in m, in the presses
     max_slope: float
     max_depth: float
+    # standard deviations of the gel's bulge, coarse to fine, m (`gel.deform`)
     blur_sigmas: tuple[float, ...]
-    noise: float
+    noise: float  # standard deviation of the camera's noise, counts
+    # power of the background's brightness by which the response varies over the image
+    # (`illumination`)
     illumination_exponent: float = 1.0
 
 
-def illumination(
-    background: UInt8[np.ndarray, "h w 3"], illumination_exponent: float = 1.0
-) -> Float32[np.ndarray, "h w 3"]:
+def illumination(background: Picture, illumination_exponent: float = 1.0) -> Counts:
     """Return the strength of the response over the image, per channel relative to the mean."""
     light = cv2.GaussianBlur(background.astype(np.float32), (0, 0), background.shape[1] / 40)
     light = (light / light.mean((0, 1))) ** np.float32(illumination_exponent)
@@ -85,18 +75,13 @@ def illumination(
 
 
 def shape_features(
-    surface: Float32[np.ndarray, "h w"], pitch: float, max_slope: float, max_depth: float
+    surface: Map, pitch: float, max_slope: float, max_depth: float
 ) -> Float32[np.ndarray, "10 h w"]:
-    """Return the ten features that the colours are linear in.
-
-    Args:
-        surface: of the gel, m into the gel.
-        pitch: m per pixel.
-        max_slope, max_depth: see `SensorCalibration`.
+    """Return the ten features of a surface (m into the gel) that the colours are linear in.
 
     Returns:
         nx, ny, nx^2, nx ny, ny^2, nx^3, nx^2 ny, nx ny^2, ny^3 of the unit normal's components in
-        the image plane, and the depth in m.
+            the image plane (at most `max_slope` long), and the depth in m.
     """
     padded = np.pad(surface, 1, mode="edge")
     gx = (padded[1:-1, 2:] - padded[1:-1, :-2]) * np.float32(0.5 / pitch)
@@ -117,14 +102,11 @@ def monomials(
 
 
 def shadows(
-    calibration: SensorCalibration, surface: Float32[np.ndarray, "h w"], pitch: float
+    calibration: SensorCalibration, surface: Map, pitch: float
 ) -> Float32[np.ndarray, "lights h w"]:
-    """Return the share of each light's full shadow, 0 to 1, at any resolution.
+    """Return the share of each light's full shadow, 0 to 1, on a surface (m) of a pitch (m/px).
 
-    Args:
-        calibration: the sensor file.
-        surface: of the gel, m; a depth beyond `max_depth` counts as `max_depth`.
-        pitch: of the surface, m per pixel.
+    A depth beyond `max_depth` counts as `max_depth`.
     """
     known = np.minimum(surface, np.float32(calibration.max_depth))
     depth = gel.shadow_depth(known, pitch, calibration.light_azimuths, calibration.shadow_slope)
@@ -133,16 +115,12 @@ def shadows(
 
 
 def design_matrix(
-    calibration: SensorCalibration,
-    surface: Float32[np.ndarray, "h w"],
-    pixels: Int[np.ndarray, " n"],
+    calibration: SensorCalibration, surface: Map, pixels: Int[np.ndarray, " n"]
 ) -> Float32[np.ndarray, "terms n"]:
-    """Return the terms of the colour change: the features times 1, u and v, then the shadows.
+    """Return the terms of the colour change at pixels (flat indices) of a gel's surface (m).
 
-    Args:
-        calibration: only its non-linear parameters are used.
-        surface: of the gel, m.
-        pixels: flat indices of the pixels wanted.
+    They are the features times 1, u and v, then the shadows; only the sensor file's non-linear
+    parameters are used.
     """
     h, w = surface.shape
     shape = shape_features(
@@ -161,10 +139,8 @@ def coefficients(calibration: SensorCalibration) -> Float32[np.ndarray, "3 terms
     return np.concatenate([response, calibration.shadow], 1)
 
 
-def shade(
-    calibration: SensorCalibration, surface: Float32[np.ndarray, "h w"]
-) -> Float32[np.ndarray, "h w 3"]:
-    """Render a gel surface without noise: RGB counts, neither rounded nor clipped.
+def shade(calibration: SensorCalibration, surface: Map) -> Counts:
+    """Render a gel surface (m) without noise: RGB counts, neither rounded nor clipped.
 
     This is the reference; the simulator's fused kernels must agree with it.
     """
@@ -177,10 +153,7 @@ def shade(
 def save(calibration: SensorCalibration, folder: Path, provenance: dict[str, Any]) -> None:
     """Write `sensor.json` and `background.png`, replacing an older sensor file there.
 
-    Args:
-        calibration: to write.
-        folder: made if needed.
-        provenance: source, command, presses, held-out errors; JSON-able.
+    `provenance` (JSON-able) says source, command, presses and held-out errors.
     """
     folder.mkdir(parents=True, exist_ok=True)
     rows, columns, _ = calibration.background.shape
@@ -192,12 +165,17 @@ def save(calibration: SensorCalibration, folder: Path, provenance: dict[str, Any
 
 
 def load(folder: Path) -> SensorCalibration:
-    """Read the sensor file of a folder.
-
-    Raises:
-        UserError: missing, damaged, of another format, or with inconsistent numbers.
-    """
-    description, path = _read_description(folder), folder / _JSON
+    """Read the sensor file of a folder; UserError if missing, damaged, or of another format."""
+    path = folder / _JSON
+    if not path.is_file():
+        raise UserError(f"no sensor file in {folder}: {_MAKE}")
+    try:
+        description = json.loads(path.read_text())
+        version = description["format"]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise UserError(f"{path} is no sensor file: {_MAKE}") from error
+    if version != FORMAT:
+        raise UserError(f"{path} has format {version}, this touchgoal reads {FORMAT}: {_MAKE}")
     image = read_picture(folder / _BACKGROUND)
     if image is None:
         raise UserError(f"{folder / _BACKGROUND} is missing or no picture: {_MAKE}")
@@ -211,34 +189,12 @@ def load(folder: Path) -> SensorCalibration:
         try:
             values[name] = kind(description[name])
         except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"{path} has no usable {name}: {_MAKE}") from error
+            raise UserError(f"{path} has no usable {name} ({error}): {_MAKE}") from error
     lights = len(values["light_azimuths"])
     for name, shape in {"response": (3, N_FEATURES, 3), "shadow": (3, lights)}.items():
         if values[name].shape != shape:
             raise UserError(f"{path}: {name} is {values[name].shape}, not {shape}: {_MAKE}")
-    for name in _POSITIVE:
-        if not values[name] > 0:
-            raise UserError(f"{path}: {name} must be positive, not {values[name]}: {_MAKE}")
     return SensorCalibration(background=image, **values)
-
-
-def read_provenance(folder: Path) -> dict[str, Any]:
-    """Return the provenance of a sensor file; UserError as for `load`."""
-    return _read_description(folder)["provenance"]
-
-
-def _read_description(folder: Path) -> dict[str, Any]:
-    path = folder / _JSON
-    if not path.is_file():
-        raise UserError(f"no sensor file in {folder}: {_MAKE}")
-    try:
-        description = json.loads(path.read_text())
-        version, _ = description["format"], description["provenance"]
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise UserError(f"{path} is no sensor file: {_MAKE}") from error
-    if version != FORMAT:
-        raise UserError(f"{path} has format {version}, this touchgoal reads {FORMAT}: {_MAKE}")
-    return description
 
 
 def _array(value: Any) -> Float32[np.ndarray, "..."]:
@@ -252,6 +208,12 @@ def _numbers(value: Any) -> tuple[float, ...]:
     return tuple(float(v) for v in _array(value))
 
 
+def _positive(value: Any) -> float:
+    if not (value > 0 and math.isfinite(value)):
+        raise ValueError(f"must be positive, not {value}")
+    return float(value)
+
+
 def _number(value: Any) -> float:
     return float(value) if math.isfinite(value) else math.nan
 
@@ -263,27 +225,19 @@ def _plain(value: Any) -> Any:
     return value if isinstance(value, str) else float(f"{value:.7g}")
 
 
-_POSITIVE = (
-    "pixel_pitch",
-    "shadow_slope",
-    "penumbra",
-    "max_slope",
-    "max_depth",
-    "illumination_exponent",
-)
 # Values of sensor.json besides the shape of the background, and how each is read.
 _NUMBERS: dict[str, Callable[[Any], Any]] = {
     "sensor": str,
-    "pixel_pitch": _number,
+    "pixel_pitch": _positive,
     "response": _array,
     "light_azimuths": _numbers,
-    "shadow_slope": _number,
+    "shadow_slope": _positive,
     "shadow": _array,
-    "penumbra": _number,
-    "max_slope": _number,
-    "max_depth": _number,
+    "penumbra": _positive,
+    "max_slope": _positive,
+    "max_depth": _positive,
     "blur_sigmas": _numbers,
     "noise": _number,
-    "illumination_exponent": _number,
+    "illumination_exponent": _positive,
 }
 _INNERMOST = re.compile(r"\[[^\[\]{}]*\]")  # lists of numbers go on one line

@@ -9,13 +9,7 @@ from touchgoal.runtime.errors import UserError
 
 @dataclass(frozen=True)
 class MarkerGrid:
-    """Grid of dots printed on a gel.
-
-    Attributes:
-        rows, columns: of the grid, which is centred on the image.
-        pitch: between neighbours, m.
-        diameter: of a dot, m.
-    """
+    """Dots printed on a gel, centred on the image: pitch between neighbours and diameter, m."""
 
     rows: int
     columns: int
@@ -29,38 +23,23 @@ class SensorModel:
 
     The sensor frame sits on the undeformed gel, in the middle of the image: x along the image's
     columns, y along its rows (downwards), z out of the gel. The gel is modelled as flat.
-
-    Attributes:
-        name: id that encoders and preprocessors use.
-        image_shape: (rows, columns) of a frame.
-        pixel_pitch: m of gel per pixel; square pixels.
-        pitch_range: (smallest, largest) pixel pitch among sensors of this model, m.
-        gel_size: (along x, along y) of the gel, m.
-        gel_thickness: m.
-        case_size: (along x, along y, depth) of the housing, m.
-        foundation_modulus: gel pressure per indentation, Pa/m, as the camera shows it.
-        shear_modulus: of the gel's material, Pa.
-        normal_stiffness: of the whole gel under a typical curved contact, N/m.
-        shear_stiffness: of the whole gel, N/m.
-        frame_rate: Hz.
-        sensor_file: folder with the calibration of a typical sensor (`sensor_calibration`).
-        markers: dots printed on the gel, if any.
     """
 
-    name: str
-    image_shape: tuple[int, int]
-    pixel_pitch: float
+    name: str  # id that encoders and preprocessors use
+    image_shape: tuple[int, int]  # (rows, columns) of a frame
+    pixel_pitch: float  # m of gel per pixel; square pixels
+    # (smallest, largest) pixel pitch among sensors of this model, m
     pitch_range: tuple[float, float]
-    gel_size: tuple[float, float]
-    gel_thickness: float
-    case_size: tuple[float, float, float]
-    foundation_modulus: float
-    shear_modulus: float
-    normal_stiffness: float
-    shear_stiffness: float
-    frame_rate: float
-    sensor_file: Path
-    markers: MarkerGrid | None = None
+    gel_size: tuple[float, float]  # (along x, along y) of the gel, m
+    gel_thickness: float  # m
+    case_size: tuple[float, float, float]  # (along x, along y, depth) of the housing, m
+    foundation_modulus: float  # gel pressure per indentation, Pa/m, as the camera shows it
+    shear_modulus: float  # of the gel's material, Pa
+    normal_stiffness: float  # of the whole gel under a typical curved contact, N/m
+    shear_stiffness: float  # of the whole gel, N/m
+    frame_rate: float  # Hz
+    sensor_file: Path  # folder with the calibration of a typical sensor (`sensor_calibration`)
+    markers: MarkerGrid | None = None  # dots printed on the gel, if any
 
 
 _FILES = Path(__file__).parent / "sensor_files"
@@ -176,11 +155,7 @@ def find_model(name: str) -> SensorModel:
 
 
 def find_sensor(name: str) -> SensorModel:
-    """Return a sensor model by name, or one sensor by the folder of its sensor file.
-
-    Raises:
-        UserError: it is neither.
-    """
+    """Return a sensor by model name, or by the folder of its sensor file; UserError if neither."""
     if name in SENSORS:
         return SENSORS[name]
     folder = Path(name)

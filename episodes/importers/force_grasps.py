@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from touchgoal.control.sensors.gel_corners import rectify
+from touchgoal.control.sensors.tactile_camera import rectify
 from touchgoal.control.tactile.sensor_models import GELSIGHT_WEDGE
 from touchgoal.episodes.media import read_frames
 from touchgoal.runtime.errors import UserError

@@ -11,8 +11,7 @@ from jaxtyping import Float, Int
 
 from touchgoal.control import features as ft
 from touchgoal.control.grippers.hand_commands import PERIOD, SHUT, HandCommands, LastCommand
-from touchgoal.control.motion.servo_lag import SERVO_DAMPING, ServoLag
-from touchgoal.control.motion.tracker import Tracker
+from touchgoal.control.motion.tracker import SERVO_DAMPING, ServoLag, Tracker
 from touchgoal.control.safety.action_filter import ActionFilter, Measurements
 from touchgoal.sim_envs.cell.estimated_wrench import EstimatedWrench
 from touchgoal.sim_envs.config import DeploymentConfig

@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32, UInt8
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.control.motion.rotations import fingers_down
-from touchgoal.control.safety.task_ceilings import TASK_FORCES
+from touchgoal.control.safety.limits import TASK_FORCES
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.deployed_arm import DeployedArm
 from touchgoal.sim_envs.cell.estimated_wrench import ForceMonitor
@@ -63,7 +63,7 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
     ## Episode end
 
     Terminated: success, or a failure (`failures()`). `over_force`: the force on the hand is above
-    the task's ceiling (`control/safety/task_ceilings.py`), at which `deploy` stops the arm.
+    the task's ceiling (`control/safety/limits.py`), at which `deploy` stops the arm.
     Truncated: after `max_seconds`.
 
     ## Info

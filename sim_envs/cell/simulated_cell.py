@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
-from touchgoal.control.motion.servo_lag import SERVO_DAMPING
-from touchgoal.control.safety.braking import braked_velocity
+from touchgoal.control.motion.tracker import SERVO_DAMPING
+from touchgoal.control.safety.limits import braked_velocity
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.cell.estimated_wrench import WrenchError

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from touchgoal.control.grippers import robotiq_registers as registers
+from touchgoal.control.grippers import robotiq as registers
 from touchgoal.control.sensors.load_cell import with_checksum
 from touchgoal.control.sensors.serial_port import modbus_crc
 from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell

@@ -14,8 +14,7 @@ from jaxtyping import Float
 from ruckig import InputParameter, Ruckig, Trajectory
 
 from touchgoal.control.motion.rotations import rotation_matrix, rotation_vector
-from touchgoal.control.safety.braking import braked_velocity
-from touchgoal.control.safety.limits import UR5E
+from touchgoal.control.safety.limits import UR5E, braked_velocity
 from touchgoal.sim_envs.cell.simulated_cell import DT, SimulatedCell
 
 _READY, _DONE = 1, 2

@@ -1,0 +1,15 @@
+"""Arrays of fingertip sensors: pictures (RGB, rows by columns), and maps of a gel."""
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+Picture = UInt8[np.ndarray, "h w 3"]
+Pictures = UInt8[np.ndarray, "n h w 3"]
+Counts = Float32[np.ndarray, "h w 3"]
+"""A picture that is not rounded, counts of 0 to 255."""
+AnyPicture = Picture | Counts
+Map = Float32[np.ndarray, "h w"]
+"""Such as a gel's surface, m into the gel."""
+Circle = Float[np.ndarray, " 3"]
+"""Centre x (column), centre y (row) and radius of a contact, px; (0, 0) is the first pixel."""
+Circles = Float[np.ndarray, "n 3"]
