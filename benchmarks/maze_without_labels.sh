@@ -6,7 +6,7 @@ set -eu
 
 demos() { # name, options
     [ -f "runs/maze/$1/metrics.json" ] ||
-        touchgoal collect-demos --task bead-maze --env.disturbance 0.003 "${@:2}" --resume --out "runs/maze/$1"
+        touchgoal collect-demos --task bead-maze --env.disturbance 0.003 "${@:2}" --out "runs/maze/$1"
 }
 demos validation --env.split validation --env.n-wires 16 --episodes 12 --seed 20000
 demos train --env.n-wires 260 --episodes 130
@@ -32,7 +32,7 @@ from pathlib import Path
 import torch
 
 from touchgoal.encoders import pretrained
-from touchgoal.encoders.ssl.untrained import backbone_for
+from touchgoal.encoders.backbones.sparsh import backbone_for
 
 torch.manual_seed(0)
 backbone = backbone_for("mae", "compact", "gelsight_mini_markers", stride=2)
