@@ -20,11 +20,7 @@ from touchgoal.encoders.alignment.data import (
     prepare_touch_data,
     split_by_episode,
 )
-from touchgoal.encoders.alignment.retrieval import (
-    evaluate_retrieval,
-    mean_average_precision,
-    top1,
-)
+from touchgoal.encoders.alignment.retrieval import evaluate_retrieval, mean_average_precision, top1
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS as PRESETS_VIT
 from touchgoal.encoders.training.batch_noise import BatchNoise

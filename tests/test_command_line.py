@@ -77,9 +77,7 @@ def test_a_bad_value_names_the_option_as_it_was_typed() -> None:
         options("--env.mass", "nan", "nan")
 
 
-def test_help_shows_the_first_options_and_help_all_shows_all(
-    capsys: pytest.CaptureFixture,
-) -> None:
+def test_help_shows_the_first_options_and_help_all_shows_all(capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(SystemExit):
         options("--help")
     short = capsys.readouterr().out
@@ -90,9 +88,7 @@ def test_help_shows_the_first_options_and_help_all_shows_all(
     assert "--env.timestep" in capsys.readouterr().out
 
 
-def test_arguments_and_the_folder_have_names_and_defaults(
-    capsys: pytest.CaptureFixture,
-) -> None:
+def test_arguments_and_the_folder_have_names_and_defaults(capsys: pytest.CaptureFixture) -> None:
     for name, usage in {
         "check-sensor": "[OPTIONS] SOURCE",
         "reward-curves": "[OPTIONS] SOURCE",

@@ -126,10 +126,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_a_disk_that_fills_up_costs_one_episode_and_is_said_in_a_line(
-    small_disk: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
+    small_disk: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Through the command, on a real file system: the table is there, earlier episodes are whole."""
     monkeypatch.setattr("touchgoal.control.deployment.preflight._MIN_FREE_BYTES", 0)

@@ -15,13 +15,7 @@ from touchgoal.control.arms import franka, ur
 from touchgoal.control.arms.streaming import ArmConfig, ArmProcess, shift_wrench
 from touchgoal.control.grippers.franka_hand import FrankaHand
 from touchgoal.control.grippers.robotiq import Robotiq, RobotiqConfig
-from touchgoal.control.interfaces import (
-    Arm,
-    Camera,
-    DriverError,
-    Gripper,
-    LoadCell,
-)
+from touchgoal.control.interfaces import Arm, Camera, DriverError, Gripper, LoadCell
 from touchgoal.control.safety.limits import FR3, UR5E
 from touchgoal.control.sensors.load_cell import SerialLoadCell
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig

@@ -216,10 +216,7 @@ def test_embeddings_are_unit_vectors_of_one_space(rng: np.random.Generator) -> N
     frames = rng.integers(0, 256, (70, 60, 80, 3)).astype(np.uint8)
     touch = encoder.embed_frames(frames, frames[0])
     assert touch.shape == (70, 16)
-    for rows in (
-        touch,
-        encoder.embed_text_goal(["soft", "a hard ball"], towers),
-    ):
+    for rows in (touch, encoder.embed_text_goal(["soft", "a hard ball"], towers)):
         np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1, rtol=1e-5)
         assert rows.shape[1] == 16
     one = encoder.embed_frames(frames[69:], frames[0])

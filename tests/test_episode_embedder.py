@@ -21,10 +21,7 @@ from touchgoal.encoders.backbones.vit import PRESETS
 from touchgoal.episodes.recording import EpisodeSpec
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
-from touchgoal.rewards.curves import (
-    Contact,
-    first_contact,
-)
+from touchgoal.rewards.curves import Contact, first_contact
 from touchgoal.rewards.embedding_distance import (
     EpisodeEmbedder,
     check_words,

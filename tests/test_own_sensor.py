@@ -17,10 +17,7 @@ from touchgoal.control.sensors.fingertip_source import open_frames, recorded_fra
 from touchgoal.control.sensors.live_picture import LivePicture
 from touchgoal.control.tactile.depth import DepthEstimator
 from touchgoal.control.tactile.sensor_calibration import load, shade
-from touchgoal.control.tactile.sensor_models import (
-    GELSIGHT_MINI,
-    GELSIGHT_MINI_MARKERS,
-)
+from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, press, untouched

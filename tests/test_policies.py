@@ -25,11 +25,7 @@ from touchgoal.policies.evaluation.evaluate import evaluate, run_trials, trial_s
 from touchgoal.policies.evaluation.report import film_trials
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.policies.evaluation.table import table
-from touchgoal.policies.training.training_data import (
-    choose_episodes,
-    common_sensor,
-    find_task,
-)
+from touchgoal.policies.training.training_data import choose_episodes, common_sensor, find_task
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.folder_lock import FolderLock
 from touchgoal.runtime.provenance import portable

@@ -157,9 +157,7 @@ def test_scale_maps_the_usual_start_to_one_and_end_to_zero(tmp_path: Path) -> No
 def replace_text(normalizer: DistanceNormalizer) -> DistanceNormalizer:
     """The normalizer with an entry for text, which the drawn words cannot fit (their ends are alike)."""
     return replace(
-        normalizer,
-        start=normalizer.start | {"text": 1.0},
-        goal=normalizer.goal | {"text": 0.0},
+        normalizer, start=normalizer.start | {"text": 1.0}, goal=normalizer.goal | {"text": 0.0}
     )
 
 

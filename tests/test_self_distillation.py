@@ -19,16 +19,10 @@ from touchgoal.encoders.backbones.sparsh import backbone_for, vit_for
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.ssl import train
 from touchgoal.encoders.ssl.config import DINO_PRESETS, DinoConfig
-from touchgoal.encoders.ssl.dino import (
-    Dino,
-    cross_entropy_of_views,
-    information,
-)
+from touchgoal.encoders.ssl.dino import Dino, cross_entropy_of_views, information
 from touchgoal.encoders.ssl.frames import sample_frames
 from touchgoal.encoders.ssl.masks import cover, cut, draw_blocks, draw_size, draw_targets
-from touchgoal.encoders.ssl.self_distillation import (
-    SelfDistillation,
-)
+from touchgoal.encoders.ssl.self_distillation import SelfDistillation
 from touchgoal.encoders.ssl.train import train_unlabelled
 from touchgoal.encoders.ssl.validation import token_statistics
 from touchgoal.encoders.training.options import TrainerOptions

@@ -11,10 +11,7 @@ from touchgoal.control.tactile.sensor_models import DIGIT, GELSIGHT, GELSIGHT_MI
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI as MINI
 from touchgoal.encoders.pretrained import load_encoder, save
 from touchgoal.encoders.whitening.covariance import inverse_square_root
-from touchgoal.encoders.whitening.simulated_surfaces import (
-    WhiteningConfig,
-    train,
-)
+from touchgoal.encoders.whitening.simulated_surfaces import WhiteningConfig, train
 from touchgoal.sim_envs.config import NO_RANDOMIZATION, PickPlaceConfig, SensorRandomization
 from touchgoal.sim_envs.experts.pick_place import PickPlaceExpert
 from touchgoal.sim_envs.pick_place import PickPlace

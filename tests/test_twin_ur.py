@@ -268,12 +268,7 @@ def test_ur_picks_and_places(ur5e: RunningTwin) -> None:
     height = max(layout["object"][2], 0.0185)
     pick, place = [*layout["object"][:2], height], [*layout["goal"], height]
     said = client(
-        places,
-        ur5e.cell.address,
-        ur5e.cell.gripper.port,
-        pick,
-        place,
-        yaw_of(layout["object"]),
+        places, ur5e.cell.address, ur5e.cell.gripper.port, pick, place, yaw_of(layout["object"])
     )
     assert said == {"air": 3, "object": 2}
     truth = ur5e.ask("truth")

@@ -17,11 +17,7 @@ from numbered_pictures import BITS, numbered, until
 
 from touchgoal.control.interfaces import DriverError, TactileSensor
 from touchgoal.control.sensors.fingertip_source import fingertip_video
-from touchgoal.control.sensors.picture_integrity import (
-    BrokenBlocks,
-    FrozenParts,
-    JpegDecoder,
-)
+from touchgoal.control.sensors.picture_integrity import BrokenBlocks, FrozenParts, JpegDecoder
 from touchgoal.control.sensors.tactile_camera import (
     DIGIT_CROP,
     GELSIGHT_MINI_CROP,
