@@ -24,6 +24,7 @@ COMMANDS = {
     "collect-demos": "record an expert's episodes of a task, or failures on purpose",
     "collect-touches": "record objects slid over a simulated sensor, to learn from without labels",
     "teleop": "lead the bead along a wire with keys, and record it",
+    "annotate": "find and caption the objects that VisGel's recordings touch",
     "train-encoder": "train a touch encoder",
     "train-estimators": "train networks that estimate contact from touch and poses from camera pictures",
     "train-policy": "train a policy on recorded episodes",

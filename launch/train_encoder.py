@@ -32,8 +32,10 @@ class Align(TrainingOptions):
 
     PRESETS: ClassVar = _presets("align", ALIGN_PRESETS)
 
+    data: Path
+    """Episode set to train on, or the annotations.jsonl of `annotate`, with --sensor."""
     validation: Path
-    """Set of other episodes, at least four of each object. Retrieval on one half of them chooses the
+    """Set (or annotations.jsonl) of other episodes, at least four of each object. Retrieval on one half of them chooses the
     best epoch; the other half is the test set."""
     out: Path | None = None
     """Folder of the run; the encoder goes to its `encoder/`."""
@@ -202,6 +204,9 @@ def _align(config: Align) -> None:
     from touchgoal.runtime.progress import track
 
     check_training(config, config.out)
+    if config.data.suffix == ".jsonl":
+        _align_annotated(config)
+        return
     data, validation = open_sets(config.data, config.validation)
     sensor = find_sensor_name(config.sensor, data, validation)
     successes = [i for i in range(len(data)) if data.meta(i).get("success") is True]
@@ -227,6 +232,24 @@ def _align(config: Align) -> None:
     normalizer = fit_normalizer(embedded, ("image", "tactile", "text"), scene_of(data.features))
     normalizer.save(out / "encoder" / NORMALIZER)
     print(f"encoder and normalizer: {out / 'encoder'}")
+
+
+def _align_annotated(config: Align) -> None:
+    """Align on the annotations of `annotate`; without successful episodes no normalizer is fitted."""
+    from touchgoal.encoders.alignment.align import align
+    from touchgoal.encoders.annotation.touches import open_annotations
+    from touchgoal.encoders.towers.towers import load_towers
+    from touchgoal.encoders.training.run import open_training
+    from touchgoal.runtime.provenance import provenance
+
+    train, val = open_annotations(config.data, config.validation, config.sensor)
+    towers = load_towers(config.towers)
+    out = open_training(config, "train-encoder")
+    print(f"{len(train)} touches of {len(train.descriptions)} captions; {len(val)} for validation")
+    source = {"data": str(config.data), "validation": str(config.validation), **provenance()}
+    assert config.sensor is not None  # open_annotations has checked it
+    align(train, val, towers, config.align, config.sensor, out, config, source)
+    print(f"encoder: {out / 'encoder'}")
 
 
 def _train_unlabelled(config: Mae | Dino | IJepa | VJepa) -> None:

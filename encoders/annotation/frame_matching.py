@@ -1,0 +1,98 @@
+"""Frame matching: the tactile frame of deepest contact and the camera frame before it that shows the object.
+
+MMWand, appendix A: the contact frame maximises the norm of the pixel difference to the untouched tactile
+frame; the reference frame is the first unobstructed camera frame.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.encoders.annotation.boxes import Box, Image, intersection
+from touchgoal.encoders.annotation.left_out import LeftOut
+
+_UNTOUCHED = 5  # frames of a recording closest to the reference, taken as untouched
+
+
+@dataclass(frozen=True)
+class ContactFrame:
+    """Frame of the largest deformation.
+
+    Attributes:
+        index: Index of the frame.
+        deformation: Norm of its difference to the reference frame, counts.
+        threshold: Smallest norm that counts as contact, counts.
+    """
+
+    index: int
+    deformation: float
+    threshold: float
+
+
+def match_contact(
+    touches: Iterable[Image], reference: Image, min_deformation: float
+) -> ContactFrame:
+    """Return the contact frame of a recording.
+
+    Noise alone puts every untouched frame at nearly the same distance from the reference. The threshold
+    is `min_deformation` times the median distance of the 5 frames closest to the reference.
+
+    Args:
+        touches: Tactile frames in time.
+        reference: Tactile frame without contact.
+        min_deformation: Factor of the untouched frames' distance, above 1.
+
+    Raises:
+        LeftOut: Too few frames are active, or none is deformed enough.
+    """
+    distances = deformations(touches, reference)
+    active = np.flatnonzero(np.isfinite(distances))
+    if len(active) <= _UNTOUCHED:
+        raise LeftOut("fewer than 6 active tactile frames")
+    untouched = np.sort(distances[active])[:_UNTOUCHED]
+    threshold = min_deformation * float(np.median(untouched))
+    index = int(active[distances[active].argmax()])
+    if distances[index] <= threshold:
+        raise LeftOut("not enough deformation: the sensor touches nothing")
+    return ContactFrame(index, float(distances[index]), threshold)
+
+
+def deformations(touches: Iterable[Image], reference: Image) -> Float[np.ndarray, " n"]:
+    """Return the norm of each frame's difference to the reference, counts; NaN for inactive frames.
+
+    A frame is inactive if it has one colour, or repeats the reference or the frame before it.
+
+    Raises:
+        LeftOut: A frame has another size than the reference.
+    """
+    distances, before = [], reference
+    for touch in touches:
+        if touch.shape != reference.shape:
+            raise LeftOut("tactile frames of different sizes")
+        inactive = np.array_equal(touch, before) or np.array_equal(touch, reference)
+        inactive = inactive or bool((touch == touch[0, 0]).all())
+        difference = np.subtract(touch, reference, dtype=np.float32)
+        distances.append(np.nan if inactive else float(np.linalg.norm(difference)))
+        before = touch
+    return np.asarray(distances, np.float64)
+
+
+def match_reference(sensor: Sequence[Box | None]) -> int:
+    """Return the first frame in which the sensor does not cover the place that it will touch.
+
+    Args:
+        sensor: The sensor's box in each camera frame up to the contact frame, the last; None where it is
+            not in view.
+
+    Raises:
+        LeftOut: The sensor is lost at the contact, or covers the place in every frame.
+    """
+    contact = sensor[-1]
+    if contact is None:
+        raise LeftOut("the tracker lost the sensor before the contact")
+    for i, box in enumerate(sensor):
+        if box is None or not intersection(box, contact):
+            return i
+    raise LeftOut("the sensor hides the touched place in every frame before the contact")

@@ -1,0 +1,137 @@
+"""Annotated touches as lines of a JSONL file: written one by one, so that a kill costs the last line at most."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Generic, TypeVar
+
+from pydantic import Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
+
+from touchgoal.encoders.annotation.boxes import Box
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import STRICT
+
+
+@dataclass(frozen=True, config=STRICT)
+class Instance:
+    """An object in view."""
+
+    box: Box
+    """In the reference image, px."""
+    score: float
+    """Confidence of the detector."""
+    caption: str
+    """Answer of the captioner on the object's crop."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class Contact:
+    """The frame of the largest deformation."""
+
+    image: str
+    """Camera image of that time; the sensor hides the object."""
+    sensor: Box
+    """The sensor's box in it, px."""
+    deformation: float
+    """Norm of the tactile frame's difference to the reference, counts."""
+    threshold: float
+    """Smallest norm that counts as contact, counts."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class AnnotatedTouch:
+    """One touch: a line of `annotations.jsonl`. Files are named by absolute paths."""
+
+    name: str
+    """The recording."""
+    touch: str
+    """Tactile image of the contact."""
+    reference_touch: str
+    """Tactile image without contact."""
+    image: str
+    """Camera image in which the sensor does not hide the object."""
+    instances: Annotated[tuple[Instance, ...], Field(min_length=1)]
+    """Every object in view, by confidence."""
+    touched: Annotated[int, Field(ge=0)]
+    """Index of the touched one."""
+    overlap: float
+    """IoU of its box and the sensor's box at the contact."""
+    object: str
+    """Id of the touched object: its caption, unless someone who knows better writes another."""
+    dropped: dict[str, int]
+    """Number of boxes that were not taken for objects, by reason."""
+    contact: Contact
+    provenance: dict[str, Any]
+    """Models, thresholds and prompts."""
+
+    def __post_init__(self) -> None:
+        """Check the index of the touched instance."""
+        if self.touched >= len(self.instances):
+            raise ValueError(f"touched is {self.touched} of {len(self.instances)} instances")
+
+
+@dataclass(frozen=True, config=STRICT)
+class LeftOutRecording:
+    """A recording without annotation: a line of `left_out.jsonl`."""
+
+    name: str
+    reason: str
+    provenance: dict[str, Any]
+
+
+Line = TypeVar("Line", AnnotatedTouch, LeftOutRecording)
+
+
+class LinesFile(Generic[Line]):
+    """A JSONL file that grows; a last line that a kill cut short is removed when it is opened to write."""
+
+    def __init__(self, path: Path, kind: type[Line]) -> None:
+        """Name a file, which need not exist, and what its lines are."""
+        self.path, self._lines = path, TypeAdapter(kind)
+
+    def read(self) -> Iterator[Line]:
+        """Yield the lines, of a file that need not exist.
+
+        Raises:
+            UserError: A line is broken.
+        """
+        if not self.path.exists():
+            return
+        with self.path.open("rb") as lines:
+            for number, line in enumerate(lines, 1):
+                try:
+                    yield self._lines.validate_json(line)
+                except ValidationError as error:
+                    first = error.errors()[0]
+                    key = ".".join(map(str, first["loc"]))
+                    raise UserError(
+                        f"{self.path}:{number}: {f'{key}: ' if key else ''}{first['msg']}; mend or "
+                        "delete the line"
+                    ) from error
+
+    def remove_unfinished(self) -> None:
+        """Cut off a last line without its end."""
+        if self.path.exists():
+            data = self.path.read_bytes()
+            if data and not data.endswith(b"\n"):
+                with self.path.open("r+b") as file:
+                    file.truncate(data.rfind(b"\n") + 1)
+
+    def append(self, line: Line) -> None:
+        """Write one more line, complete or not at all."""
+        text = json.dumps(self._lines.dump_python(line, mode="json"), ensure_ascii=False)
+        with self.path.open("ab") as file:
+            file.write(text.encode() + b"\n")
+
+
+def read_annotations(path: Path) -> list[AnnotatedTouch]:
+    """Read the records that `annotate` wrote.
+
+    Raises:
+        UserError: There is no such file, it is empty, or a line is broken.
+    """
+    records = list(LinesFile(path, AnnotatedTouch).read())
+    if not records:
+        raise UserError(f"{path} holds no annotated touch: give an annotations.jsonl of annotate")
+    return records
