@@ -36,7 +36,7 @@ class Config(AnnotationSettings, _Source):
 def main(config: Config) -> None:
     """Annotate the missing recordings, and print what could not be annotated and why."""
     from touchgoal.encoders.annotation.annotate import ANNOTATIONS, annotate_all
-    from touchgoal.encoders.annotation.pretrained_pipeline import PretrainedModels
+    from touchgoal.encoders.annotation.models import PretrainedModels
     from touchgoal.encoders.training.trainer import check_device
     from touchgoal.episodes.importers.visgel import find_root, read_visgel_list
     from touchgoal.runtime.interruption import on_interruption

@@ -9,12 +9,12 @@ from touchgoal.encoders.annotation.boxes import Box, Image, crop
 from touchgoal.encoders.annotation.config import AnnotationSettings
 from touchgoal.encoders.annotation.frame_matching import match_contact, match_reference
 from touchgoal.encoders.annotation.instance_matching import match_instance, select_instances
-from touchgoal.encoders.annotation.left_out import LeftOut
 from touchgoal.encoders.annotation.models import AnnotationModels
 from touchgoal.encoders.annotation.records import (
     AnnotatedTouch,
     Contact,
     Instance,
+    LeftOut,
     LeftOutRecording,
     LinesFile,
 )

@@ -1,5 +1,7 @@
 """Boxes in an image: overlap, duplicates, crops."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from jaxtyping import UInt8
@@ -11,6 +13,19 @@ Image = UInt8[np.ndarray, "h w 3"]
 """RGB."""
 
 _GREY = (128, 128, 128)
+
+
+@dataclass(frozen=True)
+class Detection:
+    """A box in an image.
+
+    Attributes:
+        box: In px.
+        score: Confidence of the detector, in [0, 1].
+    """
+
+    box: Box
+    score: float
 
 
 def area(box: Box) -> float:

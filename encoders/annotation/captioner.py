@@ -1,5 +1,7 @@
 """Captions by BLIP-2 (Li et al., ICML 2023)."""
 
+from typing import Any
+
 import torch
 
 from touchgoal.encoders.annotation.boxes import Image
@@ -17,7 +19,7 @@ class Blip2:
         from transformers import AutoTokenizer, Blip2Processor
         from transformers.models.blip.image_processing_pil_blip import BlipImageProcessorPil
 
-        self._processor = Blip2Processor(
+        self._processor: Any = Blip2Processor(
             load_part(source, BlipImageProcessorPil),
             load_part(source, AutoTokenizer),
             num_query_tokens=self._model.config.num_query_tokens,

@@ -1,9 +1,10 @@
 """Open-vocabulary detection by Grounding DINO (Liu et al., ECCV 2024), in the place of the paper's GLIP."""
 
+from typing import Any
+
 import torch
 
-from touchgoal.encoders.annotation.boxes import Image, area, clipped
-from touchgoal.encoders.annotation.models import Detection
+from touchgoal.encoders.annotation.boxes import Detection, Image, area, clipped
 from touchgoal.encoders.annotation.pretrained_models import load_model, load_part
 
 _LOWEST_SCORE = 0.05  # boxes below are background; the others are counted as low confidence
@@ -22,7 +23,7 @@ class GroundingDino:
             GroundingDinoImageProcessorPil,
         )
 
-        self._processor = GroundingDinoProcessor(
+        self._processor: Any = GroundingDinoProcessor(
             load_part(source, GroundingDinoImageProcessorPil), load_part(source, AutoTokenizer)
         )
         self._device = device

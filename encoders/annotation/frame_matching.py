@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from touchgoal.encoders.annotation.boxes import Box, Image, intersection
-from touchgoal.encoders.annotation.left_out import LeftOut
+from touchgoal.encoders.annotation.records import LeftOut
 
 _UNTOUCHED = 5  # frames of a recording closest to the reference, taken as untouched
 

@@ -3,9 +3,8 @@
 from collections import Counter
 from collections.abc import Sequence
 
-from touchgoal.encoders.annotation.boxes import Box, iou
-from touchgoal.encoders.annotation.left_out import LeftOut
-from touchgoal.encoders.annotation.models import Detection
+from touchgoal.encoders.annotation.boxes import Box, Detection, iou
+from touchgoal.encoders.annotation.records import LeftOut
 
 _SAME_OBJECT = 0.7  # IoU of two boxes of one object
 _SAME_AS_SENSOR = 0.5  # IoU of a box with the sensor's

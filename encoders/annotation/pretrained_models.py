@@ -3,12 +3,14 @@
 import os
 from typing import Any
 
+import torch
+
 from touchgoal.encoders.towers.wheels import wheel_folder
 from touchgoal.runtime.errors import UserError
 
 
 def load_model(source: str, class_name: str, model_type: str, device: str) -> Any:
-    """Load a model of one class, frozen.
+    """Load a model of one class, frozen, in float32: some checkpoints are stored in half precision.
 
     Args:
         source: Hugging Face id or local folder.
@@ -31,7 +33,7 @@ def load_model(source: str, class_name: str, model_type: str, device: str) -> An
         if (kind := config.get("model_type")) != model_type:
             raise UserError(f"{source} is a '{kind}', no {model_type}: give a {model_type}")
         model, report = getattr(transformers, class_name).from_pretrained(
-            source, local_files_only=local, output_loading_info=True
+            source, local_files_only=local, dtype=torch.float32, output_loading_info=True
         )
     except OSError as error:
         raise _not_found(source, model_type) from error

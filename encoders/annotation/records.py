@@ -71,6 +71,10 @@ class AnnotatedTouch:
             raise ValueError(f"touched is {self.touched} of {len(self.instances)} instances")
 
 
+class LeftOut(Exception):
+    """A recording cannot be annotated; the message is one of a few fixed reasons."""
+
+
 @dataclass(frozen=True, config=STRICT)
 class LeftOutRecording:
     """A recording without annotation: a line of `left_out.jsonl`."""
