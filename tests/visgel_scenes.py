@@ -10,6 +10,7 @@ import numpy as np
 
 from touchgoal.encoders.annotation.boxes import Box, Detection, Image
 from touchgoal.encoders.annotation.sensor_tracking import track_csrt
+from touchgoal.runtime.picture_file import read_picture
 
 COLOURS = {"red ball": (210, 40, 40), "green cup": (40, 190, 60), "blue box": (50, 70, 220)}
 SENSOR = 26  # px
@@ -149,8 +150,9 @@ class KnownBoxes:
         self._scene_of = {}
         for scene in scenes:
             for path in (root / Path(scene.contact_image).parent).iterdir():
-                picture = cv2.imread(str(path))
-                self._scene_of[picture[:, :, ::-1].tobytes()] = scene, int(path.stem[-4:])
+                picture = read_picture(path)
+                assert picture is not None
+                self._scene_of[picture.tobytes()] = scene, int(path.stem[-4:])
 
     def detect(self, image: Image, prompt: str) -> list[Detection]:
         scene, frame = self._scene_of[image.tobytes()]
@@ -190,9 +192,6 @@ def make_detector(folder: Path) -> Path:
         "num_attention_heads": 2,
         "intermediate_size": 32,
     }
-    layers: dict[str, Any] = {
-        f"{part}_{key}": n for part in ("encoder", "decoder") for key, n in _SIZES.items()
-    }
     config = GroundingDinoConfig(
         backbone_config=SwinConfig(
             image_size=64,
@@ -200,22 +199,24 @@ def make_detector(folder: Path) -> Path:
             depths=[1, 1, 1, 1],
             num_heads=[1, 1, 2, 2],
             window_size=4,
-            out_indices=[2, 3, 4],
+            **{"out_indices": [2, 3, 4]},
         ),
         text_config=BertConfig(vocab_size=len(words), hidden_size=16, **small),
         num_queries=6,
         d_model=32,
         max_text_len=16,
-        **layers,
+        encoder_layers=1,
+        decoder_layers=2,  # one fails
+        encoder_ffn_dim=16,
+        decoder_ffn_dim=16,
+        encoder_attention_heads=2,
+        decoder_attention_heads=2,
     )
     torch.manual_seed(0)
     GroundingDinoForObjectDetection(config).save_pretrained(folder)
     size = {"shortest_edge": 128, "longest_edge": 256}  # 64 fails
     GroundingDinoImageProcessorPil(size=size).save_pretrained(folder)
     return folder
-
-
-_SIZES = {"layers": 1, "ffn_dim": 16, "attention_heads": 2}
 
 
 def make_captioner(folder: Path) -> Path:
