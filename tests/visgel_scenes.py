@@ -192,6 +192,7 @@ def make_detector(folder: Path) -> Path:
         "num_attention_heads": 2,
         "intermediate_size": 32,
     }
+    levels: dict[str, Any] = {"out_indices": [2, 3, 4]}  # pyright does not know it
     config = GroundingDinoConfig(
         backbone_config=SwinConfig(
             image_size=64,
@@ -199,7 +200,7 @@ def make_detector(folder: Path) -> Path:
             depths=[1, 1, 1, 1],
             num_heads=[1, 1, 2, 2],
             window_size=4,
-            **{"out_indices": [2, 3, 4]},
+            **levels,
         ),
         text_config=BertConfig(vocab_size=len(words), hidden_size=16, **small),
         num_queries=6,
