@@ -8,6 +8,7 @@ from typing import Any, get_args
 from beartype import BeartypeConf, beartype
 from jaxtyping import AbstractArray
 from jaxtyping._decorator import _destring_annotation
+from jaxtyping._decorator import jaxtyped as plain_jaxtyped
 from jaxtyping._storage import pop_shape_memo, push_shape_memo
 
 _check = beartype(conf=BeartypeConf(is_pep484_tower=True))
@@ -30,6 +31,8 @@ def jaxtyped(fn: Any = None, *, typechecker: Any = None) -> Any:
         return type(fn)(jaxtyped(fn.__func__))
     if isinstance(fn, property):
         return property(*(f and jaxtyped(f) for f in (fn.fget, fn.fset, fn.fdel)))
+    if inspect.isgeneratorfunction(fn):  # its body runs later, among the axes of whoever asks
+        return plain_jaxtyped(fn, typechecker=_check)
     if "<locals>" in fn.__qualname__:
         if fn.__code__ in _met:
             return fn
