@@ -52,8 +52,6 @@ def annotated_touches(records: Sequence[AnnotatedTouch], sensor: str) -> Touches
         view_index=index,
         object=tuple(objects),
         descriptions={name: list(captions) for name, captions in descriptions.items()},
-        side=np.zeros(len(frames), int),
-        episode_index=index,
     )
 
 
