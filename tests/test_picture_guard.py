@@ -30,7 +30,7 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.tactile.optics import render_untouched
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 
-REAL = Path("/work/shared/data")
+REAL = Path(__file__).parents[2] / "shared" / "data"  # beside the project; not part of it
 MINI = load(GELSIGHT_MINI.sensor_file)
 
 
