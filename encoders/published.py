@@ -39,15 +39,14 @@ def load_published(
 
         save(load_published("facebook/sparsh-dino-base", stride=2), Path("sparsh-dino"), {}, half=False)
 
+    UserError: no such weights, or tensors that do not fit, which are listed.
+
     Args:
         name: A file of weights, a folder with one, or a Hugging Face id.
         stride: Frames between those that an embedding uses. Default: 5 for two stacked frames and 2
             for clips, as trained, with sensors at 60 Hz.
         subtract: Subtract the untouched sensor, as Sparsh does for the DIGIT and the GelSight Mini and
             not for the GelSight of 2017.
-
-    Raises:
-        UserError: No such weights, or tensors that do not fit, which are listed.
     """
     path = find_published(name)
     if path is None:

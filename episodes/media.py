@@ -16,8 +16,7 @@ from touchgoal.runtime.atomic_write import write_file
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.picture_file import read_picture
 
-# Every second frame is a key frame, so that one frame is found by decoding at most two.
-KEY_FRAME_INTERVAL = 2
+KEY_FRAME_INTERVAL = 2  # frames, so that one frame is found by decoding at most two
 # No B frames: presentation order is decoding order and the first time stamp is exactly 0.
 _SEEKABLE = {"g": str(KEY_FRAME_INTERVAL), "bf": "0", "preset": "veryfast"}
 _PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
@@ -104,11 +103,8 @@ def write_video(path: Path, frames: UInt8[np.ndarray, "n h w 3"], fps: float | i
 def read_frames(path: Path) -> tuple[UInt8[np.ndarray, "n h w 3"], float | None]:
     """Read all frames of a video file, or of a folder of images in natural order (2 before 10).
 
-    Returns:
-        RGB frames, and frames per second (None for a folder).
-
-    Raises:
-        UserError: Nothing there, nothing readable, or images of different sizes.
+    Returns RGB frames, and frames per second (None for a folder). UserError: nothing there, nothing
+    readable, or images of different sizes.
     """
     if path.is_dir():
         return _read_folder(path), None

@@ -8,8 +8,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 
-# Simulated episodes may begin with the same resting frames; above this share they are copies.
-_SHARED_FRACTION = 0.1
+_SHARED_FRACTION = 0.1  # above it they are copies; simulated ones may begin with the same frames
 NamedChecksums = tuple[str, frozenset[int]]
 """A recording's name for messages, and the checksums of all its frames."""
 

@@ -184,18 +184,13 @@ def collect(
 
     Workers simulate and encode; this process alone writes, so that an interruption loses at most
     the episodes in progress. The progress bar counts successes and names the commonest failure.
+    Returns the `meta` of each episode, outcome and success included. UserError: nothing to record,
+    the set cannot be continued, or another process records into it. NoSuccessError: the first
+    `max_failures` episodes failed; they are recorded.
 
     Args:
         roles: Actor and expert; must pickle.
         max_failures: Stop after so many first episodes without a success; None for never.
-
-    Returns:
-        The `meta` of each episode, outcome and success included.
-
-    Raises:
-        UserError: Nothing to record, the set cannot be continued, or another process records
-            into it.
-        NoSuccessError: The first `max_failures` episodes failed; they are recorded.
     """
     if not specs:
         raise UserError("nothing to collect: ask for at least one episode")

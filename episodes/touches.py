@@ -30,14 +30,11 @@ class Touches:
     """n tactile frames of e episodes, with b backgrounds: one per episode and side."""
 
     frames: UInt8[np.ndarray, "n h w 3"]  # raw sensor RGB, one side each
-    # the same sensors without contact, per episode and side
-    background: UInt8[np.ndarray, "b h w 3"]
+    background: UInt8[np.ndarray, "b h w 3"]  # untouched, per episode and side
     background_index: Int[np.ndarray, " n"]  # row of `background` for each frame
-    # the wrist camera's unoccluded image of the object, one per episode
-    view: UInt8[np.ndarray, "e H W 3"]
+    view: UInt8[np.ndarray, "e H W 3"]  # wrist image of the bare object, one per episode
     view_index: Int[np.ndarray, " n"]  # row of `view` for each frame
-    # catalogue id of the object that each frame touches; "" without contact
-    object: tuple[str, ...]
+    object: tuple[str, ...]  # catalogue id of what each frame touches; "" without contact
     descriptions: dict[str, list[str]]  # catalogue id -> sentences on how the object feels
 
     def __len__(self) -> int:
@@ -56,15 +53,13 @@ def collect_touches(
     median of a side's first 5 frames. The view is the wrist image 5 frames before the last one
     without contact on either side (the first, if that is earlier or there is no contact), when the
     hand does not yet hide the object. An episode with fewer frames of a kind gives all it has.
+    UserError: the set lacks the images or the meta, or has no contact.
 
     Args:
         episodes: Set whose meta has `object` and `descriptions`.
         contact_frames_per_episode: Number of frames in contact, both sides together.
         no_contact_frames_per_episode: Number of frames without contact on their side.
         seed: Random seed; an episode's draw does not depend on the other episodes.
-
-    Raises:
-        UserError: The set lacks the images or the meta, or has no contact.
     """
     sides = _check(episodes)
     most = len(episodes) * (contact_frames_per_episode + no_contact_frames_per_episode)

@@ -18,8 +18,7 @@ from touchgoal.sim_envs.config import TaskName
 
 RECIPE = "recipe.json"
 
-# Delays between policy and arm, wider than measured on the wire: see `DeploymentConfig`.
-_DEPLOYED = shlex.split(
+_DEPLOYED = shlex.split(  # delays wider than measured on the wire: see `DeploymentConfig`
     "--env.as-deployed --env.deployment.state-delay 0 0.05 --env.deployment.picture-delay 0 0.08 "
     "--env.deployment.command-delay 0 0.04 --env.deployment.jitter 0 0.03 "
     "--env.deployment.plan-ticks 0 1 1 2"
@@ -140,8 +139,7 @@ def _pick_place(config: Config, out: Path) -> list[list[str]]:
 def _bead_maze(config: Config, out: Path) -> list[list[str]]:
     """Return the steps: regression of the expert that knows the wire, corrected likewise."""
     touch = out / "touch" if config.learn_touch else config.touch
-    # Observing two ticks it led the bead less often on validation wires.
-    learn = shlex.split(
+    learn = shlex.split(  # Observing two ticks it led the bead less often on validation wires.
         "--representation body_twist --arm-state commanded --train.lr 1e-3 --env.start-angle 10 "
         "--task bead-maze --head regression --observation-horizon 4 "
         f"--train.snapshot-epochs 5 --train.epochs {config.epochs or 5}"

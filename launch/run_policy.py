@@ -7,13 +7,7 @@ from pathlib import Path
 
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
-from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
-
-ENVS: dict[TaskName, TaskConfig] = {
-    "pick-place": PickPlaceConfig(),
-    "bead-maze": BeadMazeConfig(split="validation"),
-}
-"""Default options of each task's environment."""
+from touchgoal.sim_envs.config import ENVS, BeadMazeConfig, PickPlaceConfig, TaskName
 
 
 @checked_dataclass

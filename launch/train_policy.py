@@ -22,6 +22,7 @@ from touchgoal.runtime.option_types import (
     NotNegative,
     checked_dataclass,
 )
+from touchgoal.sim_envs.config import ENVS as _ENVS
 from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
 
 if TYPE_CHECKING:
@@ -29,11 +30,8 @@ if TYPE_CHECKING:
     from touchgoal.policies.network import PolicyConfig
     from touchgoal.policies.perception.frozen_touch import TouchEmbedder
 
-ENVS: dict[TaskName, TaskConfig] = {
-    "bead-maze": BeadMazeConfig(split="validation"),
-    "pick-place": PickPlaceConfig(),
-}
-"""Default options of each task's environment."""
+ENVS = dict(reversed(_ENVS.items()))
+"""Default options of each task's environment; `--help` shows the first one's."""
 # Sparsh (C.7). It leaves open how many ticks of a plan are done (here all 8), at what rate, and for
 # how long to train (here the 600 epochs of diffusion_policy's real-robot tasks).
 _PAPER = {

@@ -64,16 +64,15 @@ class LearnedPolicy:
     ) -> None:
         """Get ready for an episode.
 
+        UserError: the embedder is not the training's, an estimator is missing, or plans are too
+        short to come so late.
+
         Args:
             network: for inference.
             touch: the embedder that the network was trained with.
             estimator: estimates the columns that only a simulator knows; None if there are none.
             plan_ticks: see above. On the first tick the arm stands, and the plan is waited for.
             directory: see above.
-
-        Raises:
-            UserError: the embedder is not the training's, an estimator is missing, or plans are too
-                short to come so late.
         """
         self.config = config = network.config
         if (touch.name if touch else "") != config.touch:

@@ -110,10 +110,8 @@ class PolicyConfig:
 class ObservationBatch:
     """Observations of the last ticks, oldest first."""
 
-    # frozen embeddings of the left and the right fingertip, side by side
-    touch: Float[Tensor, "b o e"]
-    # columns of `PolicyConfig.proprioception`, side by side, SI units
-    state: Float[Tensor, "b o s"]
+    touch: Float[Tensor, "b o e"]  # frozen embeddings of left and right fingertip, side by side
+    state: Float[Tensor, "b o s"]  # `PolicyConfig.proprioception`, side by side, SI units
     # difference images of the latest tick, for the end-to-end encoder; None without
     pictures: UInt8[Tensor, "b k h w 3"] | None = None
 

@@ -13,10 +13,10 @@ from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.goals import (
-    FrameNumber,
+    GoalPicture,
     GoalSpec,
     Inputs,
-    PictureArray,
+    OwnFrame,
     Sentence,
     TouchArrays,
     parse_goal,
@@ -125,13 +125,13 @@ def _as_specs(goal: GoalLike, episode: Episode) -> list[GoalSpec]:
     """Return a script's goal in the forms of rewards/goals.py."""
     if isinstance(goal, np.ndarray):
         check_images("the goal", goal, ndim=(3,))
-        return [PictureArray(goal)]
+        return [GoalPicture(goal)]
     if isinstance(goal, Mapping):
         return _array_specs(goal, episode)
     if isinstance(goal, int):
         if goal < 0:
             raise UserError(f"goal {goal} is not a frame: count from 0, or give 'last'")
-        return [FrameNumber(goal)]
+        return [OwnFrame(goal)]
     known = goal.strip() == "last" or goal.strip().startswith(_FORMS)
     return [parse_goal(goal) if known else Sentence(goal)]
 
@@ -145,7 +145,7 @@ def _array_specs(goal: Mapping[str, np.ndarray], episode: Episode) -> list[GoalS
     sides = {key for key in TACTILE if key in episode.frames}
     if touch and touch.keys() != sides:
         raise UserError("the goal's fingertips must be the trajectory's: left, right or both")
-    specs: list[GoalSpec] = [PictureArray(goal["image"])] if "image" in goal else []
+    specs: list[GoalSpec] = [GoalPicture(goal["image"])] if "image" in goal else []
     if touch:
         untouched = {key: touch_background(episode.frames[key]) for key in touch}
         specs.append(TouchArrays(touch, untouched))

@@ -23,10 +23,9 @@ from touchgoal.rewards.curves import Contact, Curves, first_contact
 from touchgoal.rewards.goals import (
     EpisodeEnd,
     Goal,
+    GoalPicture,
     GoalSpec,
     Modality,
-    PictureArray,
-    PictureFile,
     PictureGoal,
     Sentence,
     TouchArrays,
@@ -45,12 +44,10 @@ class EmbeddedEpisode:
     source: str  # name of the trajectory, for people
     fps: float  # frames per second
     contact: Contact  # first contact
-    # encoders and sensors; only embeddings of equal ones can be compared
-    made_with: EmbeddingSource
+    made_with: EmbeddingSource  # encoders and sensors; embeddings of others cannot be compared
     image: Float32[np.ndarray, "n d"] | None = None  # unit image embeddings; None without a camera
     sides: tuple[str, ...] = ()  # keys of the fingertips that have touch embeddings
-    # unit touch embeddings; None without touch
-    touch: Float32[np.ndarray, "sides n k"] | None = None
+    touch: Float32[np.ndarray, "sides n k"] | None = None  # unit embeddings; None without touch
     # unit embeddings of the sentences about its object; None if there are none or they were not
     # requested
     descriptions: Float32[np.ndarray, "m k"] | None = None
@@ -84,8 +81,7 @@ class EmbeddedGoal:
     """A goal as unit embeddings, one per modality that has a goal."""
 
     forms: Mapping[str, str]  # the goals as a user writes them, by modality
-    # modalities whose goal is a frame of the measured trajectory itself
-    same_episode: frozenset[str]
+    same_episode: frozenset[str]  # modalities whose goal is the trajectory's own frame
     image: Float32[np.ndarray, " d"] | None = None
     touch: Float32[np.ndarray, "sides k"] | None = None
     text: Float32[np.ndarray, " k"] | None = None
@@ -103,13 +99,12 @@ class EpisodeEmbedder:
     ) -> None:
         """Take the encoders.
 
+        UserError: the encoder was trained with other towers.
+
         Args:
             encoder: touch encoder (put into evaluation mode), which takes sentences if it was aligned
                 with these towers; None to measure images alone.
             camera: key of the camera whose images are measured; "" for a plain video's.
-
-        Raises:
-            UserError: the encoder was trained with other towers.
         """
         self._towers = towers
         self.encoder = encoder
@@ -203,7 +198,7 @@ class EpisodeEmbedder:
         if isinstance(spec, Sentence):
             assert self._towers.pretrained_together  # or a sentence is no goal for pictures
             return _unit(self._towers.embed_texts([spec.text]))[0]
-        if isinstance(spec, PictureFile | PictureArray):
+        if isinstance(spec, GoalPicture):
             return self.embed_pictures(spec.read())[0]
         if isinstance(spec, EpisodeEnd):
             camera = self._camera or FRONT

@@ -36,15 +36,12 @@ def fit_normalizer(
     another's: its own last frame; and for image the last frame of every other episode, for tactile
     that of every other episode with the same object, for text every sentence about its object. The
     5 frames before the last stand for the end (the last one is at distance 0 of itself), the first
-    5 for the start.
+    5 for the start. UserError: too few episodes, a failed or too short one, one embedded otherwise,
+    or a modality that is missing or does not separate start from end.
 
     Args:
         episodes: at least two that end in the goal state, embedded alike.
         scene: where they were recorded, see `scene_of`.
-
-    Raises:
-        UserError: too few episodes, a failed or too short one, one embedded otherwise, or a
-            modality that is missing or does not separate start from end.
     """
     _check_training(episodes, modalities)
     start, goal, separated = {}, {}, {}

@@ -47,62 +47,41 @@ class Inputs:
 
 
 @dataclass(frozen=True)
-class LastFrame:
-    """The last frame of the measured trajectory."""
+class OwnFrame:
+    """Frame `index` (from 0) of the measured trajectory; None: its last one."""
 
+    index: int | None = None
     modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
 
     def __str__(self) -> str:
-        return "last"
+        return "last" if self.index is None else f"frame:{self.index}"
 
 
 @dataclass(frozen=True)
-class FrameNumber:
-    """Frame `index` (from 0) of the measured trajectory."""
+class GoalPicture:
+    """An image of the goal as the measured camera would take it: a file, or RGB from a script."""
 
-    index: int
-    modalities: ClassVar[tuple[Modality, ...]] = ("image", "tactile")
-
-    def __str__(self) -> str:
-        return f"frame:{self.index}"
-
-
-@dataclass(frozen=True)
-class PictureFile:
-    """An image file of the goal, as the measured camera would take it."""
-
-    path: Path
+    picture: Path | UInt8[np.ndarray, "h w 3"]
     modalities: ClassVar[tuple[Modality, ...]] = ("image",)
 
     def __str__(self) -> str:
-        return f"image:{self.path}"
+        return f"image:{self.picture}" if isinstance(self.picture, Path) else "image: an array"
 
     def read(self) -> UInt8[np.ndarray, "1 h w 3"]:
-        """Return the image, RGB.
-
-        UserError: there is no such file, it is not an image, or it is too small.
-        """
-        pixels = read_picture(self.path)
-        if pixels is None and not self.path.exists():
-            raise UserError(f"goal image {self.path} does not exist")
-        if pixels is None:
-            raise UserError(f"goal image {self.path} cannot be read as an image")
-        return _not_tiny(pixels, f"goal image {self.path}")
-
-
-@dataclass(frozen=True, eq=False)
-class PictureArray:
-    """An image of the goal, as the measured camera would take it, from a script."""
-
-    picture: UInt8[np.ndarray, "h w 3"]
-    modalities: ClassVar[tuple[Modality, ...]] = ("image",)
-
-    def __str__(self) -> str:
-        return "image: an array"
-
-    def read(self) -> UInt8[np.ndarray, "1 h w 3"]:
-        """Return the image, RGB; UserError if it is too small."""
-        return _not_tiny(self.picture, "the goal image")
+        """Return the image, RGB; UserError: no such file, not an image, or too small."""
+        name, pixels = "the goal image", self.picture
+        if isinstance(pixels, Path):
+            name, path = f"goal image {pixels}", pixels
+            if (pixels := read_picture(path)) is None:
+                wrong = "cannot be read as an image" if path.exists() else "does not exist"
+                raise UserError(f"{name} {wrong}")
+        height, width, _ = pixels.shape
+        if min(height, width) < _SMALLEST:
+            raise UserError(
+                f"{name} is {width} x {height} pixels: give one as the camera takes it, at least "
+                f"{_SMALLEST} x {_SMALLEST}"
+            )
+        return pixels[None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,8 +135,7 @@ class Sentence:
         return f"text:{self.text}"
 
 
-OwnFrame = LastFrame | FrameNumber
-PictureGoal = OwnFrame | PictureFile | PictureArray | EpisodeEnd | Sentence
+PictureGoal = OwnFrame | GoalPicture | EpisodeEnd | Sentence
 TouchGoal = OwnFrame | TouchArrays | EpisodeEnd
 GoalSpec = PictureGoal | TouchGoal
 
@@ -182,19 +160,16 @@ class Goal:
 
 
 def parse_goal(text: str) -> GoalSpec:
-    """Read a goal in one of `FORMS`.
-
-    UserError: any other text; the message lists the forms.
-    """
+    """Read a goal in one of `FORMS`; UserError, with the forms, for any other text."""
     kind, _, value = text.strip().partition(":")
     value = value.strip()
     episode = re.fullmatch(r"(.+)#(\d+)", value)
     if text.strip() == "last":
-        return LastFrame()
+        return OwnFrame()
     if kind == "frame" and re.fullmatch(r"\d+", value):
-        return FrameNumber(int(value))
+        return OwnFrame(int(value))
     if kind == "image" and value:
-        return PictureFile(Path(value))
+        return GoalPicture(Path(value))
     if kind == "episode" and episode:
         return EpisodeEnd(Path(episode[1]), int(episode[2]))
     if kind == "text" and value:
@@ -242,7 +217,7 @@ def check_goal(goal: Goal, inputs: Inputs) -> None:
     for spec in (goal.image, goal.tactile):
         if isinstance(spec, OwnFrame) and inputs.length is not None:
             frame_index(spec, inputs.length, inputs.name)
-    if isinstance(goal.image, PictureFile | PictureArray):
+    if isinstance(goal.image, GoalPicture):
         goal.image.read()
     if isinstance(goal.image, EpisodeEnd):
         goal.image.read([inputs.camera or FRONT])
@@ -252,21 +227,11 @@ def check_goal(goal: Goal, inputs: Inputs) -> None:
 
 def frame_index(spec: OwnFrame, length: int, source: str) -> int:
     """Return the frame of the trajectory that is its goal; UserError if it has no such frame."""
-    if isinstance(spec, LastFrame):
+    if spec.index is None:
         return length - 1
     if spec.index >= length:
         raise UserError(f"goal '{spec}' lies beyond {source}, whose frames are 0 to {length - 1}")
     return spec.index
-
-
-def _not_tiny(picture: UInt8[np.ndarray, "h w 3"], name: str) -> UInt8[np.ndarray, "1 h w 3"]:
-    height, width, _ = picture.shape
-    if min(height, width) < _SMALLEST:
-        raise UserError(
-            f"{name} is {width} x {height} pixels: give one as the camera takes it, at least "
-            f"{_SMALLEST} x {_SMALLEST}"
-        )
-    return picture[None]
 
 
 def _no_words(spec: Sentence) -> str:

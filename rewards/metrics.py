@@ -41,21 +41,18 @@ class CurveMetrics:
     start: float  # d_0 (curve)
     end: float  # d_T (curve)
     net_drop: float  # d_0 - d_T (curve)
-    # rank correlation of v and t, average ranks for ties; None for a constant curve
-    spearman: float | None
+    spearman: float | None  # of v and t, average ranks for ties; None for a constant curve
     kendall_tau_b: float | None  # tau-b of v and t; None for a constant curve
     # local maxima, ends excluded, with prominence >= eps. White noise of standard deviation sigma
     # has about 4 in 100 frames
     peaks: int
     largest_rebound: float  # max_t (d_t - min_{s<=t} d_s), the largest rise after a minimum (curve)
-    # integral of d over the episode's duration taken as 1 (trapezoids); lower is earlier
-    area: float
+    area: float  # integral of d (trapezoids), duration taken as 1; lower is earlier
     t_drop_10: int | None  # first frame at which 10 % of the net drop has fallen
     t_drop_25: int | None  # the same for 25 %
     t_drop_50: int | None  # the same for 50 %, the primary one
     contact: int | None  # first contact frame, as given
-    # t_drop_50 - contact (frames); negative when the curve falls before contact
-    contact_lag: int | None
+    contact_lag: int | None  # t_drop_50 - contact (frames); negative if it falls before contact
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields by name, ready for JSON."""
@@ -65,14 +62,13 @@ class CurveMetrics:
 def measure_curve(d: Curve, contact: int | None, eps: float | None = None) -> CurveMetrics:
     """Measure one curve.
 
+    ValueError: fewer than 2 frames, a value that is not finite, a contact outside the curve.
+
     Args:
         d: distance to the goal per frame, at least 2 frames, finite.
         contact: first frame in contact; None without contact.
         eps: noise threshold (curve). Default: 3 sigma of this curve. Give the same eps to several
             curves to compare their peaks on equal terms.
-
-    Raises:
-        ValueError: fewer than 2 frames, a value that is not finite, a contact outside the curve.
     """
     d = _validated(d, contact)
     sigma = noise(d, contact)

@@ -63,8 +63,7 @@ class DistanceNormalizer:
 
     start: dict[str, float]  # median raw distance of the start of a training episode to a goal
     goal: dict[str, float]  # the same for its end
-    # share of (episode, goal) pairs whose end is nearer the goal than its start
-    separated: dict[str, float]
+    separated: dict[str, float]  # share of (episode, goal) pairs whose end is nearer than the start
     source: EmbeddingSource  # encoders, camera and sensor of the embeddings
     scene: str  # see `scene_of`
     episodes: int  # number of training episodes

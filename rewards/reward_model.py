@@ -52,13 +52,9 @@ def load_reward_model(
 ) -> RewardModel:
     """Check the goals, load the encoders, and choose the normalizer.
 
-    Args:
-        normalizer: a file of `fit-normalizer`, one already read, "encoder" for the one in the touch
-            encoder's folder, "none" for raw distances, or None for the encoder's one if it was
-            fitted on trajectories of this scene, else raw distances.
-
-    Raises:
-        UserError: whatever would stop the measurement.
+    `normalizer`: a file of `fit-normalizer`, one already read, "encoder" for the one in the touch
+    encoder's folder, "none" for raw distances, or None for the encoder's one if it was fitted on
+    trajectories of this scene, else raw distances. UserError: whatever would stop the measurement.
     """
     if isinstance(towers, str) or towers is None:
         picture_words = towers not in (None, OfflineTowers.name)

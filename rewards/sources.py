@@ -144,16 +144,15 @@ def open_source(
 ) -> Source:
     """Open and check a source.
 
+    UserError: nothing there, damaged, no such camera or episode, fewer than 2 frames, or an option
+    that the source does not take.
+
     Args:
         path: a set of episodes, or the folder of a run that holds one as `episodes`; a video file;
             a folder of images.
         camera: the episodes' camera, by its key or its last word ("front"); unused for a video.
         index: which episodes of the set; none for all.
         fps: frames per second of a folder of images; None for 20.
-
-    Raises:
-        UserError: nothing there, damaged, no such camera or episode, fewer than 2 frames, or an
-            option that the source does not take.
     """
     if not path.exists():
         raise UserError(f"{path} does not exist: give a set of episodes, a video or a folder")

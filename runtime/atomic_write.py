@@ -15,11 +15,8 @@ def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a temporary name to write to; move the file to `path` once it is on disk.
 
     Its folder is made if needed. To change two files together, open first the one that is to be
-    replaced last. A block that fails leaves the older file as it was.
-
-    Raises:
-        OSError: It cannot be written; with the path, also where a library reports a full disk in
-            its own way.
+    replaced last. A block that fails leaves the older file as it was. OSError: it cannot be
+    written; with the path, also where a library reports a full disk in its own way.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(path.name + ".tmp")

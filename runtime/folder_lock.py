@@ -23,9 +23,8 @@ class FolderLock:
     ) -> None:
         """Take the lock.
 
-        Raises:
-            UserError: Another one holds it, with the refusal ({} stands for the folder); or the
-                folder cannot be made.
+        UserError: another one holds it, with the refusal ({} stands for the folder); or the folder
+        cannot be made.
         """
         made = not folder.exists()
         try:

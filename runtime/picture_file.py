@@ -17,8 +17,7 @@ _MOST_PIXELS = 50_000_000  # a small file may unpack to gigabytes
 def read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"] | None:
     """Read the RGB image of a file; None if it is missing or unreadable.
 
-    Raises:
-        UserError: It has more than 50 million pixels.
+    UserError: it has more than 50 million pixels.
     """
     try:
         return decode_picture(path.read_bytes(), str(path))

@@ -37,10 +37,8 @@ def open_run(out: Path | None, command: str, config: Any, adds: bool = False) ->
 
     The folder is `runs/<date>_<command>` where the user named none. The first run's record is
     `config.json`; later ones, which add to what the folder holds, are `config_2.json` and so on.
-
-    Raises:
-        UserError: Another process writes into the folder, it holds the results of another run, or
-            it cannot be written to.
+    UserError: another process writes into the folder, it holds the results of another run, or it
+    cannot be written to.
     """
     folder = out or _dated_folder(command)
     check_writable(folder)

@@ -50,8 +50,7 @@ DEPLOY_TEST = SeedRange(6_000_000, 2_000_000)  # benchmark deploy
 REPLAY = SeedRange(8_000_000, 1_000_000)  # benchmark replay
 DEMO = SeedRange(9_000_000, 1_000_000)
 
-# Shapes of the bead maze's wires have seeds of their own, apart from the episodes'.
-WIRES: dict[str, SeedRange] = {
+WIRES: dict[str, SeedRange] = {  # shapes of wires have seeds apart from the episodes'
     "test": SeedRange(0, 1_000_000),
     "validation": SeedRange(1_000_000, 1_000_000),
     "training": SeedRange(2_000_000, 1_000_000),

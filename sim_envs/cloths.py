@@ -13,7 +13,8 @@ from jaxtyping import Float32, UInt8
 from touchgoal.sim_envs.config import RigConfig
 from touchgoal.sim_envs.indenter_rig import rig_unit
 from touchgoal.sim_envs.tactile.markers import draw
-from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, press, untouched
+from touchgoal.sim_envs.tactile.optics import render_untouched
+from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, press
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance
 
@@ -56,7 +57,7 @@ def press_cloth(config: RigConfig, index: int) -> ClothClip:
     last = float(np.exp(rng.uniform(*np.log(_DEPTHS))))
     turn, tilt = float(rng.uniform(0, 2 * np.pi)), rng.normal(0, 0.01, 2)
     place, on_cloth = rng.normal(0, 1.5e-3, 2), rng.uniform(0, TILE, 2)
-    frames = [_dotted(untouched(unit, rng), unit)]
+    frames = [_dotted(render_untouched(unit, rng), unit)]
     for depth in np.linspace(0.4, 1.0, FRAMES - 1) * last:
         place = place + rng.normal(0, _DRIFT, 2)
         pose = SurfacePose(

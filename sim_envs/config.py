@@ -314,6 +314,11 @@ TASKS: dict[TaskName, type[PickPlaceConfig] | type[BeadMazeConfig]] = {
     "pick-place": PickPlaceConfig,
     "bead-maze": BeadMazeConfig,
 }
+ENVS: dict[TaskName, TaskConfig] = {
+    "pick-place": PickPlaceConfig(),
+    "bead-maze": BeadMazeConfig(split="validation"),
+}
+"""Environments in which policies are tried."""
 
 
 @checked_dataclass

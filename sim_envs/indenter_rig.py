@@ -40,13 +40,11 @@ _TIP, _CONE, _OPENING = 0.3e-3, 4e-3, math.radians(120)  # sharp probe: m, m, ra
 class Stroke:
     """One press and slide."""
 
-    # the sensor's pictures, RGB, of which the first `REST` are untouched
-    frames: UInt8[np.ndarray, "t h w 3"]
+    frames: UInt8[np.ndarray, "t h w 3"]  # RGB, the first `REST` untouched
     # force (N) and torque (Nm) of the probe on the pad, sensor frame; pressed is -z
     wrench: Float32[np.ndarray, "t 6"]
     slip: Bool[np.ndarray, " t"]  # whether the probe slides over the gel
-    # tractions (kPa, `forces.tractions`); recordings of strokes leave it out
-    field: Float32[np.ndarray, "t 3 24 24"]
+    field: Float32[np.ndarray, "t 3 24 24"]  # kPa, `forces.tractions`; not in recordings
     indenter: Indenter
     load: float  # largest normal load, N
     friction: float  # coefficient of this stroke

@@ -43,13 +43,10 @@ _FIELD, _TURN = 3.5e-3, math.radians(30)  # m and rad from the middle, at most
 class Slide:
     """One object moved over the sensor."""
 
-    # the sensor's pictures, RGB, of which the first `REST` are untouched
-    frames: UInt8[np.ndarray, "t h w 3"]
-    # force (N) and torque (Nm) of the object on the pad, sensor frame
-    wrench: Float32[np.ndarray, "t 6"]
+    frames: UInt8[np.ndarray, "t h w 3"]  # RGB, the first `REST` untouched
+    wrench: Float32[np.ndarray, "t 6"]  # N and Nm of the object on the pad, sensor frame
     slip: Bool[np.ndarray, " t"]  # whether it slides over the gel
-    # x and y (m) of the object in the sensor frame, and its turn about z (rad)
-    pose: Float32[np.ndarray, "t 3"]
+    pose: Float32[np.ndarray, "t 3"]  # of the object: x, y (m), turn about z (rad); sensor frame
     held: str  # name of the object
     load: float  # normal load, N
 
@@ -116,10 +113,8 @@ def pulled(
     """Return forces (N) on a gel of `stiffness` N/m under an object at these places (m), and slip.
 
     The gel's point of rest is drawn along as soon as it would pull with more than `limit` N.
-
-    Args:
-        places: x, y and, if it turns, the way along a ring of the patch's mean radius; its force is
-            torsion over that radius.
+    `places`: x, y and, if it turns, the way along a ring of the patch's mean radius; its force is
+    torsion over that radius.
     """
     rest = places[0].astype(float)
     force, slip = np.zeros(places.shape), np.zeros(len(places), bool)

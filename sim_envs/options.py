@@ -13,13 +13,12 @@ Config = TypeVar("Config")
 def with_options(config: Config, options: Mapping[str, Any]) -> Config:
     """Return the config with the fields named in `options` replaced.
 
+    UserError: there is no such field, or a value is out of its range.
+
     Args:
         config: a dataclass.
         options: new values by field name; of a field that is a config itself (`randomization`)
             either a config or a mapping of the fields of it that change.
-
-    Raises:
-        UserError: there is no such field, or a value is out of its range.
     """
     assert is_dataclass(config) and not isinstance(config, type)
     names = [field.name for field in fields(config)]

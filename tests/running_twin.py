@@ -41,8 +41,9 @@ class RunningTwin:
         deadline = time.monotonic() + 120
         self.cell_file = out / "cell.json"
         while not self.cell_file.exists():
-            alive = self._process.poll() is None and time.monotonic() < deadline
-            assert alive, self._process.communicate()[1]
+            if self._process.poll() is not None or time.monotonic() > deadline:
+                self._process.kill()
+                raise AssertionError(f"no twin: {self._process.communicate()[1]}")
             time.sleep(0.05)
         self.cell = read_cell_file(self.cell_file)
 
@@ -66,7 +67,11 @@ class RunningTwin:
     def close(self) -> None:
         """Ctrl-C, which it ends well after."""
         self._process.send_signal(signal.SIGINT)
-        assert self._process.wait(20) == 0, self._process.communicate()[1]
+        try:
+            self._process.wait(20)
+        finally:
+            self._process.kill()
+        assert self._process.returncode == 0, self._process.communicate()[1]
 
 
 def client(function: Callable, *arguments: object, using: Callable | None = None) -> dict[str, Any]:

@@ -30,13 +30,11 @@ from touchgoal.rewards.embedding_distance import (
 )
 from touchgoal.rewards.goals import (
     EpisodeEnd,
-    FrameNumber,
     Goal,
+    GoalPicture,
     GoalSpec,
-    LastFrame,
     Modality,
-    PictureArray,
-    PictureFile,
+    OwnFrame,
     Sentence,
     assign_goals,
     parse_goal,
@@ -99,7 +97,7 @@ def test_curves_are_causal(embedder: EpisodeEmbedder) -> None:
     """What comes later changes no value, once the 5 frames of the background are over."""
     whole = recorded(color=160)
     part = replace(whole, frames={k: v[:9] for k, v in whole.frames.items()})
-    goal = choose([PictureArray(np.full((32, 32, 3), 90, np.uint8)), Sentence("soft")])
+    goal = choose([GoalPicture(np.full((32, 32, 3), 90, np.uint8)), Sentence("soft")])
     long, short = (
         compute_curves(e, embedder.embed_goal(goal, e), None)
         for e in (embedder.embed_episode(x, 20.0, "x") for x in (whole, part))
@@ -124,7 +122,7 @@ def test_contact_is_the_simulators_or_detected() -> None:
 def test_episode_is_embedded_once_for_all_goals(embedder: EpisodeEmbedder) -> None:
     e = embedder.embed_episode(recorded(), 20.0, "mine", descriptions=True)
     assert e.modalities == ALL and (e.object, e.success) == ("apple", True)
-    goal = choose([LastFrame(), Sentence("hard and smooth")], e.modalities)
+    goal = choose([OwnFrame(), Sentence("hard and smooth")], e.modalities)
     curves = compute_curves(e, embedder.embed_goal(goal, e), None)
     assert set(curves.raw) == set(ALL) and not curves.normalised
     assert curves.raw["image"][-1] == pytest.approx(0, abs=1e-6)
@@ -133,10 +131,10 @@ def test_episode_is_embedded_once_for_all_goals(embedder: EpisodeEmbedder) -> No
     assert e.descriptions is not None and embedder.embed_goal(goal, e).text is not None
     assert embedder.embed_goal(goal, e).text == pytest.approx(e.descriptions[0], abs=1e-6)
 
-    third = embedder.embed_goal(choose([FrameNumber(3)], e.modalities), e)
+    third = embedder.embed_goal(choose([OwnFrame(3)], e.modalities), e)
     assert compute_distances(e, third)["image"].argmin() == 3
     with pytest.raises(UserError, match="frames are 0 to 11"):
-        embedder.embed_goal(choose([FrameNumber(12)], e.modalities), e)
+        embedder.embed_goal(choose([OwnFrame(12)], e.modalities), e)
 
 
 def test_goals_from_a_picture_and_from_another_episode(
@@ -157,13 +155,13 @@ def test_goals_from_a_picture_and_from_another_episode(
         embedder.embed_goal(choose([EpisodeEnd(tmp_path / "set", 2)], ALL), mine)
 
     Image.fromarray(stored.frames[FRONT][-1]).save(tmp_path / "end.png")
-    picture = embedder.embed_goal(choose([PictureFile(tmp_path / "end.png")], ALL), mine)
+    picture = embedder.embed_goal(choose([GoalPicture(tmp_path / "end.png")], ALL), mine)
     assert picture.touch is None and picture.image == pytest.approx(other.pictures()[-1], abs=1e-5)
     (tmp_path / "end.png").write_text("no picture")
     with pytest.raises(UserError, match=r"end\.png cannot be read"):
-        PictureFile(tmp_path / "end.png").read()
+        GoalPicture(tmp_path / "end.png").read()
     with pytest.raises(UserError, match="does not exist"):
-        PictureFile(tmp_path / "none.png").read()
+        GoalPicture(tmp_path / "none.png").read()
 
 
 def test_video_has_pictures_alone(embedder: EpisodeEmbedder) -> None:
@@ -171,7 +169,7 @@ def test_video_has_pictures_alone(embedder: EpisodeEmbedder) -> None:
     episode = embedder.embed_episode(recorded(), 20.0, "mine")
     for any_embedder in (embedder, EpisodeEmbedder(PaintTowers(), None)):
         video = any_embedder.embed_video(frames, 30.0, "a.mp4")
-        goal = choose([LastFrame()], video.modalities)
+        goal = choose([OwnFrame()], video.modalities)
         curves = compute_curves(video, any_embedder.embed_goal(goal, video), None)
         assert list(curves.costs) == ["image"] and curves.contact.frame is None
         of_episode = compute_curves(episode, embedder.embed_goal(goal, episode), None)
@@ -198,7 +196,7 @@ def test_what_cannot_be_embedded_is_refused(embedder: EpisodeEmbedder) -> None:
 def test_encoders_without_words_measure_touch() -> None:
     """Learned without labels, or an ImageNet network: 0 at the goal, as far untouched as can be."""
     torch.manual_seed(0)
-    goal = choose([LastFrame()], ("image", "tactile"))
+    goal = choose([OwnFrame()], ("image", "tactile"))
     for encoder in (
         TouchBackbone(TouchBackboneConfig.for_sensor(PRESETS["tiny"], "gelsight_mini")),
         PooledEncoder(PooledEncoderConfig.for_sensor("gelsight_mini")),

@@ -20,7 +20,8 @@ from touchgoal.control.tactile.sensor_calibration import load, shade
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, GELSIGHT_MINI_MARKERS
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
-from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, press, untouched
+from touchgoal.sim_envs.tactile.optics import render_untouched
+from touchgoal.sim_envs.tactile.rig.surface_press import SurfacePose, press
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
@@ -41,13 +42,13 @@ def pressing(unit: SensorInstance, at: tuple[float, float]) -> Iterator[np.ndarr
         pose = SurfacePose((x, y), 0.0, (0.0, 0.0), (0.0, 0.0), depth * 1e-3)
         yield press(BALL, pose, unit, RNG)
     for _ in range(4):
-        yield untouched(unit, RNG)
+        yield render_untouched(unit, RNG)
 
 
 @pytest.fixture(scope="module")
 def session() -> list[np.ndarray]:
     """A whole recording: a settled gel, then a press in each part."""
-    frames = [untouched(UNIT, RNG) for _ in range(30)]
+    frames = [render_untouched(UNIT, RNG) for _ in range(30)]
     return frames + [frame for at in centres(UNIT) for frame in pressing(UNIT, at)]
 
 
@@ -186,7 +187,7 @@ def test_check_sensor_says_what_is_off(
 def test_a_sensor_check_counts_markers() -> None:
     frames = []
     for moved in (0.0, 0.0, 3.0):
-        frame = untouched(UNIT, RNG)
+        frame = render_untouched(UNIT, RNG)
         for row, column in np.ndindex(7, 9):
             at = 160 + 31.9 * (column - 4) + moved, 120 + 31.9 * (row - 3)
             fixed = round(16 * at[0]), round(16 * at[1])

@@ -32,7 +32,7 @@ from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.rewards.api import reward_curve
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
-from touchgoal.rewards.goals import GoalSpec, Inputs, LastFrame, PictureFile, Sentence, assign_goals
+from touchgoal.rewards.goals import GoalPicture, GoalSpec, Inputs, OwnFrame, Sentence, assign_goals
 from touchgoal.rewards.normalizer import DistanceNormalizer
 from touchgoal.rewards.online import CostMeter, OnlineCost, load_cell_cost
 from touchgoal.rewards.reward_model import RewardModel, load_reward_model
@@ -223,7 +223,7 @@ def test_published_weights_bring_no_normalizer(run_folder: Path, tmp_path: Path)
     weights = tmp_path / "mae_vittiny.safetensors"
     save_file(published(), weights)
     source = open_source(run_folder / "episodes", "front")
-    model = load_reward_model(source.inputs, [LastFrame()], str(weights))
+    model = load_reward_model(source.inputs, [OwnFrame()], str(weights))
     assert "published weights and loaded encoders come without a normalizer" in model.note
 
 
@@ -308,7 +308,7 @@ def test_cost_during_a_run_is_raw_where_no_normalizer_applies(
     encoder: TouchEncoder, tmp_path: Path
 ) -> None:
     Image.fromarray(IMAGES[9]).save(tmp_path / "end.png")
-    picture, words = PictureFile(tmp_path / "end.png"), Sentence("soft")
+    picture, words = GoalPicture(tmp_path / "end.png"), Sentence("soft")
     tick = {FRONT: IMAGES[0], TACTILE_LEFT: TOUCH["left"][0], TACTILE_RIGHT: TOUCH["right"][0]}
     cost = OnlineCost(CostMeter(model_of(encoder, None, picture)))
     expected = reward_curve(IMAGES, goal=IMAGES[9], towers=PaintTowers()).costs["image"][0]
@@ -317,7 +317,7 @@ def test_cost_during_a_run_is_raw_where_no_normalizer_applies(
     with pytest.raises(UserError, match="raw distances of several modalities"):
         CostMeter(model_of(encoder, None, picture, words))
     with pytest.raises(UserError, match="not known before the end"):
-        CostMeter(model_of(encoder, None, LastFrame()))
+        CostMeter(model_of(encoder, None, OwnFrame()))
 
 
 def model_of(
@@ -335,7 +335,7 @@ def test_cost_during_a_run_is_that_of_its_recording(encoder: TouchEncoder, tmp_p
     embedder = EpisodeEmbedder(PaintTowers(), encoder)
     ends = {"image": 1.0, "text": 1.0}, {"image": 0.1, "text": 0.2}
     normalizer = DistanceNormalizer(*ends, {}, embedder.made_with, "recorded, not simulated", 3)
-    goals = [PictureFile(tmp_path / "end.png"), Sentence("soft")]
+    goals = [GoalPicture(tmp_path / "end.png"), Sentence("soft")]
     frames = {FRONT: IMAGES, TACTILE_LEFT: left, TACTILE_RIGHT: TOUCH["right"]}
     recording = embedder.embed_episode(Episode(frames=frames, task="", meta={}), 20.0, "recording")
     goal = embedder.embed_goal(assign_goals(goals, recording.modalities), recording)

@@ -29,12 +29,11 @@ from touchgoal.rewards.embedding_distance import (
 from touchgoal.rewards.fit_normalizer import fit_normalizer as fit
 from touchgoal.rewards.goals import (
     EpisodeEnd,
-    FrameNumber,
     Goal,
+    GoalPicture,
     GoalSpec,
-    LastFrame,
     Modality,
-    PictureFile,
+    OwnFrame,
     Sentence,
     assign_goals,
     parse_goal,
@@ -95,9 +94,9 @@ def goal_of(episode: EmbeddedEpisode) -> EmbeddedGoal:
 @pytest.mark.parametrize(
     ("text", "goal"),
     [
-        ("last", LastFrame()),
-        ("frame:0", FrameNumber(0)),
-        ("image:ends/cup.png", PictureFile(Path("ends/cup.png"))),
+        ("last", OwnFrame()),
+        ("frame:0", OwnFrame(0)),
+        ("image:ends/cup.png", GoalPicture(Path("ends/cup.png"))),
         ("episode:data/a#b#12", EpisodeEnd(Path("data/a#b"), 12)),
         ("text:hard, smooth: round", Sentence("hard, smooth: round")),
     ],
@@ -115,7 +114,7 @@ def test_unknown_goal_lists_the_forms(text: str) -> None:
 
 
 def test_each_modality_takes_the_first_goal_that_speaks_for_it() -> None:
-    last, picture, words = LastFrame(), PictureFile(Path("a.png")), Sentence("soft")
+    last, picture, words = OwnFrame(), GoalPicture(Path("a.png")), Sentence("soft")
     chosen = choose([picture, last, words], ALL)
     assert (chosen.image, chosen.tactile, chosen.text) == (picture, last, words)
     assert chosen.as_dict() == {"image": "image:a.png", "tactile": "last", "text": "text:soft"}

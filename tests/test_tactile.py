@@ -25,7 +25,7 @@ from touchgoal.sim_envs.tactile.geometry import (
     add_mesh,
     add_primitive,
 )
-from touchgoal.sim_envs.tactile.optics import colour_change, render
+from touchgoal.sim_envs.tactile.optics import colour_change, render, render_untouched
 from touchgoal.sim_envs.tactile.pad import TactileFrame
 from touchgoal.sim_envs.tactile.rig.press_bench import PressBench
 from touchgoal.sim_envs.tactile.rig.surface_press import (
@@ -33,7 +33,6 @@ from touchgoal.sim_envs.tactile.rig.surface_press import (
     overlap,
     press,
     random_pose,
-    untouched,
 )
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface, random_surface
 from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
@@ -283,7 +282,7 @@ def test_the_same_seed_presses_the_same_surface() -> None:
         rng = np.random.default_rng(3)
         unit = sample_instance(GELSIGHT_MINI, rng)
         pressed = press(random_surface(rng), random_pose(rng), unit, rng)
-        return pressed, untouched(unit, rng)
+        return pressed, render_untouched(unit, rng)
 
     (one, rest), (other, _) = touch(), touch()
     np.testing.assert_array_equal(one, other)
@@ -318,7 +317,7 @@ def test_an_encoder_fitted_to_surfaces_comes_back(tmp_path: Path) -> None:
     loaded = load_encoder(tmp_path)
     rng = np.random.default_rng(1)
     unit = sample_instance(GELSIGHT_MINI, rng)
-    frames = np.stack([untouched(unit, rng), press(random_surface(rng), LEVEL, unit, rng)])
+    frames = np.stack([render_untouched(unit, rng), press(random_surface(rng), LEVEL, unit, rng)])
     embedded = loaded.embed(frames)
     assert np.linalg.norm(embedded[1]) == pytest.approx(1, abs=0.02)
     np.testing.assert_allclose(embedded, encoder.embed(frames), atol=1e-4)
@@ -327,7 +326,7 @@ def test_an_encoder_fitted_to_surfaces_comes_back(tmp_path: Path) -> None:
 def test_the_shipped_one_loads_and_takes_the_light_out() -> None:
     rng = np.random.default_rng(0)
     unit = sample_instance(GELSIGHT_MINI, rng)
-    rest = untouched(unit, rng)
+    rest = render_untouched(unit, rng)
     frame = press(Surface("ball", 5e-3, 1.0, SMOOTH, 1.0), LEVEL, unit, rng)
     lit = np.rint(frame * 1.1).clip(0, 255).astype(np.uint8)
     steady, brighter, other = load_encoder("gelsight_mini_surfaces").embed(
@@ -340,7 +339,7 @@ def test_light_on_an_untouched_gel_is_no_touch() -> None:
     """A fifth of the lightest touch, wanted on real frames (`benchmark real-touch`): here a light ball."""
     rng = np.random.default_rng(0)
     unit = sample_instance(GELSIGHT_MINI, rng)
-    rest, again = untouched(unit, rng), untouched(unit, rng)
+    rest, again = render_untouched(unit, rng), render_untouched(unit, rng)
     light = press(Surface("ball", 5e-3, 1.0, SMOOTH, 1.0), replace(LEVEL, depth=0.05e-3), unit, rng)
     frames = [again, *(np.rint(again * gain).astype(np.uint8) for gain in (0.9, 1.1)), light]
     same, darker, brighter, touched = load_encoder("gelsight_mini_surfaces").embed(

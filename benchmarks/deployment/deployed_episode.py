@@ -98,10 +98,7 @@ def deployed_twin(
     """Run a twin with a scene and yield the cell file that it wrote.
 
     Twins of different numbers run side by side. An exact one reports true forces, without an arm's
-    estimation error.
-
-    Raises:
-        UserError: The twin does not start.
+    estimation error. UserError: the twin does not start.
     """
     kind = "--env.wires" if scene.task == "bead-maze" else "--env.objects"
     command = [sys.executable, "-m", "touchgoal.launch", "twin", "--task", scene.task]

@@ -7,9 +7,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from touchgoal.benchmarks.deployment.trials import ENVS, TrialOptions, try_cases
+from touchgoal.benchmarks.deployment.trials import TrialOptions, try_cases
 from touchgoal.runtime.option_types import NotNegative, Positive, checked_dataclass
-from touchgoal.sim_envs.config import AS_DEPLOYED, IDEAL_DEPLOYMENT, DeploymentConfig, TaskName
+from touchgoal.sim_envs.config import (
+    AS_DEPLOYED,
+    ENVS,
+    IDEAL_DEPLOYMENT,
+    DeploymentConfig,
+    TaskName,
+)
 
 
 @checked_dataclass
@@ -28,8 +34,7 @@ class Config(TrialOptions):
     """Image rates, Hz."""
 
 
-# parts of `--env.as-deployed`
-_PARTS = {
+_PARTS = {  # parts of `--env.as-deployed`
     "lag, limits and tracker": ("tracker",),
     "a Franka Hand": ("franka_hand",),
     "an estimated wrench": ("estimated_wrench",),

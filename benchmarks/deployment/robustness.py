@@ -3,16 +3,16 @@
 from dataclasses import replace
 from typing import Any
 
-from touchgoal.benchmarks.deployment.trials import ENVS, TrialOptions, try_cases
+from touchgoal.benchmarks.deployment.trials import TrialOptions, try_cases
 from touchgoal.runtime.option_types import checked_dataclass
-from touchgoal.sim_envs.config import TASKS, BrightnessChange, TaskName
+from touchgoal.sim_envs.config import ENVS, BrightnessChange, TaskName
 
 
 @checked_dataclass
 class Config(TrialOptions):
     """Options of benchmark robustness."""
 
-    tasks: tuple[TaskName, ...] = tuple(TASKS)
+    tasks: tuple[TaskName, ...] = tuple(ENVS)
     """Tasks; the maze is on validation wires."""
     light: tuple[BrightnessChange, ...] = (-0.15, -0.05, 0.0, 0.1, -0.8)
     """Changes of the fingertips' light after the first picture, as shares; a row each."""

@@ -11,12 +11,7 @@ from touchgoal.benchmarks.options import CORES, BenchmarkOptions
 from touchgoal.policies.evaluation.evaluate import evaluate
 from touchgoal.runtime import seeds
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
-from touchgoal.sim_envs.config import BeadMazeConfig, PickPlaceConfig, TaskConfig, TaskName
-
-ENVS: dict[TaskName, TaskConfig] = {
-    "pick-place": PickPlaceConfig(),
-    "bead-maze": BeadMazeConfig(split="validation"),
-}
+from touchgoal.sim_envs.config import TaskConfig
 
 
 @checked_dataclass

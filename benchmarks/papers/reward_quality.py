@@ -22,7 +22,7 @@ from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.rewards.curves import Curves
 from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
-from touchgoal.rewards.goals import EpisodeEnd, Goal, LastFrame, Sentence
+from touchgoal.rewards.goals import EpisodeEnd, Goal, OwnFrame, Sentence
 from touchgoal.rewards.metrics import CurveMetrics, measure_curve
 from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
 from touchgoal.rewards.report.summary import metrics_table
@@ -47,8 +47,7 @@ class Config(BenchmarkOptions):
     """Processes that simulate."""
 
 
-# new wordings: no training saw these sentences
-SENTENCES = {
+SENTENCES = {  # new wordings: no training saw these sentences
     "glass_ball": "a hard smooth round object",
     "golf_ball": "a hard ball full of little dents",
     "foam_ball": "a squishy sphere with a coarse surface",
@@ -141,8 +140,8 @@ def record_and_measure(
             episode = embedder.embed_episode(episodes.read(i), episodes.fps, f"{outcome}#{i}")
             sentence = Sentence(SENTENCES[names[i]])
             goals = (
-                Goal(image=LastFrame(), tactile=LastFrame()),
-                Goal(image=LastFrame(), text=sentence),
+                Goal(image=OwnFrame(), tactile=OwnFrame()),
+                Goal(image=OwnFrame(), text=sentence),
                 Goal(image=ends[i], tactile=ends[i], text=sentence),
             )
             embedded = (embedder.embed_goal(goal, episode) for goal in goals)

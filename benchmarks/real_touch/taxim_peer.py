@@ -28,8 +28,7 @@ _UNTOUCHED_HEIGHT = 5.0  # mm above the gel
 def real_presses(sensor: str) -> PressSet:
     """Return the wheel's 48 presses of `gelsight` or 24 of `gelsight_mini`, at 320x240.
 
-    Raises:
-        UserError: the wheel is not installed.
+    UserError: the wheel is not installed.
     """
     spec = importlib.util.find_spec("taxim")
     if spec is None or spec.origin is None:

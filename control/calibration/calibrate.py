@@ -41,8 +41,7 @@ class FittedCalibration:
     circles: Circles  # of the fitted presses, moved to their pictures, px
     # of the fitted presses, m; where unknown, fitted, which pictures determine poorly
     ball_radius: Float[np.ndarray, " n"]
-    # whether the response varies over the image; not if all presses lie in one place
-    varies_over_image: bool
+    varies_over_image: bool  # of the response; not if all presses lie in one place
     # label_offset, label_slope: true centre x, centre y and radius (px) are about offset + slope x
     # label
     label_offset: Circle
@@ -89,8 +88,7 @@ def fit(
     steps = press_fit.PressFit(
         presses, background, varies_over_image, illumination_exponent, trust_labels
     )
-    # A typical gel, still without response and limits.
-    initial = SensorCalibration(
+    initial = SensorCalibration(  # A typical gel, still without response and limits.
         sensor=sensor,
         background=background,
         pixel_pitch=pitch,

@@ -63,8 +63,7 @@ def from_led_ring(sensor: SensorModel, ring: LedRing) -> SensorCalibration:
         shadow_slope=elevation,
         shadow=np.diag(np.full(3, -ring.shadowed * ring.brightness)).astype(np.float32),
         penumbra=5e-5,
-        # Steeper than this a wall turns away from the lamps.
-        max_slope=float(np.sin(np.arctan(elevation))),
+        max_slope=float(np.sin(np.arctan(elevation))),  # steeper walls turn away
         max_depth=1e-3,
         blur_sigmas=(1.05e-3, 0.525e-3, 0.2625e-3, 0.1225e-3),  # as fitted to the Mini's gel
         noise=0.97,

@@ -18,8 +18,7 @@ from touchgoal.control.calibration.press_set import PressSet
 from touchgoal.control.tactile.sensor_calibration import SensorCalibration
 from touchgoal.runtime.errors import UserError
 
-# Errors (L1) above this share of the background's own mean that the fit explains nothing.
-_USELESS = 0.9
+_USELESS = 0.9  # L1 errors above this share of the background's: the fit explains nothing
 _AT_LIMIT = 0.2  # share of circles at a search limit that is worth a warning
 _MAX_SHOWN = 6  # held-out presses in the picture
 _CONTRAST = 4  # of the difference column

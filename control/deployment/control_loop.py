@@ -70,8 +70,7 @@ class Ending:
     done: bool | None = None  # whether the task is done, as far as this ending tells; None: unknown
     stopped: bool = False  # whether the arm was stopped, by a fault or a person
     advice: str = ""  # what to do about it
-    # s from the decision to stop until the arm was at rest; infinite if it never was
-    rest_seconds: float = 0.0
+    rest_seconds: float = 0.0  # s from the decision to stop to rest; infinite if it never was
 
     def __str__(self) -> str:
         if not self.stopped:
@@ -100,8 +99,7 @@ class RunLog:
     # lateness, answer_times: s by which each tick began too late, and that the actor took
     lateness: list[float] = field(default_factory=list)
     answer_times: list[float] = field(default_factory=list)
-    # how often each limit changed a command
-    limit_counts: dict[str, int] = field(default_factory=dict)
+    limit_counts: dict[str, int] = field(default_factory=dict)  # commands changed, by limit
     # the loop's and the arm's clock at each tick, s
     clocks: list[tuple[float, float]] = field(default_factory=list)
 

@@ -36,8 +36,7 @@ class CellReading:
     load: LoadReading | None  # of the load cell; None without one
     age: float  # of the oldest picture, s
     oldest_source: str  # source of that picture
-    # depth in the left and the right gel, m; 0 without fingertips
-    indentation: Float[np.ndarray, "2"]
+    indentation: Float[np.ndarray, "2"]  # depth in left and right gel, m; 0 without fingertips
     fault: str  # a device's own report of a fault; empty if none
 
 

@@ -23,8 +23,7 @@ from touchgoal.control.safety.action_filter import ActionFilter
 _SPEED_SHARE = 0.9  # of what the safety layer lets a policy do: a plan should not be clamped
 _START_SPEED_SHARE = 0.3  # of that, for the start move: a person watches where it goes
 _HELD_ERROR = 0.02  # rad; the arm was held: the plan waits until it has caught up
-# rad between command and arm beyond which the plan waits; 0.06 is usual at this speed
-_MAX_LAG = 0.12
+_MAX_LAG = 0.12  # rad between command and arm beyond which the plan waits; 0.06 is usual
 _GRIPPER_MOVES = 5e-4  # m a tick, the least of a moving gripper
 _CLEARANCE = 0.12  # m above the object before and after the grasp
 _OFF_THE_FLOOR = 0.002, 0.0007  # m that fingertips keep above their box's floor: grasping, placing

@@ -104,8 +104,7 @@ class FrankaHandClient:
         if not command.grasp:
             self._running = self._hand.move_async(command.width, SPEED)
             return
-        # Any object met before that width counts as grasped.
-        self._running = self._hand.grasp_async(
+        self._running = self._hand.grasp_async(  # an object met earlier counts as grasped
             command.width,
             SPEED,
             self._force,

@@ -68,14 +68,12 @@ class ArmModel:
     flange_offset: float  # m from the last joint to the flange, along its z axis
     hand_yaw: float  # rad by which a hand is turned on the flange
     limits: JointLimits  # the maker's; beyond them the controller stops the arm
-    # joint positions (rad) over the table with the fingers down, elbow where people expect it
-    home: Joints
+    home: Joints  # rad, over the table, fingers down, elbow where people expect it
 
 
 FR3_ARM = ArmModel(
     "FR3",
-    # Franka's FR3 description, as shipped in franky-sim's fr3.xml.
-    links=(
+    links=(  # Franka's FR3 description, as shipped in franky-sim's fr3.xml.
         ((0.0, 0.0, 0.333), 0.0),
         ((0.0, 0.0, 0.0), -np.pi / 2),
         ((0.0, -0.316, 0.0), np.pi / 2),

@@ -26,8 +26,7 @@ _PULLED = 8  # of them draw the arm towards its home, ever less; then nothing di
 # Other starts. Of 1,000 poses in reach with any rotation, 66 % (FR3) and 54 % (UR5e) are found from home,
 # 100 % and 99.9 % with these.
 _RESTARTS = 48
-# Weights of squared errors: 10 mrad count as 1 mm.
-_ERROR_WEIGHTS = np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])
+_ERROR_WEIGHTS = np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])  # squared: 10 mrad as 1 mm
 
 
 def _rotation(axis: str, angle: casadi.SX | float) -> casadi.SX:

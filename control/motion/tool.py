@@ -22,8 +22,7 @@ class Tool:
     force: tuple[float, float]  # N, least and greatest grasp force that can be set
     mass: float  # kg, beyond the flange; the sensors' is unpublished and not included
     centre_of_mass: Point  # m, hand frame
-    # m, hand frame: corners of a box around the fingertips, fully open
-    finger_corners: tuple[Point, ...]
+    finger_corners: tuple[Point, ...]  # m, hand frame: of a box around the open fingertips
 
 
 def _corners(tcp_offset: float, half_stroke: float) -> tuple[Point, ...]:

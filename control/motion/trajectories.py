@@ -206,8 +206,7 @@ def _excess(coefficients: Float[np.ndarray, "d n"], timing: Timing, limits: Join
 
     Speed, acceleration and jerk fall with the duration to the power of -1, -2 and -3.
     """
-    # Also where the jerk changes, and the moments before.
-    corners = timing.starts, timing.starts - 1e-9
+    corners = timing.starts, timing.starts - 1e-9  # where the jerk changes, and before
     t = np.concatenate([np.linspace(0, timing.duration, _SAMPLES), *corners])
     s, *rates = timing.derivatives(t)
     s1, s2, s3 = (rate[:, None] for rate in rates)

@@ -43,16 +43,14 @@ class RobotLimits:
     acceleration_share: float = 0.5
     margin: float = 0.1  # distance from the ends of the joints' ranges, rad
     max_step: float = 0.05  # rad, largest joint change in one control tick
-    # rad between commanded and measured joints that mean a blocked or lost arm
-    tracking: float = 0.2
+    tracking: float = 0.2  # rad between command and arm that mean a blocked or lost arm
     tip_speed: float = 0.5  # m/s, of the flange and of each corner of the fingertips
     # m by which commands stay inside the boxes: the 1 kHz stream cuts the corners of their path
     reserve: float = 0.6e-3
     # External force at the TCP (N) and torque in a joint (Nm) that stop the arm.
     force: float = 15.0
     torque: float = 10.0
-    # depth (m) in a gel that stops the arm (`control.tactile.indentation`)
-    indentation: float = 1.5e-3
+    indentation: float = 1.5e-3  # m of depth in a gel that stops the arm (`tactile.indentation`)
 
     @property
     def hardware(self) -> JointLimits:

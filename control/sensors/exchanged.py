@@ -8,8 +8,7 @@ from touchgoal.control.tactile.background import local_change
 
 _CLEARLY = 1.5  # times that a fingertip is more like the other's sensor file
 _SMALL = 32  # px of a side at which pictures of cameras are compared
-# Counts by which half of a picture's pixels change at least, when its camera has moved.
-_MOVED = 2.5
+_MOVED = 2.5  # counts by which half of a picture changes at least, when its camera has moved
 _TIMES = 3.0  # that the other one's must change less
 
 

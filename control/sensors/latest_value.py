@@ -6,8 +6,6 @@ from typing import Generic, TypeVar
 
 from touchgoal.control.interfaces import DriverError
 
-_FIRST_TIMEOUT = 5.0  # s
-
 T = TypeVar("T")
 
 
@@ -18,8 +16,8 @@ class LatestValue(Generic[T]):
     a DriverError with the same text.
     """
 
-    def __init__(self, name: str, poll: Callable[[], T | None]) -> None:
-        self._name, self._poll = name, poll
+    def __init__(self, name: str, poll: Callable[[], T | None], timeout: float = 5.0) -> None:
+        self._name, self._poll, self._timeout = name, poll, timeout
         self._value: T | None = None
         self._error: Exception | None = None
         self._updated, self._stop = threading.Event(), threading.Event()
@@ -27,8 +25,8 @@ class LatestValue(Generic[T]):
         self._thread.start()
 
     def read(self) -> T:
-        """Return the latest reading; wait up to 5 s for the first one."""
-        self._updated.wait(_FIRST_TIMEOUT)
+        """Return the latest reading; wait up to `timeout` s for the first one."""
+        self._updated.wait(self._timeout)
         if self._error is not None:
             raise DriverError(f"{self._name}: {self._error}") from self._error
         if self._value is None:

@@ -11,8 +11,7 @@ from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.runtime.errors import UserError
 
 _ROOT = Path("/sys/class/video4linux")
-# What the USB product names contain, as gsrobotics and digit-interface look for them.
-_PRODUCTS = {
+_PRODUCTS = {  # in USB product names, as gsrobotics and digit-interface look for them
     "gelsight_mini": "GelSight Mini",
     "gelsight_mini_markers": "GelSight Mini",
     "digit": "DIGIT",

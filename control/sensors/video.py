@@ -36,23 +36,20 @@ class VideoConfig:
     # index of a camera (`0`), a device (`/dev/video2`) or the address of an MJPEG stream
     # (`http://...`)
     source: str
-    # (width, height) to request from a camera; None: its default
-    size: tuple[int, int] | None = None
+    size: tuple[int, int] | None = None  # (width, height) to request; None: the camera's own
     rate: float = 25.0  # Hz; requested from a camera, and expected by `problem`
     # exposure, white_balance: fixed values for a camera, in V4L2's units (`v4l2-ctl --list-ctrls`;
     # usually 0.1 ms, and kelvin); None: unchanged
     exposure: float | None = None
     white_balance: int | None = None
-    # s without a frame after which a stream counts as lost and is opened again
-    timeout: float = 1.0
+    timeout: float = 1.0  # s without a frame after which a stream counts as lost, to open again
     # s after which an identical picture, or part of one, counts as old; infinity for rendered
     # pictures, which lack the noise of real ones
     frozen_after: float = 0.5
     # identical pictures in a row required besides, for a lock-step twin, whose time is not wall
     # time
     frozen_pictures: int = 0
-    # whether the pictures are a fingertip's: smooth but for its dots, so broken ones show
-    gel: bool = False
+    gel: bool = False  # a fingertip's: smooth but for its dots, so broken pictures show
     dots: float = 0.0  # diameter of the printed dots as a share of the picture's diagonal; 0: none
     # looks up the camera's device at each opening, when `source` is a serial number
     device: Callable[[], str] | None = None

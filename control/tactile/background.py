@@ -19,8 +19,7 @@ _BLUR_CELLS = 1.5
 # Cosines down and across the image that count as drift: a half wave of 60 px at 320 x 240, the
 # smooth pattern by which a Mini differs from one day to the next (Tactile-MNIST).
 _WAVES = 4, 5
-# Share of a frame that enters the background: 2 s of a 25 Hz sensor, slower than any contact.
-_RATE = 0.02
+_RATE = 0.02  # share of a frame that enters: 2 s at 25 Hz, slower than any contact
 # Standard deviations between 150,000 real touches of Minis (Tactile-MNIST), counts.
 _OFFSET_SPREAD, _PATTERN_SPREAD = 2.4, 2.4
 _MOVED = 1.5  # counts of local change among the first frames that are no noise

@@ -29,15 +29,13 @@ def shading(gx, gy, gain, places, coefficients, max_slope):
         for j in range(w):
             x, y = gx[i, j], gy[i, j]
             square = x * x + y * y
-            # n = -g / length
-            if square > (1 + square) * steepest:
+            if square > (1 + square) * steepest:  # n = -g / length
                 squared, bend = square / steepest, 1 / max(square, 1e-6)
             else:
                 squared, bend = 1 + square, 1 / (1 + square)
             inverse = -1 / np.sqrt(squared)
             _fill_terms(terms, x * inverse, y * inverse)
-            # dn/dg = -(1 - bend g g^T) / length
-            bend *= inverse
+            bend *= inverse  # dn/dg = -(1 - bend g g^T) / length
             xx, xy, yy = inverse - bend * x * x, -bend * x * y, inverse - bend * y * y
             for c in range(3):
                 v = by_x = by_y = 0.0
@@ -102,9 +100,8 @@ def best_slopes(left, error, gx, gy, gain, places, coefficients, lengths, outlie
 def normal_equations(error, by_gx, by_gy, by_depth, weight):
     """Sum weighted products of errors and derivatives over the colours.
 
-    Returns:
-        gx gx, gx gy, gy gy, gx depth, gy depth, depth depth (6 maps); gx, gy, depth times error (3
-            maps).
+    Returns gx gx, gx gy, gy gy, gx depth, gy depth, depth depth (6 maps); gx, gy, depth times error
+    (3 maps).
     """
     h, w = weight.shape
     curvature, slope = np.empty((6, h, w), np.float32), np.empty((3, h, w), np.float32)

@@ -50,17 +50,14 @@ class SensorCalibration:
     # counts per channel and feature (`shape_features`); the last axis multiplies (1, u, v), where u
     # and v run from -1 to 1 across columns and rows
     response: Float32[np.ndarray, "3 10 3"]
-    # of the lights in the image, degrees from x (right) towards y (down)
-    light_azimuths: tuple[float, ...]
+    light_azimuths: tuple[float, ...]  # of the lights, degrees from image x (right) to y (down)
     shadow_slope: float  # tangent of the lights' height above the gel plane
-    # counts per channel in the deepest shadow of each light
-    shadow: Float32[np.ndarray, "3 lights"]
+    shadow: Float32[np.ndarray, "3 lights"]  # counts in each light's deepest shadow
     penumbra: float  # shadow depth (`gel.shadow_depth`) of a half-shadow, m
     # max_slope, max_depth: largest length of (nx, ny), and depth in m, in the presses
     max_slope: float
     max_depth: float
-    # standard deviations of the gel's bulge, coarse to fine, m (`gel.deform`)
-    blur_sigmas: tuple[float, ...]
+    blur_sigmas: tuple[float, ...]  # of the gel's bulge, coarse to fine, m (`gel.deform`)
     noise: float  # standard deviation of the camera's noise, counts
     # power of the background's brightness by which the response varies over the image
     # (`illumination`)
@@ -79,15 +76,13 @@ def shape_features(
 ) -> Float32[np.ndarray, "10 h w"]:
     """Return the ten features of a surface (m into the gel) that the colours are linear in.
 
-    Returns:
-        nx, ny, nx^2, nx ny, ny^2, nx^3, nx^2 ny, nx ny^2, ny^3 of the unit normal's components in
-            the image plane (at most `max_slope` long), and the depth in m.
+    Returns nx, ny, nx^2, nx ny, ny^2, nx^3, nx^2 ny, nx ny^2, ny^3 of the unit normal's components
+    in the image plane (at most `max_slope` long), and the depth in m.
     """
     padded = np.pad(surface, 1, mode="edge")
     gx = (padded[1:-1, 2:] - padded[1:-1, :-2]) * np.float32(0.5 / pitch)
     gy = (padded[2:, 1:-1] - padded[:-2, 1:-1]) * np.float32(0.5 / pitch)
-    # |n| = s / sqrt(1 + s^2) for slope s; at most `max_slope`
-    square = gx * gx + gy * gy
+    square = gx * gx + gy * gy  # |n| = s / sqrt(1 + s^2) for slope s; at most `max_slope`
     inverse = -1 / np.sqrt(np.maximum(1 + square, square / np.float32(max_slope**2)))
     depth = np.minimum(surface, np.float32(max_depth))
     return np.stack([*monomials(gx * inverse, gy * inverse), depth])

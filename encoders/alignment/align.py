@@ -57,18 +57,13 @@ def align(
     Writes what `trainer.fit` does, and at the end the epoch with the best retrieval (mean of both
     mAPs) on one half of the validation episodes to `encoder/`. Its retrieval on the other half, the
     test set, is stored as `test_metrics`. Killed and resumed, it ends with the same weights as
-    uninterrupted.
+    uninterrupted. Returns the encoder as saved in `out_dir/encoder`, in evaluation mode, on the
+    CPU. UserError: unfit data, no such device, or a folder that does not fit `options.resume`.
 
     Args:
         val: Touches of other episodes.
         out_dir: A new run's folder, or one to resume.
         recipe: JSON-able provenance of the touches, stored with the weights.
-
-    Returns:
-        The encoder as saved in `out_dir/encoder`, in evaluation mode, on the CPU.
-
-    Raises:
-        UserError: Unfit data, no such device, or a folder that does not fit `options.resume`.
     """
     data, val_data = (
         prepare_touch_data(t, towers, sensor, config.no_contact_texts) for t in (train, val)
@@ -133,8 +128,7 @@ class AlignedBatch:
 
     touch: Float[Tensor, "b d"]  # touch embeddings
     text: Float[Tensor, "b d"]  # embedding of one sentence for each touch
-    # embedding of one image for each touch, meaningless without contact
-    image: Float[Tensor, "b d"]
+    image: Float[Tensor, "b d"]  # embedding of one image each, meaningless without contact
     contact: Bool[Tensor, " b"]  # whether the touch has an image
     same: Bool[Tensor, "b b"]  # whether touches i and j have the same object or the same sentence
 

@@ -83,8 +83,7 @@ class AlignConfig:
 
 
 ALIGN_PRESETS: dict[str, AlignConfig] = {
-    # 10,000 touches in about 15 minutes on two CPU cores
-    "default": AlignConfig(),
+    "default": AlignConfig(),  # 10,000 touches in about 15 minutes on two CPU cores
     # Section V of the MMWand paper. What it leaves open is plain here: a constant learning rate, no
     # augmentation, no touches without contact. Meant for CLIP towers and a large GPU.
     "paper": AlignConfig(

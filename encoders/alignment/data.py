@@ -25,8 +25,7 @@ class TouchData:
 
     touch: Float16[Tensor, "n 3 h w"]  # preprocessed frames in half precision, to save memory
     label: Int[Tensor, " n"]  # row of `names` of each touch
-    # False for touches without contact, which have sentences but no image
-    contact: Bool[Tensor, " n"]
+    contact: Bool[Tensor, " n"]  # False: it has sentences but no image
     view_index: Int[Tensor, " n"]  # row of `images` of each touch
     images: Float[Tensor, "e i"]  # image tower's embedding of each view, not normalised
     texts: Float[Tensor, "m t"]  # text tower's embedding of each sentence, not normalised

@@ -11,7 +11,7 @@ def info_nce(
     temperature: float,
     positives: Bool[Tensor, "n n"] | None = None,
 ) -> Float[Tensor, ""]:
-    """Return the one-directional loss: each anchor picks its own among all targets.
+    """Return the one-directional loss, mean over anchors: each picks its own among all targets.
 
     Args:
         anchor: L2-normalised embeddings.
@@ -20,9 +20,6 @@ def info_nce(
             the mean over the right answers (SupCon's L_out, Khosla et al. 2020). With None only the
             partner is right, and another touch of the same object counts as wrong: in the paper's
             batches of 64, 46 % of the anchors have one.
-
-    Returns:
-        Mean over the anchors.
     """
     log_p = (anchor @ target.T / temperature).log_softmax(1)
     if positives is None:

@@ -37,8 +37,7 @@ class PooledEncoderConfig:
     features: int  # width of an embedding
     sensor: str  # name of the fingertip sensor
     preprocessor: str  # `TactilePreprocessor.id` at training
-    # `Towers.name` of the towers whose sentences it embeds; None without sentences
-    towers: str | None = None
+    towers: str | None = None  # `Towers.name`, whose sentences it embeds; None without
     text_dim: int = 0  # width of their text embeddings
 
     @classmethod

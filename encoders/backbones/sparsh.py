@@ -16,8 +16,7 @@ Method = Literal["mae", "dino", "ijepa", "vjepa"]
 UPRIGHT, SQUARE, NORM_EPSILON = (320, 240), (224, 224), 1e-6
 
 
-# Two frames on top of each other, the newer first.
-_BASE = ViTConfig(
+_BASE = ViTConfig(  # Two frames on top of each other, the newer first.
     patch_size=16, channels=6, width=768, depth=12, heads=12, norm_epsilon=NORM_EPSILON
 )
 _SQUARE_BASE = replace(_BASE, image_size=SQUARE, learned_positions=True)
@@ -28,8 +27,7 @@ SPARSH_BASE: dict[str, ViTConfig] = {
     "vjepa": replace(_SQUARE_BASE, channels=3, tubelet=2, frames=4),
 }
 _PUBLISHED_SIZES = {"tiny": (192, 3), "small": (384, 6), "base": (768, 12)}  # width, heads
-# Our presets of these names, with widths that three axes divide, for clips.
-_SIZES = {
+_SIZES = {  # Our presets of these names, with widths that three axes divide, for clips.
     "tiny": ViTConfig(patch_size=40, width=48, depth=2, heads=2, mlp_ratio=2.0),
     "compact": ViTConfig(width=144, depth=4, heads=4),
     "small": ViTConfig(),

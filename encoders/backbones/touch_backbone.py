@@ -22,11 +22,9 @@ class TouchBackboneConfig:
     """Architecture of a backbone, and what it was trained with."""
 
     vit: ViTConfig  # the ViT
-    # name of the fingertip sensor; None for a published Sparsh encoder, which takes any
-    sensor: str | None
+    sensor: str | None  # the fingertip's; None for a published Sparsh encoder, which takes any
     preprocessor: str  # `TactilePreprocessor.id` at training, or one of `sparsh_input.py`
-    # frames between the input frames: two stacked ones (six channels) or a clip (tubelets)
-    stride: int = 1
+    stride: int = 1  # frames between those stacked (two: six channels) or of a clip (tubelets)
 
     @classmethod
     def for_sensor(cls, vit: ViTConfig, sensor: str, stride: int = 1) -> "TouchBackboneConfig":

@@ -25,8 +25,7 @@ class ViTConfig:
     heads: int = 3  # attention heads; they divide `width`
     mlp_ratio: float = 4.0  # hidden width of a block's MLP over `width`
     class_token: bool = False  # prepend a learned token and pool by it; otherwise pool by the mean
-    # learned tokens without position, not part of the output (Darcet et al. 2024)
-    registers: int = 0
+    registers: int = 0  # learned tokens without position, not put out (Darcet et al. 2024)
     # initial value of learned factors on both branches of a block (Touvron et al. 2021), if any
     layer_scale: float | None = None
     tubelet: int = 1  # frames in a token; 1 for images, more for clips of any multiple of it

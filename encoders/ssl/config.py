@@ -79,8 +79,7 @@ class MaeConfig(_UnlabelledConfig):
 
 MAE_PRESETS: dict[str, MaeConfig] = {
     "default": MaeConfig(),
-    # As released, but for the decoder's positions, which are learned there.
-    "paper": MaeConfig(
+    "paper": MaeConfig(  # As released, but for the decoder's positions, which are learned there.
         vit="base",
         stacked=True,
         mask_ratio=0.75,

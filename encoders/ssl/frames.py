@@ -68,17 +68,15 @@ def sample_frames(
 ) -> TouchFrames:
     """Draw ticks at random from every episode, with every fingertip of each.
 
-    The background is a fingertip's first frame: episodes start untouched. The first frame also stands
-    for frames before it, as it does when a policy acts.
+    The background is a fingertip's first frame: episodes start untouched. The first frame also
+    stands for frames before it, as it does when a policy acts. UserError: no touch in the set, or
+    another sensor's.
 
     Args:
         per_episode: Ticks drawn from each episode; all of a shorter one.
         seed: Random seed; an episode's draw does not depend on the other episodes.
         offsets: Ticks from the drawn frame back to each frame of a sample, 0 first; None for single
             frames.
-
-    Raises:
-        UserError: No touch in the set, or another sensor's.
     """
     sides = {side: key for side, key in enumerate(TACTILE) if key in episodes.features}
     if not sides:
@@ -108,14 +106,13 @@ def sample_recordings(
 ) -> TouchFrames:
     """Draw images at random from every recording, as `sample_frames` does from episodes.
 
+    UserError: an image is broken, or not of the sensor's shape.
+
     Args:
         recordings: Recordings of one sensor, at least one.
         per_recording: Images drawn from each; all of a shorter one.
         seed: Random seed; a recording's draw does not depend on later recordings.
         offsets: As for `sample_frames`.
-
-    Raises:
-        UserError: An image is broken, or not of the sensor's shape.
     """
     sensor = recordings[0].sensor
     preprocess = preprocessor_for(sensor)
@@ -140,12 +137,11 @@ def _draw_rows(
 def find_sensor_name(sensor: str | None, *sets: EpisodeSet) -> str:
     """Return the fingertip sensor of all episodes.
 
+    UserError: unknown, not named, or not the same in all episodes.
+
     Args:
         sensor: Its name, for episodes that do not name theirs.
         sets: Episode sets.
-
-    Raises:
-        UserError: Unknown, not named, or not the same in all episodes.
     """
     sensor = sensor or str(sets[0].meta(0).get("sensor", ""))
     if not sensor:

@@ -40,21 +40,16 @@ def train_unlabelled(
 ) -> TouchBackbone:
     """Train a backbone by the objective of `config`.
 
-    Writes what `trainer.fit` does, and at the end the backbone, or its teacher, to `encoder/`. Killed
-    and resumed, it ends with the same weights as uninterrupted.
+    Writes what `trainer.fit` does, and at the end the backbone, or its teacher, to `encoder/`.
+    Killed and resumed, it ends with the same weights as uninterrupted. Returns the backbone as
+    saved, for inference, on the CPU. UserError: no such device, a folder that does not fit
+    `options.resume`, or a collapsed encoder, which is not saved.
 
     Args:
         val: Touches of other episodes.
         config: Hyperparameters; their class chooses the objective.
         out_dir: A new run's folder, or one to resume.
         recipe: JSON-able provenance of the touches, stored with the weights.
-
-    Returns:
-        The backbone as saved, for inference, on the CPU.
-
-    Raises:
-        UserError: No such device, a folder that does not fit `options.resume`, or a collapsed encoder,
-            which is not saved.
     """
     method, objective = _OBJECTIVES[type(config)]
     optimizer = _optimizer(config)

@@ -106,12 +106,9 @@ def token_statistics(tokens: Float[Tensor, "n p d"]) -> dict[str, float]:
     """Measure how touches differ in their tokens.
 
     The mean over touches is subtracted at each place first: position codes make the tokens of one
-    touch differ even at collapse.
-
-    Returns:
-        `token_spread`, the mean square of what is left over the tokens' own: 0 if all touches are
-        equal; `effective_rank`, the exponential of the entropy of its covariance's spectrum (Roy
-        and Vetterli 2007): the number of dimensions in which touches differ.
+    touch differ even at collapse. Returns `token_spread`, the mean square of what is left over the
+    tokens' own: 0 if all touches are equal; `effective_rank`, the exponential of the entropy of its
+    covariance's spectrum (Roy and Vetterli 2007): the number of dimensions in which touches differ.
     """
     apart = (tokens - tokens.mean(0)).double()
     spread = apart.square().mean() / tokens.double().square().mean()

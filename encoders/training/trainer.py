@@ -39,19 +39,16 @@ class OptimizerConfig:
     # are left out of their epoch
     batch_size: int
     lr: float  # highest learning rate
-    # weight decay of weight matrices and convolutions; biases, norms and tokens have none
-    weight_decay: float
+    weight_decay: float  # of weight matrices and convolutions; not biases, norms and tokens
     betas: tuple[float, float] = (0.9, 0.999)  # Adam's betas
     # AdamW (Loshchilov and Hutter 2019); otherwise Adam with weight decay as an L2 term in the
     # gradient
     decoupled_weight_decay: bool = True
     warmup: float = 0.1  # share of the steps in which the rate rises linearly from 0
     max_warmup_steps: float = math.inf  # upper bound of these steps
-    # rate at the end over `lr`, reached by a cosine; 1 keeps the rate constant
-    final_lr: float = 0.0
+    final_lr: float = 0.0  # last rate over `lr`, reached by a cosine; 1 keeps it constant
     max_grad_norm: float | None = None  # norm that gradients are clipped to; None clips nothing
-    # weight decay at the end, reached by a cosine; None keeps it constant
-    final_weight_decay: float | None = None
+    final_weight_decay: float | None = None  # reached by a cosine; None keeps it constant
 
     def build(self, module: nn.Module) -> torch.optim.Optimizer:
         """Return the optimizer of a module's parameters."""
@@ -108,8 +105,7 @@ class Training:
     # sample, comes from the noise
     batch: Callable[[Int[Tensor, " b"], BatchNoise], dict[str, Any]]
     optimizer: OptimizerConfig  # settings of the optimizer
-    # JSON-able checksum of the data and settings. A run resumes only with the same
-    identity: Mapping[str, Any]
+    identity: Mapping[str, Any]  # JSON-able: data and settings; a run resumes only with the same
     # called after every epoch; returns metrics to record beside the mean losses
     evaluate: Callable[[], Metrics] = dict
     progress: Callable[[Metrics], str] = str  # returns the line to print for an epoch's metrics
@@ -127,18 +123,13 @@ def fit(
     """Train; after Ctrl-C the finished epochs can be resumed.
 
     Writes `metrics.jsonl` (a line an epoch), TensorBoard's event files and `checkpoint.pt` (after
-    every epoch).
+    every epoch). Returns the metrics of every epoch, and the provenance to store beside the
+    weights. UserError: no such device, or a folder that does not fit `options.resume`.
 
     Args:
         training: What to train; its modules are moved to the device, and changed.
         out_dir: A new run's folder, or with `options.resume` the one to resume.
         recipe: JSON-able provenance: command, commit, data and their checksum.
-
-    Returns:
-        The metrics of every epoch, and the provenance to store beside the weights.
-
-    Raises:
-        UserError: No such device, or a folder that does not fit `options.resume`.
     """
     checkpoint.check_run_folder(out_dir, options.resume)
     accelerator = _accelerator(options.device)

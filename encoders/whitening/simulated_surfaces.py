@@ -16,7 +16,8 @@ from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.encoders.backbones.pooled_encoder import FEATURES, PooledEncoder, PooledEncoderConfig
 from touchgoal.encoders.whitening.covariance import inverse_square_root
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.tactile.rig.surface_press import press, random_pose, untouched
+from touchgoal.sim_envs.tactile.optics import render_untouched
+from touchgoal.sim_envs.tactile.rig.surface_press import press, random_pose
 from touchgoal.sim_envs.tactile.rig.surfaces import random_surface
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
@@ -91,7 +92,7 @@ def _visible_press(
     surface, unit: SensorInstance, rng: np.random.Generator
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
     """Return the camera images of the untouched and of the pressed sensor."""
-    rest = untouched(unit, rng)
+    rest = render_untouched(unit, rng)
     frame = rest
     for _ in range(_TRIES):
         frame = press(surface, random_pose(rng), unit, rng)

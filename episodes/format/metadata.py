@@ -29,8 +29,7 @@ class SetMetadata:
     features: dict[str, dict[str, Any]]  # as in info.json
     tasks: tuple[str, ...] = ()  # all instructions; the position is the task_index
     stats: dict[str, Stats] | None = None  # statistics over all frames by key
-    # table meta/episodes, one row an episode; None before the first
-    episodes: pa.Table | None = None
+    episodes: pa.Table | None = None  # meta/episodes, a row an episode; None before the first
 
     @property
     def n_episodes(self) -> int:

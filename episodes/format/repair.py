@@ -137,13 +137,8 @@ def repair(root: str | os.PathLike[str]) -> list[str]:
 
     Every episode whose files are whole stays, in order; other files move to `repaired/` inside the
     set, and so does the old meta/, which is rebuilt from the data files. A killed repair can be run
-    again.
-
-    Returns:
-        What was done, one line each; [] if the set was sound.
-
-    Raises:
-        UserError: Not a set, one of another version, or one that lerobot wrote or continued.
+    again. Returns what was done, one line each; [] if the set was sound. UserError: not a set, one
+    of another version, or one that lerobot wrote or continued.
     """
     root = set_files.set_folder(Path(root))
     if not validate(root):

@@ -42,8 +42,7 @@ def _histogram_statistics(counts: Float[np.ndarray, " 256"]) -> dict[str, float]
     stats |= {"mean": mean, "std": variance**0.5}
     cumulative = np.cumsum(counts)
     for name, q in QUANTILES.items():
-        # Linear interpolation between order statistics, numpy's default.
-        rank = q * (cumulative[-1] - 1)
+        rank = q * (cumulative[-1] - 1)  # linear between order statistics, numpy's default
         below, above = np.searchsorted(cumulative, [np.floor(rank), np.ceil(rank)], side="right")
         stats[name] = float(below + (above - below) * (rank - np.floor(rank)))
     return stats

@@ -33,8 +33,7 @@ class GraspTrial:
     object: str  # name of the object
     held: bool  # whether it was still in the hand after lifting
     held_out: bool  # whether it belongs to the published test files
-    # each fingertip's images at `MOMENTS`, the first without contact
-    fingers: tuple[TouchClip, TouchClip]
+    fingers: tuple[TouchClip, TouchClip]  # each one's images at `MOMENTS`, the first untouched
 
 
 def read_grasps(folder: Path, sensor: str | None = None) -> Iterator[GraspTrial]:

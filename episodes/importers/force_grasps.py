@@ -27,11 +27,9 @@ class ForceGrasp:
     trial: str  # name of the grasp
     object: str  # id of the object
     video: Path  # video file
-    # grasp force of each frame, N, as the load cell gives it, with spikes and drift
-    force: Float[np.ndarray, " n"]
+    force: Float[np.ndarray, " n"]  # of each frame, N, as measured, with spikes and drift
     width: Float[np.ndarray, " n"]  # gripper width of each frame, m
-    # corners of the gel in the images, px, if they are to be rectified
-    corners: Corners | None = None
+    corners: Corners | None = None  # of the gel in the images, px, to rectify them
 
     def frames(self) -> UInt8[np.ndarray, "m h w 3"]:
         """Return as many RGB frames as `force` has: raw, or rectified to a GelSight Wedge's gel."""

@@ -34,8 +34,7 @@ class LabelledVideo:
     object: str  # id of the object
     name: str  # name of the object
     split: str  # train, val, test or unlabelled
-    # hardness, roughness and bumpiness, 0 to 2; None where not ranked
-    ranks: tuple[int, int, int] | None
+    ranks: tuple[int, int, int] | None  # `PROPERTIES`, 0 to 2; None where not ranked
     sensor: ClassVar[str] = "gelsight_mini"
 
     def frames(self) -> UInt8[np.ndarray, "n h w 3"]:

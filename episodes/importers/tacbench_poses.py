@@ -60,13 +60,12 @@ def read_bags(
 ) -> Iterator[PoseBag]:
     """Read the recordings of a published folder, one at a time.
 
+    UserError: no such files, another sensor's, or a content that is not as published.
+
     Args:
         folder: Folder with train/ and test/.
         finger: Finger; the paper uses the ring finger.
         sensor: Sensor model, which must be a DIGIT.
-
-    Raises:
-        UserError: No such files, another sensor's, or a content that is not as published.
     """
     paths = _bags(folder)
     if not paths:

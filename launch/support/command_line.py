@@ -34,12 +34,10 @@ def parse(
 ) -> Any:
     """Parse the arguments after a command's name into its Config, or that of a subcommand.
 
-    A Config with an option `--preset` has the defaults of each of its values in `PRESETS`. A command
-    with `--task` has each task's default environment options; `--env.*` are those of the typed task.
-
-    Raises:
-        UserError: A value is out of range.
-        SystemExit: Help was asked for (0), or an argument was not understood (2).
+    A Config with an option `--preset` has the defaults of each of its values in `PRESETS`. A
+    command with `--task` has each task's default environment options; `--env.*` are those of the
+    typed task. UserError: a value is out of range. SystemExit: help was asked for (0), or an
+    argument was not understood (2).
     """
     _refuse_empty_values(arguments)
     short = not {"--help", "-h"}.isdisjoint(arguments)  # tyro does not accept what it hides

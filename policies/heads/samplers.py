@@ -35,11 +35,7 @@ def inference_timesteps(config: SamplerConfig) -> Int[Tensor, " {config.num_infe
 def add_noise(
     config: SamplerConfig, clean: Float[Tensor, "b h a"], noise: BatchNoise
 ) -> tuple[Float[Tensor, "b h a"], Float[Tensor, " b"], Float[Tensor, "b h a"]]:
-    """Make a training example of every sample, at a random step.
-
-    Returns:
-        Noisy samples, their steps, the network's targets.
-    """
+    """Return noisy samples, each at a random step, these steps, and the network's targets."""
     b = len(clean)
     added = noise.randn(clean.shape).to(clean)
     if config.kind == "flow":

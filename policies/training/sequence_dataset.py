@@ -31,8 +31,7 @@ class Recordings:
     state: Float32[Tensor, "n s"]  # proprioception
     actions: Float32[Tensor, "n 8"]  # `features.ACTION`
     lengths: tuple[int, ...]  # ticks of each episode
-    # difference images for the end-to-end encoder; None without
-    pictures: UInt8[Tensor, "n k h w 3"] | None = None
+    pictures: UInt8[Tensor, "n k h w 3"] | None = None  # for the end-to-end encoder
     # on both pads (N, Nm, pad frames); None unless the policy is trained on it
     wrench: Float32[Tensor, "n 12"] | None = None
 

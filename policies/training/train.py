@@ -37,18 +37,13 @@ def train(
 
     Beside the files of `trainer.fit` it writes snapshots to `snapshots/epoch-<n>/`, and the last
     one to `policy/`. A run that is killed and resumed ends with the same weights as an
-    uninterrupted one.
+    uninterrupted one. Returns the policy as saved in `out_dir/policy`. UserError: no such device,
+    or a folder that does not fit `options.resume`.
 
     Args:
         validation: windows of other episodes.
         out_dir: folder of a new run, or of the one to resume.
         recipe: JSON-able provenance of the episodes, written beside the weights.
-
-    Returns:
-        The policy as saved in `out_dir/policy`.
-
-    Raises:
-        UserError: no such device, or a folder that does not fit `options.resume`.
     """
     recorded = windows.recorded
     widths = recorded.actions[:, -1].unique().tolist()

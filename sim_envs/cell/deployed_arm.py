@@ -89,8 +89,7 @@ class DeployedHand:
     def __init__(self, env: Any, rng: np.random.Generator) -> None:
         self._env = env
         self._phase = int(rng.integers(_HAND_PERIOD))
-        # width: last reading, m
-        self._goal = self.width = env.width()
+        self._goal = self.width = env.width()  # width: last reading, m
         self._commands = HandCommands(self.width)
         self._last: LastCommand = "arrived"
         self._grasps, self._age = False, 0
@@ -158,8 +157,7 @@ class DeployedArm:
         self._width = env.width_target()
         self._states = {0: self._read_state()}
         self._pictures = {0: (env.take_pictures(), env.pad_contacts())}
-        # the pads' contacts at the time of the last observation's images
-        self.contacts = env.pad_contacts()
+        self.contacts = env.pad_contacts()  # at the time of the last observation's images
 
     def run_tick(self, delta: Joints, width: float) -> None:
         """Run a control tick with the policy's action; end it where the force is too high."""

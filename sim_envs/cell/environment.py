@@ -152,9 +152,8 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Run one control tick; the reward is its gain in progress.
 
-        Raises:
-            gymnasium.error.ResetNeeded: no episode has begun.
-            ValueError: the action is not n + 1 finite numbers.
+        gymnasium.error.ResetNeeded: no episode has begun. ValueError: the action is not n + 1
+        finite numbers.
         """
         self._require_episode("step")
         action = np.asarray(action, dtype=np.float64)
@@ -173,8 +172,7 @@ class FrankaTactileEnv(SimulatedHardware, gym.Env[dict[str, Any], np.ndarray]):
             self._run_tick(action[:-1], action[-1], seconds=1 / self.config.control_hz)
         progress, success = self.end_tick()
         truncated = self._ticks >= self.config.max_seconds * self.config.control_hz
-        # Before `_info`: truth about the pads is as old as the images of this observation.
-        observation = self._observe()
+        observation = self._observe()  # before `_info`, whose truth is of these images
         failed = bool(self.failures())
         success = success and not failed
         info = self._info(progress, success)

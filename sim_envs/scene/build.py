@@ -295,8 +295,7 @@ def add_body(spec: mujoco.MjSpec, body: Body) -> None:
         mass=body.mass,
         rgba=kind.material.rgba,
         group=OBJECT_GROUP,
-        # The object's contact parameters hold against gel and table alike.
-        priority=1,
+        priority=1,  # The object's contact parameters hold against gel and table alike.
         condim=6 if rolls else 4,
         # Torsion of a patch of 5 mm radius, as of a 10 N grasp (8/15 of it: Hertz' pressure).
         friction=[kind.material.friction, 0.0025, 0.0005 if rolls else 0.0001],

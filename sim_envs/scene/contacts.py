@@ -10,8 +10,7 @@ from numba import njit
 
 from touchgoal.sim_envs.scene.build import SIDES
 
-# Which of the solver's kinds of constraint are contacts (with elliptic cones).
-_IS_CONTACT = np.zeros(16, bool)
+_IS_CONTACT = np.zeros(16, bool)  # which constraints are contacts (elliptic cones)
 _IS_CONTACT[int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)] = True
 _IS_CONTACT[int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)] = True
 SLIP_SPEED = 1e-3  # m/s of sliding between pad and object that counts as slip

@@ -34,9 +34,8 @@ class Renderer(mujoco.Renderer):
 def open_renderer(model: mujoco.MjModel, rows: int, columns: int) -> Renderer:
     """Open a renderer with its own OpenGL context; close it after use.
 
-    Raises:
-        UserError: there are no OpenGL libraries, MuJoCo chose a platform that does not work, or the
-            process was forked from one that has rendered.
+    UserError: there are no OpenGL libraries, MuJoCo chose a platform that does not work, or the
+    process was forked from one that has rendered.
     """
     global _opened_in
     if os.environ.get("MUJOCO_GL", "").lower() in ("disable", "disabled", "off", "false", "0"):

@@ -33,8 +33,7 @@ _FINE = 4  # samples along each side of such a square
 class ForceField:
     """Forces of an object on the cells of a gel, which move with it when it shears."""
 
-    # N per cell, positive where pressed; the grid is centred on the sensor frame
-    normal: Float32[np.ndarray, "h w"]
+    normal: Float32[np.ndarray, "h w"]  # N per cell, + pressed; grid centred on the sensor frame
     tangential: Float32[np.ndarray, "2 h w"]  # N per cell, along the sensor's x and y
     slipping: Bool[np.ndarray, "h w"]  # cells whose traction lies on the friction cone
     slip_fraction: float  # share of the normal force that slipping cells carry
@@ -83,8 +82,7 @@ def _match_moments(normal, pitch, place, mx, my):
     if load == 0.0:
         return
     cx, cy = sx / load, sy / load
-    # A thousandth of a cell keeps lines and single cells from leaning without end.
-    least = 1e-3 * load * pitch * pitch
+    least = 1e-3 * load * pitch * pitch  # keeps lines, single cells from leaning endlessly
     vxx, vxy, vyy = sxx - cx * sx + least, sxy - cx * sy, syy - cy * sy + least
     determinant = vxx * vyy - vxy * vxy
     a = (vyy * (mx - sx) - vxy * (my - sy)) / determinant

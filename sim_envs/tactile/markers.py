@@ -11,8 +11,7 @@ from touchgoal.control.tactile.sensor_models import MarkerGrid, SensorModel
 from touchgoal.sim_envs.tactile.forces import ForceField
 from touchgoal.sim_envs.tactile.geometry import Grid
 
-# Share of the light that a dot takes: a guess; print on a lit gel does not look black.
-DARKNESS = 0.7
+DARKNESS = 0.7  # share of the light taken, a guess: print on a lit gel is not black
 # Friction holds the gel under an object. Of the spread without friction, a stuck ball leaves 10 %
 # in the middle, 60 % at its rim and 80 % outside (the layer solved in steps of a growing contact,
 # ball radius 5 to 25 mm, 1 to 15 N): a share that falls with the pressure on the spot.
@@ -45,10 +44,8 @@ def layer_compliance(
     """Return the surface compliance of a gel to loads that are waves of number k (1/m).
 
     The gel is an incompressible elastic layer bonded to a rigid base (plane and antiplane strain).
-
-    Returns:
-        Displacement per traction along the wave and across it, m/Pa, and minus the displacement
-        per gradient of pressure, m^2/Pa: pressed down, the gel is squeezed aside.
+    Returns displacement per traction along the wave and across it, m/Pa, and minus the displacement
+    per gradient of pressure, m^2/Pa: pressed down, the gel is squeezed aside.
     """
     t, shear = sensor.gel_thickness, sensor.shear_modulus
     k = np.maximum(k, 1e-3)

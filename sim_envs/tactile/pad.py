@@ -33,8 +33,7 @@ class TactileFrame:
     """One sensor reading."""
 
     image: UInt8[np.ndarray, "h w 3"]  # camera image, RGB
-    # depth of the gel below its rest plane at half the image's resolution, m
-    surface: Float32[np.ndarray, "h2 w2"]
+    surface: Float32[np.ndarray, "h2 w2"]  # depth below rest at half the image's resolution, m
     # how deep the object itself lies in the undeformed gel, m, there; 0 beside it
     overlap: Float32[np.ndarray, "h2 w2"]
     field: ForceField | None  # forces over the whole gel; None where nothing touches

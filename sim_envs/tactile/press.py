@@ -34,8 +34,7 @@ class Press:
     tilt: tuple[float, float]
     pressure: Float32[np.ndarray, "h w"]  # on the gel's own cells, Pa; zero where nothing touches
     pitch: float  # size of a cell, m
-    # (x, y, z) of the cells from rest, m: as the solver's plate
-    displacement: tuple[float, float, float]
+    displacement: tuple[float, float, float]  # of the cells (x, y, z), m: as the solver's plate
 
     def push_in(self, height: HeightField, pitch: float) -> None:
         """Move the object's height field, of any grid centred on the sensor frame, in place."""

@@ -28,10 +28,8 @@ class SensorInstance:
     background: Int16[np.ndarray, "3 h w"]  # the untouched frame, RGB in STEPs
     # how strongly the light falls, per channel, at half the image's resolution
     illumination: Float32[np.ndarray, "3 h3 w3"]
-    # tile of camera noise in STEPs, larger than the image by NOISE_MARGIN
-    noise: Int8[np.ndarray, "3 h2 w2"]
-    # resting (x, y) of the gel's printed dots, px; none on a plain gel
-    markers: Float32[np.ndarray, "n 2"]
+    noise: Int8[np.ndarray, "3 h2 w2"]  # camera noise in STEPs, larger by NOISE_MARGIN
+    markers: Float32[np.ndarray, "n 2"]  # resting dots (x, y), px; none on a plain gel
     marker_radius: float  # px
 
     @property
@@ -45,8 +43,7 @@ def sample_instance(
 ) -> SensorInstance:
     """Draw one sensor of a model: its sensor file, varied by the randomization.
 
-    Raises:
-        UserError: if the model's sensor file is missing or damaged.
+    UserError: the model's sensor file is missing or damaged.
     """
     randomization = randomization or SensorRandomization()
     typical = load(sensor.sensor_file)

@@ -37,8 +37,7 @@ class ShearRelief:
     ) -> Float32[np.ndarray, "h w"]:
         """Return the depth (m) to add to the surface; none where the object itself holds it.
 
-        Args:
-            overlap: object's overlap with the undeformed gel, on the image's grid.
+        `overlap`: object's overlap with the undeformed gel, on the image's grid.
         """
         relief = over_picture(self.depth(field), field, self._image)
         free = (overlap <= 0).astype(np.float32)

@@ -108,9 +108,7 @@ def add_texture(
     """Add a material's pattern to a height field, in place, where it may touch the gel.
 
     Patterns are functions of the point in the object's frame, so that they stick to any shape.
-
-    Args:
-        position, rotation: pose of the object in the sensor frame.
+    `position`, `rotation`: pose of the object in the sensor frame.
     """
     if not material.texture or not material.amplitude:
         return

@@ -77,8 +77,7 @@ class ControlPort(Service):
         self._lock_step, self._on_reset = lock_step, on_reset
         self._cell, self._arm, self._pictures, self._ports = cell, arm, pictures, ports
         self._listener = ListeningPort(host, port)
-        # s left, simulated: a slow machine would end it before a packet is lost
-        self._frozen_seconds = 0.0
+        self._frozen_seconds = 0.0  # s, simulated: else a slow machine would end it too soon
         self._token = secrets.token_hex(8)
         self.address = f"{self._token}@{host}:{self._listener.port}"
 

@@ -26,13 +26,11 @@ class Pictures(Service):
     def __init__(self, cell: SimulatedCell, host: str, port: int) -> None:
         """Start the process; raises OSError if it cannot serve there."""
         self._cell, self._host = cell, host
-        # whether a client lets time go on, which must get a picture before it does
-        self.held = False
+        self.held = False  # whether a client lets time go on, and must get a picture first
         # taken, left_out: pictures that were due and taken, or not taken for the process was behind
         self.taken = self.left_out = 0
         env = cell.env
-        # Hz, simulated, of each stream by its name, such as tactile_left
-        self.rates: dict[str, int] = {}
+        self.rates: dict[str, int] = {}  # Hz, simulated, by stream, such as tactile_left
         if env.config.tactile:  # first, because later images are sent later
             names = [key.removeprefix(ft.IMAGE_PREFIX) for key in ft.TACTILE]
             self.rates |= dict.fromkeys(names, round(env.sensor.frame_rate))
@@ -45,8 +43,7 @@ class Pictures(Service):
         self._sent, self.processor_time = dict.fromkeys(self.rates, 0), 0.0
         self._unanswered = 0
         self._pipe, theirs = Pipe()
-        # Its own session: Ctrl-C is for the twin, which then ends it.
-        self._process = subprocess.Popen(
+        self._process = subprocess.Popen(  # own session: Ctrl-C is for the twin, which ends it
             [sys.executable, "-c", _PROGRAM, str(theirs.fileno()), host, str(port), *self.rates],
             pass_fds=[theirs.fileno()],
             start_new_session=True,

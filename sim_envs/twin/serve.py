@@ -45,8 +45,7 @@ class TwinConfig:
     """Options of a twin."""
 
     task: TaskConfig  # task of the cell; its `arm` is replaced by `arm`
-    # an FR3 with the Franka Hand, or a UR5e whose gripper talks as a Robotiq does
-    arm: Literal["fr3", "ur5e"]
+    arm: Literal["fr3", "ur5e"]  # FR3 with the Franka Hand, or UR5e with a Robotiq
     seed: int
     host: str  # loopback address of everything; twins at different ones run side by side
     port: int  # image port; the next one is the control port. 0: any that are free

@@ -39,8 +39,7 @@ gymnasium.register(
     "touchgoal/BeadMaze-v0", "touchgoal.sim_envs.bead_maze:BeadMaze", max_episode_steps=800
 )
 
-# One call a job. Each is imported at its first use, so that `import touchgoal` stays light.
-_INTERFACE = {
+_INTERFACE = {  # one call a job, imported at its first use: `import touchgoal` stays light
     "evaluate": "touchgoal.policies.evaluation.evaluate",
     "load_encoder": "touchgoal.encoders.pretrained",
     "load_policy": "touchgoal.policies.checkpoint",

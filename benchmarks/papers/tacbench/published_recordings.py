@@ -44,12 +44,11 @@ class Published:
 def find_published(folder: Path, sensor: str) -> Published | None:
     """Return a folder's published files; None if it has none.
 
+    UserError: the first file is damaged.
+
     Args:
         folder: TacBench's force or pose estimation, or Feeling of Success.
         sensor: decides between gels with and without dots, where the files do not.
-
-    Raises:
-        UserError: the first file is damaged.
     """
     if is_force_set(folder):
         named = _variant(sensor, _first(read_strokes(folder), folder).clip.sensor)

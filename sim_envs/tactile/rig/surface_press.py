@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from touchgoal.control.tactile.gel import deform
-from touchgoal.sim_envs.tactile.optics import render, render_untouched
+from touchgoal.sim_envs.tactile.optics import render
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, TILE_PITCH, Surface
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance
 
@@ -58,8 +58,7 @@ def overlap(
     c, s = np.float32(math.cos(pose.turn)), np.float32(math.sin(pose.turn))
     height = _body(surface, c * x + s * y, c * y - s * x)
     height += np.float32(pose.tilt[0]) * x + np.float32(pose.tilt[1]) * y
-    # cell of the texture under pixel (column j, row i): linear in j and i
-    step = pitch / TILE_PITCH
+    step = pitch / TILE_PITCH  # cell under pixel (column j, row i) is linear in j and i
     middle = (w - 1) / 2 + pose.centre[0] / pitch, (h - 1) / 2 + pose.centre[1] / pitch
     turned = step * np.array([[c, s], [-s, c]])
     shift = np.array(pose.texture_at) - turned @ middle
@@ -100,8 +99,3 @@ def press(
     pitch = 2 * instance.pixel_pitch  # surfaces are at half the image's resolution
     raw = overlap(surface, pose, (h // 2, w // 2), pitch)
     return render(deform(raw, pitch, instance.calibration.blur_sigmas), instance, rng)
-
-
-def untouched(instance: SensorInstance, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
-    """Render the same sensor untouched, RGB."""
-    return render_untouched(instance, rng)

@@ -26,8 +26,7 @@ class Surface:
     """One surface."""
 
     body: Body  # its coarse shape where it meets the gel
-    # radius of a ball or cylinder, half the width of a bar, m; of no meaning to the others
-    size: float
+    size: float  # radius of a ball or cylinder, half a bar's width, m; else unused
     slope: float  # slope beside an edge, bar or corner, m per m
     texture: Tile  # height added to the body, m
     firmness: float  # share of the overlap that indents the gel; the object takes the rest

@@ -36,8 +36,7 @@ class ArmState:
         records = np.zeros(1, messages.ROBOT_STATE)
         self.record = records.reshape(())
         names = records.dtype.names or ()
-        # views of the record's fields by name, ten times as fast to write
-        self.fields = {
+        self.fields = {  # views of the record's fields by name, ten times as fast to write
             name: records[name][0] if records[name].ndim > 1 else records[name] for name in names
         }
         self.fields["O_ddP_O"][:] = 0.0, 0.0, -9.81  # robot_state.h: "hard-coded for now"

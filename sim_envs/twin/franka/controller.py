@@ -247,8 +247,7 @@ class FrankaArm(Service):
         if motion.lost > _MAX_LOST_PACKETS:
             self.abort("communication_constraints_violation")
         elif lost and motion.generator != _TORQUE:
-            # As Franka's documentation says of a lost packet: acceleration stays as it was.
-            last = self._setpoint
+            last = self._setpoint  # a lost packet: acceleration stays (Franka's documentation)
             self._go_to(motion, last.q + DT * (last.dq + DT * last.ddq))
 
     def _take_messages(self) -> Motion | None:

@@ -27,8 +27,7 @@ class Job:
 
     request: messages.Request  # answered when the job ends
     targets: list[float]  # widths (m) still to go to, one after the other
-    # for a grasp, the open range of widths (m) that count
-    accepted: tuple[float, float] | None = None
+    accepted: tuple[float, float] | None = None  # of a grasp: open range of widths, m
     width: float = np.inf
     still: float = 0.0
 

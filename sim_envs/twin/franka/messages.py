@@ -133,8 +133,7 @@ class HandStatus(IntEnum):
     ABORTED = 3
 
 
-# Bits of a state's `errors`, in the order libfranka 0.21 reads them (asked of it one by one).
-ERRORS = (
+ERRORS = (  # bits of `errors`, in libfranka 0.21's order (asked of it one by one)
     "joint_position_limits_violation",
     "cartesian_position_limits_violation",
     "self_collision_avoidance_violation",
@@ -179,8 +178,7 @@ ERRORS = (
 )
 
 
-# Bytes of arguments that each command has; a client that sends others is dropped.
-_ARGUMENTS = {
+_ARGUMENTS = {  # Bytes of arguments that each command has; a client that sends others is dropped.
     (True, RobotCommand.CONNECT): 4,
     (True, RobotCommand.SET_COLLISION_BEHAVIOUR): COLLISION_BEHAVIOUR.itemsize,
     (True, RobotCommand.SET_NE_TO_EE): 128,

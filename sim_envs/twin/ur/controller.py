@@ -52,8 +52,7 @@ class UrController(Service):
         unused = messages.PRIMARY, messages.SECONDARY
         self._unused_ports = [ListeningPort(host, port) for port in unused]
         self._clients: dict[ClientConnection, Client] = {}
-        # Values of this millisecond, shared by all clients.
-        self._values_sent: dict[str, float | Sequence[float]] = {}
+        self._values_sent: dict[str, float | Sequence[float]] = {}  # this millisecond's
         self._inputs: dict[str, float] = dict.fromkeys(messages.INPUTS, 0)
         self.frozen = False  # nothing gets through in either direction
         self.safety, self._mode = Safety.NORMAL, _RUNNING

@@ -161,8 +161,7 @@ class UrProgram:
         # inputs: the client's input registers by name
         self.cell, self.inputs = cell, inputs
         self._protective_stop, self._zero_force = protective_stop, zero_force
-        # the motion in progress
-        self.activity: _JointMove | _LineMove | _Servo | _Stop | None = None
+        self.activity: _JointMove | _LineMove | _Servo | _Stop | None = None  # in progress
         # ints: integer output registers; running: false once the program has ended
         self.ints, self.running = [_READY] + [0] * 47, True
         self._refused = self._cycles_refused = 0
