@@ -19,8 +19,7 @@ from touchgoal.runtime.errors import UserError
 
 MetaValue = str | int | float | bool | list[str]
 
-# Columns that LeRobot adds to every frame; each is a scalar column of feature shape [1].
-INDEX_DTYPES = {
+INDEX_DTYPES = {  # which LeRobot adds to every frame, each a scalar of feature shape [1]
     "timestamp": "float32",
     "frame_index": "int64",
     "episode_index": "int64",

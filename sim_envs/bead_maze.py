@@ -173,8 +173,7 @@ def add_wire(spec: mujoco.MjSpec, wire: Wire, friction: float) -> None:
         "group": VISUAL_GROUP,
         "rgba": [0.75, 0.76, 0.8, 1],
     }
-    # With 16 rings each, the capsules take most of a render's time; the images hardly differ.
-    spec.visual.quality.numstacks = 6
+    spec.visual.quality.numstacks = 6  # with 16, capsules take most of a render's time, to no use
     maze = spec.worldbody.add_body(name="wire")  # a body of its own: one box to rule it out
     for start, end in wire.chords(sag=_SAG, longest=0.012):
         maze.add_geom(size=[WIRE_RADIUS, 0, 0], fromto=[*start, *end], **steel)

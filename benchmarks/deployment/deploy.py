@@ -9,7 +9,6 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -99,23 +98,19 @@ def _deploy(scene: Scene, policy: str, arm: str, number: int, seconds: float) ->
         return _in_environment(scene, policy)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        with _cell(scene, arm, folder, number) as cell:
+        if arm == "in-process":
+            cell = _example_cell(scene, folder / "cell.json")
+            return deploy(cell, scene, policy, arm, seconds, folder / "run")
+        with deployed_twin(scene, arm == "lock-step", folder, number) as cell:
             return deploy(cell, scene, policy, arm, seconds, folder / "run")
 
 
-@contextmanager
-def _cell(scene: Scene, arm: str, folder: Path, number: int) -> Iterator[Path]:
-    """Provide a cell file whose arm lasts as long as the context."""
-    if arm == "in-process":
-        cell = read_cell_file(_CELLS / EXAMPLES[scene.task])
-        kind, other = ("wires", "objects") if scene.task == "bead-maze" else ("objects", "wires")
-        task = replace(cell.task, seed=scene.seed, **{kind: (scene.item,), other: ()})
-        path = folder / "cell.json"
-        path.write_text(json.dumps(cell_table(replace(cell, task=task))))
-        yield path
-        return
-    with deployed_twin(scene, arm == "lock-step", folder, number) as cell_file:
-        yield cell_file
+def _example_cell(scene: Scene, path: Path) -> Path:
+    cell = read_cell_file(_CELLS / EXAMPLES[scene.task])
+    kind, other = ("wires", "objects") if scene.task == "bead-maze" else ("objects", "wires")
+    task = replace(cell.task, seed=scene.seed, **{kind: (scene.item,), other: ()})
+    path.write_text(json.dumps(cell_table(replace(cell, task=task))))
+    return path
 
 
 def _in_environment(scene: Scene, policy: str) -> Deployment:

@@ -20,8 +20,7 @@ class LedRing:
     radius: float
     distance: float
     brightness: float = 110.0  # mean of the untouched picture, counts
-    # share of a lamp's light missing in its full shadow; scattered light fills the rest
-    shadowed: float = 0.5
+    shadowed: float = 0.5  # share of a lamp's light missing in its full shadow; the rest scatters
 
 
 # As real Wedges light their gel (EstimateModulus' pictures, rectified): red from below, green from

@@ -49,8 +49,7 @@ _FRANKA_TCP = 0.0584 + SENSOR_BELOW_CARRIAGE  # carriage 58.4 mm below the hand 
 FRANKA_HAND = Tool(
     "Franka Hand with two GelSight Minis",
     tcp_offset=_FRANKA_TCP,
-    # Stroke, speed and force: Franka Hand's product manual. Mass and its centre: fr3.xml.
-    stroke=(0.0, 0.08),
+    stroke=(0.0, 0.08),  # stroke, speed, force: Franka Hand's manual; mass, its centre: fr3.xml
     speed=0.1,
     force=(30.0, 70.0),
     mass=0.76,

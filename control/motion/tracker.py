@@ -110,8 +110,7 @@ def _step(targets, step, window, weights, m, reach, fastest, ticks):
     """Return the command, the remaining targets, the reference's step and its window."""
     reference = window[-1].copy()
     if len(targets):
-        # How many times its step the reference may go, so that its mean keeps to the limits.
-        pace = float(len(targets))
+        pace = float(len(targets))  # steps that the reference may go, its mean within the limits
         for i in range(step.size):
             if step[i] != 0:
                 before = window[-m, i] - window[-m - 1, i]

@@ -122,8 +122,7 @@ def straight_line(
     nodes = -np.cos(np.pi * np.arange(_DEGREE + 1) / _DEGREE)
     q = [np.asarray(start, dtype=np.float64)]
     for s in (nodes[1:] + 1) / 2:
-        # Least motion, solved to rounding: noise of the solver would come back as jerk.
-        solution = kinematics.solve_ik_near(
+        solution = kinematics.solve_ik_near(  # least motion, to rounding: noise would show as jerk
             origin + s * (position - origin),
             rotation_matrix(s * turn) @ turned,
             q[-1],

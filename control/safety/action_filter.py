@@ -243,8 +243,7 @@ class ActionFilter:
             return clamped
 
         step = np.full(action.size, self.limits.max_step)
-        # Clipped before the division: the largest floats would overflow.
-        velocity = clamp(action, -step, step, Limit.STEP) / dt
+        velocity = clamp(action, -step, step, Limit.STEP) / dt  # clipped first: floats may overflow
         velocity = clamp(velocity, -j.velocity, j.velocity, Limit.VELOCITY)
         down = -max_stoppable_speed(state.q - j.lower, j.acceleration, dt)
         up = max_stoppable_speed(j.upper - state.q, j.acceleration, dt)

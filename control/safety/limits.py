@@ -45,8 +45,7 @@ class RobotLimits:
     max_step: float = 0.05  # rad, largest joint change in one control tick
     tracking: float = 0.2  # rad between command and arm that mean a blocked or lost arm
     tip_speed: float = 0.5  # m/s, of the flange and of each corner of the fingertips
-    # m by which commands stay inside the boxes: the 1 kHz stream cuts the corners of their path
-    reserve: float = 0.6e-3
+    reserve: float = 0.6e-3  # m that commands stay inside the boxes: the 1 kHz stream cuts corners
     # External force at the TCP (N) and torque in a joint (Nm) that stop the arm.
     force: float = 15.0
     torque: float = 10.0

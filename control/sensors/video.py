@@ -51,8 +51,7 @@ class VideoConfig:
     frozen_pictures: int = 0
     gel: bool = False  # a fingertip's: smooth but for its dots, so broken pictures show
     dots: float = 0.0  # diameter of the printed dots as a share of the picture's diagonal; 0: none
-    # looks up the camera's device at each opening, when `source` is a serial number
-    device: Callable[[], str] | None = None
+    device: Callable[[], str] | None = None  # finds it at each opening, if `source` is a serial nr.
 
     @property
     def is_camera(self) -> bool:

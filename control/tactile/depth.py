@@ -18,8 +18,7 @@ from touchgoal.control.tactile.sensor_calibration import SensorCalibration, illu
 
 Colours = Float32[np.ndarray, "3 h w"]
 
-# (pixels to a cell's side, Gauss-Newton steps, of these with a search)
-_SCHEDULE = ((8, 5, 3), (4, 3, 2), (2, 1, 0))
+_SCHEDULE = ((8, 5, 3), (4, 3, 2), (2, 1, 0))  # (cell's side in px, steps, of these with a search)
 _INNER = 5  # conjugate gradient steps to a Gauss-Newton step
 _MODEL_ERROR = 0.5  # counts by which a perfect calibration still differs from the picture
 _OUTLIER = 4.0  # standard deviations beyond which a pixel counts less

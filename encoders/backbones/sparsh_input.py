@@ -25,8 +25,7 @@ class SparshPreprocessor:
     Mean and variance are not normalised, and a change of the light stays in, as published.
     """
 
-    # height and width of the output, px: 320 x 240 as trained, 224 x 224 for learned positions
-    size: tuple[int, int]
+    size: tuple[int, int]  # rows, columns of the output, px: 320 x 240; learned positions 224 x 224
     subtract: bool = True  # subtract the untouched sensor
     sensor: None = None  # any sensor
 

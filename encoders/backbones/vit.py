@@ -16,8 +16,7 @@ from touchgoal.runtime.errors import UserError
 class ViTConfig:
     """Size of a transformer."""
 
-    # height and width of the input, px; other sizes work without learned positions
-    image_size: tuple[int, int] = (120, 160)
+    image_size: tuple[int, int] = (120, 160)  # px; other sizes work without learned positions
     patch_size: int = 16  # side of a square patch, px
     channels: int = 3  # input channels
     width: int = 192  # width of a token

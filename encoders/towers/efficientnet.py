@@ -44,8 +44,7 @@ class ConvNorm(nn.Module):
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n d y x"]:
         """Return an output with ceil(side / stride) pixels a side."""
         if self.stride > 1:
-            # 'same' puts the odd pixel of padding at the end, so it cannot be Conv2d's own padding
-            total_h, total_w = (
+            total_h, total_w = (  # not Conv2d's: 'same' puts the odd pixel of padding at the end
                 max((-(-side // self.stride) - 1) * self.stride + self.kernel - side, 0)
                 for side in x.shape[2:]
             )

@@ -106,8 +106,7 @@ class Training:
     batch: Callable[[Int[Tensor, " b"], BatchNoise], dict[str, Any]]
     optimizer: OptimizerConfig  # settings of the optimizer
     identity: Mapping[str, Any]  # JSON-able: data and settings; a run resumes only with the same
-    # called after every epoch; returns metrics to record beside the mean losses
-    evaluate: Callable[[], Metrics] = dict
+    evaluate: Callable[[], Metrics] = dict  # after every epoch: metrics to record beside the losses
     progress: Callable[[Metrics], str] = str  # returns the line to print for an epoch's metrics
     after_step: Callable[[], None] = _nothing  # called after every update of the weights
     # called with all metrics so far and the provenance before the checkpoint is written; in every

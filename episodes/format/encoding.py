@@ -35,8 +35,7 @@ from touchgoal.episodes.schema import (
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.picture_file import decode_picture
 
-# Frames a row group: reading one window of touch reads a few groups, not the whole episode.
-FRAMES_PER_ROW_GROUP = 32
+FRAMES_PER_ROW_GROUP = 32  # reading one window of touch reads a few groups, not the whole episode
 _FOOTER_KEY, _CHECKSUM_KEY = b"touchgoal", b"touchgoal.crc32"
 # Measured on noisy 320 x 240 touch: 3.6 ms and 90 kB a frame; OpenCV's default filter 8.1 ms and
 # 110 kB, PIL at compress_level 1 11.0 ms and 114 kB.

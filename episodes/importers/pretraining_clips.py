@@ -47,8 +47,7 @@ class Recording:
     sensor: str  # sensor model
     held_out: bool  # whether the published split holds it out of training
     exchanged: bool = False  # whether red and blue are exchanged in the file
-    # images of untouched gels, one of them this sensor's; empty if unknown
-    backgrounds: tuple[Path, ...] = ()
+    backgrounds: tuple[Path, ...] = ()  # untouched gels, one is this sensor's; empty if unknown
 
     def frame_checksums(self) -> frozenset[int]:
         """Return checksums of the encoded images, comparable in this process."""

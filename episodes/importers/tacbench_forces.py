@@ -45,8 +45,7 @@ class ForceStroke:
     probe: str  # sphere, sharp or flat
     clip: TouchClip  # all images of the batch
     rows: Int64[np.ndarray, " n"]  # indices of the stroke's images among them, in time
-    # force, N; two components along the gel, the third into it, positive under pressure
-    force: Float64[np.ndarray, "n 3"]
+    force: Float64[np.ndarray, "n 3"]  # N; two along the gel, the third into it, + under pressure
     slip: Bool[np.ndarray, " n"]  # whether the probe slides
     untouched: int  # index of the last image without contact before the stroke
 

@@ -18,8 +18,7 @@ _SCALE = 16.0  # grey levels per 1.0 of the input, as in `encoders/preprocess.py
 class EndToEndConfig:
     """Size of a ViT for both tactile images of the latest tick."""
 
-    # rows and columns of its input; twice as many of either train nine times slower
-    size: tuple[int, int] = (60, 80)
+    size: tuple[int, int] = (60, 80)  # rows, columns; twice either trains nine times slower
     width: int = 64  # of the embedding of one image
 
 

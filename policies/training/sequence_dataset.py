@@ -32,8 +32,7 @@ class Recordings:
     actions: Float32[Tensor, "n 8"]  # `features.ACTION`
     lengths: tuple[int, ...]  # ticks of each episode
     pictures: UInt8[Tensor, "n k h w 3"] | None = None  # for the end-to-end encoder
-    # on both pads (N, Nm, pad frames); None unless the policy is trained on it
-    wrench: Float32[Tensor, "n 12"] | None = None
+    wrench: Float32[Tensor, "n 12"] | None = None  # on both pads (N, Nm, pad frames), if trained on
 
 
 def load_recordings(

@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 from touchgoal.episodes.film import COLORS
 from touchgoal.rewards.curves import Curves
 
-# Colours that colour-blind readers can tell apart; the dashes distinguish them in grey.
-COLOR: dict[str, str] = dict(
+COLOR: dict[str, str] = dict(  # for the colour-blind, too; the dashes distinguish them in grey
     zip(("image", "tactile", "text", "image+tactile", "image+text"), COLORS, strict=True)
 )
 DASHES = {

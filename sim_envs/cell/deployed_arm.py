@@ -139,8 +139,7 @@ class DeployedArm:
             self._drive = _DirectDrive(start, limits, self._tick_ms)
         self._hand = DeployedHand(env, rng) if between.franka_hand else None
         self._wrench = EstimatedWrench(rng) if between.estimated_wrench else None
-        # control ticks by which a learned policy's plans are late
-        self.plan_ticks = int(rng.choice(between.plan_ticks))
+        self.plan_ticks = int(rng.choice(between.plan_ticks))  # by which learned plans are late
         ticks = round(env.config.max_seconds * hz) + _AHEAD
         jitter = rng.uniform(*_range(between.jitter))
         self._state_at = _read_times(rng, between.state_delay, jitter, ticks, self._tick_ms)

@@ -80,8 +80,7 @@ class SimulatedCell:
         self.time, self.steps = 0.0, 0
         # q_d, dq_d: their set-points; tau_ext: torque (N m) on each joint from outside, filtered
         self.q_d, self.dq_d, self.tau_ext = env.command.copy(), np.zeros(n), np.zeros(n)
-        # q, dq: measured joint positions (rad) and velocities (rad/s)
-        self.q, self.dq = env.joints()
+        self.q, self.dq = env.joints()  # measured joint positions (rad), velocities (rad/s)
         error_rng = np.random.default_rng(
             [seed, _ERROR_STREAM]
         )  # the episode's draws stay the same

@@ -23,8 +23,7 @@ GRIPPER_MAX_FORCE = 80.0  # N, both fingers; opening never needs a limit below i
 
 _UR5E = Path(__file__).with_name("ur5e.xml")
 ROBOTS = {"fr3": limits.FR3, "ur5e": limits.UR5E}
-# N m/rad. Franka's default joint impedance: fr3.xml. Stiff enough for the UR5e, too: our choice.
-_STIFFNESS = {
+_STIFFNESS = {  # N m/rad: Franka's default (fr3.xml), stiff enough for the UR5e (our choice)
     "fr3": (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0),
     "ur5e": (4500.0, 4500.0, 4500.0, 2000.0, 2000.0, 2000.0),
 }

@@ -34,8 +34,7 @@ class TactileFrame:
 
     image: UInt8[np.ndarray, "h w 3"]  # camera image, RGB
     surface: Float32[np.ndarray, "h2 w2"]  # depth below rest at half the image's resolution, m
-    # how deep the object itself lies in the undeformed gel, m, there; 0 beside it
-    overlap: Float32[np.ndarray, "h2 w2"]
+    overlap: Float32[np.ndarray, "h2 w2"]  # the object's depth in the undeformed gel, m; 0 beside
     field: ForceField | None  # forces over the whole gel; None where nothing touches
 
     @property

@@ -30,8 +30,7 @@ class Press:
     """Pose of an object in a gel, with the pressure under it."""
 
     shift: float  # how far it is pushed in, m
-    # its slope along x and y: `shift + tilt[0] x + tilt[1] y` is added to its height
-    tilt: tuple[float, float]
+    tilt: tuple[float, float]  # along x and y: adds `shift + tilt[0] x + tilt[1] y` to its height
     pressure: Float32[np.ndarray, "h w"]  # on the gel's own cells, Pa; zero where nothing touches
     pitch: float  # size of a cell, m
     displacement: tuple[float, float, float]  # of the cells (x, y, z), m: as the solver's plate

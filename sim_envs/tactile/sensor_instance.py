@@ -26,8 +26,7 @@ class SensorInstance:
 
     calibration: SensorCalibration
     background: Int16[np.ndarray, "3 h w"]  # the untouched frame, RGB in STEPs
-    # how strongly the light falls, per channel, at half the image's resolution
-    illumination: Float32[np.ndarray, "3 h3 w3"]
+    illumination: Float32[np.ndarray, "3 h3 w3"]  # light by channel, at half the image's resolution
     noise: Int8[np.ndarray, "3 h2 w2"]  # camera noise in STEPs, larger by NOISE_MARGIN
     markers: Float32[np.ndarray, "n 2"]  # resting dots (x, y), px; none on a plain gel
     marker_radius: float  # px

@@ -11,8 +11,7 @@ class Pace:
     """Counts simulated seconds in which a client drives the arm."""
 
     def __init__(self) -> None:
-        # s of the wall, of the twin's processor time and of its images' process.
-        self._seconds: list[np.ndarray] = []
+        self._seconds: list[np.ndarray] = []  # s: wall, the twin's processor, its images' process
         self._began: np.ndarray | None = None
         self._steps = 0
 

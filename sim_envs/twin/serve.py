@@ -64,8 +64,7 @@ class Twin:
         env = make_env(replace(config.task, arm=config.arm))
         self.cell = SimulatedCell(env, config.seed, config.wrench_error)
         if env.config.tactile:
-            # A client would lose the arm while code is loaded at the first touch.
-            warm_up(env.bodies, env.sensor)
+            warm_up(env.bodies, env.sensor)  # else a client loses the arm while code is loaded
         self._lock_step: LockStep | None = None
         self._next_step_at = time.monotonic()
         self.stopped = False  # set it to end `run`

@@ -24,8 +24,7 @@ _NOTHING = -5e-3  # m: far below the gel
 class SurfacePose:
     """Pose of a surface against the gel."""
 
-    # where the body's middle lies on the gel, m along x and y from the image's middle
-    centre: tuple[float, float]
+    centre: tuple[float, float]  # of the body on the gel, m along x and y from the image's middle
     turn: float  # about the gel's normal, rad
     tilt: tuple[float, float]  # slopes along x and y, m per m
     texture_at: tuple[float, float]  # which cell of the texture lies in the body's middle

@@ -38,8 +38,7 @@ class FrankaHand(Service):
     def __init__(self, cell: SimulatedCell, host: str) -> None:
         self.cell = cell
         self.link = messages.Link(host, messages.HAND_PORT, messages.HAND_VERSION, wide=False)
-        # commands, answers: how many commands have come, and how many were answered
-        self.commands = self.answers = 0
+        self.commands = self.answers = 0  # numbers of commands come, and of those answered
         self._milliseconds = 0
         self._held_at = 0.0  # monotonic s, of the last state while time stands
         self._job: Job | None = None
