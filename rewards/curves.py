@@ -107,7 +107,7 @@ class Curves:
         """Return a figure of costs and rewards over time; `.savefig("curves.png")` writes it."""
         from touchgoal.rewards.report.plot import draw
 
-        return draw(self, gamma)
+        return draw(self, gamma)  # pyright: ignore[reportArgumentType]  # one class by two paths
 
 
 def add_fused_curves(
