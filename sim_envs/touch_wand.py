@@ -1,0 +1,295 @@
+"""The MMWand's bench as an environment: each step is one touch of an object with a wand.
+
+A GelSight Mini and a load cell on a stick, a camera beside them, and three cameras over a green
+bench (MMWand, section III). The wand is held by hand in life; here its pose and force are given.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from touchgoal.control import features as ft
+from touchgoal.control.features import Observation
+from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import Seed, checked_dataclass
+from touchgoal.sim_envs.scene.contacts import PadContact
+from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
+from touchgoal.sim_envs.tactile.pad import TactilePad
+from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
+from touchgoal.sim_envs.wand.bench import VIEWS, Bench
+from touchgoal.sim_envs.wand.objects import WandObject, find_wand_object, wand_objects
+
+VIEW_SHAPE = (224, 224)
+CLIP = 6
+"""Tactile pictures of a touch: untouched, then at a rising force, last at the full one."""
+MAX_FORCE = 20.0  # N
+FORCE_RANGES = ((0.0, 5.0), (5.0, 10.0), (10.0, 20.0))
+"""N, the paper's three."""
+_AWAY = 0.09  # m from the surface, before contact
+_LOWEST = np.radians(12)  # of the approach over the bench, rad
+_TILT = 0.2  # how far the wand leans from the surface's normal towards its approach
+_GRAZING = 0.3  # cosine between normal and approach below which the wand would slide off
+_CASE = 0.014  # m from the gel's middle to the case's side
+_PATCH = 0.015  # m, half the gel's diagonal
+
+
+@checked_dataclass
+class TouchWandConfig:
+    """Options of the touch wand."""
+
+    sensor: str = "gelsight_mini"
+    """Sensor on the wand: a name (`touchgoal list sensors`) or the folder of a sensor file."""
+    object: str | None = None
+    """Object on the bench; drawn at each reset if none is given."""
+    views: bool = True
+    """Render the four cameras."""
+    gel: Seed = 0
+    """Which sensor instance is on the wand; another number is another gel."""
+
+
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """One touch.
+
+    Attributes:
+        before, views: view -> RGB, before contact and at contact.
+        clip: the sensor's pictures, RGB; the first is untouched.
+        load: normal force at each picture, N.
+        wrench: force (N) and torque (Nm) of the object on the gel at each picture, sensor frame.
+        point, normal: where the object is touched and its outward normal there, m, bench frame.
+    """
+
+    before: dict[str, UInt8[np.ndarray, "H W 3"]]
+    views: dict[str, UInt8[np.ndarray, "H W 3"]]
+    clip: UInt8[np.ndarray, "t h w 3"]
+    load: Float32[np.ndarray, " t"]
+    wrench: Float32[np.ndarray, "t 6"]
+    point: Float[np.ndarray, "3"]
+    normal: Float[np.ndarray, "3"]
+
+
+class TouchWand(gym.Env[Observation, np.ndarray]):
+    """One object on a bench, touched once a step.
+
+    ## Action space
+
+    `Box(-1, 1, (6,))`: where and how the wand comes.
+
+    | index | meaning | from -1 to 1 |
+    |---|---|---|
+    | 0 | azimuth of the approach | -180 to 180 degrees |
+    | 1 | elevation of the approach | 12 to 90 degrees over the bench |
+    | 2, 3 | its offset from the object's middle, across | the object's radius |
+    | 4 | turn about the wand's axis | -180 to 180 degrees |
+    | 5 | force | 0 to 20 N |
+
+    The wand goes along the approach until it meets the object, and presses near the surface's
+    normal there.
+
+    ## Observation space
+
+    `Dict`: four views `observation.images.<top, side_left, side_right, wand>` (224, 224, 3),
+    `observation.images.tactile_left` and `observation.load` (N), at contact; after `reset` without.
+
+    ## Reward
+
+    1 for a touch, 0 where the wand misses the object or cannot reach it.
+
+    ## Episode end
+
+    Truncated after 50 touches by the registered time limit.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 1}
+
+    def __init__(
+        self, config: TouchWandConfig | None = None, render_mode: str | None = None, **options: Any
+    ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise UserError(f"render_mode is 'rgb_array' or none, not {render_mode!r}")
+        self.config = config or TouchWandConfig(**options)
+        self.render_mode = render_mode
+        if self.config.object is not None:
+            find_wand_object(self.config.object)
+        self._sensor = find_sensor(self.config.sensor)
+        self._instance = gel_instance(self.config)
+        self.action_space = gym.spaces.Box(-1, 1, (6,), np.float32)
+        self.observation_space = gym.spaces.Dict(self._spaces())
+        self._bench: Bench | None = None
+        self._pad: TactilePad | None = None
+        self._renderer: Renderer | None = None
+        self._object: WandObject | None = None
+
+    @property
+    def object(self) -> WandObject:
+        """The object on the bench."""
+        assert self._object is not None, "reset first"
+        return self._object
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Put an object on the bench; `options={"object": name}` chooses it."""
+        super().reset(seed=seed)
+        names = list(wand_objects())
+        drawn = names[int(self.np_random.integers(len(names)))]
+        name = (options or {}).get("object") or self.config.object or drawn
+        if self._object is None or self._object.name != name:
+            self._open(find_wand_object(name))
+        self._move_object()
+        bench = self._placed_bench()
+        bench.place_wand(bench.centre + [0, 0, bench.radius + _AWAY], _axes(np.array([0.0, 0, 1]), 0))
+        clip, load, _ = self._press(np.zeros(3), np.zeros(1))
+        return self._observation(self._render(), clip[-1], load[-1]), self._info(False)
+
+    def step(
+        self, action: Float[np.ndarray, "6"]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Move the object a little, and touch it once."""
+        self._move_object()
+        touch = self.touch(np.asarray(action, float))
+        if touch is None:
+            clip, load, _ = self._press(np.zeros(3), np.zeros(1))
+            observation = self._observation(self._render(), clip[-1], load[-1])
+        else:
+            observation = self._observation(touch.views, touch.clip[-1], touch.load[-1])
+        return observation, float(touch is not None), False, False, self._info(touch is not None)
+
+    def touch(self, action: Float[np.ndarray, "6"]) -> Touch | None:
+        """Touch the object where it lies; None if the wand misses it or cannot reach it."""
+        bench = self._placed_bench()
+        towards, start = _approach(action, bench)
+        met = bench.surface_along(start, towards)
+        if met is None:
+            return None
+        point, normal = met
+        lean = float(np.hypot(normal[0], normal[1]))
+        if -normal @ towards < _GRAZING or point[2] < _CASE * lean:
+            return None
+        axis = normal - _TILT * (towards + normal)
+        axis /= np.linalg.norm(axis)
+        axes = _axes(axis, np.pi * action[4])
+        bench.place_wand(point + _AWAY * axis, axes)
+        before = self._render()
+        bench.place_wand(point, axes)
+        force = (action[5] + 1) / 2 * MAX_FORCE
+        clip, load, wrench = self._press(point, force * np.linspace(0, 1, CLIP))
+        return Touch(before, self._render(), clip, load, wrench, point, normal)
+
+    def random_action(self) -> Float[np.ndarray, "6"]:
+        """Draw a touch as the paper's operator: anywhere, with a force from one of three ranges."""
+        rng = self.np_random
+        low, high = FORCE_RANGES[int(rng.integers(len(FORCE_RANGES)))]
+        action = rng.uniform(-1, 1, 6)
+        action[5] = 2 * rng.uniform(low, high) / MAX_FORCE - 1
+        return action
+
+    def render(self) -> UInt8[np.ndarray, "H W 3"]:
+        """Return the view from the left."""
+        bench = self._placed_bench()
+        assert self._renderer is not None
+        self._renderer.update_scene(bench.data, "side_left")
+        return self._renderer.render()
+
+    def close(self) -> None:
+        """Free the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def _spaces(self) -> dict[str, gym.Space]:
+        shape = (*self._sensor.image_shape, 3)
+        spaces: dict[str, gym.Space] = {
+            ft.TACTILE_LEFT: gym.spaces.Box(0, 255, shape, np.uint8),
+            ft.LOAD: gym.spaces.Box(0, MAX_FORCE, (1,), np.float32),
+        }
+        if self.config.views:
+            view = gym.spaces.Box(0, 255, (*VIEW_SHAPE, 3), np.uint8)
+            spaces |= {ft.IMAGE_PREFIX + name: view for name in VIEWS}
+        return spaces
+
+    def _open(self, wand_object: WandObject) -> None:
+        """Build another object's scene."""
+        self.close()
+        bench = Bench(wand_object, VIEW_SHAPE)
+        self._pad = TactilePad(bench.model, "left", self._sensor, self._instance, bench.bodies)
+        if self.config.views or self.render_mode:
+            self._renderer = open_renderer(bench.model, *VIEW_SHAPE)
+        self._bench, self._object = bench, wand_object
+
+    def _placed_bench(self) -> Bench:
+        assert self._bench is not None, "reset first"
+        return self._bench
+
+    def _move_object(self) -> None:
+        x, y = self.np_random.uniform(-0.03, 0.03, 2)
+        self._placed_bench().place_object(x, y, self.np_random.uniform(-np.pi, np.pi))
+
+    def _press(
+        self, point: Float[np.ndarray, "3"], forces: Float[np.ndarray, " t"]
+    ) -> tuple[UInt8[np.ndarray, "t h w 3"], Float32[np.ndarray, " t"], Float32[np.ndarray, "t 6"]]:
+        """Press with rising forces (N) where the wand is; return pictures, loads and wrenches."""
+        bench, pad = self._placed_bench(), self._pad
+        assert pad is not None
+        geoms = bench.geoms_near(point, _PATCH)
+        pictures, wrenches = [], []
+        for force in forces:
+            contact = PadContact(np.array([0, 0, -force]), np.zeros(3), 0.0, geoms)
+            frame = pad.sense(bench.data, contact, self.np_random)
+            pictures.append(frame.image)
+            wrenches.append(np.zeros(6) if frame.field is None else frame.field.wrench())
+        return np.stack(pictures), forces.astype(np.float32), np.array(wrenches, np.float32)
+
+    def _render(self) -> dict[str, UInt8[np.ndarray, "H W 3"]]:
+        if not self.config.views:
+            return {}
+        bench, views = self._placed_bench(), {}
+        assert self._renderer is not None
+        for name in VIEWS:
+            self._renderer.update_scene(bench.data, name)
+            views[name] = self._renderer.render()
+        return views
+
+    def _observation(
+        self,
+        views: dict[str, UInt8[np.ndarray, "H W 3"]],
+        picture: UInt8[np.ndarray, "h w 3"],
+        load: float,
+    ) -> Observation:
+        observation = {ft.IMAGE_PREFIX + name: view for name, view in views.items()}
+        return observation | {ft.TACTILE_LEFT: picture, ft.LOAD: np.array([load], np.float32)}
+
+    def _info(self, touched: bool) -> dict[str, Any]:
+        return {ft.TRUTH_CONTACT: np.array([touched, False]), "object": self.object.name}
+
+
+def gel_instance(config: TouchWandConfig) -> SensorInstance:
+    """Return the sensor instance on the wand."""
+    return sample_instance(find_sensor(config.sensor), np.random.default_rng([config.gel, 17]))
+
+
+def _approach(
+    action: Float[np.ndarray, "6"], bench: Bench
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Return the direction in which the wand comes, and where its ray starts, bench frame."""
+    azimuth = np.pi * action[0]
+    elevation = _LOWEST + (action[1] + 1) / 2 * (np.pi / 2 - _LOWEST)
+    c, s = np.cos(elevation), np.sin(elevation)
+    away = np.array([c * np.cos(azimuth), c * np.sin(azimuth), s])
+    across = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    offset = bench.radius * (action[2] * across + action[3] * np.cross(away, across))
+    return -away, bench.centre + 2 * bench.radius * away + offset
+
+
+def _axes(axis: Float[np.ndarray, "3"], turn: float) -> Float[np.ndarray, "3 3"]:
+    """Return a sensor frame whose z (out of the gel) goes against `axis`, turned about it (rad)."""
+    z = -axis
+    side = np.cross(z, [0.0, 1, 0] if abs(z[1]) < 0.9 else [1.0, 0, 0])
+    side /= np.linalg.norm(side)
+    other = np.cross(z, side)
+    x = np.cos(turn) * side + np.sin(turn) * other
+    return np.stack([x, np.cross(z, x), z], axis=1)

@@ -1,0 +1,146 @@
+"""The wand's objects: the 102 of MMWand's Table V as shapes, materials and sentences.
+
+`objects.toml` holds them as a person writes them down (mm, g, um); here they become parts in SI
+units. Rows, rings and piles are laid out here, the same way every time.
+"""
+
+import tomllib
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Float32, Int32
+from scipy.spatial.transform import Rotation
+
+from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.scene.objects import Material, Texture
+from touchgoal.sim_envs.wand.meshes import ellipsoid, lathe, prism
+
+Look = Literal["plain", "speckled", "checker", "gradient"]
+_PRIMITIVES = ("box", "cylinder", "sphere", "capsule")
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One rigid piece of an object.
+
+    Attributes:
+        shape: "box", "cylinder", "sphere", "capsule" or "mesh".
+        size: half extents as MuJoCo takes them, m; of a mesh none.
+        position: of its centre, m, in the object's frame (z up, bench at z = 0).
+        rotation: its axes in the object's frame.
+        material: how it feels, and its colour.
+        look: pattern of two colours.
+        second_rgb: the pattern's other colour.
+        mesh: vertices (m) and faces of a mesh.
+    """
+
+    shape: str
+    size: tuple[float, ...]
+    position: Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "3 3"]
+    material: Material
+    look: Look
+    second_rgb: tuple[float, float, float]
+    mesh: tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, "m 3"]] | None = field(default=None)
+
+
+@dataclass(frozen=True, eq=False)
+class WandObject:
+    """One object of the catalogue.
+
+    Attributes:
+        name: its id.
+        number: in MMWand's Table V.
+        mass: kg.
+        descriptions: how it feels, in different words.
+        parts: its pieces.
+    """
+
+    name: str
+    number: int
+    mass: float
+    descriptions: tuple[str, ...]
+    parts: tuple[Part, ...]
+
+
+@cache
+def wand_objects() -> dict[str, WandObject]:
+    """Return the catalogue, in the paper's order."""
+    entries = tomllib.loads(Path(__file__).with_name("objects.toml").read_text())
+    return {name: _read(name, entry) for name, entry in entries.items()}
+
+
+def find_wand_object(name: str) -> WandObject:
+    """Return an object; UserError lists the names."""
+    if name not in wand_objects():
+        raise UserError(f"unknown object {name!r}; choose from: {', '.join(wand_objects())}")
+    return wand_objects()[name]
+
+
+def _read(name: str, entry: dict[str, Any]) -> WandObject:
+    common = {k: v for k, v in entry.items() if k not in ("number", "mass", "descriptions", "parts")}
+    rng = np.random.default_rng(entry["number"])
+    parts = [part for one in entry["parts"] for part in _parts(common | one, rng)]
+    mass, descriptions = entry["mass"] * 1e-3, tuple(entry["descriptions"])
+    return WandObject(name, entry["number"], mass, descriptions, tuple(parts))
+
+
+def _parts(entry: dict[str, Any], rng: np.random.Generator) -> list[Part]:
+    """Return the parts of one entry: one, or all of its row, ring or pile."""
+    part = _part(entry)
+    if row := entry.get("row"):
+        step = np.array(row["step"]) * 1e-3
+        return [replace(part, position=part.position + i * step) for i in range(row["count"])]
+    if ring := entry.get("ring"):
+        turns = Rotation.from_euler("z", np.arange(ring["count"]) * 2 * np.pi / ring["count"])
+        outwards = np.array([ring["radius"] * 1e-3, 0, 0])
+        return [
+            replace(part, position=part.position + turn @ outwards, rotation=turn @ part.rotation)
+            for turn in turns.as_matrix()
+        ]
+    if pile := entry.get("pile"):
+        return [_in_pile(part, np.array(pile["spread"]) * 1e-3, rng) for _ in range(pile["count"])]
+    return [part]
+
+
+def _in_pile(part: Part, spread: Float[np.ndarray, "3"], rng: np.random.Generator) -> Part:
+    """Scatter a part over a heap: highest in the middle, turned at random."""
+    x, y = rng.uniform(-1, 1, 2)
+    top = 2 * spread[2] * (1 - 0.7 * np.hypot(x, y))
+    place = np.array([x * spread[0], y * spread[1], max(rng.uniform(0.3, 1) * top, 1e-3)])
+    rotation = Rotation.random(random_state=rng).as_matrix()
+    return replace(part, position=part.position + place, rotation=rotation)
+
+
+def _part(entry: dict[str, Any]) -> Part:
+    shape, size = entry["shape"], tuple(1e-3 * s for s in entry.get("size", ()))
+    mesh = None
+    if shape == "ellipsoid":
+        mesh = ellipsoid(size)
+    elif shape == "lathe":
+        mesh = lathe(np.array(entry["profile"]) * 1e-3)
+    elif shape == "prism":
+        mesh = prism(entry["sides"], *size)
+    elif shape not in _PRIMITIVES:
+        raise ValueError(f"unknown shape {shape!r}")
+    material = Material(
+        Texture[entry["texture"].upper()],
+        entry.get("amplitude", 0.0) * 1e-6,
+        entry.get("wavelength", 1.0) * 1e-3,
+        entry["stiffness"],
+        entry["friction"],
+        (*entry["rgb"], entry.get("opacity", 1.0)),
+    )
+    return Part(
+        shape=shape if mesh is None else "mesh",
+        size=size if mesh is None else (),
+        position=np.array(entry.get("at", (0, 0, 0))) * 1e-3,
+        rotation=Rotation.from_euler("xyz", entry.get("turn", (0, 0, 0)), degrees=True).as_matrix(),
+        material=material,
+        look=entry.get("look", "plain"),
+        second_rgb=tuple(entry.get("rgb2", entry["rgb"])),
+        mesh=mesh,
+    )
