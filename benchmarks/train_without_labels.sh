@@ -15,10 +15,10 @@ train() { # name, options of train-encoder
 }
 
 # What is recorded already is not recorded again.
-touchgoal collect-touches --out runs/slides
-touchgoal collect-touches --out runs/slides-validation --episodes 24 --seed 1
-touchgoal collect-touches --out runs/slides-plain --sensor gelsight_mini
-touchgoal collect-touches --out runs/slides-plain-validation --sensor gelsight_mini --episodes 24 --seed 1
+touchgoal collect-touches --body slide --out runs/slides
+touchgoal collect-touches --body slide --out runs/slides-validation --episodes 24 --seed 1
+touchgoal collect-touches --body slide --out runs/slides-plain --sensor gelsight_mini
+touchgoal collect-touches --body slide --out runs/slides-plain-validation --sensor gelsight_mini --episodes 24 --seed 1
 
 mae=(--mae.stacked --mae.no-bottleneck --mae.mask-ratio 0.75 --mae.epochs 8)
 dino=(--dino.local-views 4 --dino.epochs 4)

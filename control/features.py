@@ -19,6 +19,7 @@ WRENCH = "observation.wrench"
 LOAD = "observation.load"
 FRONT = "observation.images.front"
 WRIST = "observation.images.wrist"
+WAND_VIEWS = tuple(f"observation.images.{view}" for view in ("top", "side_left", "side_right", "wand"))
 TACTILE_LEFT = "observation.images.tactile_left"
 TACTILE_RIGHT = "observation.images.tactile_right"
 ACTION = "action"
@@ -88,6 +89,10 @@ _BEFORE_ACTION = {
     ),
     FRONT: Feature("uint8", CAMERA_SHAPE, _IMAGE_NAMES, "fixed camera facing the robot, RGB"),
     WRIST: Feature("uint8", CAMERA_SHAPE, _IMAGE_NAMES, "camera on the hand, RGB"),
+    **{
+        key: Feature("uint8", (224, 224, 3), _IMAGE_NAMES, "camera of the touch wand's bench, RGB")
+        for key in WAND_VIEWS
+    },
     TACTILE_LEFT: Feature("uint8", TACTILE_SHAPE, _IMAGE_NAMES, "left fingertip sensor, RGB"),
     TACTILE_RIGHT: Feature("uint8", TACTILE_SHAPE, _IMAGE_NAMES, "right fingertip sensor, RGB"),
 }

@@ -22,7 +22,7 @@ COMMANDS = {
     "doctor": "what this machine can do, and how to install what is missing",
     "list": "objects, sensors, tasks, policies, encoders and benchmarks by name",
     "collect-demos": "record an expert's episodes of a task, or failures on purpose",
-    "collect-touches": "record objects slid over a simulated sensor, to learn from without labels",
+    "collect-touches": "record touches of objects: the MMWand data set, or slides to learn from without labels",
     "teleop": "lead the bead along a wire with keys, and record it",
     "annotate": "find and caption the objects that VisGel's recordings touch",
     "train-encoder": "train a touch encoder",

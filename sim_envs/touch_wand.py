@@ -140,7 +140,7 @@ class TouchWand(gym.Env[Observation, np.ndarray]):
         name = (options or {}).get("object") or self.config.object or drawn
         if self._object is None or self._object.name != name:
             self._open(find_wand_object(name))
-        self._move_object()
+        self.move_object()
         bench = self._placed_bench()
         bench.place_wand(bench.centre + [0, 0, bench.radius + _AWAY], _axes(np.array([0.0, 0, 1]), 0))
         clip, load, _ = self._press(np.zeros(3), np.zeros(1))
@@ -150,7 +150,7 @@ class TouchWand(gym.Env[Observation, np.ndarray]):
         self, action: Float[np.ndarray, "6"]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Move the object a little, and touch it once."""
-        self._move_object()
+        self.move_object()
         touch = self.touch(np.asarray(action, float))
         if touch is None:
             clip, load, _ = self._press(np.zeros(3), np.zeros(1))
@@ -225,7 +225,8 @@ class TouchWand(gym.Env[Observation, np.ndarray]):
         assert self._bench is not None, "reset first"
         return self._bench
 
-    def _move_object(self) -> None:
+    def move_object(self) -> None:
+        """Move and turn the object on the bench at random, as the paper's operator before each touch."""
         x, y = self.np_random.uniform(-0.03, 0.03, 2)
         self._placed_bench().place_object(x, y, self.np_random.uniform(-np.pi, np.pi))
 

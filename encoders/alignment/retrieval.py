@@ -108,8 +108,15 @@ def mean_average_precision(
     Without care for ties a collapsed encoder on a gallery sorted by object scores twice chance. For
     constant similarity the result is exactly chance. Every query has a relevant item.
     """
+    return float(average_precisions(similarity, relevant).mean())
+
+
+def average_precisions(
+    similarity: Float[np.ndarray, "n m"], relevant: Bool[np.ndarray, "n m"]
+) -> Float[np.ndarray, " n"]:
+    """Return each query's average precision, see `mean_average_precision`."""
     queries = zip(similarity, relevant, strict=True)
-    return float(np.mean([_average_precision(s, r) for s, r in queries]))
+    return np.array([_average_precision(s, r) for s, r in queries])
 
 
 def _average_precision(

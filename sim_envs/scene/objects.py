@@ -16,13 +16,19 @@ SHAPES: tuple[Shape, ...] = ("box", "cylinder", "sphere", "capsule", "mesh")
 
 
 class Texture(IntEnum):
-    """Height pattern on a surface; `sim_envs/tactile/geometry.py` evaluates it."""
+    """Height pattern on a surface; `sim_envs/tactile/texture.py` evaluates it."""
 
     SMOOTH = 0
     RIBBED = 1
     DOTTED = 2
     ROUGH = 3
     WOVEN = 4
+    WRINKLED = 5
+    GRAINED = 6
+    CELLULAR = 7
+    STRANDED = 8
+    LETTERED = 9
+    KNURLED = 10
 
 
 @dataclass(frozen=True)

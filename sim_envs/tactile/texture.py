@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numba import njit
 
-from touchgoal.sim_envs.scene.objects import Material
+from touchgoal.sim_envs.scene.objects import Material, Texture
+from touchgoal.sim_envs.tactile.rig.surfaces import WAVELENGTH, named_tile
 
 # Wave vectors of the rough pattern, cycles per wavelength: directions from all around, lengths that
 # share no period.
@@ -98,6 +99,31 @@ def _add(height, below, pitch, texture, amplitude, frequency, position, rotation
             row[j] += amplitude * pattern if row[j] > below else np.float32(0.0)
 
 
+@njit(cache=True, fastmath=True, error_model="numpy")
+@no_type_check
+def _add_tile(height, below, pitch, tile, amplitude, cells, position, rotation, facing):
+    rows, columns = height.shape
+    size = tile.shape[0]
+    first, second = (facing + 1) % 3, (facing + 2) % 3
+    for i in range(rows):
+        y = (np.float32(i) - np.float32(0.5 * (rows - 1))) * pitch - position[1]
+        row = height[i]
+        for j in range(columns):
+            if row[j] <= below:
+                continue
+            x = (np.float32(j) - np.float32(0.5 * (columns - 1))) * pitch - position[0]
+            z = -row[j] - position[2]
+            u = rotation[0, first] * x + rotation[1, first] * y + rotation[2, first] * z
+            v = rotation[0, second] * x + rotation[1, second] * y + rotation[2, second] * z
+            u, v = u * cells, v * cells
+            iu, iv = int(np.floor(u)), int(np.floor(v))
+            fu, fv = u - np.float32(iu), v - np.float32(iv)
+            a, b, c, d = iu % size, (iu + 1) % size, iv % size, (iv + 1) % size
+            near = tile[a, c] + fu * (tile[b, c] - tile[a, c])
+            far = tile[a, d] + fu * (tile[b, d] - tile[a, d])
+            row[j] += amplitude * (near + fv * (far - near))
+
+
 def add_texture(
     height: Float32[np.ndarray, "h w"],
     pitch: float,
@@ -107,7 +133,8 @@ def add_texture(
 ) -> None:
     """Add a material's pattern to a height field, in place, where it may touch the gel.
 
-    Patterns are functions of the point in the object's frame, so that they stick to any shape.
+    The first patterns are functions of the point in the object's frame, so that they stick to any
+    shape; the others are tiles, projected along the object's axis that faces the gel most.
     `position`, `rotation`: pose of the object in the sensor frame.
     """
     if not material.texture or not material.amplitude:
@@ -115,5 +142,11 @@ def add_texture(
     scalars = -2 * material.amplitude, pitch
     below, step = (np.float32(a) for a in scalars)
     amplitude, frequency = np.float32(material.amplitude), np.float32(1 / material.wavelength)
-    pose = (np.asarray(a, np.float32) for a in (position, rotation))
+    pose = [np.asarray(a, np.float32) for a in (position, rotation)]
+    if material.texture > Texture.WOVEN:
+        cells = np.float32(WAVELENGTH / material.wavelength)
+        facing = int(np.abs(pose[1][2]).argmax())
+        tile = named_tile(material.texture.name.lower())
+        _add_tile(height, below, step, tile, amplitude, cells, *pose, facing)
+        return
     _add(height, below, step, int(material.texture), amplitude, frequency, *pose)

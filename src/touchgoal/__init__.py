@@ -38,6 +38,9 @@ gymnasium.register(
 gymnasium.register(
     "touchgoal/BeadMaze-v0", "touchgoal.sim_envs.bead_maze:BeadMaze", max_episode_steps=800
 )
+gymnasium.register(
+    "touchgoal/TouchWand-v0", "touchgoal.sim_envs.touch_wand:TouchWand", max_episode_steps=50
+)
 
 _INTERFACE = {  # one call a job, imported at its first use: `import touchgoal` stays light
     "evaluate": "touchgoal.policies.evaluation.evaluate",

@@ -5,6 +5,7 @@ Textures are tiles that repeat; a press takes them anywhere, at any angle (`surf
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 import cv2
@@ -72,14 +73,15 @@ def _rough(rng: np.random.Generator) -> Tile:
     return _noise(rng, _log_uniform(rng, 5, 120), rng.uniform(0.7, 4), rng.uniform(0.5, 2.5))
 
 
-def _wrinkles(rng: np.random.Generator) -> Tile:
-    folded = np.abs(_noise(rng, _log_uniform(rng, 15, 100), rng.uniform(0.3, 2), 1.5))
+def _wrinkles(rng: np.random.Generator, wavelength: float | None = None) -> Tile:
+    wavelength = wavelength or _log_uniform(rng, 15, 100)
+    folded = np.abs(_noise(rng, wavelength, rng.uniform(0.3, 2), 1.5))
     return folded * np.float32(rng.choice([-1, 1]))
 
 
-def _phases(rng: np.random.Generator) -> tuple[Tile, Tile]:
+def _phases(rng: np.random.Generator, wavelength: float | None = None) -> tuple[Tile, Tile]:
     """Draw two crossing phases (rad) with whole numbers of periods a tile, a little uneven."""
-    periods = int(_log_uniform(rng, 4, 70))
+    periods = int(TILE / wavelength if wavelength else _log_uniform(rng, 4, 70))
     y, x = np.mgrid[:TILE, :TILE].astype(np.float32) * np.float32(2 * np.pi / TILE)
     uneven = np.float32(rng.uniform(0, 0.8))
     bend = _unit(_noise(rng, 100, 1, 1)) * uneven
@@ -92,8 +94,8 @@ def _ribs(rng: np.random.Generator) -> Tile:
     return np.abs(np.sin(a / 2)) ** np.float32(_log_uniform(rng, 0.3, 8))
 
 
-def _knurl(rng: np.random.Generator) -> Tile:
-    a, b = _phases(rng)
+def _knurl(rng: np.random.Generator, wavelength: float | None = None) -> Tile:
+    a, b = _phases(rng, wavelength)
     return (np.abs(np.sin(a / 2)) * np.abs(np.sin(b / 2))) ** np.float32(_log_uniform(rng, 0.3, 6))
 
 
@@ -105,9 +107,9 @@ def _weave(rng: np.random.Generator) -> Tile:
     )
 
 
-def _grains(rng: np.random.Generator) -> Tile:
+def _grains(rng: np.random.Generator, wavelength: float | None = None) -> Tile:
     tile = np.zeros((TILE, TILE), np.float32)
-    length = _log_uniform(rng, 3, 30)
+    length = wavelength / 2 if wavelength else _log_uniform(rng, 3, 30)
     width = length * rng.uniform(0.35, 1)
     count = int(rng.uniform(0.15, 0.8) * TILE**2 / (np.pi * length * width)) + 3
     along = rng.uniform(0, np.pi)
@@ -128,20 +130,23 @@ def _grains(rng: np.random.Generator) -> Tile:
     return tile
 
 
-def _cells(rng: np.random.Generator) -> Tile:
+def _cells(rng: np.random.Generator, wavelength: float | None = None) -> Tile:
     seeds = np.full((TILE, TILE), 255, np.uint8)
-    points = rng.integers(0, TILE, (int(_log_uniform(rng, 12, 900)), 2))
+    count = (TILE / wavelength) ** 2 if wavelength else _log_uniform(rng, 12, 900)
+    points = rng.integers(0, TILE, (int(count), 2))
     seeds[points[:, 0], points[:, 1]] = 0
     around = cv2.copyMakeBorder(seeds, 64, 64, 64, 64, cv2.BORDER_WRAP)
     distance = cv2.distanceTransform(around, cv2.DIST_L2, 3)[64:-64, 64:-64]
     return distance * np.float32(rng.choice([-1, 1]))
 
 
-def _strands(rng: np.random.Generator) -> Tile:
+def _strands(rng: np.random.Generator, wavelength: float | None = None) -> Tile:
     tile = np.zeros((TILE, TILE), np.float32)
-    width, main = int(rng.integers(1, 9)), rng.uniform(0, np.pi)
+    width = int(wavelength / 4 if wavelength else rng.integers(1, 9))
+    main = rng.uniform(0, np.pi)
     spread = rng.choice([0.15, 1.5])
-    for _ in range(int(_log_uniform(rng, 4, 60))):
+    count = 5 * TILE / wavelength if wavelength else _log_uniform(rng, 4, 60)
+    for _ in range(int(count)):
         angle = main + spread * rng.normal()
         reach = np.array([np.cos(angle), np.sin(angle)]) * rng.uniform(30, 300)
         middle = rng.uniform(0, TILE, 2)
@@ -150,12 +155,13 @@ def _strands(rng: np.random.Generator) -> Tile:
     return _rounded(tile, width) * np.float32(rng.choice([1, 1, -1]))
 
 
-def _plateaus(rng: np.random.Generator) -> Tile:
+def _plateaus(rng: np.random.Generator, wavelength: float | None = None) -> Tile:
     tile = np.zeros((TILE, TILE), np.uint8)
     white = 255.0
-    for _ in range(int(rng.integers(2, 14))):
+    count = 4 * TILE / wavelength if wavelength else rng.integers(2, 14)
+    for _ in range(int(count)):
         at = tuple(int(v) for v in rng.integers(0, TILE, 2))
-        size = _log_uniform(rng, 8, 60)
+        size = wavelength or _log_uniform(rng, 8, 60)
         if rng.random() < 0.3:
             text = "".join(rng.choice(list("ABEKRSXZ0235689"), 3))
             cv2.putText(tile, text, at, cv2.FONT_HERSHEY_SIMPLEX, size / 25, white, 3, cv2.LINE_AA)
@@ -188,3 +194,22 @@ _PATTERNS: tuple[Callable[[np.random.Generator], Tile], ...] = (
     _strands,
     _plateaus,
 )
+
+
+WAVELENGTH = 24
+"""Cells from one wrinkle, grain, cell, strand or rib of a `named_tile` to the next, about."""
+_NAMED: dict[str, Callable[[np.random.Generator, float | None], Tile]] = {
+    "wrinkled": _wrinkles,
+    "grained": _grains,
+    "cellular": _cells,
+    "stranded": _strands,
+    "lettered": _plateaus,
+    "knurled": _knurl,
+}
+
+
+@cache
+def named_tile(name: str) -> Tile:
+    """Return the tile of a texture of the object catalogues: heights from about -1 to 1."""
+    tile = 2 * _unit(_NAMED[name](np.random.default_rng(5), WAVELENGTH))  # strands and letters are raised
+    return np.ascontiguousarray(np.clip(tile, -1.5, 1.5), np.float32)

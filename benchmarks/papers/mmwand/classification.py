@@ -1,0 +1,138 @@
+"""Which object is it? MMWand's Table II on wand touches: image, touch and both, on frozen embeddings.
+
+A linear probe and the nearest neighbour on what frozen networks give; on raw pixels, too.
+"""
+
+from dataclasses import field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from touchgoal.benchmarks.options import BenchmarkOptions
+from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
+from touchgoal.benchmarks.papers.mmwand.splits import split_touches
+from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
+
+PUBLISHED = {"VGG": (94.94, 79.48, 96.66), "ResNet": (96.28, 79.48, 97.70), "ViT": (95.51, 76.90, 97.99)}
+"""MMWand's Table II, %: fine-tuned on image, touch, both."""
+PUBLISHED_PROBE = 3.24, 46.94, 47.22
+"""Its linear probe on the aligned embeddings."""
+_DECAYS = (1e-4, 1e-3, 1e-2, 1e-1)
+_BOOTSTRAPS = 500
+_PIXELS = 300  # principal components of raw pixels that the probe sees
+
+
+@checked_dataclass
+class Config(BenchmarkOptions):
+    """Options of benchmark classification."""
+
+    data: Path = field(kw_only=True)
+    """Touches recorded by `collect-touches --body wand`."""
+    encoders: tuple[str, ...] = ("gelsight_mini_surfaces", "gelsight_mini", "random:gelsight_mini")
+    """Touch encoders: see benchmark real-touch."""
+    splits: tuple[Literal["sample", "press"], ...] = ("sample", "press")
+    """What is held out; with whole objects held out there is nothing to name."""
+    seeds: Count = 3
+    """Splits of each kind."""
+    cache: Path = Path("runs/mmwand-embeddings")
+    """Folder that keeps the embeddings."""
+    seed: Seed = 0
+    """Random seed."""
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Fit probes and judge them."""
+    torch.manual_seed(config.seed)
+    data = embed_set(config.data, config.encoders, config.seed, config.cache)
+    image = data.image.mean(1)
+    inputs = {"images": image, "raw pixels": _principal(data.pixels)}
+    for name in config.encoders:
+        inputs[name] = data.touch[name]
+        inputs[f"images + {name}"] = np.hstack([_standard(image), _standard(data.touch[name])])
+    rows = [
+        {"split": split, "input": name, **_judge(data, embedding, split, config.seeds)}
+        for split in config.splits
+        for name, embedding in inputs.items()
+    ]
+    return {"table": _table(rows, len(data.names)), "rows": rows}
+
+
+def _judge(
+    data: EmbeddedSet, embedding: Float[np.ndarray, "n d"], split: Literal["sample", "press"], seeds: int
+) -> dict[str, list[float]]:
+    hits: dict[str, list[np.ndarray]] = {"probe": [], "nearest": []}
+    objects = []
+    for seed in range(seeds):
+        fold = split_touches(split, data.label, data.visit, data.describes, seed)
+        x, y = torch.from_numpy(embedding).float(), torch.from_numpy(data.label)
+        train, test = (x[rows], y[rows]) for rows in (fold.train, fold.test)
+        hits["probe"].append((probe(*train)(test[0]).argmax(1) == test[1]).numpy())
+        unit = F.normalize(train[0], dim=1), F.normalize(test[0], dim=1)
+        hits["nearest"].append((train[1][(unit[1] @ unit[0].T).argmax(1)] == test[1]).numpy())
+        objects.append(data.label[fold.test])
+    return {what: _with_interval(np.concatenate(objects), np.concatenate(h)) for what, h in hits.items()}
+
+
+def probe(x: Float[Tensor, "n d"], y: Int[Tensor, " n"]):
+    """Fit a logistic regression on standardised inputs; its decay is chosen on a fifth of the rows."""
+    mean, scale = x.mean(0), x.std(0) + 1e-6
+    x = (x - mean) / scale
+    order = torch.randperm(len(x), generator=torch.Generator().manual_seed(0))
+    out, kept = order[: len(x) // 5], order[len(x) // 5 :]
+    right = [(_logistic(x[kept], y[kept], d)(x[out]).argmax(1) == y[out]).float().mean() for d in _DECAYS]
+    predict = _logistic(x, y, _DECAYS[int(torch.stack(right).argmax())])
+    return lambda new: predict((new - mean) / scale)
+
+
+def _logistic(x: Float[Tensor, "n d"], y: Int[Tensor, " n"], decay: float):
+    classes, d = int(y.max()) + 1, x.shape[1]
+    weight = torch.zeros(d, classes, requires_grad=True)
+    bias = torch.zeros(classes, requires_grad=True)
+    optimizer = torch.optim.LBFGS([weight, bias], max_iter=60, line_search_fn="strong_wolfe")
+
+    def loss() -> Tensor:
+        optimizer.zero_grad()
+        value = F.cross_entropy(x @ weight + bias, y) + decay / 2 * weight.square().sum()
+        value.backward()
+        return value
+
+    optimizer.step(loss)
+    weight, bias = weight.detach(), bias.detach()
+    return lambda new: new @ weight + bias
+
+
+def _with_interval(objects: Int[np.ndarray, " q"], hit: np.ndarray) -> list[float]:
+    """Return accuracy (%) and its 95 % interval over objects."""
+    kinds, index = np.unique(objects, return_inverse=True)
+    total, count = np.bincount(index, hit.astype(float)), np.bincount(index)
+    drawn = np.random.default_rng(0).integers(len(kinds), size=(_BOOTSTRAPS, len(kinds)))
+    low, high = np.percentile(total[drawn].sum(1) / count[drawn].sum(1), [2.5, 97.5])
+    return [100 * float(v) for v in (hit.mean(), low, high)]
+
+
+def _standard(x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    return (x - x.mean(0)) / (x.std(0) + 1e-6)
+
+
+def _principal(pixels: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n d"]:
+    """Project pixels on their first principal components."""
+    centred = torch.from_numpy(pixels - pixels.mean(0))
+    _, _, components = torch.pca_lowrank(centred, min(_PIXELS, *centred.shape), center=False)
+    return (centred @ components).numpy()
+
+
+def _table(rows: list[dict[str, Any]], kinds: int) -> str:
+    lines = [f"right one of {kinds} objects, % [95 % over objects]; chance {100 / kinds:.1f}", ""]
+    lines.append(f"{'split':<8}{'input':<42}{'linear probe':>20}{'nearest neighbour':>22}")
+    for row in rows:
+        cells = ["{:.1f} [{:.1f}, {:.1f}]".format(*row[what]) for what in ("probe", "nearest")]
+        lines.append(f"{row['split']:<8}{row['input']:<42}{cells[0]:>20}{cells[1]:>22}")
+    lines += ["", "published (MMWand, Table II, split by sample): image / touch / both"]
+    lines += [f"  {name} fine-tuned: {' / '.join(map(str, v))}" for name, v in PUBLISHED.items()]
+    lines.append(f"  linear probe on the aligned embeddings: {' / '.join(map(str, PUBLISHED_PROBE))}")
+    return "\n".join(lines)
