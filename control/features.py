@@ -19,7 +19,9 @@ WRENCH = "observation.wrench"
 LOAD = "observation.load"
 FRONT = "observation.images.front"
 WRIST = "observation.images.wrist"
-WAND_VIEWS = tuple(f"observation.images.{view}" for view in ("top", "side_left", "side_right", "wand"))
+WAND_VIEWS = tuple(
+    f"observation.images.{view}" for view in ("top", "side_left", "side_right", "wand")
+)
 TACTILE_LEFT = "observation.images.tactile_left"
 TACTILE_RIGHT = "observation.images.tactile_right"
 ACTION = "action"

@@ -47,7 +47,9 @@ def record_touches(root: Path, sensor: str, seed: int, count: int, workers: int)
     try:
         have = len(writer)
         if have and (other := EpisodeSet(root).meta(0).get(_SET)) != config:
-            raise UserError(f"{root} holds other touches ({other}), not {config}: give another folder")
+            raise UserError(
+                f"{root} holds other touches ({other}), not {config}: give another folder"
+            )
         if have < count:
             visits = range(have // TOUCHES_A_VISIT, -(-count // TOUCHES_A_VISIT))
             with one_core_workers(workers) as pool:

@@ -15,8 +15,14 @@ from touchgoal.runtime.run_folder import open_run
 
 BENCHMARKS = {
     "bead-maze": ("papers.bead_maze", "bead maze: success on unseen wires (TacBench T5)"),
-    "retrieval": ("papers.mmwand.retrieval", "touch, pictures and sentences find each other (MMWand IV)"),
-    "classification": ("papers.mmwand.classification", "objects named by touch and sight (MMWand II)"),
+    "retrieval": (
+        "papers.mmwand.retrieval",
+        "touch, pictures and sentences find each other (MMWand IV)",
+    ),
+    "classification": (
+        "papers.mmwand.classification",
+        "objects named by touch and sight (MMWand II)",
+    ),
     "reward-quality": ("papers.reward_quality", "dense costs against outcomes (MMWand V-E)"),
     "tacbench": ("papers.tacbench.benchmark", "force, slip, pose, grasp, cloth from frozen touch"),
     "real-touch": ("real_touch.videos", "encoders on labelled videos of real touch"),

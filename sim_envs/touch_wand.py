@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int32, UInt8
 
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
@@ -33,6 +33,8 @@ _AWAY = 0.09  # m from the surface, before contact
 _LOWEST = np.radians(12)  # of the approach over the bench, rad
 _TILT = 0.2  # how far the wand leans from the surface's normal towards its approach
 _GRAZING = 0.3  # cosine between normal and approach below which the wand would slide off
+_FEELER = 0.5  # N of the first touch, by which the hand finds the object
+_FOLLOWED = 0.7  # share of the way to what it meets
 _CASE = 0.014  # m from the gel's middle to the case's side
 _PATCH = 0.015  # m, half the gel's diagonal
 
@@ -125,6 +127,12 @@ class TouchWand(gym.Env[Observation, np.ndarray]):
         self._object: WandObject | None = None
 
     @property
+    def bench(self) -> Bench:
+        """The scene."""
+        assert self._bench is not None, "reset first"
+        return self._bench
+
+    @property
     def object(self) -> WandObject:
         """The object on the bench."""
         assert self._object is not None, "reset first"
@@ -141,10 +149,12 @@ class TouchWand(gym.Env[Observation, np.ndarray]):
         if self._object is None or self._object.name != name:
             self._open(find_wand_object(name))
         self.move_object()
-        bench = self._placed_bench()
-        bench.place_wand(bench.centre + [0, 0, bench.radius + _AWAY], _axes(np.array([0.0, 0, 1]), 0))
+        bench = self.bench
+        bench.place_wand(
+            bench.centre + [0, 0, bench.radius + _AWAY], _axes(np.array([0.0, 0, 1]), 0)
+        )
         clip, load, _ = self._press(np.zeros(3), np.zeros(1))
-        return self._observation(self._render(), clip[-1], load[-1]), self._info(False)
+        return self._observation(self._render(), clip[-1], float(load[-1])), self._info(False)
 
     def step(
         self, action: Float[np.ndarray, "6"]
@@ -154,14 +164,14 @@ class TouchWand(gym.Env[Observation, np.ndarray]):
         touch = self.touch(np.asarray(action, float))
         if touch is None:
             clip, load, _ = self._press(np.zeros(3), np.zeros(1))
-            observation = self._observation(self._render(), clip[-1], load[-1])
+            observation = self._observation(self._render(), clip[-1], float(load[-1]))
         else:
-            observation = self._observation(touch.views, touch.clip[-1], touch.load[-1])
+            observation = self._observation(touch.views, touch.clip[-1], float(touch.load[-1]))
         return observation, float(touch is not None), False, False, self._info(touch is not None)
 
     def touch(self, action: Float[np.ndarray, "6"]) -> Touch | None:
         """Touch the object where it lies; None if the wand misses it or cannot reach it."""
-        bench = self._placed_bench()
+        bench = self.bench
         towards, start = _approach(action, bench)
         met = bench.surface_along(start, towards)
         if met is None:
@@ -173,9 +183,10 @@ class TouchWand(gym.Env[Observation, np.ndarray]):
         axis = normal - _TILT * (towards + normal)
         axis /= np.linalg.norm(axis)
         axes = _axes(axis, np.pi * action[4])
-        bench.place_wand(point + _AWAY * axis, axes)
+        tip = self._aim(point, axes)
+        bench.place_wand(tip + _AWAY * axis, axes)
         before = self._render()
-        bench.place_wand(point, axes)
+        bench.place_wand(tip, axes)
         force = (action[5] + 1) / 2 * MAX_FORCE
         clip, load, wrench = self._press(point, force * np.linspace(0, 1, CLIP))
         return Touch(before, self._render(), clip, load, wrench, point, normal)
@@ -190,10 +201,19 @@ class TouchWand(gym.Env[Observation, np.ndarray]):
 
     def render(self) -> UInt8[np.ndarray, "H W 3"]:
         """Return the view from the left."""
-        bench = self._placed_bench()
+        bench = self.bench
         assert self._renderer is not None
-        self._renderer.update_scene(bench.data, "side_left")
+        self._renderer.update_scene(bench.data, "side_left", bench.seen)
         return self._renderer.render()
+
+    def segment(self, view: str) -> Int32[np.ndarray, "H W"]:
+        """Return the geom that each pixel of a view shows now, -1 for none."""
+        assert self._renderer is not None, "views are off"
+        self._renderer.enable_segmentation_rendering()
+        self._renderer.update_scene(self.bench.data, view, self.bench.seen)
+        segments = self._renderer.render()[..., 0]
+        self._renderer.disable_segmentation_rendering()
+        return segments
 
     def close(self) -> None:
         """Free the renderer."""
@@ -221,20 +241,16 @@ class TouchWand(gym.Env[Observation, np.ndarray]):
             self._renderer = open_renderer(bench.model, *VIEW_SHAPE)
         self._bench, self._object = bench, wand_object
 
-    def _placed_bench(self) -> Bench:
-        assert self._bench is not None, "reset first"
-        return self._bench
-
     def move_object(self) -> None:
         """Move and turn the object on the bench at random, as the paper's operator before each touch."""
         x, y = self.np_random.uniform(-0.03, 0.03, 2)
-        self._placed_bench().place_object(x, y, self.np_random.uniform(-np.pi, np.pi))
+        self.bench.place_object(x, y, self.np_random.uniform(-np.pi, np.pi))
 
     def _press(
         self, point: Float[np.ndarray, "3"], forces: Float[np.ndarray, " t"]
     ) -> tuple[UInt8[np.ndarray, "t h w 3"], Float32[np.ndarray, " t"], Float32[np.ndarray, "t 6"]]:
         """Press with rising forces (N) where the wand is; return pictures, loads and wrenches."""
-        bench, pad = self._placed_bench(), self._pad
+        bench, pad = self.bench, self._pad
         assert pad is not None
         geoms = bench.geoms_near(point, _PATCH)
         pictures, wrenches = [], []
@@ -245,13 +261,34 @@ class TouchWand(gym.Env[Observation, np.ndarray]):
             wrenches.append(np.zeros(6) if frame.field is None else frame.field.wrench())
         return np.stack(pictures), forces.astype(np.float32), np.array(wrenches, np.float32)
 
+    def _aim(
+        self, point: Float[np.ndarray, "3"], axes: Float[np.ndarray, "3 3"]
+    ) -> Float[np.ndarray, "3"]:
+        """Return where the gel's middle goes: a hand feels what it meets, and moves most of the way there."""
+        bench, pad = self.bench, self._pad
+        assert pad is not None
+        tip = point
+        for _ in range(2):
+            bench.place_wand(tip, axes)
+            geoms = bench.geoms_near(tip, _PATCH)
+            contact = PadContact(np.array([0, 0, -_FEELER]), np.zeros(3), 0.0, geoms)
+            field = pad.sense(bench.data, contact, np.random.default_rng(0)).field
+            if field is None or not field.normal.any():
+                break
+            rows, columns = np.indices(field.normal.shape) * field.pitch
+            load = field.normal / field.normal.sum()
+            x = float((load * (columns - columns.mean())).sum())
+            y = float((load * (rows - rows.mean())).sum())
+            tip = tip + _FOLLOWED * (x * axes[:, 0] + y * axes[:, 1])
+        return tip
+
     def _render(self) -> dict[str, UInt8[np.ndarray, "H W 3"]]:
         if not self.config.views:
             return {}
-        bench, views = self._placed_bench(), {}
+        views = {}
         assert self._renderer is not None
         for name in VIEWS:
-            self._renderer.update_scene(bench.data, name)
+            self._renderer.update_scene(self.bench.data, name, self.bench.seen)
             views[name] = self._renderer.render()
         return views
 

@@ -61,7 +61,10 @@ class Heads(nn.Module):
 
     def __init__(self, touch_dim: int, image_dim: int, text_dim: int) -> None:
         super().__init__()
-        self.image, self.text = nn.Linear(image_dim, touch_dim, False), nn.Linear(text_dim, touch_dim, False)
+        self.image, self.text = (
+            nn.Linear(image_dim, touch_dim, False),
+            nn.Linear(text_dim, touch_dim, False),
+        )
         self.register_buffer("image_mean", torch.zeros(image_dim))
         self.register_buffer("text_mean", torch.zeros(text_dim))
 
@@ -98,7 +101,9 @@ def fit_heads(data: Paired, config: HeadsConfig, seed: int) -> Heads:
         label = data.label[rows]
         same = (label[:, None] == label) | (sentence[:, None] == sentence)
         tau = config.temperature
-        loss = symmetric_info_nce(touch, image, tau, same) + symmetric_info_nce(image, text, tau, same)
+        loss = symmetric_info_nce(touch, image, tau, same) + symmetric_info_nce(
+            image, text, tau, same
+        )
         if config.text_weight:
             loss = loss + config.text_weight * symmetric_info_nce(touch, text, tau, same)
         optimizer.zero_grad()
@@ -108,7 +113,9 @@ def fit_heads(data: Paired, config: HeadsConfig, seed: int) -> Heads:
     return heads.eval()
 
 
-def _draw_sentences(data: Paired, rows: Int[Tensor, " b"], draw: torch.Generator) -> Int[Tensor, " b"]:
+def _draw_sentences(
+    data: Paired, rows: Int[Tensor, " b"], draw: torch.Generator
+) -> Int[Tensor, " b"]:
     """Draw one sentence for each touch."""
     describes = data.describes[data.label[rows]].float()
     return torch.multinomial(describes, 1, generator=draw)[:, 0]

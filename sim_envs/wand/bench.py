@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from touchgoal.sim_envs.scene.build import HIDDEN_GROUP, OBJECT_GROUP, VISUAL_GROUP
 from touchgoal.sim_envs.scene.objects import HARD, Body, Material, ObjectKind, Texture
+from touchgoal.sim_envs.wand.meshes import Mesh
 from touchgoal.sim_envs.wand.objects import Part, WandObject
 
 VIEWS = ("top", "side_left", "side_right", "wand")
@@ -24,7 +25,11 @@ _LOOK = {
     "checker": mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
     "gradient": mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
 }
-_EYES = {"top": (0.0, 0.02, 0.62), "side_left": (-0.42, -0.42, 0.3), "side_right": (0.42, -0.42, 0.3)}
+_EYES = {
+    "top": (0.0, 0.02, 0.62),
+    "side_left": (-0.42, -0.42, 0.3),
+    "side_right": (0.42, -0.42, 0.3),
+}
 _FOVY = 26
 _MATERIAL = Material(Texture.SMOOTH, 0.0, 1e-3, HARD, 0.5, (*GREEN, 1.0))
 
@@ -35,6 +40,7 @@ class Bench:
     Attributes:
         model, data: the compiled scene.
         bodies: what the gel can touch, the bench among them; `TactilePad` takes them.
+        seen: what cameras show.
     """
 
     def __init__(self, wand_object: WandObject, size: tuple[int, int]) -> None:
@@ -54,6 +60,8 @@ class Bench:
         mujoco.mj_forward(self.model, self.data)
         parts = [g for g in range(self.model.ngeom) if self.model.geom_group[g] == OBJECT_GROUP]
         self._parts = [g for g in parts if self.model.geom(g).name != _BENCH]
+        self.seen = mujoco.MjvOption()
+        self.seen.geomgroup[OBJECT_GROUP] = 0
         self._centre, self.radius = _bounds(self.model, self.data, self._parts)
 
     @property
@@ -110,31 +118,38 @@ def _set_visuals(spec: mujoco.MjSpec, size: tuple[int, int]) -> None:
     visual.headlight.specular = [0.0] * 3
     world = spec.worldbody
     world.add_light(
-        name="key", pos=[0.4, -0.5, 0.9], dir=[-0.4, 0.5, -0.9], diffuse=[0.5] * 3, castshadow=True
+        name="key", pos=[0.4, -0.5, 0.85], dir=[-0.4, 0.5, -0.9], diffuse=[0.5] * 3, castshadow=True
     )
-    world.add_light(pos=[-0.6, 0.3, 0.8], dir=[0.6, -0.3, -0.8], diffuse=[0.25] * 3, castshadow=False)
+    world.add_light(
+        pos=[-0.6, 0.3, 0.8], dir=[0.6, -0.3, -0.8], diffuse=[0.25] * 3, castshadow=False
+    )
 
 
 def _bench_body(spec: mujoco.MjSpec) -> Body:
     """Add the bench's top, which thin objects are pressed against."""
-    body = Body(ObjectKind(_BENCH, "box", _MATERIAL, ()), (0.6, 0.6, 0.01), 1.0, _BENCH)
+    body = Body(ObjectKind(_BENCH, "box", _MATERIAL, ()), (0.9, 0.9, 0.01), 1.0, _BENCH)
     item = spec.worldbody.add_body(name=_BENCH, pos=[0, 0, -0.01])
-    item.add_geom(
-        name=_BENCH,
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=body.size,
-        group=OBJECT_GROUP,
-        rgba=_MATERIAL.rgba,
-        friction=[_MATERIAL.friction, 0.005, 0.0001],
-        contype=0,
-        conaffinity=0,
-    )
+    for name, group in ((_BENCH, OBJECT_GROUP), ("", VISUAL_GROUP)):
+        item.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=body.size,
+            group=group,
+            rgba=_MATERIAL.rgba,
+            friction=[_MATERIAL.friction, 0.005, 0.0001],
+            contype=0,
+            conaffinity=0,
+        )
     return body
 
 
 def _add_screen(spec: mujoco.MjSpec) -> None:
-    """Add the green walls behind the bench, seen from both sides."""
-    for place, size in (((0, 0.6, 0.5), (1.5, 0.01, 0.6)), ((-0.9, 0, 0.5), (0.01, 1.5, 0.6)), ((0.9, 0, 0.5), (0.01, 1.5, 0.6))):
+    """Add green walls and a green ceiling all around: no camera on the wand sees past them."""
+    far, thin = 0.9, 0.01
+    walls = [(sign * far * np.eye(3)[axis], axis) for axis in (0, 1) for sign in (-1, 1)]
+    for place, axis in [*walls, (far * np.eye(3)[2], 2)]:
+        size = np.full(3, far)
+        size[axis] = thin
         spec.worldbody.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX,
             size=size,
@@ -146,31 +161,44 @@ def _add_screen(spec: mujoco.MjSpec) -> None:
         )
     for name, eye in _EYES.items():
         up = (0, 1, 0) if name == "top" else (0, 0, 1)
-        spec.worldbody.add_camera(name=name, pos=eye, quat=_looking(eye, (0, 0, 0.05), up), fovy=_FOVY)
+        spec.worldbody.add_camera(
+            name=name, pos=eye, quat=_looking(eye, (0, 0, 0.05), up), fovy=_FOVY
+        )
 
 
 def _add_part(spec: mujoco.MjSpec, holder: mujoco.MjsBody, name: str, part: Part) -> Body:
+    """Add a part twice: as the gel feels it, and coarser as cameras see it."""
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, part.rotation.ravel())
     item = holder.add_body(name=name, pos=part.position, quat=quat)
-    shape: dict = {"size": [*part.size, 0, 0][:3]}
-    if part.mesh is not None:
-        vertices, faces = part.mesh
-        spec.add_mesh(
-            name=name, uservert=vertices.ravel().tolist(), userface=faces.ravel().tolist()
+    for group, mesh in ((OBJECT_GROUP, part.mesh), (VISUAL_GROUP, part.coarse)):
+        shape: dict = (
+            {"size": [*part.size, 0, 0][:3]} if mesh is None else {"meshname": _mesh(spec, mesh)}
         )
-        shape = {"meshname": name}
-    item.add_geom(
-        name=name,
-        type=getattr(mujoco.mjtGeom, f"mjGEOM_{part.shape.upper()}"),
-        material=_paint(spec, part),
-        group=OBJECT_GROUP,
-        friction=[part.material.friction, 0.005, 0.0001],
-        contype=0,
-        conaffinity=0,
-        **shape,
-    )
+        item.add_geom(
+            type=getattr(mujoco.mjtGeom, f"mjGEOM_{part.shape.upper()}"),
+            material=_paint(spec, part),
+            group=group,
+            friction=[part.material.friction, 0.005, 0.0001],
+            contype=0,
+            conaffinity=0,
+            **shape,
+        )
     return Body(ObjectKind(name, "mesh", part.material, ()), part.size, 1.0, name)
+
+
+def _mesh(spec: mujoco.MjSpec, mesh: Mesh) -> str:
+    """Return the name of a mesh, added when it is new; the parts of a row share theirs."""
+    name = f"mesh_{id(mesh)}"
+    if not any(known.name == name for known in spec.meshes):
+        vertices, faces = mesh
+        spec.add_mesh(
+            name=name,
+            uservert=vertices.ravel().tolist(),
+            userface=faces.ravel().tolist(),
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,  # thin walls enclose little
+        )
+    return name
 
 
 def _paint(spec: mujoco.MjSpec, part: Part) -> str:
@@ -179,7 +207,9 @@ def _paint(spec: mujoco.MjSpec, part: Part) -> str:
     name = "_".join(f"{v:.3f}" for v in (*part.material.rgba, *second)) + part.look
     if any(material.name == name for material in spec.materials):
         return name
-    marks = {"mark": mujoco.mjtMark.mjMARK_RANDOM, "random": 0.25} if part.look == "speckled" else {}
+    marks = (
+        {"mark": mujoco.mjtMark.mjMARK_RANDOM, "random": 0.25} if part.look == "speckled" else {}
+    )
     spec.add_texture(
         name=name,
         type=mujoco.mjtTexture.mjTEXTURE_CUBE,
@@ -191,7 +221,9 @@ def _paint(spec: mujoco.MjSpec, part: Part) -> str:
         height=64,
         **marks,
     )
-    material = spec.add_material(name=name, specular=0.3, shininess=0.4, rgba=[1, 1, 1, part.material.rgba[3]])
+    material = spec.add_material(
+        name=name, specular=0.3, shininess=0.4, rgba=[1, 1, 1, part.material.rgba[3]]
+    )
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
     return name
 
@@ -209,7 +241,13 @@ def _add_wand(spec: mujoco.MjSpec) -> None:
         (cylinder, [0.013, 0.09, 0], -0.133, dark),  # handle
     ):
         wand.add_geom(
-            type=kind, size=size, pos=[0, 0, z], rgba=rgba, group=VISUAL_GROUP, contype=0, conaffinity=0
+            type=kind,
+            size=size,
+            pos=[0, 0, z],
+            rgba=rgba,
+            group=VISUAL_GROUP,
+            contype=0,
+            conaffinity=0,
         )
     eye = (-0.055, 0.0, -0.075)
     wand.add_camera(name="wand", pos=eye, quat=_looking(eye, (0, 0, 0.005), (0, 0, -1)), fovy=70)
@@ -223,7 +261,11 @@ def _looking(
     z /= np.linalg.norm(z)
     x = np.cross(up, z)
     x /= np.linalg.norm(x)
-    return Rotation.from_matrix(np.stack([x, np.cross(z, x), z], 1)).as_quat(scalar_first=True).tolist()
+    return (
+        Rotation.from_matrix(np.stack([x, np.cross(z, x), z], 1))
+        .as_quat(scalar_first=True)
+        .tolist()
+    )
 
 
 def _bounds(

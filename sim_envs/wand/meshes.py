@@ -4,34 +4,36 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 from scipy.interpolate import PchipInterpolator
 
-Mesh = tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, "m 3"]]
+Mesh = tuple[Float32[np.ndarray, "_ 3"], Int32[np.ndarray, "_ 3"]]
 
-_EDGE = 0.8e-3  # m: on a ball of 20 mm, facets of that length stand off by 4 um
-_MOST_AROUND = 240
+FINE, COARSE = 0.8e-3, 3e-3
+"""m, edges of facets: for the gel (on a ball of 20 mm they stand off by 4 um), and for cameras."""
+_LEAST_AROUND, _MOST_AROUND = 24, 200
 
 
-def ellipsoid(axes: tuple[float, ...]) -> Mesh:
+def ellipsoid(axes: tuple[float, ...], edge: float = FINE) -> Mesh:
     """Return an ellipsoid of these half axes (m) about its centre."""
-    steps = int(np.clip(np.pi * max(axes) / _EDGE, 12, _MOST_AROUND // 2))
+    steps = _around(max(axes), edge) // 2
     angle = np.linspace(0, np.pi, steps + 1)
     rings = np.column_stack([np.sin(angle), -np.cos(angle)])
     vertices, faces = _revolve(rings, 2 * steps)
     return (vertices * np.array(axes, np.float32)).astype(np.float32), faces
 
 
-def lathe(profile: Float[np.ndarray, "n 2"]) -> Mesh:
+def lathe(profile: Float[np.ndarray, "k 2"], edge: float = FINE) -> Mesh:
     """Return a surface of revolution about z.
 
     Args:
-        profile: radius and z (m) from bottom to top; smooth between the points, closed to the axis.
+        profile: radius and z (m) along a path, smooth between the points; a hollow thing goes up
+            outside and down inside. Both ends are closed to the axis.
+        edge: of the facets, m.
     """
     along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(profile, axis=0).T))])
-    steps = int(np.clip(along[-1] / (1.5 * _EDGE), len(profile), 120))
+    steps = int(np.clip(along[-1] / (1.5 * edge), 2, 150))
     at = np.union1d(np.linspace(0, along[-1], steps), along)  # corners stay corners
     smooth = PchipInterpolator(along, profile)(at)  # never overshoots
     ends = [[0, smooth[0, 1]]], smooth, [[0, smooth[-1, 1]]]
-    around = int(np.clip(2 * np.pi * profile[:, 0].max() / _EDGE, 24, _MOST_AROUND))
-    return _revolve(np.concatenate(ends), around)
+    return _revolve(np.concatenate(ends), _around(profile[:, 0].max(), edge))
 
 
 def prism(sides: int, radius: float, half_length: float) -> Mesh:
@@ -40,7 +42,11 @@ def prism(sides: int, radius: float, half_length: float) -> Mesh:
     return _revolve(np.array(ends), sides)
 
 
-def _revolve(rings: Float[np.ndarray, "n 2"], around: int) -> Mesh:
+def _around(radius: float, edge: float) -> int:
+    return int(np.clip(2 * np.pi * radius / edge, _LEAST_AROUND, _MOST_AROUND)) // 2 * 2
+
+
+def _revolve(rings: Float[np.ndarray, "k 2"], around: int) -> Mesh:
     """Turn radii and heights about z; the first and the last radius are 0."""
     angle = np.arange(around) * 2 * np.pi / around
     inner = rings[1:-1]

@@ -5,18 +5,18 @@ units. Rows, rings and piles are laid out here, the same way every time.
 """
 
 import tomllib
-from dataclasses import dataclass, field, replace
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.scene.objects import Material, Texture
-from touchgoal.sim_envs.wand.meshes import ellipsoid, lathe, prism
+from touchgoal.sim_envs.wand.meshes import COARSE, Mesh, ellipsoid, lathe, prism
 
 Look = Literal["plain", "speckled", "checker", "gradient"]
 _PRIMITIVES = ("box", "cylinder", "sphere", "capsule")
@@ -34,7 +34,7 @@ class Part:
         material: how it feels, and its colour.
         look: pattern of two colours.
         second_rgb: the pattern's other colour.
-        mesh: vertices (m) and faces of a mesh.
+        mesh, coarse: vertices (m) and faces of a mesh, for the gel and for cameras.
     """
 
     shape: str
@@ -44,7 +44,8 @@ class Part:
     material: Material
     look: Look
     second_rgb: tuple[float, float, float]
-    mesh: tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, "m 3"]] | None = field(default=None)
+    mesh: Mesh | None
+    coarse: Mesh | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,14 +57,20 @@ class WandObject:
         number: in MMWand's Table V.
         mass: kg.
         descriptions: how it feels, in different words.
-        parts: its pieces.
     """
 
     name: str
     number: int
     mass: float
     descriptions: tuple[str, ...]
-    parts: tuple[Part, ...]
+    _entry: dict[str, Any]
+
+    @cached_property
+    def parts(self) -> tuple[Part, ...]:
+        """Its pieces."""
+        common = {k: v for k, v in self._entry.items() if k != "parts"}
+        rng = np.random.default_rng(self.number)
+        return tuple(p for one in self._entry["parts"] for p in _parts(common | one, rng))
 
 
 @cache
@@ -81,11 +88,8 @@ def find_wand_object(name: str) -> WandObject:
 
 
 def _read(name: str, entry: dict[str, Any]) -> WandObject:
-    common = {k: v for k, v in entry.items() if k not in ("number", "mass", "descriptions", "parts")}
-    rng = np.random.default_rng(entry["number"])
-    parts = [part for one in entry["parts"] for part in _parts(common | one, rng)]
     mass, descriptions = entry["mass"] * 1e-3, tuple(entry["descriptions"])
-    return WandObject(name, entry["number"], mass, descriptions, tuple(parts))
+    return WandObject(name, entry["number"], mass, descriptions, entry)
 
 
 def _parts(entry: dict[str, Any], rng: np.random.Generator) -> list[Part]:
@@ -95,7 +99,8 @@ def _parts(entry: dict[str, Any], rng: np.random.Generator) -> list[Part]:
         step = np.array(row["step"]) * 1e-3
         return [replace(part, position=part.position + i * step) for i in range(row["count"])]
     if ring := entry.get("ring"):
-        turns = Rotation.from_euler("z", np.arange(ring["count"]) * 2 * np.pi / ring["count"])
+        angles = np.arange(ring["count"]) * 2 * np.pi / ring["count"]
+        turns = Rotation.from_rotvec(angles[:, None] * [0, 0, 1])
         outwards = np.array([ring["radius"] * 1e-3, 0, 0])
         return [
             replace(part, position=part.position + turn @ outwards, rotation=turn @ part.rotation)
@@ -108,22 +113,25 @@ def _parts(entry: dict[str, Any], rng: np.random.Generator) -> list[Part]:
 
 def _in_pile(part: Part, spread: Float[np.ndarray, "3"], rng: np.random.Generator) -> Part:
     """Scatter a part over a heap: highest in the middle, turned at random."""
-    x, y = rng.uniform(-1, 1, 2)
-    top = 2 * spread[2] * (1 - 0.7 * np.hypot(x, y))
-    place = np.array([x * spread[0], y * spread[1], max(rng.uniform(0.3, 1) * top, 1e-3)])
+    away, angle = np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
+    x, y = away * np.cos(angle), away * np.sin(angle)
     rotation = Rotation.random(random_state=rng).as_matrix()
+    lowest = -part.size[0] if part.coarse is None else float((part.coarse[0] @ rotation[2]).min())
+    height = rng.uniform(0.55, 1) * 2 * spread[2] * (1 - away**2)
+    place = np.array([x * spread[0], y * spread[1], max(height, -lowest)])
     return replace(part, position=part.position + place, rotation=rotation)
 
 
 def _part(entry: dict[str, Any]) -> Part:
     shape, size = entry["shape"], tuple(1e-3 * s for s in entry.get("size", ()))
-    mesh = None
+    mesh = coarse = None
     if shape == "ellipsoid":
-        mesh = ellipsoid(size)
+        mesh, coarse = ellipsoid(size), ellipsoid(size, COARSE)
     elif shape == "lathe":
-        mesh = lathe(np.array(entry["profile"]) * 1e-3)
+        profile = np.array(entry["profile"]) * 1e-3
+        mesh, coarse = lathe(profile), lathe(profile, COARSE)
     elif shape == "prism":
-        mesh = prism(entry["sides"], *size)
+        mesh = coarse = prism(entry["sides"], *size)
     elif shape not in _PRIMITIVES:
         raise ValueError(f"unknown shape {shape!r}")
     material = Material(
@@ -143,4 +151,5 @@ def _part(entry: dict[str, Any]) -> Part:
         look=entry.get("look", "plain"),
         second_rgb=tuple(entry.get("rgb2", entry["rgb"])),
         mesh=mesh,
+        coarse=coarse,
     )

@@ -18,7 +18,11 @@ from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_s
 from touchgoal.benchmarks.papers.mmwand.splits import split_touches
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 
-PUBLISHED = {"VGG": (94.94, 79.48, 96.66), "ResNet": (96.28, 79.48, 97.70), "ViT": (95.51, 76.90, 97.99)}
+PUBLISHED = {
+    "VGG": (94.94, 79.48, 96.66),
+    "ResNet": (96.28, 79.48, 97.70),
+    "ViT": (95.51, 76.90, 97.99),
+}
 """MMWand's Table II, %: fine-tuned on image, touch, both."""
 PUBLISHED_PROBE = 3.24, 46.94, 47.22
 """Its linear probe on the aligned embeddings."""
@@ -63,19 +67,24 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def _judge(
-    data: EmbeddedSet, embedding: Float[np.ndarray, "n d"], split: Literal["sample", "press"], seeds: int
+    data: EmbeddedSet,
+    embedding: Float[np.ndarray, "n d"],
+    split: Literal["sample", "press"],
+    seeds: int,
 ) -> dict[str, list[float]]:
     hits: dict[str, list[np.ndarray]] = {"probe": [], "nearest": []}
     objects = []
     for seed in range(seeds):
         fold = split_touches(split, data.label, data.visit, data.describes, seed)
         x, y = torch.from_numpy(embedding).float(), torch.from_numpy(data.label)
-        train, test = (x[rows], y[rows]) for rows in (fold.train, fold.test)
+        train, test = ((x[rows], y[rows]) for rows in (fold.train, fold.test))
         hits["probe"].append((probe(*train)(test[0]).argmax(1) == test[1]).numpy())
         unit = F.normalize(train[0], dim=1), F.normalize(test[0], dim=1)
         hits["nearest"].append((train[1][(unit[1] @ unit[0].T).argmax(1)] == test[1]).numpy())
         objects.append(data.label[fold.test])
-    return {what: _with_interval(np.concatenate(objects), np.concatenate(h)) for what, h in hits.items()}
+    return {
+        what: _with_interval(np.concatenate(objects), np.concatenate(h)) for what, h in hits.items()
+    }
 
 
 def probe(x: Float[Tensor, "n d"], y: Int[Tensor, " n"]):
@@ -84,7 +93,9 @@ def probe(x: Float[Tensor, "n d"], y: Int[Tensor, " n"]):
     x = (x - mean) / scale
     order = torch.randperm(len(x), generator=torch.Generator().manual_seed(0))
     out, kept = order[: len(x) // 5], order[len(x) // 5 :]
-    right = [(_logistic(x[kept], y[kept], d)(x[out]).argmax(1) == y[out]).float().mean() for d in _DECAYS]
+    right = [
+        (_logistic(x[kept], y[kept], d)(x[out]).argmax(1) == y[out]).float().mean() for d in _DECAYS
+    ]
     predict = _logistic(x, y, _DECAYS[int(torch.stack(right).argmax())])
     return lambda new: predict((new - mean) / scale)
 
@@ -134,5 +145,7 @@ def _table(rows: list[dict[str, Any]], kinds: int) -> str:
         lines.append(f"{row['split']:<8}{row['input']:<42}{cells[0]:>20}{cells[1]:>22}")
     lines += ["", "published (MMWand, Table II, split by sample): image / touch / both"]
     lines += [f"  {name} fine-tuned: {' / '.join(map(str, v))}" for name, v in PUBLISHED.items()]
-    lines.append(f"  linear probe on the aligned embeddings: {' / '.join(map(str, PUBLISHED_PROBE))}")
+    lines.append(
+        f"  linear probe on the aligned embeddings: {' / '.join(map(str, PUBLISHED_PROBE))}"
+    )
     return "\n".join(lines)

@@ -60,14 +60,18 @@ def embed_set(root: Path, encoders: tuple[str, ...], seed: int, cache: Path) -> 
     """
     episodes = EpisodeSet(root)
     if not len(episodes) or ft.WAND_VIEWS[0] not in episodes.features:
-        raise UserError(f"{root} holds no touches with views: record with collect-touches --body wand")
+        raise UserError(
+            f"{root} holds no touches with views: record with collect-touches --body wand"
+        )
     meta = [episodes.meta(i) for i in range(len(episodes))]
     names = tuple(sorted({str(m["object"]) for m in meta}))
     of = {str(m["object"]): list(m["descriptions"]) for m in meta}  # pyright: ignore[reportArgumentType]
     sentences = tuple(sorted({s for name in names for s in of[name]}))
     towers = load_towers("offline")
     touch = {
-        name: _kept(cache, episodes, f"touch {name} {seed}", lambda n=name: _touches(episodes, n, seed))
+        name: _kept(
+            cache, episodes, f"touch {name} {seed}", lambda n=name: _touches(episodes, n, seed)
+        )
         for name in encoders
     }
     return EmbeddedSet(

@@ -62,10 +62,28 @@ def run(config: Config) -> dict[str, Any]:
     rows = []
     for split in config.splits:
         for name, with_text in [(n, t) for n in config.encoders for t in (True, False)]:
-            precisions = [_one(data, name, with_text, split, s, config) for s in range(config.seeds)]
-            rows.append({"split": split, "encoder": name, "touch_text": with_text, **_summary(precisions)})
-        rows.append({"split": split, "encoder": "raw pixels", "touch_text": None, **_pixel_row(data, split, config)})
-        rows.append({"split": split, "encoder": "chance", "touch_text": None, **_chance_row(data, split, config)})
+            precisions = [
+                _one(data, name, with_text, split, s, config) for s in range(config.seeds)
+            ]
+            rows.append(
+                {"split": split, "encoder": name, "touch_text": with_text, **_summary(precisions)}
+            )
+        rows.append(
+            {
+                "split": split,
+                "encoder": "raw pixels",
+                "touch_text": None,
+                **_pixel_row(data, split, config),
+            }
+        )
+        rows.append(
+            {
+                "split": split,
+                "encoder": "chance",
+                "touch_text": None,
+                **_chance_row(data, split, config),
+            }
+        )
     pool = _pools(data, config)
     return {"table": _table(rows, pool), "rows": rows, "pools": pool}
 
@@ -83,7 +101,9 @@ def _one(
         texts=torch.from_numpy(data.texts[fold.train_text]),
         describes=torch.from_numpy(data.describes[:, fold.train_text]),
     )
-    options = config.heads if with_text else HeadsConfig(**{**vars(config.heads), "text_weight": 0.0})
+    options = (
+        config.heads if with_text else HeadsConfig(**{**vars(config.heads), "text_weight": 0.0})
+    )
     heads = fit_heads(paired, options, seed)
     return _precisions(data, fold, touch, heads)
 
@@ -122,10 +142,15 @@ def judge(
         similarity = embedded[first] @ embedded[second].T
         if pair == "touch image":
             similarity = np.where(own, -np.inf, similarity)
-        for one, other, s, r in ((first, second, similarity, relevant), (second, first, similarity.T, relevant.T)):
+        for one, other, s, r in (
+            (first, second, similarity, relevant),
+            (second, first, similarity.T, relevant.T),
+        ):
             asked = r.any(1)
             precision = average_precisions(s[asked], r[asked])
-            found[f"{one} to {other}"] = list(zip(of_object[one][asked].tolist(), precision.tolist(), strict=True))
+            found[f"{one} to {other}"] = list(
+                zip(of_object[one][asked].tolist(), precision.tolist(), strict=True)
+            )
     return found
 
 
@@ -139,9 +164,27 @@ def _pixel_row(data: EmbeddedSet, split: Split, config: Config) -> dict[str, Any
         image = data.image.mean(1)
         image = image / np.linalg.norm(image, axis=1, keepdims=True)
         texts = data.texts / np.linalg.norm(data.texts, axis=1, keepdims=True)
-        of_nearest = np.stack([texts[data.describes[k] & fold.train_text].mean(0) for k in data.label[nearest]])
-        by_image = judge(data, fold, {"touch": image[nearest], "image": image[fold.test], "text": np.zeros((fold.test_text.sum(), image.shape[1]))})
-        by_text = judge(data, fold, {"touch": of_nearest, "image": np.zeros((len(fold.test), texts.shape[1])), "text": texts[fold.test_text]})
+        of_nearest = np.stack(
+            [texts[data.describes[k] & fold.train_text].mean(0) for k in data.label[nearest]]
+        )
+        by_image = judge(
+            data,
+            fold,
+            {
+                "touch": image[nearest],
+                "image": image[fold.test],
+                "text": np.zeros((fold.test_text.sum(), image.shape[1])),
+            },
+        )
+        by_text = judge(
+            data,
+            fold,
+            {
+                "touch": of_nearest,
+                "image": np.zeros((len(fold.test), texts.shape[1])),
+                "text": texts[fold.test_text],
+            },
+        )
         found.append(
             {d: by_image[d] for d in ("touch to image", "image to touch")}
             | {d: by_text[d] for d in ("touch to text", "text to touch")}
@@ -154,7 +197,13 @@ def _chance_row(data: EmbeddedSet, split: Split, config: Config) -> dict[str, An
     for seed in range(config.seeds):
         fold = split_touches(split, data.label, data.visit, data.describes, seed)
         n, m = len(fold.test), int(fold.test_text.sum())
-        found.append(judge(data, fold, {"touch": np.zeros((n, 1)), "image": np.zeros((n, 1)), "text": np.zeros((m, 1))}))
+        found.append(
+            judge(
+                data,
+                fold,
+                {"touch": np.zeros((n, 1)), "image": np.zeros((n, 1)), "text": np.zeros((m, 1))},
+            )
+        )
     return _summary(found)
 
 
@@ -178,12 +227,20 @@ def _pools(data: EmbeddedSet, config: Config) -> dict[str, dict[str, int]]:
     for split in config.splits:
         fold = split_touches(split, data.label, data.visit, data.describes, 0)
         kinds = len(np.unique(data.label[fold.test]))
-        pools[split] = {"train": len(fold.train), "test": len(fold.test), "sentences": int(fold.test_text.sum()), "objects": kinds}
+        pools[split] = {
+            "train": len(fold.train),
+            "test": len(fold.test),
+            "sentences": int(fold.test_text.sum()),
+            "objects": kinds,
+        }
     return pools
 
 
 def _table(rows: list[dict[str, Any]], pools: dict[str, dict[str, int]]) -> str:
-    lines = ["mAP in %, mean over seeds [95 % over objects]; published: MMWand, Table IV, split by sample", ""]
+    lines = [
+        "mAP in %, mean over seeds [95 % over objects]; published: MMWand, Table IV, split by sample",
+        "",
+    ]
     for split, pool in pools.items():
         lines.append(
             f"split by {split}: {pool['train']} touches to train on; {pool['test']} touches and pictures of "
@@ -195,7 +252,10 @@ def _table(rows: list[dict[str, Any]], pools: dict[str, dict[str, int]]) -> str:
                 lines.append(f"{what:<40}" + "".join(f"{v[i]:>22.2f}" for v in PUBLISHED.values()))
         for row in (r for r in rows if r["split"] == split):
             name = row["encoder"] + (", without touch-text" if row["touch_text"] is False else "")
-            cells = [f"{'%.1f [%.1f, %.1f]' % tuple(row[d]):>22}" if d in row else f"{'':>22}" for d in PUBLISHED]
+            cells = [
+                f"{'{:.1f} [{:.1f}, {:.1f}]'.format(*row[d]):>22}" if d in row else f"{'':>22}"
+                for d in PUBLISHED
+            ]
             lines.append(f"{name:<40}" + "".join(cells))
         lines.append("")
     return "\n".join(lines)

@@ -1,0 +1,117 @@
+"""Green screen: cut what stands before it out, and put another background behind (MMWand, Figure 3).
+
+The screen is told by its chromaticity, the share of each colour in a pixel, which shading and
+shadows hardly change. Its own chromaticity is found in the picture, so light of another tint needs
+no setting.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.picture_file import read_picture
+
+Picture = UInt8[np.ndarray, "h w 3"]
+Alpha = Float32[np.ndarray, "h w"]
+
+_NEAR, _FAR = 0.035, 0.09  # distance from the screen's chromaticity: surely screen, surely not
+_DARK = 12  # counts of all colours together below which a pixel has no chromaticity to speak of
+_GREEN = 0.45  # least share of green in a screen
+_SMALLEST = 6  # px: specks below this area are noise
+_PICTURES = (".png", ".jpg", ".jpeg")
+
+
+def screen_chromaticity(picture: Picture) -> Float32[np.ndarray, "2"]:
+    """Return the screen's shares of red and green: the commonest among the green pixels.
+
+    Raises:
+        UserError: hardly anything in the picture is green.
+    """
+    shares, bright = _chromaticity(picture)
+    green = bright & (shares[..., 1] > _GREEN)
+    if green.mean() < 0.05:
+        raise UserError("no green screen: less than 5 % of the picture is green")
+    bins = np.round(shares[green] * 100).astype(int)
+    _, index, count = np.unique(bins, axis=0, return_inverse=True, return_counts=True)
+    return np.median(shares[green][index.ravel() == count.argmax()], axis=0).astype(np.float32)
+
+
+def foreground(picture: Picture) -> Alpha:
+    """Return how much of each pixel stands before the screen, 0 to 1.
+
+    Raises:
+        UserError: there is no green screen.
+    """
+    shares, bright = _chromaticity(picture)
+    away = np.linalg.norm(shares - screen_chromaticity(picture), axis=2)
+    alpha = np.clip((away - _NEAR) / (_FAR - _NEAR), 0, 1)
+    alpha[~bright] = 1  # black is no screen: a screen in shadow is still green
+    return _without_specks(alpha.astype(np.float32))
+
+
+def replace_background(picture: Picture, background: Picture) -> Picture:
+    """Return the picture before another background of any size."""
+    h, w = picture.shape[:2]
+    alpha = foreground(picture)[..., None]
+    behind = cv2.resize(background, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32)
+    mixed = alpha * _without_spill(picture, alpha[..., 0]) + (1 - alpha) * behind
+    return np.clip(mixed + 0.5, 0, 255).astype(np.uint8)
+
+
+def read_backgrounds(folder: Path) -> list[Picture]:
+    """Read all pictures of a folder; UserError if it has none."""
+    paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in _PICTURES)
+    if not paths:
+        raise UserError(f"no pictures in {folder}: give a folder of {', '.join(_PICTURES)}")
+    pictures = [(path, read_picture(path)) for path in paths]
+    if bad := [path.name for path, picture in pictures if picture is None]:
+        raise UserError(f"{folder}: {', '.join(bad)} cannot be read as a picture")
+    return [picture for _, picture in pictures if picture is not None]
+
+
+def random_background(rng: np.random.Generator, size: tuple[int, int] = (224, 224)) -> Picture:
+    """Draw a background: coloured clouds of several sizes, and a few edges as of furniture."""
+    h, w = size
+    picture = np.full((h, w, 3), rng.uniform(30, 220, 3), np.float32)
+    for cells in (2, 5, 12, 30):
+        clouds = rng.normal(0, 90 / np.sqrt(cells), (cells, cells, 3)).astype(np.float32)
+        picture += cv2.resize(clouds, (w, h), interpolation=cv2.INTER_CUBIC)
+    for _ in range(int(rng.integers(0, 6))):
+        corners = rng.uniform(-0.2, 1.2, (4, 2)) * (w, h)
+        hull = cv2.convexHull(corners.astype(np.int32))
+        shade = np.array(picture)
+        cv2.fillConvexPoly(shade, hull, rng.uniform(20, 235, 3).tolist(), cv2.LINE_AA)
+        picture = cv2.addWeighted(picture, 0.4, shade, 0.6, 0)
+    return np.clip(picture, 0, 255).astype(np.uint8)
+
+
+def _chromaticity(picture: Picture) -> tuple[Float32[np.ndarray, "h w 2"], Bool[np.ndarray, "h w"]]:
+    """Return the shares of red and green, and where they can be trusted."""
+    total = picture.astype(np.float32).sum(2)
+    return picture[..., :2] / np.maximum(total, 1)[..., None], total > _DARK
+
+
+def _without_specks(alpha: Alpha) -> Alpha:
+    """Give specks of a few pixels to what surrounds them."""
+    for solid, fill in ((alpha > 0.5, 0.0), (alpha <= 0.5, 1.0)):
+        _, parts, stats, _ = cv2.connectedComponentsWithStats(
+            solid.astype(np.uint8), connectivity=8
+        )
+        small = stats[:, cv2.CC_STAT_AREA] < _SMALLEST
+        small[0] = False
+        alpha = np.where(small[parts], np.float32(fill), alpha)
+    return alpha
+
+
+def _without_spill(picture: Picture, alpha: Alpha) -> Float32[np.ndarray, "h w 3"]:
+    """Take the screen's green out of mixed pixels; solid ones keep their own green."""
+    out = picture.astype(np.float32)
+    edge = cv2.dilate((alpha < 1).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    limit = (out[..., 0] + out[..., 2]) / 2
+    out[..., 1] = np.where(
+        edge, np.minimum(out[..., 1], np.maximum(limit, out[..., 1] * 0.3)), out[..., 1]
+    )
+    return out

@@ -1,0 +1,168 @@
+"""The MMWand twin: its catalogue, its touches, their recording, and the green screen."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from touchgoal.control import features as ft
+from touchgoal.encoders.alignment.green_screen import (
+    foreground,
+    random_background,
+    replace_background,
+)
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.episodes.wand_recording import TOUCHES_A_VISIT, record_touches
+from touchgoal.runtime.errors import UserError
+from touchgoal.sim_envs.scene.build import OBJECT_GROUP
+from touchgoal.sim_envs.touch_wand import MAX_FORCE, Touch, TouchWand
+from touchgoal.sim_envs.wand.bench import GREEN, VIEWS, Bench
+from touchgoal.sim_envs.wand.objects import find_wand_object, wand_objects
+
+SEEN = ("apple", "cucumber", "wine_glass", "rice")  # one of them as green as the screen
+
+
+def touch_once(env: TouchWand, seed: int = 0, force: float | None = None) -> Touch:
+    env.reset(seed=seed)
+    while True:
+        env.move_object()
+        action = env.random_action()
+        if force is not None:
+            action[5] = 2 * force / MAX_FORCE - 1
+        if (touch := env.touch(action)) is not None:
+            return touch
+
+
+def test_the_catalogue_is_the_papers() -> None:
+    objects = wand_objects()
+    assert [o.number for o in objects.values()] == list(range(1, 103))
+    sentences = [s for o in objects.values() for s in o.descriptions]
+    assert len(set(sentences)) == len(sentences)
+    assert all(3 <= len(o.descriptions) <= 5 and o.mass > 0 for o in objects.values())
+    with pytest.raises(UserError, match="unknown object 'pear'; choose from: apple, "):
+        find_wand_object("pear")
+
+
+def test_every_object_stands_on_the_bench() -> None:
+    for item in wand_objects().values():
+        bench = Bench(item, (16, 16))
+        geoms = [g for g in range(bench.model.ngeom) if bench.model.geom_group[g] == OBJECT_GROUP]
+        assert 1 < len(geoms) <= 61 and bench.radius < 0.2, item.name
+        lowest = min(
+            _lowest(bench.model, bench.data, g)
+            for g in geoms
+            if bench.model.geom(g).name != "bench"
+        )
+        assert -0.004 < lowest < 0.002, item.name
+
+
+def test_gymnasium_contract() -> None:
+    env = gym.make("touchgoal/TouchWand-v0", views=False)
+    check_env(env.unwrapped, skip_render_check=True)
+    env.reset(seed=0, options={"object": "key"})
+    assert env.unwrapped.object.name == "key"  # pyright: ignore[reportAttributeAccessIssue]
+    env.close()
+
+
+def test_a_touch_is_the_same_for_a_seed_and_carries_its_force() -> None:
+    env = TouchWand(object="pineapple", views=False)
+    one, again, other = (touch_once(env, seed, 12.0) for seed in (3, 3, 4))
+    env.close()
+    np.testing.assert_array_equal(one.clip, again.clip)
+    assert (one.clip != other.clip).any()
+    np.testing.assert_allclose(one.wrench[:, 2], -one.load, atol=1e-3)  # Newton's third law
+    assert one.load[0] == 0 and one.load[-1] == pytest.approx(12.0)
+
+
+def test_the_gel_shows_what_is_touched() -> None:
+    """More force, more change; what is soft gives way: a sponge marks the gel less than a screw."""
+    change = {}
+    for name in ("sponge", "screw"):
+        for force in (2.0, 18.0):
+            env = TouchWand(object=name, views=False)
+            clips = [touch_once(env, seed, force).clip.astype(float) for seed in range(6)]
+            env.close()
+            change[name, force] = np.median([np.abs(c[-1] - c[0]).max() for c in clips])
+    assert change["screw", 18.0] > change["screw", 2.0]
+    assert change["screw", 18.0] > 2 * change["sponge", 18.0]
+
+
+def test_recording_resumes_to_the_same_set(tmp_path: Path) -> None:
+    count = TOUCHES_A_VISIT + 2
+    record_touches(tmp_path / "part", "gelsight_mini", 5, 3, 1)
+    resumed = record_touches(tmp_path / "part", "gelsight_mini", 5, count, 2)
+    whole = record_touches(tmp_path / "whole", "gelsight_mini", 5, count, 2)
+    assert len(resumed) == len(whole) == count and resumed.checksum == whole.checksum
+    assert {whole.meta(i)["object"] for i in range(count)} == {"apple", "clementine"}
+    touch = whole.read(0, [*ft.WAND_VIEWS, ft.TACTILE_LEFT, ft.LOAD]).frames
+    top = touch[ft.WAND_VIEWS[0]]
+    assert (top[0] == top[1]).all() and (top[1] != top[2]).any()  # the wand arrives once
+    assert touch[ft.LOAD][0] == 0 < touch[ft.LOAD][-1] <= MAX_FORCE
+    with pytest.raises(UserError, match="holds other touches"):
+        record_touches(tmp_path / "whole", "gelsight_mini", 6, count, 1)
+
+
+@pytest.mark.slow
+def test_a_killed_recording_goes_on(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "touchgoal.launch", "collect-touches", "--episodes", "20"]
+    command += ["--workers", "1", "--out", str(tmp_path / "run")]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    info = tmp_path / "run" / "episodes" / "meta" / "info.json"
+    while not info.exists():
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    subprocess.run(command, check=True, capture_output=True)
+    assert len(EpisodeSet(tmp_path / "run" / "episodes")) == 20
+
+
+@pytest.mark.parametrize("name", SEEN)
+def test_the_green_screen_is_cut_out(name: str) -> None:
+    """Against MuJoCo's own segmentation; a green object stays whole, shadows go."""
+    env = TouchWand(object=name)
+    touch = touch_once(env, 3)
+    model = env.bench.model
+    green = np.array([_is_screen(model, g) for g in range(model.ngeom)] + [True])
+    for view in VIEWS:
+        solid = ~green[env.segment(view)]
+        found = foreground(touch.views[view]) > 0.5
+        assert (solid & found).sum() / (solid | found).sum() >= 0.98, view
+    behind = random_background(np.random.default_rng(0))
+    free = foreground(touch.views["top"]) == 0
+    mixed = replace_background(touch.views["top"], behind)
+    np.testing.assert_array_equal(mixed[free], behind[free])
+    env.close()
+    with pytest.raises(UserError, match="no green screen"):
+        foreground(np.full((64, 64, 3), 200, np.uint8))
+
+
+def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+    """Return the lowest point of a geom, m."""
+    mesh = int(model.geom_dataid[geom])
+    down = data.geom_xmat[geom].reshape(3, 3)[2]
+    if mesh >= 0:
+        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        reach = (model.mesh_vert[first : first + count] @ down).min()
+    else:
+        reach = -model.geom_rbound[geom]
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+            reach = -np.abs(down) @ model.geom_size[geom]
+        elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER:
+            radius, half = model.geom_size[geom][:2]
+            reach = -abs(down[2]) * half - np.hypot(down[0], down[1]) * radius
+        elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE:
+            radius, half = model.geom_size[geom][:2]
+            reach = -abs(down[2]) * half - radius
+    return float(data.geom_xpos[geom][2] + reach)
+
+
+def _is_screen(model: mujoco.MjModel, geom: int) -> bool:
+    same = np.abs(model.geom_rgba[geom][:3] - GREEN).max() < 1e-3
+    return bool(same and model.geom_matid[geom] < 0)
