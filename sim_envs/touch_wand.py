@@ -5,7 +5,7 @@ bench (MMWand, section III). The wand is held by hand in life; here its pose and
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -74,7 +74,7 @@ class Touch:
     normal: Float[np.ndarray, "3"]
 
 
-class TouchWand(gym.Env[Observation, np.ndarray]):
+class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
     """One object on a bench, touched once a step.
 
     ## Action space
@@ -106,7 +106,7 @@ class TouchWand(gym.Env[Observation, np.ndarray]):
     Truncated after 50 touches by the registered time limit.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 1}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012
 
     def __init__(
         self, config: TouchWandConfig | None = None, render_mode: str | None = None, **options: Any

@@ -102,7 +102,7 @@ def _without_specks(alpha: Alpha) -> Alpha:
         )
         small = stats[:, cv2.CC_STAT_AREA] < _SMALLEST
         small[0] = False
-        alpha = np.where(small[parts], np.float32(fill), alpha)
+        alpha = np.where(np.isin(parts, np.flatnonzero(small)), np.float32(fill), alpha)
     return alpha
 
 

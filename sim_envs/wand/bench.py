@@ -114,8 +114,8 @@ def _set_visuals(spec: mujoco.MjSpec, size: tuple[int, int]) -> None:
     visual.map.znear, visual.map.zfar = 0.02, 10.0
     visual.global_.offheight, visual.global_.offwidth = size
     visual.quality.shadowsize, visual.quality.offsamples, visual.quality.numslices = _SHADOW, 0, 40
-    visual.headlight.ambient, visual.headlight.diffuse = [0.25] * 3, [0.25] * 3
-    visual.headlight.specular = [0.0] * 3
+    visual.headlight.ambient = visual.headlight.diffuse = np.full(3, 0.25, np.float32)
+    visual.headlight.specular = np.zeros(3, np.float32)
     world = spec.worldbody
     world.add_light(
         name="key", pos=[0.4, -0.5, 0.85], dir=[-0.4, 0.5, -0.9], diffuse=[0.5] * 3, castshadow=True
@@ -170,7 +170,7 @@ def _add_part(spec: mujoco.MjSpec, holder: mujoco.MjsBody, name: str, part: Part
     """Add a part twice: as the gel feels it, and coarser as cameras see it."""
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, part.rotation.ravel())
-    item = holder.add_body(name=name, pos=part.position, quat=quat)
+    item = holder.add_body(name=name, pos=part.position.tolist(), quat=quat.tolist())
     for group, mesh in ((OBJECT_GROUP, part.mesh), (VISUAL_GROUP, part.coarse)):
         shape: dict = (
             {"size": [*part.size, 0, 0][:3]} if mesh is None else {"meshname": _mesh(spec, mesh)}

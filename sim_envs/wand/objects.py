@@ -115,7 +115,7 @@ def _in_pile(part: Part, spread: Float[np.ndarray, "3"], rng: np.random.Generato
     """Scatter a part over a heap: highest in the middle, turned at random."""
     away, angle = np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
     x, y = away * np.cos(angle), away * np.sin(angle)
-    rotation = Rotation.random(random_state=rng).as_matrix()
+    rotation = Rotation.random(rng=rng).as_matrix()
     lowest = -part.size[0] if part.coarse is None else float((part.coarse[0] @ rotation[2]).min())
     height = rng.uniform(0.55, 1) * 2 * spread[2] * (1 - away**2)
     place = np.array([x * spread[0], y * spread[1], max(height, -lowest)])

@@ -54,7 +54,7 @@ def split_touches(
     if split == "object":
         out = _some(rng, np.unique(label))
         test = np.isin(label, out)
-        held = describes[out].any(0)
+        held = describes[out].sum(0) > 0
         return Fold(np.flatnonzero(~test), np.flatnonzero(test), ~held, held)
     if split == "press":
         test = np.isin(visit, _some(rng, np.unique(visit)))
