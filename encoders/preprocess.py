@@ -100,15 +100,18 @@ PREPROCESSORS = {
 }
 
 
-def preprocessor_for(sensor: str) -> TactilePreprocessor:
-    """Return the preprocessor of a sensor; UserError for an unknown one."""
+_FACTORS = {1: 1.0, 3: 2.0, 4: 1.6}  # version -> height and width of the output against version 1's
+
+
+def preprocessor_for(sensor: str, version: int = 1) -> TactilePreprocessor:
+    """Return a preprocessor of a sensor; UserError for an unknown one.
+
+    Version 1 gives 120 x 160 px of a sensor of 4:3, version 3 240 x 320, version 4 192 x 256.
+    """
     if sensor not in PREPROCESSORS:
         raise UserError(f"unknown sensor '{sensor}': choose from {', '.join(PREPROCESSORS)}")
-    return PREPROCESSORS[sensor]
-
-
-def fine_preprocessor_for(sensor: str) -> TactilePreprocessor:
-    """Return version 3, twice as high and wide; UserError for an unknown sensor."""
-    plain = preprocessor_for(sensor)
-    h, w = plain.size
-    return replace(plain, version=3, size=(2 * h, 2 * w))
+    if version not in _FACTORS:
+        raise UserError(f"this version of touchgoal has no preprocessor {sensor}/v{version}")
+    plain = PREPROCESSORS[sensor]
+    h, w = (round(_FACTORS[version] * side) for side in plain.size)
+    return replace(plain, version=version, size=(h, w))

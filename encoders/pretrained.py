@@ -10,7 +10,7 @@ from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncode
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
 from touchgoal.encoders.backbones.touch_backbone import TouchBackbone, TouchBackboneConfig
 from touchgoal.encoders.backbones.vit import ViTConfig
-from touchgoal.encoders.preprocess import fine_preprocessor_for, preprocessor_for
+from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.published import find_published, load_published
 from touchgoal.encoders.training.weights import WeightsFormat
 from touchgoal.runtime.errors import UserError
@@ -146,8 +146,8 @@ def _check_sensor(
         )
     if config.sensor is None:  # Sparsh's, with the preprocessor in the config
         return
-    whitened = isinstance(config, PooledEncoderConfig)
-    current = (fine_preprocessor_for if whitened else preprocessor_for)(config.sensor).id
+    version = config.preprocessor_version if isinstance(config, PooledEncoderConfig) else 1
+    current = preprocessor_for(config.sensor, version).id
     if config.preprocessor != current:
         raise UserError(
             f"the encoder in {directory} needs the preprocessor {config.preprocessor}, this version has "

@@ -23,7 +23,7 @@ from touchgoal.control.tactile.light_gain import (
 from touchgoal.control.tactile.picture_guard import explain
 from touchgoal.control.tactile.sensor_calibration import load
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI, SensorModel, find_sensor
-from touchgoal.encoders.preprocess import fine_preprocessor_for, preprocessor_for
+from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.policies.checkpoint import SHIPPED_POLICIES, SavedPolicy
 from touchgoal.policies.perception.end_to_end import difference_images
 from touchgoal.runtime.errors import UserError
@@ -116,7 +116,7 @@ READERS: dict[str, Callable[[Frame, Frame], np.ndarray]] = {
     "ball": find_circle,
     "force": lambda frame, rest: change_statistics(frame, rest.astype(np.float32)),
     "encoders": lambda frame, rest: preprocessor_for("gelsight_mini")(frame[None], rest),
-    "whitened encoders": lambda frame, rest: fine_preprocessor_for("gelsight_mini")(
+    "whitened encoders": lambda frame, rest: preprocessor_for("gelsight_mini", 3)(
         frame[None], rest
     ),
     "end to end": lambda frame, rest: (

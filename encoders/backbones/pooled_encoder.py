@@ -13,15 +13,17 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
-from touchgoal.encoders.preprocess import fine_preprocessor_for
+from touchgoal.encoders.preprocess import preprocessor_for
 from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_normalised
 from touchgoal.encoders.whitening.text_head import TextHead
 
-# Blocks after which the image is pooled, and channels there: edges, textures, parts. The last stages
-# are specific to ImageNet's classes and separate touches less well.
+# Blocks after which the image is pooled, and channels there: edges, textures, parts. Later blocks are
+# specific to ImageNet's classes and separate touches less well.
 STAGES = ((4, 40), (7, 80), (10, 112), (14, 192))
-FEATURES = 2 * sum(channels for _, channels in STAGES)
+# Up to block 10, at stride 16, on 192 x 256 px: half the time of block 14 on 240 x 320, and real objects
+# are told apart as well.
+_LAST_BLOCK, _PREPROCESSOR_VERSION = 10, 4
 _CONTRAST = 4.0  # counts of the network's input per count of change
 # Strength of contact in a cell of a twelfth of the image's height: root mean square change of 2 x 2 px
 # means, counts. On PhysiCLeAR's training videos 95 % of untouched frames have 1.0 to 2.8, also in a tenth
@@ -37,13 +39,23 @@ class PooledEncoderConfig:
     features: int  # width of an embedding
     sensor: str  # name of the fingertip sensor
     preprocessor: str  # `TactilePreprocessor.id` at training
-    towers: str | None = None  # `Towers.name`, whose sentences it embeds; None without
+    # `Towers.name` of the towers whose sentences and images it embeds; None without them
+    towers: str | None = None
     text_dim: int = 0  # width of their text embeddings
+    image_dim: int = 0  # width of their image embeddings; 0 without images
+    last_block: int = STAGES[-1][0]  # of the network
 
     @classmethod
     def for_sensor(cls, sensor: str) -> "PooledEncoderConfig":
         """Return the config for a sensor; UserError for an unknown one."""
-        return cls(FEATURES, sensor, fine_preprocessor_for(sensor).id)
+        features = 2 * sum(channels for block, channels in STAGES if block <= _LAST_BLOCK)
+        preprocessor = preprocessor_for(sensor, _PREPROCESSOR_VERSION).id
+        return cls(features, sensor, preprocessor, last_block=_LAST_BLOCK)
+
+    @property
+    def preprocessor_version(self) -> int:
+        """Version of the preprocessor at training."""
+        return int(self.preprocessor.rpartition("/v")[2])
 
     @property
     def embedding_dim(self) -> int:
@@ -62,9 +74,11 @@ class PooledEncoder(BaseTouchEncoder):
     whitening: Float[Tensor, "d d"]
     text_mean: Float[Tensor, " t"]
     text_matrix: Float[Tensor, "t d"]
+    image_mean: Float[Tensor, " i"]
+    image_matrix: Float[Tensor, "i d"]
 
     def __init__(self, config: PooledEncoderConfig) -> None:
-        preprocess = fine_preprocessor_for(config.sensor)
+        preprocess = preprocessor_for(config.sensor, config.preprocessor_version)
         super().__init__(preprocess, config.features)
         self.config, self._scale = config, preprocess.scale
         self.register_buffer("mean", torch.zeros(config.features))
@@ -72,6 +86,9 @@ class PooledEncoder(BaseTouchEncoder):
         if config.towers is not None:
             self.register_buffer("text_mean", torch.zeros(config.text_dim))
             self.register_buffer("text_matrix", torch.zeros(config.text_dim, config.features))
+        if config.image_dim:
+            self.register_buffer("image_mean", torch.zeros(config.image_dim))
+            self.register_buffer("image_matrix", torch.zeros(config.image_dim, config.features))
         self._network = [load_efficientnet_lite0()]  # in a list: no part of the state
 
     @property
@@ -87,6 +104,10 @@ class PooledEncoder(BaseTouchEncoder):
     def project_text(self, embeddings: Float[Tensor, "n t"]) -> Float[Tensor, "n d"]:
         """See BaseTouchEncoder."""
         return TextHead(self.text_mean, self.text_matrix)(embeddings)
+
+    def project_image(self, embeddings: Float[Tensor, "n i"]) -> Float[Tensor, "n d"]:
+        """Map the image tower's embeddings to touch, as unit vectors; only with `image_dim`."""
+        return TextHead(self.image_mean, self.image_matrix)(embeddings)
 
     @property
     def covariance(self) -> Float[np.ndarray, "d d"]:
@@ -128,7 +149,7 @@ class PooledEncoder(BaseTouchEncoder):
         drawn = (128 + _CONTRAST * self._scale * touch).clamp(0, 255) / 255
         x = network.stem(imagenet_normalised(drawn).contiguous(memory_format=torch.channels_last))
         stages, pooled = [], {block for block, _ in STAGES}
-        for i in range(STAGES[-1][0] + 1):
+        for i in range(self.config.last_block + 1):
             x = network.blocks[i](x)
             if i in pooled:
                 stages.append(x)

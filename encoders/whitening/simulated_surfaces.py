@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float32, UInt8
 
 from touchgoal.control.tactile.sensor_models import SensorModel
-from touchgoal.encoders.backbones.pooled_encoder import FEATURES, PooledEncoder, PooledEncoderConfig
+from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
 from touchgoal.encoders.whitening.covariance import inverse_square_root
 from touchgoal.runtime.progress import track
 from touchgoal.sim_envs.tactile.optics import render_untouched
@@ -44,15 +44,15 @@ class WhiteningConfig:
 def train(sensor: SensorModel, name: str, config: WhiteningConfig) -> PooledEncoder:
     """Return an encoder for the sensor called `name`, fitted to simulated touch."""
     encoder = PooledEncoder(PooledEncoderConfig.for_sensor(name))
-    total, square = np.zeros(FEATURES), np.zeros((FEATURES, FEATURES))
-    within = np.zeros((FEATURES, FEATURES))
+    d = encoder.config.features
+    total, square, within = np.zeros(d), np.zeros((d, d)), np.zeros((d, d))
     count, step = config.surfaces * config.presses, max(1, _BATCH // config.presses)
     batches = _pooled(encoder, sensor, config, step)
     for rows in track(batches, "surfaces", "batch", -(-config.surfaces // step)):
         total += rows.sum((0, 1))
-        flat = rows.reshape(-1, FEATURES)
+        flat = rows.reshape(-1, d)
         square += flat.T @ flat
-        apart = (rows - rows.mean(1, keepdims=True)).reshape(-1, FEATURES)
+        apart = (rows - rows.mean(1, keepdims=True)).reshape(-1, d)
         within += apart.T @ apart
     mean = total / count
     spread = np.sqrt(np.diag(square) / count - mean**2) + 1e-4
@@ -77,7 +77,7 @@ def _pooled(
                 before, after = _visible_press(surface, unit, rng)
                 touches.append(encoder.preprocess(after[None], before)[0])
         rows = encoder.pool(torch.from_numpy(np.stack(touches))).numpy()
-        yield rows.reshape(-1, config.presses, FEATURES)
+        yield rows.reshape(-1, config.presses, rows.shape[1])
 
 
 def _unit(sensor: SensorModel, rng: np.random.Generator) -> SensorInstance:
