@@ -18,7 +18,7 @@ VIEWS = ("top", "side_left", "side_right", "wand")
 """Cameras: overhead, from both sides, and the point of view on the wand."""
 GREEN = (0.05, 0.62, 0.2)  # of the green screen
 _BENCH = "bench"
-_SHADOW = 1024
+_SHADOW = 512  # px; at 1024 a third of the time of a touch goes into shadows
 _LOOK = {
     "plain": mujoco.mjtBuiltin.mjBUILTIN_FLAT,
     "speckled": mujoco.mjtBuiltin.mjBUILTIN_FLAT,
