@@ -1,0 +1,69 @@
+"""Touches by the wand, read as training data: pictures, views, objects and sentences."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int, UInt8
+
+from touchgoal.control import features as ft
+from touchgoal.encoders.towers.towers import Towers
+from touchgoal.episodes.store import EpisodeSet
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.progress import track
+
+
+@dataclass(frozen=True, eq=False)
+class WandSet:
+    """n touches of k objects on which there are m sentences."""
+
+    episodes: EpisodeSet  # one touch each
+    names: tuple[str, ...]  # objects, sorted
+    label: Int[np.ndarray, " n"]  # object of each touch
+    visit: Int[np.ndarray, " n"]  # visit of each touch, see `wand_recording`
+    sentences: tuple[str, ...]  # sorted
+    describes: Bool[np.ndarray, "k m"]  # whether sentence j is on object i
+
+    @classmethod
+    def open(cls, root: Path) -> "WandSet":
+        """Open a set; UserError if it was not recorded by `collect-touches --body wand`."""
+        episodes = EpisodeSet(root)
+        if not len(episodes) or ft.WAND_VIEWS[0] not in episodes.features:
+            raise UserError(
+                f"{root} holds no touches with views: record with collect-touches --body wand"
+            )
+        meta = [episodes.meta(i) for i in range(len(episodes))]
+        of: dict[str, list[str]] = {}
+        for m in meta:
+            assert isinstance(m["descriptions"], list)
+            of[str(m["object"])] = m["descriptions"]
+        names, sentences = sorted(of), sorted({s for said in of.values() for s in said})
+        return cls(
+            episodes=episodes,
+            names=tuple(names),
+            label=np.array([names.index(str(m["object"])) for m in meta]),
+            visit=np.array([int(str(m["visit"])) for m in meta]),
+            sentences=tuple(sentences),
+            describes=np.array([[s in of[name] for s in sentences] for name in names]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+    def pictures(self, i: int) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
+        """Return the untouched and the firmest picture of a touch, RGB."""
+        last = self.episodes.lengths[i] - 1
+        untouched, touched = self.episodes.read(i, [ft.TACTILE_LEFT], [0, last]).frames[
+            ft.TACTILE_LEFT
+        ]
+        return untouched, touched
+
+    def embed_views(self, towers: Towers) -> Float32[np.ndarray, "n v i"]:
+        """Embed the views before contact, not normalised; long work."""
+        rows = []
+        for i in track(range(len(self)), "embedding views", "touch"):
+            frames = self.episodes.read(i, list(ft.WAND_VIEWS), [0]).frames
+            views = np.concatenate([frames[key] for key in ft.WAND_VIEWS])
+            rows.append(towers.embed_images(views))
+        return torch.stack(rows).numpy()
