@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import tyro
 from pydantic import Field
 
-from touchgoal.encoders.alignment.config import ALIGN_PRESETS, AlignConfig
+from touchgoal.encoders.alignment.config import ALIGN_PRESETS, AlignConfig, HeadsConfig
 from touchgoal.encoders.ssl import config as ssl
 from touchgoal.encoders.training.options import TrainerOptions, TrainingOptions
 from touchgoal.runtime.option_types import (
@@ -149,6 +149,29 @@ class Surfaces:
 
 
 @checked_dataclass
+class Words:
+    """Give an encoder of `surfaces` words and pictures: maps into its embeddings, which stay as they are."""
+
+    data: Path
+    """Touches of objects, recorded by `collect-touches --body wand`."""
+    encoder: str = "gelsight_mini_surfaces"
+    """Encoder to add to: a name, or its folder."""
+    towers: str = "offline"
+    """Frozen image and text towers: offline, or a CLIP as Hugging Face id or local folder."""
+    surfaces: Annotated[Count, RARE] = 2000
+    """Random surfaces that teach roughness and bumpiness beside the objects."""
+    backgrounds: str = "screen"
+    """What stands behind the objects in the views: screen (the green screen, as recorded), generated, or a
+    folder of pictures."""
+    heads: HeadsConfig = HeadsConfig()
+    """Training of the maps."""
+    seed: Seed = 0
+    """Random seed."""
+    out: Path | None = None
+    """Folder of the run; the encoder goes to its `encoder/`."""
+
+
+@checked_dataclass
 class Adapt:
     """Adapt an encoder of `surfaces` to videos of your own objects, several of each."""
 
@@ -173,17 +196,20 @@ Config = (
     | Annotated[IJepa, tyro.conf.subcommand("ijepa")]
     | Annotated[VJepa, tyro.conf.subcommand("vjepa")]
     | Annotated[Surfaces, tyro.conf.subcommand("surfaces")]
+    | Annotated[Words, tyro.conf.subcommand("words")]
     | Annotated[Adapt, tyro.conf.subcommand("adapt")]
 )
 
 
-def main(config: Align | Mae | Dino | IJepa | VJepa | Surfaces | Adapt) -> None:
+def main(config: Align | Mae | Dino | IJepa | VJepa | Surfaces | Words | Adapt) -> None:
     """Train one kind of encoder."""
     match config:
         case Align():
             _align(config)
         case Surfaces():
             _fit_to_surfaces(config)
+        case Words():
+            _add_words(config)
         case Adapt():
             _adapt(config)
         case _:
@@ -291,6 +317,45 @@ def _fit_to_surfaces(config: Surfaces) -> None:
         "(Apache-2.0), not stored here",
     }
     save(encoder, out / "encoder", {**source, **asdict(whitening), **provenance()})
+    print(f"encoder: {out / 'encoder'}")
+
+
+def _add_words(config: Words) -> None:
+    from touchgoal.control.tactile.sensor_models import find_sensor
+    from touchgoal.encoders.alignment.wand_set import WandSet
+    from touchgoal.encoders.alignment.words import add_words
+    from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
+    from touchgoal.encoders.pretrained import load_encoder, save
+    from touchgoal.encoders.towers.towers import load_towers
+    from touchgoal.runtime.errors import UserError
+    from touchgoal.runtime.provenance import provenance
+    from touchgoal.runtime.run_folder import open_run
+
+    data, encoder = WandSet.open(config.data), load_encoder(config.encoder)
+    if not isinstance(encoder, PooledEncoder):
+        raise UserError(
+            f"{config.encoder} was not trained by `train-encoder surfaces`: add words to one that was"
+        )
+    sensor, towers = find_sensor(encoder.config.sensor), load_towers(config.towers)
+    out = open_run(config.out, "train-encoder", config)
+    worded = add_words(
+        encoder,
+        data,
+        towers,
+        config.heads,
+        sensor,
+        config.surfaces,
+        config.backgrounds,
+        config.seed,
+    )
+    source = {"data": str(config.data), "touches": len(data), "objects": len(data.names)}
+    source |= {
+        "surfaces": config.surfaces,
+        "backgrounds": config.backgrounds,
+        "heads": asdict(config.heads),
+        "seed": config.seed,
+    }
+    save(worded, out / "encoder", {"words_added_to": config.encoder, **source, **provenance()})
     print(f"encoder: {out / 'encoder'}")
 
 

@@ -82,6 +82,24 @@ class AlignConfig:
     """Random changes of the touches."""
 
 
+@checked_dataclass
+class HeadsConfig:
+    """Training of the heads."""
+
+    epochs: Count = 40
+    """Passes over the touches."""
+    batch_size: Count = 256
+    """Touches in each step."""
+    lr: Positive = 2e-3
+    """Highest learning rate; it falls to 0 by a cosine."""
+    weight_decay: NotNegative = 0.02
+    """Decoupled weight decay."""
+    temperature: Positive = 0.1
+    """Temperature of the InfoNCE losses."""
+    text_weight: NotNegative = 1.0
+    """Weight of the touch-text loss: lambda in the MMWand paper; 0 leaves it out."""
+
+
 ALIGN_PRESETS: dict[str, AlignConfig] = {
     "default": AlignConfig(),  # 10,000 touches in about 15 minutes on two CPU cores
     # Section V of the MMWand paper. What it leaves open is plain here: a constant learning rate, no

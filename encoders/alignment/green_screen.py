@@ -5,6 +5,7 @@ shadows hardly change. Its own chromaticity is found in the picture, so light of
 no setting.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -86,6 +87,25 @@ def random_background(rng: np.random.Generator, size: tuple[int, int] = (224, 22
         cv2.fillConvexPoly(shade, hull, rng.uniform(20, 235, 3).tolist(), cv2.LINE_AA)
         picture = cv2.addWeighted(picture, 0.4, shade, 0.6, 0)
     return np.clip(picture, 0, 255).astype(np.uint8)
+
+
+def background_changer(backgrounds: str, seed: int) -> Callable[[Picture], Picture]:
+    """Return what puts a picture before random backgrounds.
+
+    Args:
+        backgrounds: "screen" leaves it as it is, "generated" draws them, or a folder of pictures.
+        seed: random seed.
+
+    Raises:
+        UserError: the folder has no pictures.
+    """
+    if backgrounds == "screen":
+        return lambda picture: picture
+    rng = np.random.default_rng(seed)
+    if backgrounds == "generated":
+        return lambda picture: replace_background(picture, random_background(rng))
+    pictures = read_backgrounds(Path(backgrounds))
+    return lambda picture: replace_background(picture, pictures[rng.integers(len(pictures))])
 
 
 def _chromaticity(picture: Picture) -> tuple[Float32[np.ndarray, "h w 2"], Bool[np.ndarray, "h w"]]:

@@ -12,45 +12,19 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.alignment.infonce import symmetric_info_nce
-from touchgoal.runtime.option_types import Count, NotNegative, Positive, checked_dataclass
-
-
-@checked_dataclass
-class HeadsConfig:
-    """Training of the heads."""
-
-    epochs: Count = 40
-    """Passes over the touches."""
-    batch_size: Count = 256
-    """Touches in each step."""
-    lr: Positive = 2e-3
-    """Highest learning rate; it falls to 0 by a cosine."""
-    weight_decay: NotNegative = 0.02
-    """Decoupled weight decay."""
-    temperature: Positive = 0.1
-    """Temperature of the InfoNCE losses."""
-    text_weight: NotNegative = 1.0
-    """Weight of the touch-text loss: lambda in the MMWand paper; 0 leaves it out."""
 
 
 @dataclass(frozen=True, eq=False)
 class Paired:
-    """n touches with v views each, and the m sentences on their k objects.
+    """n touches, v views of the first k of them, and m sentences on their o objects."""
 
-    Attributes:
-        touch: Unit touch embeddings.
-        label: Object of each touch.
-        image: Image tower's embeddings of each touch's views.
-        texts: Text tower's embeddings.
-        describes: Whether sentence j is on object i.
-    """
-
-    touch: Float[Tensor, "n d"]
-    label: Int[Tensor, " n"]
-    image: Float[Tensor, "n v i"]
-    texts: Float[Tensor, "m t"]
-    describes: Bool[Tensor, "k m"]
+    touch: Float[Tensor, "n d"]  # unit touch embeddings
+    label: Int[Tensor, " n"]  # object of each touch
+    image: Float[Tensor, "k v i"]  # image tower's embeddings
+    texts: Float[Tensor, "m t"]  # text tower's embeddings
+    describes: Bool[Tensor, "o m"]  # whether sentence j is on object i
 
 
 class Heads(nn.Module):
@@ -94,23 +68,28 @@ def fit_heads(data: Paired, config: HeadsConfig, seed: int) -> Heads:
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for _ in range(steps):
         rows = torch.randperm(n, generator=draw)[: config.batch_size]
-        view = torch.randint(data.image.shape[1], (len(rows),), generator=draw)
-        sentence = _draw_sentences(data, rows, draw)
-        touch = data.touch[rows]
-        image, text = heads.images(data.image[rows, view]), heads.texts(data.texts[sentence])
-        label = data.label[rows]
-        same = (label[:, None] == label) | (sentence[:, None] == sentence)
-        tau = config.temperature
-        loss = symmetric_info_nce(touch, image, tau, same) + symmetric_info_nce(
-            image, text, tau, same
-        )
-        if config.text_weight:
-            loss = loss + config.text_weight * symmetric_info_nce(touch, text, tau, same)
         optimizer.zero_grad()
-        loss.backward()
+        _loss(heads, data, rows, config, draw).backward()
         optimizer.step()
         schedule.step()
     return heads.eval()
+
+
+def _loss(
+    heads: Heads, data: Paired, rows: Int[Tensor, " b"], config: HeadsConfig, draw: torch.Generator
+) -> Float[Tensor, ""]:
+    """Return the loss of a batch; touches without views take part in touch and text alone."""
+    sentence, label, tau = _draw_sentences(data, rows, draw), data.label[rows], config.temperature
+    touch, text = data.touch[rows], heads.texts(data.texts[sentence])
+    same = (label[:, None] == label) | (sentence[:, None] == sentence)
+    seen = rows < len(data.image)
+    view = torch.randint(data.image.shape[1], (int(seen.sum()),), generator=draw)
+    image, both = heads.images(data.image[rows[seen], view]), same[seen][:, seen]
+    loss = symmetric_info_nce(touch[seen], image, tau, both)
+    loss = loss + symmetric_info_nce(image, text[seen], tau, both)
+    if config.text_weight:
+        loss = loss + config.text_weight * symmetric_info_nce(touch, text, tau, same)
+    return loss
 
 
 def _draw_sentences(

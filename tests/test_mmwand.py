@@ -1,0 +1,144 @@
+"""MMWand's tables: splits that hold out what they say, retrieval with a known answer, words for a frozen encoder."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet
+from touchgoal.benchmarks.papers.mmwand.retrieval import PUBLISHED, judge
+from touchgoal.benchmarks.papers.mmwand.splits import SPLITS, Fold, split_touches
+from touchgoal.encoders.alignment.config import HeadsConfig
+from touchgoal.encoders.alignment.heads import Paired, fit_heads
+from touchgoal.encoders.pretrained import load_encoder
+from touchgoal.encoders.whitening.surface_words import surface_ranks
+from touchgoal.episodes.wand_recording import record_touches
+from touchgoal.launch.__main__ import main
+from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
+
+OBJECTS, TOUCHES = 10, 200
+
+
+@pytest.fixture(scope="module")
+def wand(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("wand") / "episodes"
+    record_touches(root, "gelsight_mini", 0, 36, 1)
+    return root
+
+
+def made_up(seed: int = 0) -> EmbeddedSet:
+    """Each object has a direction of its own in every modality, beside noise."""
+    rng = np.random.default_rng(seed)
+    label, owner = np.arange(TOUCHES) % OBJECTS, np.repeat(np.arange(OBJECTS), 4)
+
+    def embeddings(of: np.ndarray, width: int) -> np.ndarray:
+        places = rng.normal(size=(OBJECTS, width))
+        return (places[of] + 0.3 * rng.normal(size=(len(of), width))).astype(np.float32)
+
+    return EmbeddedSet(
+        names=tuple("abcdefghij"),
+        label=label,
+        visit=np.arange(TOUCHES) // 5,
+        sentences=tuple(map(str, range(len(owner)))),
+        describes=owner == np.arange(OBJECTS)[:, None],
+        texts=embeddings(owner, 24),
+        image=embeddings(label, 32)[:, None],
+        touch={"touch": embeddings(label, 16)},
+        pixels=embeddings(label, 8),
+    )
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_a_split_holds_out_what_it_says(split) -> None:
+    data = made_up()
+    fold, again = (
+        split_touches(split, data.label, data.visit, data.describes, seed) for seed in (1, 1)
+    )
+    assert not set(fold.train) & set(fold.test) and (fold.test == again.test).all()
+    assert 0.1 < len(fold.test) / TOUCHES < 0.3
+    if split == "object":
+        assert not set(data.label[fold.train]) & set(data.label[fold.test])
+    if split == "press":
+        assert not set(data.visit[fold.train]) & set(data.visit[fold.test])
+    if split in ("object", "sentence"):
+        assert not (fold.train_text & fold.test_text).any()
+    if split == "sentence":
+        assert (data.describes[:, fold.test_text].sum(1) == 1).all()
+
+
+def test_retrieval_knows_the_right_answer_and_chance() -> None:
+    data = made_up()
+    every = Fold(np.arange(0), np.arange(TOUCHES), np.ones(40, bool), np.ones(40, bool))
+    one_hot = np.eye(OBJECTS)
+    told = {"touch": one_hot[data.label], "image": one_hot[data.label]}
+    told["text"] = one_hot[data.describes.argmax(0)]
+    blind = {name: np.zeros_like(rows) for name, rows in told.items()}
+    assert judge(data, every, told).keys() == PUBLISHED.keys()
+    for found in judge(data, every, told).values():
+        assert np.mean([p for _, p in found]) == pytest.approx(1)
+    for direction, found in judge(data, every, blind).items():
+        assert 0.09 < np.mean([p for _, p in found]) < 0.16, direction
+
+
+def test_heads_bring_words_and_pictures_to_touch() -> None:
+    data = made_up()
+    touch = F.normalize(torch.from_numpy(data.touch["touch"]), dim=1)
+    paired = Paired(
+        touch=touch,
+        label=torch.from_numpy(data.label),
+        image=torch.from_numpy(data.image),
+        texts=torch.from_numpy(data.texts),
+        describes=torch.from_numpy(data.describes),
+    )
+    heads = fit_heads(paired, HeadsConfig(epochs=60, batch_size=100), 0)
+    again = fit_heads(paired, HeadsConfig(epochs=60, batch_size=100), 0)
+    assert torch.equal(heads.text.weight, again.text.weight)
+    texts = heads.texts(paired.texts).detach()
+    images = heads.images(paired.image[:, 0]).detach()
+    owner = paired.describes.long().argmax(0)
+    assert (owner[(touch @ texts.T).argmax(1)] == paired.label).float().mean() > 0.95
+    assert (paired.label[(touch @ images.T).argmax(1)] == paired.label).float().mean() > 0.95
+
+
+def test_a_surface_is_called_what_it_is() -> None:
+    x = np.linspace(0, 2 * np.pi, TILE, endpoint=False, dtype=np.float32)
+    fine, coarse = np.sin(64 * x), np.sin(6 * x)
+
+    def ranks(texture: np.ndarray) -> tuple[int, int]:
+        tile = np.broadcast_to(texture, (TILE, TILE)).astype(np.float32)
+        return surface_ranks(Surface("flat", 1.0, 1.0, tile, 1.0))
+
+    assert ranks(0 * fine) == (0, 0)
+    assert ranks(40e-6 * fine)[0] == 2 and ranks(40e-6 * fine)[1] == 0
+    assert ranks(200e-6 * coarse) == (0, 2)
+
+
+def test_words_are_added_to_an_encoder_that_stays_as_it_is(wand: Path, tmp_path: Path) -> None:
+    command = (
+        f"train-encoder words --data {wand} --out {tmp_path / 'run'} --surfaces 6 --heads.epochs 2"
+    )
+    command += " --backgrounds generated"
+    assert main(command.split()) in (0, None)
+    worded, plain = load_encoder(tmp_path / "run/encoder"), load_encoder("gelsight_mini_surfaces")
+    picture = np.random.default_rng(0).integers(0, 255, (2, 240, 320, 3), dtype=np.uint8)
+    np.testing.assert_allclose(worded.embed(picture), plain.embed(picture), atol=2e-3)
+    assert worded.towers == "offline"
+
+
+@pytest.mark.parametrize("name", ["retrieval", "classification"])
+def test_the_benchmarks_run(
+    name: str, wand: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = (
+        f"benchmark {name} --data {wand} --cache {wand.parent / 'cache'} --out {tmp_path / 'run'}"
+    )
+    command += " --encoders gelsight_mini --seeds 1"
+    command += " --heads.epochs 2" if name == "retrieval" else ""
+    assert main([*command.split(), "--splits", "sample", "press"]) in (0, None)
+    printed = capsys.readouterr().out
+    assert "published" in printed and "raw pixels" in printed and "gelsight_mini" in printed
+    rows = json.loads((tmp_path / "run/metrics.json").read_text())["rows"]
+    assert {row["split"] for row in rows} == {"sample", "press"}
