@@ -28,19 +28,6 @@ _CONTRAST = 4.0  # counts of input per count of change
 _BATCH = 32
 _RATES = {"efficientnet": 5e-4, "resnet": 1e-3, "vit": 1e-3}
 _DECAY = 0.05
-_SMALL_VIT = {
-    "hidden_size": 192,
-    "num_hidden_layers": 6,
-    "num_attention_heads": 3,
-    "intermediate_size": 768,
-}
-_SMALL_RESNET = {
-    "embedding_size": 32,
-    "hidden_sizes": [32, 64, 128, 256],
-    "depths": [2, 2, 2, 2],
-    "layer_type": "basic",
-}
-
 Pictures = UInt8[np.ndarray, "n h w 3"]
 
 
@@ -149,11 +136,21 @@ def _backbone(network: Network) -> tuple[nn.Module, Callable[[nn.Module, Tensor]
     except ImportError as error:
         raise UserError(f"ResNet and ViT need: {install_extra('towers')}") from error
     if network == "resnet":
-        model = ResNetModel(ResNetConfig(**_SMALL_RESNET))
-        return model, lambda m, x: m(x).pooler_output.flatten(1), 256
-    config = ViTConfig(image_size=list(SIZE), patch_size=16, **_SMALL_VIT)
-    return (
-        ViTModel(config, add_pooling_layer=False),
-        lambda m, x: m(x).last_hidden_state.mean(1),
-        192,
+        small = ResNetConfig(
+            embedding_size=32,
+            hidden_sizes=[32, 64, 128, 256],
+            depths=[2, 2, 2, 2],
+            layer_type="basic",
+        )
+        return ResNetModel(small), lambda m, x: m(x).pooler_output.flatten(1), 256
+    width = 192
+    tiny = ViTConfig(
+        image_size=list(SIZE),  # pyright: ignore[reportArgumentType]  # takes both sides
+        patch_size=16,
+        hidden_size=width,
+        num_hidden_layers=6,
+        num_attention_heads=3,
+        intermediate_size=4 * width,
     )
+    vit = ViTModel(tiny, add_pooling_layer=False)
+    return vit, lambda m, x: m(x).last_hidden_state.mean(1), width
