@@ -68,11 +68,13 @@ class WandSet:
 
     def embed_views(
         self, towers: Towers, change: Callable[[Picture], Picture] = lambda view: view
-    ) -> Float32[np.ndarray, "n v i"]:
-        """Embed the views before contact, each changed first, not normalised; long work."""
-        rows = []
-        for i in track(range(len(self)), "embedding views", "touch"):
-            frames = self.episodes.read(i, list(ft.WAND_VIEWS), [0]).frames
-            views = [change(frames[key][0]) for key in ft.WAND_VIEWS]
-            rows.append(towers.embed_images(np.stack(views)))
+    ) -> Float32[np.ndarray, "n 1 i"]:
+        """Embed the wand's own view before contact, which shows what is about to be touched.
+
+        Each view is changed first; embeddings are not normalised. Long work.
+        """
+        rows = [
+            towers.embed_images(change(self.view(i))[None])
+            for i in track(range(len(self)), "embedding views", "touch")
+        ]
         return torch.stack(rows).numpy()

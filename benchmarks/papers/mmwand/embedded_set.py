@@ -28,7 +28,7 @@ class EmbeddedSet:
     sentences: tuple[str, ...]
     describes: Bool[np.ndarray, "k m"]  # whether sentence j is on object i
     texts: Float32[np.ndarray, "m t"]  # text tower's embeddings
-    image: Float32[np.ndarray, "n v i"]  # image tower's embeddings of the views before contact
+    image: Float32[np.ndarray, "n v i"]  # image tower's embeddings of the v views
     touch: dict[str, Float32[np.ndarray, "n _"]]  # encoder -> touch embeddings
     pixels: Float32[np.ndarray, "n p"]  # change against the untouched gel, 40 x 30 px with its sign
 
@@ -57,7 +57,7 @@ def embed_set(root: Path, encoders: tuple[str, ...], seed: int, cache: Path) -> 
         sentences=data.sentences,
         describes=data.describes,
         texts=towers.embed_texts(list(data.sentences)).numpy(),
-        image=_kept(cache, data, f"views {towers.name}", lambda: data.embed_views(towers)),
+        image=_kept(cache, data, f"wand view {towers.name}", lambda: data.embed_views(towers)),
         touch=made,
         pixels=_kept(cache, data, f"pixels {_SMALL}", lambda: _pixels(data)),
     )
