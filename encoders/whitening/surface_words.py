@@ -5,13 +5,12 @@ little of how it looks on a real gel, and such words did harm (real hardness at 
 from .80 to .59).
 """
 
-import cv2
 import numpy as np
 
 from touchgoal.encoders.whitening.text_head import RANK_WORDS
-from touchgoal.sim_envs.tactile.rig.surfaces import TILE_PITCH, Surface
+from touchgoal.sim_envs.tactile.rig.surfaces import TILE, TILE_PITCH, Surface
 
-_FINE = 0.5e-3  # m: what is finer is roughness, what is coarser bumps
+_FINE = 1.5e-3  # m, wavelength: what is finer is roughness, what is coarser bumps
 # um, standard deviations of the fine and of the coarse part of a texture, between the three ranks: a gel
 # shows 3 um of fine relief faintly, and 12 um plainly.
 _ROUGH, _BUMPY = (3.0, 12.0), (10.0, 50.0)
@@ -32,8 +31,10 @@ def surface_sentences(surface: Surface) -> list[str]:
 
 def surface_ranks(surface: Surface) -> tuple[int, int]:
     """Return roughness and bumpiness of a surface, 0 to 2."""
-    coarse = cv2.GaussianBlur(surface.texture, (0, 0), _FINE / TILE_PITCH)
-    fine = 1e6 * float((surface.texture - coarse).std())
-    return int(np.searchsorted(_ROUGH, fine)), int(
-        np.searchsorted(_BUMPY, 1e6 * float(coarse.std()))
-    )
+    spectrum = np.fft.rfft2(surface.texture)  # a tile repeats, so the split is exact
+    along, across = np.fft.fftfreq(TILE, TILE_PITCH), np.fft.rfftfreq(TILE, TILE_PITCH)
+    is_fine = np.hypot(along[:, None], across) > 1 / _FINE
+    spectrum[0, 0] = 0  # height itself is neither
+    parts = (np.fft.irfft2(np.where(kept, spectrum, 0)) for kept in (is_fine, ~is_fine))
+    fine, coarse = (1e6 * float(part.std()) for part in parts)
+    return int(np.searchsorted(_ROUGH, fine)), int(np.searchsorted(_BUMPY, coarse))
