@@ -17,7 +17,8 @@ from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder, PooledEncoderConfig
 from touchgoal.encoders.whitening.covariance import inverse_square_root
 from touchgoal.runtime.progress import track
-from touchgoal.sim_envs.tactile.rig.surface_press import press, random_pose, untouched
+from touchgoal.sim_envs.tactile.optics import render_untouched
+from touchgoal.sim_envs.tactile.rig.surface_press import press, random_pose
 from touchgoal.sim_envs.tactile.rig.surfaces import Surface, random_surface
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 

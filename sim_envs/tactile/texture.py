@@ -142,11 +142,11 @@ def add_texture(
     scalars = -2 * material.amplitude, pitch
     below, step = (np.float32(a) for a in scalars)
     amplitude, frequency = np.float32(material.amplitude), np.float32(1 / material.wavelength)
-    pose = [np.asarray(a, np.float32) for a in (position, rotation)]
+    place, turn = (np.asarray(a, np.float32) for a in (position, rotation))
     if material.texture > Texture.WOVEN:
         cells = np.float32(WAVELENGTH / material.wavelength)
-        facing = int(np.abs(pose[1][2]).argmax())
+        facing = int(np.abs(turn[2]).argmax())
         tile = named_tile(material.texture.name.lower())
-        _add_tile(height, below, step, tile, amplitude, cells, *pose, facing)
+        _add_tile(height, below, step, tile, amplitude, cells, place, turn, facing)
         return
-    _add(height, below, step, int(material.texture), amplitude, frequency, *pose)
+    _add(height, below, step, int(material.texture), amplitude, frequency, place, turn)
