@@ -1,8 +1,7 @@
 """Recording of touches by the wand: the MMWand data set on the simulated bench.
 
 A visit puts one object on the bench and touches it several times, each time moved. A round visits
-every object once, with one gel on the wand; the next round has another. Each touch is an episode of
-six frames: the tactile clip at the sensor's rate, beside views that change once, at contact.
+every object once, with one gel on the wand; the next round has another. Each touch is an episode.
 """
 
 from collections.abc import Iterator
@@ -10,23 +9,23 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
 
 from touchgoal.control import features as ft
+from touchgoal.control.tactile.gel_wear import find_wear
+from touchgoal.control.tactile.sensor_models import find_sensor
 from touchgoal.episodes.format.encoding import EncodedEpisode, encode
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
+from touchgoal.episodes.wand_episode import FPS, SET, Visit, wand_episode
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
 from touchgoal.runtime.worker_pool import one_core_workers
-from touchgoal.sim_envs.touch_wand import CLIP, Touch, TouchWand, TouchWandConfig
-from touchgoal.sim_envs.wand.objects import WandObject, wand_objects
+from touchgoal.sim_envs.touch_wand import Touch, TouchWand, TouchWandConfig
+from touchgoal.sim_envs.wand.objects import wand_objects
 
-FPS = 25
-"""Pictures a second of a GelSight Mini."""
 TOUCHES_A_VISIT = 9
-_BEFORE = 2  # frames of a clip that show the views before contact
 _TRIES = 2000  # random approaches before an object counts as out of reach
-_SET = "wand"  # meta: sensor and seed of the set
 
 
 def record_touches(root: Path, sensor: str, seed: int, count: int, workers: int) -> EpisodeSet:
@@ -46,7 +45,7 @@ def record_touches(root: Path, sensor: str, seed: int, count: int, workers: int)
     writer = EpisodeWriter(root, fps=FPS)
     try:
         have = len(writer)
-        if have and (other := EpisodeSet(root).meta(0).get(_SET)) != config:
+        if have and (other := EpisodeSet(root).meta(0).get(SET)) != config:
             raise UserError(
                 f"{root} holds other touches ({other}), not {config}: give another folder"
             )
@@ -57,6 +56,8 @@ def record_touches(root: Path, sensor: str, seed: int, count: int, workers: int)
                 bar = track(_touches(made, visits, have, count), "touches", "touch", count - have)
                 for episode in bar:
                     writer.append(episode)
+                    if wear := episode.description.meta["gel_wear"]:
+                        print(f"touch {len(writer) - 1}: the gel looks {wear}: take a new one")
     finally:
         writer.close()
     return EpisodeSet(root)
@@ -72,18 +73,18 @@ def _touches(
                 yield episode
 
 
-def _visit(sensor: str, seed: int, visit: int) -> list[EncodedEpisode]:
+def _visit(sensor: str, seed: int, number: int) -> list[EncodedEpisode]:
     """Touch one object several times."""
     objects = list(wand_objects().values())
-    gel, which = divmod(visit, len(objects))
-    item = objects[which]
+    gel, which = divmod(number, len(objects))
+    item, origin = objects[which], f"{sensor}, seed {seed}"
+    visit = Visit(origin, sensor, item.name, item.descriptions, gel, number)
     env = TouchWand(TouchWandConfig(sensor=sensor, object=item.name, gel=seed + gel))
-    env.reset(seed=int(np.random.SeedSequence([seed, visit]).generate_state(1)[0]))
+    env.reset(seed=int(np.random.SeedSequence([seed, number]).generate_state(1)[0]))
+    camera = np.random.default_rng([seed, number, 1])
     try:
-        return [
-            encode(_episode(_random_touch(env), item, sensor, seed, gel, visit), FPS)
-            for _ in range(TOUCHES_A_VISIT)
-        ]
+        first = env.untouched(camera)
+        return [encode(_episode(env, visit, first, camera), FPS) for _ in range(TOUCHES_A_VISIT)]
     finally:
         env.close()
 
@@ -99,28 +100,13 @@ def _random_touch(env: TouchWand) -> Touch:
 
 
 def _episode(
-    touch: Touch, item: WandObject, sensor: str, seed: int, gel: int, visit: int
+    env: TouchWand, visit: Visit, first: UInt8[np.ndarray, "h w 3"], camera: np.random.Generator
 ) -> Episode:
-    contact = touch.load > 0
-    frames = {
-        key: np.stack([touch.before[name]] * _BEFORE + [touch.views[name]] * (CLIP - _BEFORE))
-        for key in ft.WAND_VIEWS
-        if (name := key.removeprefix(ft.IMAGE_PREFIX)) in touch.views
-    }
-    frames |= {
-        ft.TACTILE_LEFT: touch.clip,
-        ft.LOAD: touch.load[:, None],
-        ft.TRUTH_PAD_WRENCH: np.hstack([touch.wrench, np.zeros((CLIP, 6), np.float32)]),
-        ft.TRUTH_CONTACT: np.stack([contact, np.zeros(CLIP, bool)], axis=1),
-    }
-    meta = {
-        _SET: f"{sensor}, seed {seed}",
-        "sensor": sensor,
-        "object": item.name,
-        "descriptions": list(item.descriptions),
-        "gel": gel,
-        "visit": visit,
-        "force": float(touch.load[-1]),
-        "untouched_frames": 1,
-    }
-    return Episode(frames, f"touch the {item.name.replace('_', ' ')} with the wand", meta)
+    """Touch the object once, and look at the gel afterwards; `first` is its first picture."""
+    touch = _random_touch(env)
+    wear = find_wear(env.untouched(camera), first, find_sensor(visit.sensor))
+    episode = wand_episode(touch, visit, wear)
+    nothing = np.zeros(ft.WAND_CLIP, bool)
+    episode.frames[ft.TRUTH_PAD_WRENCH] = np.hstack([touch.wrench, np.zeros_like(touch.wrench)])
+    episode.frames[ft.TRUTH_CONTACT] = np.stack([touch.load > 0, nothing], axis=1)
+    return episode

@@ -1,4 +1,13 @@
-"""Record touches: the objects of MMWand under a simulated wand, or objects slid over a sensor."""
+"""Record touches: of a simulated wand (the MMWand data set), of a real one, or slides over a sensor.
+
+With --wand FILE a person presses a real wand on real objects. FILE names its devices: copy
+control/cell/examples/wand.toml. Hold the wand free and still until it says "press"; press slowly by hand,
+hold until it says "lift", and lift. It names the force that is still wanted. Every touch is on disk before
+the next begins; Ctrl-C ends, and the same line with --out continues. Once an object:
+
+    touchgoal collect-touches --wand wand.toml --object apple --out runs/wand
+    touchgoal collect-touches --wand wand.toml --object mug --description "smooth, hard and cold" --out runs/wand
+"""
 
 import os
 from pathlib import Path
@@ -21,7 +30,8 @@ class Config:
     MMWand data set). slide: one object slid and turned over the sensor for a second, 66 pictures at 60 Hz,
     to learn from without labels; Sparsh's 460,000 pictures are 7,000 of these."""
     episodes: Count | None = None
-    """Number of touches or slides; by default 5182 touches, as MMWand has, or 300 slides."""
+    """Number of touches or slides; by default 5182 touches, as MMWand has, or 300 slides. Of a real wand: of
+    this object; by default no end."""
     sensor: str | None = None
     """Fingertip sensor, by name or folder of a sensor file; by default gelsight_mini for the wand,
     gelsight_mini_markers for slides."""
@@ -29,19 +39,38 @@ class Config:
     """Random seed."""
     workers: Count = os.cpu_count() or 1
     """Number of simulating processes."""
+    wand: Path | None = None
+    """File that names the devices of a real wand, which then records in place of the simulated one."""
+    object: str | None = None
+    """Object that the real wand touches: one of MMWand's 102 (a wrong name lists them), or one of your own
+    with --description."""
+    description: tuple[str, ...] = ()
+    """How an object of your own feels; three to five sentences in different words are best."""
+    new_gel: bool = False
+    """Another gel is on the real wand than at the last touch in --out."""
 
 
 def main(config: Any) -> None:
     """Record the missing episodes."""
+    if config.wand is None:
+        _simulate(config)
+    else:
+        _record_real(config)
+
+
+def _simulate(config: Any) -> None:
     from touchgoal.control.tactile.sensor_models import find_sensor
     from touchgoal.episodes.bench_recording import record_bench
     from touchgoal.episodes.format.set_files import INFO
     from touchgoal.episodes.store import EpisodeSet
     from touchgoal.episodes.wand_recording import record_touches
+    from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.interruption import on_interruption
     from touchgoal.runtime.run_folder import open_run
     from touchgoal.sim_envs.config import RigConfig
 
+    if config.object or config.description or config.new_gel:
+        raise UserError("--object, --description and --new-gel are for a real wand: give --wand FILE")
     count = config.episodes or _DEFAULT[config.body][0]
     sensor = config.sensor or _DEFAULT[config.body][1]
     find_sensor(sensor)  # a wrong one is refused before anything is written
@@ -60,15 +89,51 @@ def main(config: Any) -> None:
         print("nothing left to record:", end=" ")
     print(f"{len(episodes)} episodes, {sum(episodes.lengths)} images in {root}")
     if config.body == "wand":
-        print(_table_row(episodes))
+        print(_table_row(episodes, "simulation"))
 
 
-def _table_row(episodes: Any) -> str:
-    """Return the set's row of MMWand's Table I."""
+def _record_real(config: Any) -> None:
+    """Record from a real wand until Ctrl-C, or the number of touches is reached."""
+    from touchgoal.control.cell.config_file import read_config
+    from touchgoal.control.cell.wand import WandConfig
+    from touchgoal.episodes.real_wand_recording import record_real_touches
+    from touchgoal.runtime.errors import UserError
+    from touchgoal.runtime.run_folder import open_run
+
+    if config.body != "wand" or config.sensor:
+        raise UserError("--wand FILE records touches, and the file names the sensor: leave out --body, --sensor")
+    wand = read_config(config.wand, WandConfig, "wand file")
+    name, descriptions = _described(config.object, config.description)
+    out = open_run(config.out, "collect-touches", config, adds=True)
+    root = out / "episodes"
+    episodes = record_real_touches(root, wand, name, descriptions, config.episodes, config.new_gel)
+    if episodes is None:
+        raise UserError("no touch was recorded")
+    print(f"{len(episodes)} touches in {root}; the same line with --out {out} continues")
+    print(_table_row(episodes, "human"))
+
+
+def _described(name: str | None, descriptions: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
+    """Return an object's name and sentences: the user's own, or the catalogue's."""
+    from touchgoal.runtime.errors import UserError
+    from touchgoal.sim_envs.wand.objects import find_wand_object
+
+    if not name:
+        raise UserError("--object is missing: name what the wand touches")
+    if descriptions:
+        return name, descriptions
+    try:
+        return name, find_wand_object(name).descriptions
+    except UserError as error:
+        raise UserError(f"--object: {error}; or say with --description how it feels") from error
+
+
+def _table_row(episodes: Any, source: str) -> str:
+    """Return the set's row of MMWand's Table I; `source` is who touched."""
     objects = {str(episodes.meta(i)["object"]) for i in range(len(episodes))}
     return (
         "\nData set (MMWand, Table I)     objects   touches   source      labels   views   language   other\n"
         "MMWand as published                102     5,182   human       yes      4       yes        vision, touch, force\n"
-        f"this set                    {len(objects):>10}{len(episodes):>10,}   simulation  yes      4       yes        "
+        f"this set                    {len(objects):>10}{len(episodes):>10,}   {source:<12}yes      4       yes        "
         "vision, touch, force"
     )

@@ -37,5 +37,24 @@ def terminable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+@contextmanager
+def stop_on_request() -> Iterator[Callable[[], bool]]:
+    """Take Ctrl-C and SIGTERM in the block as a request, and yield a function that says if it came.
+
+    Nothing is interrupted half done. Outside the main thread no request comes.
+    """
+    requests: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    numbers = signal.SIGINT, signal.SIGTERM
+    before = [signal.signal(number, lambda n, _: requests.append(n)) for number in numbers]
+    try:
+        yield lambda: bool(requests)
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
 def _terminate(number: int, frame: FrameType | None) -> None:
     raise Terminated

@@ -23,12 +23,7 @@ from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_in
 from touchgoal.sim_envs.wand.bench import VIEWS, Bench
 from touchgoal.sim_envs.wand.objects import WandObject, find_wand_object, wand_objects
 
-VIEW_SHAPE = (224, 224)
-CLIP = 6
-"""Tactile pictures of a touch: untouched, then at a rising force, last at the full one."""
-MAX_FORCE = 20.0  # N
-FORCE_RANGES = ((0.0, 5.0), (5.0, 10.0), (10.0, 20.0))
-"""N, the paper's three."""
+MAX_FORCE = ft.WAND_FORCES[-1][1]  # N
 _AWAY = 0.09  # m from the surface, before contact
 _LOWEST = np.radians(12)  # of the approach over the bench, rad
 _TILT = 0.2  # how far the wand leans from the surface's normal towards its approach
@@ -188,13 +183,19 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         before = self._render()
         bench.place_wand(tip, axes)
         force = (action[5] + 1) / 2 * MAX_FORCE
-        clip, load, wrench = self._press(point, force * np.linspace(0, 1, CLIP))
+        clip, load, wrench = self._press(point, force * np.linspace(0, 1, ft.WAND_CLIP))
         return Touch(before, self._render(), clip, load, wrench, point, normal)
+
+    def untouched(self, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the untouched gel's picture, with the camera's noise drawn from `rng`."""
+        assert self._pad is not None, "reset first"
+        free = PadContact(np.zeros(3), np.zeros(3), 0.0, frozenset())
+        return self._pad.sense(self.bench.data, free, rng).image
 
     def random_action(self) -> Float[np.ndarray, "6"]:
         """Draw a touch as the paper's operator: anywhere, with a force from one of three ranges."""
         rng = self.np_random
-        low, high = FORCE_RANGES[int(rng.integers(len(FORCE_RANGES)))]
+        low, high = ft.WAND_FORCES[int(rng.integers(len(ft.WAND_FORCES)))]
         action = rng.uniform(-1, 1, 6)
         action[5] = 2 * rng.uniform(low, high) / MAX_FORCE - 1
         return action
@@ -228,17 +229,17 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
             ft.LOAD: gym.spaces.Box(0, MAX_FORCE, (1,), np.float32),
         }
         if self.config.views:
-            view = gym.spaces.Box(0, 255, (*VIEW_SHAPE, 3), np.uint8)
+            view = gym.spaces.Box(0, 255, (*ft.WAND_VIEW_SHAPE, 3), np.uint8)
             spaces |= {ft.IMAGE_PREFIX + name: view for name in VIEWS}
         return spaces
 
     def _open(self, wand_object: WandObject) -> None:
         """Build another object's scene."""
         self.close()
-        bench = Bench(wand_object, VIEW_SHAPE)
+        bench = Bench(wand_object, ft.WAND_VIEW_SHAPE)
         self._pad = TactilePad(bench.model, "left", self._sensor, self._instance, bench.bodies)
         if self.config.views or self.render_mode:
-            self._renderer = open_renderer(bench.model, *VIEW_SHAPE)
+            self._renderer = open_renderer(bench.model, *ft.WAND_VIEW_SHAPE)
         self._bench, self._object = bench, wand_object
 
     def move_object(self) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from touchgoal.control.cell.cell_file import EXAMPLES, cell_table, find_cell_file, read_cell_file
+from touchgoal.control.cell.cell_file import CELLS, EXAMPLES, cell_table, find_cell_file, read_cell_file
 from touchgoal.control.cell.limits import cell_limits
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3
@@ -32,7 +32,7 @@ def write_cell_file(folder: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", CELLS.values(), ids=lambda p: p.stem)
 def test_example_cell_files_are_read(path: Path) -> None:
     maze = path.stem == "sim_maze"
     cell = read_cell_file(path)

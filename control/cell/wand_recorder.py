@@ -1,0 +1,210 @@
+"""Recording of touches that a person makes with a real wand, picked from what its devices show.
+
+Contact begins when load cell and gel agree, and ends when either says so. What the load cell reads
+in free air is taken off: the head's weight on it changes with the wand's tilt.
+"""
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from touchgoal.control import features as ft
+from touchgoal.control.arrays import Picture
+from touchgoal.control.cell.wand import Moment
+from touchgoal.control.tactile.background import Background, local_change
+from touchgoal.control.tactile.contact import ContactDetector, threshold_for
+from touchgoal.control.tactile.gel_wear import GelWear, find_wear
+from touchgoal.control.tactile.sensor_models import SensorModel
+
+_CONTACT = 0.3  # N over what the load cell reads in free air; an HX711's noise is 0.005
+_LEAST_FORCE = 0.5  # N of a touch
+_BEFORE = 25  # moments, 1 s of a Mini: so long before contact a hand is some centimetres away
+_SETTLING = 12  # moments without a change, after a touch or at the start
+_PART = 5  # first and last of them that are compared
+_SETTLED = 1.5  # counts of local change between their medians; a compressed stream is never still
+_HELD = 5  # moments near the largest force
+_NEAR = 0.1  # below the largest force, as a share, that counts as near
+_LONGEST = 250  # moments of a touch
+
+
+@dataclass(frozen=True, eq=False)
+class WandTouch:
+    """One touch of a real wand.
+
+    Attributes:
+        before, views: view -> RGB, a second before contact and at the largest force.
+        clip: the sensor's pictures, RGB; the first is untouched, the last at the largest force.
+        load: normal force at each picture, N.
+        wear: what the gel looks like after it; None if it has not changed.
+    """
+
+    before: dict[str, UInt8[np.ndarray, "H W 3"]]
+    views: dict[str, UInt8[np.ndarray, "H W 3"]]
+    clip: UInt8[np.ndarray, "t h w 3"]
+    load: Float32[np.ndarray, " t"]
+    wear: GelWear | None
+
+
+def force_range(force: float) -> int:
+    """Return which of the paper's three ranges a force (N) lies in."""
+    return int(np.searchsorted([high for _, high in ft.WAND_FORCES[:-1]], force))
+
+
+class WandRecorder:
+    """Recorder of one touch after another; `hint` says what to do now.
+
+    Attributes:
+        hint: for the person who presses.
+        force: in free air 0, N.
+        counts: touches in each of the paper's ranges of force.
+        wear: of the gel when it was last seen untouched.
+    """
+
+    def __init__(
+        self, sensor: SensorModel, first: Picture | None = None, counts: tuple[int, ...] = (0, 0, 0)
+    ) -> None:
+        """`first`: this gel's first untouched picture, None for a new one; `counts`: touches a range."""
+        self.hint, self.force = "leave the gel untouched", 0.0
+        self.counts = list(counts)
+        self.wear: GelWear | None = None
+        self._sensor, self._first = sensor, first
+        self._free: deque[Moment] = deque(maxlen=_BEFORE)  # untouched, since the last touch
+        self._detector: ContactDetector | None = None  # None until the gel has settled
+        self._air = 0.0  # what the load cell reads in free air, N
+        self._press: list[tuple[Picture, float]] = []
+        self._before: Moment | None = None
+        self._peak: Moment | None = None
+        self._made: WandTouch | None = None  # until the gel has been looked at
+
+    def update(self, moment: Moment) -> WandTouch | str | None:
+        """Process the next moment; return a touch when the gel has settled after it.
+
+        A text says why a touch does not count.
+        """
+        self.force = moment.force - self._air
+        if self._detector is None:
+            return self._settle(moment)
+        touching = self._detector.update(moment.picture)
+        if self._press:
+            return self._follow(moment, touching)
+        elif touching and self.force > _CONTACT:
+            self._before, self._peak = self._free[0], moment
+            self._press = [(moment.picture, self.force)]
+        elif touching:
+            self.hint = "press harder, or let go: the gel is touched, but the load cell reads nothing"
+        elif self.force > _CONTACT:
+            self.hint = "press with the gel: the load cell reads a force, but the gel shows nothing"
+            self._air += 0.02 * self.force  # or the wand was turned: its head's weight
+        else:
+            self._free.append(moment)
+            self._air = float(np.median([free.force for free in self._free]))
+            self.hint = self._wanted()
+        return None
+
+    def drop(self, hint: str) -> WandTouch | None:
+        """Give up the touch in hand, because of a lost device; return a finished one, if any."""
+        self.hint = hint
+        self._begin_to_settle()
+        return self._take()
+
+    def finish(self) -> WandTouch | None:
+        """End here; return the touch in hand as far as it has come, if it counts."""
+        if self._press:
+            self._end_press()
+        return self.drop("ended")
+
+    def _settle(self, moment: Moment) -> WandTouch | None:
+        self._free.append(moment)
+        recent = list(self._free)[-_SETTLING:]
+        if len(recent) < _SETTLING:
+            return None
+        pictures = np.stack([free.picture for free in recent])
+        parts = pictures[:_PART], pictures[-_PART:]
+        start, end = (np.median(part, 0).astype(np.uint8) for part in parts)
+        moved = float(local_change(end, start).max()) > _SETTLED
+        if moved or np.ptp([free.force for free in recent]) > _CONTACT:
+            self.hint = "leave the gel untouched and the wand still, until it has settled"
+            return None
+        middle = np.median(pictures, 0).astype(np.uint8)
+        self._first = middle if self._first is None else self._first
+        self.wear = find_wear(middle, self._first, self._sensor)
+        threshold = threshold_for(pictures, middle)
+        self._detector = ContactDetector(Background(middle[None]), threshold)
+        self._free = deque(recent, maxlen=_BEFORE)
+        self._air = float(np.median([free.force for free in recent]))
+        self.hint = self._wanted()
+        return self._take()
+
+    def _take(self) -> WandTouch | None:
+        """Return the finished touch, if any, with what the gel looks like now; and count it."""
+        made, self._made = self._made, None
+        if made is None:
+            return None
+        self.counts[force_range(float(made.load[-1]))] += 1
+        return replace(made, wear=self.wear)
+
+    def _follow(self, moment: Moment, touching: bool) -> str | None:
+        """Follow a touch from contact to the lift."""
+        if not touching or self.force < _CONTACT / 2:
+            return self._end_press()
+        largest = max(force for _, force in self._press)
+        if len(self._press) < _LONGEST:
+            self._press.append((moment.picture, self.force))
+            if self.force > largest:
+                self._peak, largest = moment, self.force
+        if largest > ft.WAND_FORCES[-1][1]:
+            self.hint = f"too hard, lift: {ft.WAND_FORCES[-1][1]:g} N at most"
+        else:
+            self.hint = "lift" if self._held() else "hold"
+        return None
+
+    def _held(self) -> bool:
+        forces = [force for _, force in self._press]
+        return sum(force > (1 - _NEAR) * max(forces) for force in forces) >= _HELD
+
+    def _end_press(self) -> str | None:
+        """Make a touch of what was pressed, or return why it does not count."""
+        assert self._before is not None and self._peak is not None
+        forces = np.array([force for _, force in self._press])
+        rise = int(forces.argmax()) + 1
+        wrong = None
+        if forces.max() > ft.WAND_FORCES[-1][1]:
+            wrong = "not recorded, too hard: press less"
+        elif forces.max() < _LEAST_FORCE:
+            wrong = "not recorded, too light: press harder"
+        elif rise < ft.WAND_CLIP - 1 or not self._held():
+            wrong = "not recorded, too quick: press slowly, and hold before you lift"
+        else:
+            chosen = evenly_loaded(forces[:rise], ft.WAND_CLIP - 1)
+            clip = [self._before.picture, *(self._press[i][0] for i in chosen)]
+            load = np.concatenate([[0.0], forces[chosen]]).astype(np.float32)
+            before, views = self._before.views, self._peak.views
+            self._made = WandTouch(before, views, np.stack(clip), load, None)
+        self.hint = "let the gel settle"
+        self._begin_to_settle()
+        return wrong
+
+    def _begin_to_settle(self) -> None:
+        self._press, self._detector, self._before, self._peak = [], None, None, None
+        self._free.clear()
+
+    def _wanted(self) -> str:
+        """Name the range of which there are fewest touches."""
+        low, high = ft.WAND_FORCES[int(np.argmin(self.counts))]
+        done = ", ".join(
+            f"{n} of {a:g}-{b:g} N" for n, (a, b) in zip(self.counts, ft.WAND_FORCES, strict=True)
+        )
+        return f"press with {low:g} to {high:g} N (recorded: {done})"
+
+
+def evenly_loaded(forces: Float[np.ndarray, " n"], count: int) -> list[int]:
+    """Choose `count` of at least as many moments, in order, whose forces rise evenly to the last."""
+    chosen: list[int] = []
+    for k in range(1, count):
+        first = chosen[-1] + 1 if chosen else 0
+        last = len(forces) - (count - k)  # leaves one each for those that follow
+        aim = forces[-1] * k / count
+        chosen.append(first + int(np.abs(forces[first:last] - aim).argmin()))
+    return [*chosen, len(forces) - 1]

@@ -1,0 +1,82 @@
+"""The episode of a wand's touch, simulated or real: six frames, the same keys and facts in both.
+
+The tactile clip is at the sensor's rate; the views beside it change once, at contact.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from touchgoal.control import features as ft
+from touchgoal.control.tactile.gel_wear import GelWear
+from touchgoal.episodes.schema import Episode
+
+FPS = 25
+"""Pictures a second of a GelSight Mini."""
+SET = "wand"
+"""Meta: where the touches of a set come from; sets of another origin are not continued."""
+_BEFORE = 2  # frames of a clip that show the views before contact
+
+
+@runtime_checkable
+class Touched(Protocol):
+    """A touch, simulated or real; see `touch_wand.Touch` and `wand_recorder.WandTouch`."""
+
+    @property
+    def before(self) -> dict[str, UInt8[np.ndarray, "H W 3"]]: ...
+
+    @property
+    def views(self) -> dict[str, UInt8[np.ndarray, "H W 3"]]: ...
+
+    @property
+    def clip(self) -> UInt8[np.ndarray, "t h w 3"]: ...
+
+    @property
+    def load(self) -> Float32[np.ndarray, " t"]: ...
+
+
+@dataclass(frozen=True)
+class Visit:
+    """One stay of an object on the bench.
+
+    Attributes:
+        origin: of the set, see `SET`.
+        sensor: on the wand.
+        object: its name.
+        descriptions: how the object feels, in words.
+        gel: which gel is on the wand.
+        number: of the visit in the set.
+    """
+
+    origin: str
+    sensor: str
+    object: str
+    descriptions: tuple[str, ...]
+    gel: int
+    number: int
+
+
+def wand_episode(touch: Touched, visit: Visit, wear: GelWear | None) -> Episode:
+    """Return a touch as an episode; `wear` is the gel's after it."""
+    frames = {
+        key: np.stack(
+            [touch.before[view]] * _BEFORE + [touch.views[view]] * (ft.WAND_CLIP - _BEFORE)
+        )
+        for key in ft.WAND_VIEWS
+        if (view := key.removeprefix(ft.IMAGE_PREFIX)) in touch.views
+    }
+    frames |= {ft.TACTILE_LEFT: touch.clip, ft.LOAD: touch.load[:, None]}
+    meta = {
+        SET: visit.origin,
+        "sensor": visit.sensor,
+        "object": visit.object,
+        "descriptions": list(visit.descriptions),
+        "gel": visit.gel,
+        "gel_wear": wear.kind if wear else "",
+        "visit": visit.number,
+        "force": float(touch.load[-1]),
+        "untouched_frames": 1,
+    }
+    return Episode(frames, f"touch the {visit.object.replace('_', ' ')} with the wand", meta)
