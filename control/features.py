@@ -45,11 +45,6 @@ N_JOINTS = 7  # of an FR3, which policies are made for; see `features_of` for ot
 CONTROL_HZ = 20
 TACTILE_SHAPE = (240, 320, 3)
 CAMERA_SHAPE = (128, 128, 3)
-WAND_VIEW_SHAPE = (224, 224)
-WAND_CLIP = 6
-"""Tactile pictures of a wand's touch: untouched, then at a rising force, last at the largest."""
-WAND_FORCES = ((0.0, 5.0), (5.0, 10.0), (10.0, 20.0))
-"""Ranges of a wand's largest force, N (MMWand)."""
 
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")

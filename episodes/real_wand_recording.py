@@ -9,10 +9,11 @@ from pathlib import Path
 from touchgoal.control import features as ft
 from touchgoal.control.arrays import Picture
 from touchgoal.control.cell.wand import Wand, WandConfig, connect_wand
-from touchgoal.control.cell.wand_recorder import WandRecorder, WandTouch, force_range
+from touchgoal.control.cell.wand_recorder import WandRecorder
 from touchgoal.control.interfaces import DriverError
 from touchgoal.control.tactile.picture_guard import check_untouched
 from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.control.wand_touch import FORCE_RANGES, WandTouch, force_range
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.episodes.wand_episode import FPS, SET, Visit, wand_episode
 from touchgoal.runtime.errors import UserError
@@ -98,7 +99,7 @@ class _Session:
     def _save(self, touch: WandTouch | None) -> None:
         if touch is None:
             return
-        self._writer.append(wand_episode(touch, self._visit, touch.wear))
+        self._writer.append(wand_episode(touch, self._visit, self._recorder.wear))
         self._line.say(f"recorded {sum(self._recorder.counts)}: {touch.load[-1]:.1f} N")
 
     def _warn(self) -> None:
@@ -159,7 +160,7 @@ def _continued(
 
 def _counts(episodes: EpisodeSet | None, name: str) -> tuple[int, ...]:
     """Return how many touches of an object a set has in each range of force."""
-    counts = [0] * len(ft.WAND_FORCES)
+    counts = [0] * len(FORCE_RANGES)
     for i in range(len(episodes) if episodes else 0):
         meta = episodes.meta(i)
         if meta["object"] == name:

@@ -4,13 +4,12 @@ The tactile clip is at the sensor's rate; the views beside it change once, at co
 """
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, UInt8
 
 from touchgoal.control import features as ft
 from touchgoal.control.tactile.gel_wear import GelWear
+from touchgoal.control.wand_touch import CLIP, WandTouch
 from touchgoal.episodes.schema import Episode
 
 FPS = 25
@@ -18,23 +17,6 @@ FPS = 25
 SET = "wand"
 """Meta: where the touches of a set come from; sets of another origin are not continued."""
 _BEFORE = 2  # frames of a clip that show the views before contact
-
-
-@runtime_checkable
-class Touched(Protocol):
-    """A touch, simulated or real; see `touch_wand.Touch` and `wand_recorder.WandTouch`."""
-
-    @property
-    def before(self) -> dict[str, UInt8[np.ndarray, "H W 3"]]: ...
-
-    @property
-    def views(self) -> dict[str, UInt8[np.ndarray, "H W 3"]]: ...
-
-    @property
-    def clip(self) -> UInt8[np.ndarray, "t h w 3"]: ...
-
-    @property
-    def load(self) -> Float32[np.ndarray, " t"]: ...
 
 
 @dataclass(frozen=True)
@@ -58,12 +40,10 @@ class Visit:
     number: int
 
 
-def wand_episode(touch: Touched, visit: Visit, wear: GelWear | None) -> Episode:
+def wand_episode(touch: WandTouch, visit: Visit, wear: GelWear | None) -> Episode:
     """Return a touch as an episode; `wear` is the gel's after it."""
     frames = {
-        key: np.stack(
-            [touch.before[view]] * _BEFORE + [touch.views[view]] * (ft.WAND_CLIP - _BEFORE)
-        )
+        key: np.stack([touch.before[view]] * _BEFORE + [touch.views[view]] * (CLIP - _BEFORE))
         for key in ft.WAND_VIEWS
         if (view := key.removeprefix(ft.IMAGE_PREFIX)) in touch.views
     }

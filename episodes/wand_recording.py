@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 from touchgoal.control import features as ft
 from touchgoal.control.tactile.gel_wear import find_wear
 from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.control.wand_touch import CLIP
 from touchgoal.episodes.format.encoding import EncodedEpisode, encode
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
@@ -106,7 +107,7 @@ def _episode(
     touch = _random_touch(env)
     wear = find_wear(env.untouched(camera), first, find_sensor(visit.sensor))
     episode = wand_episode(touch, visit, wear)
-    nothing = np.zeros(ft.WAND_CLIP, bool)
+    nothing = np.zeros(CLIP, bool)
     episode.frames[ft.TRUTH_PAD_WRENCH] = np.hstack([touch.wrench, np.zeros_like(touch.wrench)])
     episode.frames[ft.TRUTH_CONTACT] = np.stack([touch.load > 0, nothing], axis=1)
     return episode

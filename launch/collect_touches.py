@@ -70,7 +70,9 @@ def _simulate(config: Any) -> None:
     from touchgoal.sim_envs.config import RigConfig
 
     if config.object or config.description or config.new_gel:
-        raise UserError("--object, --description and --new-gel are for a real wand: give --wand FILE")
+        raise UserError(
+            "--object, --description and --new-gel are for a real wand: give --wand FILE"
+        )
     count = config.episodes or _DEFAULT[config.body][0]
     sensor = config.sensor or _DEFAULT[config.body][1]
     find_sensor(sensor)  # a wrong one is refused before anything is written
@@ -101,9 +103,11 @@ def _record_real(config: Any) -> None:
     from touchgoal.runtime.run_folder import open_run
 
     if config.body != "wand" or config.sensor:
-        raise UserError("--wand FILE records touches, and the file names the sensor: leave out --body, --sensor")
-    wand = read_config(config.wand, WandConfig, "wand file")
+        raise UserError(
+            "--wand FILE records touches, and the file names the sensor: leave out --body, --sensor"
+        )
     name, descriptions = _described(config.object, config.description)
+    wand = read_config(config.wand, WandConfig, "wand file")
     out = open_run(config.out, "collect-touches", config, adds=True)
     root = out / "episodes"
     episodes = record_real_touches(root, wand, name, descriptions, config.episodes, config.new_gel)

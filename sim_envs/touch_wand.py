@@ -14,6 +14,7 @@ from jaxtyping import Float, Float32, Int32, UInt8
 from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.control.wand_touch import CLIP, FORCE_RANGES, MAX_FORCE, VIEW_SHAPE, WandTouch
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Seed, checked_dataclass
 from touchgoal.sim_envs.scene.contacts import PadContact
@@ -23,7 +24,6 @@ from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_in
 from touchgoal.sim_envs.wand.bench import VIEWS, Bench
 from touchgoal.sim_envs.wand.objects import WandObject, find_wand_object, wand_objects
 
-MAX_FORCE = ft.WAND_FORCES[-1][1]  # N
 _AWAY = 0.09  # m from the surface, before contact
 _LOWEST = np.radians(12)  # of the approach over the bench, rad
 _TILT = 0.2  # how far the wand leans from the surface's normal towards its approach
@@ -49,21 +49,14 @@ class TouchWandConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Touch:
-    """One touch.
+class Touch(WandTouch):
+    """One simulated touch.
 
     Attributes:
-        before, views: view -> RGB, before contact and at contact.
-        clip: the sensor's pictures, RGB; the first is untouched.
-        load: normal force at each picture, N.
         wrench: force (N) and torque (Nm) of the object on the gel at each picture, sensor frame.
         point, normal: where the object is touched and its outward normal there, m, bench frame.
     """
 
-    before: dict[str, UInt8[np.ndarray, "H W 3"]]
-    views: dict[str, UInt8[np.ndarray, "H W 3"]]
-    clip: UInt8[np.ndarray, "t h w 3"]
-    load: Float32[np.ndarray, " t"]
     wrench: Float32[np.ndarray, "t 6"]
     point: Float[np.ndarray, "3"]
     normal: Float[np.ndarray, "3"]
@@ -183,7 +176,7 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         before = self._render()
         bench.place_wand(tip, axes)
         force = (action[5] + 1) / 2 * MAX_FORCE
-        clip, load, wrench = self._press(point, force * np.linspace(0, 1, ft.WAND_CLIP))
+        clip, load, wrench = self._press(point, force * np.linspace(0, 1, CLIP))
         return Touch(before, self._render(), clip, load, wrench, point, normal)
 
     def untouched(self, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
@@ -195,7 +188,7 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
     def random_action(self) -> Float[np.ndarray, "6"]:
         """Draw a touch as the paper's operator: anywhere, with a force from one of three ranges."""
         rng = self.np_random
-        low, high = ft.WAND_FORCES[int(rng.integers(len(ft.WAND_FORCES)))]
+        low, high = FORCE_RANGES[int(rng.integers(len(FORCE_RANGES)))]
         action = rng.uniform(-1, 1, 6)
         action[5] = 2 * rng.uniform(low, high) / MAX_FORCE - 1
         return action
@@ -229,17 +222,17 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
             ft.LOAD: gym.spaces.Box(0, MAX_FORCE, (1,), np.float32),
         }
         if self.config.views:
-            view = gym.spaces.Box(0, 255, (*ft.WAND_VIEW_SHAPE, 3), np.uint8)
+            view = gym.spaces.Box(0, 255, (*VIEW_SHAPE, 3), np.uint8)
             spaces |= {ft.IMAGE_PREFIX + name: view for name in VIEWS}
         return spaces
 
     def _open(self, wand_object: WandObject) -> None:
         """Build another object's scene."""
         self.close()
-        bench = Bench(wand_object, ft.WAND_VIEW_SHAPE)
+        bench = Bench(wand_object, VIEW_SHAPE)
         self._pad = TactilePad(bench.model, "left", self._sensor, self._instance, bench.bodies)
         if self.config.views or self.render_mode:
-            self._renderer = open_renderer(bench.model, *ft.WAND_VIEW_SHAPE)
+            self._renderer = open_renderer(bench.model, *VIEW_SHAPE)
         self._bench, self._object = bench, wand_object
 
     def move_object(self) -> None:

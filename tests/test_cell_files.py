@@ -7,7 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from touchgoal.control.cell.cell_file import CELLS, EXAMPLES, cell_table, find_cell_file, read_cell_file
+from touchgoal.control.cell.cell_file import (
+    CELLS,
+    EXAMPLES,
+    cell_table,
+    find_cell_file,
+    read_cell_file,
+)
 from touchgoal.control.cell.limits import cell_limits
 from touchgoal.control.safety.action_filter import ActionFilter
 from touchgoal.control.safety.limits import FR3

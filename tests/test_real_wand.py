@@ -15,18 +15,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from in_process import in_process_workers
 
 from touchgoal.benchmarks.papers.mmwand.embedded_set import touch_pictures
 from touchgoal.control import features as ft
 from touchgoal.control.cell.wand import Moment
-from touchgoal.control.cell.wand_recorder import WandRecorder, WandTouch, evenly_loaded
+from touchgoal.control.cell.wand_recorder import WandRecorder, evenly_loaded
 from touchgoal.control.sensors import latest_value
 from touchgoal.control.sensors.load_cell import with_checksum
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
+from touchgoal.control.wand_touch import FORCE_RANGES, MAX_FORCE, WandTouch
+from touchgoal.episodes import wand_recording
 from touchgoal.episodes.store import EpisodeSet
-from touchgoal.episodes.wand_recording import record_touches
 from touchgoal.launch.__main__ import main
-from touchgoal.sim_envs.touch_wand import MAX_FORCE, TouchWand
+from touchgoal.sim_envs.touch_wand import TouchWand
 from touchgoal.sim_envs.twin.mjpeg import Stream, StreamServer
 from touchgoal.sim_envs.twin.serial.devices import SerialPort
 from touchgoal.sim_envs.wand.objects import find_wand_object
@@ -65,13 +67,13 @@ class Screen(io.StringIO):
 class Person(threading.Thread):
     """A wand's devices, and the hand that holds it; `silent` stops the load cell."""
 
-    def __init__(self, folder: Path, ramp: np.ndarray, screen: Screen) -> None:
+    def __init__(self, folder: Path, ramp: np.ndarray) -> None:
         super().__init__(daemon=True)
         self.streams = {name: Stream() for name in ("gel", *VIEWS)}
         self.server = StreamServer(self.streams, "127.0.0.1", 0)
         self.port, self.silent = SerialPort(folder / "load_cell"), False
         self.gone, self.interrupt_after = False, ""
-        self._ramp, self._screen, self._rng = ramp, screen, np.random.default_rng(0)
+        self.ramp, self.screen, self._rng = ramp, Screen(), np.random.default_rng(0)
         self._force = self._goal = 0.0
         self.file = folder / "wand.toml"
         url = f"http://127.0.0.1:{self.server.port}"
@@ -86,9 +88,10 @@ class Person(threading.Thread):
         tick = 0
         while not self.gone:
             tick += 1
-            self._obey(self._screen.lines[-1] if self._screen.lines else "")
+            self._obey(self.screen.lines[-1] if self.screen.lines else "")
             force = max(self._force, 0.0)
-            picture = self._ramp[int(np.ceil(force / MAX_FORCE * 5))] + self._rng.normal(0, 1, (240, 320, 3))
+            pressed = self.ramp[int(np.ceil(force / MAX_FORCE * 5))]
+            picture = pressed + self._rng.normal(0, 1, pressed.shape)
             self.streams["gel"].publish(np.clip(picture, 0, 255).astype(np.uint8))
             light = 160 if force > 0 else 60
             for name in VIEWS:
@@ -107,7 +110,7 @@ class Person(threading.Thread):
         step = self._goal / 12 if self._goal else -4.0
         self._force = float(np.clip(self._force + step, 0, self._goal or self._force))
         self._force = self._force if self._goal or self._force > 0.5 else 0.0
-        if self.interrupt_after and any(self.interrupt_after in x for x in self._screen.lines):
+        if self.interrupt_after and any(self.interrupt_after in x for x in self.screen.lines):
             self.interrupt_after = ""
             os.kill(os.getpid(), signal.SIGINT)
 
@@ -119,31 +122,28 @@ class Person(threading.Thread):
 
 
 @pytest.fixture
-def person(
-    tmp_path: Path, ramp: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[tuple[Person, Screen]]:
-    screen = Screen()
-    monkeypatch.setattr(sys, "stdout", screen)
-    holder = Person(tmp_path, ramp, screen)
-    yield holder, screen
-    holder.leave()
+def person(tmp_path: Path, ramp: np.ndarray) -> Iterator[Person]:
+    someone = Person(tmp_path, ramp)
+    yield someone
+    someone.leave()
 
 
-def collect(holder: Person, out: Path, *options: str) -> None:
-    main(["collect-touches", "--wand", str(holder.file), "--out", str(out), *options])
+def collect(person: Person, out: Path, *options: str) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdout", person.screen)
+        main(["collect-touches", "--wand", str(person.file), "--out", str(out), *options])
 
 
 def test_three_touches_are_recorded_as_the_twins_and_ctrl_c_loses_nothing(
-    person: tuple[Person, Screen], tmp_path: Path
+    person: Person, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    holder, screen = person
     out = tmp_path / "run"
-    collect(holder, out, "--object", "screw", "--episodes", "3")
+    collect(person, out, "--object", "screw", "--episodes", "3")
     found = EpisodeSet(out / "episodes")
     meta = [found.meta(i) for i in range(3)]
     assert len(found) == 3
     forces = sorted(float(m["force"]) for m in meta)  # pyright: ignore[reportArgumentType]
-    assert all(low < f <= high for f, (low, high) in zip(forces, ft.WAND_FORCES, strict=True))
+    assert all(low < f <= high for f, (low, high) in zip(forces, FORCE_RANGES, strict=True))
     assert meta[0]["descriptions"] == list(find_wand_object("screw").descriptions)
     assert [m["gel_wear"] for m in meta] == ["", "", ""]
     frames = found.read(0).frames
@@ -152,18 +152,20 @@ def test_three_touches_are_recorded_as_the_twins_and_ctrl_c_loses_nothing(
     view = frames[ft.WAND_VIEWS[0]].mean((1, 2, 3))
     np.testing.assert_allclose(view, [60, 60, 160, 160, 160, 160], atol=3)
     untouched, touched = touch_pictures(found, 2)
-    assert np.abs(untouched.astype(float) - holder._ramp[0]).mean() < 2
+    assert np.abs(untouched.astype(float) - person.ramp[0]).mean() < 2
     assert np.abs(touched.astype(float) - untouched).max() > 20
 
-    twin = record_touches(tmp_path / "twin", "gelsight_mini", 0, 1, 1)
+    monkeypatch.setattr(wand_recording, "TOUCHES_A_VISIT", 1)
+    with in_process_workers():
+        twin = wand_recording.record_touches(tmp_path / "twin", "gelsight_mini", 0, 1, 1)
     assert set(twin.meta(0)) == set(meta[0]) and twin.fps == found.fps
     keys = {key for key in twin.features if not key.startswith("truth.")}
     assert keys == set(found.features)
     assert all(twin.features[key]["shape"] == found.features[key]["shape"] for key in keys)
 
-    screen.lines.clear()
-    holder.interrupt_after = "recorded 1:"
-    collect(holder, out, "--object", "mug", "--description", "smooth and hard", "--new-gel")
+    person.screen.lines.clear()
+    person.interrupt_after = "recorded 1:"
+    collect(person, out, "--object", "mug", "--description", "smooth and hard", "--new-gel")
     more = EpisodeSet(out / "episodes")
     assert len(more) in (4, 5)  # the touch in hand, too, if it was held
     last = more.meta(3)
@@ -171,40 +173,38 @@ def test_three_touches_are_recorded_as_the_twins_and_ctrl_c_loses_nothing(
     assert last["descriptions"] == ["smooth and hard"]
 
 
-def test_a_lost_camera_is_said_and_waited_for(person: tuple[Person, Screen], tmp_path: Path) -> None:
-    holder, screen = person
+def test_a_lost_camera_is_waited_for(person: Person, tmp_path: Path) -> None:
 
     def lose() -> None:
-        while not any(line.startswith("press with") for line in screen.lines):
+        while not any(line.startswith("press with") for line in person.screen.lines):
             time.sleep(0.01)
-        holder.streams["side_left"].lost = time.monotonic() + 1.5
+        person.streams["side_left"].lost = time.monotonic() + 1.5
 
     threading.Thread(target=lose, daemon=True).start()
-    collect(holder, tmp_path / "run", "--object", "screw", "--episodes", "1")
-    lost = [line for line in screen.lines if line.startswith("side_left: ")]
+    collect(person, tmp_path / "run", "--object", "screw", "--episodes", "1")
+    lost = [line for line in person.screen.lines if line.startswith("side_left: ")]
     assert lost and "check its cable" in lost[0]
     assert len(EpisodeSet(tmp_path / "run" / "episodes")) == 1
 
 
 def test_a_silent_load_cell_is_said(
-    person: tuple[Person, Screen], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    person: Person, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    holder, screen = person
     monkeypatch.setattr(latest_value, "_FIRST_TIMEOUT", 2.0)
-    holder.silent = True
+    person.silent = True
     with pytest.raises(SystemExit, match="load cell .* gives nothing: check cable, power"):
-        collect(holder, tmp_path / "run", "--object", "screw")
-    holder.silent = False
+        collect(person, tmp_path / "run", "--object", "screw")
+    person.silent = False
 
     def fall_silent() -> None:
-        while not any(line.startswith("press with") for line in screen.lines):
+        while not any(line.startswith("press with") for line in person.screen.lines):
             time.sleep(0.01)
-        holder.silent = True
-        holder.interrupt_after = "load cell: nothing new for"
+        person.silent = True
+        person.interrupt_after = "load cell: nothing new for"
 
     threading.Thread(target=fall_silent, daemon=True).start()
     with pytest.raises(SystemExit, match="no touch was recorded"):
-        collect(holder, tmp_path / "run", "--object", "screw")
+        collect(person, tmp_path / "run", "--object", "screw")
 
 
 @pytest.mark.parametrize(
@@ -235,14 +235,14 @@ class Hand:
         self._ramp, self._rng = ramp, np.random.default_rng(0)
 
     def feel(self, *forces: float, shown: float | None = None) -> list[WandTouch | str]:
-        """Return the touches, and the texts on what does not count; `shown`: force on the picture."""
+        """Return the touches, and why others do not count; `shown`: force that the picture shows."""
         made = []
         for force in forces:
-            seen = force if shown is None else shown
+            seen = min(force, MAX_FORCE) if shown is None else shown
             picture = self._ramp[int(np.ceil(seen / 4))] + self._rng.normal(0, 1, (240, 320, 3))
             picture[100:102, 60:160] += self.scratch
             view = {"top": np.full((2, 2, 3), int(force > 0), np.uint8)}
-            moment = Moment(np.clip(picture, 0, 255).astype(np.uint8), view, force + 0.4)
+            moment = Moment(np.clip(picture, 0, 255).astype(np.uint8), view, float(force) + 0.4)
             made.append(self.recorder.update(moment))
         return [one for one in made if one is not None]
 
@@ -250,26 +250,25 @@ class Hand:
 def test_a_gel_that_a_press_scratches_is_said(ramp: np.ndarray) -> None:
     hand, press = Hand(ramp), [2.0, 4, 6, 8, 10, 12, 12, 12, 12, 12]
     assert hand.feel(*[0.0] * 15) == []
-    (first,) = hand.feel(*press, *[0.0] * 15)
+    assert len(hand.feel(*press, *[0.0] * 15)) == 1 and hand.recorder.wear is None
     hand.scratch = -20
-    (second,) = hand.feel(*press, *[0.0] * 15)
-    assert isinstance(first, WandTouch) and isinstance(second, WandTouch)
-    assert first.wear is None and second.wear is not None
-    assert "the gel looks scratched" in str(second.wear) and "new gel" in str(second.wear)
+    (made,) = hand.feel(*press, *[0.0] * 15)
+    assert isinstance(made, WandTouch) and hand.recorder.wear is not None
+    assert "the gel looks scratched" in str(hand.recorder.wear)
+    assert "put on a new gel" in str(hand.recorder.wear)
     assert hand.recorder.counts == [0, 0, 2] and "press with 0 to 5 N" in hand.recorder.hint
-    (third,) = hand.feel(*press, *[0.0] * 15)  # a worn gel goes on, if the person does
-    assert isinstance(third, WandTouch) and third.wear is not None
+    assert len(hand.feel(*press, *[0.0] * 15)) == 1  # a worn gel goes on, if the person does
 
 
 def test_a_touch_that_does_not_count_is_said(ramp: np.ndarray) -> None:
     hand = Hand(ramp)
     hand.feel(*[0.0] * 15)
     assert "too quick" in str(hand.feel(*[8.0] * 2, *[0.0] * 15))
-    assert "too hard" in str(hand.feel(*np.linspace(1, 22, 12), *[22.0] * 6, *[0.0] * 15, shown=20))
-    hand.feel(5.0, shown=0.0)
+    assert "too hard" in str(hand.feel(*np.linspace(1, 22, 12), *[22.0] * 6, *[0.0] * 15))
+    hand.feel(*[5.0] * 10, shown=0.0)
     assert "the gel shows nothing" in hand.recorder.hint
-    hand.feel(*[0.0] * 15)
-    hand.feel(0.0, shown=8.0)
+    hand.feel(*[0.0] * 30)
+    hand.feel(*[0.0] * 10, shown=8.0)
     assert "the load cell reads nothing" in hand.recorder.hint
     hand.feel(*[0.0] * 3)
     hand.feel(*np.linspace(1, 8, 8), *[8.0] * 6)

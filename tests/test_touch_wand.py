@@ -12,6 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from touchgoal.control import features as ft
+from touchgoal.control.wand_touch import MAX_FORCE
 from touchgoal.encoders.alignment.green_screen import (
     foreground,
     random_background,
@@ -22,7 +23,7 @@ from touchgoal.episodes.wand_recording import TOUCHES_A_VISIT, record_touches
 from touchgoal.launch.__main__ import main
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.scene.build import OBJECT_GROUP
-from touchgoal.sim_envs.touch_wand import MAX_FORCE, Touch, TouchWand
+from touchgoal.sim_envs.touch_wand import Touch, TouchWand
 from touchgoal.sim_envs.wand.bench import GREEN, VIEWS, Bench
 from touchgoal.sim_envs.wand.objects import find_wand_object, wand_objects
 

@@ -21,6 +21,7 @@ from touchgoal.control.sensors.load_cell import LoadCellConfig, SerialLoadCell
 from touchgoal.control.sensors.tactile_camera import TactileCamera, fingertip_view
 from touchgoal.control.sensors.video import VideoCamera, VideoConfig
 from touchgoal.control.tactile.sensor_models import find_sensor
+from touchgoal.control.wand_touch import VIEW_SHAPE
 from touchgoal.runtime.option_types import STRICT, Corners
 
 _SILENT = 0.5  # s without news of a device that mean a problem
@@ -137,9 +138,7 @@ def connect_wand(config: WandConfig) -> Wand:
 def _open_gel(own: GelSection) -> TactileCamera:
     model = find_sensor(own.sensor)
     video = fingertip_video(own.source, model, own.corners)
-    locked = replace(
-        video, size=own.size, exposure=own.exposure, white_balance=own.white_balance
-    )
+    locked = replace(video, size=own.size, exposure=own.exposure, white_balance=own.white_balance)
     view = fingertip_view(model, own.source, own.border, own.corners)
     return TactileCamera(VideoCamera(locked), model, view)
 
@@ -150,4 +149,4 @@ def _square(picture: Picture) -> UInt8[np.ndarray, "H W 3"]:
     side = min(height, width)
     top, left = (height - side) // 2, (width - side) // 2
     square = picture[top : top + side, left : left + side]
-    return cv2.resize(square, ft.WAND_VIEW_SHAPE, interpolation=cv2.INTER_AREA)
+    return cv2.resize(square, VIEW_SHAPE, interpolation=cv2.INTER_AREA)

@@ -5,18 +5,17 @@ in free air is taken off: the head's weight on it changes with the wand's tilt.
 """
 
 from collections import deque
-from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float
 
-from touchgoal.control import features as ft
 from touchgoal.control.arrays import Picture
 from touchgoal.control.cell.wand import Moment
 from touchgoal.control.tactile.background import Background, local_change
 from touchgoal.control.tactile.contact import ContactDetector, threshold_for
 from touchgoal.control.tactile.gel_wear import GelWear, find_wear
 from touchgoal.control.tactile.sensor_models import SensorModel
+from touchgoal.control.wand_touch import CLIP, FORCE_RANGES, MAX_FORCE, WandTouch, force_range
 
 _CONTACT = 0.3  # N over what the load cell reads in free air; an HX711's noise is 0.005
 _LEAST_FORCE = 0.5  # N of a touch
@@ -24,32 +23,13 @@ _BEFORE = 25  # moments, 1 s of a Mini: so long before contact a hand is some ce
 _SETTLING = 12  # moments without a change, after a touch or at the start
 _PART = 5  # first and last of them that are compared
 _SETTLED = 1.5  # counts of local change between their medians; a compressed stream is never still
+_LASTING = 10  # moments at which gel and load cell disagree before it is said
+_TURNED = (
+    0.02  # of a force without a touch that a moment takes for the head's weight: it was turned
+)
 _HELD = 5  # moments near the largest force
 _NEAR = 0.1  # below the largest force, as a share, that counts as near
 _LONGEST = 250  # moments of a touch
-
-
-@dataclass(frozen=True, eq=False)
-class WandTouch:
-    """One touch of a real wand.
-
-    Attributes:
-        before, views: view -> RGB, a second before contact and at the largest force.
-        clip: the sensor's pictures, RGB; the first is untouched, the last at the largest force.
-        load: normal force at each picture, N.
-        wear: what the gel looks like after it; None if it has not changed.
-    """
-
-    before: dict[str, UInt8[np.ndarray, "H W 3"]]
-    views: dict[str, UInt8[np.ndarray, "H W 3"]]
-    clip: UInt8[np.ndarray, "t h w 3"]
-    load: Float32[np.ndarray, " t"]
-    wear: GelWear | None
-
-
-def force_range(force: float) -> int:
-    """Return which of the paper's three ranges a force (N) lies in."""
-    return int(np.searchsorted([high for _, high in ft.WAND_FORCES[:-1]], force))
 
 
 class WandRecorder:
@@ -74,6 +54,7 @@ class WandRecorder:
         self._detector: ContactDetector | None = None  # None until the gel has settled
         self._air = 0.0  # what the load cell reads in free air, N
         self._press: list[tuple[Picture, float]] = []
+        self._disagreed = 0  # moments in a row at which gel and load cell disagree
         self._before: Moment | None = None
         self._peak: Moment | None = None
         self._made: WandTouch | None = None  # until the gel has been looked at
@@ -92,16 +73,25 @@ class WandRecorder:
         elif touching and self.force > _CONTACT:
             self._before, self._peak = self._free[0], moment
             self._press = [(moment.picture, self.force)]
-        elif touching:
-            self.hint = "press harder, or let go: the gel is touched, but the load cell reads nothing"
-        elif self.force > _CONTACT:
-            self.hint = "press with the gel: the load cell reads a force, but the gel shows nothing"
-            self._air += 0.02 * self.force  # or the wand was turned: its head's weight
+        elif touching or self.force > _CONTACT:
+            self._disagree(touching)
         else:
+            self._disagreed = 0
             self._free.append(moment)
             self._air = float(np.median([free.force for free in self._free]))
             self.hint = self._wanted()
         return None
+
+    def _disagree(self, touching: bool) -> None:
+        """Say which device shows nothing, when it has lasted."""
+        self._disagreed += 1
+        if touching:
+            advice = "press harder, or let go: the gel is touched, but the load cell reads nothing"
+        else:
+            advice = "press with the gel: the load cell reads a force, but the gel shows nothing"
+            self._air += _TURNED * self.force
+        if self._disagreed >= _LASTING:
+            self.hint = advice
 
     def drop(self, hint: str) -> WandTouch | None:
         """Give up the touch in hand, because of a lost device; return a finished one, if any."""
@@ -134,16 +124,15 @@ class WandRecorder:
         self._detector = ContactDetector(Background(middle[None]), threshold)
         self._free = deque(recent, maxlen=_BEFORE)
         self._air = float(np.median([free.force for free in recent]))
-        self.hint = self._wanted()
-        return self._take()
+        made, self.hint = self._take(), self._wanted()
+        return made
 
     def _take(self) -> WandTouch | None:
-        """Return the finished touch, if any, with what the gel looks like now; and count it."""
+        """Return the finished touch, if any, and count it."""
         made, self._made = self._made, None
-        if made is None:
-            return None
-        self.counts[force_range(float(made.load[-1]))] += 1
-        return replace(made, wear=self.wear)
+        if made is not None:
+            self.counts[force_range(float(made.load[-1]))] += 1
+        return made
 
     def _follow(self, moment: Moment, touching: bool) -> str | None:
         """Follow a touch from contact to the lift."""
@@ -154,8 +143,8 @@ class WandRecorder:
             self._press.append((moment.picture, self.force))
             if self.force > largest:
                 self._peak, largest = moment, self.force
-        if largest > ft.WAND_FORCES[-1][1]:
-            self.hint = f"too hard, lift: {ft.WAND_FORCES[-1][1]:g} N at most"
+        if largest > MAX_FORCE:
+            self.hint = f"too hard, lift: {MAX_FORCE:g} N at most"
         else:
             self.hint = "lift" if self._held() else "hold"
         return None
@@ -170,18 +159,18 @@ class WandRecorder:
         forces = np.array([force for _, force in self._press])
         rise = int(forces.argmax()) + 1
         wrong = None
-        if forces.max() > ft.WAND_FORCES[-1][1]:
+        if forces.max() > MAX_FORCE:
             wrong = "not recorded, too hard: press less"
         elif forces.max() < _LEAST_FORCE:
             wrong = "not recorded, too light: press harder"
-        elif rise < ft.WAND_CLIP - 1 or not self._held():
+        elif rise < CLIP - 1 or not self._held():
             wrong = "not recorded, too quick: press slowly, and hold before you lift"
         else:
-            chosen = evenly_loaded(forces[:rise], ft.WAND_CLIP - 1)
+            chosen = evenly_loaded(forces[:rise], CLIP - 1)
             clip = [self._before.picture, *(self._press[i][0] for i in chosen)]
             load = np.concatenate([[0.0], forces[chosen]]).astype(np.float32)
             before, views = self._before.views, self._peak.views
-            self._made = WandTouch(before, views, np.stack(clip), load, None)
+            self._made = WandTouch(before, views, np.stack(clip), load)
         self.hint = "let the gel settle"
         self._begin_to_settle()
         return wrong
@@ -192,9 +181,9 @@ class WandRecorder:
 
     def _wanted(self) -> str:
         """Name the range of which there are fewest touches."""
-        low, high = ft.WAND_FORCES[int(np.argmin(self.counts))]
+        low, high = FORCE_RANGES[int(np.argmin(self.counts))]
         done = ", ".join(
-            f"{n} of {a:g}-{b:g} N" for n, (a, b) in zip(self.counts, ft.WAND_FORCES, strict=True)
+            f"{n} of {a:g}-{b:g} N" for n, (a, b) in zip(self.counts, FORCE_RANGES, strict=True)
         )
         return f"press with {low:g} to {high:g} N (recorded: {done})"
 

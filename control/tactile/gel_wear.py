@@ -42,7 +42,9 @@ class GelWear:
 
     def __str__(self) -> str:
         x, y = (1e3 * side for side in self.place)
-        remedy = "wipe it clean, or put on a new gel" if self.kind == "dirty" else "put on a new gel"
+        remedy = (
+            "wipe it clean, or put on a new gel" if self.kind == "dirty" else "put on a new gel"
+        )
         return (
             f"the gel looks {self.kind}, {1e3 * self.length:.1f} mm long at {x:.0f} mm from the left and "
             f"{y:.0f} mm from the top of its picture: {remedy}"
