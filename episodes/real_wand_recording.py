@@ -161,8 +161,7 @@ def _continued(
 def _counts(episodes: EpisodeSet | None, name: str) -> tuple[int, ...]:
     """Return how many touches of an object a set has in each range of force."""
     counts = [0] * len(FORCE_RANGES)
-    for i in range(len(episodes) if episodes else 0):
-        meta = episodes.meta(i)
+    for meta in [] if episodes is None else map(episodes.meta, range(len(episodes))):
         if meta["object"] == name:
             counts[force_range(float(meta["force"]))] += 1  # pyright: ignore[reportArgumentType]
     return tuple(counts)

@@ -19,6 +19,8 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.option_types import Seed, checked_dataclass
 from touchgoal.sim_envs.scene.contacts import PadContact
 from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
+from touchgoal.sim_envs.tactile.markers import draw
+from touchgoal.sim_envs.tactile.optics import render_untouched
 from touchgoal.sim_envs.tactile.pad import TactilePad
 from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
 from touchgoal.sim_envs.wand.bench import VIEWS, Bench
@@ -181,9 +183,9 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
 
     def untouched(self, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
         """Return the untouched gel's picture, with the camera's noise drawn from `rng`."""
-        assert self._pad is not None, "reset first"
-        free = PadContact(np.zeros(3), np.zeros(3), 0.0, frozenset())
-        return self._pad.sense(self.bench.data, free, rng).image
+        picture = render_untouched(self._instance, rng)
+        draw(picture, self._instance.markers, self._instance.marker_radius)
+        return picture
 
     def random_action(self) -> Float[np.ndarray, "6"]:
         """Draw a touch as the paper's operator: anywhere, with a force from one of three ranges."""
