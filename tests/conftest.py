@@ -32,6 +32,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """For what runs in real time alone, files without it are not read: that takes seconds."""
+    alone = config.option.markexpr == "realtime" and collection_path.suffix == ".py"
+    return True if alone and "realtime" not in collection_path.read_text() else None
+
+
 @pytest.fixture
 def in_process() -> Iterator[None]:
     with in_process_workers():

@@ -289,7 +289,7 @@ def test_doctor_and_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture) -> 
 
 @pytest.mark.slow
 def test_benchmark_reward_quality(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    small = partial(PickPlaceConfig, control_hz=10, cameras=("front",))
+    small = partial(PickPlaceConfig, control_hz=5, cameras=("front",))
     monkeypatch.setattr(reward_quality, "PickPlaceConfig", small)
     run("benchmark", "reward-quality", "--episodes", 1, "--out", tmp_path)
     result = json.loads((tmp_path / "metrics.json").read_text())

@@ -91,9 +91,11 @@ def test_a_stalled_camera_stops_the_arm_and_the_episode_is_kept(
     while np.abs(twin.ask("truth")["dq"]).max() < 0.1:
         assert process.poll() is None, process.communicate()[1]
         time.sleep(0.02)
-    twin.ask("stall front 60")
+    twin.ask("stall front 600")
+    while twin.ask("truth")["rest"] < 1 and process.poll() is None:  # longer than it is held
+        time.sleep(0.02)
+    twin.ask("stall front 0")  # a program that ends waits for the picture on its way
     _, complaint = process.communicate(timeout=_PATIENCE)
-    twin.ask("stall front 0")
     assert process.returncode == STOPPED and "observation age" in complaint and "front" in complaint
     said = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert said["stopped"] and said["rest_seconds"] < 3 and "cable" in said["advice"]

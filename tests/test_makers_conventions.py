@@ -48,7 +48,6 @@ def reads_franka(address: str, home: list[float]) -> dict:
     }
 
 
-@pytest.mark.realtime
 def test_franka_signs_frames_and_units(fr3: RunningTwin) -> None:
     """robot_state.h: "Forces applied by the robot to the environment are positive"; O_T_EE = O_T_F F_T_EE.
 
@@ -148,8 +147,7 @@ def test_ur_signs_frames_and_units(ur5e: RunningTwin) -> None:
     np.testing.assert_allclose(tool, [0, 0, UR5E.tool.tcp_offset], atol=1e-4)
 
 
-@pytest.mark.realtime
-@pytest.mark.parametrize("name", ["fr3", "ur5e"])
+@pytest.mark.parametrize("name", ["fr3", pytest.param("ur5e", marks=pytest.mark.realtime)])
 def test_drivers_say_what_the_environment_does_to_the_robot(
     name: str, request: pytest.FixtureRequest
 ) -> None:

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from running_twin import RunningTwin, client, yaw_of
 
-pytestmark = pytest.mark.realtime
-
 HOME = [0.0, -0.3, 0.0, -2.2, 0.0, 1.9, 0.785]
 
 
@@ -86,6 +84,7 @@ def moves(address: str, home: list[float]) -> dict:
     }
 
 
+@pytest.mark.realtime
 def test_franka_holds_clients_to_its_limits(fr3: RunningTwin) -> None:
     fr3.begin("reset 3")
     said = through_franky(moves, fr3)
@@ -183,6 +182,7 @@ def suffers(address: str, home: list[float]) -> dict:
     return {"said": said, "mode": mode, "rejected": rejected, "recovered": recovered}
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("fault", "error", "mode", "recovers"),
     [

@@ -20,8 +20,6 @@ from touchgoal.sim_envs.pick_place import PickPlace
 from touchgoal.sim_envs.twin.mjpeg import Stream
 from touchgoal.sim_envs.twin.pace import Pace
 
-pytestmark = pytest.mark.realtime
-
 
 @pytest.mark.parametrize("arm", ["fr3", "ur5e"])
 def test_arm_follows_without_lag(arm: Literal["fr3", "ur5e"]) -> None:

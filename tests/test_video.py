@@ -16,6 +16,7 @@ import pytest
 from numbered_pictures import BITS, numbered, until
 
 from touchgoal.control.interfaces import DriverError, TactileSensor
+from touchgoal.control.sensors import video
 from touchgoal.control.sensors.fingertip_source import fingertip_video
 from touchgoal.control.sensors.picture_integrity import BrokenBlocks, FrozenParts, JpegDecoder
 from touchgoal.control.sensors.tactile_camera import (
@@ -278,7 +279,10 @@ def test_a_fingertip_is_cut_turned_and_scaled(tmp_path: Path) -> None:
     sensor.close()
 
 
-def test_a_stream_that_never_gives_a_picture_is_said(streamer: Streamer) -> None:
+def test_a_stream_that_never_gives_a_picture_is_said(
+    streamer: Streamer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(video, "_OPEN_TIMEOUT", 0.5)
     streamer.stalled = True
     with pytest.raises((UserError, DriverError)):
         VideoCamera(VideoConfig(streamer.url)).read()
