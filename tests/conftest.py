@@ -53,7 +53,7 @@ def fr3(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningTwin]:
     twin.close()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def ur5e(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningTwin]:
     """A UR5e in real time; touch is left out, for it takes time."""
     arguments = ["--arm", "ur5e", *_CELL, "--env.cameras", "front", "--env.no-tactile"]

@@ -118,8 +118,8 @@ def test_calls_are_answered_and_errors_arrive_as_errors(log: Path) -> None:
 
 
 def test_a_library_that_hangs_is_ended(log: Path) -> None:
-    with pytest.raises(DriverError, match="did not connect within 5 s"):
-        odd(log, "hangs at once", connect_timeout=5.0)
+    with pytest.raises(DriverError, match="did not connect within 3 s"):
+        odd(log, "hangs at once", connect_timeout=3.0)
     assert not running(pid(log))
     log.unlink()
     child = odd(log)
