@@ -33,6 +33,9 @@ class Config:
     illumination_exponent: Positive | None = None
     """Power of the background's brightness by which the response varies over the image; default: the
     one that reads the balls at their size (four fits, a few minutes)."""
+    squares: bool = False
+    """Let the response vary with the square of the place, too: reads the borders more exactly, from 40
+    presses or more all over the gel."""
     out: Path | None = None
     """Folder of the run; the sensor file goes to its `sensor_file/`."""
     held_out: Annotated[float, Field(ge=0.1, le=0.5)] = 0.25
@@ -48,6 +51,7 @@ def main(config: Config) -> None:
     from touchgoal.control.calibration import report
     from touchgoal.control.calibration.calibrate import (
         ILLUMINATION_EXPONENTS,
+        SQUARES_MINIMUM,
         STEPS,
         depth_errors,
         fit,
@@ -58,6 +62,7 @@ def main(config: Config) -> None:
     from touchgoal.control.tactile.picture_guard import check_presses, check_untouched
     from touchgoal.control.tactile.sensor_calibration import save
     from touchgoal.control.tactile.sensor_models import find_model
+    from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.json_file import write_json
     from touchgoal.runtime.progress import progress_bar
     from touchgoal.runtime.provenance import provenance
@@ -66,6 +71,11 @@ def main(config: Config) -> None:
     model = find_model(config.sensor)
     pitch = config.mm_per_pixel * 1e-3
     presses = read_presses(config.presses, pitch, config.ball_mm or math.nan)
+    if config.squares and len(presses) < SQUARES_MINIMUM:
+        raise UserError(
+            f"--squares needs {SQUARES_MINIMUM} presses, {config.presses} has {len(presses)}: add "
+            "presses, or leave the option out"
+        )
     if config.check_lamps:
         background, where = presses.background, config.presses
         check_untouched(background, model, f"{where}/background.png")
@@ -76,10 +86,21 @@ def main(config: Config) -> None:
     if power is None:
         fits = len(ILLUMINATION_EXPONENTS)
         with progress_bar("finding how the light varies", fits, "fit") as bar:
-            power = select_illumination_exponent(train, pitch, config.sensor, bar.update)
+            power = select_illumination_exponent(
+                train, pitch, config.sensor, bar.update, config.squares
+            )
     with progress_bar("fitting", 2 * STEPS, "step") as bar:
-        judged = fit(train, pitch, config.sensor, bar.update, illumination_exponent=power)
-        fitted = fit(presses, pitch, config.sensor, bar.update, illumination_exponent=power)
+        judged, fitted = (
+            fit(
+                each,
+                pitch,
+                config.sensor,
+                bar.update,
+                illumination_exponent=power,
+                squares=config.squares,
+            )
+            for each in (train, presses)
+        )
     errors = report.held_out_errors(judged, test)
     print(report.errors_table(errors, len(test)))
     report.refuse_useless(errors)

@@ -11,6 +11,7 @@ import pytest
 
 from touchgoal.control.calibration.ball import ball_overlap, press_surface, sphere_in
 from touchgoal.control.calibration.calibrate import fit, median_background
+from touchgoal.control.calibration.press_fit import FitState, PressFit
 from touchgoal.control.calibration.press_set import (
     PressSet,
     read_presses,
@@ -101,6 +102,27 @@ def test_light_comes_from_where_it_stands() -> None:
         behind = np.rint([60 - 24 * np.sin(azimuth), 80 - 24 * np.cos(azimuth)]).astype(int)
         assert change[(*flank, channel)] > 15
         assert change[(*behind, channel)] < -5
+
+
+def test_squares_of_the_place_are_fitted_and_stored(tmp_path: Path) -> None:
+    """A response that falls off to both sides comes back from presses with it, not without."""
+    linear = known_sensor()
+    falloff = np.zeros((3, sensor_calibration.N_FEATURES, 2), np.float32)
+    falloff[:, :2, 0] = -0.6 * linear.response[:, :2, 0]
+    true = replace(linear, response=np.concatenate([linear.response, falloff], 2))
+    sensor_calibration.save(true, tmp_path, {})
+    assert json.loads((tmp_path / "sensor.json").read_text())["format"] == 3
+    stored = sensor_calibration.load(tmp_path)
+    np.testing.assert_allclose(stored.response, true.response, rtol=1e-6)
+    presses = made_presses(stored, 24)
+    errors = []
+    for start in (linear, true):
+        blank = replace(start, response=np.zeros_like(start.response))
+        steps = PressFit(presses, stored.background, True, 1.0, trust_labels=True)
+        found = steps.fit_response(FitState(blank, presses.circles, presses.ball_radius))
+        wrong = found.calibration.response[:, :2, :3] - true.response[:, :2, :3]
+        errors.append(np.abs(wrong).mean())
+    assert errors[1] < 0.5 * errors[0]
 
 
 @pytest.mark.slow

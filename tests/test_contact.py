@@ -120,6 +120,34 @@ def test_a_stream_that_starts_with_one_frame_learns_its_noise() -> None:
     assert detector.threshold > THRESHOLD
 
 
+def test_a_shaking_camera_over_dots_is_no_contact() -> None:
+    """Half a pixel moves every dot's rim by tens of counts; a dent in one place still shows."""
+    height = np.zeros(40)
+    height[25:] = 15
+    frames = sensed(np.ones(40), height)
+    angles = np.random.default_rng(0).uniform(0, 2 * np.pi, 40)
+    for i, angle in enumerate(angles):
+        for x, y in np.mgrid[16:WIDTH:32, 16:HEIGHT:32].reshape(2, -1).T:
+            cv2.circle(frames[i], (int(x), int(y)), 8, (30, 30, 30), cv2.FILLED)
+        shift = 0.5 * min(i, 1) * np.array([np.cos(angle), np.sin(angle)])
+        matrix = np.float32([[1, 0, shift[0]], [0, 1, shift[1]]])
+        size = WIDTH, HEIGHT
+        frames[i] = cv2.warpAffine(frames[i], matrix, size, borderMode=cv2.BORDER_REPLICATE)
+    detector = ContactDetector(Background(frames[:1]))
+    assert [detector.update(frame) for frame in frames[1:]] == (height[1:] > 0).tolist()
+
+
+def test_noise_above_the_first_threshold_is_learned() -> None:
+    rng = np.random.default_rng(0)
+    height = np.zeros(30)
+    height[20:] = 120
+    clean = sensed(np.ones(30), height)
+    frames = np.clip(clean + rng.normal(0, 30, clean.shape), 0, 255).astype(np.uint8)
+    assert contact_strength(frames[1:6], frames[0]).min() > 5.0, "must look like a strong contact"
+    detector = ContactDetector(Background(frames[:1]))
+    assert [detector.update(frame) for frame in frames[1:]] == (height[1:] > 0).tolist()
+
+
 def test_two_touched_frames_among_the_first_five_leave_the_threshold() -> None:
     """People who record clips touch early: 12 of 409 real clips do."""
     height = np.array([0, 0, 0, 40, 60], float)

@@ -151,12 +151,19 @@ def test_contact_appears_where_it_is() -> None:
         assert change[near, channel].mean() > change[far, channel].mean() + 10
 
 
-def test_fast_picture_is_the_reference_formula_s() -> None:
+@pytest.mark.parametrize("squares", [False, True])
+def test_fast_picture_is_the_reference_formula_s(squares: bool) -> None:
     """Half the resolution and 1/16 count steps against the reference at full resolution."""
-    frame = sense(Body(CATALOGUE["glass_ball"], (0.008,), 0.1), at=[1e-3, 0, 0.007], force=6.0)
-    quiet = replace(INSTANCE, noise=np.zeros_like(INSTANCE.noise))
+    frame = sense(Body(CATALOGUE["glass_ball"], (0.008,), 0.1), at=[4e-3, -3e-3, 0.007], force=6.0)
+    calibration = INSTANCE.calibration
+    if squares:
+        falloff = calibration.response[..., :1] * np.float32([-0.9, 1.5])
+        response = np.concatenate([calibration.response, falloff], 2)
+        calibration = replace(calibration, response=response)
+    noise = np.zeros_like(INSTANCE.noise)
+    quiet = replace(INSTANCE, calibration=calibration, noise=noise)
     fast = render(frame.surface, quiet, np.random.default_rng(0)).astype(float)
-    slow = np.clip(shade(INSTANCE.calibration, frame.depth), 0, 255)
+    slow = np.clip(shade(calibration, frame.depth), 0, 255)
     assert np.abs(slow - INSTANCE.calibration.background).max() > 40
     error = np.abs(fast - slow)
     assert error.mean() < 0.6 and np.quantile(error, 0.999) < 6

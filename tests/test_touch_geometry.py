@@ -222,6 +222,32 @@ def test_a_grid_that_jumps_and_stops_does_not_swap_dots(gel: SensorInstance) -> 
         assert now.found.all() and error.max() < 0.5
 
 
+@pytest.mark.parametrize("kind", ["jump", "turn", "shear", "drag"])
+def test_dots_are_followed_through_half_a_spacing(gel: SensorInstance, kind: str) -> None:
+    """Nearest spots are the neighbours' then: of all dots, of those at the rim, or in one place."""
+    rng = np.random.default_rng(8)
+    plain = render_untouched(gel, rng)
+    assert DOTTED.markers is not None
+    half = 0.5 * DOTTED.markers.pitch / gel.pixel_pitch
+    away = gel.markers - gel.markers.mean(0)
+    for _ in range(4):
+        matrix = {"turn": np.array([[0, 1], [-1, 0]]), "shear": rng.normal(size=(2, 2))}.get(kind)
+        shape = np.ones((63, 2)) if matrix is None else away @ matrix.T
+        if kind == "drag":
+            centre = rng.uniform(-60, 60, 2)
+            shape = np.exp(-((away - centre) ** 2).sum(1, keepdims=True) / (2 * 60**2)) * [0.8, 0.6]
+        if kind == "jump":
+            shape = shape * rng.normal(size=2)
+        moved = half * shape / np.linalg.norm(shape, axis=1).max() + rng.normal(0, 0.5, (63, 2))
+        tracker = MarkerTracker(dotted(plain, gel), DOTTED.markers, gel.pixel_pitch)
+        for motion in (moved, np.zeros((63, 2))):
+            now = tracker.update(dotted(plain, gel, motion))
+            true = gel.markers + motion
+            whole = ((true > 4) & (true < [WIDTH - 5, HEIGHT - 5])).all(1)
+            error = np.linalg.norm(now.positions.reshape(-1, 2) - true, axis=1)
+            assert now.found.reshape(-1)[whole].all() and error[whole].max() < 0.5
+
+
 @pytest.mark.parametrize(
     ("degrees", "scale", "shift"), [(12, 1.0, 4), (-20, 0.9, 0), (3, 1.15, -6)]
 )

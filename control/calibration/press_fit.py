@@ -32,6 +32,7 @@ BLUR_PYRAMID = (3.0e-3, 1.5e-3, 0.75e-3, 0.35e-3)
 """Standard deviations of Taxim's gel, m; one factor scales them all."""
 
 _PIXELS = 5000  # of a press that take part in the fit
+_LIGHTS = 3  # whose shadows are fitted
 _FOLDS = 4
 _MOVES = 8  # Gauss-Newton steps of a circle
 _RIDGE = 1e-3  # of each term's own energy; between 1e-4 and 1e-2 the held-out error hardly moves
@@ -99,8 +100,7 @@ class PressFit:
             _sample(image, background, circle)
             for image, circle in zip(presses.images, presses.circles, strict=True)
         ]
-        self._used = np.ones(3 * N_FEATURES + 3, bool)
-        self._used[N_FEATURES : 3 * N_FEATURES] = varies_over_image
+        self._varies = varies_over_image
 
     def initialise(
         self, initial: SensorCalibration, ball_radius: Float64[np.ndarray, " n"]
@@ -202,13 +202,13 @@ class PressFit:
         product = np.sum([n.product for n in normals], 0)
         square = np.sum([n.square for n in normals], 0)
         solved = np.zeros_like(product)
+        used = np.ones(product.shape[1], bool)
+        used[N_FEATURES:-_LIGHTS] = self._varies
         for channel in range(3):
-            part = square[channel][np.ix_(self._used, self._used)]
+            part = square[channel][np.ix_(used, used)]
             energy = np.diag(part)
             ridge = np.diag(_RIDGE * energy + 1e-12 * energy.max())
-            solved[channel, self._used] = np.linalg.solve(
-                part + ridge, product[channel, self._used]
-            )
+            solved[channel, used] = np.linalg.solve(part + ridge, product[channel, used])
         return solved
 
     def _refine_circle(
@@ -273,8 +273,8 @@ def _sample(image: Picture, background: Picture, circle: Circle) -> _Sample:
 
 
 def _with_response(calibration: SensorCalibration, solved: Weights) -> SensorCalibration:
-    response, shadow = np.split(solved.astype(np.float32), [3 * N_FEATURES], 1)
-    response = response.reshape(3, 3, N_FEATURES).transpose(0, 2, 1)
+    response, shadow = np.split(solved.astype(np.float32), [-_LIGHTS], 1)
+    response = response.reshape(3, -1, N_FEATURES).transpose(0, 2, 1)
     azimuths = np.degrees(np.arctan2(response[:, 1, 0], response[:, 0, 0]))
     return replace(
         calibration,

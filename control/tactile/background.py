@@ -23,6 +23,7 @@ _RATE = 0.02  # share of a frame that enters: 2 s at 25 Hz, slower than any cont
 # Standard deviations between 150,000 real touches of Minis (Tactile-MNIST), counts.
 _OFFSET_SPREAD, _PATTERN_SPREAD = 2.4, 2.4
 _MOVED = 1.5  # counts of local change among the first frames that are no noise
+_JITTER = 1.0  # px by which a camera shakes; dots that move farther together are a touch
 _ANOTHER_SENSOR = 5.0  # counts of local change to a reference; drift of the full spread gives 3
 
 
@@ -98,18 +99,34 @@ class Background:
 
 
 def local_change(frame: AnyPicture, background: AnyPicture) -> Float32[np.ndarray, "H W"]:
-    """Return the change from the background that no drift of the light explains, counts.
+    """Return the change from the background that neither light nor jitter explains, counts.
 
     Low spatial frequencies and a factor on the background are fitted to each channel of the blurred
-    difference and subtracted; what is left is its norm over the channels, at a quarter of the
-    resolution.
+    difference, and one shift of the whole picture by up to a pixel to all of them. They are
+    subtracted; what is left is its norm over the channels, at a quarter of the resolution.
     """
     reference = _blurred(background)
     change = _high_pass(_blurred(frame) - reference)
     structure = _high_pass(reference)
     energy = (structure**2).sum((0, 1)) + 1.0
     change -= (change * structure).sum((0, 1)) / energy * structure
+    change -= _shifted(change, structure)
     return np.sqrt((change**2).sum(2))
+
+
+def _shifted(
+    change: Float32[np.ndarray, "H W 3"], structure: Float32[np.ndarray, "H W 3"]
+) -> Float32[np.ndarray, "H W 3"]:
+    """Return the part of a change that a small shift of the whole picture explains."""
+    kernel = np.float32([[-0.5, 0, 0.5]]) / _CELL
+    sides = [
+        cv2.filter2D(structure, -1, k, borderType=cv2.BORDER_REPLICATE) for k in (kernel, kernel.T)
+    ]
+    slopes = np.stack([side.ravel() for side in sides])  # counts a px, along x and y
+    normal = slopes @ slopes.T + np.eye(2, dtype=np.float32)
+    shift = np.linalg.solve(normal, slopes @ change.ravel())
+    shift *= min(1, _JITTER / max(float(np.hypot(*shift)), 1e-6))
+    return (shift @ slopes).reshape(change.shape)
 
 
 def _blurred(image: np.ndarray) -> Float32[np.ndarray, "H W 3"]:

@@ -14,7 +14,12 @@ from touchgoal.control.arrays import Counts, Map, Picture
 from touchgoal.control.tactile import depth_steps
 from touchgoal.control.tactile.background import cosines
 from touchgoal.control.tactile.light_gain import remove_gain
-from touchgoal.control.tactile.sensor_calibration import SensorCalibration, illumination, shadows
+from touchgoal.control.tactile.sensor_calibration import (
+    SensorCalibration,
+    illumination,
+    position_terms,
+    shadows,
+)
 
 Colours = Float32[np.ndarray, "3 h w"]
 
@@ -79,8 +84,9 @@ class _Level:
         self._noise = np.float32(np.hypot(p.noise / cell, _MODEL_ERROR))
         self._rest = np.float32(cell**2 / _PATCH / _REST**2)
         u, v = np.linspace(-1, 1, w), np.linspace(-1, 1, h)[:, None]
-        places = np.stack(np.broadcast_arrays(1, u, v)).astype(np.float32)
-        self._places = places if p.response[..., 1:].any() else places[:1]  # the most common, fast
+        # Without variation over the image, the most common, it is faster.
+        n = p.response.shape[2] if p.response[..., 1:].any() else 1
+        self._places = position_terms(u, v, n).astype(np.float32)
         waves = len(self._places)
         self._coefficients = _coefficients(p.response[..., :waves])
         per_depth = np.tensordot(p.response[:, 9, :waves], self._places, 1)
@@ -164,7 +170,7 @@ class _Level:
 
 
 def _coefficients(response: Float32[np.ndarray, "3 10 waves"]) -> Float32[np.ndarray, "rows 10"]:
-    """Return the coefficients of 1 and the normal's `monomials`: by colour, x, y; R, G, B; 1, u, v."""
+    """Return the coefficients of 1 and the normal's `monomials`: by colour, x, y; R, G, B; position."""
     r = np.moveaxis(response, 2, 1)  # channel, wave, feature
     out = np.zeros((3, *r.shape[:2], 10), np.float32)
     out[0, ..., 1:] = r[..., :9]

@@ -17,7 +17,7 @@ def shading(gx, gy, gain, places, coefficients, max_slope):
     Args:
         gx, gy: slopes of the surface along columns and rows, maps.
         gain: of the light, colours.
-        places: 1, or 1, u and v, of each cell (waves, rows, columns).
+        places: `position_terms` of each cell (waves, rows, columns).
         coefficients: the sensor file's, ordered as by `depth`.
         max_slope: beyond it only the direction counts.
     """

@@ -5,9 +5,10 @@ from functools import cache
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Float32, Int
 
 from touchgoal.control.arrays import AnyPicture, Picture
+from touchgoal.control.tactile.marker_matching import Dots, Flags, Spots, match, spread
 from touchgoal.control.tactile.sensor_models import MarkerGrid
 from touchgoal.runtime.errors import UserError
 
@@ -17,9 +18,6 @@ _NOISE = 0.02  # darkness of a spot that may be noise
 _RIM = 2.0  # px around a dot's nominal radius that may still be dark
 _LARGER = 1.1  # times a dot's nominal radius: how large those of another gel may be
 
-Dots = Float32[np.ndarray, "rows columns 2"]
-Flags = Bool[np.ndarray, "rows columns"]
-Spots = Float32[np.ndarray, "n 2"]
 Grey = Float32[np.ndarray, "h w 1"]
 
 
@@ -42,12 +40,11 @@ class Markers:
 class MarkerTracker:
     """Tracker of one gel's dots: at `rest` in an untouched RGB frame, and `now`, in the last one.
 
-    A dot takes the spot nearest to its expected place if it is that spot's nearest dot as well and
-    lies within half the pitch: dots can get lost, which is flagged, but not swapped. Dots are
-    expected either to keep moving or to stay, whichever explains the frame better: a grid that
-    jumps and stops would overshoot onto its neighbours. A lost dot is expected where its
-    neighbours' displacement carries it. The grid's sizes may be off by a fifth; `pixel_pitch` is m
-    per px. UserError if the untouched frame does not show it.
+    The dots are expected to stay, to keep moving, or else to be back at rest or to have jumped by
+    up to half a spacing, turned and sheared, whichever explains the frame best (`marker_matching`).
+    A dot that no spot fits is lost, which is flagged; it is expected where its neighbours'
+    displacement carries it. The grid's sizes may be off by a fifth; `pixel_pitch` is m per px.
+    UserError if the untouched frame does not show it.
     """
 
     def __init__(self, untouched: Picture, grid: MarkerGrid, pixel_pitch: float) -> None:
@@ -56,7 +53,7 @@ class MarkerTracker:
         _, darkness = _spots(_grey(untouched), self._size)
         self._faintest = _FAINTEST * _usual(darkness, grid)
         steps = np.diff(self.rest.positions, axis=1)
-        self._reach = 0.5 * float(np.median(np.linalg.norm(steps, axis=-1)))
+        self._spacing = float(np.median(np.linalg.norm(steps, axis=-1)))
         self._motion = np.zeros_like(self.rest.positions)
 
     @property
@@ -70,32 +67,19 @@ class MarkerTracker:
         grey = _grey(frame)
         spots, darkness = _spots(grey, self._size)
         spots = spots[darkness > self._faintest]
-        for _ in range(2):  # steep shading may throw the first centre off by several pixels
-            spots = _refined(grey, spots, self._size / 2)
-        matches = [
-            _match(expected, spots, self._reach) for expected in (before, before + self._motion)
-        ]
-        positions, found, _ = min(matches, key=lambda match: match[2])
+        centres = _refined(grey, spots, self._size / 2)
+        # Steep shading may throw the first centre off by several pixels.
+        off = (np.rint(centres) != np.rint(spots)).any(1)
+        centres[off] = _refined(grey, centres[off], self._size / 2)
+        starts = [before, before + self._motion, self.rest.positions]
+        height, width, _ = frame.shape
+        positions, found = match(starts, centres, self._spacing, (width, height))
         if found.any():
-            moved = _spread(positions - self.rest.positions, found)
+            moved = spread(positions - self.rest.positions, found)
             positions[~found] = (self.rest.positions + moved)[~found]
         self._motion = positions - before
         self.now = Markers(positions, found)
         return self.now
-
-
-def _match(expected: Dots, spots: Spots, reach: float) -> tuple[Dots, Flags, float]:
-    """Match dots with spots: positions, which were found, mean distance (px; `reach` if lost)."""
-    positions, found = expected.copy(), np.zeros(expected.shape[:2], bool)
-    if not len(spots):
-        return positions, found, reach
-    distance = np.linalg.norm(expected[:, :, None] - spots, axis=-1)
-    spot = distance.argmin(-1)
-    nearest = distance.reshape(-1, len(spots)).argmin(0)[spot]
-    own = np.arange(spot.size).reshape(spot.shape)
-    found = (nearest == own) & (distance.min(-1) < reach)
-    positions[found] = spots[spot[found]]
-    return positions, found, float(np.where(found, distance.min(-1), reach).mean())
 
 
 def find_markers(image: Picture, grid: MarkerGrid, pixel_pitch: float) -> Markers:
@@ -226,14 +210,6 @@ def _fullest(cells: Int[np.ndarray, "n 2"], grid: MarkerGrid) -> Int[np.ndarray,
     ]
     size = np.array([grid.columns, grid.rows])
     return max(corners, key=lambda c: int(((real >= c) & (real < c + size)).all(1).sum()))
-
-
-def _spread(field: Dots, known: Flags) -> Dots:
-    """Average a field over known neighbours, the nearest counting most."""
-    weight = known.astype(np.float32)
-    total = cv2.GaussianBlur(field * weight[..., None], (0, 0), 1.0, borderType=cv2.BORDER_CONSTANT)
-    share = cv2.GaussianBlur(weight, (0, 0), 1.0, borderType=cv2.BORDER_CONSTANT)
-    return total / np.maximum(share, 1e-6)[..., None]
 
 
 def _padded(image: np.ndarray, radius: float) -> tuple[np.ndarray, int]:

@@ -2,8 +2,9 @@
 
 A gel surface h(x, y), m into the gel (`gel.deform`), has slopes gx = dh/dx, gy = dh/dy by central
 differences and the unit normal's image-plane part (nx, ny) = -(gx, gy) / sqrt(1 + gx^2 + gy^2).
-With the ten features f_k of `shape_features`, position p = (1, u, v), u and v from -1 to 1 across
-columns and rows, and the shadow depths s_l of `gel.shadow_depth`, channel c shows
+With the ten features f_k of `shape_features`, position p = (1, u, v) or (1, u, v, u^2, v^2), u and v
+from -1 to 1 across columns and rows, and the shadow depths s_l of `gel.shadow_depth`, channel c
+shows
 
     I_c = background_c + noise + gain_c (
         sum over k, m of response[c,k,m] f_k p_m  +  sum over l of shadow[c,l] s_l / (s_l +
@@ -35,7 +36,8 @@ from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.picture_file import read_picture
 
 N_FEATURES = 10
-FORMAT = 2
+PLACES = {2: 3, 3: 5}
+"""Position terms by the format of the sensor file: 1, u and v; from 3 on their squares, too."""
 _JSON, _BACKGROUND = "sensor.json", "background.png"
 _MAKE = "make one with: touchgoal calibrate PRESSES"
 
@@ -47,9 +49,8 @@ class SensorCalibration:
     sensor: str  # name of the sensor model
     background: Picture  # the untouched sensor, RGB
     pixel_pitch: float  # m per pixel
-    # counts per channel and feature (`shape_features`); the last axis multiplies (1, u, v), where u
-    # and v run from -1 to 1 across columns and rows
-    response: Float32[np.ndarray, "3 10 3"]
+    # counts per channel and feature (`shape_features`); the last axis multiplies `position_terms`
+    response: Float32[np.ndarray, "3 10 places"]
     light_azimuths: tuple[float, ...]  # of the lights, degrees from image x (right) to y (down)
     shadow_slope: float  # tangent of the lights' height above the gel plane
     shadow: Float32[np.ndarray, "3 lights"]  # counts in each light's deepest shadow
@@ -69,6 +70,14 @@ def illumination(background: Picture, illumination_exponent: float = 1.0) -> Cou
     light = cv2.GaussianBlur(background.astype(np.float32), (0, 0), background.shape[1] / 40)
     light = (light / light.mean((0, 1))) ** np.float32(illumination_exponent)
     return light / light.mean((0, 1))
+
+
+def position_terms(
+    u: Float[np.ndarray, "..."], v: Float[np.ndarray, "..."], n: int
+) -> Float[np.ndarray, "places ..."]:
+    """Return the first `n` of 1, u, v, u^2, v^2; u and v run from -1 to 1 across columns and rows."""
+    terms = np.broadcast_arrays(np.ones_like(u), u, v, u * u, v * v)
+    return np.stack(terms[:n])
 
 
 def shape_features(
@@ -114,8 +123,8 @@ def design_matrix(
 ) -> Float32[np.ndarray, "terms n"]:
     """Return the terms of the colour change at pixels (flat indices) of a gel's surface (m).
 
-    They are the features times 1, u and v, then the shadows; only the sensor file's non-linear
-    parameters are used.
+    They are the features times each of `position_terms`, then the shadows; of the sensor file only
+    the non-linear parameters and the number of position terms are used.
     """
     h, w = surface.shape
     shape = shape_features(
@@ -124,7 +133,8 @@ def design_matrix(
     shape = shape.reshape(N_FEATURES, -1)[:, pixels]
     v, u = np.divmod(pixels, w) * (2 / np.array([[h - 1], [w - 1]], np.float32)) - 1
     dark = shadows(calibration, surface, calibration.pixel_pitch).reshape(-1, h * w)[:, pixels]
-    terms = np.concatenate([shape, shape * u, shape * v, dark])
+    places = position_terms(u, v, calibration.response.shape[2])
+    terms = np.concatenate([*(shape * place for place in places), dark])
     return terms.astype(np.float32, copy=False)
 
 
@@ -153,7 +163,8 @@ def save(calibration: SensorCalibration, folder: Path, provenance: dict[str, Any
     folder.mkdir(parents=True, exist_ok=True)
     rows, columns, _ = calibration.background.shape
     numbers = {name: _plain(getattr(calibration, name)) for name in _NUMBERS}
-    description = {"format": FORMAT, "image_shape": [rows, columns], **numbers}
+    version = next(n for n, places in PLACES.items() if places == calibration.response.shape[2])
+    description = {"format": version, "image_shape": [rows, columns], **numbers}
     text = json.dumps({**description, "provenance": provenance}, indent=1)
     cv2.imwrite(str(folder / _BACKGROUND), calibration.background[..., ::-1])
     (folder / _JSON).write_text(_INNERMOST.sub(lambda m: " ".join(m[0].split()), text) + "\n")
@@ -169,8 +180,9 @@ def load(folder: Path) -> SensorCalibration:
         version = description["format"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise UserError(f"{path} is no sensor file: {_MAKE}") from error
-    if version != FORMAT:
-        raise UserError(f"{path} has format {version}, this touchgoal reads {FORMAT}: {_MAKE}")
+    if version not in PLACES:
+        known = " and ".join(map(str, PLACES))
+        raise UserError(f"{path} has format {version}, this touchgoal reads {known}: {_MAKE}")
     image = read_picture(folder / _BACKGROUND)
     if image is None:
         raise UserError(f"{folder / _BACKGROUND} is missing or no picture: {_MAKE}")
@@ -186,7 +198,10 @@ def load(folder: Path) -> SensorCalibration:
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"{path} has no usable {name} ({error}): {_MAKE}") from error
     lights = len(values["light_azimuths"])
-    for name, shape in {"response": (3, N_FEATURES, 3), "shadow": (3, lights)}.items():
+    for name, shape in {
+        "response": (3, N_FEATURES, PLACES[version]),
+        "shadow": (3, lights),
+    }.items():
         if values[name].shape != shape:
             raise UserError(f"{path}: {name} is {values[name].shape}, not {shape}: {_MAKE}")
     return SensorCalibration(background=image, **values)

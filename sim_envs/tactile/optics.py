@@ -54,6 +54,7 @@ def _colours(surface, per_pitch, response, limits, dark, shadow, gain, out):
     scale = half * per_pitch
     max_slope, max_depth = limits
     flattest = one / (max_slope * max_slope)
+    squares, down = response.shape[2] > 3, np.empty(10, np.float32)
     nx, ny, pressed = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
     for i in range(h):
         row, above, below = surface[i], surface[max(i - 1, 0)], surface[min(i + 1, h - 1)]
@@ -67,7 +68,11 @@ def _colours(surface, per_pitch, response, limits, dark, shadow, gain, out):
         v = np.float32((4 * i + 1) / (2 * h - 1) - 1)
         d0, d1, d2 = dark[0, i], dark[1, i], dark[2, i]
         for c in range(3):
-            a = _along(response[c, :, 0], response[c, :, 2], v)
+            for k in range(10):
+                down[k] = response[c, k, 2]
+                if squares:
+                    down[k] += v * response[c, k, 4]
+            a = _along(response[c, :, 0], down, v)
             b = _along(response[c, :, 1], response[c, :, 1], zero)
             s0, s1, s2 = shadow[c, 0], shadow[c, 1], shadow[c, 2]
             light, change = gain[c, i], out[c, i]
@@ -75,6 +80,11 @@ def _colours(surface, per_pitch, response, limits, dark, shadow, gain, out):
                 x, y, z, u = nx[j], ny[j], pressed[j], across[j]
                 lit = _response(x, y, z, a) + u * _response(x, y, z, b)
                 change[j] = light[j] * (lit + s0 * d0[j] + s1 * d1[j] + s2 * d2[j])
+            if squares:
+                b = _along(response[c, :, 3], response[c, :, 3], zero)
+                for j in range(w):
+                    u = across[j]
+                    change[j] += light[j] * u * u * _response(nx[j], ny[j], pressed[j], b)
 
 
 def colour_change(surface: HeightField, instance: SensorInstance) -> Float32[np.ndarray, "3 h w"]:
