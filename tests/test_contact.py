@@ -130,7 +130,7 @@ def test_a_shaking_camera_over_dots_is_no_contact() -> None:
         for x, y in np.mgrid[16:WIDTH:32, 16:HEIGHT:32].reshape(2, -1).T:
             cv2.circle(frames[i], (int(x), int(y)), 8, (30, 30, 30), cv2.FILLED)
         shift = 0.5 * min(i, 1) * np.array([np.cos(angle), np.sin(angle)])
-        matrix = np.float32([[1, 0, shift[0]], [0, 1, shift[1]]])
+        matrix = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32)
         size = WIDTH, HEIGHT
         frames[i] = cv2.warpAffine(frames[i], matrix, size, borderMode=cv2.BORDER_REPLICATE)
     detector = ContactDetector(Background(frames[:1]))

@@ -118,7 +118,7 @@ def _shifted(
     change: Float32[np.ndarray, "H W 3"], structure: Float32[np.ndarray, "H W 3"]
 ) -> Float32[np.ndarray, "H W 3"]:
     """Return the part of a change that a small shift of the whole picture explains."""
-    kernel = np.float32([[-0.5, 0, 0.5]]) / _CELL
+    kernel = np.array([[-0.5, 0, 0.5]], np.float32) / _CELL
     sides = [
         cv2.filter2D(structure, -1, k, borderType=cv2.BORDER_REPLICATE) for k in (kernel, kernel.T)
     ]

@@ -19,7 +19,7 @@ Points = Float32[np.ndarray, "dots 2"]
 
 # Lengths are in spacings of the grid.
 _REACH = 0.5  # farthest spot from a dot's expected place
-_CLEAR = 0.05  # mean distance up to which no jump is searched
+_CLEAR = 0.08  # distance and motion cost of a start after which no other is tried
 _FARTHEST = 1  # jump along x or y that is searched
 _BINS = 8  # of the search, a spacing
 _JUMPS = 4  # likeliest ones that are tried
@@ -46,7 +46,7 @@ def match(
     """Match dots with spots (px): positions, and which were found; the others are as expected.
 
     `starts` are places where the dots may be, the first their last ones: the first that explains
-    the frame is taken, or if none does, the best of them and of jumps by up to a spacing. `spacing`
+    the frame is taken, or if none does, the best. Jumps by up to a spacing come second. `spacing`
     is the grid's, px; a dot outside the frame of `size` (width, height) is not missed.
     """
     shape = starts[0].shape
@@ -74,9 +74,10 @@ def match(
 
 
 def _starts(places: list[Points], spots: Spots, spacing: float) -> Iterator[Points]:
-    yield from places
+    yield places[0]
     for jump in _likely_jumps(places[0], spots, spacing):
         yield places[0] + jump
+    yield from places[1:]
 
 
 def spread(field: Dots, known: Flags) -> Dots:
@@ -118,7 +119,7 @@ def _affine(
 ) -> Float32[np.ndarray, "3 2"]:
     """Fit motions (px) linearly to 1, x and y, dots beyond `stray` (px) counting little."""
     solved = np.zeros((3, 2), np.float32)
-    stiff = np.diag(np.float32([0, _STIFF, _STIFF]))
+    stiff = np.diag(np.array([0, _STIFF, _STIFF], np.float32))
     weight = np.ones(len(terms), np.float32)
     for _ in range(3):
         weighted = terms * weight[:, None]
