@@ -157,7 +157,7 @@ def test_fast_picture_is_the_reference_formula_s(squares: bool) -> None:
     frame = sense(Body(CATALOGUE["glass_ball"], (0.008,), 0.1), at=[4e-3, -3e-3, 0.007], force=6.0)
     calibration = INSTANCE.calibration
     if squares:
-        falloff = calibration.response[..., :1] * np.float32([-0.9, 1.5])
+        falloff = calibration.response[..., :1] * np.float32([-0.9, 1.5])  # pyright: ignore[reportArgumentType]
         response = np.concatenate([calibration.response, falloff], 2)
         calibration = replace(calibration, response=response)
     noise = np.zeros_like(INSTANCE.noise)
