@@ -23,6 +23,10 @@ BENCHMARKS = {
         "papers.mmwand.classification",
         "objects named by touch and sight (MMWand II)",
     ),
+    "zero-shot": (
+        "papers.mmwand.real.zero_shot",
+        "materials of real objects by sentences (MMWand III)",
+    ),
     "reward-quality": ("papers.reward_quality", "dense costs against outcomes (MMWand V-E)"),
     "tacbench": ("papers.tacbench.benchmark", "force, slip, pose, grasp, cloth from frozen touch"),
     "real-touch": ("real_touch.videos", "encoders on labelled videos of real touch"),

@@ -16,8 +16,10 @@ from torch import Tensor
 from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
 from touchgoal.benchmarks.papers.mmwand.fine_tuned import Modality, Network, accuracy, read_pictures
+from touchgoal.benchmarks.papers.mmwand.real.dome_tables import run_classification
 from touchgoal.benchmarks.papers.mmwand.splits import split_touches
 from touchgoal.encoders.alignment.wand_set import WandSet
+from touchgoal.episodes.importers.touch_sets.vt60 import is_vt60
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 
 PUBLISHED = {
@@ -38,7 +40,8 @@ class Config(BenchmarkOptions):
     """Options of benchmark classification."""
 
     data: Path = field(kw_only=True)
-    """Touches recorded by `collect-touches --body wand`."""
+    """Touches recorded by `collect-touches --body wand`, or vt60's folder (real touches of a dome, with
+    which come networks of their own: of the other options only `cache` and `seed` count)."""
     encoders: tuple[str, ...] = ("gelsight_mini_surfaces", "gelsight_mini", "random:gelsight_mini")
     """Touch encoders: see benchmark real-touch."""
     splits: tuple[Literal["sample", "press"], ...] = ("sample", "press")
@@ -59,6 +62,8 @@ class Config(BenchmarkOptions):
 
 def run(config: Config) -> dict[str, Any]:
     """Fit probes and judge them."""
+    if is_vt60(config.data):
+        return run_classification(config.data, config.seed, config.cache)
     torch.manual_seed(config.seed)
     data = embed_set(config.data, config.encoders, config.seed, config.cache)
     image = data.image.mean(1)

@@ -16,10 +16,12 @@ from jaxtyping import Bool, Float
 
 from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
+from touchgoal.benchmarks.papers.mmwand.real.dome_tables import run_retrieval
 from touchgoal.benchmarks.papers.mmwand.splits import SPLITS, Fold, Split, split_touches
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.alignment.heads import Heads, Paired, fit_heads
 from touchgoal.encoders.alignment.retrieval import average_precisions
+from touchgoal.episodes.importers.touch_sets.vt60 import is_vt60
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
 
 PUBLISHED = {
@@ -42,7 +44,8 @@ class Config(BenchmarkOptions):
     """Options of benchmark retrieval."""
 
     data: Path = field(kw_only=True)
-    """Touches recorded by `collect-touches --body wand`."""
+    """Touches recorded by `collect-touches --body wand`, or vt60's folder (real touches of a dome, with
+    which come networks of their own: of the other options only `cache` and `seed` count)."""
     encoders: tuple[str, ...] = ("gelsight_mini_surfaces", "gelsight_mini", "random:gelsight_mini")
     """Touch encoders: see benchmark real-touch."""
     splits: tuple[Split, ...] = SPLITS
@@ -59,6 +62,8 @@ class Config(BenchmarkOptions):
 
 def run(config: Config) -> dict[str, Any]:
     """Fit heads and judge retrieval, split by split."""
+    if is_vt60(config.data):
+        return run_retrieval(config.data, config.seed, config.cache)
     data = embed_set(config.data, config.encoders, config.seed, config.cache)
     rows = []
     for split in config.splits:

@@ -1,0 +1,92 @@
+"""Materials of real objects by sentences, never trained on: MMWand's Table III, on ObjectFolder Real.
+
+A touch gets the material whose sentences are nearest on average. The gel's untouched picture is
+the median of all touches, because none is published.
+"""
+
+from dataclasses import field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from touchgoal.benchmarks.options import BenchmarkOptions
+from touchgoal.encoders.pretrained import load_encoder
+from touchgoal.encoders.towers.towers import load_towers
+from touchgoal.episodes.importers.touch_sets.objectfolder_real import (
+    read_objectfolder_real,
+    read_touches,
+)
+from touchgoal.runtime.errors import UserError
+from touchgoal.runtime.option_types import checked_dataclass
+
+SENTENCES = {
+    "ceramic": ("hard, smooth glazed ceramic", "a smooth and hard object like porcelain"),
+    "glass": ("hard and very smooth glass", "a perfectly smooth, slick and hard object"),
+    "iron": ("hard, rough cast iron", "a hard object with a coarse, grainy surface"),
+    "plastic": ("smooth, firm plastic", "a slightly flexible object with a fine molded texture"),
+    "polycarbonate": ("hard, smooth clear plastic", "a rigid and slick object of molded plastic"),
+    "steel": ("hard, smooth polished steel", "a hard object with a sleek metal surface"),
+    "wood": ("hard wood with a fine grain", "a firm object with shallow lines along the grain"),
+}
+"""What each material commonly feels like; no sentence was chosen by its score."""
+_BOOTSTRAPS = 1000
+
+
+@checked_dataclass
+class Config(BenchmarkOptions):
+    """Options of benchmark zero-shot."""
+
+    data: Path = field(kw_only=True)
+    """Folder of ObjectFolder Real, with objects.csv and touch/."""
+    encoders: tuple[str, ...] = ("gelsight_mini",)
+    """Touch encoders with words: names or folders."""
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Name the material of every labelled object."""
+    objects = read_objectfolder_real(config.data)
+    touches, untouched = read_touches(objects)
+    labelled = [i for i, item in enumerate(objects) if item.material is not None]
+    materials = sorted({str(objects[i].material) for i in labelled})
+    if unknown := [name for name in materials if name not in SENTENCES]:
+        raise UserError(f"no sentence for {unknown[0]}; materials: {', '.join(SENTENCES)}")
+    truth = np.array([materials.index(str(objects[i].material)) for i in labelled])
+    sentences = [sentence for name in materials for sentence in SENTENCES[name]]
+    rows = []
+    for name in config.encoders:
+        encoder = load_encoder(name).eval()
+        if encoder.towers is None:
+            raise UserError(f"{name} has no words: choose an encoder that `align` or `adapt` made")
+        towers = load_towers(encoder.towers)
+        touch = encoder.embed_frames(touches[labelled], untouched)
+        text = encoder.embed_text_goal(sentences, towers)
+        scores = (touch @ text.T).reshape(len(truth), len(materials), -1).mean(2)
+        rows.append({"encoder": name, **_judge(scores, truth)})
+    frequent = float(np.bincount(truth).max() / len(truth))
+    return {"table": _table(rows, frequent, len(truth), materials), "rows": rows}
+
+
+def _judge(scores: Float[np.ndarray, "n c"], truth: np.ndarray) -> dict[str, Any]:
+    hit = scores.argmax(1) == truth
+    drawn = np.random.default_rng(0).integers(len(hit), size=(_BOOTSTRAPS, len(hit)))
+    low, high = np.percentile(hit[drawn].mean(1), [2.5, 97.5])
+    recall = [hit[truth == k].mean() for k in np.unique(truth)]
+    return {
+        "accuracy": float(hit.mean()),
+        "interval": [float(low), float(high)],
+        "balanced": float(np.mean(recall)),
+    }
+
+
+def _table(rows: list[dict[str, Any]], frequent: float, objects: int, materials: list[str]) -> str:
+    lines = [
+        f"material of {objects} real objects by sentences [95 % over objects]: {', '.join(materials)}",
+        f"{'':<40}{'right':<22}balanced",
+    ]
+    for row in rows:
+        cell = "{:.2f} [{:.2f}, {:.2f}]".format(row["accuracy"], *row["interval"])
+        lines.append(f"{row['encoder']:<40}{cell:<22}{row['balanced']:.2f}")
+    lines.append(f"{'the most frequent material':<40}{frequent:<22.2f}{1 / len(materials):.2f}")
+    return "\n".join(lines)
