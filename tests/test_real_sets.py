@@ -23,7 +23,7 @@ from touchgoal.episodes.importers.touch_sets.vt60 import (
 )
 from touchgoal.runtime.errors import UserError
 
-CLASSES, OBJECTS, TOUCHES, VIEWS = 2, 4, 8, 4
+CLASSES, OBJECTS, TOUCHES, VIEWS = 2, 4, 4, 4
 
 
 def write_table(path: Path, *rows: tuple[object, ...]) -> None:
@@ -119,7 +119,7 @@ def test_touch_finds_sight_of_unseen_objects(dome: Path, tmp_path: Path) -> None
 
 
 def test_objectfolder_real(tmp_path: Path) -> None:
-    rows = [("index", "name", "material")]
+    rows: list[tuple[object, ...]] = [("index", "name", "material")]
     materials = ("Steel", "Wood", "Steel", "")
     for i, material in enumerate(materials, 1):
         picture = np.full((320, 240, 3), 100.0)

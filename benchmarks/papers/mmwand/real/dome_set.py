@@ -73,7 +73,7 @@ def embed_dome(folder: Path, seed: int, cache: Path) -> DomeSet:
     if not kept.exists():
         arrays = {**_embed_touches(data, seed), "image": _embed_views(data)}
         with atomic_write(kept) as unfinished, unfinished.open("wb") as file:
-            np.savez(file, **arrays)
+            np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
     with np.load(kept) as arrays:
         return DomeSet(data, {name: arrays[name] for name in INPUTS}, arrays["image"])
 

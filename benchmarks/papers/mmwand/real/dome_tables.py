@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from touchgoal.benchmarks.papers.mmwand.real.dome_set import (
     INPUTS,
+    PIXELS,
     DomeFold,
     DomeSet,
     DomeSplit,
@@ -26,6 +27,7 @@ from touchgoal.encoders.probes.ridge import ridge_scores
 SPLITS: tuple[DomeSplit, ...] = ("press", "object")
 _STRENGTHS = (0.01, 0.1, 1.0)
 _BOOTSTRAPS = 1000
+_NEAREST = "nearest raw pixels, no head"
 
 Interval = tuple[float, float, float]
 """Mean and 95 % interval over objects, %."""
@@ -44,7 +46,7 @@ def run_retrieval(folder: Path, seed: int, cache: Path) -> dict[str, Any]:
     """Return the table of retrieval between touch and image."""
     data, rows = embed_dome(folder, seed, cache), []
     for split in SPLITS:
-        for name in (*INPUTS, "chance"):
+        for name in (*INPUTS, _NEAREST, "chance"):
             found = _retrieve(data, name, split, seed)
             rows.append({"split": split, "input": name, **found})
     return {"table": _retrieval_table(data, rows), "rows": rows}
@@ -65,6 +67,8 @@ def _retrieve(data: DomeSet, name: str, split: DomeSplit, seed: int) -> dict[str
         view_object = data.listed.view_object[fold.test_view]
         if name == "chance":
             cosine = np.zeros((len(touch_object), len(view_object)))
+        elif name == _NEAREST:
+            cosine = _nearest_touch(data, fold)
         else:
             answers = _answer(data, name, fold, split)
             cosine = _unit(answers.touch) @ _unit(answers.image).T
@@ -84,6 +88,16 @@ def _retrieve(data: DomeSet, name: str, split: DomeSplit, seed: int) -> dict[str
         ):
             found.setdefault(direction, []).append((asked, average_precisions(s, r)))
     return {direction: _mean(pairs) for direction, pairs in found.items()}
+
+
+def _nearest_touch(data: DomeSet, fold: DomeFold) -> Float[np.ndarray, "b d"]:
+    """Return cosines to the test views of the mean view of the nearest training touch's object."""
+    listed, pixels = data.listed, _unit(data.touch[PIXELS])
+    found = (pixels[fold.test_touch] @ pixels[fold.train_touch].T).argmax(1)
+    mean = np.zeros((len(listed.names), data.image.shape[1]), np.float32)
+    np.add.at(mean, listed.view_object[fold.train_view], data.image[fold.train_view])
+    nearest = listed.touch_object[fold.train_touch[found]]
+    return _unit(mean[nearest]) @ data.image[fold.test_view].T
 
 
 def _classify(data: DomeSet, name: str, seed: int) -> dict[str, Interval]:
@@ -171,6 +185,7 @@ def _retrieval_table(data: DomeSet, rows: list[dict[str, Any]]) -> str:
         f"{len(listed.touches)} touches and {len(listed.views)} views of {len(listed.names)} objects "
         f"of {len(listed.classes)} classes; mAP in % over four folds [95 % over objects]",
         "object's touches: the mean cosine over an object's held-out touches",
+        "nearest raw pixels: the views of the nearest training touch's object stand for a touch",
         "pixels outside the sensor feel nothing: what they find is the light of the session",
     ]
     for split in SPLITS:
