@@ -23,7 +23,7 @@ from touchgoal.episodes.importers.touch_sets.vt60 import (
 )
 from touchgoal.runtime.errors import UserError
 
-CLASSES, OBJECTS, TOUCHES, VIEWS = 2, 4, 4, 4
+CLASSES, OBJECTS, TOUCHES, VIEWS = 2, 4, 8, 4
 
 
 def write_table(path: Path, *rows: tuple[object, ...]) -> None:
