@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from in_process import in_process_workers
 
-from touchgoal.benchmarks.papers.mmwand.embedded_set import touch_pictures
 from touchgoal.control import features as ft
 from touchgoal.control.cell.wand import Moment
 from touchgoal.control.cell.wand_recorder import WandRecorder, evenly_loaded
@@ -25,6 +24,7 @@ from touchgoal.control.sensors import latest_value
 from touchgoal.control.sensors.load_cell import with_checksum
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 from touchgoal.control.wand_touch import FORCE_RANGES, MAX_FORCE, WandTouch
+from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.episodes import wand_recording
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.launch.__main__ import main
@@ -151,7 +151,7 @@ def test_three_touches_are_recorded_as_the_twins_and_ctrl_c_loses_nothing(
     assert load[0] == 0 and (np.diff(load) > 0).all() and load[-1] == pytest.approx(forces[0])
     view = frames[ft.WAND_VIEWS[0]].mean((1, 2, 3))
     np.testing.assert_allclose(view, [60, 60, 160, 160, 160, 160], atol=3)
-    untouched, touched = touch_pictures(found, 2)
+    untouched, touched = WandSet.open(found.root).pictures(2)
     assert np.abs(untouched.astype(float) - person.ramp[0]).mean() < 2
     assert np.abs(touched.astype(float) - untouched).max() > 20
 
