@@ -20,7 +20,6 @@ from in_process import in_process_workers
 from touchgoal.control import features as ft
 from touchgoal.control.cell.wand import Moment
 from touchgoal.control.cell.wand_recorder import WandRecorder, evenly_loaded
-from touchgoal.control.sensors import latest_value
 from touchgoal.control.sensors.load_cell import with_checksum
 from touchgoal.control.tactile.sensor_models import GELSIGHT_MINI
 from touchgoal.control.wand_touch import FORCE_RANGES, MAX_FORCE, WandTouch
@@ -187,10 +186,7 @@ def test_a_lost_camera_is_waited_for(person: Person, tmp_path: Path) -> None:
     assert len(EpisodeSet(tmp_path / "run" / "episodes")) == 1
 
 
-def test_a_silent_load_cell_is_said(
-    person: Person, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(latest_value, "_FIRST_TIMEOUT", 2.0)
+def test_a_silent_load_cell_is_said(person: Person, tmp_path: Path) -> None:
     person.silent = True
     with pytest.raises(SystemExit, match="load cell .* gives nothing: check cable, power"):
         collect(person, tmp_path / "run", "--object", "screw")
