@@ -99,30 +99,6 @@ def nearest(metrics: Metrics) -> str:
     return "; ".join(rows)
 
 
-def retrieved(metrics: Metrics) -> str:
-    """mAP from touch to text of the first encoder, by split, beside chance."""
-    first, parts = metrics["rows"][0]["encoder"], []
-    for split in dict.fromkeys(row["split"] for row in metrics["rows"]):
-        rows = {
-            r["encoder"]: r
-            for r in metrics["rows"]
-            if r["split"] == split and r["touch_text"] is not False
-        }
-        (mean, low, high), chance = rows[first]["touch to text"], rows["chance"]["touch to text"][0]
-        parts.append(f"{split} {mean:.1f} [{low:.1f}, {high:.1f}] (chance {chance:.1f})")
-    return "; ".join(parts)
-
-
-def named(metrics: Metrics) -> str:
-    """Accuracy of the linear probe on split by press: pictures, touch, both."""
-    rows = [
-        row for row in metrics["rows"] if row["split"] == "press" and row["input"] != "raw pixels"
-    ]
-    return "; ".join(
-        "{} {:.0f} % [{:.0f}, {:.0f}]".format(r["input"], *r["probe"]) for r in rows[:3]
-    )
-
-
 def faults(metrics: Metrics) -> str:
     """Faults that lose no episode, and the longest time to rest."""
     rows = metrics["rows"]
