@@ -22,7 +22,7 @@ from touchgoal.sim_envs.scene.rendering import Renderer, open_renderer
 from touchgoal.sim_envs.tactile.markers import draw
 from touchgoal.sim_envs.tactile.optics import render_untouched
 from touchgoal.sim_envs.tactile.pad import TactilePad
-from touchgoal.sim_envs.tactile.sensor_instance import SensorInstance, sample_instance
+from touchgoal.sim_envs.tactile.sensor_instance import sample_instance
 from touchgoal.sim_envs.wand.bench import VIEWS, Bench
 from touchgoal.sim_envs.wand.objects import WandObject, find_wand_object, wand_objects
 
@@ -108,7 +108,7 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         if self.config.object is not None:
             find_wand_object(self.config.object)
         self._sensor = find_sensor(self.config.sensor)
-        self._instance = gel_instance(self.config)
+        self._instance = sample_instance(self._sensor, np.random.default_rng([self.config.gel, 17]))
         self.action_space = gym.spaces.Box(-1, 1, (6,), np.float32)
         self.observation_space = gym.spaces.Dict(self._spaces())
         self._bench: Bench | None = None
@@ -178,7 +178,7 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         before = self._render()
         bench.place_wand(tip, axes)
         force = (action[5] + 1) / 2 * MAX_FORCE
-        clip, load, wrench = self._press(point, force * np.linspace(0, 1, CLIP))
+        clip, load, wrench = self._press(tip, force * np.linspace(0, 1, CLIP))
         return Touch(before, self._render(), clip, load, wrench, point, normal)
 
     def untouched(self, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
@@ -199,14 +199,14 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         """Return the view from the left."""
         bench = self.bench
         assert self._renderer is not None
-        self._renderer.update_scene(bench.data, "side_left", bench.seen)
+        self._renderer.update_scene(bench.data, "side_left", bench.shown)
         return self._renderer.render()
 
     def segment(self, view: str) -> Int32[np.ndarray, "H W"]:
         """Return the geom that each pixel of a view shows now, -1 for none."""
         assert self._renderer is not None, "views are off"
         self._renderer.enable_segmentation_rendering()
-        self._renderer.update_scene(self.bench.data, view, self.bench.seen)
+        self._renderer.update_scene(self.bench.data, view, self.bench.shown)
         segments = self._renderer.render()[..., 0]
         self._renderer.disable_segmentation_rendering()
         return segments
@@ -284,7 +284,7 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
         views = {}
         assert self._renderer is not None
         for name in VIEWS:
-            self._renderer.update_scene(self.bench.data, name, self.bench.seen)
+            self._renderer.update_scene(self.bench.data, name, self.bench.shown)
             views[name] = self._renderer.render()
         return views
 
@@ -299,11 +299,6 @@ class TouchWand(gym.Env[dict[str, Any], np.ndarray]):
 
     def _info(self, touched: bool) -> dict[str, Any]:
         return {ft.TRUTH_CONTACT: np.array([touched, False]), "object": self.object.name}
-
-
-def gel_instance(config: TouchWandConfig) -> SensorInstance:
-    """Return the sensor instance on the wand."""
-    return sample_instance(find_sensor(config.sensor), np.random.default_rng([config.gel, 17]))
 
 
 def _approach(

@@ -14,7 +14,9 @@ from touchgoal.benchmarks.papers.mmwand.retrieval import PUBLISHED, judge
 from touchgoal.benchmarks.papers.mmwand.splits import SPLITS, Fold, split_touches
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.alignment.heads import Paired, fit_heads
+from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.pretrained import load_encoder
+from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.encoders.whitening.surface_words import surface_ranks
 from touchgoal.episodes import wand_recording
 from touchgoal.episodes.wand_recording import record_touches
@@ -81,10 +83,10 @@ def test_retrieval_knows_the_right_answer_and_chance() -> None:
     told["text"] = one_hot[data.describes.argmax(0)]
     blind = {name: np.zeros_like(rows) for name, rows in told.items()}
     assert judge(data, every, told).keys() == PUBLISHED.keys()
-    for found in judge(data, every, told).values():
-        assert np.mean([p for _, p in found]) == pytest.approx(1)
-    for direction, found in judge(data, every, blind).items():
-        assert 0.1 < np.mean([p for _, p in found]) < 0.19, direction
+    for _, precision in judge(data, every, told).values():
+        assert precision.mean() == pytest.approx(1)
+    for direction, (_, precision) in judge(data, every, blind).items():
+        assert 0.1 < precision.mean() < 0.19, direction
 
 
 def test_heads_bring_words_and_pictures_to_touch() -> None:
@@ -129,7 +131,10 @@ def test_words_are_added_to_an_encoder_that_stays_as_it_is(wand: Path, tmp_path:
     worded, plain = load_encoder(tmp_path / "run/encoder"), load_encoder("gelsight_mini_surfaces")
     picture = np.random.default_rng(0).integers(0, 255, (2, 240, 320, 3), dtype=np.uint8)
     np.testing.assert_allclose(worded.embed(picture), plain.embed(picture), atol=2e-3)
-    assert worded.towers == "offline"
+    assert worded.towers == "offline" and isinstance(worded, PooledEncoder)
+    words = worded.embed_text_goal(["a hard object", "a soft object"], load_towers("offline"))
+    images = worded.project_image(torch.rand(3, worded.config.image_dim)).numpy()
+    np.testing.assert_allclose(np.linalg.norm([*words, *images], axis=1), 1, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["retrieval", "classification"])

@@ -99,12 +99,16 @@ def _embed_pixels(frames: Frames, background: Untouched) -> Embeddings:
     return np.stack(small).reshape(len(frames), -1)
 
 
+def difference_pictures(frames: Frames, background: Untouched) -> Frames:
+    """Return the change against the untouched image as an image about grey."""
+    change = frames.astype(np.float32) - background
+    return np.clip(128 + _CONTRAST * change, 0, 255).astype(np.uint8)
+
+
 def _of_pictures(network: Callable[[Frames], torch.Tensor]) -> Embedder:
     @torch.no_grad()
     def embed(frames: Frames, background: Untouched) -> Embeddings:
-        change = frames.astype(np.float32) - background
-        about_grey = np.clip(128 + _CONTRAST * change, 0, 255).astype(np.uint8)
-        return network(about_grey).float().numpy()
+        return network(difference_pictures(frames, background)).float().numpy()
 
     return _one_by_one(embed)
 

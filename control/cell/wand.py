@@ -75,7 +75,7 @@ class WandConfig:
 
 @plain_dataclass(frozen=True, eq=False)
 class Moment:
-    """What a wand shows at one time: RGB picture of the gel, view -> RGB, force of the load cell (N)."""
+    """One reading of all devices: RGB picture of the gel, view -> RGB, force of the load cell (N)."""
 
     picture: Picture
     views: dict[str, UInt8[np.ndarray, "H W 3"]]

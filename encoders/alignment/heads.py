@@ -82,11 +82,11 @@ def _loss(
     sentence, label, tau = _draw_sentences(data, rows, draw), data.label[rows], config.temperature
     touch, text = data.touch[rows], heads.texts(data.texts[sentence])
     same = (label[:, None] == label) | (sentence[:, None] == sentence)
-    seen = rows < len(data.image)
-    view = torch.randint(data.image.shape[1], (int(seen.sum()),), generator=draw)
-    image, both = heads.images(data.image[rows[seen], view]), same[seen][:, seen]
-    loss = symmetric_info_nce(touch[seen], image, tau, both)
-    loss = loss + symmetric_info_nce(image, text[seen], tau, both)
+    viewed = rows < len(data.image)
+    view = torch.randint(data.image.shape[1], (int(viewed.sum()),), generator=draw)
+    image, both = heads.images(data.image[rows[viewed], view]), same[viewed][:, viewed]
+    loss = symmetric_info_nce(touch[viewed], image, tau, both)
+    loss = loss + symmetric_info_nce(image, text[viewed], tau, both)
     if config.text_weight:
         loss = loss + config.text_weight * symmetric_info_nce(touch, text, tau, same)
     return loss

@@ -6,15 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int, UInt8
+from jaxtyping import Bool, Float32, Int
 
 from touchgoal.control import features as ft
+from touchgoal.control.arrays import Picture, Pictures
 from touchgoal.encoders.towers.towers import Towers
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
-
-Picture = UInt8[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +40,7 @@ class WandSet:
         for m in meta:
             assert isinstance(m["descriptions"], list)
             of[str(m["object"])] = m["descriptions"]
-        names, sentences = sorted(of), sorted({s for said in of.values() for s in said})
+        names, sentences = sorted(of), sorted({s for own in of.values() for s in own})
         return cls(
             episodes=episodes,
             names=tuple(names),
@@ -65,6 +64,16 @@ class WandSet:
     def view(self, i: int) -> Picture:
         """Return the wand's own view before contact, RGB."""
         return self.episodes.read(i, [ft.WAND_VIEWS[-1]], [0]).frames[ft.WAND_VIEWS[-1]][0]
+
+    def embed_touches(
+        self, embed: Callable[[Pictures, Picture], Float32[np.ndarray, "_ d"]]
+    ) -> Float32[np.ndarray, "n d"]:
+        """Embed the firmest pictures by a function of pictures and their untouched one. Long work."""
+        rows = []
+        for i in track(range(len(self)), "embedding touches", "touch"):
+            untouched, touched = self.pictures(i)
+            rows.append(embed(touched[None], untouched)[0])
+        return np.stack(rows).astype(np.float32)
 
     def embed_views(
         self, towers: Towers, change: Callable[[Picture], Picture] = lambda view: view

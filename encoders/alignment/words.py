@@ -1,6 +1,5 @@
 """Words and pictures for a touch encoder that stays as it is (see `heads`)."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,7 @@ from torch import Tensor
 from touchgoal.control.tactile.sensor_models import SensorModel
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.alignment.green_screen import background_changer
-from touchgoal.encoders.alignment.heads import Paired, fit_heads
+from touchgoal.encoders.alignment.heads import Heads, Paired, fit_heads
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.towers.towers import Towers
@@ -20,7 +19,8 @@ from touchgoal.encoders.whitening.simulated_surfaces import pressed_surfaces
 from touchgoal.encoders.whitening.surface_words import surface_sentences
 from touchgoal.runtime.progress import track
 
-_FELT = 0.2  # length of an embedding below which a touch shows nothing
+_VISIBLE = 0.2  # length of an embedding below which a touch shows nothing
+_PRESSES = 2  # of each surface
 
 
 def add_words(
@@ -46,55 +46,43 @@ def add_words(
         seed: random seed.
     """
     behind = background_changer(backgrounds, seed)
-    touch = _embed(encoder, (data.pictures(i) for i in range(len(data))), len(data), "touches")
-    felt = np.flatnonzero(touch.norm(dim=1).numpy() > _FELT)
-    sentences, describes = list(data.sentences), data.describes
-    random = list(pressed_surfaces(sensor, surfaces, 2, seed))
-    pressed = _embed(
-        encoder, (pair for _, pairs in random for pair in pairs), 2 * surfaces, "surfaces"
-    )
-    said = [surface_sentences(surface) for surface, _ in random]
-    words = sorted({s for four in said for s in four})
-    on_words = np.array([[w in four for w in words] for four in said])
-    o, k = len(describes), len(random)
-    whole = np.zeros((o + k, len(sentences) + len(words)), bool)
-    whole[:o, : len(sentences)], whole[o:, len(sentences) :] = describes, on_words
-    labels = np.concatenate([data.label[felt], o + np.repeat(np.arange(k), 2)])
+    touch = torch.from_numpy(data.embed_touches(encoder.embed_frames))
+    visible = np.flatnonzero(touch.norm(dim=1).numpy() > _VISIBLE)
+    pressed, sentences = _press_surfaces(encoder, sensor, surfaces, seed)
+    texts = sorted({s for own in sentences for s in own})
+    o, k, m = len(data.names), len(sentences), len(data.sentences)
+    describes = np.zeros((o + k, m + len(texts)), bool)
+    describes[:o, :m] = data.describes
+    describes[o:, m:] = [[text in own for text in texts] for own in sentences]
+    labels = np.concatenate([data.label[visible], o + np.repeat(np.arange(k), _PRESSES)])
     paired = Paired(
-        touch=F.normalize(torch.cat([touch[felt], pressed]), dim=1),
+        touch=F.normalize(torch.cat([touch[visible], pressed]), dim=1),
         label=torch.from_numpy(labels),
-        image=torch.from_numpy(data.embed_views(towers, behind)[felt]),
-        texts=towers.embed_texts(sentences + words),
-        describes=torch.from_numpy(whole),
+        image=torch.from_numpy(data.embed_views(towers, behind)[visible]),
+        texts=towers.embed_texts([*data.sentences, *texts]),
+        describes=torch.from_numpy(describes),
     )
-    heads = fit_heads(paired, config, seed)
-    worded = PooledEncoder(
-        replace(
-            encoder.config, towers=towers.name, text_dim=towers.text_dim, image_dim=towers.image_dim
-        )
-    )
-    worded.load_state_dict(
-        {
-            **{name: encoder.state_dict()[name] for name in ("mean", "whitening")},
-            "text_mean": heads.text_mean,
-            "text_matrix": heads.text.weight.detach().T,
-            "image_mean": heads.image_mean,
-            "image_matrix": heads.image.weight.detach().T,
-        }
-    )
+    return _with_heads(encoder, towers, fit_heads(paired, config, seed))
+
+
+def _press_surfaces(
+    encoder: PooledEncoder, sensor: SensorModel, surfaces: int, seed: int
+) -> tuple[Float[Tensor, "n d"], list[list[str]]]:
+    """Return the embeddings of random surfaces' presses, one surface after another, and their sentences."""
+    rows, sentences = [], []
+    pressed = pressed_surfaces(sensor, surfaces, _PRESSES, seed)
+    for surface, presses in track(pressed, "embedding surfaces", "surface", surfaces):
+        rows += [encoder.embed_frames(after[None], before)[0] for before, after in presses]
+        sentences.append(surface_sentences(surface))
+    return torch.from_numpy(np.stack(rows)), sentences
+
+
+def _with_heads(encoder: PooledEncoder, towers: Towers, heads: Heads) -> PooledEncoder:
+    """Return a copy of an encoder with these heads."""
+    widths = {"text_dim": towers.text_dim, "image_dim": towers.image_dim}
+    worded = PooledEncoder(replace(encoder.config, towers=towers.name, **widths))
+    own = {name: encoder.state_dict()[name] for name in ("mean", "whitening")}
+    text = {"text_mean": heads.text_mean, "text_matrix": heads.text.weight.detach().T}
+    image = {"image_mean": heads.image_mean, "image_matrix": heads.image.weight.detach().T}
+    worded.load_state_dict({**own, **text, **image})
     return worded.eval()
-
-
-@torch.no_grad()
-def _embed(
-    encoder: PooledEncoder,
-    pairs: Iterator[tuple[np.ndarray, np.ndarray]],
-    count: int,
-    what: str,
-) -> Float[Tensor, "n d"]:
-    """Embed pictures, each against its own untouched one."""
-    rows = []
-    for untouched, touched in track(pairs, f"embedding {what}", "picture", count):
-        touch = torch.from_numpy(encoder.preprocess(touched[None], untouched))
-        rows.append(encoder.embed_touch(touch)[0])
-    return torch.stack(rows)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.preprocess import preprocessor_for
-from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
+from touchgoal.encoders.towers.efficientnet import EfficientNetLite0, load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_normalised
 from touchgoal.encoders.whitening.text_head import TextHead
 
@@ -141,20 +141,19 @@ class PooledEncoder(BaseTouchEncoder):
 
     def pool(self, touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d"]:
         """Return means and standard deviations over the image, stage by stage."""
-        return _pooled(self._stages(touch))
-
-    @torch.no_grad()
-    def _stages(self, touch: Float[Tensor, "n 3 h w"]) -> list[Float[Tensor, "n _ _ _"]]:
-        network = self._network[0].to(touch.device)
         drawn = (128 + _CONTRAST * self._scale * touch).clamp(0, 255) / 255
-        x = network.stem(imagenet_normalised(drawn).contiguous(memory_format=torch.channels_last))
-        stages, pooled = [], {block for block, _ in STAGES}
-        for i in range(self.config.last_block + 1):
-            x = network.blocks[i](x)
-            if i in pooled:
-                stages.append(x)
-        return stages
+        return pool_stages(self._network[0].to(touch.device), drawn, self.config.last_block)
 
 
-def _pooled(stages: list[Float[Tensor, "n _ _ _"]]) -> Float[Tensor, "n d"]:
-    return torch.cat([m for x in stages for m in (x.mean((2, 3)), x.std((2, 3)))], 1)
+@torch.no_grad()
+def pool_stages(
+    network: EfficientNetLite0, images: Float[Tensor, "n 3 h w"], last_block: int
+) -> Float[Tensor, "n d"]:
+    """Return means and standard deviations of RGB images (0 to 1) after each of `STAGES`."""
+    x = network.stem(imagenet_normalised(images).contiguous(memory_format=torch.channels_last))
+    pooled, stages = [], {block for block, _ in STAGES}
+    for i in range(last_block + 1):
+        x = network.blocks[i](x)
+        if i in stages:
+            pooled += [x.mean((2, 3)), x.std((2, 3))]
+    return torch.cat(pooled, 1)

@@ -40,7 +40,7 @@ class Bench:
     Attributes:
         model, data: the compiled scene.
         bodies: what the gel can touch, the bench among them; `TactilePad` takes them.
-        seen: what cameras show.
+        shown: geoms that cameras show.
     """
 
     def __init__(self, wand_object: WandObject, size: tuple[int, int]) -> None:
@@ -60,8 +60,8 @@ class Bench:
         mujoco.mj_forward(self.model, self.data)
         parts = [g for g in range(self.model.ngeom) if self.model.geom_group[g] == OBJECT_GROUP]
         self._parts = [g for g in parts if self.model.geom(g).name != _BENCH]
-        self.seen = mujoco.MjvOption()
-        self.seen.geomgroup[OBJECT_GROUP] = 0
+        self.shown = mujoco.MjvOption()
+        self.shown.geomgroup[OBJECT_GROUP] = 0
         self._centre, self.radius = _bounds(self.model, self.data, self._parts)
 
     @property

@@ -3,6 +3,7 @@
 A linear probe and the nearest neighbour on what frozen networks give; on raw pixels, too.
 """
 
+from collections.abc import Callable
 from dataclasses import field
 from pathlib import Path
 from typing import Any, Literal
@@ -15,7 +16,13 @@ from torch import Tensor
 
 from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
-from touchgoal.benchmarks.papers.mmwand.fine_tuned import Modality, Network, accuracy, read_pictures
+from touchgoal.benchmarks.papers.mmwand.fine_tuned import (
+    Modality,
+    Network,
+    fine_tune,
+    read_pictures,
+)
+from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from touchgoal.benchmarks.papers.mmwand.real.dome_tables import run_classification
 from touchgoal.benchmarks.papers.mmwand.splits import split_touches
 from touchgoal.encoders.alignment.wand_set import WandSet
@@ -31,7 +38,6 @@ PUBLISHED = {
 PUBLISHED_PROBE = 3.24, 46.94, 47.22
 """Its linear probe on the aligned embeddings."""
 _DECAYS = (1e-4, 1e-3, 1e-2, 1e-1)
-_BOOTSTRAPS = 500
 _PIXELS = 300  # principal components of raw pixels that the probe sees
 
 
@@ -49,11 +55,11 @@ class Config(BenchmarkOptions):
     seeds: Count = 3
     """Splits of each kind."""
     fine_tuned: tuple[Network, ...] = ()
-    """Networks to fine-tune as well, on image, touch and both, some ten minutes each on two cores."""
+    """Networks to fine-tune as well, on each split and modality; long work."""
     modalities: tuple[Modality, ...] = ("image", "touch", "both")
-    """What they are given."""
+    """Inputs of the fine-tuned networks."""
     epochs: Count = 12
-    """Passes of their training."""
+    """Passes of their training over the touches."""
     cache: Path = Path("runs/mmwand-embeddings")
     """Folder that keeps the embeddings."""
     seed: Seed = 0
@@ -64,10 +70,9 @@ def run(config: Config) -> dict[str, Any]:
     """Fit probes and judge them."""
     if is_vt60(config.data):
         return run_classification(config.data, config.seed, config.cache)
-    torch.manual_seed(config.seed)
     data = embed_set(config.data, config.encoders, config.seed, config.cache)
     image = data.image.mean(1)
-    inputs = {"images": image, "raw pixels": _principal(data.pixels)}
+    inputs = {"images": image, "raw pixels": _principal(data.pixels, config.seed)}
     for name in config.encoders:
         inputs[name] = data.touch[name]
         inputs[f"images + {name}"] = np.hstack([_standard(image), _standard(data.touch[name])])
@@ -90,15 +95,10 @@ def _fine_tuned(config: Config, data: EmbeddedSet) -> list[dict[str, Any]]:
             for modality in config.modalities:
                 inputs = list(pictures.values()) if modality == "both" else [pictures[modality]]
                 rest = data.label, fold.train, fold.test, config.epochs, config.seed
-                hit = accuracy(network, inputs, *rest)
-                found = _with_interval(data.label[fold.test], hit)
-                rows.append(
-                    {
-                        "split": split,
-                        "input": f"{network} fine-tuned, {modality}",
-                        "fine_tuned": found,
-                    }
-                )
+                right = fine_tune(network, inputs, *rest)
+                found = mean_over_objects(data.label[fold.test], right)
+                what = f"{network} fine-tuned, {modality}"
+                rows.append({"split": split, "input": what, "fine_tuned": found})
     return rows
 
 
@@ -107,23 +107,29 @@ def _judge(
     embedding: Float[np.ndarray, "n d"],
     split: Literal["sample", "press"],
     seeds: int,
-) -> dict[str, list[float]]:
+) -> dict[str, Interval]:
     hits: dict[str, list[np.ndarray]] = {"probe": [], "nearest": []}
     objects = []
     for seed in range(seeds):
         fold = split_touches(split, data.label, data.visit, data.describes, seed)
         x, y = torch.from_numpy(embedding).float(), torch.from_numpy(data.label)
         train, test = ((x[rows], y[rows]) for rows in (fold.train, fold.test))
-        hits["probe"].append((probe(*train)(test[0]).argmax(1) == test[1]).numpy())
+        hits["probe"].append((probe(*train)(test[0]).argmax(1) == test[1]).numpy().astype(float))
         unit = F.normalize(train[0], dim=1), F.normalize(test[0], dim=1)
-        hits["nearest"].append((train[1][(unit[1] @ unit[0].T).argmax(1)] == test[1]).numpy())
+        hits["nearest"].append(
+            (train[1][(unit[1] @ unit[0].T).argmax(1)] == test[1]).numpy().astype(float)
+        )
         objects.append(data.label[fold.test])
     return {
-        what: _with_interval(np.concatenate(objects), np.concatenate(h)) for what, h in hits.items()
+        what: mean_over_objects(np.concatenate(objects), np.concatenate(h))
+        for what, h in hits.items()
     }
 
 
-def probe(x: Float[Tensor, "n d"], y: Int[Tensor, " n"]):
+Predict = Callable[[Float[Tensor, "m d"]], Float[Tensor, "m c"]]
+
+
+def probe(x: Float[Tensor, "n d"], y: Int[Tensor, " n"]) -> Predict:
     """Fit a logistic regression on standardised inputs; its decay is chosen on a fifth of the rows."""
     mean, scale = x.mean(0), x.std(0) + 1e-6
     x = (x - mean) / scale
@@ -136,7 +142,7 @@ def probe(x: Float[Tensor, "n d"], y: Int[Tensor, " n"]):
     return lambda new: predict((new - mean) / scale)
 
 
-def _logistic(x: Float[Tensor, "n d"], y: Int[Tensor, " n"], decay: float):
+def _logistic(x: Float[Tensor, "n d"], y: Int[Tensor, " n"], decay: float) -> Predict:
     classes, d = int(y.max()) + 1, x.shape[1]
     weight = torch.zeros(d, classes, requires_grad=True)
     bias = torch.zeros(classes, requires_grad=True)
@@ -153,23 +159,16 @@ def _logistic(x: Float[Tensor, "n d"], y: Int[Tensor, " n"], decay: float):
     return lambda new: new @ weight + bias
 
 
-def _with_interval(objects: Int[np.ndarray, " q"], hit: np.ndarray) -> list[float]:
-    """Return accuracy (%) and its 95 % interval over objects."""
-    kinds, index = np.unique(objects, return_inverse=True)
-    total, count = np.bincount(index, hit.astype(float)), np.bincount(index)
-    drawn = np.random.default_rng(0).integers(len(kinds), size=(_BOOTSTRAPS, len(kinds)))
-    low, high = np.percentile(total[drawn].sum(1) / count[drawn].sum(1), [2.5, 97.5])
-    return [100 * float(v) for v in (hit.mean(), low, high)]
-
-
 def _standard(x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
     return (x - x.mean(0)) / (x.std(0) + 1e-6)
 
 
-def _principal(pixels: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n d"]:
+def _principal(pixels: Float[np.ndarray, "n p"], seed: int) -> Float[np.ndarray, "n d"]:
     """Project pixels on their first principal components."""
     centred = torch.from_numpy(pixels - pixels.mean(0))
-    _, _, components = torch.pca_lowrank(centred, min(_PIXELS, *centred.shape), center=False)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        _, _, components = torch.pca_lowrank(centred, min(_PIXELS, *centred.shape), center=False)
     return (centred @ components).numpy()
 
 
@@ -180,8 +179,7 @@ def _table(rows: list[dict[str, Any]], kinds: int) -> str:
     )
     for row in rows:
         cells = [
-            "{:.1f} [{:.1f}, {:.1f}]".format(*row[what]) if what in row else ""
-            for what in ("probe", "nearest", "fine_tuned")
+            cell(row[what]) if what in row else "" for what in ("probe", "nearest", "fine_tuned")
         ]
         lines.append(
             f"{row['split']:<8}{row['input']:<42}{cells[0]:>20}{cells[1]:>22}{cells[2]:>20}"

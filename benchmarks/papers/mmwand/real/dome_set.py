@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float32, Int
 
 from touchgoal.control.tactile.light_gain import remove_gain
-from touchgoal.encoders.backbones.pooled_encoder import STAGES
+from touchgoal.encoders.backbones.pooled_encoder import STAGES, pool_stages
 from touchgoal.encoders.towers.efficientnet import EfficientNetLite0, load_efficientnet_lite0
-from touchgoal.encoders.towers.towers import imagenet_normalised, load_towers
+from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.episodes.importers.touch_clip import decode
 from touchgoal.episodes.importers.touch_sets.vt60 import (
     DomeTouches,
@@ -69,12 +69,12 @@ def embed_dome(folder: Path, seed: int, cache: Path) -> DomeSet:
     key = hashlib.sha256()
     for path in (data.untouched, *data.touches, *data.views):
         key.update(f"{path.relative_to(folder)} {path.stat().st_size}".encode())
-    kept = cache / f"dome-{key.hexdigest()[:16]}-{seed}.npz"
-    if not kept.exists():
+    path = cache / f"dome-{key.hexdigest()[:16]}-{seed}.npz"
+    if not path.exists():
         arrays = {**_embed_touches(data, seed), "image": _embed_views(data)}
-        with atomic_write(kept) as unfinished, unfinished.open("wb") as file:
+        with atomic_write(path) as unfinished, unfinished.open("wb") as file:
             np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
-    with np.load(kept) as arrays:
+    with np.load(path) as arrays:
         return DomeSet(data, {name: arrays[name] for name in INPUTS}, arrays["image"])
 
 
@@ -131,22 +131,15 @@ def _random_network(seed: int) -> EfficientNetLite0:
         return EfficientNetLite0().eval()
 
 
-@torch.no_grad()
 def _pooled(
     change: list[Float32[np.ndarray, "h w 3"]], network: EfficientNetLite0, name: str
 ) -> Float32[np.ndarray, "n d"]:
-    """Return means and deviations over the picture after the stages of `pooled_encoder`."""
-    blocks, rows = [block for block, _ in STAGES], []
+    """Return what `pooled_encoder` pools from the changes."""
+    rows = []
     for start in track(range(0, len(change), _BATCH), f"embedding touch, {name}", "batch"):
         batch = np.stack([cv2.resize(c, (_SIDE, _SIDE)) for c in change[start : start + _BATCH]])
         drawn = (128 + _CONTRAST * torch.from_numpy(batch).permute(0, 3, 1, 2)).clamp(0, 255) / 255
-        x = network.stem(imagenet_normalised(drawn).contiguous(memory_format=torch.channels_last))
-        pooled = []
-        for i in range(blocks[-1] + 1):
-            x = network.blocks[i](x)
-            if i in blocks:
-                pooled += [x.mean((2, 3)), x.std((2, 3))]
-        rows.append(torch.cat(pooled, 1).numpy())
+        rows.append(pool_stages(network, drawn, STAGES[-1][0]).numpy())
     return np.concatenate(rows)
 
 

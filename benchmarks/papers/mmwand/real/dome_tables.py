@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from touchgoal.benchmarks.papers.mmwand.real.dome_set import (
     INPUTS,
     PIXELS,
@@ -26,11 +27,7 @@ from touchgoal.encoders.probes.ridge import ridge_scores
 
 SPLITS: tuple[DomeSplit, ...] = ("press", "object")
 _STRENGTHS = (0.01, 0.1, 1.0)
-_BOOTSTRAPS = 1000
 _NEAREST = "nearest raw pixels, no head"
-
-Interval = tuple[float, float, float]
-"""Mean and 95 % interval over objects, %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,13 +166,7 @@ def _unit(x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
 
 
 def _mean(pairs: list[tuple[np.ndarray, np.ndarray]]) -> Interval:
-    """Return the mean (%) of all queries, and its interval by resampling objects."""
-    objects, value = (np.concatenate(column) for column in zip(*pairs, strict=True))
-    kinds, index = np.unique(objects, return_inverse=True)
-    total, count = np.bincount(index, value), np.bincount(index)
-    drawn = np.random.default_rng(0).integers(len(kinds), size=(_BOOTSTRAPS, len(kinds)))
-    low, high = np.percentile(total[drawn].sum(1) / count[drawn].sum(1), [2.5, 97.5])
-    return 100 * float(value.mean()), 100 * float(low), 100 * float(high)
+    return mean_over_objects(*(np.concatenate(column) for column in zip(*pairs, strict=True)))
 
 
 def _retrieval_table(data: DomeSet, rows: list[dict[str, Any]]) -> str:
@@ -191,8 +182,8 @@ def _retrieval_table(data: DomeSet, rows: list[dict[str, Any]]) -> str:
     for split in SPLITS:
         lines += ["", f"{'split by ' + split:<28}" + "".join(f"{d:>28}" for d in directions)]
         for row in (row for row in rows if row["split"] == split):
-            cells = (_cell(row[d]) for d in directions)
-            lines.append(f"{row['input']:<28}" + "".join(f"{cell:>28}" for cell in cells))
+            cells = (cell(row[d]) for d in directions)
+            lines.append(f"{row['input']:<28}" + "".join(f"{c:>28}" for c in cells))
     return "\n".join(lines)
 
 
@@ -204,10 +195,6 @@ def _classification_table(data: DomeSet, rows: list[dict[str, Any]]) -> str:
         f"{'touch by':<28}" + "".join(f"{what:>22}" for what in ("image", "touch", "both")),
     ]
     for row in rows:
-        cells = (_cell(row[what]) for what in ("image", "touch", "both"))
-        lines.append(f"{row['input']:<28}" + "".join(f"{cell:>22}" for cell in cells))
+        cells = (cell(row[what]) for what in ("image", "touch", "both"))
+        lines.append(f"{row['input']:<28}" + "".join(f"{c:>22}" for c in cells))
     return "\n".join(lines)
-
-
-def _cell(value: Interval) -> str:
-    return "{:.1f} [{:.1f}, {:.1f}]".format(*value)

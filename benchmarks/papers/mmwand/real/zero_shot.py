@@ -30,7 +30,7 @@ SENTENCES = {
     "steel": ("hard, smooth polished steel", "a hard object with a sleek metal surface"),
     "wood": ("hard wood with a fine grain", "a firm object with shallow lines along the grain"),
 }
-"""What each material commonly feels like; no sentence was chosen by its score."""
+"""Sentences on the common feel of each material; none was chosen by its score."""
 _BOOTSTRAPS = 1000
 
 
