@@ -34,8 +34,8 @@ class Config:
     """Power of the background's brightness by which the response varies over the image; default: the
     one that reads the balls at their size (four fits, a few minutes)."""
     squares: bool = False
-    """Let the response vary with the square of the place, too: reads the borders more exactly, from 40
-    presses or more all over the gel."""
+    """Let the response vary with the square of the place, too, for light that falls off towards the borders;
+    from 40 presses or more all over the gel."""
     out: Path | None = None
     """Folder of the run; the sensor file goes to its `sensor_file/`."""
     held_out: Annotated[float, Field(ge=0.1, le=0.5)] = 0.25

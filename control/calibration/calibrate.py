@@ -86,8 +86,8 @@ def fit(
 
     `on_progress` is called STEPS times. With `trust_labels` the circles stay as they are, but for
     one common scale of their radii. `illumination_exponent`: see `select_illumination_exponent`.
-    With `squares` the response varies with the square of the place, too: on 46 presses of a real
-    Mini, left out by place, its left and right borders read twice as exactly.
+    With `squares` the response varies with the square of the place, too, for gels whose light falls
+    off towards the borders.
     """
     background, varies_over_image = median_background(presses), _spread_out(presses)
     steps = press_fit.PressFit(
