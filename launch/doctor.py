@@ -76,7 +76,7 @@ def _towers() -> CheckResult:
 
 def _weights() -> CheckResult:
     from touchgoal.encoders.pretrained import DEFAULT_ENCODER, load_encoder
-    from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
+    from touchgoal.rewards.distance.normalizer import NORMALIZER, DistanceNormalizer
 
     name = DEFAULT_ENCODER.name
     try:

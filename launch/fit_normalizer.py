@@ -40,8 +40,8 @@ class Config:
 
 def main(config: Config) -> None:
     """Check, embed, fit, and write normalizer.json."""
-    from touchgoal.rewards.fit_normalizer import fit_normalizer
-    from touchgoal.rewards.normalizer import NORMALIZER
+    from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
+    from touchgoal.rewards.distance.normalizer import NORMALIZER
     from touchgoal.rewards.reward_model import load_embedder
     from touchgoal.rewards.sources import open_successes
     from touchgoal.runtime.progress import track

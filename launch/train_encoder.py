@@ -223,9 +223,9 @@ def _align(config: Align) -> None:
     from touchgoal.encoders.training.run import check_training, open_sets, open_training, recipe
     from touchgoal.encoders.training.trainer import is_first_process
     from touchgoal.episodes.touches import collect_touches
-    from touchgoal.rewards.embedding_distance import EpisodeEmbedder
-    from touchgoal.rewards.fit_normalizer import fit_normalizer
-    from touchgoal.rewards.normalizer import NORMALIZER, scene_of
+    from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
+    from touchgoal.rewards.distance.normalizer import NORMALIZER, scene_of
+    from touchgoal.rewards.features.embedder import EpisodeEmbedder
     from touchgoal.runtime.errors import UserError
     from touchgoal.runtime.progress import track
 

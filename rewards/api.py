@@ -12,6 +12,7 @@ from touchgoal.encoders.towers.towers import Towers
 from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import Curves
+from touchgoal.rewards.distance.normalizer import DistanceNormalizer
 from touchgoal.rewards.goals import (
     GoalPicture,
     GoalSpec,
@@ -21,7 +22,6 @@ from touchgoal.rewards.goals import (
     TouchArrays,
     parse_goal,
 )
-from touchgoal.rewards.normalizer import DistanceNormalizer
 from touchgoal.rewards.reward_model import load_reward_model
 from touchgoal.runtime.errors import UserError
 

@@ -11,10 +11,11 @@ from touchgoal.control.features import CONTROL_HZ, FRONT, IMAGE_PREFIX, TACTILE,
 from touchgoal.control.sensors.latest_value import LatestValue
 from touchgoal.episodes.touches import touch_background
 from touchgoal.rewards.curves import Contact
-from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EmbeddedGoal, compute_curves
+from touchgoal.rewards.distance.embedding_distance import compute_curves
+from touchgoal.rewards.distance.normalizer import REAL_SCENE
+from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
 from touchgoal.rewards.goals import Inputs, parse_goal
 from touchgoal.rewards.metrics import START_FRAMES
-from touchgoal.rewards.normalizer import REAL_SCENE
 from touchgoal.rewards.reward_model import RewardModel, load_reward_model
 from touchgoal.runtime.errors import UserError
 

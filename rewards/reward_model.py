@@ -10,14 +10,11 @@ from touchgoal.encoders import pretrained
 from touchgoal.encoders.pretrained import AnyTouchEncoder
 from touchgoal.encoders.towers.towers import OfflineTowers, Towers, load_towers
 from touchgoal.rewards.curves import Curves
-from touchgoal.rewards.embedding_distance import (
-    EmbeddedEpisode,
-    EpisodeEmbedder,
-    check_words,
-    compute_curves,
-)
+from touchgoal.rewards.distance.embedding_distance import compute_curves
+from touchgoal.rewards.distance.normalizer import NORMALIZER, REMEDY, DistanceNormalizer
+from touchgoal.rewards.features.embedded import EmbeddedEpisode
+from touchgoal.rewards.features.embedder import EpisodeEmbedder, check_words
 from touchgoal.rewards.goals import Goal, GoalSpec, Inputs, assign_goals, check_goal
-from touchgoal.rewards.normalizer import NORMALIZER, REMEDY, DistanceNormalizer
 from touchgoal.runtime.errors import UserError
 
 _FIT = "touchgoal fit-normalizer, on successful episodes of your own"

@@ -20,9 +20,10 @@ from touchgoal.episodes.format.set_files import INFO
 from touchgoal.episodes.media import read_frames
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.episodes.touches import check_fingertips
-from touchgoal.rewards.embedding_distance import EmbeddedEpisode, EpisodeEmbedder, missing_camera
+from touchgoal.rewards.distance.normalizer import scene_of
+from touchgoal.rewards.features.embedded import EmbeddedEpisode
+from touchgoal.rewards.features.embedder import EpisodeEmbedder, missing_camera
 from touchgoal.rewards.goals import Inputs
-from touchgoal.rewards.normalizer import scene_of
 from touchgoal.runtime.errors import UserError
 
 CAMERAS = (FRONT, WRIST)

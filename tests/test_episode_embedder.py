@@ -22,12 +22,8 @@ from touchgoal.episodes.recording import EpisodeSpec
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.rewards.curves import Contact, first_contact
-from touchgoal.rewards.embedding_distance import (
-    EpisodeEmbedder,
-    check_words,
-    compute_curves,
-    compute_distances,
-)
+from touchgoal.rewards.distance.embedding_distance import compute_curves, compute_distances
+from touchgoal.rewards.features.embedder import EpisodeEmbedder, check_words
 from touchgoal.rewards.goals import (
     EpisodeEnd,
     Goal,

@@ -31,9 +31,10 @@ from touchgoal.episodes.schema import Episode
 from touchgoal.episodes.store import EpisodeWriter
 from touchgoal.launch.__main__ import main
 from touchgoal.rewards.api import reward_curve
-from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
+from touchgoal.rewards.distance.embedding_distance import compute_curves
+from touchgoal.rewards.distance.normalizer import DistanceNormalizer
+from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.goals import GoalPicture, GoalSpec, Inputs, OwnFrame, Sentence, assign_goals
-from touchgoal.rewards.normalizer import DistanceNormalizer
 from touchgoal.rewards.online import CostMeter, OnlineCost, load_cell_cost
 from touchgoal.rewards.reward_model import RewardModel, load_reward_model
 from touchgoal.rewards.sources import EpisodeSource, VideoSource, open_source

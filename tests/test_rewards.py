@@ -20,13 +20,10 @@ from touchgoal.rewards.curves import (
     potential_reward,
     state_reward,
 )
-from touchgoal.rewards.embedding_distance import (
-    EmbeddedEpisode,
-    EmbeddedGoal,
-    compute_curves,
-    compute_distances,
-)
-from touchgoal.rewards.fit_normalizer import fit_normalizer as fit
+from touchgoal.rewards.distance.embedding_distance import compute_curves, compute_distances
+from touchgoal.rewards.distance.fit_normalizer import fit_normalizer as fit
+from touchgoal.rewards.distance.normalizer import DistanceNormalizer, EmbeddingSource
+from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
 from touchgoal.rewards.goals import (
     EpisodeEnd,
     Goal,
@@ -38,7 +35,6 @@ from touchgoal.rewards.goals import (
     assign_goals,
     parse_goal,
 )
-from touchgoal.rewards.normalizer import DistanceNormalizer, EmbeddingSource
 from touchgoal.rewards.report.report import write_report
 from touchgoal.rewards.report.summary import metrics_table
 from touchgoal.runtime.errors import UserError

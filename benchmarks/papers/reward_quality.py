@@ -21,10 +21,11 @@ from touchgoal.episodes.schema import MetaValue
 from touchgoal.episodes.store import EpisodeSet
 from touchgoal.policies.evaluation.success_rate import SuccessRate
 from touchgoal.rewards.curves import Curves
-from touchgoal.rewards.embedding_distance import EpisodeEmbedder, compute_curves
+from touchgoal.rewards.distance.embedding_distance import compute_curves
+from touchgoal.rewards.distance.normalizer import NORMALIZER, DistanceNormalizer
+from touchgoal.rewards.features.embedder import EpisodeEmbedder
 from touchgoal.rewards.goals import EpisodeEnd, Goal, OwnFrame, Sentence
 from touchgoal.rewards.metrics import CurveMetrics, measure_curve
-from touchgoal.rewards.normalizer import NORMALIZER, DistanceNormalizer
 from touchgoal.rewards.report.summary import metrics_table
 from touchgoal.runtime import seeds
 from touchgoal.runtime.errors import UserError

@@ -1,15 +1,12 @@
-"""Distance of a trajectory to a goal in embedding space (MMWand, section V-E, with touch).
-
-All distances are cosine distances, 1 - cos, in [0, 2]; touch is averaged over the fingertips.
-"""
+"""Embedding of trajectories and goals with frozen encoders."""
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 
 from touchgoal.control.features import FRONT, TACTILE, TRUTH_CONTACT
 from touchgoal.control.tactile.picture_guard import check_untouched
@@ -19,13 +16,14 @@ from touchgoal.encoders.pretrained import AnyTouchEncoder
 from touchgoal.encoders.towers.towers import Towers
 from touchgoal.episodes.schema import Episode, is_camera
 from touchgoal.episodes.touches import touch_background
-from touchgoal.rewards.curves import Contact, Curves, first_contact
+from touchgoal.rewards.curves import Contact, first_contact
+from touchgoal.rewards.distance.normalizer import EmbeddingSource
+from touchgoal.rewards.features.embedded import EmbeddedEpisode, EmbeddedGoal
 from touchgoal.rewards.goals import (
     EpisodeEnd,
     Goal,
     GoalPicture,
     GoalSpec,
-    Modality,
     PictureGoal,
     Sentence,
     TouchArrays,
@@ -33,58 +31,7 @@ from touchgoal.rewards.goals import (
     frame_index,
 )
 from touchgoal.rewards.metrics import START_FRAMES
-from touchgoal.rewards.normalizer import DistanceNormalizer, EmbeddingSource
 from touchgoal.runtime.errors import UserError
-
-
-@dataclass(frozen=True)
-class EmbeddedEpisode:
-    """One embedded trajectory; its distance to a goal is then a dot product per frame."""
-
-    source: str  # name of the trajectory, for people
-    fps: float  # frames per second
-    contact: Contact  # first contact
-    made_with: EmbeddingSource  # encoders and sensors; embeddings of others cannot be compared
-    image: Float32[np.ndarray, "n d"] | None = None  # unit image embeddings; None without a camera
-    sides: tuple[str, ...] = ()  # keys of the fingertips that have touch embeddings
-    touch: Float32[np.ndarray, "sides n k"] | None = None  # unit embeddings; None without touch
-    # unit embeddings of the sentences about its object; None if there are none or they were not
-    # requested
-    descriptions: Float32[np.ndarray, "m k"] | None = None
-    object: str = ""  # catalogue id of the object, "" if unknown
-    success: bool | None = None  # whether the episode reached its goal, None if unknown
-    words: bool = True  # whether its touch embeddings can be compared with sentences
-
-    def __len__(self) -> int:
-        return self.touches().shape[1] if self.image is None else len(self.image)
-
-    @property
-    def modalities(self) -> tuple[Modality, ...]:
-        """Modalities that can be measured."""
-        image: tuple[Modality, ...] = () if self.image is None else ("image",)
-        touch: tuple[Modality, ...] = () if self.touch is None else ("tactile",)
-        return (*image, *touch, "text") if touch and self.words else (*image, *touch)
-
-    def pictures(self) -> Float32[np.ndarray, "n d"]:
-        """Return the image embeddings of a trajectory that has the modality image."""
-        assert self.image is not None, f"{self.source} has no pictures"
-        return self.image
-
-    def touches(self) -> Float32[np.ndarray, "sides n k"]:
-        """Return the touch embeddings of a trajectory that has the modality tactile."""
-        assert self.touch is not None, f"{self.source} has no touch"
-        return self.touch
-
-
-@dataclass(frozen=True)
-class EmbeddedGoal:
-    """A goal as unit embeddings, one per modality that has a goal."""
-
-    forms: Mapping[str, str]  # the goals as a user writes them, by modality
-    same_episode: frozenset[str]  # modalities whose goal is the trajectory's own frame
-    image: Float32[np.ndarray, " d"] | None = None
-    touch: Float32[np.ndarray, "sides k"] | None = None
-    text: Float32[np.ndarray, " k"] | None = None
 
 
 class EpisodeEmbedder:
@@ -265,63 +212,6 @@ def missing_camera(source: str, camera: str, cameras: Sequence[str]) -> str:
     """Return the message for a source that lacks a camera."""
     there = f"choose --camera {' or '.join(cameras)}" if cameras else "it has no camera"
     return f"{source} has no images of {camera}: {there}"
-
-
-def compute_distances(
-    episode: EmbeddedEpisode, goal: EmbeddedGoal
-) -> dict[str, Float[np.ndarray, " n"]]:
-    """Return the raw cosine distance per frame, for each modality that has a goal."""
-    raw = {}
-    if goal.image is not None:
-        raw["image"] = image_distances(episode.pictures(), goal.image[None])[:, 0]
-    if goal.touch is not None:
-        raw["tactile"] = touch_distances(episode.touches(), goal.touch[None])[:, 0]
-    if goal.text is not None:
-        raw["text"] = text_distances(episode.touches(), goal.text[None])[:, 0]
-    return raw
-
-
-def compute_curves(
-    episode: EmbeddedEpisode, goal: EmbeddedGoal, normalizer: DistanceNormalizer | None
-) -> Curves:
-    """Return the curves of one trajectory to one goal; without a normalizer raw, and none fused.
-
-    UserError: the normalizer lacks a modality or was fitted for something else.
-    """
-    raw = compute_distances(episode, goal)
-    same = goal.same_episode
-    normalised = normalizer.normalise(raw, episode.made_with, same) if normalizer else {}
-    return Curves(
-        episode.source,
-        goal.forms,
-        episode.fps,
-        episode.contact,
-        raw,
-        normalised,
-        same.intersection(raw),
-    )
-
-
-def image_distances(
-    image: Float32[np.ndarray, "n d"], goals: Float32[np.ndarray, "g d"]
-) -> Float[np.ndarray, "n g"]:
-    """Return the cosine distance of each image to each goal."""
-    return 1 - image.astype(np.float64) @ goals.astype(np.float64).T
-
-
-def touch_distances(
-    touch: Float32[np.ndarray, "sides n k"], goals: Float32[np.ndarray, "g sides k"]
-) -> Float[np.ndarray, "n g"]:
-    """Return the distance of each touch to each goal's same fingertip, mean over the fingertips."""
-    cosine = np.einsum("snk,gsk->ng", touch, goals, dtype=np.float64)
-    return 1 - cosine / len(touch)
-
-
-def text_distances(
-    touch: Float32[np.ndarray, "sides n k"], goals: Float32[np.ndarray, "g k"]
-) -> Float[np.ndarray, "n g"]:
-    """Return the distance of each touch to each sentence, mean over the fingertips."""
-    return 1 - np.mean(touch, axis=0, dtype=np.float64) @ goals.astype(np.float64).T
 
 
 def _unit(embeddings: torch.Tensor) -> Float32[np.ndarray, "n d"]:

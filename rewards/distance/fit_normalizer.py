@@ -5,15 +5,15 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from touchgoal.rewards.embedding_distance import (
-    EmbeddedEpisode,
+from touchgoal.rewards.distance.embedding_distance import (
     image_distances,
     text_distances,
     touch_distances,
 )
+from touchgoal.rewards.distance.normalizer import DistanceNormalizer, median_name
+from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.goals import Modality
 from touchgoal.rewards.metrics import START_FRAMES
-from touchgoal.rewards.normalizer import DistanceNormalizer, median_name
 from touchgoal.runtime.errors import UserError
 
 END_FRAMES = 5
