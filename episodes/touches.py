@@ -9,8 +9,8 @@ from jaxtyping import Bool, Int, UInt8
 from touchgoal.control.arrays import Picture
 from touchgoal.control.features import TACTILE, TRUTH_CONTACT, WRIST
 from touchgoal.control.sensors.exchanged import fingertips_exchanged
-from touchgoal.control.tactile.background import local_change
-from touchgoal.control.tactile.contact import detect_contact, threshold_for
+from touchgoal.control.tactile.background import Background, local_change
+from touchgoal.control.tactile.contact import ContactDetector, threshold_for
 from touchgoal.control.tactile.picture_guard import check_untouched
 from touchgoal.control.tactile.sensor_models import SENSORS
 from touchgoal.episodes.store import EpisodeSet
@@ -146,10 +146,27 @@ def touch_background(frames: UInt8[np.ndarray, "n h w 3"]) -> UInt8[np.ndarray, 
     return np.median(frames[:_BACKGROUND_FRAMES], axis=0).astype(np.uint8)
 
 
+class ContactStream:
+    """Contact of one fingertip over consecutive pieces of a recording.
+
+    The first piece begins with 5 frames without contact.
+    """
+
+    def __init__(self) -> None:
+        self._detector: ContactDetector | None = None
+
+    def update(self, frames: UInt8[np.ndarray, "t h w 3"]) -> Bool[np.ndarray, " t"]:
+        """Return whether each of the next frames is in contact."""
+        if self._detector is None:
+            untouched, background = frames[:_BACKGROUND_FRAMES], touch_background(frames)
+            threshold = threshold_for(untouched, background)
+            self._detector = ContactDetector(Background(background[None]), threshold)
+        return np.array([self._detector.update(frame) for frame in frames], bool)
+
+
 def contact_per_frame(frames: UInt8[np.ndarray, "t h w 3"]) -> Bool[np.ndarray, " t"]:
     """Detect contact in each frame of a fingertip; the first 5 must be without."""
-    untouched, background = frames[:_BACKGROUND_FRAMES], touch_background(frames)
-    return detect_contact(frames, background, threshold_for(untouched, background))
+    return ContactStream().update(frames)
 
 
 def _background(episodes: EpisodeSet, i: int, side: int) -> UInt8[np.ndarray, "h w 3"]:

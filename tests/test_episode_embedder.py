@@ -23,6 +23,7 @@ from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.rewards.curves import Contact, first_contact
 from touchgoal.rewards.distance.embedding_distance import compute_curves, compute_distances
+from touchgoal.rewards.features.embedded import EmbeddedEpisode
 from touchgoal.rewards.features.embedder import EpisodeEmbedder, check_words
 from touchgoal.rewards.goals import (
     EpisodeEnd,
@@ -231,3 +232,20 @@ def test_goals_that_failed_are_tried_again(tmp_path: Path, monkeypatch: pytest.M
     ends = collect_goals(["brick", "cork", "candle"], "gelsight_mini", tmp_path, 1)
     found = [(end.root.name, end.index) for end in ends]
     assert found == [("goals-0", 0), ("goals-1", 0), ("goals-0", 2)]
+
+
+def test_an_episode_embedded_in_pieces_is_the_whole(embedder: EpisodeEmbedder) -> None:
+    """Each later piece comes with the first frames and those that the encoder looks back at."""
+    whole = recorded(20)
+    context = [*range(5), *range(12 - embedder.past_frames, 12)]
+    pieces = [
+        embedder.embed_episode(
+            replace(whole, frames={key: v[rows] for key, v in whole.frames.items()}), 20.0, "x"
+        )
+        for rows in (list(range(12)), [*context, *range(12, 20)])
+    ]
+    joined = EmbeddedEpisode.joined(pieces, repeated=len(context))
+    once = embedder.embed_episode(whole, 20.0, "x")
+    assert joined.pictures() == pytest.approx(once.pictures(), abs=1e-6)
+    assert joined.touches() == pytest.approx(once.touches(), abs=1e-5)
+    assert (joined.contact, len(joined)) == (once.contact, 20)

@@ -1,7 +1,7 @@
 """Embedded trajectories and goals: everything that a distance is computed from."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float32
@@ -9,6 +9,9 @@ from jaxtyping import Float32
 from touchgoal.rewards.curves import Contact
 from touchgoal.rewards.distance.normalizer import EmbeddingSource
 from touchgoal.rewards.goals import Modality
+
+TIME_AXIS = {"image": 0, "touch": 1}
+"""Fields of `EmbeddedEpisode` with a value a frame -> the axis that counts the frames."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,20 @@ class EmbeddedEpisode:
         image: tuple[Modality, ...] = () if self.image is None else ("image",)
         touch: tuple[Modality, ...] = () if self.touch is None else ("tactile",)
         return (*image, *touch, "text") if touch and self.words else (*image, *touch)
+
+    @classmethod
+    def joined(cls, pieces: "Sequence[EmbeddedEpisode]", repeated: int) -> "EmbeddedEpisode":
+        """Return consecutive pieces of one trajectory as one.
+
+        The first `repeated` frames of every piece but the first were embedded for context only.
+        """
+        joined = {}
+        for name, axis in TIME_AXIS.items():
+            arrays = [getattr(piece, name) for piece in pieces]
+            if arrays[0] is not None:
+                later = [np.delete(a, np.s_[:repeated], axis) for a in arrays[1:]]
+                joined[name] = np.concatenate([arrays[0], *later], axis)
+        return replace(pieces[0], **joined)
 
     def pictures(self) -> Float32[np.ndarray, "n d"]:
         """Return the image embeddings of a trajectory that has the modality image."""

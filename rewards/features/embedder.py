@@ -71,20 +71,30 @@ class EpisodeEmbedder:
                 sensor=encoder.config.sensor or "",
             )
 
+    @property
+    def past_frames(self) -> int:
+        """Number of earlier frames that the embedding of a frame depends on."""
+        return 0 if self.encoder is None else max(self.encoder.offsets)
+
     def embed_episode(
-        self, episode: Episode, fps: float, source: str, descriptions: bool = False
+        self,
+        episode: Episode,
+        fps: float,
+        source: str,
+        descriptions: bool = False,
+        contact: Contact | None = None,
     ) -> EmbeddedEpisode:
         """Embed an episode's camera and fingertips; on request the sentences about it, too.
 
-        UserError: the episode lacks the camera, starts in contact, or has descriptions that are no
-        list of sentences.
+        The first contact is looked for unless it is given. UserError: the episode lacks the camera,
+        starts in contact, or has descriptions that are no list of sentences.
         """
         sides = tuple(k for k in TACTILE if k in episode.frames) if self.encoder else ()
         success = episode.meta.get("success")
         return EmbeddedEpisode(
             source=source,
             fps=fps,
-            contact=first_contact(episode),
+            contact=contact or first_contact(episode),
             made_with=self.made_with if sides else self._pictures_with,
             image=self._episode_pictures(episode, source, touch_alone=bool(sides)),
             sides=sides,
