@@ -1,6 +1,6 @@
 """Train a touch encoder: on episodes, aligned or without labels; on simulated surfaces; on videos."""
 
-from dataclasses import asdict
+from dataclasses import asdict, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -8,8 +8,9 @@ import tyro
 from pydantic import Field
 
 from touchgoal.encoders.alignment.config import ALIGN_PRESETS, AlignConfig, HeadsConfig
+from touchgoal.encoders.alignment.splits import Split
 from touchgoal.encoders.ssl import config as ssl
-from touchgoal.encoders.training.options import TrainerOptions, TrainingOptions
+from touchgoal.encoders.training.options import TrainerOptions
 from touchgoal.runtime.option_types import (
     RARE,
     Count,
@@ -27,16 +28,20 @@ def _presets(option: str, presets: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 @checked_dataclass
-class Align(TrainingOptions):
+class Align(TrainerOptions):
     """Align touch with frozen image and text networks by contrastive learning, as in MMWand."""
 
     PRESETS: ClassVar = _presets("align", ALIGN_PRESETS)
 
-    data: Path
-    """Episode set to train on, or the annotations.jsonl of `annotate`, with --sensor."""
-    validation: Path
-    """Set (or annotations.jsonl) of other episodes, at least four of each object. Retrieval on one half of them chooses the
-    best epoch; the other half is the test set."""
+    data: Path = field(kw_only=True)
+    """Episodes or touches of the wand to train on, or the annotations.jsonl of `annotate`, with
+    --sensor."""
+    validation: Path | None = None
+    """Other episodes (or another annotations.jsonl), at least four of each object. Retrieval on one half
+    of them chooses the best epoch; the other half is the test set. Of touches of the wand a fifth is
+    held out instead."""
+    split: Annotated[Split, RARE] = "press"
+    """What is held out of touches of the wand."""
     out: Path | None = None
     """Folder of the run; the encoder goes to its `encoder/`."""
     preset: Preset = "default"
@@ -218,6 +223,7 @@ def main(config: Align | Mae | Dino | IJepa | VJepa | Surfaces | Words | Adapt) 
 
 def _align(config: Align) -> None:
     from touchgoal.encoders.alignment.align import align
+    from touchgoal.encoders.alignment.wand_set import is_wand_set
     from touchgoal.encoders.ssl.frames import find_sensor_name
     from touchgoal.encoders.towers.towers import load_towers
     from touchgoal.encoders.training.run import check_training, open_sets, open_training, recipe
@@ -230,8 +236,13 @@ def _align(config: Align) -> None:
     from touchgoal.runtime.progress import track
 
     check_training(config, config.out)
+    if config.data.suffix != ".jsonl" and is_wand_set(config.data):
+        _align_wand(config)
+        return
+    if config.validation is None:
+        raise UserError("only touches of the wand hold some out by themselves: give --validation")
     if config.data.suffix == ".jsonl":
-        _align_annotated(config)
+        _align_annotated(config, config.validation)
         return
     data, validation = open_sets(config.data, config.validation)
     sensor = find_sensor_name(config.sensor, data, validation)
@@ -260,7 +271,31 @@ def _align(config: Align) -> None:
     print(f"encoder and normalizer: {out / 'encoder'}")
 
 
-def _align_annotated(config: Align) -> None:
+def _align_wand(config: Align) -> None:
+    """Align on touches of the wand; there are no successful episodes to fit a normalizer on."""
+    from touchgoal.encoders.alignment.align import align
+    from touchgoal.encoders.alignment.splits import split_touches
+    from touchgoal.encoders.alignment.wand_set import WandSet
+    from touchgoal.encoders.ssl.frames import find_sensor_name
+    from touchgoal.encoders.towers.towers import load_towers
+    from touchgoal.encoders.training.run import open_training
+    from touchgoal.runtime.errors import UserError
+    from touchgoal.runtime.provenance import provenance
+
+    if config.validation is not None:
+        raise UserError(f"{config.data} holds touches of the wand: leave --validation out")
+    data = WandSet.open(config.data)
+    sensor, towers = find_sensor_name(config.sensor, data.episodes), load_towers(config.towers)
+    fold = split_touches(config.split, data.label, data.visit, data.describes, config.seed)
+    out = open_training(config, "train-encoder")
+    print(f"{len(fold.train)} touches of {len(data.names)} objects; {len(fold.test)} held out")
+    source = {"data": str(config.data), "checksum": data.episodes.checksum, **provenance()}
+    train, test = data.touches(fold.train), data.touches(fold.test)
+    align(train, test, towers, config.align, sensor, out, config, source)
+    print(f"encoder: {out / 'encoder'}")
+
+
+def _align_annotated(config: Align, validation: Path) -> None:
     """Align on the annotations of `annotate`; without successful episodes no normalizer is fitted."""
     from touchgoal.encoders.alignment.align import align
     from touchgoal.encoders.annotation.touches import open_annotations
@@ -268,11 +303,11 @@ def _align_annotated(config: Align) -> None:
     from touchgoal.encoders.training.run import open_training
     from touchgoal.runtime.provenance import provenance
 
-    train, val = open_annotations(config.data, config.validation, config.sensor)
+    train, val = open_annotations(config.data, validation, config.sensor)
     towers = load_towers(config.towers)
     out = open_training(config, "train-encoder")
     print(f"{len(train)} touches of {len(train.descriptions)} captions; {len(val)} for validation")
-    source = {"data": str(config.data), "validation": str(config.validation), **provenance()}
+    source = {"data": str(config.data), "validation": str(validation), **provenance()}
     assert config.sensor is not None  # open_annotations has checked it
     align(train, val, towers, config.align, config.sensor, out, config, source)
     print(f"encoder: {out / 'encoder'}")

@@ -28,7 +28,7 @@ TOY = {
     "collect-demos": "--episodes 4 --workers 2 --env.objects glass_ball --env.cameras front --env.control-hz 5",
     "collect-touches": "--episodes 2 --workers 2",
     "reward-curves data/episodes": "--index 0",
-    "train-encoder align": "--align.vit tiny --align.epochs 1 --align.batch-size 8 --normalizer-episodes 2",
+    "train-encoder align": "--align.backbone vit-tiny --align.epochs 1 --align.batch-size 8 --normalizer-episodes 2",
     "train-encoder mae": "--frames 8 --mae.vit tiny --mae.epochs 1 --mae.batch-size 8",
     "train-encoder dino": "--frames 8 --dino.vit tiny --dino.epochs 1 --dino.batch-size 8",
     "train-encoder ijepa": "--frames 8 --ijepa.vit tiny --ijepa.epochs 1 --ijepa.batch-size 8",

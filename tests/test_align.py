@@ -33,7 +33,7 @@ DESCRIPTIONS = {
     "brush": ["bristles", "many fine hairs", "a scratchy brush"],
     "cloth": ["a soft woven cloth", "soft", "loose threads crossing"],
 }
-CONFIG = AlignConfig(vit="tiny", embedding_dim=16, epochs=3, batch_size=16, lr=3e-3)
+CONFIG = AlignConfig(backbone="vit-tiny", embedding_dim=16, epochs=3, batch_size=16, lr=3e-3)
 
 
 @pytest.fixture(autouse=True)
@@ -291,7 +291,7 @@ def test_killed_and_resumed_is_bit_identical(
 
 
 def test_paper_preset_runs_with_towers_pretrained_together(tmp_path: Path) -> None:
-    paper = replace(ALIGN_PRESETS["paper"], vit="tiny", epochs=1, batch_size=8)
+    paper = replace(ALIGN_PRESETS["paper"], backbone="vit-tiny", epochs=1, batch_size=8)
     encoder = run_align(TRAIN, VAL, FakeTowers(pretrained_together=True), paper, tmp_path, {})
     assert encoder.config.embedding_dim == 26 and encoder.image_head is None
     (line,) = (tmp_path / "metrics.jsonl").read_text().splitlines()

@@ -118,7 +118,7 @@ def test_reward_curves_of_a_video_and_of_a_folder(episodes: Path, tmp_path: Path
 def test_train_encoder_then_use_it(episodes: Path, validation: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     run("train-encoder", "align", "--data", episodes, "--validation", validation, "--out", out,
-        "--align.vit", "tiny", "--align.epochs", 12, "--align.batch-size", 32)  # fmt: skip
+        "--align.backbone", "vit-tiny", "--align.epochs", 12, "--align.batch-size", 32)  # fmt: skip
     recipe = pretrained.ENCODER_FORMAT.provenance(out / "encoder")
     assert recipe["data"]["train"]["episodes"] == 2 and recipe["command"].startswith("touchgoal")
     run("reward-curves", episodes, "--encoder", out / "encoder", "--index", 1,

@@ -11,9 +11,9 @@ from in_process import in_process_workers
 
 from touchgoal.benchmarks.papers.mmwand.embedded_set import EmbeddedSet
 from touchgoal.benchmarks.papers.mmwand.retrieval import PUBLISHED, judge
-from touchgoal.benchmarks.papers.mmwand.splits import SPLITS, Fold, split_touches
 from touchgoal.encoders.alignment.config import HeadsConfig
 from touchgoal.encoders.alignment.heads import Paired, fit_heads
+from touchgoal.encoders.alignment.splits import SPLITS, Fold, split_touches
 from touchgoal.encoders.backbones.pooled_encoder import PooledEncoder
 from touchgoal.encoders.pretrained import load_encoder
 from touchgoal.encoders.towers.towers import load_towers
@@ -46,6 +46,7 @@ def made_up(seed: int = 0) -> EmbeddedSet:
 
     return EmbeddedSet(
         names=tuple("abcdefghij"),
+        sensor="gelsight_mini",
         label=label,
         visit=np.arange(TOUCHES) // 5,
         sentences=tuple(map(str, range(len(owner)))),
@@ -145,9 +146,24 @@ def test_the_benchmarks_run(
         f"benchmark {name} --data {wand} --cache {wand.parent / 'cache'} --out {tmp_path / 'run'}"
     )
     command += " --encoders gelsight_mini --seeds 1"
-    command += " --heads.epochs 2" if name == "retrieval" else ""
+    if name == "retrieval":
+        command += " --heads.epochs 2 --trained efficientnet --epochs 1"
     assert main([*command.split(), "--splits", "sample", "press"]) in (0, None)
     printed = capsys.readouterr().out
     assert "published" in printed and "raw pixels" in printed and "gelsight_mini" in printed
     rows = json.loads((tmp_path / "run/metrics.json").read_text())["rows"]
     assert {row["split"] for row in rows} == {"sample", "press"}
+    if name == "retrieval":
+        assert {"efficientnet trained", "efficientnet trained, without touch-text"} <= {
+            row["row"] for row in rows
+        }
+
+
+def test_a_touch_encoder_is_aligned_on_the_wands_touches(wand: Path, tmp_path: Path) -> None:
+    command = f"train-encoder align --data {wand} --out {tmp_path / 'run'} --split sample"
+    command += " --align.backbone efficientnet --align.epochs 1 --align.batch-size 8"
+    assert main(command.split()) in (0, None)
+    encoder = load_encoder(tmp_path / "run/encoder", "gelsight_mini")
+    assert encoder.towers == "offline"
+    picture = np.random.default_rng(0).integers(0, 255, (2, 240, 320, 3), dtype=np.uint8)
+    np.testing.assert_allclose(np.linalg.norm(encoder.embed(picture), axis=1), 1, atol=1e-4)

@@ -73,7 +73,7 @@ def untrained(name: str, seed: int) -> BaseTouchEncoder:
 
 def vit_of(encoder: BaseTouchEncoder) -> ViT:
     """Return the ViT of a touch encoder; UserError if it has none."""
-    if isinstance(encoder, TouchEncoder):
+    if isinstance(encoder, TouchEncoder) and isinstance(encoder.backbone, ViT):
         return encoder.backbone
     if isinstance(encoder, TouchBackbone):
         return encoder.vit

@@ -25,7 +25,7 @@ from touchgoal.encoders.alignment.infonce import info_nce, loss_floor, symmetric
 from touchgoal.encoders.alignment.retrieval import evaluate_retrieval
 from touchgoal.encoders.alignment.touch_encoder import TouchEncoder, TouchEncoderConfig
 from touchgoal.encoders.backbones.vit import PRESETS as VIT_PRESETS
-from touchgoal.encoders.backbones.vit import random_masking
+from touchgoal.encoders.backbones.vit import ViTConfig, random_masking
 from touchgoal.encoders.towers.towers import Towers
 from touchgoal.encoders.training.batch_noise import BatchNoise
 from touchgoal.encoders.training.checkpoint import checksum
@@ -72,9 +72,7 @@ def align(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
         encoder = TouchEncoder(
-            TouchEncoderConfig.for_towers(
-                VIT_PRESETS[config.vit], towers, sensor, config.embedding_dim
-            )
+            TouchEncoderConfig.for_towers(find_vit(config), towers, sensor, config.embedding_dim)
         )
     loss, best = AlignmentLoss(encoder, config), copy.deepcopy(encoder)
 
@@ -86,15 +84,7 @@ def align(
         loss=loss,
         n_samples=len(data),
         batch=lambda rows, noise: make_batch(data, rows, config, noise),
-        optimizer=OptimizerConfig(
-            config.epochs,
-            config.batch_size,
-            config.lr,
-            config.weight_decay,
-            decoupled_weight_decay=config.optimizer == "adamw",
-            warmup=config.warmup,
-            final_lr=config.final_lr,
-        ),
+        optimizer=optimizer_config(config),
         identity={
             "align": asdict(config),
             "encoder": asdict(encoder.config),
@@ -115,6 +105,24 @@ def align(
     }
     on_first_process(lambda: pretrained.save(encoder, out_dir / _ENCODER, provenance))
     return cast(TouchEncoder, pretrained.load_encoder(out_dir / _ENCODER))
+
+
+def find_vit(config: AlignConfig) -> ViTConfig | None:
+    """Return the ViT that a config names; None for EfficientNet."""
+    return VIT_PRESETS.get(config.backbone.removeprefix("vit-"))
+
+
+def optimizer_config(config: AlignConfig) -> OptimizerConfig:
+    """Return the settings of the optimizer."""
+    return OptimizerConfig(
+        config.epochs,
+        config.batch_size,
+        config.lr,
+        config.weight_decay,
+        decoupled_weight_decay=config.optimizer == "adamw",
+        warmup=config.warmup,
+        final_lr=config.final_lr,
+    )
 
 
 def _checksum(touches: Touches) -> str:
@@ -139,8 +147,8 @@ def make_batch(
     """Return the arguments of `AlignmentLoss`: augmented, masked touches with sentences and images."""
     sentence = data.draw_sentences(rows, noise)
     touch, ids_keep = augment(data.touch[rows].float(), config.augmentation, noise), None
-    if config.mask_ratio > 0:
-        masking = partial(random_masking, VIT_PRESETS[config.vit], config.mask_ratio)
+    if config.mask_ratio > 0 and (vit := find_vit(config)) is not None:
+        masking = partial(random_masking, vit, config.mask_ratio)
         ids_keep = noise.draw(len(rows), masking)
     return {
         "touch": touch,

@@ -37,8 +37,9 @@ class Augmentation:
 class AlignConfig:
     """Hyperparameters of the alignment with frozen image and text towers."""
 
-    vit: Literal["tiny", "small", "huge"] = "small"
-    """Size of the touch backbone, a ViT."""
+    backbone: Literal["vit-tiny", "vit-small", "vit-huge", "efficientnet"] = "vit-small"
+    """Touch backbone: a ViT of random weights, or EfficientNet-Lite0 up to stride 16 that begins with
+    ImageNet's."""
     embedding_dim: Count = 256
     """Width of an embedding. A CLIP's embeddings have their own width, which is used instead."""
     epochs: Count = 10
@@ -74,7 +75,7 @@ class AlignConfig:
     )
     """Sentences for touches without contact; with none, these touches are left out."""
     mask_ratio: Annotated[float, Field(ge=0, lt=1)] = 0.5
-    """Share of the patches of each touch that training drops. Dropping half of them halves the cost
+    """Share of the patches of each touch that the training of a ViT drops. Dropping half of them halves the cost
     and does not harm (FLIP, Li et al. 2023)."""
     augmentation: Annotated[Augmentation, RARE] = Augmentation(
         shift=8, gain=0.2, offset=0.1, noise=0.03
@@ -105,7 +106,7 @@ ALIGN_PRESETS: dict[str, AlignConfig] = {
     # Section V of the MMWand paper. What it leaves open is plain here: a constant learning rate, no
     # augmentation, no touches without contact. Meant for CLIP towers and a large GPU.
     "paper": AlignConfig(
-        vit="huge",
+        backbone="vit-huge",
         epochs=100,
         batch_size=64,
         optimizer="adam",

@@ -1,4 +1,4 @@
-"""Touch encoder aligned with frozen towers: a ViT and heads into a shared space."""
+"""Touch encoder aligned with frozen towers: a backbone and heads into a shared space."""
 
 from dataclasses import dataclass, replace
 
@@ -6,6 +6,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from touchgoal.encoders.backbones.efficientnet_backbone import EfficientNetBackbone
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.backbones.vit import ViT, ViTConfig
 from touchgoal.encoders.preprocess import preprocessor_for
@@ -16,7 +17,7 @@ from touchgoal.encoders.towers.towers import Towers
 class TouchEncoderConfig:
     """Architecture of an aligned encoder, and what it was trained with."""
 
-    vit: ViTConfig  # touch backbone
+    vit: ViTConfig | None  # touch backbone; None: EfficientNet-Lite0 up to stride 16
     embedding_dim: int  # width of the shared space
     sensor: str  # name of the fingertip sensor
     preprocessor: str  # `TactilePreprocessor.id` at training
@@ -27,7 +28,7 @@ class TouchEncoderConfig:
 
     @classmethod
     def for_towers(
-        cls, vit: ViTConfig, towers: Towers, sensor: str, embedding_dim: int
+        cls, vit: ViTConfig | None, towers: Towers, sensor: str, embedding_dim: int
     ) -> "TouchEncoderConfig":
         """Return the config that fits these towers; UserError for an unknown sensor.
 
@@ -35,7 +36,7 @@ class TouchEncoderConfig:
         """
         preprocess = preprocessor_for(sensor)
         return cls(
-            vit=replace(vit, image_size=preprocess.size),
+            vit=vit and replace(vit, image_size=preprocess.size),
             embedding_dim=towers.image_dim if towers.pretrained_together else embedding_dim,
             sensor=sensor,
             preprocessor=preprocess.id,
@@ -55,12 +56,19 @@ class TouchEncoder(BaseTouchEncoder):
     """
 
     def __init__(self, config: TouchEncoderConfig) -> None:
-        """Build a randomly initialised encoder; UserError for an unknown sensor."""
-        super().__init__(preprocessor_for(config.sensor), config.embedding_dim)
+        """Build an untrained encoder (of EfficientNet: ImageNet's); UserError for an unknown sensor."""
+        preprocess = preprocessor_for(config.sensor)
+        super().__init__(preprocess, config.embedding_dim)
         self.config = config
-        self.backbone = ViT(config.vit)
+        if config.vit is None:
+            self.backbone, width = (
+                EfficientNetBackbone(preprocess.scale),
+                EfficientNetBackbone.width,
+            )
+        else:
+            self.backbone, width = ViT(config.vit), config.vit.width
         d = config.embedding_dim
-        self.touch_head = nn.Linear(config.vit.width, d, bias=False)
+        self.touch_head = nn.Linear(width, d, bias=False)
         together = config.pretrained_together
         self.image_head = None if together else nn.Linear(config.image_dim, d, bias=False)
         self.text_head = None if together else nn.Linear(config.text_dim, d, bias=False)

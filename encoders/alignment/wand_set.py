@@ -12,8 +12,15 @@ from touchgoal.control import features as ft
 from touchgoal.control.arrays import Picture, Pictures
 from touchgoal.encoders.towers.towers import Towers
 from touchgoal.episodes.store import EpisodeSet
+from touchgoal.episodes.touches import Touches
 from touchgoal.runtime.errors import UserError
 from touchgoal.runtime.progress import track
+
+
+def is_wand_set(root: Path) -> bool:
+    """Whether a folder holds touches of the wand; UserError if it holds no set."""
+    episodes = EpisodeSet(root)
+    return bool(len(episodes)) and ft.WAND_VIEWS[0] in episodes.features
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,11 +37,11 @@ class WandSet:
     @classmethod
     def open(cls, root: Path) -> "WandSet":
         """Open a set; UserError if it was not recorded by `collect-touches --body wand`."""
-        episodes = EpisodeSet(root)
-        if not len(episodes) or ft.WAND_VIEWS[0] not in episodes.features:
+        if not is_wand_set(root):
             raise UserError(
                 f"{root} holds no touches with views: record with collect-touches --body wand"
             )
+        episodes = EpisodeSet(root)
         meta = [episodes.meta(i) for i in range(len(episodes))]
         of: dict[str, list[str]] = {}
         for m in meta:
@@ -64,6 +71,19 @@ class WandSet:
     def view(self, i: int) -> Picture:
         """Return the wand's own view before contact, RGB."""
         return self.episodes.read(i, [ft.WAND_VIEWS[-1]], [0]).frames[ft.WAND_VIEWS[-1]][0]
+
+    def touches(self, rows: Int[np.ndarray, " r"]) -> Touches:
+        """Return the firmest pictures of some touches, with their views, as training data. Long work."""
+        reading = track(rows, "reading touches", "touch", len(rows))
+        pictures = [(*self.pictures(int(i)), self.view(int(i))) for i in reading]
+        untouched, touched, views = (np.stack(kind) for kind in zip(*pictures, strict=True))
+        index = np.arange(len(rows))
+        of = {
+            name: [s for s, on in zip(self.sentences, own, strict=True) if on]
+            for name, own in zip(self.names, self.describes, strict=True)
+        }
+        objects = tuple(self.names[i] for i in self.label[rows])
+        return Touches(touched, untouched, index, views, index, objects, of)
 
     def embed_touches(
         self, embed: Callable[[Pictures, Picture], Float32[np.ndarray, "_ d"]]

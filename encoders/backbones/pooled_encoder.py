@@ -10,11 +10,11 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from touchgoal.encoders.backbones.touch_backbone import BaseTouchEncoder
 from touchgoal.encoders.preprocess import preprocessor_for
-from touchgoal.encoders.towers.efficientnet import EfficientNetLite0, load_efficientnet_lite0
+from touchgoal.encoders.towers.efficientnet import load_efficientnet_lite0
 from touchgoal.encoders.towers.towers import imagenet_normalised
 from touchgoal.encoders.whitening.text_head import TextHead
 
@@ -23,7 +23,7 @@ from touchgoal.encoders.whitening.text_head import TextHead
 STAGES = ((4, 40), (7, 80), (10, 112), (14, 192))
 # Up to block 10, at stride 16, on 192 x 256 px: half the time of block 14 on 240 x 320, and real objects
 # are told apart as well.
-_LAST_BLOCK, _PREPROCESSOR_VERSION = 10, 4
+LAST_BLOCK, _PREPROCESSOR_VERSION = 10, 4
 _CONTRAST = 4.0  # counts of the network's input per count of change
 # Strength of contact in a cell of a twelfth of the image's height: root mean square change of 2 x 2 px
 # means, counts. On PhysiCLeAR's training videos 95 % of untouched frames have 1.0 to 2.8, also in a tenth
@@ -48,9 +48,9 @@ class PooledEncoderConfig:
     @classmethod
     def for_sensor(cls, sensor: str) -> "PooledEncoderConfig":
         """Return the config for a sensor; UserError for an unknown one."""
-        features = 2 * sum(channels for block, channels in STAGES if block <= _LAST_BLOCK)
+        features = 2 * sum(channels for block, channels in STAGES if block <= LAST_BLOCK)
         preprocessor = preprocessor_for(sensor, _PREPROCESSOR_VERSION).id
-        return cls(features, sensor, preprocessor, last_block=_LAST_BLOCK)
+        return cls(features, sensor, preprocessor, last_block=LAST_BLOCK)
 
     @property
     def preprocessor_version(self) -> int:
@@ -139,21 +139,32 @@ class PooledEncoder(BaseTouchEncoder):
         strength = F.adaptive_avg_pool2d(square, _CELLS).amax((1, 2)).sqrt()
         return strength**4 / (strength**4 + _HALF_LENGTH**4)
 
+    @torch.no_grad()
     def pool(self, touch: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n d"]:
         """Return means and standard deviations over the image, stage by stage."""
-        drawn = (128 + _CONTRAST * self._scale * touch).clamp(0, 255) / 255
-        return pool_stages(self._network[0].to(touch.device), drawn, self.config.last_block)
+        network = self._network[0].to(touch.device)
+        blocks = network.blocks[: self.config.last_block + 1]
+        return pool_stages(network.stem, blocks, draw(touch, self._scale))
 
 
-@torch.no_grad()
+def draw(touch: Float[Tensor, "n 3 h w"], scale: float) -> Float[Tensor, "n 3 h w"]:
+    """Return preprocessed frames as RGB images, 0 to 1: the change about grey, in more contrast.
+
+    Args:
+        touch: preprocessed frames.
+        scale: counts of change that are 1.0 in them.
+    """
+    return (128 + _CONTRAST * scale * touch).clamp(0, 255) / 255
+
+
 def pool_stages(
-    network: EfficientNetLite0, images: Float[Tensor, "n 3 h w"], last_block: int
+    stem: nn.Module, blocks: nn.Sequential, images: Float[Tensor, "n 3 h w"]
 ) -> Float[Tensor, "n d"]:
-    """Return means and standard deviations of RGB images (0 to 1) after each of `STAGES`."""
-    x = network.stem(imagenet_normalised(images).contiguous(memory_format=torch.channels_last))
+    """Return means and standard deviations of RGB images (0 to 1) after those `STAGES` that there are."""
+    x = stem(imagenet_normalised(images).contiguous(memory_format=torch.channels_last))
     pooled, stages = [], {block for block, _ in STAGES}
-    for i in range(last_block + 1):
-        x = network.blocks[i](x)
+    for i, block in enumerate(blocks):
+        x = block(x)
         if i in stages:
             pooled += [x.mean((2, 3)), x.std((2, 3))]
     return torch.cat(pooled, 1)

@@ -24,7 +24,7 @@ from touchgoal.benchmarks.papers.mmwand.fine_tuned import (
 )
 from touchgoal.benchmarks.papers.mmwand.intervals import Interval, cell, mean_over_objects
 from touchgoal.benchmarks.papers.mmwand.real.dome_tables import run_classification
-from touchgoal.benchmarks.papers.mmwand.splits import split_touches
+from touchgoal.encoders.alignment.splits import split_touches
 from touchgoal.encoders.alignment.wand_set import WandSet
 from touchgoal.episodes.importers.touch_sets.vt60 import is_vt60
 from touchgoal.runtime.option_types import Count, Seed, checked_dataclass

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float32, Int
 
 from touchgoal.benchmarks.real_touch.embedders import find_embedder
 from touchgoal.encoders.alignment.wand_set import WandSet
+from touchgoal.encoders.ssl.frames import find_sensor_name
 from touchgoal.encoders.towers.towers import load_towers
 from touchgoal.runtime.atomic_write import atomic_write
 from touchgoal.runtime.progress import track
@@ -23,6 +24,7 @@ class EmbeddedSet:
     """n touches of k objects, as the frozen networks give them."""
 
     names: tuple[str, ...]  # objects, sorted
+    sensor: str  # of the touches
     label: Int[np.ndarray, " n"]  # object of each touch
     visit: Int[np.ndarray, " n"]  # visit of each touch
     sentences: tuple[str, ...]
@@ -57,6 +59,7 @@ def embed_set(root: Path, encoders: tuple[str, ...], seed: int, cache: Path) -> 
     }
     return EmbeddedSet(
         names=data.names,
+        sensor=find_sensor_name(None, data.episodes),
         label=data.label,
         visit=data.visit,
         sentences=data.sentences,

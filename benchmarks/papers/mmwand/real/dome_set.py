@@ -139,7 +139,10 @@ def _pooled(
     for start in track(range(0, len(change), _BATCH), f"embedding touch, {name}", "batch"):
         batch = np.stack([cv2.resize(c, (_SIDE, _SIDE)) for c in change[start : start + _BATCH]])
         drawn = (128 + _CONTRAST * torch.from_numpy(batch).permute(0, 3, 1, 2)).clamp(0, 255) / 255
-        rows.append(pool_stages(network, drawn, STAGES[-1][0]).numpy())
+        with torch.no_grad():
+            rows.append(
+                pool_stages(network.stem, network.blocks[: STAGES[-1][0] + 1], drawn).numpy()
+            )
     return np.concatenate(rows)
 
 
