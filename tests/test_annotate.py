@@ -322,6 +322,13 @@ def test_align_trains_on_annotations(annotated: tuple, tmp_path: Path) -> None:
     (tmp_path / "a.jsonl").write_text("\n".join(text[:7]))
     (tmp_path / "b.jsonl").write_text("\n".join(text[7:]))
     options = ["--data", str(tmp_path / "a.jsonl"), "--validation", str(tmp_path / "b.jsonl")]
-    options += ["--sensor", "gelsight_markers", "--align.backbone", "vit-tiny", "--align.epochs", "1"]
+    options += [
+        "--sensor",
+        "gelsight_markers",
+        "--align.backbone",
+        "vit-tiny",
+        "--align.epochs",
+        "1",
+    ]
     main(["train-encoder", "align", *options, "--out", str(tmp_path / "run")])
     assert (tmp_path / "run" / "encoder").is_dir()
