@@ -210,7 +210,9 @@ def main(config: Align | Mae | Dino | IJepa | VJepa | Surfaces | Words | Adapt) 
     """Train one kind of encoder."""
     match config:
         case Align():
-            _align(config)
+            from touchgoal.launch.support.align_touch import align_touch
+
+            align_touch(config)
         case Surfaces():
             _fit_to_surfaces(config)
         case Words():
@@ -219,98 +221,6 @@ def main(config: Align | Mae | Dino | IJepa | VJepa | Surfaces | Words | Adapt) 
             _adapt(config)
         case _:
             _train_unlabelled(config)
-
-
-def _align(config: Align) -> None:
-    from touchgoal.encoders.alignment.align import align
-    from touchgoal.encoders.alignment.wand_set import is_wand_set
-    from touchgoal.encoders.ssl.frames import find_sensor_name
-    from touchgoal.encoders.towers.towers import load_towers
-    from touchgoal.encoders.training.run import check_training, open_sets, open_training, recipe
-    from touchgoal.encoders.training.trainer import is_first_process
-    from touchgoal.episodes.touches import collect_touches
-    from touchgoal.rewards.distance.fit_normalizer import fit_normalizer
-    from touchgoal.rewards.distance.normalizer import NORMALIZER, scene_of
-    from touchgoal.rewards.features.embedder import EpisodeEmbedder
-    from touchgoal.runtime.errors import UserError
-    from touchgoal.runtime.progress import track
-
-    check_training(config, config.out)
-    if config.data.suffix != ".jsonl" and is_wand_set(config.data):
-        _align_wand(config)
-        return
-    if config.validation is None:
-        raise UserError("only touches of the wand hold some out by themselves: give --validation")
-    if config.data.suffix == ".jsonl":
-        _align_annotated(config, config.validation)
-        return
-    data, validation = open_sets(config.data, config.validation)
-    sensor = find_sensor_name(config.sensor, data, validation)
-    successes = [i for i in range(len(data)) if data.meta(i).get("success") is True]
-    if not successes:
-        raise UserError(
-            f"no episode of {data.root} is marked as a success, and the normalizer of reward curves is "
-            "fitted on successes: record some, or set `success` in their meta"
-        )
-    towers = load_towers(config.towers)
-    out = open_training(config, "train-encoder")
-    drawn = config.contact_frames, config.no_contact_frames, config.seed
-    train, val = (collect_touches(episodes, *drawn) for episodes in (data, validation))
-    print(f"{len(train)} touches of {len(train.descriptions)} objects; {len(val)} for validation")
-    made_from = recipe(data, validation)
-    encoder = align(train, val, towers, config.align, sensor, out, config, made_from)
-    if not is_first_process():
-        return
-    embedder = EpisodeEmbedder(towers, encoder)
-    embedded = [
-        embedder.embed_episode(data.read(i), data.fps, f"{data.root}#{i}", True)
-        for i in track(successes[: config.normalizer_episodes], "normalizer", "episode")
-    ]
-    normalizer = fit_normalizer(embedded, ("image", "tactile", "text"), scene_of(data.features))
-    normalizer.save(out / "encoder" / NORMALIZER)
-    print(f"encoder and normalizer: {out / 'encoder'}")
-
-
-def _align_wand(config: Align) -> None:
-    """Align on touches of the wand; there are no successful episodes to fit a normalizer on."""
-    from touchgoal.encoders.alignment.align import align
-    from touchgoal.encoders.alignment.splits import split_touches
-    from touchgoal.encoders.alignment.wand_set import WandSet
-    from touchgoal.encoders.ssl.frames import find_sensor_name
-    from touchgoal.encoders.towers.towers import load_towers
-    from touchgoal.encoders.training.run import open_training
-    from touchgoal.runtime.errors import UserError
-    from touchgoal.runtime.provenance import provenance
-
-    if config.validation is not None:
-        raise UserError(f"{config.data} holds touches of the wand: leave --validation out")
-    data = WandSet.open(config.data)
-    sensor, towers = find_sensor_name(config.sensor, data.episodes), load_towers(config.towers)
-    fold = split_touches(config.split, data.label, data.visit, data.describes, config.seed)
-    out = open_training(config, "train-encoder")
-    print(f"{len(fold.train)} touches of {len(data.names)} objects; {len(fold.test)} held out")
-    source = {"data": str(config.data), "checksum": data.episodes.checksum, **provenance()}
-    train, test = data.touches(fold.train), data.touches(fold.test)
-    align(train, test, towers, config.align, sensor, out, config, source)
-    print(f"encoder: {out / 'encoder'}")
-
-
-def _align_annotated(config: Align, validation: Path) -> None:
-    """Align on the annotations of `annotate`; without successful episodes no normalizer is fitted."""
-    from touchgoal.encoders.alignment.align import align
-    from touchgoal.encoders.annotation.touches import open_annotations
-    from touchgoal.encoders.towers.towers import load_towers
-    from touchgoal.encoders.training.run import open_training
-    from touchgoal.runtime.provenance import provenance
-
-    train, val = open_annotations(config.data, validation, config.sensor)
-    towers = load_towers(config.towers)
-    out = open_training(config, "train-encoder")
-    print(f"{len(train)} touches of {len(train.descriptions)} captions; {len(val)} for validation")
-    source = {"data": str(config.data), "validation": str(validation), **provenance()}
-    assert config.sensor is not None  # open_annotations has checked it
-    align(train, val, towers, config.align, config.sensor, out, config, source)
-    print(f"encoder: {out / 'encoder'}")
 
 
 def _train_unlabelled(config: Mae | Dino | IJepa | VJepa) -> None:
