@@ -14,6 +14,7 @@ from touchgoal.control import features as ft
 from touchgoal.control.features import Observation
 from touchgoal.episodes.format import set_files
 from touchgoal.episodes.format.encoding import Description, EncodedEpisode, encode
+from touchgoal.episodes.outcomes.verify import came_out
 from touchgoal.episodes.schema import Episode, MetaValue
 from touchgoal.episodes.store import EpisodeSet, EpisodeWriter
 from touchgoal.runtime.errors import UserError
@@ -22,7 +23,7 @@ from touchgoal.runtime.worker_pool import one_core_workers
 from touchgoal.sim_envs.cell.environment import FrankaTactileEnv
 from touchgoal.sim_envs.config import BeadMazeConfig, Outcome, TaskConfig
 from touchgoal.sim_envs.scene.filming import SceneRecorder
-from touchgoal.sim_envs.scene.objects import CATALOGUE
+from touchgoal.sim_envs.scene.objects import CATALOGUE, of_same_shape
 from touchgoal.sim_envs.tasks import make_env, make_expert
 
 
@@ -74,9 +75,21 @@ def episode_specs(
         options = [{"object": name} for name in env.objects or CATALOGUE]
     n = len(outcomes)
     return [
-        EpisodeSpec(first_seed + i, outcomes[i % n], options[i // n % len(options)])
+        episode_spec(first_seed + i, outcomes[i % n], options[i // n % len(options)])
         for i in range(n * episodes)
     ]
+
+
+def episode_spec(
+    seed: int, outcome: Outcome, options: dict[str, Any], among: Sequence[str] = tuple(CATALOGUE)
+) -> EpisodeSpec:
+    """Return a spec; for outcome same_shape another object `among` these lies on the table."""
+    if outcome != "same_shape":
+        return EpisodeSpec(seed, outcome, options)
+    asked = options["object"]
+    return EpisodeSpec(
+        seed, outcome, options | {"object": of_same_shape(asked, among), "asked": asked}
+    )
 
 
 def missing_specs(
@@ -157,19 +170,26 @@ def to_episode(
     env: FrankaTactileEnv, ticks: list[dict[str, np.ndarray]], spec: EpisodeSpec
 ) -> Episode:
     """Return the ticks that `run` yielded as an episode."""
-    success = bool(ticks[-1][ft.TRUTH_SUCCESS][0])
-    asked_to_fail = spec.outcome != "success"
+    frames = {key: np.stack([tick[key] for tick in ticks]) for key in ticks[0]}
+    success = bool(frames[ft.TRUTH_SUCCESS][-1, 0])
     return Episode(
-        frames={key: np.stack([tick[key] for tick in ticks]) for key in ticks[0]},
+        frames=frames,
         task=env.instruction(),
         meta=env.episode_info()
         | {
             "task": env.task,
             "seed": spec.seed,
-            "outcome": spec.outcome if success or asked_to_fail else "failure",
+            "outcome": _outcome(spec.outcome, frames, success),
             "success": success,
         },
     )
+
+
+def _outcome(asked: Outcome, frames: dict[str, np.ndarray], success: bool) -> str:
+    """Return the outcome that was asked for, or a name that says that it did not come about."""
+    if asked == "success":
+        return "success" if success else "failure"
+    return asked if came_out(asked, frames) else f"not_{asked}"
 
 
 def collect(

@@ -35,7 +35,8 @@ class Config:
     episodes: Count = 10
     """Number of episodes of each outcome."""
     outcomes: tuple[Outcome, ...] = ("success",)
-    """Outcomes to ask the expert for: success, or (pick-place) one of four failures."""
+    """Outcomes to ask the expert for; pick-place has poor successes and failures on purpose, too. One
+    that does not come about is recorded as `not_` and its name."""
     feedback: bool = False
     """pick-place: the expert plans anew at every tick; policies learn better from that."""
     policy: str | None = None
@@ -93,7 +94,7 @@ def main(config: Config) -> None:
     write_json(out / "metrics.json", {"outcomes": outcomes, "episodes": metas})
     print(f"{len(metas)} episodes recorded, {len(EpisodeSet(root))} in {root}")
     for outcome, count in outcomes.items():
-        print(f"  {outcome:<14}{count}")
+        print(f"  {outcome:<20}{count}")
     if acts:
         rate = SuccessRate(sum(bool(meta["success"]) for meta in metas), len(metas))
         print(f"the policy succeeded in {rate}")

@@ -21,8 +21,35 @@ from touchgoal.sim_envs.scene.objects import find as find_object
 from touchgoal.sim_envs.scene.wires import PER_FAMILY, TRAINED, Family, Split, Wire, choose
 from touchgoal.sim_envs.scene.wires import find as find_wire
 
-Outcome = Literal["success", "never_touch", "drop", "wrong_object", "freeze"]
-"""How an expert of pick-place ends: success, or one of four failures on purpose."""
+Outcome = Literal[
+    "success",
+    "slow",
+    "regrasped",
+    "never_touch",
+    "never_lifted",
+    "freeze",
+    "freeze_holding",
+    "drop",
+    "released_early",
+    "off",
+    "slip",
+    "edge_grasp",
+    "pressed",
+    "overgripped",
+    "wrong_object",
+    "same_shape",
+]
+"""How an expert of pick-place ends.
+
+success; two poorer successes: slow (at half the speed) and regrasped (put down and grasped anew);
+and thirteen failures: never_touch (closes 8 cm above the object), never_lifted (grasped, and held
+on the table), freeze (stops before the touch), freeze_holding (stops on the way), drop (lets go on
+the way), released_early (lets go 4 cm before the goal and above the table), off (placed 2.5 to 3 cm
+beside the goal), slip (slides down in the hand and is held again), edge_grasp (held at its edge), pressed (pushed on
+into the table), overgripped (40 N), wrong_object (takes a distractor), same_shape (the object on
+the table has another material than the one asked for). By its place alone a slip, an edge_grasp or
+an overgripped object can still be a success of the task.
+"""
 TaskName = Literal["pick-place", "bead-maze"]
 Camera = Literal["front", "wrist"]
 Indenter = Literal["sphere", "sharp", "flat"]
@@ -244,6 +271,10 @@ class PickPlaceConfig(EnvConfig):
     default an episode ends with the placed object still in the hand."""
 
 
+Place = tuple[Annotated[float, Field(ge=0.3, le=0.7)], Annotated[float, Field(ge=-0.3, le=0.3)]]
+"""x and y on the table, m, base frame."""
+
+
 @checked_dataclass
 class PickPlaceReset:
     """Options of `PickPlace.reset`, each in place of a random draw."""
@@ -254,6 +285,13 @@ class PickPlaceReset:
     """Mass of the object, kg."""
     grasp_force: Force | None = None
     """Force of each finger, N."""
+    asked: ObjectName | None = None
+    """Object that the instruction asks for where another lies on the table; placing that one is no
+    success."""
+    start: Place | None = None
+    """Where the object starts, m, base frame."""
+    goal: Place | None = None
+    """Where it shall be placed, m, base frame."""
 
 
 @checked_dataclass

@@ -26,7 +26,8 @@ class PickPlace(FrankaTactileEnv):
     `reset` takes the options of `PickPlaceReset`.
 
     Success: the object, once lifted by 3 cm, lies at rest on the table within `tolerance` of the
-    goal for half a second, and is let go if `release` asks for it. Progress: reaching (to 0.25),
+    goal for half a second, and is let go if `release` asks for it; it must be the object that the
+    instruction asks for. Progress: reaching (to 0.25),
     grasped (0.35), carrying (to 0.85), lowering (to 0.95), success (1).
     """
 
@@ -36,7 +37,11 @@ class PickPlace(FrankaTactileEnv):
 
     def instruction(self) -> str:
         """Return the episode's task in words."""
-        return f"pick up the {self.bodies[0].kind.name.replace('_', ' ')} and place it on the disc"
+        return f"pick up the {self.asked.replace('_', ' ')} and place it on the disc"
+
+    def episode_info(self) -> dict[str, Any]:
+        """Return what distinguishes this episode: the object, how it is gripped, what was asked."""
+        return super().episode_info() | {"asked": self.asked}
 
     def scene_layout(self) -> dict[str, list[float]]:
         """Return object pose, grasp (m, yaw in rad) and goal (m), base frame."""
@@ -86,6 +91,7 @@ class PickPlace(FrankaTactileEnv):
             kind = find(chosen.object)
         mass, force = rng.uniform(*config.mass), rng.uniform(*config.grasp_force)
         self.grasp_force = force if chosen.grasp_force is None else chosen.grasp_force
+        self.asked = chosen.asked or kind.name
         self.bodies = [sample_body(kind, rng, mass if chosen.mass is None else chosen.mass)]
         others = [k for k in CATALOGUE.values() if k.name != kind.name]
         for i in range(config.distractors):
@@ -94,6 +100,10 @@ class PickPlace(FrankaTactileEnv):
                 sample_body(other, rng, rng.uniform(*config.mass), f"distractor_{i + 1}")
             )
         *self._positions, self.goal = _random_positions(rng, len(self.bodies) + 1)
+        if chosen.start is not None:
+            self._positions[0] = np.array(chosen.start)
+        if chosen.goal is not None:
+            self.goal = np.array(chosen.goal)
 
     def add_task_objects(self, spec: mujoco.MjSpec) -> None:
         """Add the disc that marks the goal."""
@@ -145,6 +155,7 @@ class PickPlace(FrankaTactileEnv):
         down = self.object_on_table() or height < 1e-3
         self._put_down = self._lifted and down
         there = self._put_down and away < self.config.tolerance and speed < 0.05
+        there &= self.asked == self.bodies[0].kind.name
         placed = there and (let_go or not self.config.release)
         self._still_ticks = self._still_ticks + 1 if placed else 0
         success = self._still_ticks >= self.config.control_hz // 2

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from touchgoal.control.features import Observation
 from touchgoal.control.motion.rotations import fingers_down, rotation_matrix, rotation_vector
 from touchgoal.sim_envs.cell.hardware import GRIPPER_MAX_WIDTH
-from touchgoal.sim_envs.experts.pick_place import (
+from touchgoal.sim_envs.experts.pick_place_plans import (
     CLEARANCE,
     LOWEST_GRASP,
     LOWEST_PLACE,
@@ -35,10 +35,8 @@ class FeedbackExpert:
     """Picks and places from any state of arm and object.
 
     It follows a funnel over the object, then over the goal: the farther beside, the higher. It acts
-    on
-    the start of the episode and the sensed state of this tick and the last, as a policy can. It
-    yields
-    to contact, does not follow a displaced object, and never lets go.
+    on the start of the episode and the sensed state of this tick and the last, as a policy can. It
+    yields to contact, does not follow a displaced object, and never lets go.
     """
 
     def __init__(self, env: PickPlace) -> None:

@@ -1,6 +1,7 @@
 """Objects to grasp: shapes, materials, and the catalogue of both."""
 
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
@@ -114,6 +115,15 @@ def find(name: str) -> ObjectKind:
     if name not in CATALOGUE:
         raise UserError(f"unknown object {name!r}; choose from: {', '.join(CATALOGUE)}")
     return CATALOGUE[name]
+
+
+def of_same_shape(name: str, among: Sequence[str]) -> str:
+    """Return the next object with the shape of `name`; UserError if there is no other."""
+    alike = [other for other in among if find(other).shape == find(name).shape]
+    others = [*alike[alike.index(name) + 1 :], *alike[: alike.index(name)]]
+    if not others:
+        raise UserError(f"same_shape needs a second {find(name).shape} beside {name}")
+    return others[0]
 
 
 def sample_body(

@@ -1,0 +1,111 @@
+"""Check by ground truth that a simulated episode of pick-place came out as it was asked to."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from touchgoal.control import features as ft
+from touchgoal.sim_envs.config import Outcome
+
+_LIFTED = 0.03  # m
+_TOLERANCE = 0.02  # m beside the goal that a success may lie
+_OVERGRIPPED = (36.0, 44.0)  # N of each finger
+_PRESSED = 20.0  # N upwards on the hand: the 120 successes of `TASK_FORCES` reach 16.5 N
+_OFF_CENTRE = 0.004  # m in the hand; successes stay within 0.003
+_SLID = 0.004  # m in the hand between lifting and the end
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth of one episode of `n` frames."""
+
+    touched: Bool[np.ndarray, " n"]  # whether a pad touches something
+    height: Float[np.ndarray, " n"]  # of the object above its start, m
+    away: Float[np.ndarray, " n"]  # of the object from the goal, m, over the table
+    in_hand: Float[np.ndarray, "n 3"]  # object in the TCP frame, m
+    pressing: Float[np.ndarray, " n"]  # force that pushes the hand up, N
+    grip: Float[np.ndarray, "n 2"]  # normal force on each pad, N
+    success: bool  # of the task
+
+    @property
+    def held(self) -> bool:
+        """Whether both pads press on something at the end."""
+        return bool((self.grip[-1] > 0.1).all())
+
+    @property
+    def carried(self) -> bool:
+        """Whether the object was lifted."""
+        return bool(self.height.max() > _LIFTED)
+
+    @property
+    def grasps(self) -> int:
+        """Number of separate times that both pads held something."""
+        gripped = (self.grip > 0.1).all(axis=1)
+        return int(gripped[0]) + int((np.diff(gripped.astype(int)) == 1).sum())
+
+    @property
+    def slide(self) -> float:
+        """Distance (m) that the object moved in the hand after it was lifted, at the end."""
+        lifted = np.flatnonzero(self.height > _LIFTED)
+        if not len(lifted):
+            return 0.0
+        return float(np.linalg.norm(self.in_hand[-1] - self.in_hand[lifted[0]]))
+
+
+def read_truth(frames: Mapping[str, np.ndarray]) -> Truth:
+    """Return the ground truth of a recorded episode of pick-place."""
+    place, start = frames[ft.TRUTH_OBJECT_POSE][:, :3], frames[ft.TRUTH_START]
+    tcp = frames[ft.TCP_POSE]
+    offset = np.einsum("nij,ni->nj", _rotations(tcp[:, 3:]), place - tcp[:, :3])
+    return Truth(
+        touched=frames[ft.TRUTH_CONTACT].any(axis=1),
+        height=place[:, 2] - start[:, 2],
+        away=np.linalg.norm(place[:, :2] - start[:, 5:7], axis=1),
+        in_hand=offset,
+        pressing=frames[ft.WRENCH][:, 2],
+        grip=-frames[ft.TRUTH_PAD_WRENCH][:, [2, 8]],
+        success=bool(frames[ft.TRUTH_SUCCESS][-1, 0]),
+    )
+
+
+def came_out(outcome: Outcome, frames: Mapping[str, np.ndarray]) -> bool:
+    """Return whether an episode ended as its expert was asked to end it."""
+    return bool(_CHECKS[outcome](read_truth(frames)))
+
+
+_CHECKS: dict[Outcome, Callable[[Truth], bool | np.bool_]] = {
+    "success": lambda t: t.success,
+    "slow": lambda t: t.success,
+    "regrasped": lambda t: t.success and t.grasps > 1,
+    "never_touch": lambda t: not t.touched.any(),
+    "never_lifted": lambda t: t.held and not t.carried,
+    "freeze": lambda t: not t.touched.any(),
+    "freeze_holding": lambda t: t.held and t.height[-1] > _LIFTED,
+    "drop": lambda t: t.carried and not t.touched[-1] and not t.success,
+    "released_early": lambda t: t.carried and not t.touched[-1] and not t.success,
+    "off": lambda t: t.held and t.carried and _TOLERANCE < t.away[-1] < 2 * _TOLERANCE,
+    "slip": lambda t: t.held and t.slide > _SLID,
+    "edge_grasp": lambda t: t.held and t.success and abs(t.in_hand[-1, 0]) > _OFF_CENTRE,
+    # A weak grip gives way: then the hand slides down over the object.
+    "pressed": lambda t: t.held and (t.pressing.max() > _PRESSED or t.slide > _SLID),
+    "overgripped": lambda t: t.success and _within(t.grip[-1], _OVERGRIPPED),
+    "wrong_object": lambda t: t.held and not t.carried and not t.success,
+    "same_shape": lambda t: t.held and t.carried and t.away[-1] < _TOLERANCE and not t.success,
+}
+
+
+def _within(values: Float[np.ndarray, " k"], bounds: tuple[float, float]) -> bool:
+    return bool(((bounds[0] < values) & (values < bounds[1])).all())
+
+
+def _rotations(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
+    """Return rotation matrices of unit quaternions (wxyz)."""
+    w, x, y, z = quaternions.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
